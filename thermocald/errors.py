@@ -1,0 +1,136 @@
+"""The tree of errors; every message says what is wrong, where, and what to do.
+
+    ThermocaldError
+     ├── UsageError (ValueError)              exit 2: wrong usage
+     │    └── ConfigurationError              exit 2: config.yaml, camera, model or programme file
+     ├── DataError (ValueError)               exit 1: the data do not allow it
+     │    ├── RecordingError                  a recording is broken
+     │    ├── TestFieldError                  a test field is broken
+     │    ├── ImageError                      an image cannot be read or used
+     │    ├── StoreError                      a store is broken, foreign, or cannot be written
+     │    │    └── StoreVersionError          a store of a newer program
+     │    └── GeometryError                   too little geometry for what was asked
+     └── DeviceError (OSError)                exit 3: a device failed
+          ├── TransientDeviceError            may pass: the daemon retries with back-off
+          │    ├── DeviceTimeout (TimeoutError)
+          │    ├── DeviceGone (ConnectionError)     unplugged, offline
+          │    └── BadReading                       truncated frame, CRC error, garbage
+          └── PermanentDeviceError            retrying cannot help: a person must act
+               ├── DeviceNotFound                   no such device
+               ├── DeviceDenied (PermissionError)   permission, unauthorized, busy for good
+               ├── WrongDevice                      identity, size or capability does not fit
+               └── DriverMissing                    an optional library is not installed
+"""
+
+from __future__ import annotations
+
+__all__ = [
+    "BadReading",
+    "ConfigurationError",
+    "DataError",
+    "DeviceDenied",
+    "DeviceError",
+    "DeviceGone",
+    "DeviceNotFound",
+    "DeviceTimeout",
+    "DriverMissing",
+    "GeometryError",
+    "ImageError",
+    "PermanentDeviceError",
+    "RecordingError",
+    "StoreError",
+    "StoreVersionError",
+    "TestFieldError",
+    "ThermocaldError",
+    "TransientDeviceError",
+    "UsageError",
+    "WrongDevice",
+]
+
+
+class ThermocaldError(Exception):
+    """Base of everything that thermocald raises on purpose; `exit_status` is CONVENTIONS §4's."""
+
+    exit_status = 1
+
+
+class UsageError(ThermocaldError, ValueError):
+    """The command or the call was used wrongly."""
+
+    exit_status = 2
+
+
+class ConfigurationError(UsageError):
+    """A configuration, camera, model or programme file is wrong."""
+
+
+class DataError(ThermocaldError, ValueError):
+    """The data do not allow what was asked."""
+
+
+class RecordingError(DataError):
+    """A recording is broken; the message names file, row and column."""
+
+
+class TestFieldError(DataError):
+    """A test field is broken or does not fit the observations."""
+
+    __test__ = False  # pytest collects classes by their name
+
+
+class ImageError(DataError):
+    """An image cannot be read, or is not what the camera gives."""
+
+
+class StoreError(DataError):
+    """A store is broken, is not ours, or cannot be written."""
+
+
+class StoreVersionError(StoreError):
+    """A store was written by a newer program."""
+
+
+class GeometryError(DataError):
+    """The geometry is too weak for what was asked."""
+
+
+class DeviceError(ThermocaldError, OSError):
+    """A device failed."""
+
+    exit_status = 3
+
+
+class TransientDeviceError(DeviceError):
+    """A fault that may pass by itself: retried with back-off."""
+
+
+class DeviceTimeout(TransientDeviceError, TimeoutError):
+    """The device did not answer in time."""
+
+
+class DeviceGone(TransientDeviceError, ConnectionError):
+    """The device was there and is not any more."""
+
+
+class BadReading(TransientDeviceError):
+    """The device answered, but not with a usable frame or value."""
+
+
+class PermanentDeviceError(DeviceError):
+    """A fault that retrying cannot mend."""
+
+
+class DeviceNotFound(PermanentDeviceError):
+    """There is no such device."""
+
+
+class DeviceDenied(PermanentDeviceError, PermissionError):
+    """The device is there but may not be used."""
+
+
+class WrongDevice(PermanentDeviceError):
+    """Something else is attached, or it cannot do what is configured."""
+
+
+class DriverMissing(PermanentDeviceError):
+    """An optional library that the driver needs is not installed."""

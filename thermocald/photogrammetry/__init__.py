@@ -1,0 +1,1 @@
+"""Photogrammetry: pure functions of arrays, and the immutable values they work on."""

@@ -1,0 +1,349 @@
+"""The camera model of CONVENTIONS §2: Brown's model in photogrammetric notation.
+
+The distortion is evaluated at the ideal point, so object point → image point is closed form and
+image point → ray is an iteration. All functions are pure and take arrays; image points are px with
+(0, 0) at the centre of the top-left pixel, y down; object points, projection centre, and interior
+orientation are mm; angles rad; `R = Rx(omega) Ry(phi) Rz(kappa)` turns camera into object axes.
+
+Parameter vectors are ordered as `IOP_NAMES` and `EOP_NAMES`. Leading dimensions of `iop` and `eop`
+are epochs; points are shared by all epochs or carry the same leading dimensions.
+
+Source: Brown, D. C. (1971): Close-range camera calibration; Luhmann, T. et al. (2014):
+Close-Range Photogrammetry and 3D Imaging, 2nd ed., sections 2.4 and 3.3; the affinity terms as
+El-Hakim (1986).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+
+from thermocald.errors import GeometryError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import ArrayLike, NDArray
+
+    Array = NDArray[np.float64]
+
+__all__ = [
+    "EOP_NAMES",
+    "IOP_NAMES",
+    "PARAMETER_NAMES",
+    "CameraModel",
+    "ExteriorOrientation",
+    "InteriorOrientation",
+    "Sensor",
+    "camera_coordinates",
+    "image_to_mm",
+    "image_to_px",
+    "partials",
+    "project",
+    "rays",
+    "rotation",
+]
+
+IOP_NAMES = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2", "C1", "C2")
+EOP_NAMES = ("omega", "phi", "kappa", "X0", "Y0", "Z0")
+PARAMETER_NAMES = IOP_NAMES + EOP_NAMES
+
+_RAY_TOLERANCE_PX = 1e-9
+_RAY_ITERATIONS = 50
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """Image size in px and pixel pitch in mm."""
+
+    width: int
+    height: int
+    pixel_pitch: float
+
+    @property
+    def centre(self) -> Array:
+        """The image centre in px, (2,)."""
+        return np.array([(self.width - 1) / 2, (self.height - 1) / 2])
+
+    def contains(self, points: ArrayLike, margin: float = 0.0) -> NDArray[np.bool_]:
+        """Which image points (..., 2) lie inside the image by at least `margin` px."""
+        p = np.asarray(points, dtype=float)
+        low, high_x, high_y = margin - 0.5, self.width - 0.5 - margin, self.height - 0.5 - margin
+        inside: NDArray[np.bool_] = (
+            (p[..., 0] >= low) & (p[..., 0] <= high_x) & (p[..., 1] >= low) & (p[..., 1] <= high_y)
+        )
+        return inside
+
+
+class _Parameters:
+    """Named values that are also a vector, in the order of their fields."""
+
+    __slots__ = ()
+
+    def as_array(self) -> Array:
+        """The values as a vector in the order of the names."""
+        return np.array([getattr(self, f.name) for f in fields(self)], dtype=float)  # type: ignore[arg-type]
+
+    @classmethod
+    def from_array(cls, values: ArrayLike) -> Self:
+        """The inverse of `as_array`."""
+        return cls(*(float(v) for v in np.asarray(values, dtype=float)))
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, float]) -> Self:
+        """From a mapping by name; names that are missing keep their defaults."""
+        return cls(**{f.name: float(values[f.name]) for f in fields(cls) if f.name in values})  # type: ignore[arg-type]
+
+    def with_values(self, **changes: float) -> Self:
+        """A copy with some values changed."""
+        return replace(self, **changes)  # type: ignore[type-var]
+
+
+@dataclass(frozen=True, slots=True)
+class InteriorOrientation(_Parameters):
+    """IOP: c, x0, y0 mm; A1 mm⁻², A2 mm⁻⁴, A3 mm⁻⁶; B1, B2 mm⁻¹; C1, C2 without unit."""
+
+    c: float
+    x0: float = 0.0
+    y0: float = 0.0
+    A1: float = 0.0
+    A2: float = 0.0
+    A3: float = 0.0
+    B1: float = 0.0
+    B2: float = 0.0
+    C1: float = 0.0
+    C2: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class ExteriorOrientation(_Parameters):
+    """EOP: omega, phi, kappa rad; X0, Y0, Z0 mm."""
+
+    omega: float
+    phi: float
+    kappa: float
+    X0: float
+    Y0: float
+    Z0: float
+
+    @property
+    def rotation(self) -> Array:
+        """R (3, 3), camera to object."""
+        return rotation(np.array([self.omega, self.phi, self.kappa]))
+
+    @property
+    def centre(self) -> Array:
+        """The projection centre (3,) mm."""
+        return np.array([self.X0, self.Y0, self.Z0])
+
+    @classmethod
+    def from_rotation(cls, R: ArrayLike, centre: ArrayLike) -> ExteriorOrientation:
+        """From R (3, 3), camera to object, and the projection centre (3,) mm."""
+        r = np.asarray(R, dtype=float)
+        phi = np.arcsin(np.clip(r[0, 2], -1.0, 1.0))
+        omega = np.arctan2(-r[1, 2], r[2, 2])
+        kappa = np.arctan2(-r[0, 1], r[0, 0])
+        return cls(float(omega), float(phi), float(kappa), *(float(v) for v in np.asarray(centre)))
+
+
+@dataclass(frozen=True, slots=True)
+class CameraModel:
+    """A sensor with its interior orientation."""
+
+    sensor: Sensor
+    interior: InteriorOrientation
+
+    def project(self, exterior: ExteriorOrientation, points: ArrayLike) -> Array:
+        """Object points (n, 3) mm → image points (n, 2) px; NaN behind the camera."""
+        return project(self.sensor, self.interior.as_array(), exterior.as_array(), points)
+
+    def rays(self, image_points: ArrayLike) -> Array:
+        """Image points (n, 2) px → unit directions (n, 3) in the camera frame."""
+        return rays(self.sensor, self.interior.as_array(), image_points)
+
+
+def rotation(angles: ArrayLike) -> Array:
+    """Angles (..., 3) omega, phi, kappa → R (..., 3, 3), camera to object."""
+    a = np.asarray(angles, dtype=float)
+    so, sp, sk = np.moveaxis(np.sin(a), -1, 0)
+    co, cp, ck = np.moveaxis(np.cos(a), -1, 0)
+    r = np.empty((*a.shape[:-1], 3, 3))
+    r[..., 0, 0] = cp * ck
+    r[..., 0, 1] = -cp * sk
+    r[..., 0, 2] = sp
+    r[..., 1, 0] = co * sk + so * sp * ck
+    r[..., 1, 1] = co * ck - so * sp * sk
+    r[..., 1, 2] = -so * cp
+    r[..., 2, 0] = so * sk - co * sp * ck
+    r[..., 2, 1] = so * ck + co * sp * sk
+    r[..., 2, 2] = co * cp
+    return r
+
+
+def camera_coordinates(eop: ArrayLike, points: ArrayLike) -> Array:
+    """Object points (..., n, 3) → camera frame (..., n, 3) mm; the camera looks along -Z."""
+    e = np.asarray(eop, dtype=float)
+    shifted = np.asarray(points, dtype=float) - e[..., None, 3:6]
+    return shifted @ rotation(e[..., :3])
+
+
+def image_to_mm(sensor: Sensor, image_points: ArrayLike) -> Array:
+    """Image points px (y down) → mm (origin at the image centre, y up)."""
+    return (np.asarray(image_points, dtype=float) - sensor.centre) * (
+        sensor.pixel_pitch * np.array([1.0, -1.0])
+    )
+
+
+def image_to_px(sensor: Sensor, points_mm: ArrayLike) -> Array:
+    """The inverse of `image_to_mm`."""
+    return np.asarray(points_mm, dtype=float) / (
+        sensor.pixel_pitch * np.array([1.0, -1.0])
+    ) + sensor.centre
+
+
+def _distort(iop: Array, x: Array, y: Array) -> tuple[Array, Array]:
+    """Ideal points (mm, about the principal point) → measured points (mm, about the centre)."""
+    _, x0, y0, A1, A2, A3, B1, B2, C1, C2 = np.moveaxis(iop[..., None, :], -1, 0)
+    r2 = x * x + y * y
+    radial = r2 * (A1 + r2 * (A2 + r2 * A3))
+    xy = x * y
+    return (
+        x0 + x * (1 + radial) + B1 * (r2 + 2 * x * x) + 2 * B2 * xy + C1 * x + C2 * y,
+        y0 + y * (1 + radial) + B2 * (r2 + 2 * y * y) + 2 * B1 * xy,
+    )
+
+
+def project(sensor: Sensor, iop: ArrayLike, eop: ArrayLike, points: ArrayLike) -> Array:
+    """Object points → image points.
+
+    iop (..., 10), eop (..., 6), points (n, 3) or (..., n, 3) mm; returns (..., n, 2) px, NaN for
+    points that are not in front of the camera.
+    """
+    i = np.asarray(iop, dtype=float)
+    q = camera_coordinates(eop, points)
+    depth = np.where(q[..., 2] < 0, -q[..., 2], np.nan)
+    scale = i[..., None, 0] / depth
+    x, y = _distort(i, scale * q[..., 0], scale * q[..., 1])
+    return image_to_px(sensor, np.stack([x, y], axis=-1))
+
+
+def _distortion_jacobian(iop: Array, x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
+    """∂(x', y')/∂(x̄, ȳ) as its four elements."""
+    _, _, _, A1, A2, A3, B1, B2, C1, C2 = np.moveaxis(iop[..., None, :], -1, 0)
+    r2 = x * x + y * y
+    radial = r2 * (A1 + r2 * (A2 + r2 * A3))
+    slope = 2 * (A1 + r2 * (2 * A2 + 3 * r2 * A3))
+    jxx = 1 + radial + slope * x * x + 6 * B1 * x + 2 * B2 * y + C1
+    jxy = slope * x * y + 2 * B1 * y + 2 * B2 * x + C2
+    jyx = slope * x * y + 2 * B2 * x + 2 * B1 * y
+    jyy = 1 + radial + slope * y * y + 6 * B2 * y + 2 * B1 * x
+    return jxx, jxy, jyx, jyy
+
+
+def partials(
+    sensor: Sensor, iop: ArrayLike, eop: ArrayLike, points: ArrayLike
+) -> tuple[Array, Array, Array]:
+    """Image points and their analytic partial derivatives.
+
+    Arguments as `project`. Returns image points (..., n, 2) px; the derivatives by the 16
+    parameters in the order of `PARAMETER_NAMES` (..., n, 2, 16); by the object point
+    (..., n, 2, 3), px/mm.
+    """
+    i = np.asarray(iop, dtype=float)
+    e = np.asarray(eop, dtype=float)
+    q = camera_coordinates(e, points)
+    c = i[..., None, 0]
+    inverse_depth = 1.0 / np.where(q[..., 2] < 0, -q[..., 2], np.nan)
+    u, v = q[..., 0] * inverse_depth, q[..., 1] * inverse_depth
+    x, y = c * u, c * v
+    xd, yd = _distort(i, x, y)
+    jxx, jxy, jyx, jyy = _distortion_jacobian(i, x, y)
+    r2 = x * x + y * y
+    r4, xy = r2 * r2, x * y
+
+    p = np.zeros((*x.shape, 2, 16))
+    px, py = p[..., 0, :], p[..., 1, :]
+    px[..., 0], py[..., 0] = jxx * u + jxy * v, jyx * u + jyy * v
+    px[..., 1] = py[..., 2] = 1.0
+    px[..., 3], py[..., 3] = x * r2, y * r2
+    px[..., 4], py[..., 4] = x * r4, y * r4
+    px[..., 5], py[..., 5] = x * r4 * r2, y * r4 * r2
+    px[..., 6], py[..., 6] = r2 + 2 * x * x, 2 * xy
+    px[..., 7], py[..., 7] = 2 * xy, r2 + 2 * y * y
+    px[..., 8], px[..., 9] = x, y
+
+    # ∂(x̄, ȳ)/∂(camera coordinates), with depth = -Zc
+    k = c * inverse_depth
+    dq = np.empty((*x.shape, 2, 3))
+    dq[..., 0, 0], dq[..., 0, 1], dq[..., 0, 2] = jxx * k, jxy * k, (jxx * u + jxy * v) * k
+    dq[..., 1, 0], dq[..., 1, 1], dq[..., 1, 2] = jyx * k, jyy * k, (jyx * u + jyy * v) * k
+
+    R = rotation(e[..., :3])
+    d_object = dq @ np.swapaxes(R, -1, -2)[..., None, :, :]
+    p[..., 13:16] = -d_object
+    # q = Rᵀ d; a small turn about the object axis w changes q by Rᵀ (d × w): the columns of the
+    # rotation axes of omega, phi, kappa in object space are w.
+    axes = _rotation_axes(e[..., :3])
+    d = np.asarray(points, dtype=float) - e[..., None, 3:6]
+    for column in range(3):
+        turned = np.cross(d, axes[..., None, :, column])
+        p[..., 10 + column] = (d_object @ turned[..., None])[..., 0]
+    scale = np.array([1.0, -1.0]) / sensor.pixel_pitch
+    p *= scale[:, None]
+    d_object = d_object * scale[:, None]
+    return image_to_px(sensor, np.stack([xd, yd], axis=-1)), p, d_object
+
+
+def _rotation_axes(angles: Array) -> Array:
+    """The object-space axes (..., 3, 3) about which omega, phi, kappa turn the camera (columns)."""
+    so, sp = np.sin(angles[..., 0]), np.sin(angles[..., 1])
+    co, cp = np.cos(angles[..., 0]), np.cos(angles[..., 1])
+    w = np.zeros((*angles.shape[:-1], 3, 3))
+    w[..., 0, 0] = 1.0
+    w[..., 1, 1], w[..., 2, 1] = co, so
+    w[..., 0, 2], w[..., 1, 2], w[..., 2, 2] = sp, -so * cp, co * cp
+    return w
+
+
+def rays(sensor: Sensor, iop: ArrayLike, image_points: ArrayLike) -> Array:
+    """Image points (..., n, 2) px → unit directions (..., n, 3) in the camera frame (looks along -Z).
+
+    Newton's method on the distortion; converges to 1e-9 px. Raises GeometryError for points where
+    it does not: beyond the radius at which the distortion polynomial folds back.
+    """
+    i = np.asarray(iop, dtype=float)
+    measured = image_to_mm(sensor, image_points)
+    xm, ym = measured[..., 0], measured[..., 1]
+    x, y = xm - i[..., None, 1], ym - i[..., None, 2]
+    tolerance = _RAY_TOLERANCE_PX * sensor.pixel_pitch
+    size = tolerance
+    for _ in range(_RAY_ITERATIONS):
+        xd, yd = _distort(i, x, y)
+        jxx, jxy, jyx, jyy = _distortion_jacobian(i, x, y)
+        determinant = jxx * jyy - jxy * jyx
+        rx, ry = xm - xd, ym - yd
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            x = x + (jyy * rx - jxy * ry) / determinant
+            y = y + (jxx * ry - jyx * rx) / determinant
+        with np.errstate(invalid="ignore"):
+            size = np.fmax(np.abs(rx), np.abs(ry))
+            if bool(np.all(size <= tolerance)):
+                break
+    jxx, jxy, jyx, jyy = _distortion_jacobian(i, x, y)
+    finite = np.isfinite(xm) & np.isfinite(ym)
+    with np.errstate(invalid="ignore"):
+        folded = (jxx * jyy - jxy * jyx <= 0) | ~(size <= tolerance) | ~np.isfinite(x)
+    failed = finite & folded
+    if bool(np.any(failed)):
+        where = np.argwhere(failed)[0]
+        point = np.asarray(image_points, dtype=float)[tuple(where)]
+        raise GeometryError(
+            f"{int(failed.sum())} image points have no ray: the first is ({point[0]:.1f}, "
+            f"{point[1]:.1f}) px. The distortion of this camera model folds back there; use points "
+            "inside the area in which it was calibrated"
+        )
+    direction = np.stack([x, y, np.broadcast_to(-i[..., None, 0], x.shape)], axis=-1)
+    unit: Array = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+    return unit

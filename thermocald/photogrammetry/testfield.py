@@ -1,0 +1,128 @@
+"""The test field: known targets with their covariance, and what of them one image shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.errors import TestFieldError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import ArrayLike, NDArray
+
+    Array = NDArray[np.float64]
+
+__all__ = ["KINDS", "Observations", "TestField"]
+
+KINDS = ("circle", "marker_corner")
+
+
+@dataclass(frozen=True, eq=False)
+class TestField:
+    """Known points: names, coordinates and standard deviations, what they look like.
+
+    names: n unique strings; points (n, 3) mm; sigmas (n, 3) mm; diameters (n,) mm, NaN where it
+    has none; kinds, codes: n strings as CONVENTIONS §3 defines them, a code may be empty.
+    """
+
+    __test__ = False  # pytest collects classes by their name
+
+    names: tuple[str, ...]
+    points: Array
+    sigmas: Array
+    diameters: Array
+    kinds: tuple[str, ...]
+    codes: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        n = len(self.names)
+        shapes = (self.points.shape, self.sigmas.shape, self.diameters.shape)
+        if shapes != ((n, 3), (n, 3), (n,)) or len(self.kinds) != n or len(self.codes) != n:
+            raise TestFieldError(f"a test field of {n} targets has columns of shapes {shapes}")
+        if len(set(self.names)) != n:
+            twice = next(name for name in self.names if self.names.count(name) > 1)
+            raise TestFieldError(f"target {twice!r} stands twice in the test field")
+        for array in (self.points, self.sigmas, self.diameters):
+            array.setflags(write=False)
+
+    @classmethod
+    def build(
+        cls,
+        names: Sequence[str],
+        points: ArrayLike,
+        sigmas: ArrayLike = 0.0,
+        diameters: ArrayLike = np.nan,
+        kinds: Sequence[str] | str = "circle",
+        codes: Sequence[str] | str = "",
+    ) -> TestField:
+        """Build from columns; a scalar stands for all targets."""
+        n = len(names)
+        return cls(
+            tuple(names),
+            np.array(points, dtype=float).reshape(n, 3),
+            np.array(np.broadcast_to(np.asarray(sigmas, dtype=float), (n, 3))),
+            np.array(np.broadcast_to(np.asarray(diameters, dtype=float), (n,))),
+            (kinds,) * n if isinstance(kinds, str) else tuple(kinds),
+            (codes,) * n if isinstance(codes, str) else tuple(codes),
+        )
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @cached_property
+    def index(self) -> dict[str, int]:
+        """Row of each target by its name."""
+        return {name: i for i, name in enumerate(self.names)}
+
+    def subset(self, rows: ArrayLike) -> TestField:
+        """The targets of some rows (indices)."""
+        r = np.asarray(rows, dtype=int)
+        return TestField(
+            tuple(self.names[i] for i in r),
+            self.points[r],
+            self.sigmas[r],
+            self.diameters[r],
+            tuple(self.kinds[i] for i in r),
+            tuple(self.codes[i] for i in r),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observations:
+    """Image points of one epoch.
+
+    targets: n row numbers in the test field, unique; points (n, 2) px; sigmas (n, 2) px;
+    covariances (n,) px² between x and y, None where none is known; quality: per-target extras by
+    name, (n,) each, such as `blur` px.
+    """
+
+    targets: NDArray[np.int64]
+    points: Array
+    sigmas: Array
+    covariances: Array | None = None
+    quality: dict[str, Array] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n = len(self.targets)
+        if self.points.shape != (n, 2) or self.sigmas.shape != (n, 2):
+            raise ValueError(
+                f"{n} targets, image points {self.points.shape}, sigmas {self.sigmas.shape}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.targets)
+
+    def select(self, keep: NDArray[np.bool_] | NDArray[np.int64]) -> Observations:
+        """Some of the observations, by mask or rows."""
+        return Observations(
+            self.targets[keep],
+            self.points[keep],
+            self.sigmas[keep],
+            None if self.covariances is None else self.covariances[keep],
+            {name: values[keep] for name, values in self.quality.items()},
+        )

@@ -1,0 +1,165 @@
+"""Normal equations of many epochs at one common linearisation point.
+
+A static camera sees the same field in every epoch, so the partial derivatives are one array for the
+whole series and each epoch differs only in its weights and residuals. All normal matrices are then
+one matrix product: (epochs × targets) · (targets × products of partials). Everything that follows
+(series adjustment, filter, discovery) works on these sums.
+
+Source: Luhmann et al. (2014), section 2.4.4; the reduction of common unknowns as Mikhail and
+Ackermann (1976), Observations and Least Squares, chapter 10.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.photogrammetry.camera_model import partials, project
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from thermocald.photogrammetry.camera_model import Sensor
+    from thermocald.photogrammetry.testfield import Observations, TestField
+
+    Array = NDArray[np.float64]
+
+__all__ = ["Normals", "ObservationGrid", "Partials", "epoch_normals", "linearise"]
+
+_UPPER = np.triu_indices(16)
+
+
+@dataclass(frozen=True, eq=False)
+class ObservationGrid:
+    """The observations of many epochs on one grid of epochs × targets of the test field.
+
+    points (E, T, 2) px, NaN where a target was not observed; weights (E, T, 3) px⁻²: the elements
+    xx, yy, xy of each point's inverse covariance, 0 where it was not observed or is rejected.
+    """
+
+    points: Array
+    weights: Array
+
+    @classmethod
+    def from_observations(
+        cls, field: TestField, epochs: Sequence[Observations | None]
+    ) -> ObservationGrid:
+        """Lay the epochs' observations out; an epoch that is None stays empty."""
+        points = np.full((len(epochs), len(field), 2), np.nan)
+        weights = np.zeros((len(epochs), len(field), 3))
+        present = [(e, obs) for e, obs in enumerate(epochs) if obs is not None and len(obs)]
+        if present:
+            row = np.concatenate([np.full(len(obs), e) for e, obs in present])
+            target = np.concatenate([obs.targets for _, obs in present])
+            sigmas = np.concatenate([obs.sigmas for _, obs in present])
+            points[row, target] = np.concatenate([obs.points for _, obs in present])
+            covariance = np.concatenate(
+                [np.zeros(len(o)) if o.covariances is None else o.covariances for _, o in present]
+            )
+            xx, yy = sigmas[:, 0] ** 2, sigmas[:, 1] ** 2
+            determinant = xx * yy - covariance**2
+            weights[row, target, 0] = yy / determinant
+            weights[row, target, 1] = xx / determinant
+            weights[row, target, 2] = -covariance / determinant
+        return cls(points, weights)
+
+    @property
+    def observed(self) -> NDArray[np.bool_]:
+        """(E, T): what takes part."""
+        return self.weights[..., 0] > 0
+
+    def reject(self, mask: NDArray[np.bool_]) -> ObservationGrid:
+        """A copy in which the observations of a mask (E, T) have no weight."""
+        return ObservationGrid(self.points, np.where(mask[..., None], 0.0, self.weights))
+
+
+@dataclass(frozen=True, eq=False)
+class Partials:
+    """The linearisation: iop (10,), eop (6,), predicted (T, 2) px, A (T, 2, 16), B (T, 2, 3)."""
+
+    iop: Array
+    eop: Array
+    predicted: Array
+    A: Array
+    B: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Normals:
+    """Per epoch: N (E, 16, 16), b (E, 16), lPl (E,), n (E,) image points that take part.
+
+    Order of `PARAMETER_NAMES`; the unknowns are corrections to the linearisation point.
+    """
+
+    N: Array
+    b: Array
+    lPl: Array
+    n: NDArray[np.int64]
+
+
+def linearise(sensor: Sensor, field: TestField, iop: ArrayLike, eop: ArrayLike) -> Partials:
+    """The partial derivatives of all targets at one point; targets out of sight get zeros."""
+    i, e = np.asarray(iop, dtype=float), np.asarray(eop, dtype=float)
+    predicted, A, B = partials(sensor, i, e, field.points)
+    seen = np.isfinite(predicted[:, 0])
+    A[~seen], B[~seen] = 0.0, 0.0
+    return Partials(i, e, predicted, A, B)
+
+
+def epoch_normals(
+    grid: ObservationGrid,
+    at: Partials,
+    residuals: Array | None = None,
+) -> Normals:
+    """Normal equations of every epoch.
+
+    residuals: (E, T, 2) px, measured minus predicted at the epochs' own parameters; by default
+    measured minus predicted at the linearisation point.
+    """
+    l = grid.points - at.predicted if residuals is None else residuals
+    N = normal_matrices(grid.weights, at.A)
+    b, lPl = right_hand_sides(grid.weights, l, at.A)
+    return Normals(N, b, lPl, grid.observed.sum(axis=1))
+
+
+def normal_matrices(weights: Array, A: Array) -> Array:
+    """Σ Aᵀ P A of every epoch: weights (E, T, 3), A (T, 2, 16) → (E, 16, 16)."""
+    E, T = weights.shape[:2]
+    k = A.shape[-1]
+    rows, columns = _UPPER if k == 16 else np.triu_indices(k)
+    ax, ay = A[:, 0], A[:, 1]
+    flat = weights[..., 0] @ (ax[:, rows] * ax[:, columns])
+    flat += weights[..., 1] @ (ay[:, rows] * ay[:, columns])
+    if np.any(weights[..., 2]):
+        flat += weights[..., 2] @ (ax[:, rows] * ay[:, columns] + ay[:, rows] * ax[:, columns])
+    N = np.empty((E, k, k))
+    N[:, rows, columns] = flat
+    N[:, columns, rows] = flat
+    return N
+
+
+def right_hand_sides(weights: Array, residuals: Array, A: Array) -> tuple[Array, Array]:
+    """Aᵀ P l (E, k) and lᵀ P l (E,) of every epoch; NaN residuals must have weight 0."""
+    lx = np.nan_to_num(residuals[..., 0])
+    ly = np.nan_to_num(residuals[..., 1])
+    px = weights[..., 0] * lx + weights[..., 2] * ly
+    py = weights[..., 2] * lx + weights[..., 1] * ly
+    b: Array = px @ A[:, 0] + py @ A[:, 1]
+    lPl: Array = np.einsum("et,et->e", px, lx) + np.einsum("et,et->e", py, ly)
+    return b, lPl
+
+
+def series_residuals(
+    sensor: Sensor, grid: ObservationGrid, field_points: Array, values: Array, chunk: int = 256
+) -> Array:
+    """Measured minus predicted (E, T, 2) px at each epoch's own parameters (E, 16)."""
+    out = np.empty_like(grid.points)
+    for start in range(0, len(values), chunk):
+        part = slice(start, start + chunk)
+        predicted = project(sensor, values[part, :10], values[part, 10:], field_points)
+        np.subtract(grid.points[part], predicted, out=out[part])
+    return out

@@ -4,8 +4,8 @@ A target is a disc of radius 1 and a concentric ring between radius 2 and 3 that
 segments. A segment in the disc's colour is a 1, one in the background's colour a 0. Read clockwise
 (as seen by the viewer), the most significant bit first, every starting segment gives another
 number: the code is the smallest of them. Of all N-bit numbers those are codes that have an even
-number of ones, and at least one pair of opposite segments that are both ones; that leaves 147 codes
-of 12 bit and 516 of 14 bit. `number` in this module and in a test field's code (`RING12:<code>`,
+number of ones, at least one pair of opposite segments that are both ones, and a gap; that leaves
+147 codes of 12 bit and 516 of 14 bit. `number` in this module and in a test field's code (`RING12:<code>`,
 `RING14:<code>`) is the code itself, not its place in somebody's list; the lists that programs print
 are in increasing order of the code.
 
@@ -53,7 +53,7 @@ def codes(bits: int) -> tuple[int, ...]:
     half = bits // 2
     return tuple(
         number
-        for number in range(1, 1 << bits, 2)
+        for number in range(1, 1 << (bits - 1), 2)  # begins with a 0: the closed ring is no code
         if number.bit_count() % 2 == 0
         and number & (number >> half) & ((1 << half) - 1)
         and number == smallest_rotation(number, bits)
@@ -100,8 +100,6 @@ def segments(bits: int, number: int) -> tuple[tuple[float, float], ...]:
     goes from x to y; with y up, negate it.
     """
     ones = [bool(number >> (bits - 1 - i) & 1) for i in range(bits)]
-    if all(ones):
-        return ((0.0, 1.0),)
     arcs = []
     for begin in (i for i in range(bits) if ones[i] and not ones[i - 1]):
         end = begin

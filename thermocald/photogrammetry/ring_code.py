@@ -5,9 +5,9 @@ segments. A segment in the disc's colour is a 1, one in the background's colour 
 (as seen by the viewer), the most significant bit first, every starting segment gives another
 number: the code is the smallest of them. Of all N-bit numbers those are codes that have an even
 number of ones, at least one pair of opposite segments that are both ones, and a gap; that leaves
-147 codes of 12 bit and 516 of 14 bit. `number` in this module and in a test field's code (`RING12:<code>`,
-`RING14:<code>`) is the code itself, not its place in somebody's list; the lists that programs print
-are in increasing order of the code.
+147 codes of 12 bit and 516 of 14 bit. `number` in this module and in a test field's code
+(`RING12:<code>`, `RING14:<code>`) is the code itself, not its place in somebody's list; the lists
+that programs print are in increasing order of the code.
 
 Source: Schneider, C. T. (1991): 3-D Vermessung von Oberflächen und Bauteilen durch Photogrammetrie
 und Bildverarbeitung, IDENT/VISION '91; rule and geometry as the expired patent DE 197 33 466 A1,

@@ -1,0 +1,1 @@
+"""The simulation: bodies that warm, effects on the camera, observations and rendered frames."""

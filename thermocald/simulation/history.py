@@ -291,7 +291,7 @@ def play(knots: Array, values: Array, half_width: float, at: Array) -> Array:
     """The play (backlash) operator: the output rests until the input is `half_width` away.
 
     P = min(max(P, T - r), T + r), P = T at the first knot. knots, values (K,), at (E,); (E,).
-    Source: Krasnosel'skii, Pokrovskii (1989): Systems with Hysteresis, section 2.
+    Source: Krasnosel'skii, Pokrovskii (1989): Systems with Hysteresis.
     """
     states = _play_states(values, half_width)
     left, right, share = _edges(knots, at)

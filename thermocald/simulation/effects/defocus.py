@@ -1,0 +1,59 @@
+"""Defocus: heat defocuses, targets blur, measuring noise grows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from thermocald.simulation.effects.base import Effect, Influence, spoken
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+    from scipy.sparse import csr_array
+
+    from thermocald.photogrammetry.testfield import TestField
+    from thermocald.simulation.history import History
+
+__all__ = ["Defocus"]
+
+
+class Defocus(Effect):
+    """Measuring noise and blur are multiplied by max(1 + k (T - T₀), 0.1); positions stay unbiased.
+
+    Noise and blur share the factor: the precision of an edge falls between the root of its blur
+    (Cramér-Rao) and in proportion to it (an operator of fixed width), and an instrument of fixed
+    windows lies at the latter.
+    """
+
+    name = "defocus"
+    noun = "defocus"
+    kind = "image"
+    linear: ClassVar[Mapping[str, str]] = {"factor": "1/K"}
+    usual = ("factor",)
+    behaviour: ClassVar[Mapping[str, str]] = {
+        "hold": "leaves positions alone; noise stays as large as it is",
+        "cycle": "makes noise come and go with the temperature",
+    }
+
+    def signal(self, history: History, **_: Any) -> NDArray[np.float64]:
+        return (history.temperature() - history.T0)[:, None]
+
+    def sensitivity(self, history: History, **_: Any) -> csr_array:
+        return history.temperature_matrix()
+
+    def influence(
+        self,
+        history: History,
+        values: Mapping[str, Any],
+        field: TestField | None = None,  # noqa: ARG002
+    ) -> Influence:
+        nothing = Influence.none(len(history.times))
+        factor = np.maximum(1.0 + values["factor"] * self.signal(history)[:, 0], 0.1)
+        return replace(nothing, noise_factor=factor, blur_factor=factor)
+
+    def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
+        return f"heat defocuses: the measuring noise grows by {spoken(estimates['factor'])}"

@@ -1,0 +1,39 @@
+"""Housing tilt: the housing turns the whole camera."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from thermocald.simulation.effects.base import Effect, coefficient_units
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import numpy as np
+    from numpy.typing import NDArray
+    from scipy.sparse import csr_array
+
+    from thermocald.simulation.history import History
+
+__all__ = ["HousingTilt"]
+
+
+class HousingTilt(Effect):
+    """Adds a (T - T₀) to omega, phi, kappa; the projection centre stays."""
+
+    name = "housing_tilt"
+    noun = "a tilt of the housing"
+    kind = "signal"
+    linear: ClassVar[Mapping[str, str]] = coefficient_units("K", ("omega", "phi", "kappa"))
+    usual = ("omega", "phi", "kappa")
+    behaviour: ClassVar[Mapping[str, str]] = {
+        "turn": "keeps its direction in space",
+        "hold": "does not move while the temperature stands",
+        "cycle": "runs along the same line up and down",
+    }
+
+    def signal(self, history: History, **_: Any) -> NDArray[np.float64]:
+        return (history.temperature() - history.T0)[:, None]
+
+    def sensitivity(self, history: History, **_: Any) -> csr_array:
+        return history.temperature_matrix()

@@ -1,0 +1,39 @@
+"""Radial distortion drift: the lens bends."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from thermocald.simulation.effects.base import Effect, coefficient_units
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import numpy as np
+    from numpy.typing import NDArray
+    from scipy.sparse import csr_array
+
+    from thermocald.simulation.history import History
+
+__all__ = ["RadialDistortionDrift"]
+
+
+class RadialDistortionDrift(Effect):
+    """Adds a (T - T₀) to A1 (A2, A3)."""
+
+    name = "radial_distortion_drift"
+    noun = "a drift of the radial distortion"
+    kind = "signal"
+    linear: ClassVar[Mapping[str, str]] = coefficient_units("K", ("A1", "A2", "A3"))
+    usual = ("A1",)
+    behaviour: ClassVar[Mapping[str, str]] = {
+        "turn": "stays radial about the principal point",
+        "hold": "does not move while the temperature stands",
+        "cycle": "runs along the same line up and down",
+    }
+
+    def signal(self, history: History, **_: Any) -> NDArray[np.float64]:
+        return (history.temperature() - history.T0)[:, None]
+
+    def sensitivity(self, history: History, **_: Any) -> csr_array:
+        return history.temperature_matrix()

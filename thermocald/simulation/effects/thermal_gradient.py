@@ -1,0 +1,48 @@
+"""Thermal gradient: heat flowing through bends the mount."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from thermocald.simulation.effects.base import Effect, coefficient_units
+from thermocald.simulation.history import slope_matrix
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import numpy as np
+    from numpy.typing import NDArray
+    from scipy.sparse import csr_array
+
+    from thermocald.simulation.history import History
+
+__all__ = ["ThermalGradient"]
+
+
+class ThermalGradient(Effect):
+    """Adds a dT/dt: the difference across a plate that heat flows through, so its bow.
+
+    In a body that warms steadily the difference between its faces is proportional to the rate:
+    Carslaw, Jaeger (1959): Conduction of Heat in Solids.
+    """
+
+    name = "thermal_gradient"
+    noun = "a thermal gradient"
+    kind = "signal"
+    linear: ClassVar[Mapping[str, str]] = coefficient_units("(K/s)")
+    usual = ("c", "x0", "y0")
+    behaviour: ClassVar[Mapping[str, str]] = {
+        "hold": "vanishes as soon as the temperature stands",
+        "rate": "grows in proportion to the rate",
+        "cycle": "changes its sign between up and down",
+        "idle": "does nothing",
+    }
+
+    def signal(self, history: History, **_: Any) -> NDArray[np.float64]:
+        p = history.polygon()
+        rate: NDArray[np.float64] = slope_matrix(p.times, history.times) @ p.values
+        return rate[:, None]
+
+    def sensitivity(self, history: History, **_: Any) -> csr_array:
+        p = history.polygon()
+        return slope_matrix(p.times, history.times) @ p.matrix

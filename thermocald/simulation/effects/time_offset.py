@@ -1,0 +1,47 @@
+"""Time offset: temperatures are stamped late or early."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from thermocald.simulation.effects.base import Effect, Parameter, spoken
+from thermocald.simulation.history import interpolation_matrix
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import numpy as np
+    from numpy.typing import NDArray
+    from scipy.sparse import csr_array
+
+    from thermocald.simulation.history import History
+
+__all__ = ["TimeOffset"]
+
+
+class TimeOffset(Effect):
+    """The linear terms follow T(t - d): a pure delay d; d < 0 where T is stamped late.
+
+    Before the first frame the temperature has always been the one of the first frame.
+    """
+
+    name = "time_offset"
+    noun = "a time offset"
+    kind = "drive"
+    nonlinear: ClassVar[Mapping[str, Parameter]] = {"d": Parameter("s", -120.0, 300.0, 10.0)}
+    behaviour: ClassVar[Mapping[str, str]] = {
+        "hold": "stops at once after the delay",
+        "rate": "shifts the whole curve by the same time, its tips stay sharp",
+        "cycle": "returns to the same line each time",
+        "idle": "does nothing",
+    }
+
+    def drive(self, history: History, d: float = 0.0, **_: Any) -> NDArray[np.float64]:
+        return history.polygon().at(history.times - d)
+
+    def sensitivity(self, history: History, d: float = 0.0, **_: Any) -> csr_array:
+        p = history.polygon()
+        return interpolation_matrix(p.times, history.times - d) @ p.matrix
+
+    def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
+        return f"the camera follows the thermometer after a pure delay of {spoken(estimates['d'])}"

@@ -14,17 +14,17 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, Literal, Protocol, Self, runtime_checkable
 
-import numpy as np
-from numpy.typing import NDArray
 
 from thermocald.errors import ConfigurationError, DriverMissing
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+    import numpy as np
+    from collections.abc import Mapping
     from types import TracebackType
 
 __all__ = [

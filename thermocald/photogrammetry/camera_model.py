@@ -167,19 +167,18 @@ class CameraModel:
 def rotation(angles: ArrayLike) -> Array:
     """Angles (..., 3) omega, phi, kappa → R (..., 3, 3), camera to object."""
     a = np.asarray(angles, dtype=float)
-    so, sp, sk = np.moveaxis(np.sin(a), -1, 0)
-    co, cp, ck = np.moveaxis(np.cos(a), -1, 0)
-    r = np.empty((*a.shape[:-1], 3, 3))
-    r[..., 0, 0] = cp * ck
-    r[..., 0, 1] = -cp * sk
-    r[..., 0, 2] = sp
-    r[..., 1, 0] = co * sk + so * sp * ck
-    r[..., 1, 1] = co * ck - so * sp * sk
-    r[..., 1, 2] = -so * cp
-    r[..., 2, 0] = so * sk - co * sp * ck
-    r[..., 2, 1] = so * ck + co * sp * sk
-    r[..., 2, 2] = co * cp
-    return r
+    sines, cosines = np.sin(a), np.cos(a)
+    so, sp, sk = sines[..., 0], sines[..., 1], sines[..., 2]
+    co, cp, ck = cosines[..., 0], cosines[..., 1], cosines[..., 2]
+    rows = [
+        cp * ck, -cp * sk, sp,
+        co * sk + so * sp * ck, co * ck - so * sp * sk, -so * cp,
+        so * sk - co * sp * ck, so * ck + co * sp * sk, co * cp,
+    ]  # fmt: skip
+    r: Array = np.array(rows)
+    if a.ndim == 1:
+        return r.reshape(3, 3)
+    return np.ascontiguousarray(np.moveaxis(r, 0, -1)).reshape(*a.shape[:-1], 3, 3)
 
 
 def camera_coordinates(eop: ArrayLike, points: ArrayLike) -> Array:
@@ -198,14 +197,15 @@ def image_to_mm(sensor: Sensor, image_points: ArrayLike) -> Array:
 
 def image_to_px(sensor: Sensor, points_mm: ArrayLike) -> Array:
     """The inverse of `image_to_mm`."""
-    return np.asarray(points_mm, dtype=float) / (
-        sensor.pixel_pitch * np.array([1.0, -1.0])
-    ) + sensor.centre
+    return (
+        np.asarray(points_mm, dtype=float) / (sensor.pixel_pitch * np.array([1.0, -1.0]))
+        + sensor.centre
+    )
 
 
 def _distort(iop: Array, x: Array, y: Array) -> tuple[Array, Array]:
     """Ideal points (mm, about the principal point) → measured points (mm, about the centre)."""
-    _, x0, y0, A1, A2, A3, B1, B2, C1, C2 = np.moveaxis(iop[..., None, :], -1, 0)
+    _, x0, y0, A1, A2, A3, B1, B2, C1, C2 = (iop[..., None, j] for j in range(10))
     r2 = x * x + y * y
     radial = r2 * (A1 + r2 * (A2 + r2 * A3))
     xy = x * y
@@ -231,7 +231,7 @@ def project(sensor: Sensor, iop: ArrayLike, eop: ArrayLike, points: ArrayLike) -
 
 def _distortion_jacobian(iop: Array, x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
     """∂(x', y')/∂(x̄, ȳ) as its four elements."""
-    _, _, _, A1, A2, A3, B1, B2, C1, C2 = np.moveaxis(iop[..., None, :], -1, 0)
+    _, _, _, A1, A2, A3, B1, B2, C1, C2 = (iop[..., None, j] for j in range(10))
     r2 = x * x + y * y
     radial = r2 * (A1 + r2 * (A2 + r2 * A3))
     slope = 2 * (A1 + r2 * (2 * A2 + 3 * r2 * A3))
@@ -253,54 +253,77 @@ def partials(
     """
     i = np.asarray(iop, dtype=float)
     e = np.asarray(eop, dtype=float)
-    q = camera_coordinates(e, points)
-    c = i[..., None, 0]
-    inverse_depth = 1.0 / np.where(q[..., 2] < 0, -q[..., 2], np.nan)
-    u, v = q[..., 0] * inverse_depth, q[..., 1] * inverse_depth
-    x, y = c * u, c * v
-    xd, yd = _distort(i, x, y)
-    jxx, jxy, jyx, jyy = _distortion_jacobian(i, x, y)
-    r2 = x * x + y * y
-    r4, xy = r2 * r2, x * y
-
-    p = np.zeros((*x.shape, 2, 16))
-    px, py = p[..., 0, :], p[..., 1, :]
-    px[..., 0], py[..., 0] = jxx * u + jxy * v, jyx * u + jyy * v
-    px[..., 1] = py[..., 2] = 1.0
-    px[..., 3], py[..., 3] = x * r2, y * r2
-    px[..., 4], py[..., 4] = x * r4, y * r4
-    px[..., 5], py[..., 5] = x * r4 * r2, y * r4 * r2
-    px[..., 6], py[..., 6] = r2 + 2 * x * x, 2 * xy
-    px[..., 7], py[..., 7] = 2 * xy, r2 + 2 * y * y
-    px[..., 8], px[..., 9] = x, y
-
-    # ∂(x̄, ȳ)/∂(camera coordinates), with depth = -Zc
-    k = c * inverse_depth
-    dq = np.empty((*x.shape, 2, 3))
-    dq[..., 0, 0], dq[..., 0, 1], dq[..., 0, 2] = jxx * k, jxy * k, (jxx * u + jxy * v) * k
-    dq[..., 1, 0], dq[..., 1, 1], dq[..., 1, 2] = jyx * k, jyy * k, (jyx * u + jyy * v) * k
-
     R = rotation(e[..., :3])
-    d_object = dq @ np.swapaxes(R, -1, -2)[..., None, :, :]
-    p[..., 13:16] = -d_object
-    # q = Rᵀ d; a small turn about the object axis w changes q by Rᵀ (d × w): the columns of the
-    # rotation axes of omega, phi, kappa in object space are w.
-    axes = _rotation_axes(e[..., :3])
-    d = np.asarray(points, dtype=float) - e[..., None, 3:6]
-    for column in range(3):
-        turned = np.cross(d, axes[..., None, :, column])
-        p[..., 10 + column] = (d_object @ turned[..., None])[..., 0]
-    scale = np.array([1.0, -1.0]) / sensor.pixel_pitch
-    p *= scale[:, None]
-    d_object = d_object * scale[:, None]
-    return image_to_px(sensor, np.stack([xd, yd], axis=-1)), p, d_object
+    # Components stand before points, (..., 3, n), so that every line below writes memory in one
+    # run; the callers see (..., n, 2, 16) through `moveaxis`.
+    shifted = np.swapaxes(np.asarray(points, dtype=float) - e[..., None, 3:6], -1, -2)
+    q = np.swapaxes(R, -1, -2) @ shifted
+    depth = -q[..., 2, :]
+    inverse_depth = 1.0 / np.where(depth > 0, depth, np.nan)
+    uv = q[..., :2, :] * inverse_depth[..., None, :]
+    k = i[..., 0, None] * inverse_depth
+    ideal = i[..., 0, None, None] * uv
+    x, y = ideal[..., 0, :], ideal[..., 1, :]
+    _, x0, y0, A1, A2, A3, B1, B2, C1, C2 = (i[..., None, j] for j in range(10))
+    squares = ideal * ideal
+    xy = x * y
+    r2 = squares[..., 0, :] + squares[..., 1, :]
+    r4 = r2 * r2
+    radial = A1 * r2 + A2 * r4 + A3 * (r4 * r2)
+
+    out = np.zeros((2, *x.shape[:-1], 16, x.shape[-1]))
+    for axis in range(2):
+        out[axis, ..., 1 + axis, :] = 1.0
+        powers = ideal[..., axis, None, :]
+        np.multiply(powers, np.stack([r2, r4, r4 * r2], axis=-2), out=out[axis, ..., 3:6, :])
+        np.add(r2, 2 * squares[..., axis, :], out=out[axis, ..., 6 + axis, :])
+        out[axis, ..., 7 - axis, :] = 2 * xy
+    out[0, ..., 8, :], out[0, ..., 9, :] = x, y
+    terms = out[..., 3:10, :]
+    xd = x0 + x * (1 + radial + C1) + B1 * terms[0, ..., 3, :] + B2 * terms[0, ..., 4, :] + C2 * y
+    yd = y0 + y * (1 + radial) + B1 * terms[1, ..., 3, :] + B2 * terms[1, ..., 4, :]
+
+    # ∂(x', y')/∂(x̄, ȳ), then by the camera coordinates (depth = -Zc), then by the object point
+    slope = 2 * (A1 + A2 * (2 * r2) + A3 * (3 * r4))
+    cross = slope * xy + 2 * (B1 * y + B2 * x)
+    jacobian = np.empty((2, *x.shape[:-1], 2, x.shape[-1]))
+    jacobian[0, ..., 0, :] = 1 + C1 + radial + slope * squares[..., 0, :] + 6 * B1 * x + 2 * B2 * y
+    jacobian[0, ..., 1, :] = cross + C2
+    jacobian[1, ..., 0, :] = cross
+    jacobian[1, ..., 1, :] = 1 + radial + slope * squares[..., 1, :] + 6 * B2 * y + 2 * B1 * x
+    by_c = (jacobian * uv).sum(axis=-2)
+    out[..., 0, :] = by_c
+    by_camera = np.concatenate([jacobian, by_c[..., None, :]], axis=-2) * k[..., None, :]
+    by_point = R @ by_camera
+    np.negative(by_point, out=out[..., 13:16, :])
+
+    # A small turn about the object axis w changes q by Rᵀ (d × w), and D·(d × w) = w·(D × d).
+    d0, d1, d2 = (shifted[..., j, :] for j in range(3))
+    D0, D1, D2 = (by_point[..., j, :] for j in range(3))
+    moment = np.stack([D1 * d2 - D2 * d1, D2 * d0 - D0 * d2, D0 * d1 - D1 * d0], axis=-2)
+    out[..., 10:13, :] = np.swapaxes(_rotation_axes(e), -1, -2) @ moment
+
+    scale = (np.array([1.0, -1.0]) / sensor.pixel_pitch).reshape(2, *(1,) * (out.ndim - 1))
+    out *= scale
+    by_point *= scale
+    return (
+        image_to_px(sensor, np.stack([xd, yd], axis=-1)),
+        _points_first(out),
+        _points_first(by_point),
+    )
 
 
-def _rotation_axes(angles: Array) -> Array:
+def _points_first(array: Array) -> Array:
+    """A view (2, ..., k, n) as (..., n, 2, k)."""
+    last = array.ndim - 1
+    return array.transpose(*range(1, last - 1), last, 0, last - 1)
+
+
+def _rotation_axes(eop: Array) -> Array:
     """The object-space axes (..., 3, 3) about which omega, phi, kappa turn the camera (columns)."""
-    so, sp = np.sin(angles[..., 0]), np.sin(angles[..., 1])
-    co, cp = np.cos(angles[..., 0]), np.cos(angles[..., 1])
-    w = np.zeros((*angles.shape[:-1], 3, 3))
+    so, sp = np.sin(eop[..., 0]), np.sin(eop[..., 1])
+    co, cp = np.cos(eop[..., 0]), np.cos(eop[..., 1])
+    w = np.zeros((*eop.shape[:-1], 3, 3))
     w[..., 0, 0] = 1.0
     w[..., 1, 1], w[..., 2, 1] = co, so
     w[..., 0, 2], w[..., 1, 2], w[..., 2, 2] = sp, -so * cp, co * cp
@@ -318,7 +341,7 @@ def rays(sensor: Sensor, iop: ArrayLike, image_points: ArrayLike) -> Array:
     xm, ym = measured[..., 0], measured[..., 1]
     x, y = xm - i[..., None, 1], ym - i[..., None, 2]
     tolerance = _RAY_TOLERANCE_PX * sensor.pixel_pitch
-    size = tolerance
+    size = np.full_like(x, np.inf)
     for _ in range(_RAY_ITERATIONS):
         xd, yd = _distort(i, x, y)
         jxx, jxy, jyx, jyy = _distortion_jacobian(i, x, y)

@@ -120,15 +120,15 @@ def epoch_normals(
     residuals: (E, T, 2) px, measured minus predicted at the epochs' own parameters; by default
     measured minus predicted at the linearisation point.
     """
-    l = grid.points - at.predicted if residuals is None else residuals
+    misclosure = grid.points - at.predicted if residuals is None else residuals
     N = normal_matrices(grid.weights, at.A)
-    b, lPl = right_hand_sides(grid.weights, l, at.A)
+    b, lPl = right_hand_sides(grid.weights, misclosure, at.A)
     return Normals(N, b, lPl, grid.observed.sum(axis=1))
 
 
 def normal_matrices(weights: Array, A: Array) -> Array:
     """Σ Aᵀ P A of every epoch: weights (E, T, 3), A (T, 2, 16) → (E, 16, 16)."""
-    E, T = weights.shape[:2]
+    E = len(weights)
     k = A.shape[-1]
     rows, columns = _UPPER if k == 16 else np.triu_indices(k)
     ax, ay = A[:, 0], A[:, 1]

@@ -10,7 +10,7 @@ Source: Terzakis and Lourakis (2020), SQPnP; Abdel-Aziz and Karara (1971), DLT.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -131,7 +131,7 @@ def _robust_resection(
     return exterior, residuals
 
 
-def _from_opencv(rvec: Array, tvec: Array) -> ExteriorOrientation:
+def _from_opencv(rvec: NDArray[Any], tvec: NDArray[Any]) -> ExteriorOrientation:
     R = cv2.Rodrigues(rvec)[0]
     return ExteriorOrientation.from_rotation(R.T @ _FLIP, (-R.T @ tvec).ravel())
 
@@ -179,11 +179,12 @@ def plane_fit(points: ArrayLike, tolerance: float = 0.002) -> tuple[Array, Array
     """
     X = np.asarray(points, dtype=float)
     centre = X.mean(axis=0)
-    _, s, axes = np.linalg.svd(X - centre, full_matrices=True)
-    if np.linalg.det(axes) < 0:
-        axes[2] *= -1
-    thickness = s[2] if len(s) > 2 else 0.0
-    return centre, axes, bool(thickness <= tolerance * max(s[0], 1e-300))
+    reduced = X - centre
+    s2, vectors = np.linalg.eigh(reduced.T @ reduced)
+    axes = vectors.T[::-1].copy()
+    (a, b, c), (d, e, f) = axes[0], axes[1]
+    axes[2] = (b * f - c * e, c * d - a * f, a * e - b * d)  # right-handed
+    return centre, axes, bool(s2[0] <= tolerance**2 * max(s2[2], 1e-300))
 
 
 def _direct_linear_transformation(sensor: Sensor, X: Array, uv: Array) -> float | None:

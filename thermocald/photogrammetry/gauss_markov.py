@@ -1,0 +1,291 @@
+"""Gauss-Markov least squares on the image points of one epoch: iteration, cofactors, tests.
+
+The working half of `adjustment`: arrays only, no judgement.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.linalg.lapack import dpotrf, dtrtri
+
+from thermocald.errors import GeometryError
+from thermocald.photogrammetry.camera_model import PARAMETER_NAMES, partials, project
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from thermocald.photogrammetry.camera_model import Sensor
+    from thermocald.photogrammetry.testfield import Observations, TestField
+
+    Array = NDArray[np.float64]
+    Mask = NDArray[np.bool_]
+
+__all__ = [
+    "NoConvergenceError",
+    "Problem",
+    "Solution",
+    "chi2_2d",
+    "cofactor_root",
+    "point_covariances",
+    "point_tests",
+    "resolve",
+    "snoop",
+    "solve",
+]
+
+_ITERATIONS = 30
+_CONVERGED = 1e-3  # of a standard deviation: far below what the result can tell
+_LINEAR = 10.0  # standard deviations that a solution may move without new partials
+_TRUSTED_REDUNDANCY = 20  # from here on the residuals themselves tell the noise
+
+
+class NoConvergenceError(Exception):
+    """The iteration did not come to an end."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Observations and unknowns of one adjustment.
+
+    points (n, 3) mm; observations in the same order; target_variances (n, 3) mm² or None;
+    unknowns (u,): positions in `PARAMETER_NAMES`; prior_weight, prior_value (u,): parameters
+    observed beforehand, weight 0 where there is none.
+    """
+
+    sensor: Sensor
+    points: Array
+    observations: Observations
+    target_variances: Array | None
+    unknowns: NDArray[np.int64]
+    prior_weight: Array
+    prior_value: Array
+
+    @classmethod
+    def build(
+        cls,
+        sensor: Sensor,
+        field: TestField,
+        observations: Observations,
+        unknowns: NDArray[np.int64],
+        priors: Mapping[str, tuple[float, float]],
+        target_sigmas: bool,
+    ) -> Problem:
+        """Collect what the iteration needs."""
+        weight, value = np.zeros(len(unknowns)), np.zeros(len(unknowns))
+        for row, parameter in enumerate(unknowns) if priors else ():
+            if PARAMETER_NAMES[parameter] in priors:
+                value[row], sd = priors[PARAMETER_NAMES[parameter]]
+                weight[row] = sd**-2
+        variances = field.sigmas[observations.targets] ** 2 if target_sigmas else None
+        return cls(
+            sensor,
+            field.points[observations.targets],
+            observations,
+            variances if variances is not None and variances.any() else None,
+            unknowns,
+            weight,
+            value,
+        )
+
+    def gradient(self, flat: Array, v: Array, values: Array) -> Array:
+        """Jᵀ v with the priors' share (u,)."""
+        g: Array = flat @ v.ravel()
+        g += self.prior_weight * (self.prior_value - values[self.unknowns])
+        return g
+
+    def cost(self, v: Array, values: Array) -> float:
+        """Weighted sum of squared residuals, the priors' included."""
+        flat = v.ravel()
+        prior = self.prior_weight @ (values[self.unknowns] - self.prior_value) ** 2
+        return float(flat @ flat + prior)
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """values (16,); J (u, 2, n) whitened partials and v (2, n) whitened residuals of all points;
+    rows (2, u, n) partials in px and residuals (2, n) px; root (u, u): cofactors = root · rootᵀ.
+    """
+
+    values: Array
+    J: Array
+    v: Array
+    rows: Array
+    residuals: Array
+    root: Array
+
+
+def chi2_2d(alpha: float) -> float:
+    """Quantile 1 - alpha of chi-square with two degrees of freedom, which has a closed form."""
+    return float(-2.0 * np.log(alpha)) if alpha > 0 else float("inf")
+
+
+def point_covariances(
+    observations: Observations, B: Array | None, target_variances: Array | None
+) -> Array:
+    """Covariance (n, 3) px² of each image point, xx, yy, xy, its object coordinates' included."""
+    out = np.zeros((len(observations), 3))
+    out[:, :2] = observations.sigmas**2
+    if observations.covariances is not None:
+        out[:, 2] = observations.covariances
+    if B is not None and target_variances is not None:
+        out[:, 0] += (B[:, 0] ** 2 * target_variances).sum(axis=1)
+        out[:, 1] += (B[:, 1] ** 2 * target_variances).sum(axis=1)
+        out[:, 2] += (B[:, 0] * B[:, 1] * target_variances).sum(axis=1)
+    return out
+
+
+def _whiten(covariance: Array, pair: Array) -> Array:
+    """Multiply (2, ..., n) components by the inverse Cholesky factor of each point's covariance."""
+    slope = covariance[:, 2] / covariance[:, 0]
+    out = np.empty_like(pair)
+    np.divide(pair[0], np.sqrt(covariance[:, 0]), out=out[0])
+    out[1] = pair[1] - slope * pair[0]
+    out[1] /= np.sqrt(covariance[:, 1] - covariance[:, 2] * slope)
+    return out
+
+
+def cofactor_root(N: Array, unknowns: NDArray[np.int64], damping: float = 0.0) -> Array:
+    """A root (u, u) of the inverse of a normal matrix: N⁻¹ = root · rootᵀ.
+
+    By Cholesky of N scaled to a unit diagonal, as the parameters differ by ten orders. Raises
+    GeometryError naming the parameters that the observations cannot tell apart.
+    """
+    diagonal = N.diagonal()
+    if not (diagonal > 0).all():
+        names = [PARAMETER_NAMES[unknowns[i]] for i in np.flatnonzero(~(diagonal > 0))]
+        raise GeometryError(f"the observations do not see {', '.join(names)} at all")
+    scale = 1.0 / np.sqrt(diagonal)
+    scaled = N * scale * scale[:, None]
+    if damping:
+        scaled.flat[:: len(scale) + 1] += damping
+    factor, info = dpotrf(scaled)
+    if info != 0 or factor.diagonal().min() < 1e-8:
+        eigenvalues, vectors = np.linalg.eigh(scaled)
+        worst = np.argsort(-np.abs(vectors[:, 0]))[:3]
+        together = ", ".join(PARAMETER_NAMES[unknowns[i]] for i in worst)
+        raise GeometryError(
+            f"the normal matrix is singular (smallest eigenvalue {eigenvalues[0]:.1e}): these "
+            f"targets cannot tell {together} apart"
+        )
+    inverse, _ = dtrtri(factor)
+    root: Array = scale[:, None] * inverse
+    return root
+
+
+def solve(problem: Problem, start: Array, use: Mask) -> Solution:
+    """Gauss-Newton, with Levenberg-Marquardt damping only where a step does not improve.
+
+    start (16,); use (n,) the observations that take part. The last step re-uses the partials: a
+    warm epoch needs them once. Raises NoConvergenceError, GeometryError.
+    """
+    u, sensor = problem.unknowns, problem.sensor
+    values, damping = start, 0.0
+    observed = problem.observations.points.T
+    for _ in range(_ITERATIONS):
+        predicted, A, B = partials(sensor, values[:10], values[10:], problem.points)
+        if not np.isfinite(predicted[use]).all():
+            raise NoConvergenceError("targets came to lie behind the camera during the iteration")
+        covariance = point_covariances(problem.observations, B, problem.target_variances)
+        rows = A.transpose(1, 2, 0)[:, u]
+        J = _whiten(covariance, rows).swapaxes(0, 1)
+        v = _whiten(covariance, observed - predicted.T)
+        flat, vu = _used(J, v, use)
+        N = flat @ flat.T
+        N.flat[:: len(u) + 1] += problem.prior_weight
+        root = cofactor_root(N, u)
+        cost = problem.cost(vu, values)
+        gradient = problem.gradient(flat, vu, values)
+        while True:
+            damped = root if damping == 0 else cofactor_root(N, u, damping)
+            trial = values.copy()
+            trial[u] += damped @ (damped.T @ gradient)
+            residuals = observed - project(sensor, trial[:10], trial[10:], problem.points).T
+            v = _whiten(covariance, residuals)
+            _, vu = _used(None, v, use)
+            new = problem.cost(vu, trial)
+            if np.isfinite(new) and new <= cost * (1 + 1e-9) + 1e-12:
+                break
+            damping = max(10 * damping, 1e-3)
+            if damping > 1e9:
+                raise NoConvergenceError("the adjustment does not converge from its start values")
+        damping = 0.0 if damping <= 1e-3 else damping / 10
+        values = trial
+        gradient = problem.gradient(flat, vu, values)
+        half = root.T @ gradient
+        if damping == 0 and float(half @ half) < _CONVERGED**2:
+            return _moved(Solution(values, J, v, rows, residuals, root), u, root @ half)
+    raise NoConvergenceError(f"the adjustment did not converge in {_ITERATIONS} iterations")
+
+
+def resolve(problem: Problem, solution: Solution, use: Mask) -> Solution:
+    """The solution with other observations: by the same partials where it hardly moves."""
+    flat, v = _used(solution.J, solution.v, use)
+    N = flat @ flat.T
+    N.flat[:: len(N) + 1] += problem.prior_weight
+    root = cofactor_root(N, problem.unknowns)
+    half = root.T @ problem.gradient(flat, v, solution.values)
+    if float(half @ half) > _LINEAR**2:
+        return solve(problem, solution.values, use)
+    moved = _moved(solution, problem.unknowns, root @ half)
+    return Solution(moved.values, moved.J, moved.v, moved.rows, moved.residuals, root)
+
+
+def _used(J: Array | None, v: Array, use: Mask) -> tuple[Array, Array]:
+    if use.all():
+        flat = v if J is None else J.reshape(len(J), -1)
+        return flat, v
+    flat = v if J is None else J[..., use].reshape(len(J), -1)
+    return flat, v[:, use]
+
+
+def _moved(s: Solution, unknowns: NDArray[np.int64], step: Array) -> Solution:
+    """A solution after a small step, its residuals by the partials."""
+    values = s.values.copy()
+    values[unknowns] += step
+    v = s.v - (step @ s.J.reshape(len(step), -1)).reshape(s.v.shape)
+    return Solution(values, s.J, v, s.rows, s.residuals - step @ s.rows, s.root)
+
+
+def point_tests(solution: Solution, use: Mask) -> tuple[Array, Array]:
+    """Chi-square with 2 degrees of freedom per point (n,), and redundancy numbers (n, 2).
+
+    A point that takes part has the residual covariance I - h'h, one that does not I + h'h.
+    """
+    h = (solution.root.T @ solution.J.reshape(len(solution.root), -1)).reshape(solution.J.shape)
+    sign = np.where(use, -1.0, 1.0)
+    claimed = (h * h).sum(axis=0)
+    qxx, qyy = 1 + sign * claimed
+    qxy = sign * (h[:, 0] * h[:, 1]).sum(axis=0)
+    vx, vy = solution.v
+    determinant = qxx * qyy - qxy**2
+    # A point that alone carries a parameter has no residual: it cannot be tested.
+    testable = determinant > 1e-9
+    test = np.where(testable, qyy * vx**2 - 2 * qxy * vx * vy + qxx * vy**2, 0.0)
+    test /= np.where(testable, determinant, 1.0)
+    return test, np.clip(1 - claimed.T, 0.0, 1.0)
+
+
+def snoop(test: Array, use: Mask, unknowns: int, alpha: float) -> Mask:
+    """Which observations stay: the worst are rejected, those that fit again come back.
+
+    test (n,) of `point_tests`; alpha: error probability of one test.
+    """
+    if alpha <= 0:
+        return use
+    n = int(use.sum())
+    # Median of chi-square(2) is 2 ln 2: a scale that the gross errors do not reach.
+    variance = float(np.partition(test[use], n // 2)[n // 2]) / (2 * np.log(2))
+    if 2 * n - unknowns < _TRUSTED_REDUNDANCY:
+        variance = max(1.0, variance)
+    limit = chi2_2d(alpha) * max(variance, 1e-12)
+    keep = use | (test <= limit)
+    suspicious = use & (test > limit)
+    if suspicious.any():
+        # One gross error lifts its neighbours: only those near the worst go at once.
+        keep[suspicious & (test >= 0.5 * test[use].max())] = False
+    return keep

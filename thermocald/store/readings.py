@@ -1,0 +1,73 @@
+"""The temperature at the instant of the frame, from readings taken at other instants."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from thermocald.epoch import Epoch
+
+    Array = NDArray[np.float64]
+
+__all__ = ["interpolate_readings", "temperature_at_frame", "temperatures_at_frame"]
+
+_LARGEST_GAP_IN_INTERVALS = 10.0
+
+
+def interpolate_readings(
+    frame_times: ArrayLike,
+    reading_times: ArrayLike,
+    readings: ArrayLike,
+    largest_gap_s: float | None = None,
+) -> Array:
+    """Readings (R,) °C at `reading_times` (R,) s → temperatures (E,) °C at `frame_times` (E,) s.
+
+    Linear between two readings; before the first and after the last, the line through the two
+    outermost, for at most one interval. NaN readings are passed over. NaN where the readings on
+    both sides are more than `largest_gap_s` apart (default: ten times their median interval), or
+    where there are none: a gap is not filled with invention.
+    """
+    frames = np.asarray(frame_times, dtype=float)
+    times, values = np.asarray(reading_times, dtype=float), np.asarray(readings, dtype=float)
+    good = np.isfinite(times) & np.isfinite(values)
+    times, unique = np.unique(times[good], return_index=True)
+    values = values[good][unique]
+    if len(times) < 2:
+        # one reading tells the temperature of its own instant
+        result = np.full(frames.shape, np.nan)
+        if len(times) == 1:
+            result[frames == times[0]] = values[0]
+        return result
+    interval = float(np.median(np.diff(times)))
+    gap = _LARGEST_GAP_IN_INTERVALS * interval if largest_gap_s is None else largest_gap_s
+    left = np.clip(np.searchsorted(times, frames, side="right") - 1, 0, len(times) - 2)
+    span = times[left + 1] - times[left]
+    slope = (values[left + 1] - values[left]) / span
+    result = values[left] + slope * (frames - times[left])
+    outside = np.maximum(times[0] - frames, frames - times[-1])
+    on_reading = (frames == times[left]) | (frames == times[left + 1])
+    result[(outside > interval) | ((span > gap) & ~on_reading)] = np.nan
+    return result
+
+
+def temperature_at_frame(epochs: Sequence[Epoch], channel: str | None = None) -> Array:
+    """One channel (the first, the reference, if None) at the instants of the frames, (E,) °C."""
+    if channel is None:
+        channel = next((name for epoch in epochs for name in epoch.temperatures), "")
+    return interpolate_readings(
+        [epoch.frame_time for epoch in epochs],
+        [epoch.temperature_time for epoch in epochs],
+        [epoch.temperatures.get(channel, np.nan) for epoch in epochs],
+    )
+
+
+def temperatures_at_frame(epochs: Sequence[Epoch]) -> dict[str, Array]:
+    """Every channel at the instants of the frames, {name: (E,) °C}, the reference first."""
+    names = dict.fromkeys(name for epoch in epochs for name in epoch.temperatures)
+    return {name: temperature_at_frame(epochs, name) for name in names}

@@ -1,0 +1,1 @@
+"""What the calibrated epochs say: statistics, significance, Monte-Carlo, thermal models."""

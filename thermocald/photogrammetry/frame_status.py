@@ -93,7 +93,7 @@ def _constant_rows(image: NDArray[Any]) -> int:
 
 
 def _noise(sample: NDArray[Any]) -> float:
-    """Median difference between neighbours in DN: 0 in a drawing, where constant rows are normal."""
+    """Median difference between neighbours in DN: 0 in a drawing, which may have constant rows."""
     if sample.shape[0] < 2:
         return 1.0
     return float(np.median(np.abs(np.diff(sample.astype(np.int32), axis=1))))

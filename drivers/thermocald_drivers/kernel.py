@@ -1,0 +1,263 @@
+"""Temperatures that the kernel already reads: hwmon, iio and thermal zones in sysfs.
+
+    thermometers:
+      - {name: lens, driver: hwmon, chip: lm75}                  # or chip: 1-0048 (the bus address)
+      - {name: board, driver: hwmon, chip: sht3x, channels: {housing: temp1}}
+      - {name: sensor, driver: iio, chip: tmp117}
+      - {name: soc, driver: thermal_zone, zone: cpu-thermal}
+
+`channels` maps our channel names to the kernel's input (`temp1`, `in_temp_ambient`) or its label;
+without it every temperature input is read, a single one as `temperature`. `minimum_c`/`maximum_c`
+bound what is believed (a broken diode reads 127 °C). The kernel numbers its devices anew at every
+plug: they are looked up by name at each open, and the name is checked again at each read.
+Source: Documentation/hwmon/sysfs-interface, ABI/testing/sysfs-bus-iio, driver-api/thermal.
+"""
+
+from __future__ import annotations
+
+import errno
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from thermocald.errors import BadReading, ConfigurationError, DeviceGone, WrongDevice
+from thermocald.hal import Thermometer
+from thermocald_drivers import support
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from thermocald.hal import Clock, Reading
+
+__all__ = ["HwmonThermometer", "IioThermometer", "ThermalZoneThermometer"]
+
+
+class _KernelThermometer(Thermometer):
+    """One device folder of a sysfs class, found by its name."""
+
+    folder: ClassVar[str]
+    prefix: ClassVar[str]
+    name_file: ClassVar[str] = "name"
+
+    def __init__(
+        self,
+        *,
+        clock: Clock,
+        chip: str,
+        channels: Mapping[str, str] | None = None,
+        minimum_c: float = -55.0,
+        maximum_c: float = 125.0,
+        sysfs: str = "/sys",
+    ) -> None:
+        self.clock = clock
+        self.chip = support.text("chip", chip)
+        self.wanted = dict(channels or {})
+        self.minimum_c = support.number("minimum_c", minimum_c, -273.15, 1000, "°C")
+        self.maximum_c = support.number("maximum_c", maximum_c, -273.15, 1000, "°C")
+        if self.minimum_c >= self.maximum_c:
+            raise ConfigurationError(f"minimum_c {minimum_c:g} is not below maximum_c {maximum_c:g}")
+        self.sysfs = Path(support.text("sysfs", sysfs))
+        self._seen = False
+        self._device: Path | None = None
+        self._channels: dict[str, str] = {}
+
+    @classmethod
+    def devices(cls, sysfs: Path) -> Iterator[tuple[Path, str, str]]:
+        """(folder, name, bus address) of each device of the class."""
+        for folder in sorted((sysfs / cls.folder).glob(cls.prefix + "*")):
+            try:
+                name = (folder / cls.name_file).read_text().strip()
+            except OSError:
+                continue  # unplugged between the listing and the reading
+            device = folder / "device"
+            yield folder, name, device.resolve().name if device.exists() else folder.name
+
+    @classmethod
+    def attached(cls, sysfs: str = "/sys") -> list[dict[str, Any]]:
+        """Configuration stanzas of what is there, for `thermocald devices`."""
+        found = list(cls.devices(Path(sysfs)))
+        names = [name for _, name, _ in found]
+        return [
+            {"options": {"chip": name if names.count(name) == 1 else address}, "about": str(folder)}
+            for folder, name, address in found
+            if cls._inputs(folder)
+        ]
+
+    def open(self) -> None:
+        self._device = None
+        found = list(self.devices(self.sysfs))
+        matches = [folder for folder, name, address in found if self.chip in (name, address)]
+        where = f"{self.sysfs / self.folder}: {self.chip!r}"
+        if not matches:
+            names = ", ".join(sorted({name for _, name, _ in found})) or "nothing"
+            raise support.absent(f"{where} is not there; there is {names}", seen=self._seen)
+        if len(matches) > 1:
+            addresses = ", ".join(a for folder, _, a in found if folder in matches)
+            raise WrongDevice(f"{where} is there {len(matches)} times; write chip: {addresses}")
+        inputs = self._inputs(matches[0])
+        if not inputs:
+            raise WrongDevice(f"{matches[0]}: this device has no temperature input")
+        self._channels = self._select(inputs, matches[0])
+        self._device, self._seen = matches[0], True
+        self._name = (matches[0] / self.name_file).read_text().strip()
+
+    def close(self) -> None:
+        self._device = None
+
+    def identity(self) -> Mapping[str, str]:
+        return {"chip": self.chip, "path": str(self._device or "")}
+
+    def _select(self, inputs: dict[str, str], folder: Path) -> dict[str, str]:
+        """{our channel: kernel's input}, from the option `channels`."""
+        if not self.wanted:
+            if len(inputs) == 1:
+                return {"temperature": next(iter(inputs))}
+            return {label or key: key for key, label in inputs.items()}
+        by_label = {label: key for key, label in inputs.items() if label}
+        chosen = {}
+        for channel, key in self.wanted.items():
+            if key not in inputs and key not in by_label:
+                known = ", ".join([*inputs, *by_label])
+                raise WrongDevice(f"{folder}: no input {key!r} for {channel!r}; there is {known}")
+            chosen[channel] = key if key in inputs else by_label[key]
+        return chosen
+
+    def read(self) -> Reading:
+        if self._device is None:
+            raise DeviceGone(f"{self.chip}: not open")
+        begin = self.clock.monotonic()
+        values: dict[str, float] = {}
+        missing: dict[str, str] = {}
+        for channel, key in self._channels.items():
+            where = f"{self._device.name} ({self.chip}) {key}"
+            try:
+                value = self._convert(self._device, key)
+                values[channel] = support.believable(value, self.minimum_c, self.maximum_c, where)
+            except BadReading as error:
+                missing[channel] = str(error)
+            except ValueError as error:
+                missing[channel] = f"{where}: not a number ({error})"
+            except OSError as error:
+                problem = support.fault(error, where, seen=True)
+                if not isinstance(problem, BadReading):
+                    raise problem from error
+                missing[channel] = str(problem)
+        self._same_device()
+        if not values:
+            raise BadReading("; ".join(missing.values()))
+        return support.middle_reading(
+            self.clock, values, begin, {"missing": missing} if missing else {}
+        )
+
+    def _same_device(self) -> None:
+        """A kernel name is handed on: hwmon3 may be another chip after a re-plug."""
+        if self._device is None:
+            return
+        try:
+            name = (self._device / self.name_file).read_text().strip()
+        except OSError as error:
+            raise DeviceGone(f"{self._device}: unplugged ({error.strerror})") from error
+        if name != self._name:
+            raise DeviceGone(f"{self._device} is {name!r} now and was {self._name!r}")
+
+    @classmethod
+    def _inputs(cls, folder: Path) -> dict[str, str]:
+        """{kernel's input: label or ''}."""
+        raise NotImplementedError
+
+    def _convert(self, folder: Path, key: str) -> float:
+        """The input's value in °C."""
+        raise NotImplementedError
+
+
+def _number(path: Path) -> float:
+    return float(path.read_text().strip())
+
+
+def _label(folder: Path, key: str) -> str:
+    try:
+        return (folder / f"{key}_label").read_text().strip()
+    except OSError:
+        return ""
+
+
+class HwmonThermometer(_KernelThermometer):
+    """`/sys/class/hwmon`: temp*_input in 1/1000 °C; temp*_fault says that the diode is open."""
+
+    folder = "class/hwmon"
+    prefix = "hwmon"
+
+    @classmethod
+    def _inputs(cls, folder: Path) -> dict[str, str]:
+        keys = sorted(path.name.removesuffix("_input") for path in folder.glob("temp*_input"))
+        return {key: _label(folder, key) for key in keys}
+
+    def _convert(self, folder: Path, key: str) -> float:
+        fault = folder / f"{key}_fault"
+        if fault.exists() and _number(fault) != 0:
+            raise BadReading(f"{folder.name} {key}: the chip reports a broken sensor (fault flag)")
+        return _number(folder / f"{key}_input") / 1000.0
+
+
+class IioThermometer(_KernelThermometer):
+    """`/sys/bus/iio/devices`: in_temp*_input, or (raw + offset)·scale, in 1/1000 °C."""
+
+    folder = "bus/iio/devices"
+    prefix = "iio:device"
+
+    @classmethod
+    def _inputs(cls, folder: Path) -> dict[str, str]:
+        keys = {
+            path.name.rsplit("_", 1)[0]
+            for end in ("input", "raw")
+            for path in folder.glob(f"in_temp*_{end}")
+        }
+        return {key: _label(folder, key) for key in sorted(keys)}
+
+    def _convert(self, folder: Path, key: str) -> float:
+        processed = folder / f"{key}_input"
+        if processed.exists():
+            return _number(processed) / 1000.0
+        raw = _number(folder / f"{key}_raw")
+        offset = self._shared(folder, key, "offset", 0.0)
+        return (raw + offset) * self._shared(folder, key, "scale", None) / 1000.0
+
+    @staticmethod
+    def _shared(folder: Path, key: str, what: str, default: float | None) -> float:
+        """A channel's own attribute, or the one that all temperature channels share."""
+        for path in (folder / f"{key}_{what}", folder / f"in_temp_{what}"):
+            if path.exists():
+                return _number(path)
+        if default is None:
+            raise BadReading(f"{folder.name} {key}: the kernel gives no {what}")
+        return default
+
+
+class ThermalZoneThermometer(_KernelThermometer):
+    """`/sys/class/thermal`: the zone's temp in 1/1000 °C; a disabled zone fails with EAGAIN."""
+
+    folder = "class/thermal"
+    prefix = "thermal_zone"
+    name_file = "type"
+
+    def __init__(self, *, clock: Clock, zone: str, **options: Any) -> None:
+        super().__init__(clock=clock, chip=support.text("zone", zone), **options)
+
+    @classmethod
+    def attached(cls, sysfs: str = "/sys") -> list[dict[str, Any]]:
+        """Configuration stanzas of what is there, for `thermocald devices`."""
+        return [
+            {"options": {"zone": name if name else folder.name}, "about": str(folder)}
+            for folder, name, _ in cls.devices(Path(sysfs))
+        ]
+
+    @classmethod
+    def _inputs(cls, folder: Path) -> dict[str, str]:
+        return {"temp": ""} if (folder / "temp").exists() else {}
+
+    def _convert(self, folder: Path, key: str) -> float:
+        try:
+            return _number(folder / key) / 1000.0
+        except OSError as error:
+            if error.errno in (errno.EAGAIN, errno.ENODATA, errno.EINVAL):
+                raise BadReading(f"{folder.name}: the zone is disabled or asleep") from error
+            raise

@@ -1,0 +1,320 @@
+"""Thermometers on a serial line that speak in lines of text.
+
+    thermometers:
+      - {name: air, driver: serial, port: /dev/ttyUSB0, instrument: vaisala-hmp}
+      - name: probe
+        driver: serial
+        port: /dev/serial/by-id/usb-FTDI_FT232R_A50285BI-if00-port0    # a name that survives re-plugs
+        baud: 9600
+        command: "T?\\r\\n"                      # sent for each reading; empty: the instrument speaks by itself
+        pattern: 'T=(?P<temperature>[-+]?\\d+\\.\\d+)F\\*(?P<checksum>[0-9A-F]{2})'
+        unit: F                                # C (default), F, K; then scale and offset
+        checksum: xor                          # of the text before the group `checksum`: xor, sum8, nmea
+
+Each named group of `pattern` is a channel. The pattern must match the **whole** line: the rest of a
+line whose head was lost (`3.5C` of `+023.5C`) is no reading. Instruments by name: see INSTRUMENTS.
+
+A line that was in the queue before the reading was asked for is never used: with `command` the
+queue is emptied first, without it the next line that *ends* after the call counts. Echo and
+garbage are skipped until `timeout_s`; the error then quotes what came.
+"""
+
+from __future__ import annotations
+
+import functools
+import operator
+import re
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from thermocald.errors import BadReading, ConfigurationError, DeviceGone, DeviceTimeout
+from thermocald.hal import Reading, Thermometer
+from thermocald_drivers import support
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from thermocald.hal import Clock
+
+__all__ = ["INSTRUMENTS", "Instrument", "SerialThermometer"]
+
+NUMBER = r"[-+]?\d+(?:\.\d+)?"
+LONGEST_LINE = 512
+QUEUE = 4000
+"""Bytes that may have waited before the kernel's buffer (4096) could have lost some."""
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """A line protocol; `framing` is data bits, parity, stop bits."""
+
+    pattern: str
+    command: str = ""
+    baud: int = 9600
+    framing: str = "8N1"
+    unit: str = "C"
+    scale: float = 1.0
+    offset: float = 0.0
+    checksum: str = "none"
+    timeout_s: float = 2.0
+
+
+INSTRUMENTS = {
+    # Papouch TM, TMU: speaks by itself every 10 s, ends with CR alone.
+    "papouch-tm": Instrument(rf"(?P<temperature>[-+]\d{{3}}\.\d)C", timeout_s=22.0),
+    # Vaisala HMP230/240/260 series, user's guides, appendix "Serial commands".
+    "vaisala-hmp": Instrument(
+        rf"(?:RH= *{NUMBER} *%RH +)?T= *(?P<temperature>{NUMBER}) *'C(?: .*)?",
+        command="SEND\r",
+        baud=4800,
+        framing="7E1",
+    ),
+    # Lake Shore 218, user's manual 6.2: eight inputs in one line; kelvin keeps the sign simple.
+    "lakeshore-218": Instrument(
+        ",".join(rf"(?P<input{k}>[-+]\d+\.\d+)" for k in range(1, 9)),
+        command="KRDG?\r\n",
+        framing="7O1",
+        unit="K",
+    ),
+    # Fluke 1522, user's guide 8.2.1; the unit is set at the instrument and must be C.
+    "fluke-1522": Instrument(r"t: *(?P<temperature>[-+]?\d+\.\d+) C", command="read?\r", baud=2400),
+}
+
+
+def _one_end(received: bytes) -> bytes:
+    """CR, LF and CR LF all end a line; empty lines are skipped anyway."""
+    return received.replace(b"\r", b"\n")
+
+
+def _xor(text: bytes) -> int:
+    return functools.reduce(operator.xor, text, 0)
+
+
+CHECKSUMS: Mapping[str, Callable[[bytes], int]] = {
+    "none": len,  # not called
+    "xor": _xor,
+    "sum8": lambda text: sum(text) & 0xFF,
+    "nmea": lambda text: _xor(text.strip(b"$*")),
+}
+UNITS: Mapping[str, Callable[[float], float]] = {
+    "C": lambda value: value,
+    "F": lambda value: (value - 32.0) / 1.8,
+    "K": lambda value: value - 273.15,
+}
+
+
+class SerialThermometer(Thermometer):
+    """A line protocol by a pattern, or an instrument by its name."""
+
+    def __init__(
+        self,
+        *,
+        clock: Clock,
+        port: str,
+        instrument: str | None = None,
+        pattern: str | None = None,
+        command: str | None = None,
+        baud: int | None = None,
+        framing: str | None = None,
+        unit: str | None = None,
+        scale: float | None = None,
+        offset: float | None = None,
+        checksum: str | None = None,
+        timeout_s: float | None = None,
+        minimum_c: float = -100.0,
+        maximum_c: float = 300.0,
+    ) -> None:
+        self.clock = clock
+        self.port = support.text("port", port)
+        if (instrument is None) == (pattern is None):
+            raise ConfigurationError(
+                f"write either instrument: ({', '.join(INSTRUMENTS)}) or pattern:"
+            )
+        if instrument is not None:
+            base = INSTRUMENTS[support.choice("instrument", instrument, list(INSTRUMENTS))]
+        else:
+            base = Instrument(support.text("pattern", pattern))
+        self.name = instrument or "serial line"
+        self.command = (base.command if command is None else command).encode("ascii")
+        self.baud = int(support.number("baud", baud or base.baud, 50, 4_000_000, "Bd", whole=True))
+        self.framing = framing or base.framing
+        if not re.fullmatch(r"[5-8][NEO][12]", self.framing):
+            raise ConfigurationError(f"framing: {self.framing!r} is not such as 8N1 or 7E1")
+        self.unit = support.choice("unit", unit or base.unit, list(UNITS))
+        self.scale = support.number("scale", base.scale if scale is None else scale, -1e6, 1e6)
+        self.offset = support.number("offset", base.offset if offset is None else offset, -1e6, 1e6)
+        self.checksum = support.choice("checksum", checksum or base.checksum, list(CHECKSUMS))
+        wait = base.timeout_s if timeout_s is None else timeout_s
+        self.timeout_s = support.number("timeout_s", wait, 0.01, 600, "s")
+        self.minimum_c = support.number("minimum_c", minimum_c, -273.15, 3000, "°C")
+        self.maximum_c = support.number("maximum_c", maximum_c, -273.15, 3000, "°C")
+        try:
+            self.pattern = re.compile(base.pattern)
+        except re.error as error:
+            raise ConfigurationError(f"pattern: {base.pattern!r}: {error}") from error
+        self.channels = [name for name in self.pattern.groupindex if name != "checksum"]
+        if not self.channels:
+            raise ConfigurationError("pattern: name the value, such as (?P<temperature>[-+0-9.]+)")
+        if self.checksum != "none" and "checksum" not in self.pattern.groupindex:
+            raise ConfigurationError("pattern: a checksum needs a group (?P<checksum>…)")
+        self._serial: Any = None
+        self._seen = False
+        self._line = b""
+        self._synchronous = False
+
+    @property
+    def where(self) -> str:
+        """The device as the user knows it."""
+        return f"{self.name} on {self.port}"
+
+    @classmethod
+    def attached(cls, sysfs: str = "/sys") -> list[dict[str, Any]]:  # noqa: ARG003
+        """Serial ports with their lasting names; what is on them cannot be known."""
+        ports = support.library("serial.tools.list_ports").comports(include_links=True)
+        links = [p for p in ports if "/by-id/" in p.device]
+        return [
+            {
+                "options": {"port": p.device, "instrument": "papouch-tm"},
+                "about": f"{p.description}; write the instrument that is on it",
+                "certain": False,
+            }
+            for p in (links or [p for p in ports if p.hwid != "n/a"])
+        ]
+
+    def open(self) -> None:
+        serial = support.library("serial")
+        data_bits, parity, stop_bits = self.framing
+        try:
+            self._serial = serial.Serial(
+                self.port,
+                self.baud,
+                bytesize=int(data_bits),
+                parity=parity,
+                stopbits=int(stop_bits),
+                timeout=0,
+                write_timeout=self.timeout_s,
+                exclusive=True,
+            )
+        except ValueError as error:
+            raise ConfigurationError(f"{self.where}: {error}") from error
+        except OSError as error:
+            if "exclusively lock" in str(error):
+                error = OSError(16, "another program holds the port")
+            hint = "is it plugged in, and the user in the group dialout?"
+            raise support.fault(error, self.where, seen=self._seen, hint=hint) from error
+        self._seen = True
+        self._line, self._synchronous = b"", False
+
+    def close(self) -> None:
+        port, self._serial = self._serial, None
+        if port is not None:
+            port.close()
+
+    def identity(self) -> Mapping[str, str]:
+        return {"instrument": self.name, "port": self.port}
+
+    def read(self) -> Reading:
+        if self._serial is None:
+            raise DeviceGone(f"{self.where}: not open")
+        begin = self.clock.monotonic()
+        try:
+            if self.command:
+                self._serial.reset_input_buffer()
+                self._line, self._synchronous = b"", True
+                self._serial.write(self.command)
+            else:
+                self._skip_queue()
+            values, ended, line = self._next_values()
+        except (OSError, TypeError) as error:  # TypeError: pyserial after a port vanished under it
+            if isinstance(error, BadReading | DeviceTimeout):
+                raise
+            raise self._lost(error) from error
+        if self.command:
+            return support.middle_reading(self.clock, values, begin, {"line": line})
+        monotonic, utc = support.on_clock(self.clock, ended)
+        return Reading(values=values, monotonic=monotonic, utc=utc, metadata={"line": line})
+
+    def _lost(self, error: Exception) -> Exception:
+        """pyserial reports an unplug without an errno, or with EIO."""
+        if isinstance(error, OSError) and type(error).__name__ == "SerialTimeoutException":
+            return DeviceTimeout(f"{self.where}: cannot send, the line is held")
+        return DeviceGone(f"{self.where}: unplugged ({error})")
+
+    def _skip_queue(self) -> None:
+        """Drop what came before now, but keep the head of the line that is under way."""
+        waiting = self._serial.read(self._serial.in_waiting or 0)
+        if len(waiting) >= QUEUE:
+            self._line, self._synchronous = b"", False  # bytes may be missing in the middle
+            return
+        head, mark, tail = (self._line + _one_end(waiting)).rpartition(b"\n")
+        if mark:
+            self._synchronous = True
+        self._line = tail if mark else head + tail
+
+    def _next_values(self) -> tuple[dict[str, float], float, str]:
+        """Channels, the machine's monotonic instant, and the text of the next matching line."""
+        deadline = time.monotonic() + self.timeout_s
+        skipped: list[str] = []
+        problem = ""
+        while True:
+            while b"\n" in self._line:
+                line, self._line = self._line.split(b"\n", 1)
+                whole, self._synchronous = self._synchronous, True
+                text = line.strip(b"\0").decode("ascii", "backslashreplace")
+                if not text or not whole or text.strip() == self.command.decode().strip():
+                    continue
+                match = self.pattern.fullmatch(text)
+                if match is None:
+                    skipped.append(text)
+                    continue
+                problem = self._checksum_problem(match, text)
+                if not problem:
+                    return self._values(match), time.monotonic(), text
+                skipped.append(text)
+            if len(self._line) > LONGEST_LINE:
+                skipped.append(self._line[:40].decode("ascii", "backslashreplace"))
+                self._line, self._synchronous = b"", False
+            left = deadline - time.monotonic()
+            if left <= 0:
+                raise self._nothing(skipped, problem)
+            self._serial.timeout = min(left, 0.5)
+            self._line += _one_end(self._serial.read(max(1, self._serial.in_waiting)))
+
+    def _nothing(self, skipped: list[str], problem: str) -> BadReading | DeviceTimeout:
+        """Why no line was good enough."""
+        rest = self._line.decode("ascii", "backslashreplace")
+        self._line, self._synchronous = b"", False
+        if problem:
+            return BadReading(f"{self.where}: {problem}")
+        if skipped or rest:
+            quoted = "; ".join(repr(text[:60]) for text in [*skipped, rest][:3] if text)
+            return BadReading(
+                f"{self.where}: no line that fits the pattern in {self.timeout_s:g} s, but {quoted}; "
+                f"is {self.baud} Bd {self.framing} right?"
+            )
+        return DeviceTimeout(f"{self.where}: silent for {self.timeout_s:g} s")
+
+    def _checksum_problem(self, match: re.Match[str], text: str) -> str:
+        if self.checksum == "none":
+            return ""
+        given = int(match["checksum"], 16)
+        computed = CHECKSUMS[self.checksum](text[: match.start("checksum")].encode("ascii"))
+        if given == computed:
+            return ""
+        return f"checksum {given:02X} in {text!r}, computed {computed:02X}"
+
+    def _values(self, match: re.Match[str]) -> dict[str, float]:
+        values = {}
+        for channel in self.channels:
+            if match[channel] is None:
+                continue
+            try:
+                value = float(match[channel])
+            except ValueError as error:
+                raise BadReading(f"{self.where}: {match[channel]!r} is not a number") from error
+            celsius = UNITS[self.unit](value * self.scale + self.offset)
+            values[channel] = support.believable(
+                celsius, self.minimum_c, self.maximum_c, f"{self.where}, {channel}"
+            )
+        return values

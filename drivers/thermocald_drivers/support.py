@@ -1,0 +1,134 @@
+"""What the drivers share: lazy libraries, bounded options, and errno translated into our errors."""
+
+from __future__ import annotations
+
+import errno
+import importlib
+import math
+import time
+from typing import TYPE_CHECKING, Any
+
+from thermocald.errors import (
+    BadReading,
+    ConfigurationError,
+    DeviceDenied,
+    DeviceError,
+    DeviceGone,
+    DeviceNotFound,
+    DeviceTimeout,
+    DriverMissing,
+)
+from thermocald.hal import Reading
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from thermocald.hal import Clock
+
+__all__ = [
+    "absent",
+    "believable",
+    "choice",
+    "fault",
+    "library",
+    "middle_reading",
+    "number",
+    "on_clock",
+    "text",
+]
+
+_GONE = {errno.ENOENT, errno.ENXIO, errno.ENODEV, errno.EREMOTEIO, errno.ENOTCONN, errno.ESHUTDOWN}
+
+
+def library(module: str, extra: str = "") -> Any:
+    """Import a device's library when the device is opened; DriverMissing says how to install it."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        hint = f": pip install 'thermocald[{extra}]'" if extra else ""
+        raise DriverMissing(f"the library {module!r} is not installed{hint} ({error})") from error
+
+
+def number(
+    name: str, value: object, low: float, high: float, unit: str = "", *, whole: bool = False
+) -> float:
+    """An option as a number within its bounds; ConfigurationError names option, value, limits."""
+    suffix = f" {unit}" if unit else ""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ConfigurationError(f"{name}: {value!r} is not a number{suffix and ' in' + suffix}")
+    if not low <= value <= high:
+        raise ConfigurationError(f"{name}: {value:g}{suffix} is not within {low:g} … {high:g}{suffix}")
+    if whole and value != int(value):
+        raise ConfigurationError(f"{name}: {value:g} is not a whole number")
+    return value
+
+
+def choice(name: str, value: object, allowed: Sequence[str]) -> str:
+    """An option out of a list of words; ConfigurationError shows the list."""
+    if not isinstance(value, str) or value not in allowed:
+        raise ConfigurationError(f"{name}: {value!r} is none of {', '.join(allowed)}")
+    return value
+
+
+def text(name: str, value: object) -> str:
+    """An option that must be a non-empty string; numbers of a YAML file are taken as written."""
+    if isinstance(value, bool) or not isinstance(value, str | int) or str(value) == "":
+        raise ConfigurationError(f"{name}: {value!r} is not a text; put it in quotes")
+    return str(value)
+
+
+def absent(message: str, *, seen: bool) -> DeviceError:
+    """What is not there: gone (retried) if it was opened once before, else not found (reported)."""
+    return DeviceGone(message) if seen else DeviceNotFound(message)
+
+
+def fault(error: OSError, where: str, *, seen: bool, hint: str = "") -> DeviceError:
+    """The device error that a system call's errno stands for.
+
+    where: the device as the user knows it; seen: whether it was opened once before; hint: what to
+    do where it is missing or denied.
+    """
+    if isinstance(error, DeviceError):
+        return error
+    reason = error.strerror or str(error) or type(error).__name__
+    advice = f"; {hint}" if hint else ""
+    if error.errno in _GONE:
+        return absent(f"{where}: {reason}{advice}", seen=seen)
+    if error.errno in (errno.EACCES, errno.EPERM):
+        return DeviceDenied(f"{where}: {reason}{advice or '; see the udev rules in systemd/'}")
+    if error.errno == errno.EBUSY:
+        return DeviceDenied(f"{where}: in use by another program or a kernel driver ({reason})")
+    if error.errno == errno.ETIMEDOUT or isinstance(error, TimeoutError):
+        return DeviceTimeout(f"{where}: no answer in time ({reason})")
+    return BadReading(f"{where}: {reason}")
+
+
+def on_clock(clock: Clock, monotonic: float) -> tuple[float, float]:
+    """An instant of the machine's CLOCK_MONOTONIC, s, on the clock's (monotonic, utc) scales."""
+    age = time.monotonic() - monotonic
+    return clock.monotonic() - age, clock.utc() - age
+
+
+def middle_reading(
+    clock: Clock,
+    values: Mapping[str, float],
+    begin: float,
+    metadata: Mapping[str, Any] | None = None,
+) -> Reading:
+    """A reading stamped half-way between `begin` (clock's monotonic, s) and now."""
+    half = (clock.monotonic() - begin) / 2.0
+    return Reading(
+        values=dict(values),
+        monotonic=clock.monotonic() - half,
+        utc=clock.utc() - half,
+        metadata=dict(metadata or {}),
+    )
+
+
+def believable(value_c: float, low_c: float, high_c: float, where: str) -> float:
+    """The temperature, if it is finite and within the sensor's range; BadReading otherwise."""
+    if not math.isfinite(value_c) or not low_c <= value_c <= high_c:
+        raise BadReading(
+            f"{where}: {value_c:g} °C is outside the sensor's range {low_c:g} … {high_c:g} °C"
+        )
+    return value_c

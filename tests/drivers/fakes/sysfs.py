@@ -1,0 +1,67 @@
+"""A sysfs tree in a temporary folder, written as the kernel lays it out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+CRC_TABLE_POLYNOMIAL = 0x8C
+
+
+class Sysfs:
+    """`root` is what the drivers are given as `sysfs`."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    def write(self, path: str, content: str) -> Path:
+        target = self.root / path
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(content + "\n")
+        return target
+
+    def hwmon(self, number: int, name: str, address: str = "", **files: str) -> Path:
+        folder = f"class/hwmon/hwmon{number}"
+        self.write(f"{folder}/name", name)
+        for file, content in files.items():
+            self.write(f"{folder}/{file}", content)
+        if address:
+            device = self.root / "devices" / address
+            device.mkdir(parents=True, exist_ok=True)
+            (self.root / folder / "device").symlink_to(device)
+        return self.root / folder
+
+    def iio(self, number: int, name: str, **files: str) -> Path:
+        folder = f"bus/iio/devices/iio:device{number}"
+        self.write(f"{folder}/name", name)
+        for file, content in files.items():
+            self.write(f"{folder}/{file}", content)
+        return self.root / folder
+
+    def zone(self, number: int, kind: str, milli: str) -> Path:
+        folder = f"class/thermal/thermal_zone{number}"
+        self.write(f"{folder}/type", kind)
+        self.write(f"{folder}/temp", milli)
+        return self.root / folder
+
+    def w1(self, rom: str, content: str) -> Path:
+        return self.write(f"bus/w1/devices/{rom}/w1_slave", content.rstrip("\n"))
+
+
+def w1_slave(celsius: float, limits: str = "4b46") -> str:
+    """What w1_therm prints for a DS18B20 at 12 bits; the CRC by table, not by the driver's code."""
+    raw = round(celsius * 16)
+    pad = raw.to_bytes(2, "little", signed=True) + bytes.fromhex(limits + "7fff")
+    pad += bytes([(0x10 - (raw & 0x0F)), 0x10])
+    crc = w1_crc(pad)
+    text = " ".join(f"{b:02x}" for b in [*pad, crc])
+    return f"{text} : crc={crc:02x} YES\n{text} t={int(raw * 1000 / 16)}"
+
+
+def w1_crc(data: bytes) -> int:
+    """Bit by bit from the most significant end of the reversed polynomial 0x31 (other form)."""
+    crc = 0
+    for byte in data:
+        for bit in range(8):
+            mix = (crc ^ (byte >> bit)) & 1
+            crc = (crc >> 1) ^ (CRC_TABLE_POLYNOMIAL if mix else 0)
+    return crc

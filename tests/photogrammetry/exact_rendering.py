@@ -1,0 +1,161 @@
+"""Frames by exact area coverage: what a target measurement is tested against.
+
+Shares no code with `thermocald.simulation`. A shape is a polygon whose vertices go through the full
+camera model one by one; the area that it covers of each sub-pixel is computed exactly (Green's
+theorem, segments split at the grid lines), the sub-pixel image is blurred with a sampled Gaussian
+and averaged over the pixels. So nothing is approximated but the outline by its vertices (720 of
+them: a sagitta of 1e-5 of the radius) and the blur by samples 1/`finer` px apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from thermocald.photogrammetry import ring_code
+from thermocald.photogrammetry.camera_model import CameraModel, ExteriorOrientation
+
+VERTICES = 720
+
+
+def coverage(polygon: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Covered area (height, width) of each cell by a polygon (n, 2); cell (0, 0) is [0, 1]².
+
+    The sign follows the polygon's turn and is taken away; parts outside the grid are clipped in y
+    by leaving them out, and in x by holding them at the border.
+    """
+    a = np.asarray(polygon, dtype=float)
+    b = np.roll(a, -1, axis=0)
+    # Cut long edges so that none crosses more than one grid line of each direction.
+    pieces = np.maximum(np.ceil(np.abs(b - a).max(axis=1)).astype(int), 1)
+    which = np.repeat(np.arange(len(a)), pieces)
+    k = np.arange(len(which)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    t0, t1 = (k / pieces[which])[:, None], ((k + 1) / pieces[which])[:, None]
+    d = (b - a)[which]
+    p, q = a[which] + t0 * d, a[which] + t1 * d
+    cuts = np.zeros((len(p), 4))
+    cuts[:, 3] = 1.0
+    for axis in (0, 1):
+        line = np.maximum(np.floor(p[:, axis]), np.floor(q[:, axis]))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = (line - p[:, axis]) / (q[:, axis] - p[:, axis])
+        cuts[:, 1 + axis] = np.where((t > 0) & (t < 1), t, 0.0)
+    cuts.sort(axis=1)
+    out = np.zeros((height, width + 1))
+    for i in range(3):
+        s = p + cuts[:, i, None] * (q - p)
+        e = p + cuts[:, i + 1, None] * (q - p)
+        dy = e[:, 1] - s[:, 1]
+        x, y = (s[:, 0] + e[:, 0]) / 2, (s[:, 1] + e[:, 1]) / 2
+        row = np.floor(y).astype(int)
+        x = np.clip(x, 0, width - 1e-9)
+        column = np.floor(x).astype(int)
+        ok = (row >= 0) & (row < height) & (dy != 0)
+        share = 1 - (x - column)
+        np.add.at(out, (row[ok], column[ok]), (dy * share)[ok])
+        np.add.at(out, (row[ok], column[ok] + 1), (dy * (1 - share))[ok])
+    area = np.cumsum(out, axis=1)[:, :width]
+    return np.abs(area)
+
+
+@dataclass
+class Scene:
+    """Shapes in object space, drawn in `ink` on `paper` DN.
+
+    shapes: polygons (n, 3) mm; light: (gx, gy) relative change of the light per px.
+    """
+
+    shapes: list[np.ndarray] = field(default_factory=list)
+    paper: float = 190.0
+    ink: float = 40.0
+    light: tuple[float, float] = (0.0, 0.0)
+
+    def disc(self, centre, normal, diameter) -> None:
+        e1, e2 = plane_axes(normal)
+        t = np.linspace(0, 2 * np.pi, VERTICES, endpoint=False)[:, None]
+        self.shapes.append(centre + diameter / 2 * (np.cos(t) * e1 + np.sin(t) * e2))
+
+    def ring(self, centre, normal, diameter, bits, number, turn=0.0) -> None:
+        """A coded target; `turn` in turns rotates it in its plane."""
+        self.disc(centre, normal, diameter)
+        e1, e2 = plane_axes(normal)
+        for begin, end in ring_code.segments(bits, number):
+            # Clockwise as the viewer sees it: from e1 to -e2, the normal points at the viewer.
+            t = -2 * np.pi * (np.linspace(begin, end, VERTICES // 3) + turn)[:, None]
+            arc = np.cos(t) * e1 + np.sin(t) * e2
+            self.shapes.append(
+                centre
+                + diameter
+                / 2
+                * np.vstack([ring_code.RING_INNER * arc, ring_code.RING_OUTER * arc[::-1]])
+            )
+
+    def patch(self, corners) -> None:
+        """A polygon (n, 3) mm, its edges cut finely so that distortion bends them."""
+        c = np.asarray(corners, dtype=float)
+        t = np.linspace(0, 1, 200, endpoint=False)[:, None]
+        self.shapes.append(np.vstack([c[i - 1] * (1 - t) + c[i] * t for i in range(len(c))]))
+
+    def render(
+        self,
+        camera: CameraModel,
+        exterior: ExteriorOrientation,
+        window: tuple[int, int, int, int] | None = None,
+        blur: float = 0.8,
+        finer: int = 4,
+    ) -> np.ndarray:
+        """Grey values (h, w), float and without noise, of the frame or of window (x, y, w, h)."""
+        x0, y0, w, h = window or (0, 0, camera.sensor.width, camera.sensor.height)
+        margin = int(np.ceil(6 * blur)) + 1
+        wide, high = (w + 2 * margin) * finer, (h + 2 * margin) * finer
+        image = np.full((high, wide), self.paper)
+        for shape in self.shapes:
+            points = camera.project(exterior, shape)
+            if not np.isfinite(points).all():
+                continue
+            grid = (points - (x0 - margin - 0.5, y0 - margin - 0.5)) * finer
+            low = np.maximum(np.floor(grid.min(axis=0)).astype(int) - 1, 0)
+            top = np.minimum(np.ceil(grid.max(axis=0)).astype(int) + 1, (wide, high))
+            if np.any(top <= low):
+                continue
+            part = coverage(grid - low, *(top - low))
+            image[low[1] : top[1], low[0] : top[0]] += (self.ink - self.paper) * part
+        u = np.arange(wide) / finer + x0 - margin
+        v = np.arange(high) / finer + y0 - margin
+        cx, cy = camera.sensor.centre
+        image *= 1 + self.light[0] * (u - cx)[None, :] + self.light[1] * (v - cy)[:, None]
+        if blur > 0:
+            size = 2 * int(np.ceil(6 * blur * finer)) + 1
+            image = cv2.GaussianBlur(image, (size, size), blur * finer)
+        small = image.reshape(h + 2 * margin, finer, w + 2 * margin, finer).mean(axis=(1, 3))
+        return small[margin:-margin, margin:-margin]
+
+
+def plane_axes(normal) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors that with the normal make a right-handed frame."""
+    n = np.asarray(normal, dtype=float) / np.linalg.norm(normal)
+    helper = np.eye(3)[np.argmin(np.abs(n))]
+    e1 = np.cross(helper, n)
+    e1 /= np.linalg.norm(e1)
+    return e1, np.cross(n, e1)
+
+
+def noisy(image: np.ndarray, rng: np.random.Generator, sd: float = 2.0) -> np.ndarray:
+    """White noise of `sd` DN, rounded to 8 bit."""
+    return np.clip(np.rint(image + rng.normal(0, sd, image.shape)), 0, 255).astype(np.uint8)
+
+
+def look_at(centre, target, roll: float = 0.0) -> ExteriorOrientation:
+    """A camera at `centre` that looks at `target`; roll in rad about the viewing axis."""
+    z = np.asarray(centre, dtype=float) - target
+    z /= np.linalg.norm(z)
+    up = np.array([0.0, 0.0, 1.0]) if abs(z[2]) < 0.99 else np.array([0.0, 1.0, 0.0])
+    x = np.cross(up, z)
+    x /= np.linalg.norm(x)
+    y = np.cross(z, x)
+    c, s = np.cos(roll), np.sin(roll)
+    return ExteriorOrientation.from_rotation(
+        np.column_stack([c * x + s * y, -s * x + c * y, z]), centre
+    )

@@ -30,30 +30,49 @@ _SINGLE_FREQUENCIES = 2000
 _POOLED_FREQUENCIES = 1000
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Autocorrelation:
     """Autocorrelation a·phi^k of a series' noise at lag k epochs.
 
     n: values; n_effective: independent values that determine a slope on `x` as well; phi, coloured:
-    the most likely phi and a (0 ≤ a ≤ 1, the rest is white).
+    the most likely phi and a (0 ≤ a ≤ 1, the rest is white); phis, coloureds, plausible (g,): the
+    grid of both and how plausible each pair is (sums to 1).
     """
 
     n: int
     n_effective: float
     phi: float
     coloured: float
+    phis: Array
+    coloureds: Array
+    plausible: Array
 
     @property
     def lag_one(self) -> float:
         """Correlation of neighbouring epochs."""
         return self.phi * self.coloured
 
+    def surrogates(self, rng: np.random.Generator, count: int, n: int) -> Array:
+        """Series of noise (count, n) of unit variance, autocorrelations drawn as plausible."""
+        series = rng.standard_normal((count, n))
+        model = rng.choice(len(self.plausible), size=count, p=self.plausible)
+        for g in np.unique(model):
+            phi, coloured = float(self.phis[g]), float(self.coloureds[g])
+            if phi and coloured:
+                rows = model == g
+                slow = _autoregressive(rng, int(rows.sum()), n, phi)
+                series[rows] = np.sqrt(coloured) * slow + np.sqrt(1 - coloured) * series[rows]
+        return series
 
-def noise_autocorrelation(y: Array, x: Array | None = None) -> Autocorrelation:
+
+def noise_autocorrelation(
+    y: Array, x: Array | None = None, *, variance: float | None = None
+) -> Autocorrelation:
     """Autocorrelation of y (n,) about its mean, or about its straight line on x (n,).
 
-    Finite values, evenly spaced; n ≥ 4. Without x, `n_effective` is that of the mean. Gaps must be
-    closed up by the caller: values on both sides of a gap then count as neighbours.
+    Finite values, evenly spaced; n ≥ 4; variance: of y, where it is known beforehand. Without x,
+    `n_effective` is that of the mean. Gaps must be closed up by the caller: values on both sides of
+    a gap then count as neighbours.
     """
     from scipy.fft import dct
 
@@ -77,7 +96,10 @@ def noise_autocorrelation(y: Array, x: Array | None = None) -> Autocorrelation:
         residual = residual - (weight @ uv) ** 2 / sxx
         degrees -= 1
         restricted = restricted + np.log(sxx)
-    deviance = degrees * np.log(np.maximum(residual, np.finfo(float).tiny)) + restricted
+    if variance is None:
+        deviance = degrees * np.log(np.maximum(residual, np.finfo(float).tiny)) + restricted
+    else:
+        deviance = residual / variance + restricted
     plausible = np.exp(-0.5 * (deviance - deviance.min()))
     plausible[0] *= len(plausible) - 1  # white noise is as likely beforehand as all others together
     plausible /= plausible.sum()
@@ -88,7 +110,13 @@ def noise_autocorrelation(y: Array, x: Array | None = None) -> Autocorrelation:
         inflation = spectrum @ uu / uu.sum()
     best = int(np.argmin(deviance))
     return Autocorrelation(
-        n, float(n / max(1.0, plausible @ inflation)), float(phi[best]), float(coloured[best])
+        n,
+        float(n / max(1.0, plausible @ inflation)),
+        float(phi[best]),
+        float(coloured[best]),
+        phi,
+        coloured,
+        plausible,
     )
 
 
@@ -112,3 +140,12 @@ def _spectra(frequency: Array) -> tuple[Array, Array, Array]:
         1 + (phi**2)[:, None] - 2 * phi[:, None] * np.cos(frequency)[None, :]
     )
     return phi, coloured, coloured[:, None] * shape + (1 - coloured)[:, None]
+
+
+def _autoregressive(rng: np.random.Generator, count: int, n: int, phi: float) -> Array:
+    """Stationary first-order autoregressive noise (count, n) of unit variance."""
+    from scipy.signal import lfilter
+
+    drive = rng.standard_normal((count, n)) * np.sqrt(1 - phi**2)
+    drive[:, 0] /= np.sqrt(1 - phi**2)
+    return np.asarray(lfilter([1.0], [1.0, -phi], drive, axis=1), dtype=float)

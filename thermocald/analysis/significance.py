@@ -79,15 +79,13 @@ class DriftTest:
     """One p-value for the whole series, whatever the windows share.
 
     statistic: mean variance ratio of the windows; p_value: share of driftless surrogates that reach
-    it; surrogates: how many; windows: how many windows the mean is over; lag_one: the series' own
-    correlation of neighbouring epochs, which the surrogates have too.
+    it; surrogates: how many; windows: how many windows the mean is over.
     """
 
     statistic: float
     p_value: float
     surrogates: int
     windows: int
-    lag_one: float
 
 
 def moving_mean(values: Array, window: int) -> Array:
@@ -182,7 +180,7 @@ def drift_test(
     starts = unbroken_windows(time_s, window)
     if not len(starts):
         return None
-    noise = noise_autocorrelation(values)
+    noise = noise_autocorrelation((values - values.mean()) / sds, variance=1.0)
     rng = np.random.default_rng(seed)
     if len(values) <= _LONG_SERIES:
         stretches = [slice(int(a), int(b)) for a, b in _runs(starts, window)]
@@ -200,16 +198,11 @@ def drift_test(
         mean_square = moving_mean(sd**2, window)
         observed += float(np.sum(moving_variance(values[stretch], window) / mean_square))
         noise_sd = sd * np.sqrt(_chi_square_factor(rng, redundancy[stretch], count))
-        series = noise_sd * _coloured_noise(rng, count, len(sd), noise.phi, noise.coloured)
+        series = noise_sd * noise.surrogates(rng, count, len(sd))
         drawn += np.sum(_row_variances(series, window) / mean_square, axis=1)
     reached = int(np.sum(drawn >= observed))
-    return DriftTest(
-        observed / statistic_windows,
-        (reached + 1) / (count + 1),
-        count,
-        statistic_windows,
-        noise.lag_one,
-    )
+    p_value = (reached + 1) / (count + 1)
+    return DriftTest(observed / statistic_windows, p_value, count, statistic_windows)
 
 
 def _chi_square_factor(rng: np.random.Generator, redundancy: Array, count: int) -> Array:
@@ -235,18 +228,3 @@ def _runs(starts: NDArray[np.int64], window: int) -> list[tuple[int, int]]:
     first = np.concatenate([starts[:1], starts[breaks + 1]])
     last = np.concatenate([starts[breaks], starts[-1:]])
     return [(int(a), int(b) + window) for a, b in zip(first, last, strict=True)]
-
-
-def _coloured_noise(
-    rng: np.random.Generator, count: int, n: int, phi: float, coloured: float
-) -> Array:
-    """Stationary noise (count, n) of unit variance with correlation coloured·phi^k."""
-    white = rng.standard_normal((count, n))
-    if coloured == 0 or phi == 0:
-        return white
-    from scipy.signal import lfilter
-
-    drive = rng.standard_normal((count, n)) * np.sqrt(1 - phi**2)
-    drive[:, 0] /= np.sqrt(1 - phi**2)
-    slow = np.asarray(lfilter([1.0], [1.0, -phi], drive, axis=1))
-    return np.asarray(np.sqrt(coloured) * slow + np.sqrt(1 - coloured) * white)

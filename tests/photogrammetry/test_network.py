@@ -1,0 +1,231 @@
+"""The free network on simulated photographs: coordinates, covariance, gross errors, refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.photogrammetry import network_cases as cases
+from thermocald.errors import GeometryError
+from thermocald.photogrammetry.network import Distance, adjust_network
+from thermocald.photogrammetry.network_checks import advice
+
+
+def _survey(field, stations, sigma, seed, distances=None, **options):
+    """Survey a simulated field; returns the network, the truth of its targets, the gross errors."""
+    rng = np.random.default_rng(seed)
+    simulation = {k: options.pop(k) for k in ("loss", "gross") if k in options}
+    photos, wrong = cases.photographs(field, stations, sigma, rng, **simulation)
+    names = [f"t{i}" for i in range(len(field))]
+    last = int(np.argmax(np.linalg.norm(field - field[0], axis=1)))
+    if distances is None:
+        length = float(np.linalg.norm(field[last] - field[0]))
+        distances = [Distance("t0", f"t{last}", length + rng.normal(0, 0.01), 0.01)]
+    network = adjust_network(cases.SENSOR, photos, names, distances, **options)
+    return network, field[[int(name[1:]) for name in network.names]], wrong
+
+
+@pytest.mark.parametrize("with_nominal", [False, True], ids=["from nothing", "from nominal"])
+def test_bent_sheet_from_twelve_rolled_stations(with_nominal):
+    field = cases.bent_sheet()
+    nominal = field * [1, 1, 0] if with_nominal else None
+    network, truth, wrong = _survey(
+        field, cases.convergent_stations(field), 0.02, seed=1, gross=0.02, nominal=nominal
+    )
+    assert len(network.stations) == 12
+    errors, normalised = cases.normalised_errors(network, truth)
+    # 324 normal values: 1 % beyond 3 would be four times too many, and 4.5 is one in 500 cases
+    assert np.mean(np.abs(normalised) < 3.0) > 0.99
+    assert np.abs(normalised).max() < 4.5
+    assert network.relative_accuracy < 1 / 20_000
+    assert np.sqrt(np.mean(errors**2)) / network.extent < 1 / 20_000
+    found = {(r.photo, int(r.target[1:])) for r in network.rejected}
+    assert len(wrong) > 15
+    assert found == set(wrong)
+    assert 0.95 < network.sigma0 < 1.05
+    interior = network.camera.interior.as_array() - cases.INTERIOR.as_array()
+    assert np.all(np.abs(interior) < 3.5 * np.sqrt(np.diag(network.interior_covariance)))
+
+
+def test_standard_deviations_are_true():
+    """Scatter over stated sd of targets and interior orientation, 100 seeded repetitions.
+
+    The mean over 90 coordinates is known to 1 % from 100 repetitions (neighbouring coordinates
+    correlate, so somewhat less), that of one interior parameter to 7 %: three of those are allowed.
+    The observations are normal; what the model does not have is not tested.
+    """
+    field = cases.bent_sheet(6, 5)
+    stations = cases.convergent_stations(field, 8)
+    errors, variances, interiors, interior_variances, sigma0 = [], [], [], [], []
+    for seed in range(100):
+        network, truth, _ = _survey(
+            field, stations, 0.05, seed, loss=0.0, nominal=field, interior=cases.INTERIOR
+        )
+        errors.append(network.points - truth)
+        variances.append(network.sigmas**2)
+        interiors.append(network.camera.interior.as_array() - cases.INTERIOR.as_array())
+        interior_variances.append(np.diag(network.interior_covariance))
+        sigma0.append(network.sigma0)
+    ratio = np.sqrt(np.mean(np.square(errors)) / np.mean(variances))
+    assert 0.9 < ratio < 1.1
+    per_axis = np.sqrt(np.mean(np.square(errors), axis=(0, 1)) / np.mean(variances, axis=(0, 1)))
+    assert np.all((per_axis > 0.9) & (per_axis < 1.1))
+    per_parameter = np.sqrt(
+        np.mean(np.square(interiors), axis=0) / np.mean(interior_variances, axis=0)
+    )
+    assert np.all((per_parameter > 0.79) & (per_parameter < 1.21))
+    assert abs(np.mean(sigma0) - 1) < 0.01
+
+
+def test_full_covariance_predicts_distances():
+    """The stated sd of distances between targets uses the correlations: normalised errors are 1.
+
+    Distances of targets that neighbour each other are far better than the sigmas alone say.
+    """
+    field = cases.bent_sheet(6, 5)
+    stations = cases.convergent_stations(field, 8)
+    rng = np.random.default_rng(7)
+    pairs = [tuple(rng.choice(30, 2, replace=False)) for _ in range(25)]
+    squares = []
+    for seed in range(100, 140):
+        network, truth, _ = _survey(
+            field, stations, 0.05, seed, loss=0.0, nominal=field, interior=cases.INTERIOR
+        )
+        for a, b in pairs:
+            e = (truth[b] - truth[a]) / np.linalg.norm(truth[b] - truth[a])
+            h = np.zeros(90)
+            h[3 * b : 3 * b + 3], h[3 * a : 3 * a + 3] = e, -e
+            difference = np.linalg.norm(network.points[b] - network.points[a])
+            error = difference - np.linalg.norm(truth[b] - truth[a])
+            squares.append(error**2 / (h @ network.covariance @ h))
+    assert 0.8 < np.sqrt(np.mean(squares)) < 1.2
+
+
+def test_inner_constraints_give_the_smallest_trace():
+    """Any other datum of the same network has a larger trace of the covariance (Granshaw 1980)."""
+    field = cases.bent_sheet(6, 5)
+    network, _, _ = _survey(
+        field, cases.convergent_stations(field, 8), 0.05, 3, interior=cases.INTERIOR,
+        distances=[Distance("t0", "t29", float(np.linalg.norm(field[29] - field[0])), 1e-6)],
+    )  # fmt: skip
+    points, Q = network.points, network.covariance
+    m = len(points)
+    G = np.zeros((m, 3, 6))
+    G[:, :, :3] = np.eye(3)
+    for axis in range(3):
+        G[:, :, 3 + axis] = np.cross(np.eye(3)[axis], points - points.mean(axis=0))
+    G = G.reshape(-1, 6)
+    assert np.abs(G.T @ Q).max() < 1e-6 * np.abs(Q).max() * m * 100
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        E = np.diag(np.repeat((rng.random(m) < 0.3).astype(float), 3))
+        S = np.eye(3 * m) - G @ np.linalg.solve(G.T @ E @ G, G.T @ E)
+        assert np.trace(S @ Q @ S.T) > np.trace(Q)
+
+
+def test_two_distances_are_weighted_and_lower_the_scale_uncertainty():
+    field = cases.bent_sheet(6, 5)
+    stations = cases.convergent_stations(field, 8)
+    lengths = [float(np.linalg.norm(field[b] - field[a])) for a, b in ((0, 29), (5, 24))]
+    one = _survey(field, stations, 0.05, 3, [Distance("t0", "t29", lengths[0], 0.1)])[0]
+    # the second is 1 mm too long and ten times worse: it may pull by a hundredth of that at most
+    two = _survey(
+        field, stations, 0.05, 3,
+        [Distance("t0", "t29", lengths[0], 0.1), Distance("t5", "t24", lengths[1] + 1.0, 1.0)],
+    )[0]  # fmt: skip
+    assert two.sd_scale < one.sd_scale
+    assert two.extent == pytest.approx(one.extent, rel=0.02 / 900)
+    assert two.extent > one.extent
+    # the distance's own share, and a little from the photographs
+    assert 1.0 < one.sd_scale / (0.1 / lengths[0]) < 1.1
+
+
+def _shift(*xyz):
+    return np.array(xyz, dtype=float)
+
+
+def _parallel(field, steps_x, steps_y):
+    centre = field.mean(axis=0)
+    return [
+        cases.looking_at(centre + _shift(x, y, 900), centre + _shift(x, y, 0), 0.0)
+        for x in steps_x
+        for y in steps_y
+    ]
+
+
+_FLAT = cases.bent_sheet(8, 6, sag=0.0)
+_BENT = cases.bent_sheet(8, 6)
+_SPOT = _BENT.mean(axis=0)
+
+
+@pytest.mark.parametrize(
+    ("field", "stations", "reason"),
+    [
+        (_BENT, cases.convergent_stations(_BENT)[:2], "2 photographs"),
+        (_FLAT, _parallel(_FLAT, (-150, 0, 150), (-100, 100)), "principal distance is uncertain"),
+        (
+            _BENT,
+            [
+                cases.looking_at(_SPOT + _shift(0, 0, 900), _SPOT + _shift(10 * i, 0, 0), i)
+                for i in range(6)
+            ],
+            "rays meet at|oriented to each other",
+        ),
+        (_BENT[:6], cases.convergent_stations(_BENT[:6]), "6 targets"),
+    ],
+    ids=["two photographs", "flat and parallel", "one place", "six targets"],
+)
+def test_weak_networks_are_refused(field, stations, reason):
+    with pytest.raises(GeometryError, match=reason):
+        _survey(field, stations, 0.05, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("distances", "reason"),
+    [
+        ([], "--scale"),
+        ([Distance("t0", "elsewhere", 100.0, 0.1)], "elsewhere"),
+        ([Distance("t0", "t47", -3.0, 0.1)], "must be positive"),
+    ],
+)
+def test_a_missing_scale_is_refused(distances, reason):
+    with pytest.raises(GeometryError, match=reason):
+        _survey(_BENT, cases.convergent_stations(_BENT), 0.05, 0, distances)
+
+
+def test_wrong_sigmas_show_in_sigma0_and_twenty_fold_ones_are_refused():
+    stations = cases.convergent_stations(_BENT)
+    photos, _ = cases.photographs(_BENT, stations, 0.05, np.random.default_rng(0))
+    names = [f"t{i}" for i in range(len(_BENT))]
+    scale = [Distance("t0", "t47", float(np.linalg.norm(_BENT[47] - _BENT[0])), 0.01)]
+    for photo in photos:
+        photo.observations.sigmas[:] = 0.05 / 20
+    with pytest.raises(GeometryError, match="times their stated sigmas"):
+        adjust_network(cases.SENSOR, photos, names, scale)
+    for photo in photos:
+        photo.observations.sigmas[:] = 0.05 / 2
+    assert adjust_network(cases.SENSOR, photos, names, scale).sigma0 == pytest.approx(2.0, rel=0.1)
+
+
+def test_advice_names_the_missing_roll():
+    flat = cases.convergent_stations(_BENT, rolled=False)
+    network, _, _ = _survey(_BENT, flat, 0.05, 0)
+    assert any("turned about its axis" in note for note in advice(network))
+    rolled, _, _ = _survey(_BENT, cases.convergent_stations(_BENT), 0.05, 0)
+    assert not any("turned about its axis" in note for note in advice(rolled))
+    sd = [float(np.sqrt(n.interior_covariance[1, 1])) for n in (network, rolled)]
+    assert sd[0] > 3 * sd[1]
+
+
+def test_a_foreign_photograph_is_left_out_and_named():
+    field = _BENT
+    rng = np.random.default_rng(5)
+    photos, _ = cases.photographs(field, cases.convergent_stations(field), 0.05, rng)
+    photos[4].observations.points[:] = rng.uniform(0, 2400, photos[4].observations.points.shape)
+    length = float(np.linalg.norm(field[47] - field[0]))
+    network = adjust_network(
+        cases.SENSOR, photos, [f"t{i}" for i in range(48)], [Distance("t0", "t47", length, 0.01)]
+    )
+    assert "photo4" in network.unused
+    assert "photo4" not in {s.photo for s in network.stations}
+    assert np.abs(cases.normalised_errors(network, field)[1]).max() < 4.5

@@ -1,0 +1,330 @@
+"""The network: targets in three dimensions from photographs, with a covariance that is true.
+
+A self-calibrating bundle adjustment without control: interior orientation common to all
+photographs, datum by inner constraints over the targets, scale by measured distances, gross errors
+found by Baarda's data snooping in its two-dimensional form. A network that cannot carry the result
+is refused with its reasons (`network_checks`).
+
+Source: Luhmann, T. et al. (2014): Close-Range Photogrammetry and 3D Imaging, 2nd ed., sections
+4.4 and 7.3; Baarda, W. (1968): A testing procedure for use in geodetic networks; Förstner, W.,
+Wrobel, B. (2016): Photogrammetric Computer Vision, section 4.6.4 (test of a point).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.photogrammetry import network_bundle as nb
+from thermocald.photogrammetry.camera_model import (
+    IOP_NAMES,
+    CameraModel,
+    ExteriorOrientation,
+    InteriorOrientation,
+    Sensor,
+)
+from thermocald.photogrammetry.network_covariance import Covariance, covariance
+from thermocald.photogrammetry.network_datum import Datum, Distance, bring_to_datum
+from thermocald.photogrammetry.network_snooping import compact, snoop
+from thermocald.photogrammetry.network_start import approximate
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from thermocald.photogrammetry.network_bundle import Bundle, ImageRays
+    from thermocald.photogrammetry.testfield import Observations
+
+    Array = NDArray[np.float64]
+    Index = NDArray[np.int64]
+
+__all__ = ["Distance", "Network", "Photo", "Rejection", "Station", "adjust_network"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Photo:
+    """One photograph: its name and what was measured in it; targets are rows of the names."""
+
+    name: str
+    observations: Observations
+
+
+@dataclass(frozen=True, slots=True)
+class Station:
+    """Where a photograph was taken from; sd of the projection centre, (3,) mm."""
+
+    photo: str
+    exterior: ExteriorOrientation
+    n_targets: int
+    sd_centre: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Rejection:
+    """An image point that was left out: residual in px, and its test value over the limit."""
+
+    photo: str
+    target: str
+    residual: float
+    test: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Network:
+    """The adjusted network.
+
+    names: m targets; points (m, 3) mm with covariance (3m, 3m) mm²; n_rays (m,); angles (m,) rad,
+    the largest angle of intersection of each target; interior with covariance (10, 10), zero for
+    what was held; free: names of what was not; residuals: one (n, 2) px per station; unused:
+    targets and photographs left out, with reasons.
+    """
+
+    names: tuple[str, ...]
+    points: Array
+    covariance: Array
+    n_rays: Index
+    angles: Array
+    camera: CameraModel
+    interior_covariance: Array
+    free: tuple[str, ...]
+    stations: tuple[Station, ...]
+    sigma0: float
+    redundancy: int
+    residuals: tuple[Array, ...]
+    rejected: tuple[Rejection, ...]
+    unused: dict[str, str]
+    datum: str
+    sd_scale: float
+
+    @property
+    def sigmas(self) -> Array:
+        """Standard deviations of the targets (m, 3) mm."""
+        result: Array = np.sqrt(np.diag(self.covariance)).reshape(-1, 3)
+        return result
+
+    @property
+    def extent(self) -> float:
+        """The largest distance between two targets, mm (of their bounding box)."""
+        return float(np.linalg.norm(np.ptp(self.points, axis=0)))
+
+    @property
+    def relative_accuracy(self) -> float:
+        """Mean standard deviation of a coordinate over the extent, without the scale's own."""
+        shape = np.diag(self.covariance).mean() - self._scale_share()
+        return float(np.sqrt(max(shape, 0.0)) / self.extent)
+
+    def _scale_share(self) -> float:
+        centred = self.points - self.points.mean(axis=0)
+        return self.sd_scale**2 * float(np.mean(centred**2))
+
+
+def adjust_network(
+    sensor: Sensor,
+    photos: Sequence[Photo],
+    names: Sequence[str],
+    distances: Sequence[Distance],
+    *,
+    interior: InteriorOrientation | None = None,
+    nominal: Array | None = None,
+    free: Sequence[str] = IOP_NAMES,
+    start: Network | None = None,
+) -> Network:
+    """Adjust a free network of photographs taken by one camera with unchanged focus.
+
+    names: the m targets that the observations' rows count; distances: measured ones between
+    targets, they give the scale; interior: approximate values, searched for if None; nominal:
+    approximate coordinates (m, 3) mm, NaN where unknown; free: the interior parameters to be
+    determined; start: an earlier result for the same photographs, whose orientation is begun with.
+    Raises GeometryError where the network cannot carry it, with the reasons.
+    """
+    from thermocald.photogrammetry.network_checks import refuse_before, refuse_weak
+
+    rays, left_out = _collect(photos, len(names), names)
+    refuse_before(rays, distances, names)
+    free_rows = np.array([IOP_NAMES.index(name) for name in free], dtype=int)
+    bundle, kept, used = (
+        approximate(sensor, rays, len(names), interior, nominal, free_rows)
+        if start is None
+        else _resume(start, photos, names, rays)
+    )
+    for i in sorted(set(range(len(photos))) - set(kept)):
+        left_out[photos[i].name] = "could not be oriented: too few targets in common with others"
+
+    bundle, rejected_rows, tests = snoop(sensor, bundle, used, free_rows)
+    good = ~rejected_rows
+    numbers, targets = compact(used.target[good], len(names))
+    final = nb.ImageRays(
+        used.photo[good], numbers[used.target[good]], used.points[good], used.whitening[good]
+    )
+    bundle = nb.Bundle(bundle.interior, bundle.rotations, bundle.centres, bundle.points[targets])
+    for row in sorted(set(range(len(names))) - set(targets.tolist())):
+        if row in rays.target:
+            left_out[names[row]] = "fewer than two photographs agree on it"
+
+    v = nb.residuals(sensor, bundle, final)
+    unknowns = len(free_rows) + 6 * len(kept) + 3 * len(targets) - 7
+    redundancy = 2 * len(final) - unknowns
+    sigma0 = float(np.sqrt(np.sum(v * v) / max(redundancy, 1)))
+    final_cofactors = covariance(sensor, bundle, final, free_rows, np.ones(len(final)))
+    placed = bring_to_datum(
+        bundle,
+        final_cofactors.points * sigma0**2,
+        distances,
+        {names[t]: i for i, t in enumerate(targets)},
+        None if nominal is None else np.asarray(nominal, dtype=float)[targets],
+    )
+    network = _result(
+        sensor, photos, names, kept, targets, placed, final_cofactors, final, sigma0, redundancy,
+        tuple(free), left_out,
+        _rejections(photos, names, kept, used, rejected_rows, tests, sensor, bundle, numbers),
+    )  # fmt: skip
+    refuse_weak(network, final_cofactors.weakest, distances)
+    return network
+
+
+def _collect(
+    photos: Sequence[Photo], m: int, names: Sequence[str]
+) -> tuple[ImageRays, dict[str, str]]:
+    """All rays of targets that at least two photographs show, and what was left out."""
+    photo, target, points, whitening = [], [], [], []
+    for i, p in enumerate(photos):
+        o = p.observations
+        photo.append(np.full(len(o), i))
+        target.append(np.asarray(o.targets, dtype=np.int64))
+        points.append(o.points)
+        C = np.zeros((len(o), 2, 2))
+        C[:, 0, 0], C[:, 1, 1] = o.sigmas[:, 0] ** 2, o.sigmas[:, 1] ** 2
+        if o.covariances is not None:
+            C[:, 0, 1] = C[:, 1, 0] = o.covariances
+        whitening.append(np.linalg.inv(np.linalg.cholesky(C)))
+    rays = nb.ImageRays(
+        np.concatenate(photo), np.concatenate(target), np.concatenate(points).astype(float),
+        np.concatenate(whitening),
+    )  # fmt: skip
+    seen = np.bincount(rays.target, minlength=m)
+    left_out = {names[int(t)]: "only one photograph shows it" for t in np.flatnonzero(seen == 1)}
+    return rays.select(seen[rays.target] >= 2), left_out
+
+
+def _resume(
+    start: Network, photos: Sequence[Photo], names: Sequence[str], rays: ImageRays
+) -> tuple[Bundle, list[int], ImageRays]:
+    """The bundle of an earlier result, for the rays of its photographs and targets."""
+    rows = {p.name: i for i, p in enumerate(photos)}
+    kept = [rows[s.photo] for s in start.stations]
+    number = np.full(len(photos), -1)
+    number[kept] = np.arange(len(kept))
+    points = np.full((len(names), 3), np.nan)
+    index = {name: i for i, name in enumerate(names)}
+    points[[index[name] for name in start.names]] = start.points
+    used = rays.select((number[rays.photo] >= 0) & np.isfinite(points[rays.target, 0]))
+    return (
+        nb.Bundle(
+            start.camera.interior.as_array(),
+            np.array([s.exterior.rotation for s in start.stations]),
+            np.array([s.exterior.centre for s in start.stations]),
+            np.nan_to_num(points),
+        ),
+        kept,
+        nb.ImageRays(number[used.photo], used.target, used.points, used.whitening),
+    )
+
+
+def _rejections(
+    photos: Sequence[Photo],
+    names: Sequence[str],
+    kept: list[int],
+    used: ImageRays,
+    rejected: NDArray[np.bool_],
+    tests: Array,
+    sensor: Sensor,
+    bundle: Bundle,
+    numbers: Index,
+) -> tuple[Rejection, ...]:
+    rows = np.flatnonzero(rejected)
+    result = []
+    for row in rows:
+        number = int(numbers[used.target[row]])
+        size = float("nan")
+        if number >= 0:
+            one = nb.ImageRays(
+                used.photo[row : row + 1], np.array([number]), used.points[row : row + 1],
+                np.eye(2)[None],
+            )  # fmt: skip
+            size = float(np.linalg.norm(nb.residuals(sensor, bundle, one)))
+        result.append(
+            Rejection(
+                photos[kept[int(used.photo[row])]].name,
+                names[int(used.target[row])],
+                size,
+                float(tests[row]),
+            )
+        )
+    return tuple(sorted(result, key=lambda r: (r.photo, r.target)))
+
+
+def _result(
+    sensor: Sensor,
+    photos: Sequence[Photo],
+    names: Sequence[str],
+    kept: list[int],
+    targets: Index,
+    placed: Datum,
+    cofactors: Covariance,
+    rays: ImageRays,
+    sigma0: float,
+    redundancy: int,
+    free: tuple[str, ...],
+    left_out: dict[str, str],
+    rejected: tuple[Rejection, ...],
+) -> Network:
+    bundle = placed.bundle
+    v_px = nb.residuals(
+        sensor, bundle,
+        nb.ImageRays(rays.photo, rays.target, rays.points,
+                     np.broadcast_to(np.eye(2), (len(rays), 2, 2))),
+    )  # fmt: skip
+    stations = []
+    for i, photo in enumerate(kept):
+        C = placed.turn @ cofactors.centres[i] @ placed.turn.T * (sigma0 * placed.scale) ** 2
+        sd = np.sqrt(np.diag(C))
+        stations.append(
+            Station(
+                photos[photo].name,
+                ExteriorOrientation.from_rotation(bundle.rotations[i], bundle.centres[i]),
+                int((rays.photo == i).sum()),
+                (float(sd[0]), float(sd[1]), float(sd[2])),
+            )
+        )
+    return Network(
+        names=tuple(names[t] for t in targets),
+        points=bundle.points,
+        covariance=placed.covariance,
+        n_rays=np.bincount(rays.target, minlength=len(targets)),
+        angles=_intersection_angles(bundle, rays),
+        camera=CameraModel(sensor, InteriorOrientation.from_array(bundle.interior)),
+        interior_covariance=cofactors.interior * sigma0**2,
+        free=free,
+        stations=tuple(stations),
+        sigma0=sigma0,
+        redundancy=redundancy,
+        residuals=tuple(v_px[rays.photo == i] for i in range(len(kept))),
+        rejected=rejected,
+        unused=left_out,
+        datum=placed.statement,
+        sd_scale=placed.sd_scale,
+    )
+
+
+def _intersection_angles(bundle: Bundle, rays: ImageRays) -> Array:
+    """The largest angle between two rays of each target, (m,) rad."""
+    d = bundle.centres[rays.photo] - bundle.points[rays.target]
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    angles = np.zeros(len(bundle.points))
+    for t in range(len(bundle.points)):
+        mine = d[rays.target == t]
+        angles[t] = np.arccos(np.clip((mine @ mine.T).min(), -1, 1)) if len(mine) > 1 else 0.0
+    return angles

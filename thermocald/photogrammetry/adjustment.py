@@ -40,6 +40,7 @@ from thermocald.photogrammetry.geometry import GeometryBounds, weaknesses
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     from thermocald.photogrammetry.camera_model import Sensor
@@ -247,7 +248,13 @@ def _result(
         tuple(int(t) for t in problem.observations.targets[~use]),
     )
     reasons = weaknesses(
-        problem.sensor, problem.points[use], problem.observations.points[use], result, s.bounds
+        problem.sensor,
+        problem.points[use],
+        problem.observations.points[use],
+        solution.values,
+        covariance,
+        s.free,
+        s.bounds,
     )
     if reasons:
         return replace(result, status="weak_geometry", reason="; ".join(reasons))

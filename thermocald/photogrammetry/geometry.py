@@ -16,9 +16,10 @@ from thermocald.photogrammetry.camera_model import IOP_NAMES, PARAMETER_NAMES, r
 from thermocald.photogrammetry.orientation import plane_fit
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from numpy.typing import NDArray
 
-    from thermocald.photogrammetry.adjustment import Adjustment
     from thermocald.photogrammetry.camera_model import Sensor
 
     Array = NDArray[np.float64]
@@ -59,16 +60,23 @@ def obliqueness_deg(eop: Array, normal: Array) -> float:
 
 
 def weaknesses(
-    sensor: Sensor, points: Array, image_points: Array, result: Adjustment, bounds: GeometryBounds
+    sensor: Sensor,
+    points: Array,
+    image_points: Array,
+    values: Array,
+    covariance: Array,
+    free: Iterable[str],
+    bounds: GeometryBounds,
 ) -> list[str]:
-    """Why the geometry does not carry the free parameters of a result; empty where it does.
+    """Why the geometry does not carry the free IOP of a result; empty where it does.
 
-    points (n, 3) mm and image_points (n, 2) px of the targets that took part. Held parameters are
-    not blamed: a pose alone needs far less.
+    points (n, 3) mm and image_points (n, 2) px of the targets that took part; values (16,) and
+    covariance (16, 16) of the adjustment. Held parameters are not blamed: a pose alone needs far
+    less.
     """
     reasons: list[str] = []
-    values, sd = result.values, result.sd
-    free = set(result.free)
+    sd = np.sqrt(covariance.diagonal())
+    free = set(free)
     if "c" in free:
         if sd[0] > bounds.relative_sd_c * values[0]:
             reasons.append(
@@ -97,17 +105,17 @@ def weaknesses(
                 f"the targets cover {coverage:.1%} of the image (at least {bounds.coverage:.0%} "
                 "are needed)"
             )
-    pair = _strongest_correlation(result, bounds.correlation)
+    pair = _strongest_correlation(covariance, bounds.correlation)
     if pair:
         reasons.append(pair)
     return reasons
 
 
-def _strongest_correlation(result: Adjustment, bound: float) -> str:
-    variance = result.covariance.diagonal()
+def _strongest_correlation(covariance: Array, bound: float) -> str:
+    variance = covariance.diagonal()
     u = np.flatnonzero(variance > 0)
     scale = 1.0 / np.sqrt(variance[u])
-    r = np.abs(result.covariance[np.ix_(u, u)] * scale * scale[:, None])
+    r = np.abs(covariance[np.ix_(u, u)] * scale * scale[:, None])
     r[np.diag_indices_from(r)] = 0.0
     # Only pairs that an IOP takes part in: EOP alone do not spoil the camera.
     inner = r[u < len(IOP_NAMES)]

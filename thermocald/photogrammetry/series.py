@@ -1,0 +1,382 @@
+"""Adjustment of a whole series: every epoch its own parameters, all epochs their common ones.
+
+Parameters are per epoch (`free`, and the EOP with `exterior="per_epoch"`), common to the series
+(the EOP with `exterior="series"`, and a constant offset per target), or held. Common unknowns are
+reduced: each epoch contributes its normal equations with its own parameters eliminated.
+
+Two standard deviations come out of it. That of a difference within the series holds the noise of the
+epoch and the differences of visibility; the *level*, what all epochs have in common (the EOP's and the
+targets' uncertainty), is stated beside it and cancels in every drift. A target that is hidden now and
+then shifts single epochs by its coordinate error; with `target_offsets` that error is an unknown
+with the test field's sigma as its prior.
+
+Source: DESIGN idea 3; the test for standing still is Rao's score test (1948).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from thermocald.photogrammetry.adjustment import DEFAULT_FREE, Adjustment
+from thermocald.photogrammetry.camera_model import (
+    IOP_NAMES,
+    PARAMETER_NAMES,
+    ExteriorOrientation,
+    InteriorOrientation,
+)
+from thermocald.photogrammetry.geometry import GeometryBounds, weaknesses
+from thermocald.photogrammetry.normals import ObservationGrid, linearise, series_residuals
+from thermocald.photogrammetry.series_system import SeriesSystem, snoop_series
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from thermocald.photogrammetry.camera_model import Sensor
+    from thermocald.photogrammetry.normals import Partials
+    from thermocald.photogrammetry.testfield import Observations, TestField
+
+    Array = NDArray[np.float64]
+
+__all__ = ["SeriesAdjustment", "SeriesSettings", "adjust_series"]
+
+_EOP = np.arange(10, 16)
+_ITERATIONS = 15
+_CONVERGED = 1e-3  # of a standard deviation
+_ROUNDS = 8  # of data snooping
+_RELINEARISE_PX = 1.0  # movement of the mean that changes the partials by more than about 1e-3
+_FEW = 0.6  # share of a series' targets below which an epoch's geometry is looked at by itself
+
+
+@dataclass(frozen=True, slots=True)
+class SeriesSettings:
+    """What is estimated per epoch and what once.
+
+    exterior: `series` for a camera that stands still; free: IOP per epoch, the others are held;
+    target_offsets: a constant offset per target with the test field's sigmas as prior, only with
+    `exterior="series"`; snooping_alpha, max_rejected, scale, bounds as in `AdjustmentSettings`.
+    """
+
+    exterior: Literal["per_epoch", "series"] = "series"
+    free: tuple[str, ...] = DEFAULT_FREE
+    target_offsets: bool = True
+    snooping_alpha: float = 0.001
+    max_rejected: float = 0.35
+    scale: Literal["posterior", "prior"] = "posterior"
+    bounds: GeometryBounds = field(default_factory=GeometryBounds)
+
+    @property
+    def per_epoch(self) -> NDArray[np.int64]:
+        """Positions of the parameters that every epoch has of its own."""
+        own = [i for i, name in enumerate(IOP_NAMES) if name in self.free]
+        if self.exterior == "per_epoch":
+            own += list(_EOP)
+        return np.array(own, dtype=np.int64)
+
+    @property
+    def common(self) -> NDArray[np.int64]:
+        """Positions of the parameters that are estimated once."""
+        return _EOP if self.exterior == "series" else np.empty(0, dtype=np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class SeriesAdjustment:
+    """The adjusted series; rows are epochs, parameters in the order of `PARAMETER_NAMES`.
+
+    values (E, 16), NaN where an epoch has no result; covariance (E, 16, 16): relative to the
+    series; level_covariance (16, 16): common to all epochs; sigma0 (E,); redundancy (E,);
+    observed, rejected (E, T); residuals (E, T, 2) px; offsets, offset_sds (T, 2) px, NaN where
+    none was estimated; status, reasons: per epoch; stillness (E,): chi-square with 6 degrees of
+    freedom of the epoch's own EOP against the series', NaN where the EOP are per epoch.
+    """
+
+    settings: SeriesSettings
+    values: Array
+    covariance: Array
+    level_covariance: Array
+    sigma0: Array
+    redundancy: Array
+    observed: NDArray[np.bool_]
+    rejected: NDArray[np.bool_]
+    residuals: Array
+    offsets: Array
+    offset_sds: Array
+    status: tuple[str, ...]
+    reasons: tuple[str, ...]
+    stillness: Array
+
+    @property
+    def sd(self) -> Array:
+        """Standard deviations (E, 16), NaN where held; common parameters have their level's."""
+        variance = np.diagonal(self.covariance, axis1=1, axis2=2).copy()
+        level = np.diag(self.level_covariance)
+        common = self.settings.common
+        variance[:, common] = level[common]
+        out: Array = np.sqrt(np.where(variance > 0, variance, np.nan))
+        out[~self.ok] = np.nan
+        return out
+
+    @property
+    def level_sd(self) -> Array:
+        """Standard deviation (16,) of what all epochs have in common."""
+        return np.sqrt(np.clip(np.diag(self.level_covariance), 0.0, None))
+
+    @property
+    def ok(self) -> NDArray[np.bool_]:
+        """(E,): epochs with a result."""
+        return np.array([s == "ok" for s in self.status], dtype=bool)
+
+    def epoch(self, row: int) -> Adjustment:
+        """One epoch as an `Adjustment`, for the store and the exports."""
+        ok = self.status[row] == "ok"
+        targets = np.flatnonzero(self.observed[row] | self.rejected[row])
+        covariance = self.covariance[row].copy()
+        common = np.ix_(self.settings.common, self.settings.common)
+        covariance[common] = self.level_covariance[common]
+        n = len(targets)
+        return Adjustment(
+            self.status[row],
+            self.reasons[row],
+            InteriorOrientation.from_array(self.values[row, :10]) if ok else None,
+            ExteriorOrientation.from_array(self.values[row, 10:]) if ok else None,
+            covariance if ok else np.zeros((16, 16)),
+            tuple(PARAMETER_NAMES[i] for i in self.settings.per_epoch if i < 10),
+            float(self.sigma0[row]),
+            int(self.redundancy[row]) if ok else 0,
+            targets,
+            self.residuals[row, targets],
+            np.full((n, 2), np.nan),
+            np.full(n, np.nan),
+            tuple(int(t) for t in np.flatnonzero(self.rejected[row])),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Estimate:
+    """values (E, 16) and offsets (T, 2) px, the residuals (E, T, 2) px they leave, the system."""
+
+    values: Array
+    offsets: Array
+    residuals: Array
+    system: SeriesSystem
+
+
+def adjust_series(
+    sensor: Sensor,
+    testfield: TestField,
+    epochs: Sequence[Observations | None],
+    interior: InteriorOrientation,
+    exterior: ExteriorOrientation,
+    settings: SeriesSettings | None = None,
+) -> SeriesAdjustment:
+    """Adjust all epochs of a camera, from start values good to a few per cent.
+
+    epochs: the observations, None for an epoch without. Never raises for data: an epoch without a
+    result has a status and a reason.
+    """
+    s = settings or SeriesSettings()
+    series = _Series(sensor, testfield, ObservationGrid.from_observations(testfield, epochs), s)
+    start = np.concatenate([interior.as_array(), exterior.as_array()])
+    values = np.tile(start, (len(epochs), 1))
+    use = series.grid.observed & series.enough[:, None]
+    estimate = series.solve(values, np.zeros((len(testfield), 2)), use, 1.0)
+    variance = 1.0
+    for _ in range(_ROUNDS if s.snooping_alpha > 0 else 0):
+        tests = estimate.system.point_tests(estimate.residuals, series.grid.weights)
+        offered = series.grid.observed & series.enough[:, None]
+        keep = snoop_series(tests, offered, use, len(s.per_epoch), s.snooping_alpha)
+        previous, variance = variance, series.variance(estimate)
+        settled = not series.has_offsets or abs(variance / previous - 1) < 0.02
+        if np.array_equal(keep, use) and settled:
+            break
+        use = keep
+        estimate = series.solve(estimate.values, estimate.offsets, use, variance)
+    return series.result(estimate, use)
+
+
+@dataclass(frozen=True, eq=False)
+class _Series:
+    sensor: Sensor
+    testfield: TestField
+    grid: ObservationGrid
+    s: SeriesSettings
+
+    @property
+    def enough(self) -> NDArray[np.bool_]:
+        """(E,): epochs with enough targets for their own parameters."""
+        count = 2 * self.grid.observed.sum(axis=1) - len(self.s.per_epoch)
+        enough: NDArray[np.bool_] = count >= self.s.bounds.minimum_redundancy
+        return enough
+
+    @property
+    def has_offsets(self) -> bool:
+        """Whether the targets' offsets are unknowns: only where the field has sigmas."""
+        wanted = self.s.target_offsets and self.s.exterior == "series"
+        return wanted and bool((self.testfield.sigmas > 0).any())
+
+    def solve(
+        self, values: Array, offsets: Array, use: NDArray[np.bool_], variance: float
+    ) -> _Estimate:
+        """Gauss-Newton with one linearisation at the series' mean, renewed while that moves.
+
+        variance: of unit weight, by which the offsets' prior is weighted against image points.
+        """
+        weights = np.where(use[..., None], self.grid.weights, 0.0)
+        system = self._linearised(values, weights, use, variance)
+        for _ in range(_ITERATIONS):
+            residuals = self._residuals(values, offsets)
+            step = system.step(residuals, offsets)
+            values = values.copy()
+            values[:, system.own] += step.d_own
+            values[:, system.common] += step.d_common
+            offsets = offsets + step.d_offsets
+            if step.size < _CONVERGED:
+                return _Estimate(values, offsets, residuals, system)
+            moved = np.zeros(16)
+            moved[system.common] = step.d_common
+            if system.good.any():
+                moved[system.own] = np.median(step.d_own[system.good], axis=0)
+            if np.abs(system.at.A @ moved).max(initial=0.0) > _RELINEARISE_PX:
+                system = self._linearised(values, weights, use, variance)
+        return _Estimate(values, offsets, self._residuals(values, offsets), system)
+
+    def _linearised(
+        self, values: Array, weights: Array, use: NDArray[np.bool_], variance: float
+    ) -> SeriesSystem:
+        used = use.any(axis=1)
+        mean = np.median(values[used] if used.any() else values, axis=0)
+        at = linearise(self.sensor, self.testfield, mean[:10], mean[10:])
+        prior = self._offset_prior(at) * variance if self.has_offsets else None
+        return SeriesSystem.build(at, weights, self.s.per_epoch, self.s.common, prior)
+
+    def _residuals(self, values: Array, offsets: Array) -> Array:
+        out = series_residuals(self.sensor, self.grid, self.testfield.points, values)
+        return out - offsets if self.has_offsets else out
+
+    def _offset_prior(self, at: Partials) -> Array:
+        """Inverse covariance (T, 3) px⁻² of the offsets, from that of the object coordinates."""
+        variance = self.testfield.sigmas**2
+        tiny = 1e-12  # px²: a target without sigma has no offset
+        xx = (at.B[:, 0] ** 2 * variance).sum(axis=1) + tiny
+        yy = (at.B[:, 1] ** 2 * variance).sum(axis=1) + tiny
+        xy = (at.B[:, 0] * at.B[:, 1] * variance).sum(axis=1)
+        determinant = xx * yy - xy**2
+        return np.stack([yy, xx, -xy], axis=1) / determinant[:, None]
+
+    def _sums(self, estimate: _Estimate) -> tuple[Array, Array]:
+        """Weighted sum of squares (E,) and redundancy (E,) of every epoch."""
+        w, v = estimate.system.weights, np.nan_to_num(estimate.residuals)
+        vPv = (
+            w[..., 0] * v[..., 0] ** 2
+            + w[..., 1] * v[..., 1] ** 2
+            + 2 * w[..., 2] * v[..., 0] * v[..., 1]
+        ).sum(axis=1)
+        n = (w[..., 0] > 0).sum(axis=1) * estimate.system.good
+        share = estimate.system.common_share() * n / max(int(n.sum()), 1)
+        return vPv, 2 * n - len(self.s.per_epoch) - share
+
+    def variance(self, estimate: _Estimate) -> float:
+        """Variance of unit weight of the series, the median over its epochs."""
+        vPv, redundancy = self._sums(estimate)
+        good = estimate.system.good & (redundancy > 0)
+        return float(np.median(vPv[good] / redundancy[good])) if good.any() else 1.0
+
+    def result(self, estimate: _Estimate, use: NDArray[np.bool_]) -> SeriesAdjustment:
+        """Judge the epochs and scale the covariances."""
+        system, s = estimate.system, self.s
+        vPv, redundancy = self._sums(estimate)
+        positive = redundancy > 0
+        sigma0 = np.sqrt(vPv / np.where(positive, redundancy, 1.0))
+        sigma0[~positive] = np.nan
+        relative, level = system.covariances()
+        pooled = self.variance(estimate)
+        if s.scale == "posterior":
+            relative *= np.nan_to_num(sigma0, nan=1.0)[:, None, None] ** 2
+            level *= pooled
+        stillness = np.full(len(sigma0), np.nan)
+        if s.exterior == "series":
+            stillness = system.score(estimate.residuals, _EOP) / np.where(positive, sigma0**2, 1.0)
+        values = estimate.values.copy()
+        observed = self.grid.observed
+        status, reasons = self._judge(estimate, use, relative)
+        values[[word != "ok" for word in status]] = np.nan
+        return SeriesAdjustment(
+            s, values, relative, level, sigma0, redundancy, use, observed & ~use,
+            estimate.residuals, estimate.offsets if self.has_offsets else estimate.offsets * np.nan,
+            np.sqrt(system.offset_cofactors() * pooled), tuple(status), tuple(reasons), stillness,
+        )  # fmt: skip
+
+    def _judge(
+        self, estimate: _Estimate, use: NDArray[np.bool_], covariance: Array
+    ) -> tuple[list[str], list[str]]:
+        """Status and reason of every epoch."""
+        observed, bounds = self.grid.observed, self.s.bounds
+        offered, used = observed.sum(axis=1), use.sum(axis=1)
+        status, reasons = ["ok"] * len(use), [""] * len(use)
+
+        def say(rows: NDArray[np.bool_], word: str, sentence: str) -> None:
+            for row in np.flatnonzero(rows):
+                if status[row] == "ok":
+                    status[row] = word
+                    reasons[row] = sentence.format(n=offered[row], bad=offered[row] - used[row])
+
+        say(offered == 0, "no_observations", "no target was measured")
+        say(
+            ~self.enough,
+            "too_few_targets",
+            f"{{n}} targets for {len(self.s.per_epoch)} unknowns of the epoch leave too little "
+            "redundancy: show more targets or hold parameters fixed",
+        )
+        say(
+            used < (1 - self.s.max_rejected) * offered,
+            "too_many_rejected",
+            "{bad} of {n} targets contradict the others: a moved test field, a wrong one, or a "
+            "blurred image",
+        )
+        say(~estimate.system.good, "weak_geometry", "these targets cannot carry the parameters")
+        variance = np.diagonal(covariance, axis1=1, axis2=2)
+        c, pitch = estimate.values[:, 0], self.sensor.pixel_pitch
+        say(
+            np.sqrt(variance[:, 0]) > bounds.relative_sd_c * c,
+            "weak_geometry",
+            f"the principal distance is known to worse than {bounds.relative_sd_c:.1%}",
+        )
+        say(
+            np.sqrt(variance[:, 1:3].max(axis=1)) > bounds.sd_point_px * pitch,
+            "weak_geometry",
+            f"the principal point is known to worse than {bounds.sd_point_px:.0f} px",
+        )
+        # Geometry is that of the series' targets; only epochs that see few of them are looked at
+        # one by one.
+        ever = use.any(axis=0).sum()
+        few = (used < _FEW * ever) & (np.array(status) == "ok")
+        typical = int(np.argmax(used))
+        for row in {typical, *map(int, np.flatnonzero(few))}:
+            if status[row] != "ok":
+                continue
+            said = self._weaknesses(estimate, use[row], covariance[row], row)
+            if said and row == typical:
+                say(np.ones(len(use), dtype=bool), "weak_geometry", said)
+            elif said:
+                status[row], reasons[row] = "weak_geometry", said
+        return status, reasons
+
+    def _weaknesses(
+        self, estimate: _Estimate, used: NDArray[np.bool_], covariance: Array, row: int
+    ) -> str:
+        """What `geometry.weaknesses` says of one epoch."""
+        values = estimate.values[row]
+        said = weaknesses(
+            self.sensor,
+            self.testfield.points[used],
+            self.grid.points[row, used],
+            values,
+            covariance,
+            self.s.free,
+            self.s.bounds,
+        )
+        return "; ".join(said).replace("{", "(").replace("}", ")")

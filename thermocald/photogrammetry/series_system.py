@@ -1,0 +1,298 @@
+"""The linearised series: normal equations of all epochs with their common unknowns reduced.
+
+The working half of `series`: arrays only. Own parameters are per epoch (p of them), common ones are
+the series' (q parameters, then the offsets in x and in y of the T targets).
+
+Source: the reduction of common unknowns as Helmert blocking, Wolf, H. (1978): The Helmert block
+method.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.photogrammetry.gauss_markov import chi2_2d
+from thermocald.photogrammetry.normals import normal_matrices, right_hand_sides
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from thermocald.photogrammetry.normals import Partials
+
+    Array = NDArray[np.float64]
+    Mask = NDArray[np.bool_]
+    Columns = NDArray[np.int64]
+
+__all__ = ["SeriesSystem", "Step", "snoop_series"]
+
+_CHUNK = 128  # epochs whose couplings with the offsets are held at a time
+_TRUSTED_REDUNDANCY = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """Corrections d_own (E, p), d_common (q,), d_offsets (T, 2) px; size in standard deviations."""
+
+    d_own: Array
+    d_common: Array
+    d_offsets: Array
+    size: float
+
+
+@dataclass(frozen=True, eq=False)
+class SeriesSystem:
+    """Normal equations at one linearisation.
+
+    weights (E, T, 3), 0 where a point takes no part; own (p,), common (q,): columns; N (E, 16, 16);
+    Q (E, p, p): cofactors of an epoch's own parameters, the common ones held; good (E,): epochs
+    that carry theirs; Q_common (q + 2T, q + 2T), or (q, q) without offsets; prior (T, 3) px⁻² of
+    the offsets, or None.
+    """
+
+    at: Partials
+    weights: Array
+    own: Columns
+    common: Columns
+    N: Array
+    Q: Array
+    good: Mask
+    Q_common: Array
+    prior: Array | None
+
+    @classmethod
+    def build(
+        cls, at: Partials, weights: Array, own: Columns, common: Columns, prior: Array | None
+    ) -> SeriesSystem:
+        """Form, invert, and reduce the normal equations."""
+        N = normal_matrices(weights, at.A)
+        Q, good = _invert(N[:, own[:, None], own])
+        good &= (weights[..., 0] > 0).any(axis=1)
+        system = cls(at, weights, own, common, N, Q, good, np.empty((0, 0)), prior)
+        full = _common_matrix(system)
+        for part, C in system.couplings():
+            half = np.swapaxes(np.linalg.cholesky(Q[part]), 1, 2) @ C
+            half = half.reshape(-1, half.shape[-1])
+            full -= half.T @ half
+        return cls(at, weights, own, common, N, Q, good, _inverse(full), prior)
+
+    def couplings(self) -> Iterator[tuple[NDArray[np.int64], Array]]:
+        """Chunks of good epochs and their blocks (e, p, q + 2T) of own with common unknowns."""
+        rows = np.flatnonzero(self.good)
+        q = len(self.common) + (0 if self.prior is None else 2 * len(self.at.A))
+        if q == 0 or len(self.own) == 0:
+            return
+        for start in range(0, len(rows), _CHUNK):
+            part = rows[start : start + _CHUNK]
+            yield part, self._coupling(part)
+
+    def _coupling(self, part: NDArray[np.int64]) -> Array:
+        parameters = self.N[part][:, self.own[:, None], self.common]
+        if self.prior is None:
+            return parameters
+        wx, wy, wxy = (self.weights[part][:, None, :, k] for k in range(3))
+        ax, ay = self.at.A[:, 0, self.own].T, self.at.A[:, 1, self.own].T
+        return np.concatenate([parameters, wx * ax + wxy * ay, wxy * ax + wy * ay], axis=2)
+
+    def step(self, residuals: Array, offsets: Array) -> Step:
+        """One Gauss-Newton step from residuals (E, T, 2) px and the offsets they stand at."""
+        b, _ = right_hand_sides(self.weights, residuals, self.at.A)
+        b[~self.good] = 0.0
+        right = b[:, self.own]
+        q = len(self.common)
+        total = b[:, self.common].sum(axis=0)
+        if self.prior is not None:
+            total = np.concatenate([total, self._offset_gradient(residuals, offsets)])
+        solved = (self.Q @ right[..., None])[..., 0]
+        for part, C in self.couplings():
+            total -= np.einsum("epi,ep->i", C, solved[part])
+        d_all = self.Q_common @ total
+        size = float(np.sqrt(max(total @ d_all, 0.0)))
+        if q:
+            for part, C in self.couplings():
+                right[part] -= C @ d_all
+            solved = (self.Q @ right[..., None])[..., 0]
+        solved[~self.good] = 0.0
+        size += float(np.sqrt(max((right * solved).sum(axis=1).max(initial=0.0), 0.0)))
+        d_offsets = d_all[q:].reshape(2, -1).T if self.prior is not None else np.zeros_like(offsets)
+        return Step(solved, d_all[:q], d_offsets, size)
+
+    def _offset_gradient(self, residuals: Array, offsets: Array) -> Array:
+        assert self.prior is not None
+        w = self.weights[self.good]
+        v = np.nan_to_num(residuals[self.good])
+        x = (w[..., 0] * v[..., 0] + w[..., 2] * v[..., 1]).sum(axis=0)
+        y = (w[..., 2] * v[..., 0] + w[..., 1] * v[..., 1]).sum(axis=0)
+        x -= self.prior[:, 0] * offsets[:, 0] + self.prior[:, 2] * offsets[:, 1]
+        y -= self.prior[:, 2] * offsets[:, 0] + self.prior[:, 1] * offsets[:, 1]
+        return np.concatenate([x, y])
+
+    def point_tests(self, residuals: Array, weights: Array) -> Array:
+        """Chi-square (2) of every image point (E, T) against its epoch.
+
+        weights (E, T, 3): a priori, also of the points that take no part; those are tested as
+        check points. The common unknowns are taken as known, as they rest on all epochs.
+        """
+        rows, columns = np.triu_indices(len(self.own))
+        Q = self.Q[:, rows, columns] * np.where(rows == columns, 1.0, 2.0)
+        ax, ay = self.at.A[:, 0, self.own], self.at.A[:, 1, self.own]
+        sign = np.where(self.weights[..., 0] > 0, -1.0, 1.0)
+        lxx = sign * (Q @ (ax[:, rows] * ax[:, columns]).T)
+        lyy = sign * (Q @ (ay[:, rows] * ay[:, columns]).T)
+        mixed = 0.5 * (ax[:, rows] * ay[:, columns] + ay[:, rows] * ax[:, columns])
+        lxy = sign * (Q @ mixed.T)
+        offered = weights[..., 0] > 0
+        wx, wy, wxy = (np.where(offered, weights[..., k], k < 2) for k in range(3))
+        determinant = wx * wy - wxy * wxy
+        vxx, vyy = wy / determinant + lxx, wx / determinant + lyy
+        vxy = lxy - wxy / determinant
+        x, y = residuals[..., 0], residuals[..., 1]
+        d = vxx * vyy - vxy * vxy
+        testable = offered & (d > 1e-9 / determinant)
+        test = np.where(testable, vyy * x * x - 2 * vxy * x * y + vxx * y * y, 0.0)
+        result: Array = test / np.where(testable, d, 1.0)
+        return result
+
+    def common_share(self) -> float:
+        """How many of the observations the common unknowns use up."""
+        q = len(self.common)
+        if self.prior is None:
+            return float(q)
+        T = len(self.prior)
+        x, y = np.arange(q, q + T), np.arange(q + T, q + 2 * T)
+        held = (
+            self.Q_common[x, x] @ self.prior[:, 0]
+            + self.Q_common[y, y] @ self.prior[:, 1]
+            + 2 * self.Q_common[x, y] @ self.prior[:, 2]
+        )
+        return float(q + 2 * T - held)
+
+    def covariances(self) -> tuple[Array, Array]:
+        """Cofactors (E, 16, 16) relative to the series, and (16, 16) of what all have in common.
+
+        An epoch's parameters depend on the common unknowns by -G; what of G is the same in all
+        epochs cancels in differences within the series, the rest is the epoch's own.
+        """
+        E, own, common = len(self.N), self.own, self.common
+        relative = np.zeros((E, 16, 16))
+        cofactors = self.Q.copy()
+        level = np.zeros((16, 16))
+        width = len(self.Q_common)
+        if width:
+            mean = np.zeros((len(own), width))
+            for part, C in self.couplings():
+                mean += (self.Q[part] @ C).sum(axis=0)
+            mean /= max(int(self.good.sum()), 1)
+            root = _root(self.Q_common)
+            for part, C in self.couplings():
+                deviation = (self.Q[part] @ C - mean) @ root
+                cofactors[part] += deviation @ np.swapaxes(deviation, 1, 2)
+            own_level = mean @ root
+            common_root = root[: len(common)]
+            level[own[:, None], own] = own_level @ own_level.T
+            level[common[:, None], common] = common_root @ common_root.T
+            level[own[:, None], common] = -own_level @ common_root.T
+            level[common[:, None], own] = level[own[:, None], common].T
+        relative[:, own[:, None], own] = cofactors
+        relative[~self.good] = 0.0
+        return relative, level
+
+    def offset_cofactors(self) -> Array:
+        """Cofactors (T, 2) px² of the offsets in x and y; NaN without offsets."""
+        if self.prior is None:
+            return np.full((len(self.at.A), 2), np.nan)
+        return np.diag(self.Q_common)[len(self.common) :].reshape(2, -1).T
+
+    def score(self, residuals: Array, columns: Columns) -> Array:
+        """Chi-square (E,) of held parameters being the same in an epoch as in the series.
+
+        Rao's score test: the gradient by these columns, with the epoch's own parameters reduced.
+        """
+        b, _ = right_hand_sides(self.weights, residuals, self.at.A)
+        C = self.N[:, self.own[:, None], columns]
+        QC = self.Q @ C
+        V = self.N[:, columns[:, None], columns] - np.swapaxes(C, 1, 2) @ QC
+        g = b[:, columns] - np.einsum("epi,ep->ei", QC, b[:, self.own])
+        inverse, good = _invert(V)
+        score = np.einsum("ei,eij,ej->e", g, inverse, g)
+        return np.where(good & self.good, score, np.nan)
+
+
+def snoop_series(tests: Array, offered: Mask, used: Mask, unknowns: int, alpha: float) -> Mask:
+    """Which image points (E, T) stay, epoch by epoch, as `gauss_markov.snoop` does."""
+    n = used.sum(axis=1)
+    ordered = np.sort(np.where(used, tests, np.inf), axis=1)
+    middle = ordered[np.arange(len(n)), np.minimum(n // 2, tests.shape[1] - 1)]
+    variance = np.where(n > 0, middle, 1.0) / (2 * np.log(2))
+    variance = np.where(2 * n - unknowns < _TRUSTED_REDUNDANCY, np.maximum(variance, 1), variance)
+    limit = (chi2_2d(alpha) * np.maximum(variance, 1e-12))[:, None]
+    worst = np.where(used, tests, 0.0).max(axis=1, initial=0.0)[:, None]
+    keep: Mask = (used | (tests <= limit)) & ~(used & (tests > limit) & (tests >= 0.5 * worst))
+    return keep & offered
+
+
+def _common_matrix(system: SeriesSystem) -> Array:
+    """The common unknowns' own block, over all good epochs, with the offsets' prior."""
+    common, good = system.common, system.good
+    q = len(common)
+    parameters: Array = system.N[good][:, common[:, None], common].sum(axis=0)
+    if system.prior is None:
+        return parameters
+    weights = system.weights[good].sum(axis=0)
+    A = system.at.A[..., common]
+    T = len(weights)
+    full = np.zeros((q + 2 * T, q + 2 * T))
+    full[:q, :q] = parameters
+    x, y = np.arange(q, q + T), np.arange(q + T, q + 2 * T)
+    full[x, x] = weights[:, 0] + system.prior[:, 0]
+    full[y, y] = weights[:, 1] + system.prior[:, 1]
+    full[x, y] = full[y, x] = weights[:, 2] + system.prior[:, 2]
+    wx, wy, wxy = (weights[:, k, None] for k in range(3))
+    full[x, :q] = wx * A[:, 0] + wxy * A[:, 1]
+    full[y, :q] = wxy * A[:, 0] + wy * A[:, 1]
+    full[:q, q:] = full[q:, :q].T
+    return full
+
+
+def _invert(N: Array) -> tuple[Array, Mask]:
+    """Inverse of each matrix (E, p, p), scaled to a unit diagonal first; which could be inverted."""
+    p = N.shape[-1]
+    diagonal = np.diagonal(N, axis1=1, axis2=2)
+    good: Mask = (diagonal > 0).all(axis=1)
+    scale = 1.0 / np.sqrt(np.where(good[:, None], diagonal, 1.0))
+    both = scale[:, :, None] * scale[:, None, :]
+    scaled = N * both
+    scaled[~good] = np.eye(p)
+    try:
+        inverse = np.linalg.inv(scaled)
+    except np.linalg.LinAlgError:
+        singular = np.linalg.eigvalsh(scaled)[:, 0] < 1e-13
+        scaled[singular] = np.eye(p)
+        inverse = np.linalg.inv(scaled)
+        good &= ~singular
+    left = np.diagonal(inverse, axis1=1, axis2=2)
+    good &= ((left > 0) & (left < 1e13)).all(axis=1)
+    inverse = 0.5 * (inverse + np.swapaxes(inverse, 1, 2)) * both
+    inverse[~good] = np.eye(p)
+    return inverse, good
+
+
+def _inverse(N: Array) -> Array:
+    """Inverse of one matrix, by the parameters that it determines."""
+    if len(N) == 0:
+        return N
+    scale = 1.0 / np.sqrt(np.clip(np.diag(N), 1e-300, None))
+    both = np.outer(scale, scale)
+    inverse: Array = np.linalg.pinv(N * both, rcond=1e-13, hermitian=True) * both
+    return inverse
+
+
+def _root(Q: Array) -> Array:
+    """A root of a covariance, Q = root · rootᵀ."""
+    values, vectors = np.linalg.eigh(Q)
+    root: Array = vectors * np.sqrt(np.clip(values, 0.0, None))
+    return root

@@ -64,7 +64,8 @@ def _gain(sensor: Sensor, vignetting: float) -> NDArray[np.float32]:
 def _paper(sensor: Sensor, paper_dn: float, vignetting: float) -> NDArray[np.int16]:
     """The empty scene in fixed point, even numbers."""
     half = np.float32(paper_dn * _FRACTION / 2)
-    return 2 * np.rint(_gain(sensor, vignetting) * half).astype(np.int16)
+    fixed: NDArray[np.int16] = np.rint(_gain(sensor, vignetting) * half).astype(np.int16)
+    return fixed + fixed
 
 
 @lru_cache(maxsize=8)
@@ -88,7 +89,7 @@ class Scene:
         self.field = field
         self.look = look or Look()
         self._normals = surface_normals(field)
-        self._facing: NDArray[np.bool_] | None = None
+        self._facing = np.zeros(len(field), dtype=bool)
         self._outlines: Outlines | None = None
 
     def _shapes(self, centre: Array) -> Outlines:

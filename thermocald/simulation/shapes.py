@@ -177,7 +177,8 @@ def outlines(field: TestField, normals: Array) -> Outlines:
     Circles without a diameter, and markers of which the field lacks a corner, are left out.
     """
     rows, weights, offset, sign, counts, shape = [], [], [], [], [], []
-    centre, normal = [], []
+    centre: list[int] = []
+    normal: list[Array] = []
     markers: dict[tuple[str, int], dict[int, int]] = {}
     for i in range(len(field)):
         if field.kinds[i] == "marker_corner":

@@ -25,8 +25,8 @@ __all__ = ["corner_field", "corner_view"]
 
 # In-plane directions (right, down) of a viewer in front of each plane.
 _PLANES = {
-    "x": (np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, -1.0])),
-    "y": (np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, -1.0])),
+    "x": (np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, -1.0])),
+    "y": (np.array([-1.0, 0.0, 0.0]), np.array([0.0, 0.0, -1.0])),
     "z": (np.array([1.0, 0.0, 0.0]), np.array([0.0, -1.0, 0.0])),
 }
 
@@ -90,7 +90,7 @@ def corner_field(
 def corner_view(field: TestField, distance_mm: float, roll_deg: float = 0.0) -> ExteriorOrientation:
     """The orientation of a camera that looks into the corner along its diagonal.
 
-    The camera looks at the middle of the targets from `distance_mm`; Z is up in the image at roll 0.
+    From `distance_mm` it looks at the middle of the targets; Z is up in the image at roll 0.
     """
     middle = field.points.mean(axis=0)
     backward = np.ones(3) / np.sqrt(3.0)

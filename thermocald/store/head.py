@@ -14,7 +14,16 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-__all__ = ["FORMAT", "CameraSpec", "Channel", "Head", "head_yaml", "read_head"]
+__all__ = [
+    "FORMAT",
+    "CameraSpec",
+    "Channel",
+    "Head",
+    "head_document",
+    "head_yaml",
+    "parse_head",
+    "read_head",
+]
 
 FORMAT = "thermocald-recording/1"
 
@@ -116,14 +125,18 @@ def read_head(folder: Path) -> Head:
         raise RecordingError(f"{folder}: is no folder; a recording is a folder with recording.yaml")
     if not path.is_file():
         raise RecordingError(f"{folder}: is no recording: recording.yaml is missing")
-    document = read_yaml(path, RecordingError)
+    return parse_head(read_yaml(path, RecordingError), path)
+
+
+def parse_head(document: Mapping[str, Any], path: Path) -> Head:
+    """The head in a mapping of `recording.yaml`; `path` is for the messages."""
     top = _Reader(path, document)
     found = top.text("format")
     if found != FORMAT:
         raise top.fail("format", f"is {found[:60]!r}; this program reads {FORMAT!r}")
     known = {"format", "name", "series", "interval", "camera", "temperatures"}
     return Head(
-        name=top.text("name", folder.resolve().name),
+        name=top.text("name", path.resolve().parent.name),
         series=top.text("series", "M1"),
         interval=top.positive("interval", "s"),
         camera=_camera(top),
@@ -171,8 +184,8 @@ def _channels(top: _Reader) -> dict[str, Channel]:
     return channels
 
 
-def head_yaml(head: Head) -> str:
-    """The text of `recording.yaml`."""
+def head_document(head: Head) -> dict[str, Any]:
+    """The mapping that `recording.yaml` holds; JSON-able where `extra` is."""
     sensor = head.camera.sensor
     camera: dict[str, Any] = {
         "name": head.camera.name,
@@ -199,4 +212,9 @@ def head_yaml(head: Head) -> str:
     }
     if temperatures:
         document["temperatures"] = temperatures
-    return dump_yaml({**document, **head.extra})
+    return {**document, **head.extra}
+
+
+def head_yaml(head: Head) -> str:
+    """The text of `recording.yaml`."""
+    return dump_yaml(head_document(head))

@@ -40,16 +40,14 @@ def interpolate_readings(
     values = values[good][unique]
     if len(times) < 2:
         # one reading tells the temperature of its own instant
-        result = np.full(frames.shape, np.nan)
-        if len(times) == 1:
-            result[frames == times[0]] = values[0]
-        return result
+        only = float(values[0]) if len(values) else np.nan
+        return np.where(np.isin(frames, times), only, np.nan)
     interval = float(np.median(np.diff(times)))
     gap = _LARGEST_GAP_IN_INTERVALS * interval if largest_gap_s is None else largest_gap_s
     left = np.clip(np.searchsorted(times, frames, side="right") - 1, 0, len(times) - 2)
     span = times[left + 1] - times[left]
     slope = (values[left + 1] - values[left]) / span
-    result = values[left] + slope * (frames - times[left])
+    result: Array = values[left] + slope * (frames - times[left])
     outside = np.maximum(times[0] - frames, frames - times[-1])
     on_reading = (frames == times[left]) | (frames == times[left + 1])
     result[(outside > interval) | ((span > gap) & ~on_reading)] = np.nan

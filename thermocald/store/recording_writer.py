@@ -8,8 +8,6 @@ import os
 import shutil
 from typing import TYPE_CHECKING, Self
 
-import numpy as np
-
 from thermocald.errors import RecordingError
 from thermocald.store.head import CameraSpec, Channel, Head, head_yaml
 from thermocald.store.testfield_file import testfield_csv
@@ -20,6 +18,7 @@ if TYPE_CHECKING:
     from types import TracebackType
     from typing import Any, TextIO
 
+    import numpy as np
     from numpy.typing import NDArray
 
     from thermocald.epoch import Epoch

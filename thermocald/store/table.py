@@ -7,6 +7,7 @@ observations is read in one to two seconds and costs the memory of a chunk.
 from __future__ import annotations
 
 import csv
+import io
 from itertools import islice
 from typing import TYPE_CHECKING
 
@@ -31,6 +32,7 @@ _MAX_EXACT_INTEGER = 2**53
 class Table:
     """A CSV file with a header; raises `error` if it, or a required column, is missing.
 
+    text: the table itself where it is not the content of `path`, which then is for the messages.
     columns: the names in the header, in their order.
     """
 
@@ -39,8 +41,10 @@ class Table:
         path: Path,
         required: Sequence[str],
         error: type[ThermocaldError] = RecordingError,
+        text: str | None = None,
     ) -> None:
         self.path = path
+        self._text = text
         self._error = error
         self.columns = self._header()
         for name in required:
@@ -71,6 +75,8 @@ class Table:
         raise self._error(f"{where}: {message}")
 
     def _open(self) -> TextIO:
+        if self._text is not None:
+            return io.StringIO(self._text, newline="")
         try:
             return self.path.open(newline="", encoding="utf-8-sig")
         except OSError as cause:
@@ -118,7 +124,7 @@ class Chunk:
         self.first = first
         self._size = len(rows)
         width = len(table.columns)
-        if any(len(row) != width for row in rows):
+        if set(map(len, rows)) != {width}:
             short = next(i for i, row in enumerate(rows) if len(row) != width)
             self.fail(
                 short,

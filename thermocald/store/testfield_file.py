@@ -16,7 +16,13 @@ from thermocald.store.table import Table
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = ["read_testfield", "require_millimetres", "testfield_csv", "write_testfield"]
+__all__ = [
+    "parse_testfield",
+    "read_testfield",
+    "require_millimetres",
+    "testfield_csv",
+    "write_testfield",
+]
 
 _REQUIRED = ("target", "X", "Y", "Z", "diameter", "sX", "sY", "sZ")
 
@@ -32,7 +38,15 @@ def read_testfield(path: Path) -> TestField:
     Raises TestFieldError, naming file, line and column, where a column is missing, a number is
     none, a target stands twice or the coordinates look like metres.
     """
-    table = Table(path, _REQUIRED, TestFieldError)
+    return _read(Table(path, _REQUIRED, TestFieldError))
+
+
+def parse_testfield(text: str, path: Path) -> TestField:
+    """A test field from the text of a `testfield.csv`; `path` is for the messages."""
+    return _read(Table(path, _REQUIRED, TestFieldError, text))
+
+
+def _read(table: Table) -> TestField:
     names: list[str] = []
     columns: dict[str, list[float]] = {name: [] for name in _REQUIRED[1:]}
     kinds: list[str] = []
@@ -63,7 +77,7 @@ def read_testfield(path: Path) -> TestField:
         found = chunk.text("code") if "code" in table.columns else empty
         codes.extend(code.strip() for code in found)
     if not names:
-        raise TestFieldError(f"{path}: holds no targets")
+        raise TestFieldError(f"{table.path}: holds no targets")
     field = TestField.build(
         names,
         np.array([columns["X"], columns["Y"], columns["Z"]]).T,
@@ -72,7 +86,7 @@ def read_testfield(path: Path) -> TestField:
         kinds,
         codes,
     )
-    require_millimetres(field, str(path))
+    require_millimetres(field, str(table.path))
     return field
 
 
@@ -91,9 +105,9 @@ def require_millimetres(
         smallest = max(smallest, _SMALLEST_FIELD_IN_PRINCIPAL_DISTANCES * principal_distance)
     if extent < smallest:
         raise TestFieldError(
-            f"{where}: the test field is {extent:.4g} mm across, less than the {smallest:.4g} mm that "
-            "a camera can see sharply: coordinates in metres? Write X, Y, Z, diameter, sX, sY, sZ "
-            "in mm (metres times 1000)"
+            f"{where}: the test field is {extent:.4g} mm across, less than the {smallest:.4g} mm "
+            "that a camera can see sharply: coordinates in metres? Write X, Y, Z, diameter, "
+            "sX, sY, sZ in mm (metres times 1000)"
         )
 
 

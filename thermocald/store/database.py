@@ -1,0 +1,368 @@
+"""The store: everything of a daemon in one SQLite file.
+
+Several cameras, each with series of epochs. An epoch is one transaction: a killed writer loses at
+most the epoch in hand. Nothing is changed or deleted: a later calibration of an epoch is a further
+revision, and triggers in the file refuse everything else.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import threading
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from thermocald.errors import StoreError
+from thermocald.store.columns import (
+    CHUNK,
+    FIXED,
+    build_missing_chunks,
+    read_columns,
+    rebuild_chunks,
+    status_codes,
+)
+from thermocald.store.connection import Mode, connect, in_words
+from thermocald.store.epoch_table import StoredEpoch, insert_epoch, select_epochs
+from thermocald.store.head import Head, head_document, parse_head
+from thermocald.store.readings import interpolate_readings
+from thermocald.store.row import NOT_CALIBRATED, EpochResult, Event, StoredSeries
+from thermocald.store.testfield_file import parse_testfield, testfield_csv
+
+if TYPE_CHECKING:
+    import sqlite3
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from pathlib import Path
+    from types import TracebackType
+
+    from numpy.typing import NDArray
+
+    from thermocald.epoch import Epoch
+    from thermocald.photogrammetry.testfield import Observations, TestField
+
+    Array = NDArray[np.float64]
+
+__all__ = ["Store"]
+
+
+class Store:
+    """An open store; use `Store.open` and a `with` block. Threads may share it."""
+
+    def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
+        self.path = path
+        self._db = connection
+        self._lock = threading.RLock()
+        self._ends: dict[int, tuple[int, int]] = {}  # series → last number, rows in no chunk
+
+    @classmethod
+    def open(cls, path: Path, mode: Mode = "read", *, durable: bool = True) -> Self:
+        """Open a store; for appending it is made if it does not exist.
+
+        durable: what is committed survives a power cut; False: the end of the process only, for
+        what can be computed again. Raises StoreError, StoreVersionError.
+        """
+        return cls(path, connect(path, mode, durable=durable))
+
+    def close(self) -> None:
+        """Close the file; may be called twice."""
+        with self._lock, in_words(self.path, "the store cannot be closed"):
+            self._db.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def create_series(
+        self,
+        head: Head,
+        testfield: TestField,
+        *,
+        start: str = "",
+        identity: Mapping[str, Any] | None = None,
+        settings: Mapping[str, Any] | None = None,
+        created_utc: float = 0.0,
+    ) -> StoredSeries:
+        """Begin a series; StoreError if the camera has one of this name already."""
+        if taken := {*FIXED, *_DERIVED} & set(head.channels):
+            raise StoreError(f"a temperature channel cannot be called {min(taken)!r}")
+        csv = testfield_csv(testfield)
+        digest = hashlib.sha256(csv.encode()).hexdigest()
+        with self._transaction(f"series {head.series!r} was not begun"):
+            if self._select_series(head.camera.name, head.series):
+                raise StoreError(
+                    f"{self.path}: camera {head.camera.name!r} has a series {head.series!r} "
+                    "already; choose another name"
+                )
+            self._db.execute(
+                "INSERT OR IGNORE INTO testfield (digest, csv) VALUES (?, ?)", (digest, csv)
+            )
+            self._db.execute(
+                "INSERT INTO series (camera, name, start, created_utc, head, identity, settings, "
+                "testfield_id) SELECT ?, ?, ?, ?, ?, ?, ?, id FROM testfield WHERE digest = ?",
+                (
+                    head.camera.name,
+                    head.series,
+                    start,
+                    created_utc,
+                    json.dumps(head_document(head), default=str),
+                    json.dumps(dict(identity or {}), default=str),
+                    json.dumps(dict(settings or {}), default=str),
+                    digest,
+                ),
+            )
+        return self.find_series(head.camera.name, head.series)
+
+    def all_series(self) -> list[StoredSeries]:
+        """All series, in the order in which they were begun."""
+        return self._select_series()
+
+    def find_series(self, camera: str | None = None, name: str | None = None) -> StoredSeries:
+        """The one series of a camera and a name, either of which may be left open.
+
+        Raises StoreError, listing what there is, if none or several fit.
+        """
+        found = self._select_series(camera, name)
+        if len(found) != 1:
+            there = ", ".join(f"{s.camera}/{s.name}" for s in self.all_series()) or "none"
+            raise StoreError(
+                f"{self.path}: {'several series fit' if found else 'there is no such series'}; "
+                f"camera/series in this store: {there}"
+            )
+        return found[0]
+
+    def append(
+        self,
+        series: StoredSeries,
+        epoch: Epoch,
+        result: EpochResult | None = None,
+        *,
+        extra: Mapping[str, float] | None = None,
+        clock_trusted: bool = True,
+        events: Iterable[Event] = (),
+    ) -> None:
+        """Keep one epoch, its result and what happened meanwhile, in one transaction.
+
+        result: None if it is to be calibrated later, by `amend`. extra: further columns such as
+        blur. Raises StoreError, and keeps nothing of the epoch, if its number does not come after
+        the last one or the disk is full.
+        """
+        if taken := {*FIXED, *_DERIVED, *series.head.channels} & set(extra or ()):
+            raise StoreError(f"an extra column cannot be called {min(taken)!r}")
+        result = result or EpochResult(NOT_CALIBRATED)
+        with self._transaction(f"epoch {epoch.number} of series {series.name!r} was not kept"):
+            last, loose = self._ends.get(series.id) or self._end(series)
+            if epoch.number <= last:
+                raise StoreError(
+                    f"{self.path}: epoch {epoch.number} of series {series.name!r} comes after "
+                    f"epoch {last}; numbers must increase"
+                )
+            insert_epoch(
+                self._db, series.id, StoredEpoch(epoch, result, extra or {}, clock_trusted, 0)
+            )
+            self._insert_events(events)
+            if loose + 1 == CHUNK:
+                build_missing_chunks(self._db, series.id)
+        self._ends[series.id] = (epoch.number, (loose + 1) % CHUNK)
+
+    def amend(
+        self,
+        series: StoredSeries,
+        number: int,
+        result: EpochResult,
+        *,
+        observations: Observations | None = None,
+        extra: Mapping[str, float] | None = None,
+    ) -> None:
+        """Keep a later calibration of an epoch; `observations`, `extra` None: as they were."""
+        with self._transaction(f"the calibration of epoch {number} was not kept"):
+            then = next(select_epochs(self._db, series.id, number, number, details=False), None)
+            if then is None:
+                raise StoreError(f"{self.path}: series {series.name!r} has no epoch {number}")
+            stored = StoredEpoch(
+                replace(then.epoch, observations=observations),
+                result,
+                then.extra if extra is None else extra,
+                then.clock_trusted,
+                then.revision + 1,
+            )
+            insert_epoch(self._db, series.id, stored)
+
+    def add_event(self, event: Event) -> None:
+        """Log something that happened apart from an epoch."""
+        with self._transaction("an event was not kept"):
+            self._insert_events([event])
+
+    def rebuild_columns(self, series: StoredSeries) -> None:
+        """Derive the column chunks anew: after many `amend`s reading is faster for it."""
+        with self._transaction("the columns were not rebuilt"):
+            rebuild_chunks(self._db, series.id)
+
+    def last_epoch(self, series: StoredSeries) -> int | None:
+        """The number of the last epoch kept, None if there is none: where to resume."""
+        last = self._end(series)[0]
+        return None if last < 0 else last
+
+    def epochs(
+        self,
+        series: StoredSeries,
+        first: int = 0,
+        last: int | None = None,
+        *,
+        details: bool = True,
+    ) -> Iterator[StoredEpoch]:
+        """The epochs numbered `first` to `last`, one after the other, in constant memory.
+
+        details: False leaves out observations and covariances, and is faster.
+        """
+        with in_words(self.path, "epochs cannot be read"):
+            yield from select_epochs(self._db, series.id, first, last, details=details)
+
+    def observations(
+        self, series: StoredSeries, numbers: Iterable[int]
+    ) -> Iterator[Observations | None]:
+        """The observations of some epochs; StoreError for a number that is not there."""
+        for number in numbers:
+            stored = next(self.epochs(series, number, number), None)
+            if stored is None:
+                raise StoreError(f"{self.path}: series {series.name!r} has no epoch {number}")
+            yield stored.epoch.observations
+
+    def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
+        """(E, 16, 16) covariances of some epochs, NaN for those without a result."""
+        result = np.full((len(numbers), 16, 16), np.nan)
+        for i, number in enumerate(numbers):
+            stored = next(self.epochs(series, number, number), None)
+            if stored is not None and stored.result.covariance is not None:
+                result[i] = stored.result.covariance
+        return result
+
+    def column_names(self, series: StoredSeries) -> list[str]:
+        """What `series_columns` can give, but extra columns."""
+        return ["epoch", *FIXED[1:], "status", *series.head.channels]
+
+    def series_columns(self, series: StoredSeries, names: Sequence[str]) -> dict[str, NDArray[Any]]:
+        """Columns over all epochs by name, (E,) each: a million epochs in a fraction of a second.
+
+        Names are those of `column_names` and of extra columns: `epoch`, `frame_time`, `c`, `sd_c`,
+        `sigma0`, a temperature channel (°C as read; see `temperatures_at_frame`), `blur` …; numbers
+        are float64, NaN where an epoch has none; `status` is text.
+        """
+        source = {name: _source(name, series) for name in names}
+        with self._lock, in_words(self.path, "columns cannot be read"):
+            columns: dict[str, NDArray[Any]] = dict(
+                read_columns(self._db, series.id, list(dict.fromkeys(source.values())))
+            )
+            if "status" in columns:
+                codes = dict(status_codes(self._db))
+                words = np.array([codes.get(i, "") for i in range(max(codes, default=0) + 1)])
+                columns["status"] = words[columns["status"].astype(np.int64)]
+        return {name: columns[source[name]] for name in names}
+
+    def temperatures_at_frame(self, series: StoredSeries) -> dict[str, Array]:
+        """Every channel brought to the instants of the frames, {name: (E,) °C}."""
+        names = ["frame_time", "temperature_time", *series.head.channels]
+        columns = self.series_columns(series, names)
+        return {
+            name: interpolate_readings(
+                columns["frame_time"], columns["temperature_time"], columns[name]
+            )
+            for name in series.head.channels
+        }
+
+    def events(self, series: StoredSeries | None = None, since_utc: float = 0.0) -> list[Event]:
+        """What happened, oldest first; of one series, or all."""
+        rows = self._query(
+            "SELECT utc, kind, text, series_id, epoch, data FROM event WHERE utc >= ? "
+            "AND series_id IS ifnull(?, series_id) ORDER BY id",
+            (since_utc, None if series is None else series.id),
+        )
+        return [
+            Event(utc, kind, text, series_id, epoch, json.loads(data))
+            for utc, kind, text, series_id, epoch, data in rows
+        ]
+
+    def check(self) -> None:
+        """Read the whole file; StoreError if it is damaged."""
+        ((verdict,), *_) = self._query("PRAGMA integrity_check", ())
+        if verdict != "ok":
+            raise StoreError(f"{self.path}: is damaged: {verdict}")
+
+    def _select_series(
+        self, camera: str | None = None, name: str | None = None
+    ) -> list[StoredSeries]:
+        rows = self._query(
+            "SELECT s.id, head, csv, start, identity, settings, created_utc FROM series s "
+            "JOIN testfield t ON t.id = testfield_id "
+            "WHERE camera = ifnull(?, camera) AND name = ifnull(?, name) ORDER BY s.id",
+            (camera, name),
+        )
+        return [
+            StoredSeries(
+                number,
+                parse_head(json.loads(head), self.path),
+                parse_testfield(csv, self.path),
+                start,
+                json.loads(identity),
+                json.loads(settings),
+                created,
+            )
+            for number, head, csv, start, identity, settings, created in rows
+        ]
+
+    def _end(self, series: StoredSeries) -> tuple[int, int]:
+        """The last epoch number of a series (-1: none) and how many rows are in no chunk."""
+        ((last, count),) = self._query(
+            "SELECT ifnull(max(number), -1), count(*) FROM epoch "
+            "WHERE series_id = ? AND revision = 0",
+            (series.id,),
+        )
+        return int(last), int(count) % CHUNK
+
+    def _insert_events(self, events: Iterable[Event]) -> None:
+        self._db.executemany(
+            "INSERT INTO event (utc, kind, text, series_id, epoch, data) VALUES (?, ?, ?, ?, ?, ?)",
+            [
+                (e.utc, e.kind, e.text, e.series, e.epoch, json.dumps(dict(e.data), default=str))
+                for e in events
+            ],
+        )
+
+    def _query(self, statement: str, values: Sequence[Any]) -> list[tuple[Any, ...]]:
+        with self._lock, in_words(self.path, "the store cannot be read"):
+            return self._db.execute(statement, values).fetchall()
+
+    @contextmanager
+    def _transaction(self, failed: str) -> Iterator[None]:
+        """All or nothing; `failed` begins the message of the error."""
+        with self._lock, in_words(self.path, failed):
+            self._db.execute("BEGIN IMMEDIATE")
+            try:
+                yield
+                self._db.execute("COMMIT")
+            except BaseException:
+                # SQLite has rolled back by itself after some errors, such as a full disk
+                if self._db.in_transaction:
+                    self._db.execute("ROLLBACK")
+                raise
+
+
+_DERIVED = ("epoch", "status")
+
+
+def _source(name: str, series: StoredSeries) -> str:
+    """The name in the chunks of a column by its public name."""
+    if name == "epoch":
+        return "number"
+    if name in FIXED or name == "status":
+        return name
+    return f"temperatures.{name}" if name in series.head.channels else f"extra.{name}"

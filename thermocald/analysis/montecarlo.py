@@ -176,7 +176,7 @@ def simulate_errors(
 def plane_errors(
     sensor: Sensor, iop: Array, sets: Array, points: Array, distance_mm: float
 ) -> Array:
-    """Errors (n, k, 2) mm of image points (k, 2) px under sets of IOP (n, 10) against `iop` (10,)."""
+    """Errors (n, k, 2) mm of image points (k, 2) px under sets (n, 10) against `iop` (10,)."""
     dx, dy, ok = _PlaneErrors(sensor, iop, points, distance_mm)(sets)
     errors = np.stack([dx.T, dy.T], axis=-1)
     errors[~ok] = np.nan
@@ -230,7 +230,7 @@ class _PlaneErrors:
 
 
 class _Distortion:
-    """The distortion of sets of IOP (n, 10) at points (k, n) mm; terms that are zero are left out."""
+    """The distortion of sets of IOP (n, 10) at points (k, n) mm; leaves out terms that are zero."""
 
     def __init__(self, sets: Array) -> None:
         columns = np.ascontiguousarray(sets.T)

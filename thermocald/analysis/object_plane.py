@@ -91,7 +91,8 @@ def plane_jacobian(sensor: Sensor, iop: ArrayLike, points: Array, distance_mm: f
     plane = on_plane(sensor, iop, points, distance_mm)
     object_points = np.column_stack([plane, np.full(len(plane), -distance_mm)])
     _, by_parameter, by_object = partials(sensor, iop, np.zeros(6), object_points)
-    return -np.linalg.solve(by_object[:, :, :2], by_parameter[:, :, :10])
+    solved = np.linalg.solve(by_object[:, :, :2], by_parameter[:, :, :10])
+    return np.asarray(-solved, dtype=np.float64)
 
 
 def propagate(jacobian: Array, covariance: Array) -> Array:

@@ -25,6 +25,7 @@ from thermocald.photogrammetry.camera_model import (
     Sensor,
     project,
 )
+from thermocald.photogrammetry.normals import ObservationGrid
 from thermocald.photogrammetry.series import SeriesSettings, adjust_series
 from thermocald.photogrammetry.testfield import Observations, TestField
 
@@ -103,8 +104,10 @@ def main() -> int:
     peer = opencv_seconds(field, epochs[0])
     settings = SeriesSettings(exterior="per_epoch", target_offsets=False)
 
+    grid = ObservationGrid.from_observations(field, epochs)
+
     def batch() -> object:
-        return adjust_series(SENSOR, field, epochs, INTERIOR, EXTERIOR, settings)
+        return adjust_series(SENSOR, field, grid, INTERIOR, EXTERIOR, settings)
 
     per_epoch = median_seconds(batch, 3) / len(epochs)
     rows = [

@@ -53,18 +53,25 @@ class ObservationGrid:
         weights = np.zeros((len(epochs), len(field), 3))
         present = [(e, obs) for e, obs in enumerate(epochs) if obs is not None and len(obs)]
         if present:
-            row = np.concatenate([np.full(len(obs), e) for e, obs in present])
-            target = np.concatenate([obs.targets for _, obs in present])
-            sigmas = np.concatenate([obs.sigmas for _, obs in present])
-            points[row, target] = np.concatenate([obs.points for _, obs in present])
-            covariance = np.concatenate(
-                [np.zeros(len(o)) if o.covariances is None else o.covariances for _, o in present]
-            )
-            xx, yy = sigmas[:, 0] ** 2, sigmas[:, 1] ** 2
-            determinant = xx * yy - covariance**2
-            weights[row, target, 0] = yy / determinant
-            weights[row, target, 1] = xx / determinant
-            weights[row, target, 2] = -covariance / determinant
+            counts = [len(obs) for _, obs in present]
+            flat = np.repeat([e * len(field) for e, _ in present], counts)
+            flat += np.concatenate([obs.targets for _, obs in present])
+            variance = np.concatenate([obs.sigmas for _, obs in present]) ** 2
+            points.reshape(-1, 2)[flat] = np.concatenate([obs.points for _, obs in present])
+            inverse = np.zeros((len(flat), 3))
+            if all(obs.covariances is None for _, obs in present):
+                np.divide(1.0, variance, out=inverse[:, :2])
+            else:
+                xy = np.concatenate(
+                    [
+                        np.zeros(len(o)) if o.covariances is None else o.covariances
+                        for _, o in present
+                    ]
+                )
+                determinant = variance[:, 0] * variance[:, 1] - xy**2
+                inverse[:, :2] = variance[:, ::-1] / determinant[:, None]
+                inverse[:, 2] = -xy / determinant
+            weights.reshape(-1, 3)[flat] = inverse
         return cls(points, weights)
 
     @property
@@ -132,8 +139,11 @@ def normal_matrices(weights: Array, A: Array) -> Array:
     k = A.shape[-1]
     rows, columns = _UPPER if k == 16 else np.triu_indices(k)
     ax, ay = A[:, 0], A[:, 1]
-    flat = weights[..., 0] @ (ax[:, rows] * ax[:, columns])
-    flat += weights[..., 1] @ (ay[:, rows] * ay[:, columns])
+    xx, yy = ax[:, rows] * ax[:, columns], ay[:, rows] * ay[:, columns]
+    if np.array_equal(weights[..., 0], weights[..., 1]):
+        flat = weights[..., 0] @ (xx + yy)
+    else:
+        flat = weights[..., 0] @ xx + weights[..., 1] @ yy
     if np.any(weights[..., 2]):
         flat += weights[..., 2] @ (ax[:, rows] * ay[:, columns] + ay[:, rows] * ax[:, columns])
     N = np.empty((E, k, k))
@@ -144,10 +154,12 @@ def normal_matrices(weights: Array, A: Array) -> Array:
 
 def right_hand_sides(weights: Array, residuals: Array, A: Array) -> tuple[Array, Array]:
     """Aᵀ P l (E, k) and lᵀ P l (E,) of every epoch; NaN residuals must have weight 0."""
-    lx = np.nan_to_num(residuals[..., 0])
-    ly = np.nan_to_num(residuals[..., 1])
-    px = weights[..., 0] * lx + weights[..., 2] * ly
-    py = weights[..., 2] * lx + weights[..., 1] * ly
+    used = weights[..., 0] > 0
+    lx, ly = np.where(used, residuals[..., 0], 0.0), np.where(used, residuals[..., 1], 0.0)
+    px, py = weights[..., 0] * lx, weights[..., 1] * ly
+    if np.any(weights[..., 2]):
+        px += weights[..., 2] * ly
+        py += weights[..., 2] * lx
     b: Array = px @ A[:, 0] + py @ A[:, 1]
     lPl: Array = np.einsum("et,et->e", px, lx) + np.einsum("et,et->e", py, ly)
     return b, lPl

@@ -26,6 +26,7 @@ from thermocald.photogrammetry.camera_model import (
     PARAMETER_NAMES,
     ExteriorOrientation,
     InteriorOrientation,
+    project,
 )
 from thermocald.photogrammetry.geometry import GeometryBounds, weaknesses
 from thermocald.photogrammetry.normals import ObservationGrid, linearise, series_residuals
@@ -46,7 +47,7 @@ __all__ = ["SeriesAdjustment", "SeriesSettings", "adjust_series"]
 
 _EOP = np.arange(10, 16)
 _ITERATIONS = 15
-_CONVERGED = 1e-3  # of a standard deviation
+_SMALL = 0.03  # standard deviations: a last step that the partials carry to 1e-4
 _ROUNDS = 8  # of data snooping
 _RELINEARISE_PX = 1.0  # movement of the mean that changes the partials by more than about 1e-3
 _FEW = 0.6  # share of a series' targets below which an epoch's geometry is looked at by itself
@@ -168,33 +169,27 @@ class _Estimate:
 def adjust_series(
     sensor: Sensor,
     testfield: TestField,
-    epochs: Sequence[Observations | None],
+    epochs: Sequence[Observations | None] | ObservationGrid,
     interior: InteriorOrientation,
     exterior: ExteriorOrientation,
     settings: SeriesSettings | None = None,
 ) -> SeriesAdjustment:
     """Adjust all epochs of a camera, from start values good to a few per cent.
 
-    epochs: the observations, None for an epoch without. Never raises for data: an epoch without a
+    epochs: the observations, None for an epoch without, or the grid of them. Never raises for data: an epoch without a
     result has a status and a reason.
     """
     s = settings or SeriesSettings()
-    series = _Series(sensor, testfield, ObservationGrid.from_observations(testfield, epochs), s)
+    if not isinstance(epochs, ObservationGrid):
+        epochs = ObservationGrid.from_observations(testfield, epochs)
+    series = _Series(sensor, testfield, epochs, s)
     start = np.concatenate([interior.as_array(), exterior.as_array()])
-    values = np.tile(start, (len(epochs), 1))
-    use = series.grid.observed & series.enough[:, None]
+    use = epochs.observed & series.enough[:, None]
+    values = np.tile(start, (len(use), 1))
     estimate = series.solve(values, np.zeros((len(testfield), 2)), use, 1.0)
-    variance = 1.0
-    for _ in range(_ROUNDS if s.snooping_alpha > 0 else 0):
-        tests = estimate.system.point_tests(estimate.residuals, series.grid.weights)
-        offered = series.grid.observed & series.enough[:, None]
-        keep = snoop_series(tests, offered, use, len(s.per_epoch), s.snooping_alpha)
-        previous, variance = variance, series.variance(estimate)
-        settled = not series.has_offsets or abs(variance / previous - 1) < 0.02
-        if np.array_equal(keep, use) and settled:
-            break
-        use = keep
-        estimate = series.solve(estimate.values, estimate.offsets, use, variance)
+    if s.snooping_alpha > 0:
+        snoop = series.snoop_together if len(s.common) else series.snoop_apart
+        estimate, use = snoop(estimate, use)
     return series.result(estimate, use)
 
 
@@ -227,22 +222,65 @@ class _Series:
         """
         weights = np.where(use[..., None], self.grid.weights, 0.0)
         system = self._linearised(values, weights, use, variance)
+        residuals = self._residuals(values, offsets)
         for _ in range(_ITERATIONS):
-            residuals = self._residuals(values, offsets)
             step = system.step(residuals, offsets)
             values = values.copy()
             values[:, system.own] += step.d_own
             values[:, system.common] += step.d_common
             offsets = offsets + step.d_offsets
-            if step.size < _CONVERGED:
+            if step.size < _SMALL:
+                residuals = system.moved(residuals, step)
                 return _Estimate(values, offsets, residuals, system)
+            residuals = self._residuals(values, offsets)
             moved = np.zeros(16)
             moved[system.common] = step.d_common
             if system.good.any():
                 moved[system.own] = np.median(step.d_own[system.good], axis=0)
             if np.abs(system.at.A @ moved).max(initial=0.0) > _RELINEARISE_PX:
                 system = self._linearised(values, weights, use, variance)
-        return _Estimate(values, offsets, self._residuals(values, offsets), system)
+        return _Estimate(values, offsets, residuals, system)
+
+    def snoop_together(
+        self, estimate: _Estimate, use: NDArray[np.bool_]
+    ) -> tuple[_Estimate, NDArray[np.bool_]]:
+        """Data snooping where all epochs share unknowns: every round solves the series again."""
+        variance, offered = 1.0, use
+        for _ in range(_ROUNDS):
+            tests = estimate.system.point_tests(estimate.residuals, self.grid.weights)
+            keep = snoop_series(tests, offered, use, len(self.s.per_epoch), self.s.snooping_alpha)
+            previous, variance = variance, self.variance(estimate)
+            settled = not self.has_offsets or abs(variance / previous - 1) < 0.02
+            if settled and np.array_equal(keep, use):
+                break
+            use = keep
+            estimate = self.solve(estimate.values, estimate.offsets, use, variance)
+        return estimate, use
+
+    def snoop_apart(
+        self, estimate: _Estimate, use: NDArray[np.bool_]
+    ) -> tuple[_Estimate, NDArray[np.bool_]]:
+        """Data snooping where epochs share nothing: only those that changed are solved again."""
+        whole, values, residuals = estimate.system, estimate.values, estimate.residuals
+        offered, use = use, use.copy()
+        rows, system = np.arange(len(use)), whole
+        for _ in range(_ROUNDS):
+            tests = system.point_tests(residuals[rows], self.grid.weights[rows])
+            keep = snoop_series(
+                tests, offered[rows], use[rows], len(self.s.per_epoch), self.s.snooping_alpha
+            )
+            changed = (keep != use[rows]).any(axis=1)
+            rows, keep = rows[changed], keep[changed]
+            if len(rows) == 0:
+                break
+            use[rows] = keep
+            weights = np.where(keep[..., None], self.grid.weights[rows], 0.0)
+            system = SeriesSystem.build(whole.at, weights, whole.own, whole.common, None)
+            step = system.step(residuals[rows], estimate.offsets)
+            values[rows[:, None], whole.own] += step.d_own
+            residuals[rows] = system.moved(residuals[rows], step)
+            whole.replace(rows, system)
+        return _Estimate(values, estimate.offsets, residuals, whole), use
 
     def _linearised(
         self, values: Array, weights: Array, use: NDArray[np.bool_], variance: float
@@ -254,7 +292,11 @@ class _Series:
         return SeriesSystem.build(at, weights, self.s.per_epoch, self.s.common, prior)
 
     def _residuals(self, values: Array, offsets: Array) -> Array:
-        out = series_residuals(self.sensor, self.grid, self.testfield.points, values)
+        if (values == values[:1]).all():
+            first = project(self.sensor, values[0, :10], values[0, 10:], self.testfield.points)
+            out = self.grid.points - first
+        else:
+            out = series_residuals(self.sensor, self.grid, self.testfield.points, values)
         return out - offsets if self.has_offsets else out
 
     def _offset_prior(self, at: Partials) -> Array:

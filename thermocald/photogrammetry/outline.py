@@ -1,7 +1,7 @@
 """How a flat round target maps into the image: the projected outline, distortion and all.
 
 The map takes the unit disc in the target's plane to pixels and is a polynomial of second order
-about the projected centre, F(s, t) = c + J·(s, t) + ½ H[(s, t), (s, t)]. J makes the ellipse; H holds
+about the projected centre, F(q) = c + J q + ½ H[q, q] with q = (s, t). J makes the ellipse; H holds
 what makes the centre of the outline another point than the projected centre: the perspective's
 foreshortening and the bend of the distortion across the target. Terms of third order are odd, they
 change the outline symmetrically and move no centre.
@@ -58,7 +58,7 @@ class LocalMap:
     @property
     def semi_axes(self) -> Array:
         """Semi-axes of the ellipses (n, 2) px, the major one first."""
-        axes: Array = np.linalg.svd(self.linear, compute_uv=False)
+        axes: Array = np.asarray(np.linalg.svd(self.linear, compute_uv=False), dtype=float)
         return axes
 
     @property
@@ -71,8 +71,8 @@ class LocalMap:
 def target_axes(normals: Array) -> tuple[Array, Array]:
     """Two unit vectors (n, 3) each that span the planes with these normals (n, 3)."""
     helper = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
-    e1 = np.cross(helper, normals)
-    e1 /= np.linalg.norm(e1, axis=1, keepdims=True)
+    across: Array = np.cross(helper, normals)
+    e1: Array = across / np.linalg.norm(across, axis=1, keepdims=True)
     return e1, np.cross(normals, e1)
 
 
@@ -97,7 +97,7 @@ def local_maps(
 
 
 def from_ellipses(centre: Array, semi_axes: Array, angle: Array) -> LocalMap:
-    """Maps of ellipses: centres (n, 2) px, semi-axes (n, 2) px, angle (n,) rad of the first axis."""
+    """Maps of ellipses: centres, semi-axes (n, 2) px, angle (n,) rad of the first semi-axis."""
     c, s = np.cos(angle), np.sin(angle)
     linear = np.stack(
         [

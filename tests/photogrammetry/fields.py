@@ -1,0 +1,59 @@
+"""Test fields for the tests of target measurement: a corner of three sheets, coded and plain."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tests.photogrammetry.exact_rendering import Scene, look_at
+from thermocald.photogrammetry import ring_code
+from thermocald.photogrammetry.camera_model import CameraModel, InteriorOrientation, Sensor
+from thermocald.photogrammetry.testfield import TestField
+
+PI_SENSOR = Sensor(3280, 2464, 0.00112)
+PI_CAMERA = CameraModel(
+    PI_SENSOR,
+    InteriorOrientation(3.04, 0.02, -0.015, A1=-4e-3, A2=1e-4, B1=1e-4, B2=-1e-4, C1=1e-4),
+)
+
+
+def corner_field(
+    per_side: int = 7, spacing: float = 60.0, diameter: float = 10.0, bits: int = 14,
+    coded_every: int = 3, inset: float = 45.0,
+) -> tuple[TestField, np.ndarray]:
+    """Three sheets in a room's corner; the field and each target's normal (n, 3)."""  # fmt: skip
+    codes = ring_code.codes(bits)
+    names, points, normals, kinds = [], [], [], []
+    number = 0
+    for plane in range(3):
+        normal = np.eye(3)[plane]
+        u, v = np.eye(3)[(plane + 1) % 3], np.eye(3)[(plane + 2) % 3]
+        for i in range(per_side):
+            for j in range(per_side):
+                points.append((inset + spacing * i) * u + (inset + spacing * j) * v)
+                normals.append(normal)
+                coded = (i + 2 * j) % coded_every == 0
+                kinds.append(f"RING{bits}:{codes[number]}" if coded else "")
+                number += coded
+                names.append(f"{'XYZ'[plane]}{i}{j}")
+    field = TestField.build(names, points, 0.01, diameter, "circle", kinds)
+    return field, np.array(normals)
+
+
+def draw(field: TestField, normals: np.ndarray, **scene) -> Scene:
+    """The scene of a field; coded targets are turned differently each."""
+    drawn = Scene(**scene)
+    for i, code in enumerate(field.codes):
+        if ring_code.is_ring(code):
+            drawn.ring(
+                field.points[i], normals[i], field.diameters[i], *ring_code.parse(code),
+                turn=0.37 * i % 1,
+            )  # fmt: skip
+        elif field.kinds[i] == "circle":
+            drawn.disc(field.points[i], normals[i], field.diameters[i])
+    return drawn
+
+
+def station(distance: float = 750.0, target=(200.0, 200.0, 200.0), roll: float = 0.0):
+    """Before the corner, looking in along its diagonal."""
+    direction = np.ones(3) / np.sqrt(3)
+    return look_at(np.array(target) + distance * direction, np.array(target), roll)

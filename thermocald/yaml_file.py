@@ -46,7 +46,7 @@ def read_yaml(path: Path, error: type[ThermocaldError] = ConfigurationError) -> 
         what = cause.strerror if isinstance(cause, OSError) else "is not UTF-8 text"
         raise error(f"{path}: cannot be read: {what}") from cause
     try:
-        document = yaml.load(text, Loader=_Loader)  # noqa: S506  a SafeLoader's child
+        document = yaml.load(text, Loader=_Loader)
     except yaml.MarkedYAMLError as cause:
         mark = cause.problem_mark
         where = "" if mark is None else f", line {mark.line + 1}, column {mark.column + 1}"

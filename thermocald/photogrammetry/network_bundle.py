@@ -7,7 +7,8 @@ regular without constraining anything that the photographs determine.
 Rotations are updated in object space (`R ← exp([w]×) R`), so no camera can look into a gimbal lock.
 
 Source: Granshaw, S. I. (1980): Bundle adjustment methods in engineering photogrammetry,
-Photogrammetric Record 10(56); Triggs, B. et al. (2000): Bundle adjustment — a modern synthesis, sections 6 and 9.
+Photogrammetric Record 10(56); Triggs, B. et al. (2000): Bundle adjustment — a modern synthesis,
+sections 6 and 9.
 """
 
 from __future__ import annotations

@@ -1,0 +1,236 @@
+"""Printed test fields: rasterised as a printer would, targets lie where the CSV says."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from thermocald.errors import UsageError
+from thermocald.output.testfield_layout import TRIM, Design, field_of, lay_out, paper_size
+from thermocald.output.testfield_print import default_diameter, print_testfield
+from thermocald.photogrammetry import ring_code
+from thermocald.store.testfield_file import read_testfield
+
+DPI = 200
+MM = DPI / 25.4  # px
+
+
+def rasterise(pdf, page=0, dpi=DPI):
+    """One page as a grey image (H, W)."""
+    pdfium = pytest.importorskip("pypdfium2")
+    document = pdfium.PdfDocument(pdf)
+    try:
+        bitmap = document[page].render(scale=dpi / 72, grayscale=True)
+        return bitmap.to_numpy().copy().reshape(bitmap.height, bitmap.width)
+    finally:
+        document.close()
+
+
+def page_px(field, rows, page, image):
+    """Where targets on a single sheet should be on the raster, px, (0, 0) a pixel's centre.
+
+    The renderer stretches the page to whole pixels.
+    """
+    xy = field.points[rows, :2] + TRIM
+    scale = np.array(image.shape[::-1]) / page
+    return np.column_stack([xy[:, 0], page[1] - xy[:, 1]]) * scale - 0.5
+
+
+def centroid(image, centre, radius_px, light=False):
+    """Grey-weighted centroid within a circle that holds nothing else."""
+    x0, y0 = np.rint(centre).astype(int)
+    n = int(radius_px) + 1
+    window = image[y0 - n : y0 + n + 1, x0 - n : x0 + n + 1].astype(float)
+    weight = window if light else 255.0 - window
+    y, x = np.mgrid[-n : n + 1, -n : n + 1]
+    weight *= np.hypot(x - (centre[0] - x0), y - (centre[1] - y0)) < radius_px
+    return np.array(
+        [x0 + np.sum(weight * x) / weight.sum(), y0 + np.sum(weight * y) / weight.sum()]
+    )
+
+
+@pytest.mark.parametrize(
+    ("paper", "options"),
+    [
+        ("A4", {}),
+        ("A3", {"bits": 14}),
+        ("250x330", {"dictionary": "DICT_APRILTAG_36h11"}),
+        ("A4", {"light": True}),
+    ],
+    ids=["A4", "A3 14 bit", "odd size with markers", "light on dark"],
+)
+def test_rasterised_discs_are_where_the_csv_says(tmp_path, paper, options):
+    page = paper_size(paper)
+    design = Design(page, default_diameter(page), **options)
+    print_testfield(design, tmp_path)
+    field = read_testfield(tmp_path / "testfield.csv")
+    image = rasterise(tmp_path / "testfield.pdf")
+    assert image.shape == pytest.approx((page[1] * MM, page[0] * MM), abs=1.01)
+    circles = [i for i, kind in enumerate(field.kinds) if kind == "circle"]
+    assert len(circles) >= 30
+    expected = page_px(field, circles, page, image)
+    # beyond the disc, but neither its ring nor its name
+    reach = 1.3 / 2 * design.diameter * MM
+    found = np.array([centroid(image, p, reach, design.light) for p in expected])
+    # a hundredth of a millimetre: a tenth of a printer's dot
+    assert np.abs(found - expected).max() / MM < 0.01
+
+
+@pytest.mark.parametrize("bits", [12, 14])
+def test_rasterised_rings_carry_the_code_of_the_csv(tmp_path, bits):
+    """The ring is read off the raster pixel by pixel, clockwise, without the program's decoder."""
+    page = paper_size("A4")
+    print_testfield(Design(page, 7.0, bits=bits), tmp_path)
+    field = read_testfield(tmp_path / "testfield.csv")
+    image = rasterise(tmp_path / "testfield.pdf", dpi=DPI)
+    coded = [i for i, code in enumerate(field.codes) if code]
+    assert len({field.codes[i] for i in coded}) == len(coded) >= 20
+    middle = 0.5 * (ring_code.RING_INNER + ring_code.RING_OUTER) * 3.5 * MM
+    for i, centre in zip(coded, page_px(field, coded, page, image), strict=True):
+        turns = 2 * np.pi * (np.arange(bits) + 0.5) / bits  # y down: clockwise
+        x, y = np.rint(centre[:, None] + middle * np.array([np.cos(turns), np.sin(turns)])).astype(
+            int
+        )
+        word = "".join("1" if grey < 128 else "0" for grey in image[y, x])
+        smallest = min(int(word[k:] + word[:k], 2) for k in range(bits))
+        assert f"RING{bits}:{smallest}" == field.codes[i]
+
+
+def test_markers_are_found_by_opencv_where_the_csv_says(tmp_path):
+    page = paper_size("A3", landscape=True)
+    print_testfield(Design(page, 9.0, dictionary="DICT_APRILTAG_36h11"), tmp_path)
+    field = read_testfield(tmp_path / "testfield.csv")
+    image = rasterise(tmp_path / "testfield.pdf")
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    corners, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(image)
+    found = {
+        f"DICT_APRILTAG_36h11:{int(number)}:{k}": corner[0, k]
+        for number, corner in zip(ids.ravel(), corners, strict=True)
+        for k in range(4)
+    }
+    rows = [i for i, kind in enumerate(field.kinds) if kind == "marker_corner"]
+    assert {field.codes[i] for i in rows} == set(found)
+    expected = page_px(field, rows, page, image)
+    errors = [found[field.codes[i]] - p for i, p in zip(rows, expected, strict=True)]
+    assert np.abs(errors).max() / MM < 0.2  # OpenCV's corners without refinement: 1 to 2 px
+
+
+def test_rulers_are_as_long_as_they_say(tmp_path):
+    print_testfield(Design(paper_size("A4"), 7.0), tmp_path)
+    image = rasterise(tmp_path / "testfield.pdf", dpi=600)
+    mm = 600 / 25.4
+    dark = image < 128
+    for lengthwise in (dark, np.rot90(dark, k=-1)):  # the second: the left edge becomes the top
+        height = lengthwise.shape[0]
+        # the ten-millimetre ticks stand 6 to 7 mm inside the trimmed edge, alone there
+        level = TRIM + 6.5
+        row = int(height - level * mm) if lengthwise is dark else int(level * mm)
+        ticks = np.flatnonzero(np.diff(np.concatenate([[0], lengthwise[row].astype(int)])) == 1)
+        assert len(ticks) == 11
+        assert (ticks[-1] - ticks[0]) / mm == pytest.approx(100.0, abs=0.05)
+        assert np.diff(ticks) / mm == pytest.approx(10.0, abs=0.06)
+
+
+def test_svg_draws_the_same_page(tmp_path):
+    """Page size and the centres of all discs, read from the SVG's own path data."""
+    import re
+    import xml.etree.ElementTree as ET
+
+    page = paper_size("A4")
+    printed = print_testfield(Design(page, 7.0), tmp_path)
+    root = ET.parse(tmp_path / "testfield.svg").getroot()
+    size = [float(root.get(side).removesuffix("pt")) / 72 * 25.4 for side in ("width", "height")]
+    assert size == pytest.approx(page, abs=0.01)
+    boxes = []
+    for path in root.iter("{http://www.w3.org/2000/svg}path"):
+        numbers = np.array(
+            [float(n) for n in re.findall(r"-?\d+\.?\d*(?:e-?\d+)?", path.get("d", ""))]
+        )
+        if len(numbers) % 2 == 0 and len(numbers) > 20:
+            xy = numbers.reshape(-1, 2) / 72 * 25.4
+            boxes.append(np.concatenate([xy.min(axis=0), xy.max(axis=0)]))
+    boxes = np.array(boxes)
+    centres = (boxes[:, :2] + boxes[:, 2:]) / 2
+    sides = boxes[:, 2:] - boxes[:, :2]
+    discs = centres[np.all(np.abs(sides - 7.0) < 0.01, axis=1)]
+    expected = printed.field.points[:, :2] + TRIM
+    expected[:, 1] = page[1] - expected[:, 1]
+    distance = np.linalg.norm(expected[:, None] - discs[None], axis=2).min(axis=1)
+    assert distance.max() < 0.005
+
+
+def test_corner_is_three_perpendicular_sheets_with_distinct_codes(tmp_path):
+    design = Design(paper_size("A3"), 9.0, sheets=3)
+    printed = print_testfield(design, tmp_path)
+    assert [f.name for f in printed.files] == [
+        "testfield.pdf", "testfield-1.svg", "testfield-2.svg", "testfield-3.svg", "testfield.csv",
+    ]  # fmt: skip
+    field = printed.field
+    planes = [np.flatnonzero(np.abs(field.points[:, axis]) < 1e-9) for axis in (2, 0, 1)]
+    assert [len(p) for p in planes] == [len(s.targets) for s in printed.sheets]
+    assert field.points.min() >= 0
+    codes = [c for c in field.codes if c]
+    assert len(set(codes)) == len(codes)
+    # seen from outside, on each sheet the order right, up, towards the viewer is right-handed:
+    # otherwise the ring codes of that sheet would be mirrored
+    for rows, sheet, normal in zip(planes, printed.sheets, np.eye(3)[[2, 0, 1]], strict=True):
+        local = np.array([[t.x, t.y] for t in sheet.targets])
+        axes = np.linalg.lstsq(
+            np.column_stack([local, np.ones(len(local))]), field.points[rows], rcond=None
+        )[0][:2]
+        assert np.cross(axes[0], axes[1]) == pytest.approx(normal, abs=1e-9)
+
+
+def test_sigmas_are_those_of_an_unsurveyed_print():
+    flat = field_of(lay_out(Design(paper_size("A3"), 9.0)))
+    assert flat.sigmas[:, 2].min() > flat.sigmas[:, 0].max() > flat.sigmas[:, 0].min() > 0.09
+    corner = field_of(lay_out(Design(paper_size("A3"), 9.0, sheets=3)))
+    assert corner.sigmas.min() > 2.9
+
+
+@pytest.mark.parametrize("name", ["A4", "A3", "A2", "A1", "A0"])
+@pytest.mark.parametrize("landscape", [False, True])
+def test_every_paper_has_a_sensible_default(name, landscape):
+    page = paper_size(name, landscape=landscape)
+    (sheet,) = lay_out(Design(page, default_diameter(page)))
+    assert 60 < len(sheet.targets) < 160
+    a, b = sheet.scale_bar
+    assert a.y == b.y
+    assert b.x - a.x > 0.6 * sheet.size[0]
+    for target in sheet.targets:
+        reach = 3 * default_diameter(page) / 2 if target.code else default_diameter(page) / 2
+        assert reach < target.x < sheet.size[0] - reach
+        assert reach < target.y < sheet.size[1] - reach
+
+
+@pytest.mark.parametrize(
+    ("design", "reason"),
+    [
+        (Design((210, 297), 60.0), "smaller discs or larger paper"),
+        (Design((841, 1189), 8.0, bits=12), "--bits 14"),
+        (Design((841, 1189), 3.0, bits=14), "more than the 516"),
+        (Design((210, 297), 7.0, bits=13), "12 and 14"),
+        (Design((210, 297), 7.0, bits=0), "cannot be identified"),
+        (Design((210, 297), 7.0, dictionary="DICT_KLINGON"), "DICT_KLINGON"),
+        (Design((210, 297), 0.5), "0.5 mm"),
+        (Design((210, 297), 7.0, sheets=2), "three of a corner"),
+        (Design((210, 297), 7.0, pitch=10.0), "need 29.75 mm"),
+    ],
+)
+def test_impossible_designs_are_refused(design, reason, tmp_path):
+    with pytest.raises(UsageError, match=reason):
+        print_testfield(design, tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("text", ["A9", "20", "axb", "10x10", "9000x9000", "nanxnan"])
+def test_unknown_paper_is_refused(text):
+    with pytest.raises(UsageError, match="paper"):
+        paper_size(text)
+
+
+def test_unwritable_folder_is_one_error(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UsageError, match="file"):
+        print_testfield(Design((210, 297), 7.0), tmp_path / "file")

@@ -17,8 +17,12 @@ PI_CAMERA = CameraModel(
 
 
 def corner_field(
-    per_side: int = 7, spacing: float = 60.0, diameter: float = 10.0, bits: int = 14,
-    coded_every: int = 3, inset: float = 45.0,
+    per_side: int = 7,
+    spacing: float = 60.0,
+    diameter: float = 10.0,
+    bits: int = 14,
+    coded_every: int = 3,
+    inset: float = 45.0,
 ) -> tuple[TestField, np.ndarray]:
     """Three sheets in a room's corner; the field and each target's normal (n, 3)."""  # fmt: skip
     codes = ring_code.codes(bits)

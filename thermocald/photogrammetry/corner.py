@@ -67,8 +67,11 @@ def fit_corners(
     cell (n,) px: width of the marker's border and of the quiet zone about it; nothing beyond is
     looked at. reach: px, how far along the edges pixels are used.
     """
+    if len(corners) == 0:
+        none = np.zeros(0)
+        return CornerFit(np.zeros((0, 2)), np.zeros((0, 2, 2)), *(none,) * 5, ())
     parts = []
-    for i in range(0, max(len(corners), 1), chunk):
+    for i in range(0, len(corners), chunk):
         s = slice(i, i + chunk)
         parts.append(_fit(image, corners[s], before[s], after[s], cell[s], reach))
 
@@ -142,7 +145,7 @@ def _fit(
     height, width = image.shape
     sides = np.stack([before - corners, after - corners])
     along = np.minimum(0.45 * np.linalg.norm(sides, axis=-1).min(axis=0), reach)
-    half = int(np.ceil(along.max())) if n else 1
+    half = int(np.ceil(along.max()))
     offset = np.arange(-half, half + 1)
     origin = np.rint(corners).astype(int)
     x = (origin[:, 0, None, None] + offset[None, None, :]).repeat(len(offset), 1).reshape(n, -1)
@@ -172,8 +175,8 @@ def _fit(
         median: Array = np.nanmedian(part, axis=1)
         return median
 
-    background = share(depth < -1) if n else np.zeros(0)
-    contrast = (share(depth > 1) if n else np.zeros(0)) - background
+    background = share(depth < -1)
+    contrast = share(depth > 1) - background
     p = np.column_stack(
         [
             corners,

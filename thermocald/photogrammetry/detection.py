@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -110,7 +110,7 @@ def find_circles(image: NDArray[np.uint8], scale: int = 1, ink: int = -1) -> Can
 
 
 def _is_ellipse(
-    contour: NDArray[np.int32], x: float, y: float, a: float, b: float, angle: float
+    contour: NDArray[Any], x: float, y: float, a: float, b: float, angle: float
 ) -> bool:
     """Whether the contour's points keep to the ellipse, to a pixel's raster and some per cent."""
     if min(a, b) < 0.75:

@@ -1,6 +1,10 @@
 """One entry for measuring a frame: everything of a test field that it shows, and what was missed.
 
-image ─► status ─► markers and ring codes ─► orientation ─► plain circles ─► centres, covariances
+    image ─► status ─► markers and ring codes ─► orientation ─► all circles ─► centres, covariances
+
+Coded targets only tell where the camera stands; from there every circle in view has a predicted
+outline, coded or plain, and is fitted there. So a code ring in a reflection costs nothing but
+itself, and plain circles need no search.
 """
 
 from __future__ import annotations
@@ -8,10 +12,25 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 
+from thermocald.errors import GeometryError
+from thermocald.photogrammetry import ring_code
+from thermocald.photogrammetry.camera_model import Sensor
+from thermocald.photogrammetry.circle import fit_circles
+from thermocald.photogrammetry.detection import Candidates, find_circles, read_codes
 from thermocald.photogrammetry.frame_status import OK, FrameStatus, inspect_frame
-from thermocald.photogrammetry.markers import measure_markers
+from thermocald.photogrammetry.identification import Orientation, orient, refine
+from thermocald.photogrammetry.markers import (
+    detect_markers,
+    is_marker,
+    measure_markers,
+    parse_marker,
+    to_8_bit,
+)
+from thermocald.photogrammetry.outline import LocalMap, local_maps
+from thermocald.photogrammetry.planes import field_normals
 from thermocald.photogrammetry.testfield import Observations
 
 if TYPE_CHECKING:
@@ -19,24 +38,31 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from thermocald.photogrammetry.camera_model import (
-        ExteriorOrientation,
-        InteriorOrientation,
-        Sensor,
-    )
+    from thermocald.photogrammetry.camera_model import ExteriorOrientation, InteriorOrientation
+    from thermocald.photogrammetry.circle import CircleFit
     from thermocald.photogrammetry.testfield import TestField
 
-__all__ = ["Measurement", "Prior", "measure"]
+    Array = NDArray[np.float64]
+    Image = NDArray[np.uint8] | NDArray[np.uint16]
+
+__all__ = ["Measurement", "Prior", "measure", "predicted_maps"]
 
 _FEWEST = 4
+_SEARCHES = ((2, -1), (2, 1), (1, -1), (1, 1))  # scale, ink
+_ENOUGH_CODES = 0.5
+_LARGE_WIDTH = 1200
+_LARGEST_TILT_COSINE = 0.2  # 78°: beyond, a sheet is seen edge-on
+_MARKER_NEIGHBOURHOOD = 2.0  # sides of the marker that names a circle
+_GROSS_SD = 8.0
+_GROSS_PX = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class Prior:
     """What is known of the camera before a frame is measured; None for what is not.
 
-    With both orientations the targets are looked for where they should be; without, they are
-    found by their codes.
+    With both orientations the targets are looked for where they should be first; where they are
+    not, and without, they are found by their codes. principal_distance: mm, from a data sheet.
     """
 
     sensor: Sensor | None = None
@@ -47,19 +73,29 @@ class Prior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measurement:
-    """What a frame gave: observations (none where the status is not ok), and {row: reason} for the
-    targets of the field that were looked for and not measured.
+    """What a frame gave: observations (none where the status is not ok), {row: reason} for targets
+    of the field that are in view and not measured, and the approximate orientation (None where
+    the targets did not carry one).
     """
 
     observations: Observations
     status: FrameStatus = OK
     missed: dict[int, str] = field(default_factory=dict)
+    orientation: Orientation | None = None
 
 
-def measure(image: NDArray[Any], testfield: TestField, prior: Prior | None = None) -> Measurement:
+def measure(
+    image: NDArray[Any],
+    testfield: TestField,
+    prior: Prior | None = None,
+    eccentricity: bool = True,
+) -> Measurement:
     """Measure a test field in a frame (H, W), grey, 8 or 16 bit.
 
     Never raises for what a camera may deliver: the status says what is wrong with the frame.
+    eccentricity: False measures the centres of ellipses instead of the projected target centres.
+    Quality per target: `blur` px, `contrast`, `grey` (background), `noise` DN, `saturation` and
+    `misfit` (residuals over noise; markers have none: NaN).
     Raises TestFieldError where the field's codes are wrong.
     """
     prior = prior or Prior()
@@ -67,13 +103,297 @@ def measure(image: NDArray[Any], testfield: TestField, prior: Prior | None = Non
     status = inspect_frame(image, size)
     if not status.ok:
         return Measurement(_nothing(), status)
+    sensor = prior.sensor or Sensor(image.shape[1], image.shape[0], 1.0)
     missed: dict[int, str] = {}
-    observations = measure_markers(image, testfield, missed)
-    if len(observations) == 0:
+    corners = measure_markers(image, testfield, missed)
+    circles = np.array([kind == "circle" for kind in testfield.kinds], dtype=bool)
+    if not circles.any():
+        return _finish(testfield, corners, missed, None, foreign=False)
+
+    if prior.interior is not None and prior.exterior is not None:
+        from thermocald.photogrammetry.camera_model import CameraModel
+
+        known = Orientation(CameraModel(sensor, prior.interior), prior.exterior, np.zeros((0, 2)))
+        found = _measure_circles(image, testfield, known, corners, None, eccentricity)
+        if len(found[0]) >= max(_FEWEST, 0.5 * (len(found[0]) + len(found[1]))):
+            missed.update(found[1])
+            return _finish(testfield, _join(corners, found[0]), missed, found[2], False)
+
+    rows, points, maps, foreign = _find_coded(image, testfield, len(corners) < _FEWEST)
+    pair_rows = np.concatenate([corners.targets, rows])
+    pair_points = np.concatenate([corners.points, points])
+    if len(pair_rows) < _FEWEST:
+        return _few(image, testfield, corners, rows, maps, missed, foreign)
+    try:
+        orientation = orient(
+            sensor, testfield.points[pair_rows], pair_points, prior.principal_distance,
+            prior.interior,
+        )  # fmt: skip
+    except GeometryError as error:
+        return Measurement(
+            _nothing(),
+            FrameStatus(
+                "other_field",
+                f"{len(pair_rows)} codes of the test field are seen, but not where it has them "
+                f"({error})",
+            ),
+            missed,
+        )
+    measured, lost, orientation = _measure_circles(
+        image, testfield, orientation, corners, prior.interior, eccentricity
+    )
+    missed.update(lost)
+    return _finish(testfield, _join(corners, measured), missed, orientation, foreign)
+
+
+def predicted_maps(
+    testfield: TestField, orientation: Orientation, eccentricity: bool = True
+) -> tuple[NDArray[np.int64], LocalMap]:
+    """Rows and outlines of the field's circles that face the camera and lie in the image.
+
+    A circle whose plane is not known is taken as facing the camera, and has no eccentricity.
+    """
+    circles = np.array([kind == "circle" for kind in testfield.kinds], dtype=bool)
+    rows = np.nonzero(circles & np.isfinite(testfield.diameters))[0]
+    X = testfield.points[rows]
+    normals = field_normals(testfield)[rows]
+    view = orientation.exterior.centre - X
+    view = view / np.linalg.norm(view, axis=1, keepdims=True)
+    unknown = ~np.isfinite(normals[:, 0])
+    normals = np.where(unknown[:, None], view, normals)
+    cosine = np.abs(np.sum(view * normals, axis=1))
+    maps = local_maps(
+        orientation.camera.sensor, orientation.camera.interior.as_array(),
+        orientation.exterior.as_array(), X, normals, testfield.diameters[rows] / 2,
+    )  # fmt: skip
+    visible = (
+        np.isfinite(maps.second).all(axis=(1, 2))
+        & np.isfinite(maps.linear).all(axis=(1, 2))
+        & orientation.camera.sensor.contains(np.nan_to_num(maps.centre, nan=-1e9))
+        & (cosine > _LARGEST_TILT_COSINE)
+    )
+    maps = maps if eccentricity else maps.without_eccentricity()
+    return rows[visible], maps.select(visible)
+
+
+def _measure_circles(
+    image: Image,
+    testfield: TestField,
+    orientation: Orientation,
+    corners: Observations,
+    interior: InteriorOrientation | None,
+    eccentricity: bool,
+) -> tuple[Observations, dict[int, str], Orientation]:
+    """Fit every circle in view, improve the orientation with them, and fit once more if needed."""
+    rows, maps = predicted_maps(testfield, orientation, eccentricity)
+    coded = np.array([ring_code.is_ring(testfield.codes[r]) for r in rows], dtype=bool)
+    fit = fit_circles(image, maps, coded)
+    good = fit.good
+    if good.sum() + len(corners) < _FEWEST:
+        return _nothing(), dict(zip(rows.tolist(), fit.reasons, strict=True)), orientation
+    pairs = np.concatenate([corners.targets, rows[good]])
+    better = refine(
+        orientation.camera.sensor, orientation.camera.interior, orientation.exterior,
+        testfield.points[pairs], np.concatenate([corners.points, fit.points[good]]),
+        fixed=interior is not None,
+    )  # fmt: skip
+    new_rows, new_maps = predicted_maps(testfield, better, eccentricity)
+    same = len(new_rows) == len(rows) and bool(np.all(new_rows == rows))
+    # The outlines' asymmetry decides about the centres, the rest is estimated anyway.
+    if not same or np.abs(new_maps.second - maps.second).max(initial=0.0) > 0.002 or not good.all():
+        start = None
+        if same:
+            start = np.where(good[:, None], fit.parameters, 0.0)
+            fresh = ~good
+            new_maps = LocalMap(
+                np.where(fresh[:, None], new_maps.centre, fit.points), new_maps.linear,
+                new_maps.second,
+            )  # fmt: skip
+        rows, maps = new_rows, new_maps
+        coded = np.array([ring_code.is_ring(testfield.codes[r]) for r in rows], dtype=bool)
+        blur = float(np.median(fit.parameters[good, 5])) if good.any() else 0.9
+        if start is not None and good.all():
+            fit = fit_circles(image, maps, coded, blur, fit.noise, start, iterations=2)
+        else:
+            fit = fit_circles(image, maps, coded, blur, fit.noise)
+    return (*_observations(rows, fit, testfield, better), better)
+
+
+def _observations(
+    rows: NDArray[np.int64], fit: CircleFit, testfield: TestField, orientation: Orientation
+) -> tuple[Observations, dict[int, str]]:
+    """The good fits; a circle far from where its target must be is another circle."""
+    reasons = list(fit.reasons)
+    predicted = orientation.camera.project(orientation.exterior, testfield.points[rows])
+    off = np.abs(fit.points - predicted).max(axis=1, initial=0.0)
+    limit = max(_GROSS_PX, _GROSS_SD * min(orientation.scatter, 1.0))
+    for i in np.nonzero(off > limit)[0]:
+        reasons[i] = reasons[i] or "not where the target must be"
+    good = np.array([not reason for reason in reasons], dtype=bool)
+    c = fit.covariances[good]
+    p = fit.parameters[good]
+    observations = Observations(
+        rows[good].astype(np.int64),
+        p[:, :2],
+        np.sqrt(np.stack([c[:, 0, 0], c[:, 1, 1]], axis=-1)),
+        c[:, 0, 1],
+        {
+            "blur": p[:, 5],
+            "contrast": p[:, 7],
+            "grey": p[:, 6],
+            "noise": np.sqrt(fit.noise.variance(p[:, 6])).astype(float),
+            "saturation": fit.saturation[good],
+            "misfit": fit.misfit[good],
+        },
+    )
+    return observations, {int(r): why for r, why in zip(rows, reasons, strict=True) if why}
+
+
+def _find_coded(
+    image: Image, testfield: TestField, needed: bool
+) -> tuple[NDArray[np.int64], Array, LocalMap, bool]:
+    """Rows, centres (n, 2), and maps of ring-coded and marker-named circles; whether codes were
+    seen that are not of this field. `needed`: search on until enough are found.
+    """
+    row_of: dict[tuple[int, int], int] = {}
+    named: dict[str, dict[int, int]] = {}
+    for row, code in enumerate(testfield.codes):
+        if testfield.kinds[row] != "circle" or not code:
+            continue
+        if ring_code.is_ring(code):
+            row_of[ring_code.parse(code)] = row
+        elif is_marker(code):
+            dictionary, marker, corner = parse_marker(code)
+            if corner is None:
+                named.setdefault(dictionary, {})[marker] = row
+    if not row_of and not named:
+        return _no_codes()
+    grey = to_8_bit(image)
+    best: tuple[NDArray[np.int64], Array, LocalMap] | None = None
+    foreign = False
+    searches = _SEARCHES if image.shape[1] > _LARGE_WIDTH else _SEARCHES[2:]
+    for scale, ink in searches:
+        candidates = find_circles(grey, scale, ink)
+        codes = read_codes(grey, candidates)
+        keys = list(zip(codes.bits.tolist(), codes.numbers.tolist(), strict=True))
+        ours = [i for i, key in enumerate(keys) if key in row_of]
+        foreign = foreign or len(ours) < len(keys)
+        rows = [row_of[keys[i]] for i in ours]
+        which = [int(codes.rows[i]) for i in ours]
+        for row, place in _circles_by_marker(grey, candidates, named):
+            if place not in which:
+                rows.append(row)
+                which.append(place)
+        if best is None or len(rows) > len(best[0]):
+            maps = candidates.maps.select(np.array(which, dtype=np.int64))
+            best = np.array(rows, dtype=np.int64), maps.centre, maps
+        enough = max(_FEWEST + 2, _ENOUGH_CODES * (len(row_of) + sum(map(len, named.values()))))
+        if len(best[0]) >= enough or (not needed and len(best[0]) >= _FEWEST):
+            break
+    if best is None:
+        return _no_codes()
+    return (*best, foreign)
+
+
+def _no_codes() -> tuple[NDArray[np.int64], Array, LocalMap, bool]:
+    none = LocalMap(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 2, 3)))
+    return np.zeros(0, dtype=np.int64), np.zeros((0, 2)), none, False
+
+
+def _circles_by_marker(
+    grey: NDArray[np.uint8], candidates: Candidates, named: dict[str, dict[int, int]]
+) -> list[tuple[int, int]]:
+    """(row, candidate) of circles that a marker names: the one circle nearest to its centre."""
+    pairs: list[tuple[int, int]] = []
+    for dictionary, row_of in named.items():
+        found = detect_markers(grey, dictionary, frozenset(row_of))
+        for number, quad in zip(found.numbers.tolist(), found.corners, strict=True):
+            side = np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1).mean()
+            distance = np.linalg.norm(candidates.maps.centre - quad.mean(axis=0), axis=1)
+            outside = np.array(
+                [cv2.pointPolygonTest(quad.astype(np.float32), tuple(c), True) < 0
+                 for c in candidates.maps.centre], dtype=bool,
+            )  # fmt: skip
+            near = np.nonzero(outside & (distance < _MARKER_NEIGHBOURHOOD * side))[0]
+            if len(near):
+                pairs.append((row_of[number], int(near[np.argmin(distance[near])])))
+    return pairs
+
+
+def _few(
+    image: Image,
+    testfield: TestField,
+    corners: Observations,
+    rows: NDArray[np.int64],
+    maps: LocalMap,
+    missed: dict[int, str],
+    foreign: bool,
+) -> Measurement:
+    """Too few codes for an orientation: those that there are, as ellipses."""
+    coded = np.array([ring_code.is_ring(testfield.codes[r]) for r in rows], dtype=bool)
+    fit = fit_circles(image, maps, coded)
+    good = fit.good
+    missed.update({int(r): why for r, why in zip(rows, fit.reasons, strict=True) if why})
+    c = fit.covariances[good]
+    p = fit.parameters[good]
+    circles = Observations(
+        rows[good], p[:, :2], np.sqrt(np.stack([c[:, 0, 0], c[:, 1, 1]], axis=-1)), c[:, 0, 1],
+        {
+            "blur": p[:, 5], "contrast": p[:, 7], "grey": p[:, 6],
+            "noise": np.sqrt(fit.noise.variance(p[:, 6])).astype(float),
+            "saturation": fit.saturation[good], "misfit": fit.misfit[good],
+        },
+    )  # fmt: skip
+    return _finish(testfield, _join(corners, circles), missed, None, foreign)
+
+
+def _finish(
+    testfield: TestField,
+    observations: Observations,
+    missed: dict[int, str],
+    orientation: Orientation | None,
+    foreign: bool,
+) -> Measurement:
+    n = len(observations)
+    status = OK
+    coded = any(testfield.codes)
+    if n < _FEWEST and foreign:
+        status = FrameStatus(
+            "other_field", "the ring codes in the frame are not those of this test field"
+        )
+    elif n == 0 and not coded:
+        status = FrameStatus(
+            "nothing_found",
+            "the test field has no coded target and the camera's orientation is not known: plain "
+            "circles alone cannot be told apart",
+        )
+    elif n == 0:
         status = FrameStatus("nothing_found", "no target of the test field is found in the frame")
-    elif len(observations) < _FEWEST:
-        status = FrameStatus("too_few", f"only {len(observations)} targets are found in the frame")
-    return Measurement(observations, status, missed)
+    elif n < _FEWEST:
+        status = FrameStatus("too_few", f"only {n} targets are found in the frame")
+    return Measurement(observations, status, missed, orientation)
+
+
+def _join(first: Observations, second: Observations) -> Observations:
+    """Both, in the order of the test field."""
+    if len(second) == 0:
+        return first
+    targets = np.concatenate([first.targets, second.targets])
+    order = np.argsort(targets, kind="stable")
+    names = [*second.quality, *(k for k in first.quality if k not in second.quality)]
+
+    def column(part: Observations, name: str) -> Array:
+        return part.quality.get(name, np.full(len(part), np.nan))
+
+    assert first.covariances is not None
+    assert second.covariances is not None
+    return Observations(
+        targets[order],
+        np.concatenate([first.points, second.points])[order],
+        np.concatenate([first.sigmas, second.sigmas])[order],
+        np.concatenate([first.covariances, second.covariances])[order],
+        {k: np.concatenate([column(first, k), column(second, k)])[order] for k in names},
+    )
 
 
 def _nothing() -> Observations:

@@ -49,7 +49,8 @@ Kind = Literal["camera", "thermometer", "output"]
 class Frame:
     """One image as a camera gave it.
 
-    image: (H, W) uint8 or uint16 grey values, not writeable; None where `encoded` holds a JPEG.
+    image: (H, W) uint8 or uint16 grey values, not writeable; None where `encoded` holds a JPEG, or
+    where it was measured before and `metadata["observations"]` says what it showed.
     monotonic, utc: s, the middle of the exposure as well as the device tells it, on the clock's
     two scales; exposure: s or None; sequence: the device's own frame number or None.
     metadata: what else the device said, JSON-able.
@@ -64,8 +65,10 @@ class Frame:
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.image is None and self.encoded is None:
-            raise ValueError("a frame needs an image or encoded bytes")
+        if self.image is None and self.encoded is None and "observations" not in self.metadata:
+            raise ValueError(
+                "a frame needs an image, encoded bytes, or observations in its metadata"
+            )
         if self.image is not None:
             self.image.setflags(write=False)
 

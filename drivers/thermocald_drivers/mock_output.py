@@ -1,0 +1,57 @@
+"""An output that keeps what it got.
+
+outputs:
+  - {name: kept, driver: mock, keep: 1000, faults: []}   # see thermocald_drivers/faults.py
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING, Any
+
+from thermocald.errors import DeviceGone
+from thermocald.hal import Output
+from thermocald_drivers import support
+from thermocald_drivers.faults import Faults
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from thermocald.hal import Clock
+
+__all__ = ["MockOutput"]
+
+
+class MockOutput(Output):
+    """Keeps the last results in `results`, oldest first."""
+
+    def __init__(
+        self,
+        *,
+        clock: Clock,
+        keep: int = 1000,
+        faults: Sequence[Mapping[str, object]] = (),
+        timeout_s: float = 1.0,
+    ) -> None:
+        self.clock = clock
+        self.timeout_s = timeout_s
+        self.faults = Faults("mock output", clock, faults, timeout_s)
+        size = int(support.number("keep", keep, 1, 1_000_000, whole=True))
+        self.results: deque[dict[str, Any]] = deque(maxlen=size)
+        self._open = False
+
+    def open(self) -> None:
+        self.faults.on_open()
+        self._open = True
+
+    def close(self) -> None:
+        self._open = False
+
+    def identity(self) -> Mapping[str, str]:
+        return {"name": "mock output"}
+
+    def emit(self, result: Mapping[str, Any]) -> None:
+        if not self._open:
+            raise DeviceGone("mock output: it is not open")
+        self.faults.refuse(self.faults.on_call(), "acknowledgement")
+        self.results.append(dict(result))

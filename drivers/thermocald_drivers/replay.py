@@ -1,0 +1,146 @@
+"""A recording played as a camera and as a thermometer.
+
+    cameras:
+      - {name: replayed, driver: replay, recording: ../recordings/M1}
+    thermometers:
+      - {name: replayed, driver: replay, recording: ../recordings/M1}
+
+`loop: true` starts over at the end, with instants that go on. Otherwise the end is a
+RecordingEndedError, which no retry mends; what could not be taken then is a BadReading now.
+
+Frames keep the instants at which they were taken: `utc` is the recorded one, `monotonic` the same
+on the clock's monotonic scale. A JPEG comes as it was recorded, in `encoded`. A recording of
+measurements gives frames without a picture, whose `metadata["observations"]` hold what
+`thermocald.photogrammetry.exchange` reads. `metadata["epoch"]` is the epoch's number.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from thermocald.errors import BadReading, DeviceGone, DeviceNotFound, PermanentDeviceError
+from thermocald.hal import Camera, Device, Frame, Reading, Thermometer
+from thermocald_drivers import support
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from thermocald.epoch import Epoch
+    from thermocald.hal import Clock
+    from thermocald.store.recording import Recording
+
+__all__ = ["RecordingEndedError", "ReplayCamera", "ReplayThermometer"]
+
+
+class RecordingEndedError(PermanentDeviceError):
+    """All epochs of the recording have been played."""
+
+
+class _Replay(Device):
+    """The epochs of a recording, one after the other; opening it again goes on, not back."""
+
+    def __init__(self, *, clock: Clock, recording: str | Path, loop: bool = False) -> None:
+        self.clock = clock
+        self._path = (
+            Path(recording)
+            if isinstance(recording, Path)
+            else Path(support.text("recording", recording))
+        )
+        self._loop = loop
+        self._recording: Recording | None = None
+        self._epochs: Iterator[Epoch] | None = None
+        self._shift_s = 0.0
+        self._open = False
+
+    def open(self) -> None:
+        if not self._path.is_dir():
+            raise DeviceNotFound(f"{self._path}: there is no such recording")
+        if self._recording is None:
+            from thermocald.store.recording import open_recording
+
+            self._recording = open_recording(self._path)
+            self._epochs = self._recording.iter_epochs()
+        self._open = True
+
+    def close(self) -> None:
+        self._open = False
+
+    def identity(self) -> Mapping[str, str]:
+        if self._recording is None:
+            return {"name": "replay"}
+        head = self._recording.head
+        return {"name": head.camera.name, "recording": head.name, "series": head.series}
+
+    def _next(self) -> Epoch:
+        if not self._open or self._epochs is None or self._recording is None:
+            raise DeviceGone(f"{self._path}: it is not open")
+        epoch = next(self._epochs, None)
+        if epoch is None and self._loop:
+            times = self._recording.columns.frame_time
+            self._shift_s += float(times[-1] - times[0]) + self._recording.interval
+            self._epochs = self._recording.iter_epochs()
+            epoch = next(self._epochs)
+        if epoch is None:
+            raise RecordingEndedError(f"{self._path}: the recording has ended")
+        return epoch
+
+    def _instants(self, recorded: float) -> tuple[float, float]:
+        """(monotonic, utc) of a recorded UTC instant."""
+        utc = recorded + self._shift_s
+        return utc - self.clock.utc() + self.clock.monotonic(), utc
+
+
+class ReplayCamera(_Replay, Camera):
+    """Gives the frames, or the measurements, of a recording."""
+
+    def capture(self) -> Frame:
+        epoch = self._next()
+        monotonic, utc = self._instants(epoch.frame_time)
+        metadata: dict[str, Any] = {"epoch": epoch.number}
+        if epoch.observations is not None and self._recording is not None:
+            from thermocald.photogrammetry.exchange import observations_to_lists
+
+            field = self._recording.testfield
+            metadata["observations"] = observations_to_lists(epoch.observations, field)
+        if epoch.frame is None:
+            if epoch.observations is None:
+                raise BadReading(f"{self._path}: epoch {epoch.number} has no frame")
+            return Frame(None, monotonic, utc, sequence=epoch.number, metadata=metadata)
+        try:
+            data = epoch.frame.read_bytes()
+        except OSError as error:
+            raise BadReading(f"{epoch.frame}: cannot be read: {error.strerror}") from error
+        if data.startswith(b"\xff\xd8"):
+            return Frame(
+                None, monotonic, utc, sequence=epoch.number, encoded=data, metadata=metadata
+            )
+        return Frame(
+            _decoded(data, epoch.frame), monotonic, utc, sequence=epoch.number, metadata=metadata
+        )
+
+
+class ReplayThermometer(_Replay, Thermometer):
+    """Gives the readings of a recording, of all its channels."""
+
+    def read(self) -> Reading:
+        epoch = self._next()
+        values = {name: t for name, t in epoch.temperatures.items() if t == t}  # not NaN
+        if not values:
+            raise BadReading(f"{self._path}: epoch {epoch.number} has no temperature")
+        monotonic, utc = self._instants(epoch.temperature_time)
+        return Reading(values, monotonic, utc, {"epoch": epoch.number})
+
+
+def _decoded(data: bytes, path: Path) -> Any:
+    """A picture's grey values (H, W); BadReading if it is none."""
+    import cv2
+    import numpy as np
+
+    image = None
+    if data:
+        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    if image is None:
+        raise BadReading(f"{path}: is no image")
+    return image

@@ -34,7 +34,7 @@ POLLS = 20
 
 @dataclass(frozen=True)
 class Compensation:
-    """The factory's calibration: dig_T (3), dig_P (9), dig_H (6), as the data sheet numbers them."""
+    """The factory's calibration: dig_T (3), dig_P (9) and dig_H (6) of the data sheet."""
 
     t: tuple[int, ...]
     p: tuple[int, ...]

@@ -54,7 +54,9 @@ class _KernelThermometer(Thermometer):
         self.minimum_c = support.number("minimum_c", minimum_c, -273.15, 1000, "°C")
         self.maximum_c = support.number("maximum_c", maximum_c, -273.15, 1000, "°C")
         if self.minimum_c >= self.maximum_c:
-            raise ConfigurationError(f"minimum_c {minimum_c:g} is not below maximum_c {maximum_c:g}")
+            raise ConfigurationError(
+                f"minimum_c {minimum_c:g} is not below maximum_c {maximum_c:g}"
+            )
         self.sysfs = Path(support.text("sysfs", sysfs))
         self._seen = False
         self._device: Path | None = None

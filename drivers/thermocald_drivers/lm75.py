@@ -90,6 +90,8 @@ class Lm75Thermometer(I2cThermometer):
         if self.name == "tmp102" and raw & 1:  # the chip marks extended words itself
             return signed(raw >> 3, 13) / 16.0, {"extended": True}
         if raw & ((1 << (16 - self.variant.bits)) - 1):
-            raise BadReading(f"{self.where}: 0x{raw:04x} has bits set that a {self.name} leaves zero")
+            raise BadReading(
+                f"{self.where}: 0x{raw:04x} has bits set that a {self.name} leaves zero"
+            )
         step = 1 << (self.variant.bits - 8)
         return signed(raw >> (16 - self.variant.bits), self.variant.bits) / step, {}

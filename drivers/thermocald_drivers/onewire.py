@@ -3,8 +3,8 @@
     thermometers:
       - name: field
         driver: ds18b20
-        sensors: {camera: 28-000000bfe244, air: 28-00000a1b2c3d}   # {channel: ROM id}; all in parallel
-        timeout_s: 3                                               # a conversion takes 0.75 s
+        sensors: {camera: 28-000000bfe244, air: 28-00000a1b2c3d}   # {channel: ROM id}
+        timeout_s: 3                                               # one conversion: 0.75 s
 
 What this driver does not believe: a CRC that fails (computed here too, over the printed bytes), all
 zeros (a shorted or unplugged line: the CRC of zeros is zero), a `t=` that does not fit its bytes,
@@ -93,7 +93,9 @@ class Ds18b20Thermometer(Thermometer):
     ) -> None:
         self.clock = clock
         if not isinstance(sensors, dict) or not sensors:
-            raise ConfigurationError("sensors: write {channel: ROM id}, such as {temperature: 28-0123}")
+            raise ConfigurationError(
+                "sensors: write {channel: ROM id}, such as {temperature: 28-0123}"
+            )
         self.sensors = {str(k): support.text(f"sensors.{k}", v) for k, v in sensors.items()}
         self.timeout_s = support.number("timeout_s", timeout_s, 0.01, 60, "s")
         self.attempts = int(support.number("attempts", attempts, 1, 10, whole=True))

@@ -1,18 +1,19 @@
-"""Thermometers on a serial line that speak in lines of text.
+r"""Thermometers on a serial line that speak in lines of text.
 
     thermometers:
       - {name: air, driver: serial, port: /dev/ttyUSB0, instrument: vaisala-hmp}
       - name: probe
         driver: serial
-        port: /dev/serial/by-id/usb-FTDI_FT232R_A50285BI-if00-port0    # a name that survives re-plugs
+        port: /dev/serial/by-id/usb-FTDI_FT232R_A50285BI-if00-port0   # lasts over re-plugs
         baud: 9600
-        command: "T?\\r\\n"                      # sent for each reading; empty: the instrument speaks by itself
+        command: "T?\\r\\n"                      # sent for each reading; empty: it speaks by itself
         pattern: 'T=(?P<temperature>[-+]?\\d+\\.\\d+)F\\*(?P<checksum>[0-9A-F]{2})'
-        unit: F                                # C (default), F, K; then scale and offset
-        checksum: xor                          # of the text before the group `checksum`: xor, sum8, nmea
+        unit: F                                # C (default), F, K
+        checksum: xor                                    # of the text before it: xor, sum8, nmea
 
-Each named group of `pattern` is a channel. The pattern must match the **whole** line: the rest of a
-line whose head was lost (`3.5C` of `+023.5C`) is no reading. Instruments by name: see INSTRUMENTS.
+Each named group of `pattern` is a channel, scaled and offset, then brought to °C by `unit`. The
+pattern must match the **whole** line: the rest of a line whose head was lost (`3.5C` of `+023.5C`)
+is no reading. Instruments by name: see INSTRUMENTS.
 
 A line that was in the queue before the reading was asked for is never used: with `command` the
 queue is emptied first, without it the next line that *ends* after the call counts. Echo and
@@ -24,6 +25,7 @@ from __future__ import annotations
 import functools
 import operator
 import re
+import termios
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -41,6 +43,7 @@ __all__ = ["INSTRUMENTS", "Instrument", "SerialThermometer"]
 
 NUMBER = r"[-+]?\d+(?:\.\d+)?"
 LONGEST_LINE = 512
+POLL_S = 0.05  # changing pyserial's time-out later would set up the whole port anew
 QUEUE = 4000
 """Bytes that may have waited before the kernel's buffer (4096) could have lost some."""
 
@@ -62,7 +65,7 @@ class Instrument:
 
 INSTRUMENTS = {
     # Papouch TM, TMU: speaks by itself every 10 s, ends with CR alone.
-    "papouch-tm": Instrument(rf"(?P<temperature>[-+]\d{{3}}\.\d)C", timeout_s=22.0),
+    "papouch-tm": Instrument(r"(?P<temperature>[-+]\d{3}\.\d)C", timeout_s=22.0),
     # Vaisala HMP230/240/260 series, user's guides, appendix "Serial commands".
     "vaisala-hmp": Instrument(
         rf"(?:RH= *{NUMBER} *%RH +)?T= *(?P<temperature>{NUMBER}) *'C(?: .*)?",
@@ -184,7 +187,7 @@ class SerialThermometer(Thermometer):
 
     def open(self) -> None:
         serial = support.library("serial")
-        data_bits, parity, stop_bits = self.framing
+        data_bits, parity, stop_bits = tuple(self.framing)
         try:
             self._serial = serial.Serial(
                 self.port,
@@ -192,7 +195,7 @@ class SerialThermometer(Thermometer):
                 bytesize=int(data_bits),
                 parity=parity,
                 stopbits=int(stop_bits),
-                timeout=0,
+                timeout=POLL_S,
                 write_timeout=self.timeout_s,
                 exclusive=True,
             )
@@ -226,7 +229,7 @@ class SerialThermometer(Thermometer):
             else:
                 self._skip_queue()
             values, ended, line = self._next_values()
-        except (OSError, TypeError) as error:  # TypeError: pyserial after a port vanished under it
+        except (OSError, termios.error) as error:  # a termios.error is no OSError
             if isinstance(error, BadReading | DeviceTimeout):
                 raise
             raise self._lost(error) from error
@@ -236,14 +239,14 @@ class SerialThermometer(Thermometer):
         return Reading(values=values, monotonic=monotonic, utc=utc, metadata={"line": line})
 
     def _lost(self, error: Exception) -> Exception:
-        """pyserial reports an unplug without an errno, or with EIO."""
+        """Pyserial reports an unplug without an errno, or with EIO."""
         if isinstance(error, OSError) and type(error).__name__ == "SerialTimeoutException":
             return DeviceTimeout(f"{self.where}: cannot send, the line is held")
         return DeviceGone(f"{self.where}: unplugged ({error})")
 
     def _skip_queue(self) -> None:
         """Drop what came before now, but keep the head of the line that is under way."""
-        waiting = self._serial.read(self._serial.in_waiting or 0)
+        waiting = self._serial.read(self._serial.in_waiting)
         if len(waiting) >= QUEUE:
             self._line, self._synchronous = b"", False  # bytes may be missing in the middle
             return
@@ -275,10 +278,8 @@ class SerialThermometer(Thermometer):
             if len(self._line) > LONGEST_LINE:
                 skipped.append(self._line[:40].decode("ascii", "backslashreplace"))
                 self._line, self._synchronous = b"", False
-            left = deadline - time.monotonic()
-            if left <= 0:
+            if time.monotonic() >= deadline:
                 raise self._nothing(skipped, problem)
-            self._serial.timeout = min(left, 0.5)
             self._line += _one_end(self._serial.read(max(1, self._serial.in_waiting)))
 
     def _nothing(self, skipped: list[str], problem: str) -> BadReading | DeviceTimeout:
@@ -290,7 +291,7 @@ class SerialThermometer(Thermometer):
         if skipped or rest:
             quoted = "; ".join(repr(text[:60]) for text in [*skipped, rest][:3] if text)
             return BadReading(
-                f"{self.where}: no line that fits the pattern in {self.timeout_s:g} s, but {quoted}; "
+                f"{self.where}: no line fits the pattern in {self.timeout_s:g} s, but {quoted}; "
                 f"is {self.baud} Bd {self.framing} right?"
             )
         return DeviceTimeout(f"{self.where}: silent for {self.timeout_s:g} s")

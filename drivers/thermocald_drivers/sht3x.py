@@ -26,7 +26,7 @@ CONVERSION_S = 0.0155
 
 
 def crc8(data: bytes) -> int:
-    """Polynomial 0x31, start 0xFF; crc8(BE EF) is 0x92 (data sheet, table 20)."""
+    """The chip's CRC: polynomial 0x31, start 0xFF; of BE EF it is 0x92 (data sheet, table 20)."""
     crc = 0xFF
     for byte in data:
         crc ^= byte

@@ -57,7 +57,9 @@ def number(
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise ConfigurationError(f"{name}: {value!r} is not a number{suffix and ' in' + suffix}")
     if not low <= value <= high:
-        raise ConfigurationError(f"{name}: {value:g}{suffix} is not within {low:g} … {high:g}{suffix}")
+        raise ConfigurationError(
+            f"{name}: {value:g}{suffix} is not within {low:g} … {high:g}{suffix}"
+        )
     if whole and value != int(value):
         raise ConfigurationError(f"{name}: {value:g} is not a whole number")
     return value

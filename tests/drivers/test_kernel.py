@@ -41,7 +41,7 @@ def test_channels_are_chosen_by_input_or_label(sysfs):
 
 def test_a_channel_that_is_not_there(sysfs):
     sysfs.hwmon(0, "it87", temp2_input="51000")
-    with pytest.raises(WrongDevice, match="temp1.*there is temp2"):
+    with pytest.raises(WrongDevice, match=r"temp1.*there is temp2"):
         thermometer("hwmon", sysfs, chip="it87", channels={"lens": "temp1"}).open()
 
 
@@ -56,7 +56,10 @@ def test_an_open_diode_is_not_a_temperature(sysfs):
 
 def test_the_fault_flag_counts(sysfs):
     sysfs.hwmon(0, "lm90", temp1_input="21000", temp1_fault="1")
-    with thermometer("hwmon", sysfs, chip="lm90") as device, pytest.raises(BadReading, match="fault"):
+    with (
+        thermometer("hwmon", sysfs, chip="lm90") as device,
+        pytest.raises(BadReading, match="fault"),
+    ):
         device.read()
 
 

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 
 def os_error(number: int) -> OSError:
@@ -57,7 +60,8 @@ class Bus:
         if chip.on_read:
             chip.on_read(chip, register)
         data = b"".join(
-            chip.registers.get(register + k, b"") for k in range(count)
+            chip.registers.get(register + k, b"")
+            for k in range(count)
             if k == 0 or len(chip.registers.get(register, b"")) == 1
         )
         return (data + b"\xff" * count)[:count]

@@ -1,0 +1,160 @@
+"""A status LED and a relay on the Raspberry Pi's pins, through gpiozero.
+
+    outputs:
+      - {name: status, driver: led, pin: 17}       # BCM number; steady: ok, blinking: no result
+      - name: lamp
+        driver: relay
+        pin: 27
+        active_high: false                         # most relay boards switch at low
+        limit_c: 60
+        watchdog_s: 30                             # no epoch for so long: off
+        programme: [{seconds: 600, hold_c: null}, {seconds: 1500, hold_c: 45}]
+
+The relay fails safe: it is off before the first result, after the last, at the limit (for good),
+without a temperature, when no result comes for `watchdog_s`, when the program closes it, and, since
+the kernel releases the pins of a process that dies, after a crash (choose the relay's wiring so
+that a released pin is off). See `heating` for the programme.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from typing import TYPE_CHECKING, Any
+
+from thermocald.errors import BadReading, DeviceDenied, DeviceGone, DeviceNotFound
+from thermocald.hal import Output
+from thermocald_drivers import support
+from thermocald_drivers.heating import HeatingProgramme
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from thermocald.hal import Clock
+
+__all__ = ["LedOutput", "RelayOutput"]
+
+log = logging.getLogger(__name__)
+
+
+def _pin(kind: str, pin: int, active_high: bool) -> Any:
+    """A gpiozero device; its own errors become ours."""
+    gpiozero = support.library("gpiozero", "gpio")
+    try:
+        return getattr(gpiozero, kind)(pin, active_high=active_high, initial_value=False)
+    except gpiozero.BadPinFactory as error:
+        raise DeviceNotFound(f"GPIO {pin}: this machine has no usable pins ({error})") from error
+    except gpiozero.GPIOPinInUse as error:
+        raise DeviceDenied(f"GPIO {pin}: in use ({error})") from error
+    except (gpiozero.PinInvalidPin, gpiozero.PinError) as error:
+        raise DeviceNotFound(f"GPIO {pin}: {error}") from error
+    except OSError as error:
+        hint = "is the user in the group gpio?"
+        raise support.fault(error, f"GPIO {pin}", seen=False, hint=hint) from error
+
+
+class LedOutput(Output):
+    """Steady while epochs have results, blinking while they have none, dark while closed."""
+
+    def __init__(
+        self, *, clock: Clock, pin: int, active_high: bool = True, blink_s: float = 0.25
+    ) -> None:
+        self.clock = clock
+        self.pin = int(support.number("pin", pin, 0, 53, whole=True))
+        self.active_high = bool(active_high)
+        self.blink_s = support.number("blink_s", blink_s, 0.05, 10, "s")
+        self._led: Any = None
+
+    def open(self) -> None:
+        self._led = _pin("LED", self.pin, self.active_high)
+        self._good: bool | None = None
+
+    def close(self) -> None:
+        led, self._led = self._led, None
+        if led is not None:
+            led.off()
+            led.close()
+
+    def emit(self, result: Mapping[str, Any]) -> None:
+        if self._led is None:
+            raise DeviceGone(f"LED at GPIO {self.pin}: not open")
+        good = result.get("status") == "ok"
+        if good == self._good:
+            return  # restarting the blinking at each epoch would hide it
+        self._good = good
+        if good:
+            self._led.on()
+        else:
+            self._led.blink(on_time=self.blink_s, off_time=self.blink_s, background=True)
+
+
+class RelayOutput(Output):
+    """A heating lamp under a programme; see the module's docstring for when it is off."""
+
+    def __init__(
+        self,
+        *,
+        clock: Clock,
+        pin: int,
+        limit_c: float,
+        programme: Sequence[Mapping[str, Any]],
+        active_high: bool = True,
+        watchdog_s: float = 30.0,
+        **options: Any,
+    ) -> None:
+        self.clock = clock
+        self.pin = int(support.number("pin", pin, 0, 53, whole=True))
+        self.active_high = bool(active_high)
+        self.watchdog_s = support.number("watchdog_s", watchdog_s, 0.05, 3600, "s")
+        self.programme = HeatingProgramme(limit_c=limit_c, programme=programme, **options)
+        self._relay: Any = None
+        self._lock = threading.Lock()
+        self._watchdog: threading.Timer | None = None
+
+    def open(self) -> None:
+        self._relay = _pin("DigitalOutputDevice", self.pin, self.active_high)
+        self.programme.reset()
+        self._begin = self.clock.monotonic()
+
+    def close(self) -> None:
+        self._stop_watchdog()
+        with self._lock:
+            relay, self._relay = self._relay, None
+            if relay is not None:
+                relay.off()
+                relay.close()
+
+    def emit(self, result: Mapping[str, Any]) -> None:
+        self._stop_watchdog()
+        was_tripped = self.programme.tripped
+        with self._lock:
+            if self._relay is None:
+                raise DeviceGone(f"relay at GPIO {self.pin}: not open")
+            value = result.get(self.programme.channel)
+            temperature = float(value) if isinstance(value, int | float) else None
+            heat = self.programme.decide(self.clock.monotonic() - self._begin, temperature)
+            self._relay.value = heat
+        if self.programme.tripped:
+            if not was_tripped:
+                raise BadReading(
+                    f"relay at GPIO {self.pin}: off for good, {self.programme.tripped}"
+                )
+            return
+        if heat:
+            self._watchdog = threading.Timer(self.watchdog_s, self._starve)
+            self._watchdog.daemon = True
+            self._watchdog.start()
+
+    def _stop_watchdog(self) -> None:
+        watchdog, self._watchdog = self._watchdog, None
+        if watchdog is not None:
+            watchdog.cancel()
+            watchdog.join()
+
+    def _starve(self) -> None:
+        """No result for `watchdog_s`: off until the next one."""
+        with self._lock:
+            if self._relay is not None:
+                self._relay.off()
+                self.programme.heating = False
+        log.warning("relay at GPIO %d: no result for %g s, off", self.pin, self.watchdog_s)

@@ -1,0 +1,126 @@
+"""Camera buffers to grey images: GREY, Y10 to Y16, YUYV, UYVY, NV12, YU12, MJPEG, Bayer.
+
+Grey means luminance: of a colour format its Y plane, of a Bayer mosaic OpenCV's demosaiced grey in
+full size and full depth. A buffer that is too short, or a JPEG without an end, is a BadReading.
+Source: Linux userspace API, "Image formats" (V4L2 fourcc codes).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from thermocald.errors import BadReading
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    Grey = NDArray[np.uint8] | NDArray[np.uint16]
+
+__all__ = ["BAYER_ORDERS", "FORMATS", "decode", "jpeg_end"]
+
+BAYER_ORDERS = {
+    # V4L2's names tell the first row: RG10 begins R G
+    "RGGB": "RGGB", "RG10": "RGGB", "RG12": "RGGB", "RG16": "RGGB", "pRAA": "RGGB",
+    "BA81": "BGGR", "BG10": "BGGR", "BG12": "BGGR", "BYR2": "BGGR", "pBAA": "BGGR",
+    "GBRG": "GBRG", "GB10": "GBRG", "GB12": "GBRG", "GB16": "GBRG", "pGAA": "GBRG",
+    "GRBG": "GRBG", "BA10": "GRBG", "BA12": "GRBG", "GR16": "GRBG", "pgAA": "GRBG",
+}  # fmt: skip
+_BAYER_8 = {"RGGB", "BA81", "GBRG", "GRBG"}
+_BAYER_PACKED = {"pRAA", "pBAA", "pGAA", "pgAA"}
+
+
+def _plane(data: memoryview, height: int, row_bytes: int, stride: int) -> NDArray[np.uint8]:
+    """(height, row_bytes) bytes out of rows of `stride` bytes; the last may lack its padding."""
+    stride = max(stride, row_bytes)
+    needed = stride * (height - 1) + row_bytes
+    if len(data) < needed:
+        raise BadReading(f"partial frame: {len(data)} of {needed} bytes")
+    flat = np.frombuffer(data, np.uint8)
+    rows = np.lib.stride_tricks.as_strided(flat, (height, row_bytes), (stride, 1))
+    return rows.copy()  # the camera writes into its buffer again as soon as it is given back
+
+
+def _grey8(data: memoryview, width: int, height: int, stride: int) -> Grey:
+    return _plane(data, height, width, stride)
+
+
+def _grey16(data: memoryview, width: int, height: int, stride: int) -> Grey:
+    return _plane(data, height, 2 * width, stride).view("<u2")
+
+
+def _yuyv(data: memoryview, width: int, height: int, stride: int) -> Grey:
+    return np.ascontiguousarray(_plane(data, height, 2 * width, stride)[:, 0::2])
+
+
+def _uyvy(data: memoryview, width: int, height: int, stride: int) -> Grey:
+    return np.ascontiguousarray(_plane(data, height, 2 * width, stride)[:, 1::2])
+
+
+def unpack_10(packed: NDArray[np.uint8]) -> NDArray[np.uint16]:
+    """MIPI RAW10: four high bytes, then one byte with the four pairs of low bits."""
+    high = packed.reshape(packed.shape[0], -1, 5)
+    low = high[..., 4:5] >> np.array([0, 2, 4, 6], np.uint8) & 3
+    pixels = (high[..., :4].astype(np.uint16) << np.uint16(2)) | low
+    return pixels.reshape(packed.shape[0], -1).astype(np.uint16)
+
+
+def _bayer(order: str, mosaic: Grey) -> Grey:
+    import cv2
+
+    grey = cv2.cvtColor(mosaic, getattr(cv2, f"COLOR_Bayer{order}2GRAY"))
+    return cast("Grey", grey)
+
+
+def _bayer_reader(fourcc: str) -> Callable[[memoryview, int, int, int], Grey]:
+    order = BAYER_ORDERS[fourcc]
+
+    def read(data: memoryview, width: int, height: int, stride: int) -> Grey:
+        if fourcc in _BAYER_8:
+            return _bayer(order, _grey8(data, width, height, stride))
+        if fourcc in _BAYER_PACKED:
+            return _bayer(order, unpack_10(_plane(data, height, width * 5 // 4, stride)))
+        return _bayer(order, _grey16(data, width, height, stride))
+
+    return read
+
+
+FORMATS: dict[str, Callable[[memoryview, int, int, int], Grey]] = {
+    "GREY": _grey8,
+    "Y10 ": _grey16,
+    "Y12 ": _grey16,
+    "Y16 ": _grey16,
+    "YUYV": _yuyv,
+    "UYVY": _uyvy,
+    "NV12": _grey8,
+    "YU12": _grey8,
+    **{fourcc: _bayer_reader(fourcc) for fourcc in BAYER_ORDERS},
+}
+
+
+def jpeg_end(data: bytes) -> bool:
+    """Whether the bytes begin and end as a JPEG does; cameras pad the end with zeros."""
+    return data[:2] == b"\xff\xd8" and data.rstrip(b"\0")[-2:] == b"\xff\xd9"
+
+
+def decode(
+    data: memoryview, fourcc: str, width: int, height: int, stride: int = 0
+) -> tuple[Grey, bytes | None]:
+    """(grey image, the JPEG as it came or None) of one buffer; copies, so the buffer is free."""
+    if fourcc not in ("MJPG", "JPEG"):
+        return FORMATS[fourcc](data, width, height, stride), None
+    import simplejpeg
+
+    encoded = bytes(data)
+    if not jpeg_end(encoded):
+        raise BadReading(f"partial frame: {len(encoded)} bytes without the end of a JPEG")
+    try:
+        grey = simplejpeg.decode_jpeg(encoded, colorspace="GRAY")[:, :, 0]
+    except ValueError as error:
+        raise BadReading(f"broken JPEG: {error}") from error
+    if grey.shape != (height, width):
+        raise BadReading(f"the JPEG has {grey.shape[1]}×{grey.shape[0]} px, not {width}×{height}")
+    return np.ascontiguousarray(grey), encoded

@@ -1,0 +1,329 @@
+"""Cameras of Video4Linux: UVC (USB) cameras, and the Raspberry Pi camera in legacy mode.
+
+    cameras:
+      - name: logitech
+        driver: v4l2
+        device: /dev/v4l/by-id/usb-046d_HD_Pro_Webcam_C920_8A3F-video-index0 # serial: 8A3F
+        width: 1920
+        height: 1080
+        pixel_format: MJPG            # GREY, Y16, YUYV, UYVY, NV12, YU12, MJPG, Bayer (RG10, pRAA, …)
+        exposure_s: 0.0156            # manual, read back at each frame
+        gain: 0
+        focus: 0                      # manual focus position of the camera
+        white_balance_k: 4600
+        controls: {power_line_frequency: 1, sharpness: 0}     # any other, named as v4l2-ctl does
+        timeout_s: 5
+
+Every control is set, read back, and read again with each frame: a camera that does not obey, or
+that falls back to automatic, is an error and not a frame (`strict: false` stores it in the frame's
+metadata instead). The frame's time is that of its buffer, brought to the middle of the exposure;
+frames that were exposed before `capture` was called are thrown away. `backend: opencv` (or `auto`
+without linuxpy) uses OpenCV.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from thermocald.errors import (
+    BadReading,
+    ConfigurationError,
+    DeviceError,
+    DeviceGone,
+    DeviceTimeout,
+    DriverMissing,
+    WrongDevice,
+)
+from thermocald.hal import Camera, Frame
+from thermocald_drivers import pixel_formats, support
+from thermocald_drivers.v4l2_stream import Grab, LinuxpyStream, OpenCvStream, Stream
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from thermocald.hal import Clock
+
+__all__ = ["V4l2Camera"]
+
+EXPOSURE_AUTO, EXPOSURE = 0x009A0901, 0x009A0902
+GAIN_AUTO, GAIN = 0x00980912, 0x00980913
+FOCUS_AUTO, FOCUS = 0x009A090C, 0x009A090A
+WHITE_AUTO, WHITE = 0x0098090C, 0x0098091A
+MANUAL_EXPOSURE = 1
+EXPOSURE_UNIT_S = 1e-4
+FUTURE_S = 0.1
+"""A stamp may lie this far ahead (vivid: up to a frame); beyond it is not CLOCK_MONOTONIC."""
+
+
+class V4l2Camera(Camera):
+    """One capture device, streaming while it is open."""
+
+    def __init__(
+        self,
+        *,
+        clock: Clock,
+        width: int,
+        height: int,
+        device: str | None = None,
+        serial: str | None = None,
+        card: str | None = None,
+        pixel_format: str = "YUYV",
+        exposure_s: float | None = None,
+        gain: int | None = None,
+        focus: int | None = None,
+        white_balance_k: int | None = None,
+        controls: Mapping[str, int] | None = None,
+        strict: bool = True,
+        timeout_s: float = 5.0,
+        backend: str = "auto",
+        dev: str = "/dev",
+    ) -> None:
+        self.clock = clock
+        self.width = int(support.number("width", width, 16, 20000, "px", whole=True))
+        self.height = int(support.number("height", height, 16, 20000, "px", whole=True))
+        if (device is None) == (serial is None):
+            raise ConfigurationError("write either device: (/dev/v4l/by-id/…) or serial:")
+        self.device, self.serial, self.card = device, serial, card
+        known = ["MJPG", *(name.strip() for name in pixel_formats.FORMATS)]
+        self.pixel_format = support.choice("pixel_format", pixel_format, known).ljust(4)
+        self.exposure_s = (
+            None if exposure_s is None else support.number("exposure_s", exposure_s, 1e-5, 60, "s")
+        )
+        wanted = {"gain": gain, "focus": focus, "white_balance_k": white_balance_k}
+        for name, value in wanted.items():
+            if value is not None:
+                support.number(name, value, 0, 1e6, whole=True)
+        self.gain, self.focus, self.white_balance_k = gain, focus, white_balance_k
+        self.named = dict(controls or {})
+        self.strict = bool(strict)
+        self.timeout_s = support.number("timeout_s", timeout_s, 0.05, 600, "s")
+        self.backend = support.choice("backend", backend, ["auto", "linuxpy", "opencv"])
+        self.dev = Path(dev)
+        self._stream: Stream | None = None
+        self._seen = False
+        self._asked: dict[int, int] = {}
+        self._names: dict[int, str] = {}
+        self._limits: dict[int, str] = {}
+
+    @property
+    def where(self) -> str:
+        """The device as the user knows it."""
+        return f"camera {self.device or self.serial}"
+
+    @classmethod
+    def attached(cls, sysfs: str = "/sys", dev: str = "/dev") -> list[dict[str, Any]]:
+        """Capture nodes by their lasting names (by-id, by-path), else /dev/videoN."""
+        found = []
+        for node in sorted(Path(sysfs).glob("class/video4linux/video*")):
+            try:
+                name = (node / "name").read_text().strip()
+                if (node / "index").read_text().strip() != "0":
+                    continue  # a UVC camera's second node carries metadata, not frames
+            except OSError:
+                continue
+            path = Path(dev) / node.name
+            links = [
+                link
+                for folder in ("by-id", "by-path")
+                for link in sorted((Path(dev) / "v4l" / folder).glob("*"))
+                if link.resolve() == path.resolve()
+            ]
+            lasting = str(links[0] if links else path)
+            options = {"device": lasting, "width": 1920, "height": 1080, "pixel_format": "MJPG"}
+            about = f"{name} ({path}); sizes: v4l2-ctl -d {path} --list-formats-ext"
+            found.append({"options": options, "about": about})
+        return found
+
+    def open(self) -> None:
+        path = self._path()
+        try:
+            self._stream = self._open_stream(path)
+            self._check_card(path)
+            self._set_controls()
+            self._stream.start()
+        except DeviceError:
+            self.close()
+            raise
+        except OSError as error:
+            self.close()
+            hint = "is it plugged in, and the user in the group video?"
+            raise support.fault(error, self.where, seen=self._seen, hint=hint) from error
+        self._seen = True
+
+    def close(self) -> None:
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            stream.close()
+
+    def identity(self) -> Mapping[str, str]:
+        card = self._stream.card if self._stream else ""
+        return {"device": str(self.device or self.serial), "card": card}
+
+    def capture(self) -> Frame:
+        if self._stream is None:
+            raise DeviceGone(f"{self.where}: not open")
+        called = time.monotonic()
+        deadline = called + self.timeout_s
+        try:
+            exposure = self._exposure(self._stream)
+            grab, stamp, dropped = self._fresh(self._stream, called, deadline, exposure)
+            disobeyed = self._disobeyed(self._stream)
+        except DeviceError:
+            raise
+        except OSError as error:
+            raise support.fault(error, self.where, seen=True) from error
+        if disobeyed and self.strict:
+            raise BadReading(f"{self.where}: {'; '.join(disobeyed)}")
+        middle = stamp + (0.5 if grab.start_of_exposure else -0.5) * (exposure or 0.0)
+        monotonic, utc = support.on_clock(self.clock, middle)
+        metadata: dict[str, Any] = {
+            "timestamp": "buffer" if grab.stamp is not None else "call",
+            "stale_frames_dropped": dropped,
+            "controls": {self._names[c]: value for c, value in self._asked.items()},
+        }
+        if disobeyed:
+            metadata["disobeyed"] = disobeyed
+        return Frame(
+            image=grab.image,
+            encoded=grab.encoded,
+            monotonic=monotonic,
+            utc=utc,
+            exposure=exposure,
+            sequence=grab.sequence,
+            metadata=metadata,
+        )
+
+    def _fresh(
+        self, stream: Stream, called: float, deadline: float, exposure: float | None
+    ) -> tuple[Grab, float, int]:
+        """(frame, its stamp in s, stale frames dropped): exposed after the call."""
+        dropped = 0
+        broken: BadReading | None = None
+
+        def accept(stamp: float | None, start_of_exposure: bool) -> bool:
+            now = time.monotonic()
+            stamp = now if stamp is None else stamp
+            if not now - 3600.0 < stamp < now + FUTURE_S:
+                raise WrongDevice(
+                    f"{self.where}: the frame's stamp {stamp:.3f} s is not of this machine's "
+                    f"monotonic clock ({now:.3f} s)"
+                )
+            return stamp - (0.0 if start_of_exposure else exposure or 0.0) >= called
+
+        while True:
+            try:
+                grab = stream.grab(deadline, accept)
+            except BadReading as error:
+                broken = error
+                if time.monotonic() >= deadline:
+                    raise
+                continue
+            except DeviceTimeout as error:
+                if broken is not None:
+                    raise BadReading(f"{self.where}: only broken frames; {broken}") from error
+                after = f", {dropped} old ones were in the queue" if dropped else ""
+                raise DeviceTimeout(
+                    f"{self.where}: no new frame in {self.timeout_s:g} s{after}"
+                ) from error
+            if grab is not None:
+                return grab, time.monotonic() if grab.stamp is None else grab.stamp, dropped
+            dropped += 1
+
+    def _path(self) -> str:
+        """The node; a serial number is looked up among udev's names."""
+        if self.device is not None:
+            return self.device
+        links = sorted((self.dev / "v4l/by-id").glob(f"*{self.serial}*-video-index0"))
+        if len(links) > 1:
+            names = ", ".join(link.name for link in links)
+            raise WrongDevice(f"camera {self.serial}: several fit: {names}; write device:")
+        if not links:
+            raise support.absent(
+                f"camera {self.serial}: none in {self.dev}/v4l/by-id", seen=self._seen
+            )
+        return str(links[0])
+
+    def _open_stream(self, path: str) -> Stream:
+        arguments = (path, self.pixel_format, self.width, self.height)
+        if self.backend == "opencv":
+            return OpenCvStream(*arguments)
+        try:
+            support.library("linuxpy.video.device", "v4l2")
+        except DriverMissing:
+            if self.backend == "linuxpy":
+                raise
+            return OpenCvStream(*arguments)
+        return LinuxpyStream(*arguments)
+
+    def _check_card(self, path: str) -> None:
+        card = self._stream.card if self._stream else ""
+        if self.card is not None and self.card not in card:
+            raise WrongDevice(f"{path}: this is {card!r}, not {self.card!r}")
+
+    def _wanted(self, stream: Stream) -> dict[int, int]:
+        """{control: value} in the order in which they must be set: manual mode first."""
+        available = stream.controls()
+        self._names = {number: control.name for number, control in available.items()}
+        self._limits = {
+            number: f"{c.minimum} … {c.maximum} in steps of {c.step}"
+            for number, c in available.items()
+        }
+        wanted: dict[int, int] = {}
+        for value, automatic, off, control, unit in (
+            (self.exposure_s, EXPOSURE_AUTO, MANUAL_EXPOSURE, EXPOSURE, EXPOSURE_UNIT_S),
+            (self.gain, GAIN_AUTO, 0, GAIN, 1),
+            (self.focus, FOCUS_AUTO, 0, FOCUS, 1),
+            (self.white_balance_k, WHITE_AUTO, 0, WHITE, 1),
+        ):
+            if value is None:
+                continue
+            if automatic in available:
+                wanted[automatic] = off
+            wanted[control] = round(value / unit)
+        by_name = {name: number for number, name in self._names.items()}
+        for name, number_value in self.named.items():
+            if name not in by_name:
+                known = ", ".join(sorted(by_name)) or "none"
+                raise WrongDevice(f"{self.where}: there is no control {name!r}; it has {known}")
+            wanted[by_name[name]] = int(support.number(name, number_value, -(2**31), 2**31 - 1))
+        for number in wanted:
+            if number not in available:
+                raise WrongDevice(f"{self.where}: no control 0x{number:08x} to set manually")
+        return wanted
+
+    def _set_controls(self) -> None:
+        stream = self._stream
+        if stream is None:
+            return
+        self._asked = self._wanted(stream)
+        for control, value in self._asked.items():
+            try:
+                stream.set(control, value)
+            except OSError as error:
+                raise WrongDevice(
+                    f"{self.where}: does not take {self._names[control]} = {value} "
+                    f"({error.strerror}); it takes {self._limits[control]}"
+                ) from error
+        disobeyed = self._disobeyed(stream)
+        if disobeyed and self.strict:
+            raise WrongDevice(f"{self.where}: {'; '.join(disobeyed)}")
+
+    def _disobeyed(self, stream: Stream) -> list[str]:
+        """Sentences on controls that do not read back as they were set."""
+        found = []
+        for control, value in self._asked.items():
+            now = stream.get(control)
+            if now != value:
+                limits = self._limits[control]
+                found.append(f"{self._names[control]} was set to {value} and is {now} ({limits})")
+        return found
+
+    def _exposure(self, stream: Stream) -> float | None:
+        """s, where the camera is in manual exposure and tells it."""
+        if EXPOSURE not in self._names or (
+            EXPOSURE_AUTO in self._names and stream.get(EXPOSURE_AUTO) != MANUAL_EXPOSURE
+        ):
+            return None
+        return stream.get(EXPOSURE) * EXPOSURE_UNIT_S

@@ -1,0 +1,270 @@
+"""One V4L2 capture stream: buffers with the kernel's time stamps, with a time-out on every wait.
+
+Two implementations of one contract: linuxpy's ioctls, and OpenCV where linuxpy is not installed.
+linuxpy's own frame iterator waits for ever after an unplug, hence the poll here.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import select
+import threading
+import time
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+from thermocald.errors import BadReading, DeviceGone, DeviceTimeout, WrongDevice
+from thermocald_drivers import pixel_formats, support
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from thermocald_drivers.pixel_formats import Grey
+
+    Accept = Callable[[float | None, bool], bool]
+
+__all__ = ["Control", "Grab", "LinuxpyStream", "OpenCvStream", "Stream"]
+
+ERROR, TYPE_MASK, MONOTONIC, COPY, START_OF_EXPOSURE = 0x40, 0xE000, 0x2000, 0x4000, 0x10000
+BUFFERS = 3
+OPENCV_PROPERTIES = {
+    # V4L2 control: OpenCV's property
+    0x009A0901: "CAP_PROP_AUTO_EXPOSURE",
+    0x009A0902: "CAP_PROP_EXPOSURE",
+    0x00980913: "CAP_PROP_GAIN",
+    0x009A090C: "CAP_PROP_AUTOFOCUS",
+    0x009A090A: "CAP_PROP_FOCUS",
+    0x0098090C: "CAP_PROP_AUTO_WB",
+    0x0098091A: "CAP_PROP_WB_TEMPERATURE",
+}
+
+
+@dataclass(frozen=True)
+class Control:
+    """A setting of the camera; `name` is its name in lower case with underscores."""
+
+    id: int
+    name: str
+    minimum: int
+    maximum: int
+    step: int
+
+
+@dataclass(frozen=True)
+class Grab:
+    """One buffer: stamp (s, CLOCK_MONOTONIC, None if the driver gives none), what it marks."""
+
+    image: Grey
+    encoded: bytes | None
+    stamp: float | None
+    start_of_exposure: bool
+    sequence: int | None
+
+
+class Stream(Protocol):
+    """What the camera needs of a stream.
+
+    `grab` gives the next buffer, or None if `accept(stamp, start_of_exposure)` does not want it (an
+    old frame is not worth decoding); it raises BadReading for a buffer in error.
+    """
+
+    card: str
+
+    def controls(self) -> dict[int, Control]:
+        """By V4L2 identity."""
+
+    def get(self, control: int) -> int: ...
+    def set(self, control: int, value: int) -> None: ...
+    def start(self) -> None: ...
+    def grab(self, deadline: float, accept: Accept) -> Grab | None: ...
+    def close(self) -> None: ...
+
+
+class LinuxpyStream:
+    """Memory-mapped capture through linuxpy's ioctl wrappers."""
+
+    def __init__(self, path: str, fourcc: str, width: int, height: int) -> None:
+        self._path, self._fourcc = path, fourcc
+        self._video = support.library("linuxpy.video.device", "v4l2")
+        self._device = self._video.Device(path)
+        self._capture: Any = None
+        self._size, self._stride = (width, height), 0
+        self._device.open()
+        try:
+            self._set_format(width, height)
+        except OSError:
+            self._device.close()
+            raise
+
+    def _set_format(self, width: int, height: int) -> None:
+        path, fourcc = self._path, self._fourcc
+        self.card = self._device.info.card
+        capabilities = self._device.info.device_capabilities
+        if self._video.Capability.VIDEO_CAPTURE not in capabilities:
+            raise WrongDevice(
+                f"{path}: {self.card!r} is no capture device; try its first /dev/video"
+            )
+        kind = self._video.BufferType.VIDEO_CAPTURE
+        self._video.set_format(self._device, kind, width, height, fourcc)
+        pixels = self._video.get_raw_format(self._device, kind).fmt.pix
+        got = pixels.pixelformat.to_bytes(4, "little").decode("ascii", "replace")
+        if (pixels.width, pixels.height, got) != (width, height, fourcc):
+            raise WrongDevice(
+                f"{path}: asked for {width}×{height} {fourcc}, the camera gives "
+                f"{pixels.width}×{pixels.height} {got}; see v4l2-ctl --list-formats-ext"
+            )
+        self._stride = int(pixels.bytesperline)
+
+    def controls(self) -> dict[int, Control]:
+        return {
+            c.id: Control(c.id, _plain_name(c.name.decode()), c.minimum, c.maximum, c.step)
+            for c in self._video.iter_read_controls(self._device)
+        }
+
+    def get(self, control: int) -> int:
+        return int(self._video.get_control(self._device, control))
+
+    def set(self, control: int, value: int) -> None:
+        self._video.set_control(self._device, control, value)
+
+    def start(self) -> None:
+        self._capture = self._video.VideoCapture(self._device, size=BUFFERS)
+        self._capture.open()
+
+    def grab(self, deadline: float, accept: Accept) -> Grab | None:
+        buffer = self._dequeue(deadline)
+        stamp: float | None = buffer.timestamp.secs + buffer.timestamp.usecs * 1e-6
+        if not stamp or buffer.flags & TYPE_MASK not in (MONOTONIC, COPY):
+            stamp = None
+        at_start = bool(buffer.flags & START_OF_EXPOSURE)
+        try:
+            if not accept(stamp, at_start):
+                return None
+            if buffer.flags & ERROR:
+                raise BadReading(
+                    f"{self._path}: the driver flags frame {buffer.sequence} as broken"
+                )
+            used = memoryview(self._capture.buffer.buffers[buffer.index])[: buffer.bytesused]
+            try:
+                image, encoded = pixel_formats.decode(used, self._fourcc, *self._size, self._stride)
+            finally:
+                used.release()
+        finally:
+            self._video.enqueue_buffer(
+                self._device, buffer.type, self._video.Memory.MMAP, 0, buffer.index
+            )
+        return Grab(image, encoded, stamp, at_start, int(buffer.sequence))
+
+    def _dequeue(self, deadline: float) -> Any:
+        poll = select.poll()
+        poll.register(self._device.fileno(), select.POLLIN)
+        kind, memory = self._video.BufferType.VIDEO_CAPTURE, self._video.Memory.MMAP
+        while True:
+            try:
+                return self._video.dequeue_buffer(self._device, kind, memory)
+            except BlockingIOError:
+                left = deadline - time.monotonic()
+                if left <= 0:
+                    raise DeviceTimeout(f"{self._path}: no frame came") from None
+                poll.poll(left * 1000.0)
+
+    def close(self) -> None:
+        for action in (self._capture.close if self._capture else None, self._device.close):
+            try:
+                if action:
+                    action()
+            except OSError:
+                continue  # an unplugged camera cannot be stopped
+        self._capture = None
+
+
+class OpenCvStream:
+    """OpenCV's V4L2 back end; a grab that blocks (10 s) is left behind in its own thread."""
+
+    def __init__(self, path: str, fourcc: str, width: int, height: int) -> None:
+        self._cv2 = cv2 = support.library("cv2")
+        self._path, self._fourcc, self._size = path, fourcc, (width, height)
+        self._pending: Future[Grab] | None = None
+        if not os.access(path, os.F_OK):
+            raise FileNotFoundError(errno.ENOENT, "No such file or directory", path)
+        if not os.access(path, os.R_OK | os.W_OK):
+            raise PermissionError(errno.EACCES, "Permission denied", path)
+        self._capture = cv2.VideoCapture(path, cv2.CAP_V4L2)
+        if not self._capture.isOpened():
+            raise DeviceGone(f"{path}: OpenCV cannot open it (busy, or no capture device)")
+        self.card = "unknown: OpenCV does not tell"
+        # OpenCV resets a device to 640×480 on open; order matters: format, then size
+        self._capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*fourcc))
+        self._capture.set(cv2.CAP_PROP_FRAME_WIDTH, width)
+        self._capture.set(cv2.CAP_PROP_FRAME_HEIGHT, height)
+        self._capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
+        self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+        got = (
+            int(self._capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
+            int(self._capture.get(cv2.CAP_PROP_FRAME_HEIGHT)),
+        )
+        if got != (width, height):
+            self._capture.release()
+            raise WrongDevice(
+                f"{path}: asked for {width}×{height}, the camera gives {got[0]}×{got[1]}"
+            )
+
+    def controls(self) -> dict[int, Control]:
+        return {
+            number: Control(number, name.removeprefix("CAP_PROP_").lower(), -(2**31), 2**31 - 1, 1)
+            for number, name in OPENCV_PROPERTIES.items()
+            if self._capture.get(getattr(self._cv2, name)) != -1
+        }
+
+    def get(self, control: int) -> int:
+        value: float = self._capture.get(getattr(self._cv2, OPENCV_PROPERTIES[control]))
+        return round(value)
+
+    def set(self, control: int, value: int) -> None:
+        self._capture.set(getattr(self._cv2, OPENCV_PROPERTIES[control]), value)
+
+    def start(self) -> None:
+        """OpenCV streams from the first grab on."""
+
+    def grab(self, deadline: float, accept: Accept) -> Grab | None:
+        if self._pending is None or self._pending.done():
+            self._pending = Future()
+            threading.Thread(
+                target=self._work, args=(self._pending,), daemon=True, name="opencv-grab"
+            ).start()
+        try:
+            grab = self._pending.result(max(0.0, deadline - time.monotonic()))
+        except OSError as error:
+            if isinstance(error, TimeoutError) and not isinstance(error, DeviceTimeout):
+                raise DeviceTimeout(f"{self._path}: no frame came") from None
+            raise
+        return grab if accept(grab.stamp, False) else None
+
+    def _work(self, task: Future[Grab]) -> None:
+        try:
+            task.set_result(self._read())
+        except (OSError, ValueError) as error:
+            task.set_exception(error)
+
+    def _read(self) -> Grab:
+        good, raw = self._capture.read()
+        if not good:
+            raise DeviceGone(f"{self._path}: OpenCV gets no frame (unplugged?)")
+        stamp = self._capture.get(self._cv2.CAP_PROP_POS_MSEC) / 1000.0
+        data = memoryview(raw.reshape(-1).view("u1"))
+        image, encoded = pixel_formats.decode(data, self._fourcc, *self._size)
+        return Grab(image, encoded, stamp if stamp > 0 else None, False, None)
+
+    def close(self) -> None:
+        if self._pending is not None and not self._pending.done():
+            capture = self._capture  # released by the thread that is still in it
+            self._pending.add_done_callback(lambda _: capture.release())
+            return
+        self._capture.release()
+
+
+def _plain_name(name: str) -> str:
+    """`Exposure Time, Absolute` as v4l2-ctl writes it: exposure_time_absolute."""
+    return "_".join("".join(c if c.isalnum() else " " for c in name.lower()).split())

@@ -1,0 +1,111 @@
+"""A broker that speaks as much of MQTT 3.1.1 as one publisher needs, and fails on demand.
+
+The laboratory uses a real mosquitto; this one can withhold an acknowledgement or drop a line.
+"""
+
+from __future__ import annotations
+
+import socket
+import threading
+
+
+class Broker:
+    """`messages` holds (topic, payload, retain); the will of a line that broke is in it too."""
+
+    def __init__(self) -> None:
+        self.messages: list[tuple[str, bytes, bool]] = []
+        self.refuse = 0
+        self.acknowledge = True
+        self.answer_connect = True
+        self.credentials: tuple[str, str] | None = None
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.port = self._server.getsockname()[1]
+        self._lines: list[socket.socket] = []
+        self._threads = [threading.Thread(target=self._accept, name="broker")]
+        self._threads[0].start()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                line, _ = self._server.accept()
+            except OSError:
+                return
+            self._lines.append(line)
+            thread = threading.Thread(target=self._serve, args=(line,), name="broker-line")
+            self._threads.append(thread)
+            thread.start()
+
+    def _serve(self, line: socket.socket) -> None:
+        will: tuple[str, bytes, bool] | None = None
+        try:
+            while packet := self._packet(line):
+                kind, flags, body = packet
+                if kind == 1:
+                    will = self._connect(line, body)
+                elif kind == 3:
+                    size = int.from_bytes(body[:2], "big")
+                    topic, rest = body[2 : 2 + size].decode(), body[2 + size :]
+                    self.messages.append((topic, rest[2:], bool(flags & 1)))
+                    if self.acknowledge:
+                        line.sendall(b"\x40\x02" + rest[:2])
+                elif kind == 12:
+                    line.sendall(b"\xd0\x00")
+                elif kind == 14:
+                    will = None
+        except OSError:
+            pass
+        finally:
+            if will:
+                self.messages.append(will)
+            line.close()
+
+    def _connect(self, line: socket.socket, body: bytes) -> tuple[str, bytes, bool] | None:
+        flags, fields, at = body[7], [], 10
+        while at < len(body):
+            size = int.from_bytes(body[at : at + 2], "big")
+            fields.append(body[at + 2 : at + 2 + size])
+            at += 2 + size
+        fields.pop(0)  # client id
+        will = (fields.pop(0).decode(), fields.pop(0), True) if flags & 4 else None
+        if flags & 0x80:
+            self.credentials = (fields.pop(0).decode(), fields.pop(0).decode())
+        if self.answer_connect:
+            line.sendall(bytes([0x20, 2, 0, self.refuse]))
+        return None if self.refuse else will
+
+    @staticmethod
+    def _packet(line: socket.socket) -> tuple[int, int, bytes] | None:
+        head = line.recv(1)
+        if not head:
+            return None
+        size = shift = 0
+        while True:
+            (byte,) = line.recv(1)
+            size |= (byte & 0x7F) << shift
+            shift += 7
+            if not byte & 0x80:
+                break
+        body = b""
+        while len(body) < size:
+            piece = line.recv(size - len(body))
+            if not piece:
+                return None
+            body += piece
+        return head[0] >> 4, head[0] & 15, body
+
+    def drop(self) -> None:
+        """Every line breaks, as when the network goes away."""
+        for line in self._lines:
+            try:
+                line.shutdown(socket.SHUT_RDWR)
+            except OSError:
+                continue
+
+    def close(self) -> None:
+        if self._server.fileno() < 0:
+            return
+        self._server.shutdown(socket.SHUT_RDWR)
+        self._server.close()
+        self.drop()
+        for thread in self._threads:
+            thread.join(2.0)

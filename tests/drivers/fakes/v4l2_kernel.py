@@ -1,0 +1,151 @@
+"""A V4L2 capture device below linuxpy: the ioctls of one camera, its buffers in a plain file.
+
+The camera makes a frame every `period_s` into the oldest queued buffer, as a kernel driver does:
+buffers that nobody fetches stay filled with old frames, and frames without a buffer are lost.
+"""
+
+from __future__ import annotations
+
+import errno
+import mmap
+import os
+import time
+from collections import deque
+from typing import TYPE_CHECKING
+
+import numpy as np
+from linuxpy.video import raw
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+PAGE = mmap.PAGESIZE
+INTEGER, BOOLEAN, MENU = 1, 2, 3
+
+
+def fail(number: int) -> OSError:
+    return OSError(number, os.strerror(number))
+
+
+class FakeCamera:
+    """Controls: {id: [name, minimum, maximum, step, value]}."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.card, self.capture_device = "Fake Webcam", True
+        self.formats = {("GREY", 64, 48), ("YUYV", 64, 48), ("MJPG", 64, 48)}
+        self.period_s = 0.01
+        self.flags = 0x2000  # monotonic, end of frame
+        self.stamp: Callable[[float], float] = lambda now: now
+        self.encode: Callable[[np.ndarray, str], bytes] = encode
+        self.controls = {
+            0x009A0901: ["Auto Exposure", 0, 3, 1, 3],
+            0x009A0902: ["Exposure Time, Absolute", 3, 2047, 1, 250],
+            0x00980913: ["Gain", 0, 255, 1, 64],
+            0x00980918: ["Power Line Frequency", 0, 2, 1, 2],
+        }
+        self.obeys: Callable[[int, int], int] = lambda _control, value: value
+        self.errors: dict[str, int] = {}
+        self.broken: set[int] = set()
+        self.stalled = False
+        self.streaming = False
+        self.opened = 0
+        self._format = ("GREY", 64, 48)
+        self._size = 8 * PAGE
+        path.write_bytes(bytes(4 * self._size))
+        self._queued: deque[int] = deque()
+        self._filled: deque[tuple[int, int, float, int]] = deque()
+        self._next_at = 0.0
+        self._sequence = 0
+
+    def ioctl(self, device, request, argument=None) -> None:
+        name = request.name
+        if name in self.errors:
+            raise fail(self.errors[name])
+        getattr(self, f"_{name.lower()}")(argument)
+
+    def _querycap(self, a) -> None:
+        a.card, a.driver, a.bus_info = self.card.encode(), b"fake", b"usb-1"
+        a.device_caps = a.capabilities = 0x04000001 if self.capture_device else 0x04800000
+
+    def _s_fmt(self, a) -> None:
+        pix = a.fmt.pix
+        wanted = (pix.pixelformat.to_bytes(4, "little").decode(), pix.width, pix.height)
+        self._format = wanted if wanted in self.formats else ("GREY", 64, 48)
+        self._g_fmt(a)
+
+    def _g_fmt(self, a) -> None:
+        fourcc, a.fmt.pix.width, a.fmt.pix.height = self._format
+        a.fmt.pix.pixelformat = raw.v4l2_fourcc(*fourcc)
+        a.fmt.pix.bytesperline = {"GREY": 1, "YUYV": 2}.get(fourcc, 0) * self._format[1]
+        a.fmt.pix.sizeimage = self._size
+
+    def _query_ext_ctrl(self, a) -> None:
+        after = a.id & 0x0FFFFFFF
+        later = sorted(number for number in self.controls if number > after)
+        if not later:
+            raise fail(errno.EINVAL)
+        a.id, a.type = later[0], INTEGER
+        name, a.minimum, a.maximum, a.step, _ = self.controls[later[0]]
+        a.name = name.encode()
+
+    def _g_ctrl(self, a) -> None:
+        a.value = self.controls[a.id][4]
+
+    def _s_ctrl(self, a) -> None:
+        _, low, high, _, _ = self.controls[a.id]
+        if not low <= a.value <= high:
+            raise fail(errno.ERANGE)
+        self.controls[a.id][4] = self.obeys(a.id, a.value)
+
+    def _reqbufs(self, a) -> None:
+        self._queued.clear()
+        self._filled.clear()
+
+    def _querybuf(self, a) -> None:
+        a.length, a.m.offset = self._size, a.index * self._size
+
+    def _qbuf(self, a) -> None:
+        self._queued.append(a.index)
+
+    def _streamon(self, _a) -> None:
+        self.streaming, self._next_at = True, time.monotonic() + self.period_s
+
+    def _streamoff(self, _a) -> None:
+        self.streaming = False
+
+    def _make_frames(self) -> None:
+        while not self.stalled and self._next_at <= time.monotonic():
+            if self._queued:
+                index = self._queued.popleft()
+                image = np.full(self._format[2:0:-1], self._sequence % 256, np.uint8)
+                data = self.encode(image, self._format[0])
+                with self.path.open("r+b") as file:
+                    file.seek(index * self._size)
+                    file.write(data)
+                self._filled.append((index, self._sequence, self._next_at, len(data)))
+            self._sequence += 1
+            self._next_at += self.period_s
+
+    def _dqbuf(self, a) -> None:
+        self._make_frames()
+        if not self._filled:
+            time.sleep(0.001)  # a plain file is always ready: poll would spin
+            raise BlockingIOError(errno.EAGAIN, "try again")
+        a.index, a.sequence, at, a.bytesused = self._filled.popleft()
+        stamp = self.stamp(at)
+        a.timestamp.secs, a.timestamp.usecs = int(stamp), round(stamp % 1 * 1e6)
+        a.flags = self.flags | (0x40 if a.sequence in self.broken else 0)
+
+
+def encode(image: np.ndarray, fourcc: str) -> bytes:
+    if fourcc == "GREY":
+        return image.tobytes()
+    if fourcc == "YUYV":
+        return np.stack([image, np.full_like(image, 128)], axis=-1).tobytes()
+    import simplejpeg
+
+    return simplejpeg.encode_jpeg(
+        np.ascontiguousarray(image[..., None]), colorspace="GRAY", quality=95
+    )

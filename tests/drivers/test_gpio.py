@@ -1,0 +1,162 @@
+"""LED and relay on gpiozero's mock pins: the pin's state is read below the driver."""
+
+from __future__ import annotations
+
+import time
+
+import gpiozero
+import pytest
+from gpiozero.pins.mock import MockFactory
+
+from thermocald.errors import BadReading, ConfigurationError, DeviceDenied, DeviceNotFound
+from thermocald.hal import VirtualClock, open_device
+
+PROGRAMME = [
+    {"seconds": 100, "hold_c": None},
+    {"seconds": 1000, "hold_c": 45.0},
+    {"seconds": 100, "hold_c": None},
+]
+
+
+@pytest.fixture
+def pins(monkeypatch):
+    factory = MockFactory()
+    monkeypatch.setattr(gpiozero.Device, "pin_factory", factory)
+    yield factory
+    factory.close()
+
+
+@pytest.fixture
+def clock():
+    return VirtualClock()
+
+
+def relay(clock, **options):
+    options = {"pin": 27, "limit_c": 60, "programme": PROGRAMME, "hysteresis_k": 1.0, **options}
+    return open_device("output", "relay", options, clock)
+
+
+def test_the_led_tells_whether_there_are_results(pins):
+    with open_device("output", "led", {"pin": 17, "blink_s": 0.05}, VirtualClock()) as led:
+        pin = pins.pin(17)
+        led.emit({"status": "ok"})
+        assert pin.state
+        led.emit({"status": "too few targets"})
+        states = set()
+        deadline = time.monotonic() + 2.0
+        while len(states) < 2 and time.monotonic() < deadline:
+            states.add(pin.state)
+        assert states == {True, False}
+        led.emit({"status": "ok"})
+        assert pin.state
+    assert not pins.pin(17).state
+
+
+def test_the_programme(pins, clock):
+    with relay(clock) as lamp:
+        pin = pins.pin(27)
+
+        def at(seconds, temperature):
+            clock.sleep_until(seconds)
+            lamp.emit({"temperature": temperature})
+            return bool(pin.state)
+
+        assert not pin.state
+        states = [at(10, 20.0), at(110, 20.0), at(200, 44.9), at(300, 45.5), at(310, 45.0)]
+        assert states == [False, True, True, False, False]  # off at the upper edge, on at the lower
+        assert at(320, 44.5)
+        assert not at(1150, 20.0)
+        assert not at(5000, 20.0)
+
+
+def test_the_limit_is_for_good(pins, clock):
+    with relay(clock) as lamp:
+        clock.sleep_until(200)
+        lamp.emit({"temperature": 20.0})
+        assert pins.pin(27).state
+        with pytest.raises(BadReading, match=r"60\.00 °C reached the limit 60 °C"):
+            lamp.emit({"temperature": 60.0})
+        assert not pins.pin(27).state
+        lamp.emit({"temperature": 20.0})
+        assert not pins.pin(27).state
+
+
+@pytest.mark.parametrize("value", [None, float("nan"), "hot"])
+def test_no_temperature_never_starts_the_lamp(pins, clock, value):
+    with relay(clock) as lamp:
+        clock.sleep_until(200)
+        lamp.emit({"temperature": value})
+        assert not pins.pin(27).state
+
+
+def test_no_temperature_for_long_stops_the_lamp(pins, clock):
+    with relay(clock, unknown_s=30) as lamp:
+        clock.sleep_until(200)
+        lamp.emit({"temperature": 20.0})
+        clock.sleep_until(210)
+        lamp.emit({"temperature": None})
+        assert pins.pin(27).state
+        clock.sleep_until(231)
+        lamp.emit({"temperature": None})
+        assert not pins.pin(27).state
+
+
+def test_no_result_for_long_stops_the_lamp(pins, clock):
+    with relay(clock, watchdog_s=0.1) as lamp:
+        clock.sleep_until(200)
+        lamp.emit({"temperature": 20.0})
+        assert pins.pin(27).state
+        deadline = time.monotonic() + 2.0
+        while pins.pin(27).state and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert not pins.pin(27).state
+        lamp.emit({"temperature": 20.0})  # and heats again with the next result
+        assert pins.pin(27).state
+
+
+def test_closing_switches_off(pins, clock):
+    lamp = relay(clock)
+    lamp.open()
+    clock.sleep_until(200)
+    lamp.emit({"temperature": 20.0})
+    lamp.close()
+    lamp.close()
+    assert not pins.pin(27).state
+
+
+def test_a_board_that_switches_at_low(pins, clock):
+    with relay(clock, active_high=False) as lamp:
+        assert pins.pin(27).state  # high: off
+        clock.sleep_until(200)
+        lamp.emit({"temperature": 20.0})
+        assert not pins.pin(27).state
+
+
+def test_a_pin_in_use(pins, clock):
+    with relay(clock), pytest.raises(DeviceDenied, match="in use"):
+        relay(clock).open()
+
+
+def test_a_machine_without_pins(monkeypatch, clock):
+    def none(*_args):
+        raise gpiozero.BadPinFactory("no pins here")
+
+    monkeypatch.setattr(gpiozero.Device, "pin_factory", None)
+    monkeypatch.setattr(gpiozero.Device, "_default_pin_factory", staticmethod(none))
+    with pytest.raises(DeviceNotFound, match="no usable pins"):
+        relay(clock).open()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"limit_c": 200}, "limit_c: 200 °C is not within"),
+        ({"limit_c": 45}, "hold_c: 45 °C is not within"),
+        ({"programme": []}, "at least one step"),
+        ({"programme": [{"seconds": 10}]}, r"programme\[0\]"),
+        ({"pin": 99}, "pin"),
+    ],
+)
+def test_a_wrong_configuration(clock, options, message):
+    with pytest.raises(ConfigurationError, match=message):
+        relay(clock, **options)

@@ -1,0 +1,107 @@
+"""JSON lines into files and pipes."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+
+import numpy as np
+import pytest
+
+from thermocald.errors import DeviceDenied, DeviceGone, DeviceTimeout, TransientDeviceError
+from thermocald.hal import VirtualClock, open_device
+
+RESULT = {"device": "rpi", "epoch": 3, "c": np.float64(3.04), "x0": float("nan"), "status": "ok"}
+
+
+def output(path, **options):
+    options = {"path": str(path), "timeout_s": 0.1, **options}
+    return open_device("output", "jsonl", options, VirtualClock())
+
+
+def lines(path):
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def test_lines_are_appended(tmp_path):
+    path = tmp_path / "results.jsonl"
+    for epoch in (1, 2):
+        with output(path) as device:
+            device.emit(RESULT | {"epoch": epoch})
+    assert lines(path) == [
+        {"device": "rpi", "epoch": k, "c": 3.04, "x0": None, "status": "ok"} for k in (1, 2)
+    ]
+
+
+def test_a_file_that_was_rotated_is_begun_anew(tmp_path):
+    path = tmp_path / "results.jsonl"
+    with output(path) as device:
+        device.emit(RESULT)
+        path.rename(tmp_path / "results.jsonl.1")
+        device.emit(RESULT)
+    assert len(lines(path)) == 1 == len(lines(tmp_path / "results.jsonl.1"))
+
+
+def test_a_full_disk_leaves_no_half_line(tmp_path, monkeypatch):
+    path = tmp_path / "results.jsonl"
+    with output(path) as device:
+        device.emit(RESULT)
+        write, left = os.write, [20]
+
+        def full(file, data):
+            if not left[0]:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            count = write(file, data[: left[0]])
+            left[0] -= count
+            return count
+
+        monkeypatch.setattr(os, "write", full)
+        with pytest.raises(TransientDeviceError, match="the disk is full"):
+            device.emit(RESULT)
+        monkeypatch.undo()
+        device.emit(RESULT)
+    assert len(lines(path)) == 2
+
+
+def test_a_pipe(tmp_path):
+    path = tmp_path / "pipe"
+    os.mkfifo(path)
+    with pytest.raises(DeviceGone, match="nobody reads"):
+        output(path).open()
+    reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    with output(path) as device:
+        device.emit(RESULT)
+        assert json.loads(os.read(reader, 4096))["epoch"] == 3
+        os.close(reader)
+        with pytest.raises(DeviceGone, match="any more"):
+            device.emit(RESULT)
+
+
+def test_a_pipe_whose_reader_sleeps(tmp_path):
+    path = tmp_path / "pipe"
+    os.mkfifo(path)
+    reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    with output(path) as device:
+
+        def fill():
+            for _ in range(2000):
+                device.emit(RESULT)
+
+        with pytest.raises(DeviceTimeout, match="too slow"):
+            fill()
+    os.close(reader)
+
+
+def test_no_permission(tmp_path, monkeypatch):
+    def denied(*_args, **_kwargs):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(os, "open", denied)
+    with pytest.raises(DeviceDenied):
+        output(tmp_path / "results.jsonl").open()
+
+
+def test_no_folder(tmp_path):
+    with pytest.raises(OSError, match="No such file"):
+        output(tmp_path / "none" / "results.jsonl").open()

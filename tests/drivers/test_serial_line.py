@@ -1,0 +1,261 @@
+"""Line protocols over a real tty (a pseudo terminal): each row of docs/how-to/thermometers.md."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+
+import pytest
+
+from tests.drivers.fakes.pty_instrument import Instrument
+from thermocald.errors import (
+    BadReading,
+    ConfigurationError,
+    DeviceDenied,
+    DeviceGone,
+    DeviceNotFound,
+    DeviceTimeout,
+)
+from thermocald.hal import SystemClock, open_device
+
+PATTERN = r"T=(?P<temperature>[-+]?\d+\.\d+)"
+
+
+@pytest.fixture
+def instrument():
+    made = []
+
+    def make(answers=None):
+        made.append(Instrument(answers))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+
+
+def thermometer(far, **options):
+    options = {"port": far.port, "timeout_s": 0.4, **options}
+    return open_device("thermometer", "serial", options, SystemClock())
+
+
+def asked(far, **options):
+    return thermometer(far, **{"pattern": PATTERN, "command": "T?\r\n", **options})
+
+
+# (instrument, command as sent, line as received, values): from the instruments' manuals
+PROTOCOLS = [
+    ("vaisala-hmp", b"SEND\r", b"RH= 43.0 %RH T= 21.0 'C Tdp= 8.0 'C\r\n", {"temperature": 21.0}),
+    ("vaisala-hmp", b"SEND\r", b"T= -7.3 'C\r\n", {"temperature": -7.3}),
+    (
+        "lakeshore-218",
+        b"KRDG?\r\n",
+        b"+293.15,+294.15,+295.15,+273.15,+300.00,+301.00,+302.00,+303.15\r\n",
+        dict(
+            zip(
+                [f"input{k}" for k in range(1, 9)],
+                [20.0, 21.0, 22.0, 0.0, 26.85, 27.85, 28.85, 30.0],
+                strict=True,
+            )
+        ),
+    ),
+    ("fluke-1522", b"read?\r", b"t: 25.587 C\r\n", {"temperature": 25.587}),
+]
+
+
+@pytest.mark.parametrize(("name", "command", "line", "values"), PROTOCOLS)
+def test_instruments_by_name(instrument, name, command, line, values):
+    far = instrument({command: line})
+    with thermometer(far, instrument=name) as device:
+        assert device.read().values == pytest.approx(values, abs=1e-9)
+    assert far.received == [command]
+
+
+def later(action, seconds=0.05):
+    thread = threading.Timer(seconds, action)
+    thread.start()
+    return thread
+
+
+def test_an_instrument_that_speaks_by_itself(instrument):
+    far = instrument()
+    with thermometer(far, instrument="papouch-tm", timeout_s=2.0) as device:
+        far.send(b"+099.9C\r3.5C\r+0")  # in the queue before the call: old, and half a line
+        time.sleep(0.05)
+        thread = later(lambda: far.send(b"21.5C\r"))
+        begin = time.monotonic()
+        reading = device.read()
+        thread.join()
+    assert reading.values == {"temperature": 21.5}
+    assert reading.monotonic == pytest.approx(begin + 0.05, abs=0.04)  # when the line ended
+
+
+def test_the_rest_of_a_line_is_no_reading(instrument):
+    """`3.5C` of `+023.5C`: the first piece after opening is dropped, even one that would fit."""
+    far = instrument()
+    with thermometer(far, pattern=r"(?P<temperature>[-+]?\d+\.\d)C", timeout_s=1.0) as device:
+        thread = later(lambda: far.send(b"3.5C\r+021.5C\r"))
+        assert device.read().values == {"temperature": 21.5}
+        thread.join()
+
+
+def test_a_line_is_never_used_twice(instrument):
+    far = instrument()
+    with thermometer(far, instrument="papouch-tm", timeout_s=0.3) as device:
+        thread = later(lambda: far.send(b"\r+021.5C\r"))
+        device.read()
+        thread.join()
+        with pytest.raises(DeviceTimeout, match=r"silent for 0\.3 s"):
+            device.read()
+
+
+def test_an_old_answer_in_the_queue_is_not_taken(instrument):
+    far = instrument({b"T?\r\n": b"T=20.00\r\n"})
+    with asked(far) as device:
+        far.send(b"T=99.00\r\n")
+        time.sleep(0.05)
+        assert device.read().values == {"temperature": 20.0}
+
+
+def test_an_answer_in_pieces(instrument):
+    far = instrument({b"T?\r\n": b"T=2"})
+    with asked(far) as device:
+        thread = later(lambda: far.send(b"0.25\r\n"))
+        assert device.read().values == {"temperature": 20.25}
+        thread.join()
+
+
+def test_echo_is_skipped(instrument):
+    far = instrument({b"T?\r\n": b"T?\r\nT=20.50\r\n"})
+    with asked(far) as device:
+        assert device.read().values == {"temperature": 20.5}
+
+
+def test_garbage_before_the_answer_is_skipped(instrument):
+    far = instrument({b"T?\r\n": b"\xff\x00\x91~\r\nready\r\nT=20.50\r\n"})
+    with asked(far) as device:
+        assert device.read().values == {"temperature": 20.5}
+
+
+@pytest.mark.parametrize("rubbish", [b"\xf8\x80\x00\xfe" * 20, b"\xf8\x80\r\n" * 20, b"T=\r\n"])
+def test_a_wrong_baud_rate_says_so(instrument, rubbish):
+    far = instrument({b"T?\r\n": rubbish})
+    with asked(far) as device, pytest.raises(BadReading, match="is 9600 Bd 8N1 right"):
+        device.read()
+
+
+def test_an_endless_line_does_not_grow(instrument):
+    far = instrument({b"T?\r\n": b"U" * 3000})
+    with asked(far) as device:
+        with pytest.raises(BadReading):
+            device.read()
+        assert len(device._line) == 0
+
+
+def test_half_a_line_then_silence(instrument):
+    far = instrument({b"T?\r\n": b"T=20."})
+    with asked(far) as device, pytest.raises(BadReading, match=r"'T=20\.'"):
+        device.read()
+
+
+def test_silence(instrument):
+    with asked(instrument()) as device, pytest.raises(DeviceTimeout, match=r"silent for 0\.4 s"):
+        device.read()
+
+
+@pytest.mark.parametrize(
+    ("unit", "scale", "offset", "line", "celsius"),
+    [("C", 1, 0, "20.0", 20.0), ("F", 1, 0, "68.0", 20.0), ("K", 1, 0, "293.15", 20.0),
+     ("C", 0.1, -5.0, "250.0", 20.0)],
+)  # fmt: skip
+def test_units_and_scales(instrument, unit, scale, offset, line, celsius):
+    far = instrument({b"T?\r\n": f"T={line}\r\n".encode()})
+    with asked(far, unit=unit, scale=scale, offset=offset) as device:
+        assert device.read().values["temperature"] == pytest.approx(celsius, abs=1e-9)
+
+
+CHECKED = PATTERN + r"\*(?P<checksum>[0-9A-F]{2})"
+
+
+@pytest.mark.parametrize("kind", ["xor", "sum8", "nmea"])
+def test_checksums(instrument, kind):
+    text = b"T=20.50*"
+    expected = {"xor": 0, "sum8": sum(text) % 256, "nmea": 0}
+    for byte in text:
+        expected["xor"] ^= byte
+    for byte in text[:-1]:
+        expected["nmea"] ^= byte
+    answers = [b"T=20.50*%02X\r\n" % expected[kind], b"T=20.51*%02X\r\n" % expected[kind]]
+    far = instrument({b"T?\r\n": answers})
+    with asked(far, pattern=CHECKED, checksum=kind) as device:
+        assert device.read().values == {"temperature": 20.5}
+        with pytest.raises(BadReading, match="checksum"):
+            device.read()
+
+
+def test_unplugged_and_plugged_again(instrument, tmp_path):
+    """A by-id link comes back with another tty behind it."""
+    link = tmp_path / "usb-thermometer"
+    far = instrument({b"T?\r\n": b"T=20.50\r\n"})
+    link.symlink_to(far.port)
+    device = asked(far, port=str(link))
+    device.open()
+    device.read()
+    far.unplug()
+    with pytest.raises(DeviceGone, match="unplugged"):
+        device.read()
+    device.close()
+    link.unlink()
+    with pytest.raises(DeviceGone):
+        device.open()
+    link.symlink_to(instrument({b"T?\r\n": b"T=21.50\r\n"}).port)
+    device.open()
+    assert device.read().values == {"temperature": 21.5}
+    device.close()
+
+
+def test_no_such_port():
+    device = open_device(
+        "thermometer", "serial", {"port": "/dev/ttyNONE", "instrument": "papouch-tm"}, SystemClock()
+    )
+    with pytest.raises(DeviceNotFound, match="dialout"):
+        device.open()
+
+
+def test_a_port_that_another_program_holds(instrument):
+    far = instrument()
+    with asked(far), pytest.raises(DeviceDenied, match="another program holds the port"):
+        asked(far).open()
+
+
+def test_permission_denied(instrument, monkeypatch):
+    far = instrument()
+    original = os.open
+
+    def denied(path, *args, **kwargs):
+        if path == far.port:
+            raise PermissionError(13, "Permission denied")
+        return original(path, *args, **kwargs)
+
+    monkeypatch.setattr(os, "open", denied)
+    with pytest.raises(DeviceDenied, match="dialout"):
+        asked(far).open()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "either instrument"),
+        ({"pattern": "("}, "pattern"),
+        ({"pattern": r"\d+"}, "name the value"),
+        ({"pattern": PATTERN, "checksum": "xor"}, "needs a group"),
+        ({"pattern": PATTERN, "unit": "R"}, "none of C, F, K"),
+        ({"pattern": PATTERN, "framing": "9N1"}, "8N1"),
+        ({"pattern": PATTERN, "baud": 3}, "not within"),
+        ({"instrument": "acme"}, "none of papouch-tm"),
+    ],
+)
+def test_a_wrong_configuration(options, message):
+    with pytest.raises(ConfigurationError, match=message):
+        open_device("thermometer", "serial", {"port": "/dev/null", **options}, SystemClock())

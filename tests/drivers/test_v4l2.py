@@ -1,0 +1,259 @@
+"""V4L2 over the ioctls of a fake kernel device; the laboratory does it with real kernel drivers."""
+
+from __future__ import annotations
+
+import errno
+import sys
+import time
+from types import SimpleNamespace
+
+import linuxpy.ioctl
+import numpy as np
+import pytest
+
+from tests.drivers.fakes.v4l2_kernel import FakeCamera
+from thermocald.errors import (
+    BadReading,
+    ConfigurationError,
+    DeviceDenied,
+    DeviceGone,
+    DeviceNotFound,
+    DeviceTimeout,
+    DriverMissing,
+    WrongDevice,
+)
+from thermocald.hal import SystemClock, VirtualClock, open_device
+
+
+@pytest.fixture
+def kernel(tmp_path, monkeypatch):
+    camera = FakeCamera(tmp_path / "video0")
+    monkeypatch.setattr(linuxpy.ioctl, "fcntl", SimpleNamespace(ioctl=camera.ioctl))
+    return camera
+
+
+def camera(kernel, clock=None, **options):
+    options = {
+        "device": str(kernel.path),
+        "width": 64,
+        "height": 48,
+        "pixel_format": "GREY",
+        "timeout_s": 0.3,
+        **options,
+    }
+    return open_device("camera", "v4l2", options, clock or SystemClock())
+
+
+@pytest.mark.parametrize("pixel_format", ["GREY", "YUYV", "MJPG"])
+def test_a_frame_of_each_format(kernel, pixel_format):
+    with camera(kernel, pixel_format=pixel_format) as device:
+        frame = device.capture()
+    assert frame.image.shape == (48, 64)
+    assert frame.image.dtype == np.uint8
+    assert np.all(frame.image == frame.sequence % 256)
+    assert (frame.encoded is not None) == (pixel_format == "MJPG")
+    assert not frame.image.flags.writeable
+
+
+def test_the_frame_is_fresh_and_its_time_the_buffers(kernel):
+    with camera(kernel, exposure_s=0.002) as device:
+        time.sleep(0.1)  # the queue fills with old frames
+        called = time.monotonic()
+        frame = device.capture()
+    assert frame.monotonic - 0.001 >= called  # exposed after the call
+    assert frame.metadata["stale_frames_dropped"] >= 3
+    assert frame.exposure == 0.002
+    assert abs(frame.utc - time.time()) < 0.1
+
+
+@pytest.mark.parametrize(("flags", "shift"), [(0x2000, -0.05), (0x12000, +0.05)])
+def test_the_time_is_the_middle_of_the_exposure(kernel, flags, shift):
+    kernel.flags = flags
+    stamps = []
+    kernel.stamp = lambda now: stamps.append(now) or now
+    with camera(kernel, exposure_s=0.1) as device:
+        frame = device.capture()
+    assert frame.monotonic == pytest.approx(stamps[-1] + shift, abs=2e-4)
+
+
+def test_times_are_on_the_daemons_clock(kernel):
+    clock = VirtualClock(utc=1_700_000_000.0, monotonic=500.0)
+    with camera(kernel, clock) as device:
+        frame = device.capture()
+    assert frame.monotonic == pytest.approx(500.0, abs=0.05)
+    assert frame.utc == pytest.approx(1_700_000_000.0, abs=0.05)
+
+
+def test_a_driver_without_stamps_says_so(kernel):
+    kernel.flags = 0
+    with camera(kernel) as device:
+        assert device.capture().metadata["timestamp"] == "call"
+
+
+def test_a_stamp_of_another_clock_is_refused(kernel):
+    kernel.stamp = lambda _now: 1_700_000_000.0
+    with camera(kernel) as device, pytest.raises(WrongDevice, match="monotonic clock"):
+        device.capture()
+
+
+def test_manual_controls_are_set(kernel):
+    controls = {"power_line_frequency": 1}
+    with camera(kernel, exposure_s=0.0156, gain=10, controls=controls) as device:
+        frame = device.capture()
+    assert [kernel.controls[c][4] for c in (0x9A0901, 0x9A0902, 0x980913, 0x980918)] == [
+        1, 156, 10, 1,
+    ]  # fmt: skip
+    assert frame.metadata["controls"]["exposure_time_absolute"] == 156
+
+
+def test_a_camera_that_does_not_obey(kernel):
+    kernel.obeys = lambda control, value: 128 if control == 0x980913 else value
+    with pytest.raises(WrongDevice, match="gain was set to 10 and is 128"):
+        camera(kernel, gain=10).open()
+    with camera(kernel, gain=10, strict=False) as device:
+        assert "gain was set to 10" in device.capture().metadata["disobeyed"][0]
+
+
+def test_a_camera_that_falls_back_to_automatic(kernel):
+    with camera(kernel, exposure_s=0.01) as device:
+        device.capture()
+        kernel.controls[0x9A0901][4] = 3
+        with pytest.raises(BadReading, match="auto_exposure was set to 1 and is 3"):
+            device.capture()
+
+
+def test_a_value_out_of_the_cameras_range(kernel):
+    with pytest.raises(WrongDevice, match=r"takes 3 … 2047 in steps of 1"):
+        camera(kernel, exposure_s=2.0).open()
+
+
+def test_a_control_that_it_does_not_have(kernel):
+    with pytest.raises(WrongDevice, match="no control 'zoom'; it has auto_exposure"):
+        camera(kernel, controls={"zoom": 1}).open()
+    with pytest.raises(WrongDevice, match="no control 0x009a090a"):
+        camera(kernel, focus=0).open()
+
+
+def test_a_size_that_it_does_not_have(kernel):
+    with pytest.raises(WrongDevice, match="asked for 1920×1080 GREY, the camera gives 64×48 GREY"):
+        camera(kernel, width=1920, height=1080).open()
+
+
+def test_another_camera_at_the_node(kernel):
+    with pytest.raises(WrongDevice, match=r"this is 'Fake Webcam'"):
+        camera(kernel, card="C920").open()
+
+
+def test_a_node_that_does_not_capture(kernel):
+    kernel.capture_device = False
+    with pytest.raises(WrongDevice, match="no capture device"):
+        camera(kernel).open()
+
+
+def test_a_stalled_camera(kernel):
+    with camera(kernel) as device:
+        device.capture()
+        kernel.stalled = True
+        begin = time.monotonic()
+        with pytest.raises(DeviceTimeout, match=r"no new frame in 0\.3 s"):
+            device.capture()
+        assert time.monotonic() - begin < 0.6
+        kernel.stalled = False
+        device.capture()
+
+
+def test_unplugged_and_plugged_again(kernel):
+    device = camera(kernel)
+    device.open()
+    device.capture()
+    kernel.errors = {"DQBUF": errno.ENODEV, "STREAMOFF": errno.ENODEV, "G_CTRL": errno.ENODEV}
+    with pytest.raises(DeviceGone):
+        device.capture()
+    device.close()
+    kernel.path.rename(kernel.path.with_name("away"))
+    with pytest.raises(DeviceGone):
+        device.open()
+    kernel.path.with_name("away").rename(kernel.path)
+    kernel.errors = {}
+    device.open()
+    device.capture()
+    device.close()
+
+
+def test_it_was_never_there(kernel):
+    kernel.path.unlink()
+    with pytest.raises(DeviceNotFound, match="group video"):
+        camera(kernel).open()
+
+
+@pytest.mark.parametrize(
+    ("call", "number", "error"),
+    [("S_FMT", errno.EBUSY, DeviceDenied), ("STREAMON", errno.EBUSY, DeviceDenied),
+     ("QUERYCAP", errno.EACCES, DeviceDenied), ("STREAMON", errno.EIO, BadReading)],
+)  # fmt: skip
+def test_busy_and_denied(kernel, call, number, error):
+    kernel.errors = {call: number}
+    with pytest.raises(error):
+        camera(kernel).open()
+
+
+def test_a_single_broken_frame_is_skipped(kernel):
+    with camera(kernel) as device:
+        sequence = device.capture().sequence
+        kernel.broken = set(range(sequence + 1, sequence + 5))
+        assert device.capture().sequence >= sequence + 5
+
+
+def test_only_broken_frames(kernel):
+    kernel.broken = set(range(1000))
+    with camera(kernel) as device, pytest.raises(BadReading, match=r"only broken|as broken"):
+        device.capture()
+
+
+@pytest.mark.parametrize(("pixel_format", "keep"), [("GREY", 1000), ("MJPG", 200), ("MJPG", 0)])
+def test_a_partial_frame(kernel, pixel_format, keep):
+    full = kernel.encode
+    kernel.encode = lambda image, fourcc: full(image, fourcc)[:keep]
+    with (
+        camera(kernel, pixel_format=pixel_format) as device,
+        pytest.raises(BadReading, match="partial frame"),
+    ):
+        device.capture()
+
+
+def test_a_jpeg_damaged_in_the_middle(kernel):
+    kernel.encode = lambda _image, _fourcc: b"\xff\xd8" + b"\x55" * 300 + b"\xff\xd9"
+    with (
+        camera(kernel, pixel_format="MJPG") as device,
+        pytest.raises(BadReading, match="broken JPEG"),
+    ):
+        device.capture()
+
+
+def test_by_serial_number(kernel, tmp_path):
+    by_id = tmp_path / "v4l/by-id"
+    by_id.mkdir(parents=True)
+    device = camera(kernel, device=None, serial="8A3F", dev=str(tmp_path))
+    with pytest.raises(DeviceNotFound, match=r"8A3F"):
+        device.open()
+    (by_id / "usb-046d_HD_Pro_Webcam_C920_8A3F-video-index0").symlink_to(kernel.path)
+    (by_id / "usb-046d_HD_Pro_Webcam_C920_8A3F-video-index1").symlink_to(tmp_path / "video1")
+    with device:
+        device.capture()
+    (by_id / "usb-046d_HD_Pro_Webcam_C920_18A3F-video-index0").symlink_to(kernel.path)
+    with pytest.raises(WrongDevice, match="several fit"):
+        device.open()
+
+
+def test_without_linuxpy(kernel, monkeypatch):
+    monkeypatch.setitem(sys.modules, "linuxpy.video.device", None)
+    with pytest.raises(DriverMissing, match=r"thermocald\[v4l2\]"):
+        camera(kernel, backend="linuxpy").open()
+
+
+@pytest.mark.parametrize(
+    "options", [{"device": None}, {"serial": "x"}, {"pixel_format": "PNG"}, {"exposure_s": "long"}]
+)
+def test_a_wrong_configuration(kernel, options):
+    with pytest.raises(ConfigurationError):
+        camera(kernel, **options)

@@ -12,6 +12,7 @@ caller closes and re-opens the device), a `PermanentDeviceError` is reported and
 
 from __future__ import annotations
 
+import inspect
 import threading
 import time
 from dataclasses import dataclass, field
@@ -40,6 +41,7 @@ __all__ = [
     "driver_names",
     "load_driver",
     "open_device",
+    "option_names",
 ]
 
 Kind = Literal["camera", "thermometer", "output"]
@@ -232,6 +234,12 @@ def load_driver(kind: Kind, name: str) -> type[Any]:
     except ImportError as error:
         raise DriverMissing(f"{kind} driver {name!r} cannot be imported: {error}") from error
     return loaded
+
+
+def option_names(kind: Kind, name: str) -> list[str]:
+    """The options that a driver's constructor takes; errors as `load_driver`."""
+    parameters = inspect.signature(load_driver(kind, name)).parameters
+    return [parameter for parameter in parameters if parameter != "clock"]
 
 
 def open_device(kind: Kind, name: str, options: Mapping[str, Any], clock: Clock) -> Any:

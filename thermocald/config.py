@@ -1,0 +1,361 @@
+"""`config.yaml`: what the daemon runs, read and bounded once at start.
+
+Names carry units. A key that is not known is an error that suggests the nearest one that is. Keys
+of a device that are not its own here are options of its driver; `options:` holds those that are
+called like one of ours. Paths are relative to the file, and so are driver options that begin with
+`./` or `../`.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
+
+from thermocald.errors import ConfigurationError
+from thermocald.yaml_file import read_yaml
+
+__all__ = [
+    "CalibrationConfig",
+    "CameraConfig",
+    "Config",
+    "DashboardConfig",
+    "DeviceConfig",
+    "FramesConfig",
+    "LoggingConfig",
+    "OutputConfig",
+    "Prior",
+    "SensorConfig",
+    "StoreConfig",
+    "ThermometerConfig",
+    "load_config",
+    "parse_config",
+]
+
+# kind of device, driver → names of the driver's options
+OptionNames = Callable[[Any, str], Sequence[str]]
+
+InteriorName = Literal["c", "x0", "y0", "A1", "A2", "A3", "B1", "B2", "C1", "C2"]
+ParameterName = Literal[InteriorName, "omega", "phi", "kappa", "X0", "Y0", "Z0"]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
+Period = Annotated[float, Field(ge=0.05, le=86400.0)]
+Positive = Annotated[float, Field(gt=0.0, le=1e9)]
+
+
+def _relative_to_file(value: Path | None, info: ValidationInfo) -> Path | None:
+    if value is None:
+        return None
+    folder: Path = (info.context or {}).get("folder", Path())
+    return folder / value.expanduser()
+
+
+class _Section(BaseModel):
+    """A part of the file: immutable, finite numbers, no unknown keys."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _suggest(cls, data: Any) -> Any:
+        if isinstance(data, dict) and cls.model_config["extra"] == "forbid":
+            for key in data:
+                if key not in cls.model_fields:
+                    raise _unknown(str(key), list(cls.model_fields))
+        return data
+
+
+class StoreConfig(_Section):
+    """Where results go. durable: what is stored survives a power cut, at the price of a sync."""
+
+    path: Path = Field(default=Path("thermocald.db"), validate_default=True)
+    durable: bool = True
+
+    _path = field_validator("path")(_relative_to_file)
+
+
+class FramesConfig(_Section):
+    """Which frames are kept, where, and for how long; None: no limit."""
+
+    keep: Literal["all", "every_n", "events", "none"] = "every_n"
+    every_n: Annotated[int, Field(ge=1, le=1_000_000)] = 360
+    folder: Path = Field(default=Path("frames"), validate_default=True)
+    max_age_days: Positive | None = 90.0
+    max_size_gb: Positive | None = 8.0
+    min_free_gb: Annotated[float, Field(ge=0.0, le=1e6)] = 0.5
+
+    _folder = field_validator("folder")(_relative_to_file)
+
+
+class SensorConfig(_Section):
+    """Size of the image and of a pixel."""
+
+    width_px: Annotated[int, Field(ge=16, le=100_000)]
+    height_px: Annotated[int, Field(ge=16, le=100_000)]
+    pixel_pitch_mm: Annotated[float, Field(gt=0.0, le=0.1)]
+
+
+class Prior(_Section):
+    """A value known beforehand, with its standard deviation, in the parameter's unit."""
+
+    value: float
+    sd: Annotated[float, Field(gt=0.0)]
+
+
+class CalibrationConfig(_Section):
+    """How epochs are adjusted.
+
+    exterior: one orientation per epoch, or one for the series of a camera that stands still;
+    free: what is estimated; fixed: values of what is not; priors: values with their sd; the
+    bounds as in `photogrammetry.geometry`.
+    """
+
+    exterior: Literal["per_epoch", "series"] = "per_epoch"
+    free: tuple[InteriorName, ...] = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2")
+    fixed: dict[InteriorName, float] = Field(default_factory=dict)
+    priors: dict[ParameterName, Prior] = Field(default_factory=dict)
+    sigma_floor_px: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0
+    target_offsets: bool = True
+    correlation_bound: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.9999
+    snooping_alpha: Annotated[float, Field(ge=0.0, le=0.1)] = 0.001
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if both := set(self.free) & set(self.fixed):
+            raise _wrong(f"{min(both)} stands in `free` and in `fixed`")
+        if len(set(self.free)) != len(self.free):
+            raise _wrong("`free` names a parameter twice")
+        return self
+
+
+class DeviceConfig(_Section):
+    """A device: a name for people, a driver (an entry point), and the driver's options."""
+
+    model_config = ConfigDict(extra="allow")
+
+    name: Name
+    driver: Annotated[str, Field(min_length=1)]
+    driver_options: dict[str, Any] = Field(default_factory=dict, alias="options")
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """What the driver's constructor gets."""
+        return {**(self.model_extra or {}), **self.driver_options}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _resolve(cls, data: Any, info: ValidationInfo) -> Any:
+        if not isinstance(data, dict):
+            return data
+        folder: Path = (info.context or {}).get("folder", Path())
+        own = _keys(cls)
+        resolved = {k: v if k in own else _resolved(v, folder) for k, v in data.items()}
+        if isinstance(data.get("options"), dict):
+            resolved["options"] = _resolved(data["options"], folder)
+        return resolved
+
+
+class ThermometerConfig(DeviceConfig):
+    """A thermometer and how often it is read."""
+
+    period_s: Period = 10.0
+
+
+class OutputConfig(DeviceConfig):
+    """Something that is told every epoch's result."""
+
+
+class CameraConfig(DeviceConfig):
+    """A camera, what is known of it, and what it looks at.
+
+    thermometers: by name, the first is the reference; testfield: None if epochs are only
+    acquired; calibration: what differs from the common settings is given in full.
+    """
+
+    period_s: Period = 10.0
+    series: Name = "M1"
+    sensor: SensorConfig | None = None
+    principal_distance_mm: Annotated[float, Field(gt=0.0, le=10_000.0)] | None = None
+    testfield: Path | None = None
+    thermometers: tuple[Name, ...] = ()
+    calibration: CalibrationConfig | None = None
+
+    _testfield = field_validator("testfield")(_relative_to_file)
+
+
+class DashboardConfig(_Section):
+    """The web page; elsewhere than on this machine it needs a token."""
+
+    enabled: bool = False
+    host: str = "127.0.0.1"
+    port: Annotated[int, Field(ge=1, le=65535)] = 8437
+    token_file: Path | None = None
+
+    _token_file = field_validator("token_file")(_relative_to_file)
+
+    @model_validator(mode="after")
+    def _guarded(self) -> Self:
+        local = self.host in ("localhost", "::1") or self.host.startswith("127.")
+        if not local and self.token_file is None:
+            raise _wrong(f"host {self.host} is open to others; name a token_file too")
+        return self
+
+
+class LoggingConfig(_Section):
+    """What goes to the journal."""
+
+    level: Literal["debug", "info", "warning", "error"] = "info"
+
+
+class Config(_Section):
+    """The whole file."""
+
+    store: StoreConfig = Field(default_factory=dict, validate_default=True)
+    frames: FramesConfig = Field(default_factory=dict, validate_default=True)
+    cameras: tuple[CameraConfig, ...] = ()
+    thermometers: tuple[ThermometerConfig, ...] = ()
+    outputs: tuple[OutputConfig, ...] = ()
+    calibration: CalibrationConfig = CalibrationConfig()
+    dashboard: DashboardConfig = DashboardConfig()
+    logging: LoggingConfig = LoggingConfig()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if not self.cameras and not self.thermometers:
+            raise _wrong("there is neither a camera nor a thermometer; nothing would be done")
+        for kind in ("cameras", "thermometers", "outputs"):
+            names = [device.name for device in getattr(self, kind)]
+            for name in names:
+                if names.count(name) > 1:
+                    raise _wrong(f"{kind}: the name {name!r} stands twice")
+        there = [thermometer.name for thermometer in self.thermometers]
+        for camera in self.cameras:
+            for name in camera.thermometers:
+                if name not in there:
+                    raise _wrong(
+                        f"camera {camera.name!r}: there is no thermometer {name!r}"
+                        + _nearest(name, there)
+                    )
+        return self
+
+    def calibration_of(self, camera: CameraConfig) -> CalibrationConfig:
+        """The settings that hold for a camera."""
+        return camera.calibration or self.calibration
+
+
+def load_config(path: Path, option_names: OptionNames | None = None) -> Config:
+    """Read and check `config.yaml`.
+
+    option_names: tells the options of a driver, so that wrong ones are found now and not when the
+    device is opened (`thermocald.hal.option_names`). Raises ConfigurationError naming the file, the
+    dotted key, the value and the bound.
+    """
+    return parse_config(read_yaml(path), path, option_names)
+
+
+def parse_config(
+    document: dict[str, Any], path: Path, option_names: OptionNames | None = None
+) -> Config:
+    """The configuration in a mapping; `path` is what relative paths and messages refer to."""
+    try:
+        config = Config.model_validate(document, context={"folder": path.absolute().parent})
+    except ValidationError as cause:
+        raise ConfigurationError(_in_words(path, cause)) from cause
+    for where, kind, device in _devices(config):
+        _check_options(f"{path}: {where}", kind, device, option_names)
+    for i, camera in enumerate(config.cameras):
+        if camera.testfield is not None and not camera.testfield.is_file():
+            raise ConfigurationError(
+                f"{path}: cameras[{i}].testfield: there is no file {camera.testfield}"
+            )
+    return config
+
+
+def _devices(config: Config) -> Iterator[tuple[str, str, DeviceConfig]]:
+    for kind in ("camera", "thermometer", "output"):
+        for i, device in enumerate(getattr(config, f"{kind}s")):
+            yield f"{kind}s[{i}]", kind, device
+
+
+def _check_options(
+    where: str, kind: str, device: DeviceConfig, option_names: OptionNames | None
+) -> None:
+    own = _keys(type(device))
+    if option_names is not None:
+        known = list(option_names(kind, device.driver))
+        for key in device.options:
+            if key not in known:
+                raise ConfigurationError(
+                    f"{where}.{key}: unknown; neither a key of a {kind} nor an option of driver "
+                    f"{device.driver!r}{_nearest(key, [*own, *known])}"
+                )
+        return
+    for key in device.model_extra or {}:
+        if near := difflib.get_close_matches(key, own, 1, 0.85):
+            raise ConfigurationError(f"{where}.{key}: unknown; is {near[0]!r} meant?")
+
+
+def _keys(section: type[_Section]) -> list[str]:
+    return [field.alias or name for name, field in section.model_fields.items()]
+
+
+def _resolved(value: Any, folder: Path) -> Any:
+    """A driver's option with paths made absolute, also within lists and mappings."""
+    if isinstance(value, str) and re.match(r"\.\.?/", value):
+        return str(folder / value)
+    if isinstance(value, list):
+        return [_resolved(entry, folder) for entry in value]
+    if isinstance(value, dict):
+        return {key: _resolved(entry, folder) for key, entry in value.items()}
+    return value
+
+
+def _wrong(message: str) -> PydanticCustomError:
+    return PydanticCustomError("thermocald", "{message}", {"message": message})
+
+
+def _unknown(key: str, known: list[str]) -> PydanticCustomError:
+    return PydanticCustomError(
+        "unknown_key", "{message}", {"message": f"unknown{_nearest(key, known)}", "key": key}
+    )
+
+
+def _nearest(key: str, known: list[str]) -> str:
+    near = difflib.get_close_matches(key, known, 1, 0.5)
+    return f"; is {near[0]!r} meant?" if near else f"; known are: {', '.join(known) or 'none'}"
+
+
+def _in_words(path: Path, error: ValidationError) -> str:
+    """The first error, as file, dotted key, value and what is allowed."""
+    first = error.errors()[0]
+    where = "".join(
+        f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]
+    ).lstrip(".")
+    context = first.get("ctx", {})
+    if first["type"] == "unknown_key":
+        where = f"{where}.{context['key']}".lstrip(".")
+    more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+    message = first["msg"]
+    if first["type"] == "missing":
+        return f"{path}: {where}: is missing{more}"
+    if first["type"] in ("thermocald", "unknown_key"):
+        return f"{path}: {where + ': ' if where else ''}{message}{more}"
+    message = message[0].lower() + message[1:]
+    return f"{path}: {where}: is {_short(first['input'])}; {message}{more}"
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}…"

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     Single = NDArray[np.float32]
     Image = NDArray[np.uint8] | NDArray[np.uint16]
 
-__all__ = ["CircleFit", "fit_circles", "windows"]
+__all__ = ["CircleFit", "Windows", "fit_circles", "windows"]
 
 REACH_PX = 4.5
 """Pixels farther from the outline carry nothing about the centre."""
@@ -75,12 +75,15 @@ class CircleFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Windows:
-    """The pixels about some targets: rows of the targets; origin (n, 2) px; x, y relative to it,
-    grey, weight (n, k); k is padded, the padding has weight 0. begin (n, 10): parameters to begin
-    with; cut (n,): whether the image's edge cuts the target.
+    """The pixels about some targets.
+
+    rows (n,) of the targets; pixel (n, k): place in the flat image; origin (n, 2) px; x, y relative
+    to it, grey, weight (n, k); k is padded, the padding has weight 0. begin (n, 10): parameters to
+    begin with; cut (n,): whether the image's edge cuts the target.
     """
 
     rows: NDArray[np.int64]
+    pixel: NDArray[np.int64]
     origin: Array
     x: Single
     y: Single
@@ -152,7 +155,8 @@ def windows(
         weight = (np.arange(k)[None] < count[:, None]).astype(np.float32)
         px, py = lx[0][at], ly[0][at]
         pixel = (py + origin[:, 1:]) * width + (px + origin[:, :1])
-        grey = flat[np.where(weight > 0, pixel, 0)].astype(np.float32)
+        pixel *= weight > 0
+        grey = flat[pixel].astype(np.float32)
         dk = d[np.arange(len(rows))[:, None], at]
         outside, inside = weight * (dk < -1.5), weight * (dk > 1.0)
         begin = np.zeros((len(rows), 10))
@@ -163,8 +167,8 @@ def windows(
         begin[:, 7] -= begin[:, 6]
         begin[:, 7] += np.abs(begin[:, 7]) < 1
         yield Windows(
-            rows, origin.astype(float), px.astype(np.float32), py.astype(np.float32), grey,
-            weight, begin, cut,
+            rows, pixel, origin.astype(float), px.astype(np.float32), py.astype(np.float32),
+            grey, weight, begin, cut,
         )  # fmt: skip
 
 

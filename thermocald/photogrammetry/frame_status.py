@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
+import cv2
 import numpy as np
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ Word = Literal[
 
 _LEAST_CONTRAST = 8.0  # DN of 255 between the darkest and brightest percentile
 _HALF_SHARE = 0.15
-_STRIDE = 4
+_REDUCED = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +63,9 @@ def inspect_frame(image: NDArray[Any], size: tuple[int, int] | None = None) -> F
             f"the frame has {width}×{height} px, the camera is set up for "
             f"{size[0]}×{size[1]} px{turned}",
         )
-    sample = image[::_STRIDE, ::_STRIDE]
+    # Averaged, so that the noise of a dark frame does not pass for contrast.
+    small = (max(width // _REDUCED, 1), max(height // _REDUCED, 1))
+    sample = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
     low, high = (int(v) for v in np.percentile(sample, (0.5, 99.5), method="nearest"))
     top = 255 if image.dtype == np.uint8 else max(int(sample.max()), 1023)
     if high - low < _LEAST_CONTRAST / 255 * top:
@@ -72,7 +75,7 @@ def inspect_frame(image: NDArray[Any], size: tuple[int, int] | None = None) -> F
             return FrameStatus("white", f"the frame is white (99 % of it at least {low} DN)")
         return FrameStatus("flat", f"the frame shows nothing (grey values {low} to {high} DN)")
     broken = _constant_rows(image)
-    if broken >= _HALF_SHARE * height and _noise(sample[: (height - broken) // _STRIDE]) > 0:
+    if broken >= _HALF_SHARE * height and _noise(image[: height - broken : 4, ::4]) > 0:
         return FrameStatus(
             "half",
             f"the frame is incomplete: its last {broken} of {height} rows hold one grey value",

@@ -32,9 +32,12 @@ if TYPE_CHECKING:
 
 __all__ = [
     "DetectedMarkers",
+    "MarkerCorners",
     "detect_markers",
     "is_marker",
+    "locate_markers",
     "marker_rows",
+    "measure_corners",
     "measure_markers",
     "parse_marker",
     "to_8_bit",
@@ -164,21 +167,47 @@ def marker_rows(testfield: TestField) -> dict[str, dict[tuple[int, int], int]]:
     return rows
 
 
-def measure_markers(
-    image: Image, testfield: TestField, missed: dict[int, str] | None = None
-) -> Observations:
-    """Measure the marker corners of a test field in an image (H, W), grey, 8 or 16 bit.
-
-    Returns the corners found, with standard deviation and covariance of each, and as quality
-    `blur` px, `contrast`, `grey` (background), `noise` DN, `saturation` (share of pixels).
-    `missed` receives {row: reason} for corners of markers that were found but not measured, and
-    for those not found at all.
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerCorners:
+    """Marker corners as found: rows (n,) of the test field, corners (n, 2) px and their neighbours
+    along the outline, before and after (n, 2) px; cell (n,) px, width of the marker's border.
     """
-    rows_of = marker_rows(testfield)
+
+    rows: NDArray[np.int64]
+    corners: Array
+    before: Array
+    after: Array
+    cell: Array
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def moved(self, found: Observations) -> MarkerCorners:
+        """With corners and neighbours moved by what `found` says of these corners."""
+        at = {int(row): i for i, row in enumerate(found.targets)}
+        shift = np.array(
+            [
+                found.points[at[row]] - corner if row in at else (np.nan, np.nan)
+                for row, corner in zip(self.rows.tolist(), self.corners, strict=True)
+            ]
+        ).reshape(-1, 2)
+        if np.isfinite(shift).any():
+            shift = np.where(np.isfinite(shift), shift, np.nanmedian(shift, axis=0))
+        else:
+            shift = np.zeros_like(shift)
+        return MarkerCorners(
+            self.rows, self.corners + shift, self.before + shift, self.after + shift, self.cell
+        )
+
+
+def locate_markers(
+    image: Image, testfield: TestField, missed: dict[int, str] | None = None
+) -> MarkerCorners:
+    """Find a test field's markers; `missed` receives {row: reason} for corners not found."""
     missed = {} if missed is None else missed
     rows: list[int] = []
     corners, before, after, cell = [], [], [], []
-    for dictionary, known in rows_of.items():
+    for dictionary, known in marker_rows(testfield).items():
         expected = frozenset(marker for marker, _ in known)
         found = detect_markers(image, dictionary, expected)
         cells = _dictionary(dictionary).markerSize + 2
@@ -196,7 +225,19 @@ def measure_markers(
                     missed[row] = "too small"
         missing = expected.difference(found.numbers.tolist())
         missed.update({r: "not found" for (m, _), r in known.items() if m in missing})
-    fit = fit_corners(image, _xy(corners), _xy(before), _xy(after), np.array(cell, dtype=float))
+    return MarkerCorners(
+        np.array(rows, dtype=np.int64), _xy(corners), _xy(before), _xy(after),
+        np.array(cell, dtype=float),
+    )  # fmt: skip
+
+
+def measure_corners(
+    image: Image, found: MarkerCorners, missed: dict[int, str] | None = None
+) -> Observations:
+    """Measure marker corners where they were found; `missed` receives reasons for the others."""
+    missed = {} if missed is None else missed
+    fit = fit_corners(image, found.corners, found.before, found.after, found.cell)
+    rows = found.rows.tolist()
     missed.update({row: why for row, why in zip(rows, fit.reasons, strict=True) if why})
     order = sorted((row, i) for i, row in enumerate(rows) if not fit.reasons[i])
     keep = np.array([i for _, i in order], dtype=np.int64)
@@ -213,6 +254,19 @@ def measure_markers(
             "saturation": fit.saturation[keep],
         },
     )
+
+
+def measure_markers(
+    image: Image, testfield: TestField, missed: dict[int, str] | None = None
+) -> Observations:
+    """Measure the marker corners of a test field in an image (H, W), grey, 8 or 16 bit.
+
+    Returns the corners found, with standard deviation and covariance of each, and as quality
+    `blur` px, `contrast`, `grey` (background), `noise` DN, `saturation` (share of pixels).
+    `missed` receives {row: reason} for corners of markers that were found but not measured, and
+    for those not found at all.
+    """
+    return measure_corners(image, locate_markers(image, testfield, missed), missed)
 
 
 def _xy(points: list[Array]) -> Array:

@@ -9,7 +9,7 @@ itself, and plain circles need no search.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import cv2
@@ -17,15 +17,17 @@ import numpy as np
 
 from thermocald.errors import GeometryError
 from thermocald.photogrammetry import ring_code
-from thermocald.photogrammetry.camera_model import Sensor
+from thermocald.photogrammetry.camera_model import CameraModel, Sensor
 from thermocald.photogrammetry.circle import fit_circles
 from thermocald.photogrammetry.detection import Candidates, find_circles, read_codes
 from thermocald.photogrammetry.frame_status import OK, FrameStatus, inspect_frame
 from thermocald.photogrammetry.identification import Orientation, orient, refine
 from thermocald.photogrammetry.markers import (
+    MarkerCorners,
     detect_markers,
     is_marker,
-    measure_markers,
+    locate_markers,
+    measure_corners,
     parse_marker,
     to_8_bit,
 )
@@ -45,7 +47,7 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
     Image = NDArray[np.uint8] | NDArray[np.uint16]
 
-__all__ = ["Measurement", "Prior", "measure", "predicted_maps"]
+__all__ = ["Measurement", "Prior", "circle_observations", "join", "measure", "predicted_maps"]
 
 _FEWEST = 4
 _SEARCHES = ((2, -1), (2, 1), (1, -1), (1, 1))  # scale, ink
@@ -74,14 +76,15 @@ class Prior:
 @dataclass(frozen=True, slots=True, eq=False)
 class Measurement:
     """What a frame gave: observations (none where the status is not ok), {row: reason} for targets
-    of the field that are in view and not measured, and the approximate orientation (None where
-    the targets did not carry one).
+    of the field that are in view and not measured, the approximate orientation (None where the
+    targets did not carry one), and where the marker corners are.
     """
 
     observations: Observations
     status: FrameStatus = OK
     missed: dict[int, str] = field(default_factory=dict)
     orientation: Orientation | None = None
+    markers: MarkerCorners | None = None
 
 
 def measure(
@@ -105,19 +108,32 @@ def measure(
         return Measurement(_nothing(), status)
     sensor = prior.sensor or Sensor(image.shape[1], image.shape[0], 1.0)
     missed: dict[int, str] = {}
-    corners = measure_markers(image, testfield, missed)
+    markers = locate_markers(image, testfield, missed)
+    corners = measure_corners(image, markers, missed)
+    found = _measure(image, testfield, prior, sensor, corners, missed, eccentricity)
+    return replace(found, markers=markers)
+
+
+def _measure(
+    image: Image,
+    testfield: TestField,
+    prior: Prior,
+    sensor: Sensor,
+    corners: Observations,
+    missed: dict[int, str],
+    eccentricity: bool,
+) -> Measurement:
+    """The circles, once the marker corners are known."""
     circles = np.array([kind == "circle" for kind in testfield.kinds], dtype=bool)
     if not circles.any():
         return _finish(testfield, corners, missed, None, foreign=False)
 
     if prior.interior is not None and prior.exterior is not None:
-        from thermocald.photogrammetry.camera_model import CameraModel
-
         known = Orientation(CameraModel(sensor, prior.interior), prior.exterior, np.zeros((0, 2)))
         found = _measure_circles(image, testfield, known, corners, None, eccentricity)
         if len(found[0]) >= max(_FEWEST, 0.5 * (len(found[0]) + len(found[1]))):
             missed.update(found[1])
-            return _finish(testfield, _join(corners, found[0]), missed, found[2], False)
+            return _finish(testfield, join(corners, found[0]), missed, found[2], False)
 
     rows, points, maps, foreign = _find_coded(image, testfield, len(corners) < _FEWEST)
     pair_rows = np.concatenate([corners.targets, rows])
@@ -143,7 +159,7 @@ def measure(
         image, testfield, orientation, corners, prior.interior, eccentricity
     )
     missed.update(lost)
-    return _finish(testfield, _join(corners, measured), missed, orientation, foreign)
+    return _finish(testfield, join(corners, measured), missed, orientation, foreign)
 
 
 def predicted_maps(
@@ -230,9 +246,16 @@ def _observations(
     for i in np.nonzero(off > limit)[0]:
         reasons[i] = reasons[i] or "not where the target must be"
     good = np.array([not reason for reason in reasons], dtype=bool)
-    c = fit.covariances[good]
-    p = fit.parameters[good]
-    observations = Observations(
+    observations = circle_observations(rows, fit, good)
+    return observations, {int(r): why for r, why in zip(rows, reasons, strict=True) if why}
+
+
+def circle_observations(
+    rows: NDArray[np.int64], fit: CircleFit, good: NDArray[np.bool_]
+) -> Observations:
+    """Some of the fits (mask) as observations of the test field's rows (n,)."""
+    c, p = fit.covariances[good], fit.parameters[good]
+    return Observations(
         rows[good].astype(np.int64),
         p[:, :2],
         np.sqrt(np.stack([c[:, 0, 0], c[:, 1, 1]], axis=-1)),
@@ -246,7 +269,6 @@ def _observations(
             "misfit": fit.misfit[good],
         },
     )
-    return observations, {int(r): why for r, why in zip(rows, reasons, strict=True) if why}
 
 
 def _find_coded(
@@ -334,17 +356,8 @@ def _few(
     fit = fit_circles(image, maps, coded)
     good = fit.good
     missed.update({int(r): why for r, why in zip(rows, fit.reasons, strict=True) if why})
-    c = fit.covariances[good]
-    p = fit.parameters[good]
-    circles = Observations(
-        rows[good], p[:, :2], np.sqrt(np.stack([c[:, 0, 0], c[:, 1, 1]], axis=-1)), c[:, 0, 1],
-        {
-            "blur": p[:, 5], "contrast": p[:, 7], "grey": p[:, 6],
-            "noise": np.sqrt(fit.noise.variance(p[:, 6])).astype(float),
-            "saturation": fit.saturation[good], "misfit": fit.misfit[good],
-        },
-    )  # fmt: skip
-    return _finish(testfield, _join(corners, circles), missed, None, foreign)
+    circles = circle_observations(rows, fit, good)
+    return _finish(testfield, join(corners, circles), missed, None, foreign)
 
 
 def _finish(
@@ -374,8 +387,8 @@ def _finish(
     return Measurement(observations, status, missed, orientation)
 
 
-def _join(first: Observations, second: Observations) -> Observations:
-    """Both, in the order of the test field."""
+def join(first: Observations, second: Observations) -> Observations:
+    """The observations of both, in the order of the test field; no target may be in both."""
     if len(second) == 0:
         return first
     targets = np.concatenate([first.targets, second.targets])

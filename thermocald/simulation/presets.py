@@ -1,0 +1,226 @@
+"""Presets: the cameras of the reference study, with the drift that it reports.
+
+Elias, Eltner, Liebold, Maas (2020): Assessing the Influence of Temperature Changes on the Geometric
+Stability of Smartphone- and Raspberry Pi Cameras, Sensors 20, 643, sections 4.1 and 4.2. What the
+text states is put in: size and direction of the drift of principal point and principal distance
+between the first and the last of 150 epochs (the RPi: at the highest temperature), σ0 growing to
+3.5 times, the RPi's way back that is not complete. The rates per kelvin follow from that and from
+the course of the temperature. What it does not state is of usual size: temperatures, distortion
+(its drift is small, as the text says), image noise, and the proportion of x to y in the drift.
+
+Sensor and lens data:
+
+* RPi camera v2.1: Raspberry Pi documentation, camera, hardware specification: IMX219,
+  3280 × 2464 px of 1.12 µm, focal length 3.04 mm, f/2.0.
+* LG Google Nexus 5: sensor Sony IMX179 (1/3.2 inch, 3264 × 2448 px of 1.4 µm), f/2.4; focal length
+  3.97 mm as the phone writes it into EXIF.
+* Samsung Galaxy S8: sensor Sony IMX333 or Samsung S5K2L2 (1/2.55 inch, 4032 × 3024 px of 1.4 µm),
+  f/1.7; focal length 4.2 mm as the phone writes it into EXIF.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.errors import ConfigurationError
+from thermocald.photogrammetry.camera_model import InteriorOrientation, Sensor
+from thermocald.simulation.course import Course
+from thermocald.simulation.device import CameraDevice, Measuring
+from thermocald.simulation.heat import HeatNetwork, Link
+from thermocald.simulation.model import ModelEffect, ThermalModel
+from thermocald.simulation.observations import Simulation
+from thermocald.simulation.programme import Programme
+from thermocald.simulation.testfields import corner_field, corner_view
+from thermocald.simulation.thermometer import SimulatedThermometer
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from thermocald.photogrammetry.testfield import TestField
+
+__all__ = ["PRESETS", "Preset", "preset_names", "preset_simulation"]
+
+_EPOCHS = 150
+_INTERVAL_S = 10.0
+_HEATED_S = 750.0  # the RPi's lamp is on for the first half
+
+
+@dataclass(frozen=True)
+class Preset:
+    """One camera in one state, as the reference reports it.
+
+    interior at T0; drift_px, drift_c_mm: of principal point and principal distance over the whole
+    warming; direction_deg: of the principal point's way, in the image (x right, y up); begin_degc,
+    end_degc: temperature at power-on and in equilibrium; noise_ratio: σ0 at the highest temperature
+    over σ0 at the begin; set_share: share of the principal point's way that does not come back;
+    lamp: heated from outside, then left to cool; distortion_drift: A1, B1, B2 over the warming.
+    """
+
+    name: str
+    about: str
+    camera: str
+    sensor: Sensor
+    interior: InteriorOrientation
+    f_number: float
+    distance_mm: float
+    drift_px: float
+    direction_deg: float
+    drift_c_mm: float
+    begin_degc: float
+    end_degc: float
+    noise_ratio: float = 1.0
+    set_share: float = 0.0
+    lamp: bool = False
+    distortion_drift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+_NEXUS = Sensor(3264, 2448, 0.0014)
+_NEXUS_INTERIOR = InteriorOrientation(
+    c=3.97, x0=0.021, y0=-0.034, A1=0.0051, A2=-4.0e-4, B1=1.2e-4, B2=-0.9e-4
+)
+_S8 = Sensor(4032, 3024, 0.0014)
+_S8_INTERIOR = InteriorOrientation(
+    c=4.2, x0=-0.017, y0=0.042, A1=0.0062, A2=-3.6e-4, B1=-0.7e-4, B2=1.1e-4
+)
+_RPI = Sensor(3280, 2464, 0.00112)
+_RPI_INTERIOR = InteriorOrientation(
+    c=3.04, x0=0.012, y0=-0.018, A1=-0.0040, A2=5.0e-4, B1=1.0e-4, B2=-2.0e-4
+)
+
+PRESETS: Mapping[str, Preset] = {
+    p.name: p
+    for p in (
+        Preset(
+            "nexus5-cold", "LG Google Nexus 5, switched on cold, warms itself",
+            "nexus5", _NEXUS, _NEXUS_INTERIOR, 2.4, 1330.0,
+            drift_px=16.0, direction_deg=-28.0, drift_c_mm=0.007, begin_degc=23.0, end_degc=40.0,
+            distortion_drift=(2e-5, -2e-5, 1e-5),
+        ),
+        Preset(
+            "nexus5-warm", "LG Google Nexus 5, warm already",
+            "nexus5", _NEXUS, _NEXUS_INTERIOR, 2.4, 1330.0,
+            drift_px=8.0, direction_deg=-28.0, drift_c_mm=0.003, begin_degc=32.0, end_degc=40.0,
+            distortion_drift=(1e-5, -1e-5, 0.5e-5),
+        ),
+        Preset(
+            "galaxy-s8-cold", "Samsung Galaxy S8, switched on cold, warms itself",
+            "galaxy-s8", _S8, _S8_INTERIOR, 1.7, 1200.0,
+            drift_px=40.0, direction_deg=152.0, drift_c_mm=0.007, begin_degc=23.0, end_degc=45.0,
+            noise_ratio=1.8, distortion_drift=(3e-5, 0.0, 0.0),
+        ),
+        Preset(
+            "galaxy-s8-warm", "Samsung Galaxy S8, warm already",
+            "galaxy-s8", _S8, _S8_INTERIOR, 1.7, 1200.0,
+            drift_px=11.0, direction_deg=152.0, drift_c_mm=0.003, begin_degc=37.0, end_degc=43.0,
+            noise_ratio=1.2, distortion_drift=(1e-5, 0.0, 0.0),
+        ),
+        Preset(
+            "rpi-v2.1-heating", "Raspberry Pi camera v2.1, heated by a lamp, then left to cool",
+            "rpi-v2.1", _RPI, _RPI_INTERIOR, 2.0, 1330.0,
+            drift_px=10.5, direction_deg=-150.0, drift_c_mm=0.005, begin_degc=25.0, end_degc=52.0,
+            noise_ratio=3.5, set_share=0.06, lamp=True, distortion_drift=(2e-5, -2e-5, -2e-5),
+        ),
+    )
+}  # fmt: skip
+"""The presets by name."""
+
+
+def preset_names() -> tuple[str, ...]:
+    """The names of the presets."""
+    return tuple(PRESETS)
+
+
+def _device(preset: Preset) -> CameraDevice:
+    """A module close to a body that gives its heat to the air: 63 % of the way after 300 s."""
+    loss = 0.2375
+    network = HeatNetwork(
+        {"board": 15.0, "housing": 52.0, "lens": 0.8, "sensor": 0.4},
+        (
+            Link("board", "housing", 6.0),
+            Link("lens", "housing", 0.4),
+            Link("sensor", "lens", 0.2),
+            Link("housing", "ambient", loss),
+        ),
+    )
+    thermometers = {
+        "temperature": SimulatedThermometer("lens"),
+        "board_temperature": SimulatedThermometer("board"),
+    }
+    return CameraDevice(
+        preset.camera, preset.sensor, network, thermometers, distance=preset.distance_mm,
+        measuring=Measuring(),
+    )  # fmt: skip
+
+
+def _programme(preset: Preset, device: CameraDevice, series: str) -> Programme:
+    (loss,) = (k.conductance for k in device.network.links if k.second == "ambient")
+    duration = (_EPOCHS - 1) * _INTERVAL_S
+    ambient = preset.begin_degc if preset.lamp else 23.0
+    power = loss * (preset.end_degc - ambient)
+    if preset.lamp:
+        sources = {"housing": Course.steps([0.0, _HEATED_S, duration + 60.0], [power, 0.0])}
+    else:
+        sources = {"board": Course.constant(power)}
+    return Programme(
+        preset.name,
+        _EPOCHS,
+        _INTERVAL_S,
+        {"ambient": Course.constant(ambient)},
+        sources,
+        series,
+        initial=preset.begin_degc,
+    )
+
+
+def preset_simulation(
+    name: str, seed: int = 0, series: str = "M1", field: TestField | None = None
+) -> Simulation:
+    """A preset ready to run, by default before a corner field of 147 circles.
+
+    Raises ConfigurationError for a name that is not among the presets.
+    """
+    if name not in PRESETS:
+        raise ConfigurationError(f"unknown preset {name!r}; known are: {', '.join(PRESETS)}")
+    preset = PRESETS[name]
+    device = _device(preset)
+    programme = _programme(preset, device, series)
+    test_field = field if field is not None else corner_field("circles", 7, 90.0)
+    bare = ThermalModel(
+        preset.camera,
+        preset.sensor,
+        preset.begin_degc,
+        preset.interior,
+        exterior=corner_view(test_field, preset.distance_mm),
+        image_sigma=device.measuring.sigma,
+        name=preset.name,
+    )
+    # without jitter the temperature at the frames hangs neither on the seed nor on the drift
+    course = Simulation(bare, device, test_field, programme).true_history.temperature()
+    warming = float(np.max(np.abs(course - course[0])))
+    angle = np.deg2rad(preset.direction_deg)
+    way = preset.drift_px * preset.sensor.pixel_pitch * np.array([np.cos(angle), np.sin(angle)])
+    x0, y0 = (float(v) for v in way * (1.0 - preset.set_share) / warming)
+    model = replace(
+        bare,
+        rates={"c": preset.drift_c_mm / warming, "x0": x0, "y0": y0},
+        effects=tuple(_effects(preset, way, warming)),
+    )
+    return Simulation(model, device, test_field, programme, seed)
+
+
+def _effects(preset: Preset, way: Any, warming: float) -> list[ModelEffect]:
+    found = []
+    if preset.set_share:
+        x0, y0 = (float(v) for v in way * preset.set_share / warming)
+        found.append(ModelEffect("permanent_set", {"x0": x0, "y0": y0}))
+    a1, b1, b2 = preset.distortion_drift
+    if a1:
+        found.append(ModelEffect("radial_distortion_drift", {"A1": a1 / warming}))
+    if b1 or b2:
+        found.append(ModelEffect("decentering_drift", {"B1": b1 / warming, "B2": b2 / warming}))
+    if preset.noise_ratio != 1.0:
+        found.append(ModelEffect("defocus", {"factor": (preset.noise_ratio - 1.0) / warming}))
+    return found

@@ -1,17 +1,20 @@
 """A camera that is rendered: a known test field, a known thermal drift.
 
-    camera:
-      driver: mock
-      testfield: markers            # markers, circles, plain, or the path of a testfield.csv
-      model: camera.thermal.yaml    # default: an RPi camera v2.1, half a pixel per kelvin
-      temperatures: [[0, 25.0], [700, 50.0], [1500, 27.0]]   # s since the first open, °C
-      seed: 0                       # of the noise; a frame's noise hangs on its number alone
-      exposure_s: 0.02
-      latency_s: 0.3                # from the call to the end of the exposure
-      faults: {…}                   # see `faults`
+    cameras:
+      - name: mock
+        driver: mock
+        testfield: markers            # markers, circles, plain, or the path of a testfield.csv
+        model: camera.thermal.yaml    # default: an RPi camera v2.1, half a pixel per kelvin
+        programme: [[0, 25.0], [700, 50.0], [1500, 27.0]]   # s since the first open, °C
+        seed: 0                       # of the noise, which hangs on the instant alone
+        exposure_s: 0.02
+        latency_s: 0.3                # from the call to the end of the exposure
+        faults: []                    # see thermocald_drivers/faults.py
+        timeout_s: 1
 
-Between the given temperatures it is a straight line, before and after them constant; the camera
-keeps its own clock from the first `open` on, so that unplugging it does not cool it.
+Between the programme's points it is a straight line, before and after them constant: the mock
+thermometer's programme, and its default, so that both together are a warming camera. The device
+has its own time from the first `open` on: unplugging it does not cool it.
 """
 
 from __future__ import annotations
@@ -22,64 +25,57 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.errors import ConfigurationError, DeviceGone
-from thermocald.hal import Camera, Frame, SystemClock
+from thermocald.hal import Camera, Frame
+from thermocald_drivers import support
+from thermocald_drivers.faults import Faults
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from numpy.typing import NDArray
+
     from thermocald.hal import Clock
-    from thermocald.simulation.model import Prediction
+    from thermocald.photogrammetry.testfield import TestField
+    from thermocald.simulation.model import Prediction, ThermalModel
+    from thermocald.simulation.scene import Scene
 
 __all__ = ["MockCamera"]
 
 
 class MockCamera(Camera):
-    """Renders what a warming camera would see; obeys the rules of hardware."""
+    """Renders what a warming camera would see; the same instants give the same frames."""
 
     def __init__(
         self,
-        clock: Clock | None = None,
+        *,
+        clock: Clock,
         testfield: str = "markers",
         model: str | None = None,
-        temperatures: Sequence[Sequence[float]] = ((0.0, 25.0), (700.0, 50.0), (1500.0, 27.0)),
+        programme: Sequence[Sequence[float]] = ((0.0, 25.0), (700.0, 50.0), (1500.0, 27.0)),
         seed: int = 0,
         exposure_s: float = 0.02,
         latency_s: float = 0.3,
+        faults: Sequence[Mapping[str, object]] = (),
+        timeout_s: float = 1.0,
     ) -> None:
-        self.clock = clock or SystemClock()
-        self._testfield = testfield
-        self._model_path = model
-        self._seed = seed
-        self._exposure = exposure_s
-        self._latency = max(latency_s, exposure_s)
-        course = np.array(temperatures, dtype=float)
-        if course.ndim != 2 or course.shape[1] != 2 or not np.isfinite(course).all():
-            raise ConfigurationError("mock camera: temperatures must be [[seconds, °C], …]")
-        if np.any(np.diff(course[:, 0]) <= 0):
-            raise ConfigurationError("mock camera: the times of temperatures must increase")
-        self._course = course
+        self.clock = clock
+        self._testfield = support.text("testfield", testfield)
+        self._model_path = None if model is None else support.text("model", model)
+        self._times, self._values = _programme(programme)
+        self._seed = int(support.number("seed", seed, 0, 2**31, whole=True))
+        self._exposure_s = support.number("exposure_s", exposure_s, 1e-6, 10.0, "s")
+        latency = support.number("latency_s", latency_s, 0.0, 60.0, "s")
+        self._latency_s = max(latency, self._exposure_s)
+        self.faults = Faults("mock camera", clock, faults, timeout_s)
         self._begin: float | None = None
         self._sequence = 0
         self._open = False
-        self._scene: Any = None
+        self._scene: Scene | None = None
+        self._last: NDArray[np.uint8] | None = None
 
     def open(self) -> None:
-        if self._scene is None:
-            from thermocald.simulation.demonstration import demonstration_model, load_field
-            from thermocald.simulation.model_file import read_model
-            from thermocald.simulation.scene import Scene
-
-            self.field = load_field(self._testfield)
-            if self._model_path:
-                self.model = read_model(Path(self._model_path))
-            else:
-                self.model = demonstration_model(self.field)
-            if self.model.exterior is None:
-                raise ConfigurationError(
-                    f"mock camera: the model {self._model_path} has no exterior orientation; "
-                    "add one, the camera must stand somewhere"
-                )
-            self._scene = Scene(self.model.sensor, self.field)
+        self.faults.on_open()
+        _ = self.scene
         if self._begin is None:
             self._begin = self.clock.monotonic()
         self._open = True
@@ -88,49 +84,78 @@ class MockCamera(Camera):
         self._open = False
 
     def identity(self) -> Mapping[str, str]:
-        return {
-            "name": "mock",
-            "testfield": self._testfield,
-            "model": self._model_path or "built in",
-        }
+        return {"name": "mock camera", "serial": f"mock-{self._seed}", "testfield": self._testfield}
+
+    @property
+    def scene(self) -> Scene:
+        """The test field before the camera; loaded when first asked for."""
+        if self._scene is None:
+            from thermocald.simulation.demonstration import demonstration_model, load_field
+            from thermocald.simulation.model_file import read_model
+            from thermocald.simulation.scene import Scene
+
+            field = load_field(self._testfield)
+            if self._model_path is None:
+                self._model = demonstration_model(field)
+            else:
+                self._model = read_model(Path(self._model_path))
+            if self._model.exterior is None:
+                raise ConfigurationError(
+                    f"{self._model_path}: has no exterior orientation; the mock camera must stand "
+                    "somewhere before its test field"
+                )
+            self._scene = Scene(self._model.sensor, field)
+        return self._scene
+
+    @property
+    def field(self) -> TestField:
+        """The test field that is drawn."""
+        return self.scene.field
+
+    @property
+    def model(self) -> ThermalModel:
+        """The true thermal model."""
+        _ = self.scene
+        return self._model
 
     def capture(self) -> Frame:
         if not self._open:
             raise DeviceGone("mock camera: it is not open")
-        start = self.clock.monotonic()
-        self.clock.sleep_until(start + self._latency)
-        monotonic = self.clock.monotonic() - 0.5 * self._exposure
-        utc = self.clock.utc() - 0.5 * self._exposure
+        kind = self.faults.on_call()
+        self.clock.sleep_until(self.clock.monotonic() + self._latency_s)
+        self.faults.refuse(kind, "frame")
+        monotonic = self.clock.monotonic() - 0.5 * self._exposure_s
+        utc = self.clock.utc() - 0.5 * self._exposure_s
         self._sequence += 1
-        image = self.picture(monotonic)
-        return Frame(
-            image,
-            monotonic,
-            utc,
-            exposure=self._exposure,
-            sequence=self._sequence,
-            metadata={"driver": "mock", "temperature": self.temperature(monotonic)},
-        )
-
-    def picture(self, monotonic: float) -> Any:
-        """What the camera sees at an instant, (H, W) 8 bit."""
-        p = self.truth(monotonic)
-        points = p.points(self.field.points)[0] if p.moves_points else None
-        seed = self._seed * 1_000_003 + self._sequence
-        return self._scene.render(p.iop[0], p.eop[0], points, seed, float(p.blur_factor[0]))
-
-    def temperature(self, monotonic: float) -> float:
-        """The true temperature °C at an instant of the monotonic clock."""
-        elapsed = monotonic - (self._begin if self._begin is not None else monotonic)
-        return float(np.interp(elapsed, self._course[:, 0], self._course[:, 1]))
+        if kind != "stuck" or self._last is None:
+            self._last = self._picture(monotonic)
+        return Frame(self._last, monotonic, utc, exposure=self._exposure_s, sequence=self._sequence)
 
     def truth(self, monotonic: float) -> Prediction:
         """The true orientation and effects at an instant of the monotonic clock."""
         from thermocald.simulation.history import History
 
-        elapsed = monotonic - (self._begin if self._begin is not None else monotonic)
-        times, values = self._course.T
-        return self.model.predict(
-            History(np.array([elapsed]), times, {"temperature": values}, "temperature", 0.0),
-            self.field,
+        elapsed = monotonic - (monotonic if self._begin is None else self._begin)
+        readings = {"temperature": self._values}
+        history = History(np.array([elapsed]), self._times, readings, "temperature", 0.0)
+        return self.model.predict(history, self.field)
+
+    def _picture(self, monotonic: float) -> Any:
+        truth = self.truth(monotonic)
+        points = truth.points(self.field.points)[0] if truth.moves_points else None
+        seed = [self._seed, round(monotonic * 1e6) & 2**63 - 1]
+        return self.scene.render(
+            truth.iop[0], truth.eop[0], points, seed, float(truth.blur_factor[0])
         )
+
+
+def _programme(points: object) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    try:
+        course = np.array(points, dtype=float)
+    except (TypeError, ValueError):
+        course = np.empty(0)
+    if course.ndim != 2 or course.shape[1] != 2 or not np.isfinite(course).all():
+        raise ConfigurationError("programme: must be a list of [seconds, °C]")
+    if np.any(np.diff(course[:, 0]) <= 0):
+        raise ConfigurationError("programme: its times must increase")
+    return course[:, 0], course[:, 1]

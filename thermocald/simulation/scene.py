@@ -25,6 +25,8 @@ from thermocald.simulation.raster import blur, coverage, windows_around
 from thermocald.simulation.shapes import Outlines, outlines, surface_normals
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from thermocald.photogrammetry.camera_model import Sensor
@@ -106,7 +108,7 @@ class Scene:
         iop: Array,
         eop: Array,
         points: Array | None = None,
-        seed: int = 0,
+        seed: int | Sequence[int] = 0,
         blur_factor: float = 1.0,
     ) -> NDArray[np.uint8]:
         """A frame (H, W) 8 bit.

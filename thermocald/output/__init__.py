@@ -1,0 +1,1 @@
+"""What users take home: reports, figures, exports, the dashboard."""

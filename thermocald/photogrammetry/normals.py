@@ -79,6 +79,12 @@ class ObservationGrid:
         """(E, T): what takes part."""
         return self.weights[..., 0] > 0
 
+    def targets(self, columns: NDArray[np.int64]) -> ObservationGrid:
+        """Some of the targets."""
+        if len(columns) == self.points.shape[1]:
+            return self
+        return ObservationGrid(self.points[:, columns], self.weights[:, columns])
+
     def reject(self, mask: NDArray[np.bool_]) -> ObservationGrid:
         """A copy in which the observations of a mask (E, T) have no weight."""
         return ObservationGrid(self.points, np.where(mask[..., None], 0.0, self.weights))

@@ -15,8 +15,9 @@ Source: DESIGN idea 3; the test for standing still is Rao's score test (1948).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+import warnings
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -50,6 +51,9 @@ _ITERATIONS = 15
 _SMALL = 0.03  # standard deviations: a last step that the partials carry to 1e-4
 _ROUNDS = 8  # of data snooping
 _RELINEARISE_PX = 1.0  # movement of the mean that changes the partials by more than about 1e-3
+_ENOUGH_FOR_NOISE = 20  # epochs
+_PRIOR_FREEDOM = 8.0  # weight of the series' noise in a target's own
+_MEDIAN_CHI2_1 = 0.4549
 _FEW = 0.6  # share of a series' targets below which an epoch's geometry is looked at by itself
 
 
@@ -58,13 +62,14 @@ class SeriesSettings:
     """What is estimated per epoch and what once.
 
     exterior: `series` for a camera that stands still; free: IOP per epoch, the others are held;
-    target_offsets: a constant offset per target with the test field's sigmas as prior, only with
-    `exterior="series"`; snooping_alpha, max_rejected, scale, bounds as in `AdjustmentSettings`.
+    target_offsets: a constant offset per target, with the test field's sigmas as prior; target_noise:
+    each target's measuring noise from its own scatter, where the series is long enough; snooping_alpha, max_rejected, scale, bounds as in `AdjustmentSettings`.
     """
 
     exterior: Literal["per_epoch", "series"] = "series"
     free: tuple[str, ...] = DEFAULT_FREE
     target_offsets: bool = True
+    target_noise: bool = True
     snooping_alpha: float = 0.001
     max_rejected: float = 0.35
     scale: Literal["posterior", "prior"] = "posterior"
@@ -131,6 +136,25 @@ class SeriesAdjustment:
         """(E,): epochs with a result."""
         return np.array([s == "ok" for s in self.status], dtype=bool)
 
+    def spread(self, targets: NDArray[np.int64], n: int) -> SeriesAdjustment:
+        """The same with its columns of targets put where they stand in a larger test field."""
+
+        def wide(array: NDArray[Any], axis: int, fill: Any) -> NDArray[Any]:
+            shape = list(array.shape)
+            shape[axis] = n
+            out = np.full(shape, fill, dtype=array.dtype)
+            out[(slice(None),) * axis + (targets,)] = array
+            return out
+
+        return replace(
+            self,
+            observed=wide(self.observed, 1, False),
+            rejected=wide(self.rejected, 1, False),
+            residuals=wide(self.residuals, 1, np.nan),
+            offsets=wide(self.offsets, 0, np.nan),
+            offset_sds=wide(self.offset_sds, 0, np.nan),
+        )
+
     def epoch(self, row: int) -> Adjustment:
         """One epoch as an `Adjustment`, for the store and the exports."""
         ok = self.status[row] == "ok"
@@ -182,15 +206,20 @@ def adjust_series(
     s = settings or SeriesSettings()
     if not isinstance(epochs, ObservationGrid):
         epochs = ObservationGrid.from_observations(testfield, epochs)
-    series = _Series(sensor, testfield, epochs, s)
+    # Targets that are never seen would only be unknowns without observations.
+    seen = np.flatnonzero(epochs.observed.any(axis=0))
+    series = _Series(sensor, testfield.subset(seen), epochs.targets(seen), s)
     start = np.concatenate([interior.as_array(), exterior.as_array()])
-    use = epochs.observed & series.enough[:, None]
+    use = series.grid.observed & series.enough[:, None]
     values = np.tile(start, (len(use), 1))
-    estimate = series.solve(values, np.zeros((len(testfield), 2)), use, 1.0)
+    estimate = series.solve(values, np.zeros((len(seen), 2)), use, 1.0)
     if s.snooping_alpha > 0:
-        snoop = series.snoop_together if len(s.common) else series.snoop_apart
-        estimate, use = snoop(estimate, use)
-    return series.result(estimate, use)
+        estimate, use = series.snoop(estimate, use)
+        if s.target_noise and len(use) >= _ENOUGH_FOR_NOISE:
+            series = series.with_target_noise(estimate, use)
+            estimate = series.solve(estimate.values, estimate.offsets, use, 1.0)
+            estimate, use = series.snoop(estimate, use)
+    return series.result(estimate, use).spread(seen, len(testfield))
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,8 +239,7 @@ class _Series:
     @property
     def has_offsets(self) -> bool:
         """Whether the targets' offsets are unknowns: only where the field has sigmas."""
-        wanted = self.s.target_offsets and self.s.exterior == "series"
-        return wanted and bool((self.testfield.sigmas > 0).any())
+        return self.s.target_offsets and bool((self.testfield.sigmas > 0).any())
 
     def solve(
         self, values: Array, offsets: Array, use: NDArray[np.bool_], variance: float
@@ -241,7 +269,38 @@ class _Series:
                 system = self._linearised(values, weights, use, variance)
         return _Estimate(values, offsets, residuals, system)
 
-    def snoop_together(
+    def snoop(
+        self, estimate: _Estimate, use: NDArray[np.bool_]
+    ) -> tuple[_Estimate, NDArray[np.bool_]]:
+        """Find the gross errors; the estimate without them and what takes part."""
+        shared = len(self.s.common) > 0 or self.has_offsets
+        return (self._snoop_together if shared else self._snoop_apart)(estimate, use)
+
+    def with_target_noise(self, estimate: _Estimate, use: NDArray[np.bool_]) -> _Series:
+        """The series with every target's weights from the scatter of its own residuals.
+
+        Corners are measured better on a near, bright marker than on a far one, and a-priori sigmas
+        seldom know it. The scatter is robust (median of squares over the epochs, about zero) and
+        drawn to the series' own variance as far as few epochs leave it uncertain.
+        """
+        v2 = np.where(use[..., None], estimate.residuals**2, np.nan)
+        w = estimate.system.weights[..., :2]
+        with np.errstate(invalid="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # targets that were never seen
+            ratio = np.nanmedian(v2 * w, axis=0) / _MEDIAN_CHI2_1
+        n = use.sum(axis=0)[:, None]
+        freedom = 2 * use.sum() - len(self.s.per_epoch) * len(use)
+        ratio *= 2 * use.sum() / max(freedom, 1)  # what the parameters have taken from residuals
+        pooled = np.nanmedian(ratio)
+        ratio = np.where(np.isfinite(ratio), ratio, pooled)
+        # A median of n squares is worth about 0.37 n degrees of freedom of a mean.
+        drawn = (0.37 * n * ratio + _PRIOR_FREEDOM * pooled) / (0.37 * n + _PRIOR_FREEDOM)
+        weights = self.grid.weights.copy()
+        weights[..., :2] /= drawn
+        weights[..., 2] /= np.sqrt(drawn.prod(axis=1))
+        return replace(self, grid=ObservationGrid(self.grid.points, weights))
+
+    def _snoop_together(
         self, estimate: _Estimate, use: NDArray[np.bool_]
     ) -> tuple[_Estimate, NDArray[np.bool_]]:
         """Data snooping where all epochs share unknowns: every round solves the series again."""
@@ -257,7 +316,7 @@ class _Series:
             estimate = self.solve(estimate.values, estimate.offsets, use, variance)
         return estimate, use
 
-    def snoop_apart(
+    def _snoop_apart(
         self, estimate: _Estimate, use: NDArray[np.bool_]
     ) -> tuple[_Estimate, NDArray[np.bool_]]:
         """Data snooping where epochs share nothing: only those that changed are solved again."""
@@ -306,8 +365,8 @@ class _Series:
         xx = (at.B[:, 0] ** 2 * variance).sum(axis=1) + tiny
         yy = (at.B[:, 1] ** 2 * variance).sum(axis=1) + tiny
         xy = (at.B[:, 0] * at.B[:, 1] * variance).sum(axis=1)
-        determinant = xx * yy - xy**2
-        return np.stack([yy, xx, -xy], axis=1) / determinant[:, None]
+        prior: Array = np.stack([yy, xx, -xy], axis=1) / (xx * yy - xy**2)[:, None]
+        return prior
 
     def _sums(self, estimate: _Estimate) -> tuple[Array, Array]:
         """Weighted sum of squares (E,) and redundancy (E,) of every epoch."""

@@ -1,0 +1,379 @@
+"""The evidence of one series: every epoch reduced to small normal equations, once.
+
+The unknowns of an epoch are the 16 parameters of the camera and three scales of the test field.
+What is constant over the series says nothing about heat: the level of every parameter and one
+offset per target (errors of the field's coordinates) are taken out here, so that a target that is
+hidden now and then does not pass for a drift. After that a hypothesis about the whole series is
+a sum over 19 × 19 matrices and no image point is touched again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.discovery.thermometer import Channel, extend, latent_times, smooth_channel
+from thermocald.errors import DataError
+from thermocald.photogrammetry.camera_model import PARAMETER_NAMES
+from thermocald.photogrammetry.normals import (
+    ObservationGrid,
+    linearise,
+    normal_matrices,
+    right_hand_sides,
+)
+from thermocald.photogrammetry.orientation import approximate_orientation, plane_fit
+from thermocald.simulation.history import History
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from thermocald.photogrammetry.camera_model import Sensor
+    from thermocald.photogrammetry.normals import Partials
+    from thermocald.photogrammetry.testfield import TestField
+
+    Array = NDArray[np.float64]
+
+__all__ = ["COLUMNS", "Evidence", "SeriesInput", "gather"]
+
+FIELD_SCALES = ("scale_X", "scale_Y", "scale_Z")
+COLUMNS = PARAMETER_NAMES + FIELD_SCALES
+_GROSS = 4.5  # standard deviations beyond which a point is a gross error
+_MIN_EPOCHS = 20
+_MIN_TARGETS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class SeriesInput:
+    """What was recorded.
+
+    frame_times (E,) s; reading_times (R,) s; readings {channel: (R,)} °C, the first the reference;
+    resolutions {channel: K or None}; grid: image points on epochs × targets; numbers (E,): the
+    epochs' own numbers.
+    """
+
+    name: str
+    camera: str
+    sensor: Sensor
+    field: TestField
+    principal_distance: float | None
+    frame_times: Array
+    reading_times: Array
+    readings: Mapping[str, Array]
+    resolutions: Mapping[str, float | None]
+    grid: ObservationGrid
+    numbers: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """One series, reduced.
+
+    times (E,) s from its begin; history: smoothed readings; channels: as instruments;
+    at: linearisation; scale (19,): px per unit of each column, N (E, 19, 19) and b (E, 19) are in
+    px-scaled columns and weighted by the noise found; yy (E,): bᵀN⁻¹b; values (E, 19): the free
+    camera of each epoch, scaled; residuals (E, T, 2) px: what the free camera leaves, offsets taken
+    out, NaN where unseen or gross; n (E,) image points; sigma0 (E,); variance: factor by which the
+    given variances were too small.
+    """
+
+    source: SeriesInput
+    times: Array
+    history: History
+    channels: Mapping[str, Channel]
+    at: Partials
+    scale: Array
+    N: Array
+    b: Array
+    yy: Array
+    values: Array
+    residuals: Array
+    weights: Array
+    offsets: Array
+    n: NDArray[np.int64]
+    sigma0: Array
+    variance: float
+    correlation: float
+    gross: int
+    excluded: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    columns: Array = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def T0(self) -> float:
+        return self.history.T0
+
+    @property
+    def dof(self) -> float:
+        """Image coordinates that the free cameras do not use up."""
+        return float(np.sum(2 * self.n - self.N.shape[1]))
+
+
+def gather(source: SeriesInput, T0: float | None = None, scale: Array | None = None) -> Evidence:
+    """Check a series and reduce it; `T0` and `scale` are M1's for M2.
+
+    Raises DataError where the data cannot carry a discovery: it says what is missing.
+    """
+    _require(source)
+    times = source.frame_times - source.frame_times[0]
+    reading_times = source.reading_times - source.frame_times[0]
+    usable = np.isfinite(reading_times)
+    reading_times = reading_times[usable]
+    present = {
+        name: np.asarray(r, dtype=float)[usable]
+        for name, r in source.readings.items()
+        if np.isfinite(np.asarray(r, dtype=float)[usable]).sum() >= _MIN_EPOCHS
+    }
+    reference = next(iter(source.readings))
+    if reference not in present:
+        raise DataError(_no_temperature(source, reference))
+    knots, channels = _instruments(reading_times, present, source.resolutions)
+    course = channels[reference].course
+    course = course[np.isfinite(course)]
+    history = History(
+        times,
+        knots,
+        {name: c.course for name, c in channels.items()},
+        reference,
+        float(np.mean(course)) if T0 is None else T0,
+    )
+    if float(np.ptp(course)) < max(1.0, 8.0 * channels[reference].noise):
+        raise DataError(
+            f"{source.name}: the temperature {reference!r} is constant within "
+            f"{float(np.ptp(course)):.2f} K; what follows it cannot be told from what does not. "
+            "Record a series in which it changes by 5 K or more"
+        )
+    return _reduce(source, times, history, channels, scale)
+
+
+def _instruments(
+    times: Array, readings: Mapping[str, Array], resolutions: Mapping[str, float | None]
+) -> tuple[Array, dict[str, Channel]]:
+    """All columns on common knots: the readings' instants and the latent ones of each column."""
+    latent = {name: latent_times(times, r, resolutions.get(name)) for name, r in readings.items()}
+    knots, first = np.unique(
+        np.concatenate([times, *latent.values()]), return_index=True
+    )
+    from_reading = first < len(times)
+    channels = {}
+    for name, r in readings.items():
+        on_knots = np.full(len(knots), np.nan)
+        on_knots[from_reading] = r[first[from_reading]]
+        own = np.isin(knots, latent[name])
+        here = from_reading | own
+        part = smooth_channel(knots[here], on_knots[here], own[here], resolutions.get(name))
+        channels[name] = extend(_spread(part, knots, here))
+    return next(iter(channels.values())).times, channels
+
+
+def _spread(channel: Channel, knots: Array, here: NDArray[np.bool_]) -> Channel:
+    """A column's instrument on all knots; those of other columns are NaN and carry nothing."""
+    K = len(knots)
+    course, deviation, sd = np.full(K, np.nan), np.zeros(K), np.full(K, 1e-6)
+    course[here], deviation[here], sd[here] = channel.course, channel.deviation, channel.sd
+    mixing = np.eye(K)
+    mixing[np.ix_(here, here)] = channel.mixing
+    return Channel(knots, course, deviation, sd, mixing, channel.noise)
+
+
+def _no_temperature(source: SeriesInput, reference: str) -> str:
+    return (
+        f"{source.name}: the recording has no temperature: the column {reference!r} holds fewer "
+        f"than {_MIN_EPOCHS} readings. Discovery compares the camera with a thermometer; record one"
+    )
+
+
+def _require(source: SeriesInput) -> None:
+    if not source.readings:
+        raise DataError(
+            f"{source.name}: the recording has no temperature column. Discovery compares the "
+            "camera with a thermometer; record one"
+        )
+    reference = next(iter(source.readings))
+    if np.isfinite(source.readings[reference]).sum() < _MIN_EPOCHS and (
+        len(source.frame_times) >= _MIN_EPOCHS
+    ):
+        raise DataError(_no_temperature(source, reference))
+    seen = source.grid.observed.sum(axis=1)
+    good = int(np.sum(seen >= _MIN_TARGETS))
+    if good < _MIN_EPOCHS:
+        raise DataError(
+            f"{source.name}: {good} of {len(seen)} epochs have {_MIN_TARGETS} targets or more; "
+            f"discovery needs {_MIN_EPOCHS} such epochs, better 100"
+        )
+    rows = source.grid.observed.any(axis=0)
+    if plane_fit(source.field.points[rows])[2]:
+        raise DataError(
+            f"{source.name}: the {int(rows.sum())} targets seen lie in one plane; principal point "
+            "and tilt cannot be told apart on it. Use a field with depth, such as a corner"
+        )
+
+
+def _running_median(values: Array, width: int = 5) -> Array:
+    """Median over time (axis 0) of up to `width` neighbours, NaN ignored."""
+    half = width // 2
+    padded = np.pad(
+        values, ((half, half), *((0, 0),) * (values.ndim - 1)), constant_values=np.nan
+    )
+    stack = np.stack([padded[k : k + len(values)] for k in range(width)])
+    stack.sort(axis=0)  # NaN go to the end
+    count = np.isfinite(stack).sum(axis=0)
+    low = np.maximum(count - 1, 0) // 2
+    high = np.minimum(count // 2, width - 1)
+    pick = np.take_along_axis
+    return 0.5 * (pick(stack, low[None], 0)[0] + pick(stack, high[None], 0)[0])
+
+
+def _spikes(l: Array, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Points that leap out of their own neighbours in time while the others do not.
+
+    Found before any adjustment, where a gross error of many pixels would hide itself and others.
+    """
+    import warnings
+
+    d = l - _running_median(l)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        d = d - np.nanmedian(d, axis=1, keepdims=True)  # the whole image may move
+        own = 1.4826 * np.nanmedian(np.abs(d), axis=(1, 2))
+    level = float(np.nanmedian(own)) if np.isfinite(own).any() else 0.0
+    limit = 7.0 * np.fmax(np.nan_to_num(own), level)
+    bad: NDArray[np.bool_] = seen & (np.max(np.abs(np.nan_to_num(d)), axis=2) > limit[:, None])
+    return bad
+
+
+def _adjusted(source: SeriesInput) -> Partials:
+    """The linearisation: one camera for the mean image of the series, robust."""
+    import warnings
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        mean = np.nanmedian(source.grid.points, axis=0)
+    # targets seen in half of the epochs carry the orientation
+    often = source.grid.observed.sum(axis=0) >= 0.5 * len(source.frame_times)
+    rows = np.flatnonzero(np.isfinite(mean[:, 0]) & often)
+    interior, exterior, _ = approximate_orientation(
+        source.sensor, source.field.points[rows], mean[rows], source.principal_distance
+    )
+    p = np.concatenate([interior.as_array(), exterior.as_array()])
+    c = p[0]
+    prior = np.array(
+        [0.2 * c, 0.1 * c, 0.1 * c, 0.3 / c**2, 0.3 / c**4, 0.3 / c**6, 0.02 / c, 0.02 / c]
+        + [0.02, 0.02]
+        + [np.inf] * 6
+    )
+    start = p.copy()
+    start[3:10] = 0.0
+    weight = np.zeros(len(mean))
+    weight[rows] = 1.0
+    at = linearise(source.sensor, source.field, p[:10], p[10:])
+    for _ in range(15):
+        l = np.where(weight[:, None] > 0, mean - at.predicted, 0.0)
+        l = np.nan_to_num(l)
+        size = np.linalg.norm(l, axis=1)
+        spread = max(1.5 * float(np.median(size[rows])), 1e-3)
+        w = weight / np.maximum(size / (2 * spread), 1.0) / spread**2
+        A = at.A.reshape(-1, 16)
+        W = np.repeat(w, 2)
+        N = A.T @ (A * W[:, None]) + np.diag(1.0 / prior**2)
+        right = A.T @ (W * l.ravel()) + (start - p) / prior**2
+        d = np.sqrt(np.diag(N))
+        step = np.linalg.solve(N / np.outer(d, d) + 1e-12 * np.eye(16), right / d) / d
+        p = p + step
+        at = linearise(source.sensor, source.field, p[:10], p[10:])
+        if np.max(np.abs(at.A.reshape(-1, 16) @ step)) < 1e-4:
+            break
+    return at
+
+
+def _solve(N: Array, b: Array) -> Array:
+    """Batched solution; a camera of too few targets is held by a weak prior of 1000 px."""
+    k = N.shape[-1]
+    result: Array = np.linalg.solve(N + 1e-6 * np.eye(k), b[..., None])[..., 0]
+    return result
+
+
+def _reduce(
+    source: SeriesInput,
+    times: Array,
+    history: History,
+    channels: Mapping[str, Channel],
+    scale: Array | None,
+) -> Evidence:
+    at = _adjusted(source)
+    X = source.field.points
+    A = np.concatenate([at.A, at.B * X[:, None, :]], axis=-1)
+    used = source.grid.observed.any(axis=0)
+    if scale is None:
+        scale = np.sqrt(np.mean(np.sum(A[used] ** 2, axis=1), axis=0))
+    A = A / scale
+    l = source.grid.points - at.predicted
+    weights = source.grid.weights
+    seen = source.grid.observed
+    bad = _spikes(l, seen)
+    offsets = np.zeros((len(X), 2))
+    values = np.zeros((len(times), len(scale)))
+    v = l
+    s0 = 1.0
+    for turn in range(5):
+        w = np.where(bad[..., None], 0.0, weights)
+        N = normal_matrices(w, A)
+        b, _ = right_hand_sides(w, l - offsets, A)
+        values = _solve(N, b)
+        v = l - offsets - (values @ A.reshape(-1, len(scale)).T).reshape(l.shape)
+        # the offset of a target: the mean of its residuals over the series
+        share = w[..., :2]
+        total = share.sum(axis=0)
+        mean = np.sum(share * np.nan_to_num(v), axis=0) / np.where(total > 0, total, np.inf)
+        offsets = offsets + mean
+        v = v - mean
+        if turn >= 1:
+            normal = np.abs(np.nan_to_num(v)) * np.sqrt(weights[..., :2])
+            s0 = 1.4826 * float(np.median(normal[seen & ~bad]))
+            local = np.nan_to_num(v - _running_median(np.where(bad[..., None], np.nan, v)))
+            # noise may grow with heat: each epoch is judged by its own spread
+            spread = np.array(
+                [1.4826 * np.median(x[k]) if k.any() else s0
+                 for x, k in zip(normal, seen & ~bad, strict=True)]
+            )  # fmt: skip
+            limit = _GROSS * np.maximum(spread, s0)[:, None]
+            outlying = np.max(np.abs(local) * np.sqrt(weights[..., :2]), axis=2)
+            bad = seen & (outlying > limit)
+    w = np.where(bad[..., None], 0.0, weights)
+    N = normal_matrices(w, A)
+    b, lPl = right_hand_sides(w, l - offsets, A)
+    values = _solve(N, b)
+    yy = np.einsum("ek,ek->e", values, b)
+    count = (seen & ~bad).sum(axis=1)
+    free = np.maximum(2 * count - len(scale), 1)
+    # one offset per target is estimated too
+    loss = 1.0 - 2 * used.sum() / max(2 * count.sum(), 1)
+    sigma0 = np.sqrt(np.maximum(lPl - yy, 0) / free / loss)
+    enough = count >= _MIN_TARGETS
+    variance = float(np.median(sigma0[enough]) ** 2)
+    v = l - offsets - (values @ A.reshape(-1, len(scale)).T).reshape(l.shape)
+    v = np.where((seen & ~bad)[..., None], v, np.nan)
+    weak = ~enough
+    N[weak], b[weak], yy[weak], count[weak] = 0.0, 0.0, 0.0, 0
+    return Evidence(
+        source, times, history, channels, at, scale,
+        N / variance, b / variance, yy / variance, values, v, w / variance, offsets,
+        count, sigma0 / np.sqrt(variance), variance, 1.0, int(bad.sum()), columns=A,
+    )  # fmt: skip
+
+
+def without_targets(evidence: Evidence, rows: NDArray[np.int64]) -> Evidence:
+    """The same series as if some targets of the field had never been observed."""
+    source = evidence.source
+    mask = np.zeros(source.grid.observed.shape, dtype=bool)
+    mask[:, rows] = True
+    reduced = _reduce(
+        replace(source, grid=source.grid.reject(mask)),
+        evidence.times,
+        evidence.history,
+        evidence.channels,
+        evidence.scale,
+    )
+    return replace(reduced, source=source, excluded=np.union1d(evidence.excluded, rows))

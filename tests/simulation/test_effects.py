@@ -1,0 +1,308 @@
+"""Every effect against its formula, and its recovery from a noisy recording of itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermocald.errors import ConfigurationError
+from thermocald.photogrammetry.camera_model import (
+    IOP_NAMES,
+    PARAMETER_NAMES,
+    InteriorOrientation,
+    Sensor,
+)
+from thermocald.simulation import effects
+from thermocald.simulation.effects.base import Effect
+from thermocald.simulation.history import History
+from thermocald.simulation.model import ModelEffect, ThermalModel
+from thermocald.simulation.testfields import corner_field
+
+T0 = 25.0
+NAMES = effects.names()
+
+
+def history(epochs=400, step=5.0, fine=0.25, T=None, board=None):
+    """Frames every 5 s, offset to the readings; the true course on a fine polygon."""
+    t = np.arange(0.0, epochs * step, fine)
+    course = T or (lambda s: T0 + 12.0 * np.sin(s / 300.0))
+    other = board or (lambda s: T0 + 5.0 * np.cos(s / 170.0))
+    readings = {"temperature": course(t), "board": other(t)}
+    return History(np.arange(1.3, t[-1], step), t, readings, "temperature", T0)
+
+
+def model(*listed, rates=None):
+    return ThermalModel(
+        camera="test",
+        sensor=Sensor(3280, 2464, 0.00112),
+        T0=T0,
+        interior=InteriorOrientation(c=3.0, A1=-0.004),
+        rates=rates if rates is not None else {"c": 2e-4, "x0": -4e-4, "y0": 3e-4},
+        effects=listed,
+    )
+
+
+def shift(h, *listed, rates=None):
+    """What effects add to the base model's prediction, (E, 16)."""
+    a = model(*listed, rates=rates).predict(h)
+    b = model(rates=rates).predict(h)
+    return np.hstack([a.iop - b.iop, a.eop - b.eop])
+
+
+def column(name):
+    return PARAMETER_NAMES.index(name)
+
+
+def test_catalogue_is_complete():
+    wanted = set(
+        "thermal_lag time_offset nonlinear_expansion softening thermal_gradient permanent_set "
+        "hysteresis self_heating creep slip cyclic_interference second_heat_source defocus "
+        "housing_tilt radial_distortion_drift decentering_drift affinity_drift "
+        "test_field_expansion target_displacement".split()
+    )
+    assert set(NAMES) == wanted
+    assert all(effects.get(name).name == name for name in NAMES)
+
+
+OFF = {
+    "thermal_lag": {"tau": 1e-6},
+    "time_offset": {"d": 0.0},
+    "hysteresis": {"half_width": 0.0},
+    "softening": {"T_k": 40.0, "c": 0.0},
+    "self_heating": {"tau": 300.0, "x0": 0.0},
+    "slip": {"time": 600.0, "x0": 0.0},
+    "cyclic_interference": {"P": 120.0, "phase": 0.3, "x0": 0.0},
+    "second_heat_source": {"channel": "board", "c": 0.0},
+    "target_displacement": {"time": 600.0, "targets": ("x11",), "dX": 0.0},
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_switched_off_changes_nothing(name):
+    effect, h, field = effects.get(name), history(), corner_field("circles", 3, 200.0)
+    values = OFF.get(name) or dict.fromkeys(effect.usual, 0.0)
+    on, off = model(ModelEffect(name, values)).predict(h, field), model().predict(h, field)
+    # a lag of a microsecond is not off: it may differ by rate × tau × dT/dt = 1e-11 mm
+    np.testing.assert_allclose(on.iop, off.iop, rtol=0, atol=1e-10)
+    np.testing.assert_array_equal(on.eop, off.eop)
+    np.testing.assert_array_equal(on.noise_factor, 1.0)
+    np.testing.assert_array_equal(on.points(field.points)[-1], field.points)
+
+
+def test_thermal_lag_of_a_ramp_and_a_sine():
+    tau, w = 84.0, 1 / 300.0
+    h = history(T=lambda s: T0 + 0.02 * s)
+    t = h.times
+    expected = T0 + 0.02 * (t - tau * (1 - np.exp(-t / tau)))
+    np.testing.assert_allclose(effects.get("thermal_lag").drive(h, tau=tau), expected, atol=1e-10)
+    h = history()
+    wt = w * tau
+    expected = T0 + 12 * (np.sin(w * t) - wt * np.cos(w * t) + wt * np.exp(-t / tau)) / (1 + wt**2)
+    np.testing.assert_allclose(effects.get("thermal_lag").drive(h, tau=tau), expected, atol=2e-6)
+    added = shift(h, ModelEffect("thermal_lag", {"tau": tau}))
+    np.testing.assert_allclose(
+        added[:, column("x0")], -4e-4 * (expected - T0 - 12 * np.sin(w * t)), atol=1e-9
+    )
+    assert np.all(added[:, [column(n) for n in PARAMETER_NAMES if n not in ("c", "x0", "y0")]] == 0)
+
+
+def test_time_offset_is_a_pure_delay():
+    h = history()
+    expected = T0 + 12 * np.sin(np.maximum(h.times - 37.0, 0.0) / 300.0)
+    np.testing.assert_allclose(effects.get("time_offset").drive(h, d=37.0), expected, atol=2e-6)
+
+
+def test_hysteresis_of_a_triangle():
+    r = 1.5
+    up_down = lambda s: T0 + 10 - np.abs(s / 50.0 - 10)  # noqa: E731  up to +10 at 500 s, then down
+    h = history(epochs=190, T=up_down)
+    T = up_down(h.times)
+    expected = np.where(h.times < 500, np.maximum(T - r, T0), np.minimum(T0 + 10 - r, T + r))
+    np.testing.assert_allclose(
+        effects.get("hysteresis").drive(h, half_width=r), expected, atol=1e-10
+    )
+
+
+T_SINE = lambda t: 12.0 * np.sin(t / 300.0)  # noqa: E731
+FORMULAS = {
+    "nonlinear_expansion": ({"c": 2e-6}, {"c": lambda t: 2e-6 * T_SINE(t) ** 2}),
+    "softening": (
+        {"T_k": 30.0, "y0": 1e-4},
+        {"y0": lambda t: 1e-4 * np.maximum(T_SINE(t) - 5.0, 0)},
+    ),
+    "thermal_gradient": ({"x0": 0.02}, {"x0": lambda t: 0.02 * 12 / 300 * np.cos(t / 300)}),
+    "permanent_set": (
+        {"x0": 1e-4},
+        {"x0": lambda t: 1e-4 * np.where(t < 150 * np.pi, T_SINE(t), 12.0)},
+    ),
+    "self_heating": (
+        {"tau": 240.0, "x0": 5e-3},
+        {"x0": lambda t: 5e-3 * (1 - np.exp(-t / 240))},
+    ),
+    "creep": ({"x0": 1e-6, "y0": -2e-6}, {"x0": lambda t: 1e-6 * t, "y0": lambda t: -2e-6 * t}),
+    "slip": ({"time": 777.0, "x0": 3e-3}, {"x0": lambda t: np.where(t >= 777, 3e-3, 0)}),
+    "cyclic_interference": (
+        {"P": 130.0, "phase": 0.7, "x0": 1e-3},
+        {"x0": lambda t: 1e-3 * np.sin(2 * np.pi * t / 130 + 0.7)},
+    ),
+    "second_heat_source": (
+        {"channel": "board", "c": 1e-4},
+        {"c": lambda t: 1e-4 * 5 * np.cos(t / 170)},
+    ),
+    "housing_tilt": ({"phi": 1e-5}, {"phi": lambda t: 1e-5 * T_SINE(t)}),
+    "radial_distortion_drift": (
+        {"A1": 1e-5, "A2": 2e-6},
+        {"A1": lambda t: 1e-5 * T_SINE(t), "A2": lambda t: 2e-6 * T_SINE(t)},
+    ),
+    "decentering_drift": ({"B1": 1e-6}, {"B1": lambda t: 1e-6 * T_SINE(t)}),
+    "affinity_drift": ({"C2": 1e-6}, {"C2": lambda t: 1e-6 * T_SINE(t)}),
+}
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+def test_signal_follows_its_formula(name):
+    values, expected = FORMULAS[name]
+    h = history()
+    added = shift(h, ModelEffect(name, values))
+    for parameter in PARAMETER_NAMES:
+        course = expected.get(parameter, np.zeros_like)(h.times)
+        scale = max(1e-12, np.abs(course).max())
+        np.testing.assert_allclose(added[:, column(parameter)] / scale, course / scale, atol=3e-6)
+
+
+def test_defocus_scales_noise_and_blur():
+    h = history(T=lambda s: T0 + 0.01 * s)
+    p = model(ModelEffect("defocus", {"factor": 0.125})).predict(h)
+    np.testing.assert_allclose(p.noise_factor, 1 + 0.125 * 0.01 * h.times, rtol=1e-12)
+    np.testing.assert_array_equal(p.blur_factor, p.noise_factor)
+    np.testing.assert_array_equal(p.iop, model().predict(h).iop)
+
+
+def test_test_field_expansion_scales_each_axis():
+    h, field = history(T=lambda s: T0 + 0.01 * s), corner_field("circles", 3, 200.0)
+    p = model(ModelEffect("test_field_expansion", {"X": 2e-5, "Z": -1e-5})).predict(h, field)
+    rise = 0.01 * h.times[-1]
+    expected = field.points * [1 + 2e-5 * rise, 1.0, 1 - 1e-5 * rise]
+    np.testing.assert_allclose(p.points(field.points)[-1], expected, rtol=1e-13)
+
+
+def test_target_displacement_moves_its_targets_alone():
+    h, field = history(), corner_field("circles", 3, 200.0)
+    values = {"time": 500.0, "targets": ("x12", "z33"), "dX": 0.2, "dY": -0.1}
+    moved = model(ModelEffect("target_displacement", values)).predict(h, field)
+    change = moved.points(field.points) - field.points
+    rows = [field.index["x12"], field.index["z33"]]
+    late = h.times >= 500.0
+    np.testing.assert_allclose(change[np.ix_(late, rows)], np.broadcast_to([0.2, -0.1, 0], (late.sum(), 2, 3)), atol=1e-12)  # fmt: skip  # noqa: E501
+    assert np.all(change[~late] == 0)
+    assert np.all(np.delete(change, rows, axis=1) == 0)
+    with pytest.raises(ConfigurationError, match="no target 'nobody'"):
+        model(ModelEffect("target_displacement", {**values, "targets": "nobody"})).predict(h, field)
+
+
+READING = [n for n in NAMES if effects.get(n).kind != "image" or n in ("defocus",)]
+
+
+@pytest.mark.parametrize("name", READING)
+@pytest.mark.parametrize("coarse", [False, True])
+def test_sensitivity_is_the_derivative(name, coarse):
+    """The matrix against differences; missing readings have no column."""
+    rng = np.random.default_rng(3)
+    step = 10.0 if coarse else 1.0
+    t = np.arange(0, 120) * step + rng.uniform(-0.4, 0.4, 120) * step
+    T = T0 + 10 * np.sin(t / t[-1] * 9) + 0.05 * rng.standard_normal(120)
+    T[[7, 8, 60]] = np.nan
+    frames = np.arange(0, 120) * step
+    h = History(frames, t, {"temperature": T, "board": T[::-1].copy()}, "temperature", T0)
+    effect = effects.get(name)
+    values = {k: p.default for k, p in effect.nonlinear.items() if not p.text}
+    values.pop("phase", None)
+    if name == "second_heat_source":
+        values["channel"] = "board"
+    exact = effect.sensitivity(h, **values).toarray()
+    by_differences = Effect.sensitivity(effect, h, **values).toarray()
+    np.testing.assert_allclose(exact, by_differences, atol=5e-6)
+    errors = rng.standard_normal((120, 3))
+    np.testing.assert_allclose(
+        effect.propagate(h, errors, **values), exact @ errors, rtol=0, atol=2e-5
+    )
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_cheap_enough_to_search(name):
+    """A course of 180 epochs in less than 1 ms, of a day in less than 20 ms."""
+    import time
+
+    effect = effects.get(name)
+    values = {k: p.default for k, p in effect.nonlinear.items() if not p.text}
+    values.pop("phase", None)
+    for epochs, limit in ((180, 1e-3), (8640, 20e-3)):
+        t = np.arange(epochs) * 10.0
+        T = T0 + np.sin(t / 500) + 0.05 * np.random.default_rng(1).standard_normal(epochs)
+        h = History(t, t + 0.3, {"temperature": T, "board": T}, "temperature", T0)
+        effect._course(h, **values)  # imports and the polygon, once per recording
+        best = min(_timed(time, effect, h, values) for _ in range(5))
+        assert best < limit
+
+
+def _timed(time, effect, h, values):
+    begin = time.perf_counter()
+    effect._course(h, **values)
+    return time.perf_counter() - begin
+
+
+def test_two_drives_follow_each_other():
+    h = history()
+    both = model(
+        ModelEffect("time_offset", {"d": 20.0}), ModelEffect("thermal_lag", {"tau": 60.0})
+    ).drive(h)
+    delayed = history(T=lambda s: T0 + 12 * np.sin(np.maximum(s - 20.0, 0) / 300.0))
+    np.testing.assert_allclose(both, effects.get("thermal_lag").drive(delayed, tau=60.0), atol=1e-5)
+
+
+def test_past_begins_with_the_series():
+    h = history(T=lambda s: np.full_like(s, T0 + 7.0))
+    for name, values in (("thermal_lag", {"tau": 500.0}), ("time_offset", {"d": 100.0}),
+                         ("hysteresis", {"half_width": 3.0})):  # fmt: skip
+        np.testing.assert_allclose(effects.get(name).drive(h, **values), T0 + 7.0, rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        ({"tau": "soon"}, "not a finite number"),
+        ({}, "'tau' .s. is missing"),
+        ({"tau": -3.0}, "negative"),
+        ({"tau": 3.0, "width": 1.0}, "no parameter 'width'"),
+    ],
+)
+def test_bad_parameters(values, says):
+    with pytest.raises(ConfigurationError, match=says):
+        ModelEffect("thermal_lag", values)
+
+
+def test_unknown_effect_suggests_the_nearest():
+    with pytest.raises(ConfigurationError, match="did you mean 'thermal_lag'"):
+        ModelEffect("thermal_lagg", {})
+
+
+def test_words():
+    lag, play = effects.get("thermal_lag"), effects.get("hysteresis")
+    said = lag.sentence({"tau": {"value": 84.13, "sd": 1.92, "unit": "s"}})
+    assert said == "the camera follows the thermometer with a lag of 84.1 ± 1.9 s"
+    assert lag.experiment_against(play) == (
+        "hold the lamp at 45 °C for 20 minutes: a thermal lag settles, hysteresis does not settle: "
+        "it stays where it is"
+    )
+    for a in NAMES:
+        for b in NAMES:
+            assert a == b or effects.get(a).experiment_against(effects.get(b))
+
+
+def test_names_of_iop_and_units_agree():
+    for name in NAMES:
+        effect = effects.get(name)
+        if effect.kind == "signal":
+            assert set(effect.linear) <= set(PARAMETER_NAMES)
+            assert set(effect.usual) <= set(effect.linear)
+            assert any(n in IOP_NAMES or n in ("omega", "phi", "kappa") for n in effect.usual)

@@ -1,0 +1,505 @@
+"""Camera files: other programs' own readers and formulas give the same pixels; round trips."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from thermocald.errors import ConfigurationError, UsageError
+from thermocald.output import camera_files
+from thermocald.photogrammetry.camera_model import IOP_NAMES, CameraModel, Sensor
+
+TOLERANCE_PX = 1e-6
+
+
+def _stated(text):
+    """Largest and RMS residual that a file states, 0 where it is exact."""
+    if "conversion: exact" in text:
+        return 0.0, 0.0
+    found = re.search(r"largest residual ([\d.e-]+) px, RMS ([\d.e-]+) px", text)
+    return float(found.group(1)), float(found.group(2))
+
+
+def _allowed(text):
+    """How far pixels may be off: what the file states, of which three digits are printed."""
+    return 1.01 * _stated(text)[0] + TOLERANCE_PX
+
+
+# --- the readers of other programs -------------------------------------------------------------
+
+
+def test_opencv_reads_the_file_and_projects_the_same_pixels(tmp_path, camera, view, truth):
+    path = tmp_path / "camera.yaml"
+    camera_files.write(camera, path, "opencv")
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    K, d = (storage.getNode(n).mat() for n in ("camera_matrix", "distortion_coefficients"))
+    size = [int(storage.getNode(n).real()) for n in ("image_width", "image_height")]
+    storage.release()
+    assert size == [3280, 2464]
+    image, _ = cv2.projectPoints(view, np.zeros(3), np.zeros(3), K, d)
+    off = np.linalg.norm(image[:, 0] - truth(camera, view), axis=1).max()
+    assert off < _allowed(path.read_text())
+
+
+_MRCAL = """
+import json, sys
+import numpy as np
+import mrcal
+model = mrcal.cameramodel(sys.argv[1])
+points = np.array(json.load(sys.stdin))
+print(json.dumps({"size": [int(v) for v in model.imagersize()], "lens": model.intrinsics()[0],
+                  "pixels": mrcal.project(points, *model.intrinsics()).tolist()}))
+"""
+
+
+def test_mrcal_reads_the_file_and_projects_the_same_pixels(tmp_path, camera, view, truth):
+    """Debian's python3-mrcal in the system's own interpreter."""
+    python = Path("/usr/bin/python3")
+    if not python.exists():
+        pytest.skip("no /usr/bin/python3 that python3-mrcal could belong to")
+    probe = subprocess.run([python, "-c", "import mrcal"], capture_output=True, check=False)
+    if probe.returncode != 0:
+        pytest.skip("python3-mrcal is not installed (apt install python3-mrcal)")
+    path = tmp_path / "camera.cameramodel"
+    camera_files.write(camera, path, "mrcal")
+    done = subprocess.run(
+        [python, "-c", _MRCAL, path], input=json.dumps(view.tolist()), capture_output=True,
+        text=True, check=True,
+    )  # fmt: skip
+    answer = json.loads(done.stdout)
+    assert answer["size"] == [3280, 2464]
+    assert answer["lens"] == ("LENSMODEL_OPENCV5" if camera.interior.A3 else "LENSMODEL_OPENCV4")
+    off = np.linalg.norm(np.array(answer["pixels"]) - truth(camera, view), axis=1).max()
+    assert off < _allowed(path.read_text())
+
+
+# --- the formulas of the other formats, written from their manuals -----------------------------
+
+
+def _radial_tangential(x, y, k1, k2, p1, p2, k3=0.0):
+    r2 = x * x + y * y
+    f = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    return (
+        x * f + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * f + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+    )
+
+
+def test_ros_file_by_its_formula(tmp_path, camera, view, truth):
+    path = tmp_path / "camera.yaml"
+    camera_files.write(camera, path, "ros", name="left")
+    info = yaml.safe_load(path.read_text())
+    assert info["camera_name"] == "left"
+    assert info["distortion_model"] == "plumb_bob"
+    for key, shape in (
+        ("camera_matrix", (3, 3)), ("distortion_coefficients", (1, 5)),
+        ("rectification_matrix", (3, 3)), ("projection_matrix", (3, 4)),
+    ):  # fmt: skip
+        assert (info[key]["rows"], info[key]["cols"]) == shape
+        assert len(info[key]["data"]) == shape[0] * shape[1]
+    K = np.array(info["camera_matrix"]["data"]).reshape(3, 3)
+    k1, k2, p1, p2, k3 = info["distortion_coefficients"]["data"]
+    x, y = _radial_tangential(*(view[:, :2] / view[:, 2:]).T, k1, k2, p1, p2, k3)
+    image = np.column_stack([K[0, 0] * x + K[0, 2], K[1, 1] * y + K[1, 2]])
+    off = np.linalg.norm(image - truth(camera, view), axis=1).max()
+    assert off < _allowed(path.read_text())
+
+
+def test_colmap_file_by_its_formula(tmp_path, camera, view, truth):
+    """COLMAP: the upper left pixel's centre is (0.5, 0.5)."""
+    path = tmp_path / "cameras.txt"
+    camera_files.write(camera, path, "colmap")
+    (line,) = [row for row in path.read_text().splitlines() if not row.startswith("#")]
+    _, model, width, height, *parameters = line.split()
+    assert (int(width), int(height)) == (3280, 2464)
+    assert (model, len(parameters)) == (
+        ("FULL_OPENCV", 12) if camera.interior.A3 else ("OPENCV", 8)
+    )
+    fx, fy, cx, cy, k1, k2, p1, p2, *rest = (float(p) for p in parameters)
+    x, y = _radial_tangential(*(view[:, :2] / view[:, 2:]).T, k1, k2, p1, p2, *rest[:1])
+    assert not any(rest[1:])
+    image = np.column_stack([fx * x + cx, fy * y + cy]) - 0.5
+    off = np.linalg.norm(image - truth(camera, view), axis=1).max()
+    assert off < _allowed(path.read_text())
+
+
+def test_kalibr_file_by_its_formula(tmp_path, camera, view, truth):
+    path = tmp_path / "camchain.yaml"
+    camera_files.write(camera, path, "kalibr")
+    cam = yaml.safe_load(path.read_text())["cam0"]
+    assert (cam["camera_model"], cam["distortion_model"]) == ("pinhole", "radtan")
+    assert cam["resolution"] == [3280, 2464]
+    fu, fv, pu, pv = cam["intrinsics"]
+    x, y = _radial_tangential(*(view[:, :2] / view[:, 2:]).T, *cam["distortion_coeffs"])
+    off = np.linalg.norm(
+        np.column_stack([fu * x + pu, fv * y + pv]) - truth(camera, view), axis=1
+    ).max()
+    assert off < _allowed(path.read_text())
+    # without a sixth-order term the fit cannot be exact, and says so
+    assert _stated(path.read_text())[0] > 0.1 or camera.interior.A3 == 0
+
+
+def test_metashape_file_by_its_formula(tmp_path, camera, view, truth):
+    """Metashape: u = w/2 + cx + x'f + x'B1 + y'B2, the upper left pixel's centre is (0.5, 0.5)."""
+    path = tmp_path / "camera.xml"
+    camera_files.write(camera, path, "metashape")
+    root = ET.parse(path).getroot()
+    assert (root.tag, root.findtext("projection")) == ("calibration", "frame")
+    v = {
+        tag: float(root.findtext(tag))
+        for tag in ["f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2"]
+    }
+    x, y = (view[:, :2] / view[:, 2:]).T
+    r2 = x * x + y * y
+    f = 1 + v["k1"] * r2 + v["k2"] * r2**2 + v["k3"] * r2**3 + v["k4"] * r2**4
+    xd = x * f + v["p1"] * (r2 + 2 * x * x) + 2 * v["p2"] * x * y
+    yd = y * f + v["p2"] * (r2 + 2 * y * y) + 2 * v["p1"] * x * y
+    w, h = int(root.findtext("width")), int(root.findtext("height"))
+    u = w * 0.5 + v["cx"] + xd * v["f"] + xd * v["b1"] + yd * v["b2"]
+    image = np.column_stack([u, h * 0.5 + v["cy"] + yd * v["f"]]) - 0.5
+    off = np.linalg.norm(image - truth(camera, view), axis=1).max()
+    assert off < _allowed(path.read_text())
+
+
+def test_aicon_file_by_its_formula(tmp_path, camera, view, truth):
+    """Image to object in closed form: the corrections stand at the measured point."""
+    path = tmp_path / "camera.ior"
+    camera_files.write(camera, path, "aicon")
+    rows = [row.split() for row in path.read_text().splitlines() if not row.startswith("#")]
+    v = {row[0]: float(row[1]) for row in rows if row[0] != "camera"}
+    assert v["Ck"] < 0
+    assert v["R0"] > 0
+    measured = truth(camera, view)
+    x = (measured[:, 0] - (v["pixels_x"] - 1) / 2) * v["sensor_width_mm"] / v["pixels_x"] - v["Xh"]
+    y = (
+        -(measured[:, 1] - (v["pixels_y"] - 1) / 2) * v["sensor_height_mm"] / v["pixels_y"]
+        - v["Yh"]
+    )
+    r2, q = x * x + y * y, v["R0"] ** 2
+    radial = v["A1"] * (r2 - q) + v["A2"] * (r2**2 - q**2) + v["A3"] * (r2**3 - q**3)
+    dx = x * radial + v["B1"] * (r2 + 2 * x * x) + 2 * v["B2"] * x * y + v["C1"] * x + v["C2"] * y
+    dy = y * radial + v["B2"] * (r2 + 2 * y * y) + 2 * v["B1"] * x * y
+    ideal = np.column_stack([(x - dx) / -v["Ck"], -(y - dy) / -v["Ck"]])
+    off_px = np.abs(ideal - view[:, :2] / view[:, 2:]).max() * 3.05 / 0.00112
+    # the residual is stated in the image, this is at the ideal point: up to the distortion's slope
+    assert off_px < 1.1 * _allowed(path.read_text())
+
+
+# --- which conversions are exact ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("interior", "exact_in"),
+    [
+        ({}, {"opencv", "ros", "colmap", "mrcal", "metashape", "json"}),
+        ({"A3": 0.0}, {"opencv", "ros", "colmap", "mrcal", "metashape", "kalibr", "json"}),
+        ({"C1": 3e-4}, {"json"}),
+        ({"C2": 3e-4}, {"json"}),
+        (
+            {"A1": 0.0, "A2": 0.0, "A3": 0.0, "B1": 0.0, "B2": 0.0, "C1": 3e-4},
+            {"opencv", "ros", "colmap", "mrcal", "metashape", "kalibr", "aicon", "json"},
+        ),
+        (
+            {"A1": 0.0, "A2": 0.0, "A3": 0.0, "B1": 0.0, "B2": 0.0, "C1": 3e-4, "C2": 2e-4},
+            {"metashape", "aicon", "json"},
+        ),
+    ],
+    ids=["no affinity", "no A3", "C1", "C2", "pinhole C1", "pinhole C1 C2"],
+)
+def test_exact_where_the_convention_allows(tmp_path, plain, interior, exact_in):
+    model = CameraModel(plain.sensor, plain.interior.with_values(**interior))
+    exact = set()
+    for name in camera_files.FORMATS:
+        statement = camera_files.write(model, tmp_path / name, name)
+        if statement.startswith("exact"):
+            exact.add(name)
+        assert name == "json" or statement in (tmp_path / name).read_text()
+    assert exact == exact_in
+
+
+def test_affinity_costs_thousandths_and_shear_a_quarter_of_a_pixel(tmp_path, plain):
+    """What the docs say; CONVENTIONS §2 lets both be fits."""
+    model = CameraModel(plain.sensor, plain.interior.with_values(C1=3e-4))
+    camera_files.write(model, tmp_path / "a", "opencv")
+    assert 1e-5 < _stated((tmp_path / "a").read_text())[0] < 1e-3
+    model = CameraModel(plain.sensor, plain.interior.with_values(C2=2e-4))
+    camera_files.write(model, tmp_path / "b", "opencv")
+    assert 0.1 < _stated((tmp_path / "b").read_text())[0] < 0.5
+    camera_files.write(model, tmp_path / "c", "metashape")
+    assert _stated((tmp_path / "c").read_text())[0] < 1e-3
+
+
+# --- round trips -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", list(camera_files.FORMATS))
+def test_round_trip(tmp_path, camera, view, truth, name):
+    path = tmp_path / camera_files.file_name("camera", name)
+    camera_files.write(camera, path, name, comment="21 °C\nin the workshop")
+    text = path.read_text(encoding="utf-8")
+    assert "in the workshop" in text
+    back = camera_files.read(path)
+    assert back.format == name
+    assert back.model.sensor.pixel_pitch == pytest.approx(camera.sensor.pixel_pitch, rel=1e-15)
+    assert (back.model.sensor.width, back.model.sensor.height) == (3280, 2464)
+    off = np.linalg.norm(truth(back.model, view) - truth(camera, view), axis=1).max()
+    stated = 0.0 if name == "json" else _allowed(text)
+    assert off < stated + 1.01 * back.largest_px + TOLERANCE_PX
+    if "conversion: exact" in text or name == "json":
+        values, own = back.model.interior.as_array(), camera.interior.as_array()
+        assert values == pytest.approx(own, rel=1e-9, abs=1e-13)
+
+
+@pytest.mark.parametrize("name", list(camera_files.FORMATS))
+def test_second_trip_changes_nothing(tmp_path, without_a3, name):
+    """What has been through a format once is in its range: the next time loses nothing."""
+    first = tmp_path / "first"
+    camera_files.write(without_a3, first, name)
+    once = camera_files.read(first).model
+    camera_files.write(once, tmp_path / "second", name)
+    twice = camera_files.read(tmp_path / "second").model
+    grid = np.array([[0, 0], [3279, 0], [0, 2463], [3279, 2463], [1600, 1200.0]])
+    r1, r2 = once.rays(grid), twice.rays(grid)
+    limit = 2e-2 if name == "aicon" else 1e-6  # aicon: a fit each time, of some 0.008 px
+    assert np.abs(r1 - r2).max() * 3.05 / 0.00112 < limit
+
+
+def test_pixel_pitch_is_asked_for_where_nobody_states_it(tmp_path, plain):
+    path = tmp_path / "camera.yaml"
+    camera_files.write(plain, path, "opencv")
+    text = "\n".join(row for row in path.read_text().splitlines() if "pixel_pitch" not in row)
+    path.write_text(text)
+    with pytest.raises(ConfigurationError, match="--pixel-pitch"):
+        camera_files.read(path)
+    back = camera_files.read(path, pixel_pitch=0.00112)
+    assert back.model.interior.as_array() == pytest.approx(plain.interior.as_array(), rel=1e-9)
+
+
+# --- imports that nobody writes here -----------------------------------------------------------
+
+
+def test_rational_model_is_imported_by_a_fit_that_states_its_residual(tmp_path, view, truth):
+    K = np.array([[2723.0, 0, 1650.0], [0, 2720.0, 1220.0], [0, 0, 1]])
+    d = np.array([0.11, -0.2, 1e-4, -2e-4, 0.02, 0.08, -0.15, 0.01])
+    path = tmp_path / "rational.yaml"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for key, value in (("image_width", 3280), ("image_height", 2464), ("camera_matrix", K),
+                       ("distortion_coefficients", d)):  # fmt: skip
+        storage.write(key, value)
+    storage.release()
+    back = camera_files.read(path, pixel_pitch=0.00112)
+    assert not back.exact
+    inside = view[np.abs(view[:, 0] / view[:, 2]) < 0.55]
+    image, _ = cv2.projectPoints(inside, np.zeros(3), np.zeros(3), K, d)
+    off = np.linalg.norm(image[:, 0] - truth(back.model, inside), axis=1)
+    assert off.max() < 1.05 * back.largest_px
+    assert 0 < back.rms_px < back.largest_px < 1.0
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("1 SIMPLE_PINHOLE 4000 3000 3500 2000.5 1500.5", {"c": 3.5, "x0": 0.0005, "C1": 0.0}),
+        ("1 PINHOLE 4000 3000 3600 3500 2000 1500", {"c": 3.5, "x0": 0.0, "C1": 0.1 / 3.5}),
+        ("7 SIMPLE_RADIAL 4000 3000 3500 2000 1500 0.1", {"A1": 0.1 / 3.5**2}),
+        ("1 RADIAL 4000 3000 3500 2000 1500 0.1 -0.05", {"A2": -0.05 / 3.5**4}),
+    ],
+)
+def test_colmap_simple_models(tmp_path, line, expected):
+    path = tmp_path / "cameras.txt"
+    path.write_text(f"# Camera list\n{line}\n")
+    back = camera_files.read(path, pixel_pitch=0.001)
+    assert back.exact
+    for name, value in expected.items():
+        assert getattr(back.model.interior, name) == pytest.approx(value, abs=1e-12)
+
+
+def test_metashape_sensor_with_covariance(tmp_path):
+    text = """<?xml version="1.0" encoding="UTF-8"?>
+<document version="1.5.0"><chunk><sensors><sensor id="0" type="frame">
+<calibration type="frame" class="adjusted"><resolution width="2256" height="1504"/>
+<f>1940.44</f><cx>13.17</cx><cy>9.91</cy><k1>-0.1</k1></calibration>
+<covariance><params>f cx k1</params><coeffs>4 0 0 0 1 0 0 0 1e-6</coeffs></covariance>
+</sensor></sensors></chunk></document>"""
+    path = tmp_path / "cameras.xml"
+    path.write_text(text)
+    back = camera_files.read(path, pixel_pitch=0.002)
+    i = back.model.interior
+    assert (i.c, i.x0, i.y0) == pytest.approx((1940.44 * 0.002, 13.17 * 0.002, -9.91 * 0.002))
+    sd = np.sqrt(np.diag(back.covariance))
+    assert sd[:3] == pytest.approx([0.004, 0.002, 0.0], abs=1e-9)
+    # A1 = k1/c²: the covariance knows both
+    assert sd[3] == pytest.approx(np.hypot(1e-3 / i.c**2, 2 * 0.1 / i.c**3 * 0.004), rel=1e-4)
+
+
+@pytest.mark.parametrize("r0", [0.0, 1.5])
+def test_balanced_terms_at_the_measured_point_are_imported(tmp_path, r0):
+    """The two conventions of CONVENTIONS §2 that are accepted on import, in one file."""
+    v = {"Ck": -8.2, "Xh": 0.03, "Yh": -0.02, "A1": -1.2e-3, "A2": 2e-5, "R0": r0, "A3": 0.0,
+         "B1": 2e-5, "B2": -1e-5, "C1": 1e-4, "C2": -5e-5, "sensor_width_mm": 8.0,
+         "sensor_height_mm": 6.0, "pixels_x": 2000, "pixels_y": 1500}  # fmt: skip
+    path = tmp_path / "camera.ior"
+    path.write_text("camera x\n" + "".join(f"{k} {value}\n" for k, value in v.items()))
+    back = camera_files.read(path)
+    assert not back.exact
+    assert 0 < back.rms_px < back.largest_px < 0.05
+    grid = np.array([[10, 10], [1990, 20], [1000, 700], [100, 1480], [1500, 300.0]])
+    x, y = (grid[:, 0] - 999.5) * 0.004 - 0.03, -(grid[:, 1] - 749.5) * 0.004 + 0.02
+    r2 = x * x + y * y
+    radial = -1.2e-3 * (r2 - r0**2) + 2e-5 * (r2**2 - r0**4)
+    dx = x * radial + 2e-5 * (r2 + 2 * x * x) - 2e-5 * x * y + 1e-4 * x - 5e-5 * y
+    dy = y * radial - 1e-5 * (r2 + 2 * y * y) + 4e-5 * x * y
+    rays = back.model.rays(grid)
+    off = np.column_stack([(x - dx) / 8.2 + rays[:, 0] / rays[:, 2],
+                           (y - dy) / 8.2 + rays[:, 1] / rays[:, 2]])  # fmt: skip
+    assert np.abs(off).max() * 8.2 / 0.004 < 1.1 * back.largest_px
+
+
+# --- covariance --------------------------------------------------------------------------------
+
+
+def _covariance(interior):
+    """A full covariance of a realistic size, with strong correlations."""
+    rng = np.random.default_rng(3)
+    sd = np.array([3e-4, 2e-4, 2e-4, 3e-5, 1e-5, 1e-6, 3e-6, 3e-6, 1e-5, 1e-5])
+    mix = rng.normal(size=(10, 10)) + 2 * np.eye(10)
+    R = mix @ mix.T
+    d = np.sqrt(np.diag(R))
+    return R / np.outer(d, d) * np.outer(sd, sd)
+
+
+def test_covariance_in_opencv_is_that_of_the_scatter(tmp_path, plain):
+    """Sample cameras of the covariance, write each, and compare the scatter of the files' values.
+
+    400 samples know a standard deviation to 3.5 %. C1 and C2 are held: where they are free each
+    sample is itself a fit, and the covariance is that of the fit.
+    """
+    Q = _covariance(plain.interior)
+    Q[8:], Q[:, 8:] = 0, 0
+    path = tmp_path / "camera.yaml"
+    camera_files.write(plain, path, "opencv", Q)
+
+    def node(name):
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+        value = storage.getNode(name).mat()
+        storage.release()
+        return value
+
+    stated, sd = node("intrinsics_covariance"), node("std_deviation_intrinsics").ravel()
+    assert sd == pytest.approx(np.sqrt(np.diag(stated)))
+    rng = np.random.default_rng(1)
+    samples = rng.multivariate_normal(plain.interior.as_array(), Q, 400)
+    from thermocald.photogrammetry.model_families import BrownOpenCV
+
+    values = np.array(
+        [
+            BrownOpenCV(5).from_brown(CameraModel(plain.sensor, plain.interior.from_array(s)))
+            for s in samples
+        ]
+    )
+    assert values.std(axis=0, ddof=1) / sd == pytest.approx(np.ones(9), abs=0.12)
+    correlation = stated / np.outer(sd, sd)
+    assert np.corrcoef(values.T) == pytest.approx(correlation, abs=0.15)
+
+
+@pytest.mark.parametrize("name", ["opencv", "json"])
+def test_covariance_comes_back(tmp_path, plain, name):
+    Q = _covariance(plain.interior)
+    if name == "opencv":
+        Q[9:], Q[:, 9:] = 0, 0  # shear has no slot
+    path = tmp_path / "camera"
+    camera_files.write(plain, path, name, Q)
+    back = camera_files.read(path).covariance
+    sd = np.sqrt(np.diag(Q))
+    assert np.sqrt(np.diag(back)) == pytest.approx(sd, rel=2e-2, abs=1e-7)
+
+
+def test_aicon_states_standard_deviations(tmp_path, plain):
+    path = tmp_path / "camera.ior"
+    Q = _covariance(plain.interior)
+    camera_files.write(plain, path, "aicon", Q)
+    rows = {row.split()[0]: row.split() for row in path.read_text().splitlines()}
+    # at zero balance Xh is x0; at the measured point to a relative 1e-3
+    assert float(rows["Xh"][2]) == pytest.approx(np.sqrt(Q[1, 1]), rel=0.01)
+    assert camera_files.read(path).covariance[1, 1] == pytest.approx(Q[1, 1], rel=0.05)
+
+
+# --- wrong files -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "reason"),
+    [
+        ("a.yaml", "%YAML:1.0\n---\ncamera_matrix: [1, 2\n", "parse|camera_matrix"),
+        ("b.yaml", "hello: 1\n", "no camera file of any"),
+        ("c.yaml", "image_width: 10\ndistortion_model: equidistant\n", "equidistant"),
+        ("d.yaml", "cam0:\n  camera_model: omni\n", "omni"),
+        ("e.txt", "1 OPENCV_FISHEYE 100 100 1 2 3 4 5 6 7 8\n", "OPENCV_FISHEYE"),
+        ("f.txt", "1 PINHOLE 100 100 90 90 50 50\n2 PINHOLE 100 100 90 90 50 50\n", "2 cameras"),
+        ("g.cameramodel", "{'lensmodel': 'LENSMODEL_SPLINED_STEREOGRAPHIC', 'imagersize': 1}",
+         "SPLINED"),
+        ("h.cameramodel", "__import__('os') # lensmodel imagersize", "Python's notation"),
+        ("i.xml", "<calibration><projection>fisheye</projection></calibration>", "fisheye"),
+        ("j.xml", "<!DOCTYPE x><calibration/>", "DOCTYPE"),
+        ("k.xml", "<calibration><f>nan</f></calibration>", "finite"),
+        ("l.ior", "Ck -8\nCk -9\n", "line 2: Ck stands twice"),
+        ("m.ior", "Ck\n", "no value"),
+        ("n.ior", "Ck -8\nfoo 3\n", "foo"),
+        ("o.json", '{"format": "thermocald-camera/1"}', "sensor or interior"),
+        ("p.txt", "1 PINHOLE 100 100 -90 90 50 50\n", "principal distance of -90"),
+        ("q.txt", "1 RADIAL 4000 3000 3500 2000 1500 -3 0\n", "folds back"),
+        ("r.txt", "1 PINHOLE 100 0 90 90 50 50\n", "100 × 0"),
+    ],
+)  # fmt: skip
+def test_wrong_files_are_one_error_that_names_the_file(tmp_path, name, text, reason):
+    path = tmp_path / name
+    path.write_text(text)
+    with pytest.raises(ConfigurationError, match=reason) as caught:
+        camera_files.read(path, pixel_pitch=0.001)
+    assert name in str(caught.value)
+
+
+def test_absent_binary_and_unknown(tmp_path, plain):
+    with pytest.raises(ConfigurationError, match=r"nowhere\.xml"):
+        camera_files.read(tmp_path / "nowhere.xml")
+    (tmp_path / "x.jpg").write_bytes(b"\xff\xd8\xff\xe0")
+    with pytest.raises(ConfigurationError, match="no text"):
+        camera_files.read(tmp_path / "x.jpg")
+    with pytest.raises(UsageError, match="there are opencv"):
+        camera_files.write(plain, tmp_path / "x", "vision9000")
+    with pytest.raises(UsageError, match="cannot be written"):
+        camera_files.write(plain, tmp_path / "no" / "folder.yaml", "opencv")
+    with pytest.raises(UsageError, match="shape"):
+        camera_files.write(plain, tmp_path / "x", "json", np.eye(3))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["x.jpg"]
+
+
+def test_other_sensor_pitch_than_the_file_says_is_refused(tmp_path, plain):
+    camera_files.write(plain, tmp_path / "a.json", "json")
+    with pytest.raises(ConfigurationError, match=r"0\.002 mm was given"):
+        camera_files.read(tmp_path / "a.json", pixel_pitch=0.002)
+
+
+def test_order_of_the_covariance_is_written_down(tmp_path, plain):
+    camera_files.write(plain, tmp_path / "a.json", "json", _covariance(plain.interior))
+    document = json.loads((tmp_path / "a.json").read_text())
+    assert document["covariance"]["parameters"] == list(IOP_NAMES)
+    assert set(document["interior"]) == {*IOP_NAMES, *(f"sd_{n}" for n in IOP_NAMES)}
+    assert document["sensor"] == {"width": 3280, "height": 2464, "pixel_pitch": 0.00112}
+
+
+def test_tiny_sensor_and_large_pitch(tmp_path, plain):
+    """A cooled infrared camera: 640 × 512 px of 15 µm."""
+    model = CameraModel(Sensor(640, 512, 0.015), plain.interior.with_values(c=12.0, A2=0.0, A3=0.0))
+    for name in camera_files.FORMATS:
+        path = tmp_path / name
+        camera_files.write(model, path, name)
+        assert camera_files.read(path).model.sensor.pixel_pitch == pytest.approx(0.015, rel=1e-12)

@@ -1,0 +1,146 @@
+"""What every camera file's module works on: the camera to be written, the camera that was read."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.errors import ConfigurationError
+from thermocald.photogrammetry.camera_model import CameraModel, InteriorOrientation, Sensor
+from thermocald.photogrammetry.conversions import Family, from_family
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+__all__ = ["Format", "ImportedCamera", "Record", "header", "import_family", "number", "numbers"]
+
+_PITCH = re.compile(r"pixel_pitch_mm[\"']?\s*[:=]\s*([0-9.eE+-]+)")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Record:
+    """A camera to be written: covariance (10, 10) of the interior orientation or None; comment:
+    free text for the file's head.
+    """
+
+    model: CameraModel
+    name: str = "camera"
+    covariance: Array | None = None
+    comment: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImportedCamera:
+    """A camera as read: our model, how well it reproduces the file's own over the image area."""
+
+    model: CameraModel
+    format: str
+    name: str
+    exact: bool
+    largest_px: float
+    rms_px: float
+    covariance: Array | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """A file format: its name, usual suffix, what it is for, and its writer and reader of text.
+
+    `encode(record)` gives the file's text and the statement of its residual; `decode(text, pitch)`
+    reads it, pitch being mm per px where the caller knows it; `recognises(text)` tells from the
+    content alone.
+    """
+
+    name: str
+    suffix: str
+    about: str
+    encode: Callable[[Record], tuple[str, str]]
+    decode: Callable[[str, float | None], ImportedCamera]
+    recognises: Callable[[str], bool]
+
+
+def header(record: Record, statement: str, mark: str = "# ") -> str:
+    """The head of a text file: origin, residual, pixel pitch, comment, each line after a mark."""
+    lines = [
+        "written by thermocald",
+        f"conversion: {statement}",
+        # other programs do without it, reading the file back into millimetres does not
+        f"pixel_pitch_mm: {record.model.sensor.pixel_pitch!r}",
+        *record.comment.splitlines(),
+    ]
+    return "".join(f"{mark}{line}\n" for line in lines)
+
+
+def _pitch(text: str, given: float | None) -> float:
+    """The pixel pitch: as given, else as a comment of ours states it."""
+    found = _PITCH.search(text)
+    pitch = given if given is not None else float(found.group(1)) if found else None
+    if pitch is None:
+        raise ConfigurationError(
+            "the file does not say how large a pixel is: give it, in mm (--pixel-pitch 0.00112 for "
+            "a Raspberry Pi camera v2.1)"
+        )
+    if not (math.isfinite(pitch) and 1e-5 < pitch < 1):
+        raise ConfigurationError(f"pixel pitch {pitch:g} mm: between 0.00001 and 1 mm are possible")
+    return pitch
+
+
+def import_family(
+    format_name: str,
+    text: str,
+    size: tuple[int, int],
+    family: Family,
+    values: Array,
+    pitch: float | None,
+    name: str = "camera",
+    covariance: Array | None = None,
+) -> ImportedCamera:
+    """A camera of another family, converted; size (width, height) px."""
+    width, height = size
+    if not (0 < width <= 100_000 and 0 < height <= 100_000):
+        raise ConfigurationError(f"image size {width} × {height} px is impossible")
+    if not np.all(np.isfinite(values)):
+        raise ConfigurationError("a camera parameter is not a number")
+    sensor = Sensor(width, height, _pitch(text, pitch))
+    # a focal length of zero or less would only fail later, and in other words
+    focal = values[0] / (sensor.pixel_pitch if family.parameters[0] == "c" else 1.0)
+    if not 0.05 * max(size) < focal < 1000 * max(size):
+        raise ConfigurationError(
+            f"a principal distance of {focal:g} px does not belong to an image of {width} × "
+            f"{height} px"
+        )
+    result = from_family(sensor, family, values, covariance)
+    return ImportedCamera(
+        CameraModel(sensor, InteriorOrientation.from_array(result.values)),
+        format_name, name, result.exact, result.largest_px, result.rms_px, result.covariance,
+    )  # fmt: skip
+
+
+def number(value: Any, what: str) -> float:
+    """A finite number, or an error that names it."""
+    try:
+        result = float(value)
+    except (TypeError, ValueError):
+        raise ConfigurationError(f"{what} is {value!r}, not a number") from None
+    if not math.isfinite(result):
+        raise ConfigurationError(f"{what} is {value!r}, not a finite number")
+    return result
+
+
+def numbers(values: Any, what: str, counts: tuple[int, ...]) -> Array:
+    """A list of finite numbers of one of some lengths, or an error that names it."""
+    if not isinstance(values, list | tuple | np.ndarray):
+        raise ConfigurationError(f"{what} is missing or no list")
+    result = np.array([number(v, what) for v in np.ravel(np.asarray(values, dtype=object))])
+    if len(result) not in counts:
+        wanted = " or ".join(map(str, counts))
+        raise ConfigurationError(f"{what} has {len(result)} numbers, not {wanted}")
+    return result

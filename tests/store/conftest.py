@@ -1,0 +1,99 @@
+"""A small recording, built the way a user's would look, and a store with some epochs."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from thermocald.epoch import Epoch
+from thermocald.photogrammetry.camera_model import Sensor
+from thermocald.photogrammetry.testfield import Observations, TestField
+from thermocald.store.database import Store
+from thermocald.store.head import CameraSpec, Channel, Head
+from thermocald.store.recording import write_recording
+from thermocald.store.row import EpochResult
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+N_TARGETS = 12
+
+
+@pytest.fixture
+def field() -> TestField:
+    rng = np.random.default_rng(1)
+    names = [f"t{i}" for i in range(N_TARGETS)]
+    diameters = np.where(np.arange(N_TARGETS) % 3 == 0, np.nan, 20.0)
+    return TestField.build(names, rng.uniform(0, 2000, (N_TARGETS, 3)), 0.02, diameters)
+
+
+@pytest.fixture
+def head() -> Head:
+    camera = CameraSpec("rpi", Sensor(3280, 2464, 0.00112), 3.04)
+    channels = {"temperature": Channel("degC", 0.0625), "board_temperature": Channel()}
+    return Head("small", "M1", 10.0, camera, channels)
+
+
+@pytest.fixture
+def make_epoch():
+    """Epoch number → epoch: its numbers are functions of the number."""
+
+    def make(number: int, targets: int = N_TARGETS) -> Epoch:
+        rng = np.random.default_rng([7, number])
+        rows = np.sort(rng.permutation(N_TARGETS)[:targets])
+        points = np.round(rng.uniform(0, 2400, (targets, 2)), 5)
+        sigmas = np.round(rng.uniform(0.01, 0.1, (targets, 2)), 4)
+        time = 1.6e9 + 10.0 * number
+        temperatures = {"temperature": 20.0 + 0.0625 * number, "board_temperature": 40.5}
+        seen = Observations(rows, points, sigmas)
+        return Epoch(number, time, time + 0.75, temperatures, observations=seen)
+
+    return make
+
+
+@pytest.fixture
+def recording_path(tmp_path: Path, field: TestField, head: Head, make_epoch) -> Path:
+    path = tmp_path / "small"
+    write_recording(
+        path,
+        name=head.name,
+        series=head.series,
+        interval=head.interval,
+        camera=head.camera,
+        channels=head.channels,
+        testfield=field,
+        epochs=[make_epoch(i) for i in range(1, 6)],
+    )
+    return path
+
+
+@pytest.fixture
+def make_result():
+    """Epoch number → result with a full covariance."""
+
+    def make(number: int, status: str = "ok") -> EpochResult:
+        rng = np.random.default_rng([8, number])
+        a = rng.normal(size=(40, 16))
+        return EpochResult(
+            status, "", rng.normal(size=16), a.T @ a * 1e-6, 1.0 + number * 1e-3, 200, 300, (1, 5)
+        )
+
+    return make
+
+
+@pytest.fixture
+def store_path(tmp_path: Path) -> Path:
+    return tmp_path / "small.db"
+
+
+@pytest.fixture
+def filled(store_path: Path, field: TestField, head: Head, make_epoch, make_result):
+    """An open store with epochs 1 to 20 of one series."""
+    with Store.open(store_path, "append", durable=False) as store:
+        series = store.create_series(head, field, start="cold", identity={"serial": "x1"})
+        for i in range(1, 21):
+            extra = {"blur": 0.8 + 0.01 * i}
+            store.append(series, make_epoch(i), make_result(i), extra=extra)
+        yield store, series

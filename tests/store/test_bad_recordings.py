@@ -1,0 +1,217 @@
+"""Every broken recording: one error that names file, line and column, and says what to do."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from thermocald.errors import RecordingError, TestFieldError, ThermocaldError
+from thermocald.store.recording import read_recording, read_testfield
+
+
+def edit(path, old: str, new: str) -> None:
+    text, replaced = re.subn(old, new, path.read_text(), count=1)
+    assert replaced
+    path.write_text(text)
+
+
+def set_field(path, line: int, column: str, value: str) -> None:
+    lines = path.read_text().split("\n")
+    names = lines[0].split(",")
+    fields = lines[line - 1].split(",")
+    fields[names.index(column)] = value
+    lines[line - 1] = ",".join(fields)
+    path.write_text("\n".join(lines))
+
+
+# file, line, column, value, what the message must hold
+CELLS = [
+    ("observations.csv", 5, "x", "NaN", "not a finite number"),
+    ("observations.csv", 5, "y", "inf", "not a finite number"),
+    ("observations.csv", 7, "x", "12,5", None),
+    ("observations.csv", 7, "x", "abc", "'abc' is not a number"),
+    ("observations.csv", 7, "x", "", "is empty"),
+    ("observations.csv", 9, "sx", "0", "above 0 px"),
+    ("observations.csv", 9, "sy", "-0.1", "above 0 px"),
+    ("observations.csv", 4, "target", "t999", "'t999' does not stand in testfield.csv"),
+    ("observations.csv", 3, "target", "t0", "'t0' stands twice in epoch 1"),
+    ("observations.csv", 6, "epoch", "77", "epoch 77 does not stand in epochs.csv"),
+    ("observations.csv", 6, "epoch", "1.5", "not an integer"),
+    ("epochs.csv", 3, "frame_time", "1599999999.0", "runs backwards"),
+    ("epochs.csv", 3, "temperature_time", "1599999999.0", "runs backwards"),
+    ("epochs.csv", 4, "frame_time", "2020-09-13 12:26", "is not a number"),
+    ("epochs.csv", 4, "frame_time", "nan", "not a finite number"),
+    ("epochs.csv", 4, "temperature", "warm", "'warm' is not a number"),
+    ("epochs.csv", 4, "temperature", "-300", "below absolute zero"),
+    ("epochs.csv", 4, "temperature_time", "", "empty although temperature was read"),
+    ("epochs.csv", 3, "epoch", "1", "stands twice or after a later one"),
+    ("epochs.csv", 3, "frame", "frames/gone.png", "is missing"),
+    ("testfield.csv", 2, "X", "NaN", "not a finite number"),
+    ("testfield.csv", 3, "target", "t0", "'t0' stands twice"),
+    ("testfield.csv", 3, "target", "", "every target needs a name"),
+    ("testfield.csv", 3, "sX", "-1", "must not be negative"),
+    ("testfield.csv", 4, "diameter", "0", "above 0 mm"),
+]
+
+
+@pytest.mark.parametrize(("file", "line", "column", "value", "message"), CELLS)
+def test_a_bad_cell_is_named(recording_path, file, line, column, value, message):
+    set_field(recording_path / file, line, column, value)
+    with pytest.raises((RecordingError, TestFieldError)) as caught:
+        read_recording(recording_path)
+    text = str(caught.value)
+    assert f"{file}, line {line}" in text
+    if message is None:
+        assert "has 7 fields instead of 6" in text
+    else:
+        assert f"column {column}: " in text
+        assert message in text
+
+
+def test_a_column_missing_is_named(recording_path):
+    for file, column in (
+        ("epochs.csv", "board_temperature"),
+        ("epochs.csv", "frame_time"),
+        ("observations.csv", "sx"),
+        ("testfield.csv", "sZ"),
+    ):
+        path = recording_path / file
+        text = path.read_text()
+        path.write_text(text.replace(column, f"other_{column}", 1))
+        with pytest.raises(ThermocaldError, match=rf"{file}, line 1: column {column} is missing"):
+            read_recording(recording_path)
+        path.write_text(text)
+
+
+def test_semicolons_are_explained(recording_path):
+    path = recording_path / "epochs.csv"
+    path.write_text(path.read_text().replace(",", ";"))
+    with pytest.raises(RecordingError, match="separate the columns with commas"):
+        read_recording(recording_path)
+
+
+def test_another_case_is_explained(recording_path):
+    edit(recording_path / "testfield.csv", "X,Y,Z", "x,y,z")
+    with pytest.raises(TestFieldError, match="is 'x' meant"):
+        read_recording(recording_path)
+
+
+@pytest.mark.parametrize("file", ["recording.yaml", "epochs.csv", "testfield.csv"])
+def test_a_missing_file_is_named(recording_path, file):
+    (recording_path / file).unlink()
+    with pytest.raises(ThermocaldError, match=file):
+        read_recording(recording_path)
+
+
+@pytest.mark.parametrize(
+    "file", ["recording.yaml", "epochs.csv", "testfield.csv", "observations.csv"]
+)
+@pytest.mark.parametrize("content", [b"", b"\x00" * 64, b"\xff\xfe\x00garbage", b'"never closed\n'])
+def test_files_that_are_none(recording_path, file, content):
+    (recording_path / file).write_bytes(content)
+    with pytest.raises(ThermocaldError, match=file):
+        read_recording(recording_path)
+
+
+def test_every_cut_through_observations_is_an_error_or_a_shorter_recording(recording_path):
+    path = recording_path / "observations.csv"
+    whole = path.read_bytes()
+    read, refused = 0, 0
+    for size in range(0, len(whole), 37):
+        path.write_bytes(whole[:size])
+        complete = whole[:size].count(b"\n")
+        try:
+            recording = read_recording(recording_path)
+        except RecordingError:
+            refused += 1
+        else:
+            read += 1
+            assert complete - 1 <= sum(len(e.observations) for e in recording.epochs) <= complete
+    assert read > 0
+    assert refused > 50
+
+
+def test_half_a_last_line_is_named(recording_path):
+    path = recording_path / "observations.csv"
+    text = path.read_text()
+    path.write_text(text[: text.rindex(",")])
+    with pytest.raises(
+        RecordingError, match=r"line 61: has 5 fields instead of 6; is the file cut"
+    ):
+        read_recording(recording_path)
+
+
+def test_lines_are_counted_past_quoted_line_ends_and_blank_lines(recording_path):
+    path = recording_path / "testfield.csv"
+    header, *rows = path.read_text().splitlines()
+    rows[0] = '"first\ntarget"' + rows[0][rows[0].index(",") :]
+    rows[3] = rows[3].replace(rows[3].split(",")[1], "nan")
+    path.write_text("\n".join([header, rows[0], "", *rows[1:]]) + "\n")
+    with pytest.raises(TestFieldError, match="line 7, column X"):  # 1 + 2 + 1 + 3
+        read_testfield(path)
+
+
+HEADS = [
+    ("format: .*", "format: thermocald-recording/9", "format: is 'thermocald-recording/9'"),
+    ("format: .*", "other: 1", "format: is missing"),
+    ("interval: .*", "interval: soon", "'soon' is not a finite number"),
+    ("interval: .*", "interval: -1", "it must be above 0"),
+    ("interval: .*", "interval: .inf", "not a finite number"),
+    ("width: 3280", "width: 0", "camera.width: is 0 px"),
+    ("width: 3280", "width: 12.5", "whole number"),
+    ("width: 3280, ", "", "camera.width: is missing"),
+    ("pixel_pitch: 0.00112", "pixel_pitch: 1.12", "thousandths of a mm"),
+    ("principal_distance: 3.04", "principal_distance: -3", "above 0"),
+    ("unit: degC", "unit: degF", "must be in degC"),
+    ("resolution: 0.0625", "resolution: fine", "temperatures.temperature.resolution"),
+    ("name: small", "name: [small]", "name: must be text"),
+    ("name: small", "name: small\nname: other", "stands twice"),
+    ("name: small", "name: !!bool x", "no YAML"),
+    ("name: small", "name: [small", "recording.yaml, line"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "message"), HEADS)
+def test_a_bad_head_is_named(recording_path, old, new, message):
+    path = recording_path / "recording.yaml"
+    edit(path, old, new)
+    with pytest.raises(RecordingError, match=re.escape(message)) as caught:
+        read_recording(recording_path)
+    assert "recording.yaml" in str(caught.value)
+
+
+def test_a_field_in_metres_is_recognised(recording_path):
+    path = recording_path / "testfield.csv"
+    header, *rows = path.read_text().splitlines()
+    metres = []
+    for row in rows:
+        name, *numbers = row.split(",")
+        metres.append(",".join([name, *(n and str(float(n) / 1000) for n in numbers)]))
+    path.write_text("\n".join([header, *metres]) + "\n")
+    with pytest.raises(TestFieldError, match="metres times 1000"):
+        read_recording(recording_path)
+
+
+def test_a_field_in_metres_is_recognised_by_the_principal_distance(recording_path):
+    """A hall of 48 m in metres is 48 "mm": too near for a lens of 12 mm, whatever it is."""
+    field = recording_path / "testfield.csv"
+    field.write_text(
+        "target,X,Y,Z,diameter,sX,sY,sZ\n"
+        + "".join(f"t{i},{4 * i},{i % 3},1,,0,0,0\n" for i in range(12))
+    )
+    read_testfield(field)
+    edit(recording_path / "recording.yaml", "distance: 3.04", "distance: 12.7")
+    with pytest.raises(TestFieldError, match="metres times 1000"):
+        read_recording(recording_path)
+
+
+def test_a_recording_of_nothing(recording_path):
+    (recording_path / "observations.csv").unlink()
+    with pytest.raises(RecordingError, match="nothing to calibrate from"):
+        read_recording(recording_path)
+
+
+def test_a_file_instead_of_a_folder(recording_path):
+    with pytest.raises(RecordingError, match="is no folder"):
+        read_recording(recording_path / "epochs.csv")

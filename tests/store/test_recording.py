@@ -1,0 +1,219 @@
+"""Recordings: what is written is read again, whole or as a stream; real ones are accepted."""
+
+from __future__ import annotations
+
+import tracemalloc
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from thermocald.epoch import Epoch
+from thermocald.errors import RecordingError
+from thermocald.photogrammetry.camera_model import InteriorOrientation
+from thermocald.photogrammetry.testfield import Observations, TestField
+from thermocald.store import recording as module
+from thermocald.store.recording import (
+    RecordingWriter,
+    open_recording,
+    read_recording,
+    read_testfield,
+    temperature_at_frame,
+    write_recording,
+    write_testfield,
+)
+
+
+def same(a: Observations, b: Observations) -> bool:
+    return (
+        np.array_equal(a.targets, b.targets)
+        and np.array_equal(a.points, b.points)
+        and np.allclose(a.sigmas, b.sigmas, rtol=1e-5)
+    )
+
+
+def test_written_recording_is_read_as_it_was(recording_path, field, head, make_epoch):
+    recording = read_recording(recording_path)
+    assert (recording.name, recording.series, recording.interval) == ("small", "M1", 10.0)
+    assert (recording.camera, dict(recording.channels)) == (head.camera, dict(head.channels))
+    assert recording.testfield.names == field.names
+    assert np.array_equal(recording.testfield.points, field.points)
+    assert np.array_equal(recording.testfield.diameters, field.diameters, equal_nan=True)
+    assert [epoch.number for epoch in recording.epochs] == [1, 2, 3, 4, 5]
+    for read, made in zip(recording.epochs, map(make_epoch, range(1, 6)), strict=True):
+        assert read.frame_time == pytest.approx(made.frame_time, abs=1e-6)
+        assert read.temperature_time == pytest.approx(made.temperature_time, abs=1e-6)
+        assert read.temperatures == made.temperatures
+        assert same(read.observations, made.observations)
+
+
+def test_head_keeps_interior_and_unknown_keys(tmp_path, field, head, make_epoch):
+    camera = replace(head.camera, interior=InteriorOrientation(3.04, 0.01, -0.02, A1=1e-3))
+    extra = {"lamp": {"power": 60}, "note": "north wall"}
+    with RecordingWriter(tmp_path / "r", replace(head, camera=camera, extra=extra), field) as w:
+        w.append(make_epoch(1))
+    recording = read_recording(tmp_path / "r")
+    assert (recording.camera, recording.extra) == (camera, extra)
+
+
+def test_stream_gives_the_same_epochs(recording_path, monkeypatch):
+    whole = read_recording(recording_path).epochs
+    monkeypatch.setattr(module, "_STREAMED_ABOVE_BYTES", 0)
+    monkeypatch.setattr(module.Table.chunks, "__defaults__", (7,))  # epochs span chunks
+    streamed = list(open_recording(recording_path).iter_epochs())
+    assert [e.number for e in streamed] == [e.number for e in whole]
+    for a, b in zip(streamed, whole, strict=True):
+        assert same(a.observations, b.observations)
+
+
+def test_epochs_without_observations_are_empty_not_missing(tmp_path, field, head, make_epoch):
+    epochs = [make_epoch(1), make_epoch(2, targets=0), make_epoch(3)]
+    with RecordingWriter(tmp_path / "r", head, field) as writer:
+        for epoch in epochs:
+            writer.append(epoch)
+    read = read_recording(tmp_path / "r").epochs
+    assert [len(epoch.observations) for epoch in read] == [12, 0, 12]
+
+
+def test_rows_in_any_order(recording_path):
+    file = recording_path / "observations.csv"
+    expected = read_recording(recording_path).epochs
+    header, *rows = file.read_text().splitlines()
+    rows.sort(key=lambda row: row.split(",")[1])  # by target, as a spreadsheet may sort
+    file.write_text("\n".join([header, *rows]) + "\n")
+    for a, b in zip(read_recording(recording_path).epochs, expected, strict=True):
+        order = np.argsort(a.observations.targets)
+        assert same(a.observations.select(order), b.observations)
+
+
+def test_covariances_and_quality_travel(tmp_path, field, head):
+    rows = np.arange(4)
+    seen = Observations(
+        rows, np.ones((4, 2)), np.full((4, 2), 0.1), np.full(4, 0.003), {"blur": rows * 0.5}
+    )
+    with RecordingWriter(tmp_path / "r", head, field) as writer:
+        writer.append(Epoch(1, 1.6e9, np.nan, observations=seen))
+    (epoch,) = read_recording(tmp_path / "r").epochs
+    assert epoch.observations.covariances.tolist() == [0.003] * 4
+    assert epoch.observations.quality["blur"].tolist() == [0.0, 0.5, 1.0, 1.5]
+
+
+def test_frames_are_kept_and_found(tmp_path, field, head):
+    image = np.arange(64, dtype=np.uint8).reshape(8, 8)
+    with RecordingWriter(tmp_path / "r", head, field) as writer:
+        writer.append(Epoch(1, 1.6e9, 1.6e9, {"temperature": 20.0}), image=image)
+        writer.append(Epoch(2, 1.6e9 + 10, np.nan), image=b"\xff\xd8 jpeg")
+        writer.append(Epoch(3, 1.6e9 + 20, np.nan))
+    recording = read_recording(tmp_path / "r")
+    assert not recording.has_observations
+    assert [e.frame and e.frame.name for e in recording.epochs] == [
+        "000001.png",
+        "000002.jpg",
+        None,
+    ]
+    assert recording.epochs[1].frame.read_bytes() == b"\xff\xd8 jpeg"
+    assert recording.epochs[2].note == "neither frame nor observations"
+
+
+def test_names_with_commas_and_quotes(tmp_path, head):
+    names = ["a,b", 'say "x"', "ä ö"]
+    field = TestField.build(names, np.eye(3) * 1000)
+    seen = Observations(np.arange(3), np.ones((3, 2)), np.ones((3, 2)))
+    with RecordingWriter(tmp_path / "r", head, field) as writer:
+        writer.append(Epoch(1, 0.0, np.nan, observations=seen))
+    recording = read_recording(tmp_path / "r")
+    assert list(recording.testfield.names) == names
+    assert recording.epochs[0].observations.targets.tolist() == [0, 1, 2]
+
+
+def test_testfield_keeps_kinds_and_codes(tmp_path):
+    codes = ["DICT_APRILTAG_36h11:17:0", "DICT_APRILTAG_36h11:17:1"]
+    field = TestField.build(
+        ["a", "b"], np.eye(3)[:2] * 999.123456789, 0.1, np.nan, "marker_corner", codes
+    )
+    write_testfield(tmp_path / "f.csv", field)
+    read = read_testfield(tmp_path / "f.csv")
+    assert (read.names, read.kinds, read.codes) == (field.names, field.kinds, field.codes)
+    assert np.array_equal(read.points, field.points)
+    assert np.array_equal(read.sigmas, field.sigmas)
+
+
+def test_extra_columns_are_kept_and_ignored(recording_path):
+    for name, column in (("epochs.csv", "weather"), ("testfield.csv", "remark")):
+        file = recording_path / name
+        header, *rows = file.read_text().splitlines()
+        file.write_text("\n".join([f"{header},{column}", *(f"{row},fine" for row in rows)]) + "\n")
+    recording = read_recording(recording_path)
+    assert recording.columns.extra == {"weather": ("fine",) * 5}
+
+
+def test_a_failing_source_leaves_nothing(tmp_path, field, head, make_epoch):
+    def epochs():
+        yield make_epoch(1)
+        raise RuntimeError("the simulation failed")
+
+    with pytest.raises(RuntimeError):
+        write_recording(
+            tmp_path / "r",
+            name="r",
+            series="M1",
+            interval=1.0,
+            camera=head.camera,
+            channels=head.channels,
+            testfield=field,
+            epochs=epochs(),
+        )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_recording_is_not_overwritten(recording_path, field, head):
+    before = (recording_path / "epochs.csv").read_bytes()
+    with pytest.raises(RecordingError, match="exists already"):
+        RecordingWriter(recording_path, head, field).__enter__()
+    assert (recording_path / "epochs.csv").read_bytes() == before
+
+
+def test_writer_refuses_numbers_that_do_not_increase(tmp_path, field, head, make_epoch):
+    epochs = [make_epoch(2), make_epoch(1)]
+    spec = {"name": "r", "series": "M1", "interval": 1.0, "camera": head.camera}
+    with pytest.raises(RecordingError, match="epoch 1 comes after 2"):
+        write_recording(
+            tmp_path / "r", **spec, channels=head.channels, testfield=field, epochs=epochs
+        )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_writing_does_not_grow_with_length(tmp_path, field, head, make_epoch):
+    def peak(epochs: int) -> int:
+        tracemalloc.start()
+        with RecordingWriter(tmp_path / f"r{epochs}", head, field) as writer:
+            for i in range(epochs):
+                writer.append(make_epoch(i))
+        size = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return size
+
+    peak(2)  # imports
+    assert peak(600) < peak(60) + 50_000
+
+
+@pytest.mark.parametrize(("camera", "rows"), [(0, 11116), (1, 9392), (2, 8272), (6, 14024)])
+def test_real_recordings_are_read_and_survive_a_round_trip(shared, tmp_path, camera, rows):
+    recording = read_recording(shared / "data" / f"aviary-cam{camera}")
+    assert len(recording.epochs) == 101
+    assert sum(len(epoch.observations) for epoch in recording.epochs) == rows
+    assert np.isnan(temperature_at_frame(recording.epochs)).all()  # none was measured
+    copy = tmp_path / "copy"
+    write_recording(
+        copy,
+        name=recording.name,
+        series=recording.series,
+        interval=recording.interval,
+        camera=recording.camera,
+        channels=recording.channels,
+        testfield=recording.testfield,
+        epochs=recording.epochs,
+    )
+    for a, b in zip(read_recording(copy).epochs, recording.epochs, strict=True):
+        assert same(a.observations, b.observations)
+        assert a.frame_time == b.frame_time

@@ -106,31 +106,43 @@ class Scene:
         blur: float = 0.8,
         finer: int = 4,
     ) -> np.ndarray:
-        """Grey values (h, w), float and without noise, of the frame or of window (x, y, w, h)."""
+        """Grey values (h, w), float and without noise, of the frame or of window (x, y, w, h).
+
+        Blur and pixel average are linear: each shape is drawn, blurred, and added by itself.
+        """
         x0, y0, w, h = window or (0, 0, camera.sensor.width, camera.sensor.height)
+        cx, cy = camera.sensor.centre
+
+        def light(u, v):
+            return 1 + self.light[0] * (u - cx)[None, :] + self.light[1] * (v - cy)[:, None]
+
+        image = self.paper * light(np.arange(x0, x0 + w), np.arange(y0, y0 + h))
         margin = int(np.ceil(6 * blur)) + 1
-        wide, high = (w + 2 * margin) * finer, (h + 2 * margin) * finer
-        image = np.full((high, wide), self.paper)
+        size = 2 * int(np.ceil(6 * blur * finer)) + 1
         for shape in self.shapes:
             points = camera.project(exterior, shape)
             if not np.isfinite(points).all():
                 continue
-            grid = (points - (x0 - margin - 0.5, y0 - margin - 0.5)) * finer
-            low = np.maximum(np.floor(grid.min(axis=0)).astype(int) - 1, 0)
-            top = np.minimum(np.ceil(grid.max(axis=0)).astype(int) + 1, (wide, high))
+            low = np.floor(points.min(axis=0) + 0.5).astype(int) - margin
+            top = np.ceil(points.max(axis=0) + 0.5).astype(int) + margin
+            low, top = np.maximum(low, (x0, y0)), np.minimum(top, (x0 + w, y0 + h))
             if np.any(top <= low):
                 continue
-            part = coverage(grid - low, *(top - low))
-            image[low[1] : top[1], low[0] : top[0]] += (self.ink - self.paper) * part
-        u = np.arange(wide) / finer + x0 - margin
-        v = np.arange(high) / finer + y0 - margin
-        cx, cy = camera.sensor.centre
-        image *= 1 + self.light[0] * (u - cx)[None, :] + self.light[1] * (v - cy)[:, None]
-        if blur > 0:
-            size = 2 * int(np.ceil(6 * blur * finer)) + 1
-            image = cv2.GaussianBlur(image, (size, size), blur * finer)
-        small = image.reshape(h + 2 * margin, finer, w + 2 * margin, finer).mean(axis=(1, 3))
-        return small[margin:-margin, margin:-margin]
+            # The patch is drawn with a margin of its own, so that its edge is right as well.
+            px, py = low - margin
+            wide, high = (top - low + 2 * margin) * finer
+            part = coverage((points + 0.5 - (px, py)) * finer, wide, high)
+            part *= self.ink - self.paper
+            if any(self.light):
+                u = (np.arange(wide) + 0.5) / finer + px - 0.5
+                v = (np.arange(high) + 0.5) / finer + py - 0.5
+                part *= light(u, v)
+            if blur > 0:
+                part = cv2.GaussianBlur(part, (size, size), blur * finer)
+            mean = part.reshape(high // finer, finer, wide // finer, finer).mean(axis=(1, 3))
+            mean = mean[margin:-margin, margin:-margin]
+            image[low[1] - y0 : top[1] - y0, low[0] - x0 : top[0] - x0] += mean
+        return image
 
 
 def plane_axes(normal) -> tuple[np.ndarray, np.ndarray]:

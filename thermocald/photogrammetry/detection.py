@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -35,10 +36,11 @@ _FEWEST_CONTOUR_POINTS = 8
 _LARGEST_SHARE = 0.12  # of the image's width
 _COMPACTNESS = 0.5
 _AREA_TOLERANCE = 0.12
-_RADIUS_TOLERANCE = 0.09
+_RADIUS_TOLERANCE = 0.03
+_SMALLEST_AXIS = 1.5
 _LARGEST_AXIS_RATIO = 3.2  # 60° obliqueness and then some perspective
-_ANGLES = 168  # a multiple of 12 and of 14
-_RADII = (0.5, 1.5, 2.3, 2.5, 2.7, 3.4)
+_ANGLES = 84  # a multiple of 12 and of 14
+_RADII = (0.5, 1.5, 2.35, 2.65, 3.4)
 _INSIDE, _OUTSIDE = 0.6, 0.4  # grey level of a sample, 0 background, 1 ink
 _SHARE = 0.94  # of the samples on a circle that must agree
 _MISFIT = 0.20
@@ -83,7 +85,7 @@ def find_circles(image: NDArray[np.uint8], scale: int = 1, ink: int = -1) -> Can
     _, mask = cv2.threshold(difference, _OFFSET_DN, 255, cv2.THRESH_BINARY)
     contours, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     longest = 4 * _LARGEST_SHARE * small.shape[1]
-    found = []
+    found, outlines = [], []
     for contour in contours:
         if not _FEWEST_CONTOUR_POINTS <= len(contour) <= longest:
             continue
@@ -93,32 +95,37 @@ def find_circles(image: NDArray[np.uint8], scale: int = 1, ink: int = -1) -> Can
             continue
         (x, y), (width, height), angle = cv2.fitEllipseDirect(contour)
         ellipse = np.pi / 4 * width * height
-        if not abs(area - ellipse) < _AREA_TOLERANCE * ellipse + 3.0:
-            continue
-        # The contour runs through pixel centres, half a pixel inside of the outline.
-        a, b = width / 2 + 0.5, height / 2 + 0.5
-        if max(a, b) > _LARGEST_AXIS_RATIO * min(a, b) or not _is_ellipse(
-            contour, x, y, width / 2, height / 2, np.radians(angle)
+        if (
+            abs(area - ellipse) < _AREA_TOLERANCE * ellipse + 3.0
+            and min(width, height) >= _SMALLEST_AXIS
+            and max(width, height) + 1 <= _LARGEST_AXIS_RATIO * (min(width, height) + 1)
         ):
-            continue
-        found.append((x, y, a, b, np.radians(angle)))
+            found.append((x, y, width / 2, height / 2, np.radians(angle)))
+            outlines.append(contour)
     e = np.array(found, dtype=float).reshape(-1, 5)
+    e = e[_are_ellipses(outlines, e)]
     centre = scale * e[:, :2] + (scale - 1) / 2
+    # A contour runs through pixel centres, half a pixel inside of the outline.
     return Candidates(
-        from_ellipses(centre, scale * e[:, 2:4], e[:, 4]), np.full(len(e), ink, dtype=np.int64)
+        from_ellipses(centre, scale * (e[:, 2:4] + 0.5), e[:, 4]),
+        np.full(len(e), ink, dtype=np.int64),
     )
 
 
-def _is_ellipse(
-    contour: NDArray[Any], x: float, y: float, a: float, b: float, angle: float
-) -> bool:
-    """Whether the contour's points keep to the ellipse, to a pixel's raster and some per cent."""
-    if min(a, b) < 0.75:
-        return False
-    c, s = np.cos(angle), np.sin(angle)
-    dx, dy = contour[:, 0, 0] - x, contour[:, 0, 1] - y
-    rho = np.sqrt(((c * dx + s * dy) / a) ** 2 + ((c * dy - s * dx) / b) ** 2)
-    return bool(np.abs(rho - 1).mean() < _RADIUS_TOLERANCE / 3 + 0.35 / min(a, b))
+def _are_ellipses(contours: list[Any], e: Array) -> NDArray[np.bool_]:
+    """Which contours keep to their ellipses (x, y, a, b, angle), to a pixel's raster and 3 %."""
+    if not contours:
+        return np.zeros(0, dtype=bool)
+    count = np.array([len(c) for c in contours])
+    which = np.repeat(np.arange(len(contours)), count)
+    points = np.concatenate(contours)[:, 0].astype(float)
+    x, y, a, b, angle = e.T
+    c, s = np.cos(angle)[which], np.sin(angle)[which]
+    dx, dy = points[:, 0] - x[which], points[:, 1] - y[which]
+    rho = np.hypot((c * dx + s * dy) / a[which], (c * dy - s * dx) / b[which])
+    off = np.bincount(which, np.abs(rho - 1)) / count
+    keeps: NDArray[np.bool_] = off < _RADIUS_TOLERANCE + 0.35 / np.minimum(a, b)
+    return keeps
 
 
 def read_codes(
@@ -161,6 +168,7 @@ def read_codes(
     )
 
 
+@cache
 def _codes(bits: int) -> frozenset[int]:
     return frozenset(ring_code.codes(bits))
 
@@ -185,7 +193,7 @@ def _ring_profiles(
             cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0,
         )  # fmt: skip
         profiles[i : i + chunk] = sampled.reshape(len(part), len(_RADII), _ANGLES)
-    ink, gap = np.median(profiles[:, 0], axis=1), np.median(profiles[:, 1], axis=1)
+    ink, gap = profiles[:, 0].mean(axis=1), profiles[:, 1].mean(axis=1)
     contrast = ink - gap
     enough = contrast * candidates.ink >= _LEAST_CONTRAST_DN
     safe = np.where(enough, contrast, 1.0)
@@ -200,7 +208,7 @@ def _ring_profiles(
         & (np.mean(level[:, 1] < _OUTSIDE, axis=1) >= _SHARE)
         & (np.mean(level[:, -1] < _OUTSIDE, axis=1) >= _SHARE)
     )
-    return level[:, 2:5].mean(axis=1), passed
+    return level[:, 2:4].mean(axis=1), passed
 
 
 def _read_family(ring: NDArray[np.float32], bits: int) -> tuple[NDArray[np.int64], Array]:

@@ -23,7 +23,7 @@ Word = Literal[
 
 _LEAST_CONTRAST = 8.0  # DN of 255 between the darkest and brightest percentile
 _HALF_SHARE = 0.15
-_REDUCED = 8
+_HALVINGS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,8 +64,10 @@ def inspect_frame(image: NDArray[Any], size: tuple[int, int] | None = None) -> F
             f"{size[0]}×{size[1]} px{turned}",
         )
     # Averaged, so that the noise of a dark frame does not pass for contrast.
-    small = (max(width // _REDUCED, 1), max(height // _REDUCED, 1))
-    sample = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
+    sample = image
+    for _ in range(_HALVINGS):
+        if min(sample.shape) >= 2:
+            sample = cv2.resize(sample, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     low, high = (int(v) for v in np.percentile(sample, (0.5, 99.5), method="nearest"))
     top = 255 if image.dtype == np.uint8 else max(int(sample.max()), 1023)
     if high - low < _LEAST_CONTRAST / 255 * top:

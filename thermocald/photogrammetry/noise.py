@@ -26,6 +26,7 @@ _CUT_LOSS = 0.9989  # variance left of a normal distribution cut at 4 sd
 _FEWEST = 200
 _ENOUGH = 20_000
 _BINS = 6
+_CONSTANT = 1.15
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,10 +36,17 @@ class NoiseModel:
     floor: float
     gain: float = 0.0
 
-    def variance(self, grey: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+    def variance(
+        self, grey: NDArray[np.floating[Any]] | np.floating[Any]
+    ) -> NDArray[np.floating[Any]]:
         """Variance in DN² at grey values, never below what quantisation leaves."""
         v: NDArray[np.floating[Any]] = np.maximum(self.floor + self.gain * grey, _QUANTISATION)
         return v
+
+    def is_constant(self, grey: NDArray[np.floating[Any]]) -> bool:
+        """Whether the variance over these grey values differs by less than a weighting is worth."""
+        low, high = self.variance(np.array([grey.min(initial=1e9), grey.max(initial=-1e9)]))
+        return bool(max(low, high) < _CONSTANT * min(low, high))
 
 
 def estimate_noise(

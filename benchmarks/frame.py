@@ -1,0 +1,161 @@
+"""Frame to parameters, 8 MP grey JPEG in memory, one thread, in multiples of decoding that JPEG.
+
+Run: python -m benchmarks.frame        (--check: exit status 1 where a bound is missed)
+Bounds: tracked epoch (decode, ~150 centres, adjustment with covariance) ≤ 1.3 ×; from nothing
+(no prior but the sensor and the lens's nominal principal distance) ≤ 4 ×. Beside it OpenCV's
+routes; they give no covariance of the parameters and no identification.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import simplejpeg
+
+from tests.photogrammetry.exact_rendering import noisy
+from tests.photogrammetry.fields import PI_CAMERA, PI_SENSOR, corner_field, draw, station
+from thermocald.photogrammetry.adjustment import Adjustment, adjust
+from thermocald.photogrammetry.measurement import Prior, measure
+from thermocald.photogrammetry.tracking import Tracker
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+REPEATS = 15
+QUALITY = 90
+BOUNDS = {"tracked epoch": 1.3, "from nothing": 4.0}
+
+
+def best(work: Callable[[], object], repeats: int = REPEATS) -> float:
+    """Shortest of several runs in s: what the work costs, without what else the machine does."""
+    times = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - begin)
+    return min(times)
+
+
+def main() -> int:
+    cv2.setNumThreads(1)
+    field, normals = corner_field()
+    exterior = station()
+    clean = draw(field, normals).render(PI_CAMERA, exterior)
+    rng = np.random.default_rng(3)
+    frames = [
+        simplejpeg.encode_jpeg(noisy(clean, rng)[..., None], QUALITY, "GRAY") for _ in range(4)
+    ]
+    truth = PI_CAMERA.project(exterior, field.points)
+    seen = PI_SENSOR.contains(truth, 30)
+    buffer = np.empty((PI_SENSOR.height, PI_SENSOR.width, 1), dtype=np.uint8)
+    turn = [0]
+
+    def decode() -> np.ndarray:
+        turn[0] = (turn[0] + 1) % len(frames)
+        simplejpeg.decode_jpeg(frames[turn[0]], "GRAY", buffer=buffer)
+        return buffer[..., 0]
+
+    tracker = Tracker(field, Prior(PI_SENSOR, principal_distance=3.04))
+    start = tracker.measure(decode())
+    assert start.orientation is not None
+    last = [
+        adjust(
+            PI_SENSOR, field, start.observations, start.orientation.camera.interior,
+            start.orientation.exterior,
+        )
+    ]  # fmt: skip
+
+    def tracked() -> Adjustment:
+        measured = tracker.measure(decode())
+        assert not measured.searched, measured.searched
+        # As in a series: the last epoch is the start of the next.
+        assert last[0].interior is not None
+        assert last[0].exterior is not None
+        last[0] = adjust(
+            PI_SENSOR, field, measured.observations, last[0].interior, last[0].exterior
+        )
+        assert last[0].ok, last[0].reason
+        return last[0]
+
+    def from_nothing() -> Adjustment:
+        measured = measure(decode(), field, Prior(PI_SENSOR, principal_distance=3.04))
+        o = measured.orientation
+        assert o is not None
+        result = adjust(PI_SENSOR, field, measured.observations, o.camera.interior, o.exterior)
+        assert result.ok, result.reason
+        return result
+
+    def calibrate(points: np.ndarray) -> float:
+        distance = np.linalg.norm(points[:, None] - truth[None, seen], axis=2)
+        nearest, which = distance.min(axis=1), np.nonzero(seen)[0][distance.argmin(axis=1)]
+        ok = nearest < 2
+        K = np.array([[2700.0, 0, 1640], [0, 2700, 1232], [0, 0, 1]])
+        rms, *_ = cv2.calibrateCameraExtended(
+            [field.points[which[ok]].astype(np.float32)], [points[ok].astype(np.float32)],
+            (PI_SENSOR.width, PI_SENSOR.height), K, np.zeros(5),
+            flags=cv2.CALIB_USE_INTRINSIC_GUESS,
+        )  # fmt: skip
+        return float(rms)
+
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    detector = cv2.aruco.ArucoDetector(dictionary)
+    parameters = cv2.SimpleBlobDetector_Params()
+    parameters.minArea, parameters.maxArea = 100, 5000
+    blobs = cv2.SimpleBlobDetector_create(parameters)
+
+    def markers_and_blobs() -> float:
+        image = decode()
+        detector.detectMarkers(image)
+        return calibrate(np.array([k.pt for k in blobs.detect(image)]))
+
+    def threshold_and_ellipses() -> float:
+        _, mask = cv2.threshold(decode(), 115, 255, cv2.THRESH_BINARY_INV)
+        contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        fits = [cv2.fitEllipse(c)[0] for c in contours if len(c) > 15]
+        return calibrate(np.array(fits))
+
+    routes: list[tuple[str, Callable[[], object], int]] = [
+        ("decode", decode, 3 * REPEATS),
+        ("tracked epoch", tracked, 3 * REPEATS),
+        ("from nothing", from_nothing, REPEATS),
+        ("decode + threshold + fitEllipse + calibrateCameraExtended", threshold_and_ellipses, 5),
+        ("decode + detectMarkers + SimpleBlobDetector + calibrateCameraExtended",
+         markers_and_blobs, 3),
+    ]  # fmt: skip
+    for _, work, _ in routes:
+        work()
+    times = {name: best(work, repeats) for name, work, repeats in routes}
+    unit = times["decode"]
+    print(
+        f"{int(seen.sum())} targets, 8 MP JPEG of quality {QUALITY}, {len(frames[0]) / 1e6:.2f} MB"
+    )
+    print(f"{'':72s}{'ms':>8s}{'× decode':>10s}{'bound':>8s}")
+    failed = False
+    for name, seconds in times.items():
+        bound = BOUNDS.get(name)
+        failed |= bound is not None and seconds > bound * unit
+        limit = f"{bound:8.1f}" if bound is not None else ""
+        print(f"{name:72s}{seconds * 1e3:8.1f}{seconds / unit:10.2f}{limit}")
+    result = from_nothing()
+    assert result.interior is not None
+    error = (result.values - np.r_[PI_CAMERA.interior.as_array(), exterior.as_array()])[:3]
+    print(
+        f"from nothing: sigma0 {result.sigma0:.2f}, c, x0, y0 off by "
+        f"{', '.join(f'{e / s:+.1f} sd' for e, s in zip(error, result.sd[:3], strict=True))}; "
+        f"RMS of OpenCV's: {threshold_and_ellipses():.3f} px (fitEllipse), "
+        f"{markers_and_blobs():.3f} px (blobs)"
+    )
+    return int(failed and "--check" in sys.argv)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -5,9 +5,11 @@ from __future__ import annotations
 import io
 import re
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+
+from thermocald.output.numbers import coefficient
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -26,6 +28,7 @@ _STYLE: dict[str, Any] = {
     "svg.hashsalt": "thermocald",  # the same study gives the same file
     "font.family": "sans-serif",
     "font.size": 9,
+    "path.simplify": False,  # curves are thinned already; it would drop zero-length strokes
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.titlesize": 10,
@@ -36,17 +39,16 @@ _STYLE: dict[str, Any] = {
     "grid.color": "#e4e4e4",
     "grid.linewidth": 0.6,
     "legend.frameon": False,
-    "figure.constrained_layout.use": True,
     "figure.max_open_warning": 0,
 }
 _PANEL_INCHES = (3.4, 2.5)
 
 
-def _figure(width: float, height: float) -> Any:
+def _figure(width: float, height: float, layout: Literal["constrained", "none"]) -> Any:
     # Without pyplot: no global state, no window, nothing to close.
     from matplotlib.figure import Figure as Canvas
 
-    return Canvas(figsize=(width, height))
+    return Canvas(figsize=(width, height), layout=layout)
 
 
 @contextmanager
@@ -69,16 +71,16 @@ def inline_svg(drawing: Any, prefix: str, label: str) -> str:
     text = re.sub(r'\bid="', f'id="{prefix}-', text)
     text = re.sub(r"url\(#", f"url(#{prefix}-", text)
     text = re.sub(r'href="#', f'href="#{prefix}-', text)
-    text = re.sub(r' d="[^"]*"', lambda path: _shorter(path[0]), text)
+    text = re.sub(r"<[^>]*>", lambda tag: _shorter(tag[0]), text)
     # The page decides the width; the height follows from the viewBox.
     head, rest = text.split(">", 1)
     head = re.sub(r'\s(width|height)="[^"]*"', "", head)
     return f'{head} role="img" aria-label="{label}">{rest}'
 
 
-def _shorter(path: str) -> str:
-    """Path data to 0.01 pt, on one line."""
-    return " " + re.sub(r"(\.\d\d)\d+", r"\1", " ".join(path.split()))
+def _shorter(tag: str) -> str:
+    """A tag with its numbers to 0.01 pt, on one line."""
+    return re.sub(r"(\.\d\d)\d+", r"\1", re.sub(r"\s+", " ", tag))
 
 
 def save(drawing: Any, folder: Path, name: str) -> list[Path]:
@@ -90,14 +92,13 @@ def save(drawing: Any, folder: Path, name: str) -> list[Path]:
     return paths
 
 
-def draw_panel(panel: Panel) -> Any:
+def draw_panel(panel: Panel, *, legend: bool = True) -> Any:
     """One panel as a drawing of its own."""
     with _style():
-        drawing = _figure(*_PANEL_INCHES)
-        # Margins that fit the axes' short labels: fitting them exactly triples the time of a report.
-        drawing.set_layout_engine("none")
+        # Fixed margins fit the short labels; fitting them exactly triples the time of a report.
+        drawing = _figure(*_PANEL_INCHES, "none")
         drawing.subplots_adjust(left=0.19, right=0.98, bottom=0.19, top=0.89)
-        _fill(drawing.subplots(), panel, legend=len(panel.curves) > 1)
+        _fill(drawing.subplots(), panel, legend=legend)
         return drawing
 
 
@@ -106,7 +107,7 @@ def draw_figure(figure: Figure) -> Any:
     with _style():
         columns = min(figure.columns, len(figure.panels))
         rows = -(-len(figure.panels) // columns)
-        drawing = _figure(_PANEL_INCHES[0] * columns, _PANEL_INCHES[1] * rows)
+        drawing = _figure(_PANEL_INCHES[0] * columns, _PANEL_INCHES[1] * rows, "constrained")
         axes = np.atleast_1d(drawing.subplots(rows, columns)).ravel()
         for i, axis in enumerate(axes):
             if i < len(figure.panels):
@@ -164,7 +165,7 @@ def draw_matrix(matrix: Array, names: Sequence[str], title: str) -> Any:
     with _style():
         n = len(names)
         size = 1.4 + 0.42 * n
-        drawing = _figure(size, size)
+        drawing = _figure(size, size, "constrained")
         axis = drawing.subplots()
         axis.set_facecolor("#dddddd")
         # Not an image: cells of an SVG stay sharp and can be edited.
@@ -177,7 +178,7 @@ def draw_matrix(matrix: Array, names: Sequence[str], title: str) -> Any:
                 axis.text(
                     column + 0.5,
                     row + 0.5,
-                    _coefficient(r),
+                    coefficient(r),
                     ha="center",
                     va="center",
                     fontsize=7,
@@ -191,13 +192,3 @@ def draw_matrix(matrix: Array, names: Sequence[str], title: str) -> Any:
         axis.tick_params(length=0)
         axis.set_title(title, loc="left")
         return drawing
-
-
-def _coefficient(r: float) -> str:
-    """Two digits, three close to ±1, and 1 only for what is 1."""
-    if abs(r) == 1:
-        return f"{r:.0f}".replace("-", "−")
-    if abs(r) >= 0.995:
-        return f"{np.sign(r) * np.floor(abs(r) * 1000) / 1000:.3f}".replace("-", "−")
-    shown = f"{r:.2f}".replace("-", "−")
-    return "0" if shown in ("0.00", "−0.00") else shown

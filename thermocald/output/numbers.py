@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 __all__ = [
+    "coefficient",
     "UNITS",
     "p_text",
     "parameter_label",
@@ -96,7 +97,21 @@ def percent(share: float, decimals: int = 0) -> str:
 
 
 def p_text(p: float) -> str:
-    """A p-value: `< 0.001`, or two digits."""
+    """A p-value: `≤ 0.001`, or two digits."""
     if not math.isfinite(p):
         return "–"
-    return "< 0.001" if p < 0.001 else f"{p:.2g}"
+    return "≤ 0.001" if p <= 0.001 else f"{p:.2g}"
+
+
+def coefficient(r: float) -> str:
+    """A correlation: two digits, three close to ±1, and 1 only for what is 1."""
+    if not math.isfinite(r):
+        return "–"
+    if abs(r) == 1:
+        shown = f"{r:.0f}"
+    elif abs(r) >= 0.995:
+        # Cut off, not rounded.
+        shown = f"{math.copysign(math.floor(abs(r) * 1000) / 1000, r):.3f}"
+    else:
+        shown = f"{r:.2f}".replace("-0.00", "0.00")
+    return shown.replace("-", _MINUS)

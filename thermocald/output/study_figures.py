@@ -32,6 +32,7 @@ __all__ = [
 ]
 
 _BAND = 1.96
+_DECADES = 30.0
 _ARROW_SHARE = 0.12  # of the image width, for the longest arrow
 
 
@@ -62,8 +63,7 @@ def deviation_figure(camera: CameraStudy) -> Figure:
 
 
 def _time_panel(camera: CameraStudy, title: str, unit: str, k: int) -> Panel:
-    extent = max(float(np.ptp(study.series.values[:, k])) for study in camera.series)
-    scale, label = _scaled(unit, extent)
+    scale, label = _scaled(unit, _extent(camera, k))
     curves = []
     for i, study in enumerate(camera.series):
         s = study.series
@@ -71,6 +71,11 @@ def _time_panel(camera: CameraStudy, title: str, unit: str, k: int) -> Panel:
         t, value, band = thin(s.time_s / 60, value, band)
         curves.append(Curve(s.name, t, value, "band", PALETTE[i % 7], value - band, value + band))
     return Panel(f"Δ{title}", "time in min", f"Δ{title}{label}", tuple(curves))
+
+
+def _extent(camera: CameraStudy, k: int) -> float:
+    """How far IOP number k goes over time."""
+    return max(float(np.ptp(study.series.values[:, k])) for study in camera.series)
 
 
 def _scaled(unit: str, extent: float) -> tuple[float, str]:
@@ -206,7 +211,7 @@ def significance_figure(camera: CameraStudy) -> Figure | None:
                     "time in min",
                     "variance ratio",
                     tuple(curves),
-                    log_y=True,
+                    log_y=_spans_decades(curves),
                     horizontal=((critical, "limit"),),
                 )
             )
@@ -244,24 +249,32 @@ def significance_figure(camera: CameraStudy) -> Figure | None:
     )
 
 
+def _spans_decades(curves: list[Curve]) -> bool:
+    """Whether positive curves need a logarithmic axis."""
+    low = min(float(np.min(c.y)) for c in curves)
+    return low > 0 and max(float(np.max(c.y)) for c in curves) / low > _DECADES
+
+
 def dependence_figure(camera: CameraStudy) -> Figure | None:
     """Parameters over the reference temperature with the fitted lines (Figure 7)."""
     panels, words = [], []
     for name in [*_free(camera), "sigma0"]:
         curves = []
+        scale, label = 1.0, ""
+        if name != "sigma0":
+            scale, label = _scaled(UNITS[name], _extent(camera, IOP_NAMES.index(name)))
         for i, study in enumerate(camera.series):
             if not study.channels or name not in study.channels[0].dependences:
                 continue
-            curves += _dependence_curves(study, name, PALETTE[i % 7])
+            curves += _dependence_curves(study, name, scale, PALETTE[i % 7])
         if curves:
             reference = camera.series[0].channels[0].thermometer.name
-            unit = UNITS[name]
             delta = "" if name == "sigma0" else "Δ"
             panels.append(
                 Panel(
                     parameter_label(name),
                     f"{parameter_label(reference)} in °C",
-                    f"{delta}{parameter_label(name)}{f' in {unit}' if unit else ''}",
+                    f"{delta}{parameter_label(name)}{label}",
                     tuple(curves),
                 )
             )
@@ -288,17 +301,18 @@ def dependence_figure(camera: CameraStudy) -> Figure | None:
     )
 
 
-def _dependence_curves(study: SeriesStudy, name: str, colour: str) -> list[Curve]:
+def _dependence_curves(study: SeriesStudy, name: str, scale: float, colour: str) -> list[Curve]:
     s = study.series
     temperature = s.thermometers[0].values
     if name == "sigma0":
         value = s.sigma0
     else:
-        value = s.values[:, IOP_NAMES.index(name)] - s.values[0, IOP_NAMES.index(name)]
+        column = s.values[:, IOP_NAMES.index(name)]
+        value = scale * (column - column[0])
     rows = np.flatnonzero(np.isfinite(temperature))
     t, v = temperature[rows], value[rows]
     ends = np.array([t.min(), t.max()])
-    slope = study.channels[0].dependences[name].slope
+    slope = scale * study.channels[0].dependences[name].slope
     shown = np.unique(np.linspace(0, len(t) - 1, min(len(t), 800)).astype(int))
     return [
         Curve(s.name, t[shown], v[shown], "points", colour),

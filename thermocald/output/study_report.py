@@ -208,7 +208,7 @@ def _parts(camera: CameraStudy, study: Study, prefix: str) -> list[_Part]:
 def _drawing(figure: Figure, prefix: str) -> _Drawing:
     name = f"{prefix}-{figure.name}"
     svgs = tuple(
-        inline_svg(draw_panel(panel), f"{name}-{i}", panel.title)
+        inline_svg(draw_panel(panel, legend=i == 0), f"{name}-{i}", panel.title)
         for i, panel in enumerate(figure.panels)
     )
     # "</" inside a script element would end it.

@@ -50,7 +50,7 @@ def _change(study: SeriesStudy) -> str:
         c = d["c"]
         if abs(c.change) > 3 * c.sd_change:
             grew = "grew" if c.change > 0 else "shrank"
-            words.append(f"the principal distance {grew} by {plain(abs(c.change), 'mm', 2)}")
+            words.append(f"the principal distance {grew} by {plain(1000 * abs(c.change), 'µm', 2)}")
         else:
             words.append("the principal distance did not change beyond its uncertainty")
     reference = s.reference

@@ -67,7 +67,7 @@ def overview_table(camera: CameraStudy) -> Table:
             )
         )
     return Table(
-        "What was measured",
+        "Series",
         (
             "series",
             "camera",
@@ -191,11 +191,11 @@ def significance_table(camera: CameraStudy, settings: StudySettings) -> Table | 
         tuple(rows),
         f"F-test at each instant: variance of {settings.window} consecutive epochs against the "
         f"mean of their squared standard deviations, one-sided at α = {settings.alpha:g}. "
-        f"Neighbouring windows share {settings.window - 1} of {settings.window} epochs, so their tests are not "
-        "independent and the success ratio is no probability. The last column is: it compares the "
-        "mean variance ratio with those of simulated series that do not drift but have the same "
-        "standard deviations and autocorrelation. "
-        "Of a parameter that does not drift, about α of the instants succeed by chance.",
+        f"Neighbouring windows share {settings.window - 1} of {settings.window} epochs, so "
+        "their tests are not independent and the success ratio is no probability; of a parameter "
+        "that does not drift, about α of the instants succeed by chance. The last column is a "
+        "probability: it compares the mean variance ratio with those of simulated series that do "
+        "not drift but have the same standard deviations and autocorrelation.",
     )
 
 
@@ -218,7 +218,7 @@ def _dependence_table(study: SeriesStudy, channel: ChannelStudy) -> Table:
         rows.append(
             (
                 parameter_label(name),
-                f"{d.r:.3f}".replace("-", "−"),
+                coefficient(d.r),
                 f"{d.n}",
                 f"{d.n_effective:.0f}",
                 p_text(channel.p_naive_holm[name]),
@@ -263,7 +263,7 @@ def correlation_noise_table(camera: CameraStudy) -> Table | None:
     rows = [
         (
             f"{parameter_label(IOP_NAMES[i])}, {parameter_label(IOP_NAMES[j])}",
-            f"{median[i, j]:.3f}".replace("-", "−"),
+            coefficient(float(median[i, j])),
             f"{noise[i, j]:.4f}",
             f"{largest[i, j]:.4f}",
         )

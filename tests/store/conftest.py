@@ -94,6 +94,6 @@ def filled(store_path: Path, field: TestField, head: Head, make_epoch, make_resu
     with Store.open(store_path, "append", durable=False) as store:
         series = store.create_series(head, field, start="cold", identity={"serial": "x1"})
         for i in range(1, 21):
-            extra = {"blur": 0.8 + 0.01 * i}
+            extra = {"blur": 0.5 * i}
             store.append(series, make_epoch(i), make_result(i), extra=extra)
         yield store, series

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from thermocald.errors import StoreError
 from thermocald.photogrammetry.camera_model import PARAMETER_NAMES
 from thermocald.store.schema import sql_name
 
@@ -31,6 +32,7 @@ __all__ = [
     "CHUNK",
     "FIXED",
     "build_missing_chunks",
+    "loose_rows",
     "read_columns",
     "rebuild_chunks",
     "status_codes",
@@ -57,7 +59,10 @@ _FIELDS = (*FIXED, "status", *_JSON)
 def read_columns(
     connection: sqlite3.Connection, series: int, names: Sequence[str]
 ) -> dict[str, Array]:
-    """Columns by their source names, (E,) float64 each, NaN where an epoch has none."""
+    """Columns by their source names, (E,) float64 each, NaN where an epoch has none.
+
+    Raises StoreError if a chunk does not fit the others.
+    """
     # named, since the planner would walk all epochs in the index of numbers
     (amended,) = connection.execute(
         "SELECT EXISTS (SELECT 1 FROM epoch INDEXED BY epoch_amended "
@@ -65,16 +70,13 @@ def read_columns(
         (series,),
     ).fetchone()
     wanted = list(dict.fromkeys([*names, "number"] if amended else names))
-    last, chunks = _chunks_end(connection, series)
-    tail = _rows(connection, series, wanted, "number > ? AND revision = 0", last)
-    size = chunks * CHUNK + len(next(iter(tail.values()), ()))
+    chunks = _Chunks(connection, series)
+    tail = _rows(connection, series, wanted, "number > ? AND revision = 0", chunks.last_number)
     columns = {}
     for name in wanted:
-        column = np.empty(size)
-        if chunks:
-            _fill_from_chunks(connection, series, name, column[: chunks * CHUNK])
-        column[chunks * CHUNK :] = tail[name]
-        columns[name] = column
+        columns[name] = np.empty(chunks.rows + len(tail[name]))
+        chunks.fill(name, columns[name][: chunks.rows])
+        columns[name][chunks.rows :] = tail[name]
     if amended:
         changes = _rows(connection, series, wanted, "revision > ?", 0, order="id")
         rows = np.searchsorted(columns["number"], changes["number"])
@@ -83,9 +85,20 @@ def read_columns(
     return {name: columns[name] for name in names}
 
 
+def loose_rows(connection: sqlite3.Connection, series: int) -> int:
+    """How many epochs of a series are in no chunk yet."""
+    last = _Chunks(connection, series).last_number
+    (count,) = connection.execute(
+        "SELECT count(*) FROM epoch WHERE series_id = ? AND revision = 0 AND number > ?",
+        (series, last),
+    ).fetchone()
+    return int(count)
+
+
 def build_missing_chunks(connection: sqlite3.Connection, series: int) -> None:
     """Write the chunks that the rows allow; within the caller's transaction."""
-    last, chunks = _chunks_end(connection, series)
+    chunks = _Chunks(connection, series)
+    first_row, last = chunks.rows, chunks.last_number
     while True:
         rows = _select(
             connection, series, _FIELDS, "number > ? AND revision = 0", last, limit=CHUNK
@@ -95,11 +108,11 @@ def build_missing_chunks(connection: sqlite3.Connection, series: int) -> None:
         columns = _columns(connection, _FIELDS, rows)
         last = int(columns["number"][-1])
         connection.executemany(
-            "INSERT INTO column_chunk (series_id, name, chunk, last_number, data) "
+            "INSERT INTO column_chunk (series_id, name, first_row, last_number, data) "
             "VALUES (?, ?, ?, ?, ?)",
-            [(series, n, chunks, last, values.tobytes()) for n, values in columns.items()],
+            [(series, n, first_row, last, values.tobytes()) for n, values in columns.items()],
         )
-        chunks += 1
+        first_row += CHUNK
 
 
 def rebuild_chunks(connection: sqlite3.Connection, series: int) -> None:
@@ -108,30 +121,43 @@ def rebuild_chunks(connection: sqlite3.Connection, series: int) -> None:
     build_missing_chunks(connection, series)
 
 
-def _chunks_end(connection: sqlite3.Connection, series: int) -> tuple[int, int]:
-    """The last epoch number in a chunk (-1 if none is) and the number of chunks."""
-    last, chunks = connection.execute(
-        "SELECT max(last_number), max(chunk) FROM column_chunk WHERE series_id = ? "
-        "AND name = 'number'",
-        (series,),
-    ).fetchone()
-    return (-1, 0) if last is None else (last, chunks + 1)
+class _Chunks:
+    """The chunks of a series. rows: how many epochs they hold; last_number: of the last of these.
 
+    Files may hold chunks of any length: CHUNK is this program's choice, not the file's.
+    """
 
-def _fill_from_chunks(
-    connection: sqlite3.Connection, series: int, name: str, column: Array
-) -> None:
-    done = 0
-    target = memoryview(column).cast("B")  # copies faster than NumPy assigns
-    for chunk, data in connection.execute(
-        "SELECT chunk, data FROM column_chunk WHERE series_id = ? AND name = ? ORDER BY chunk",
-        (series, name),
-    ):
-        start = chunk * CHUNK
-        column[done:start] = np.nan  # a channel that came later
-        done = start + CHUNK
-        target[8 * start : 8 * done] = data
-    column[done:] = np.nan
+    def __init__(self, connection: sqlite3.Connection, series: int) -> None:
+        self._connection = connection
+        self._series = series
+        found = connection.execute(
+            "SELECT first_row, length(data), last_number FROM column_chunk "
+            "WHERE series_id = ? AND name = 'number' ORDER BY first_row",
+            (series,),
+        ).fetchall()
+        self._sizes = {first: size for first, size, _ in found}
+        self.rows = 0
+        for first, size in self._sizes.items():
+            if first != self.rows or size % 8:
+                raise StoreError(f"the column chunks of series {series} are broken; rebuild them")
+            self.rows += size // 8
+        self.last_number = int(found[-1][2]) if found else -1
+
+    def fill(self, name: str, column: Array) -> None:
+        """Copy a column's chunks into (rows,); NaN where it did not exist yet, or any more."""
+        target = column.data.cast("B")  # copies faster than NumPy assigns
+        done = 0
+        for first, data in self._connection.execute(
+            "SELECT first_row, data FROM column_chunk WHERE series_id = ? AND name = ? "
+            "ORDER BY first_row",
+            (self._series, name),
+        ):
+            if self._sizes.get(first) != len(data):
+                raise StoreError(f"a chunk of column {name} is broken; rebuild the columns")
+            column[done:first] = np.nan
+            target[8 * first : 8 * first + len(data)] = data
+            done = first + len(data) // 8
+        column[done:] = np.nan
 
 
 def _rows(

@@ -21,6 +21,7 @@ from thermocald.store.columns import (
     CHUNK,
     FIXED,
     build_missing_chunks,
+    loose_rows,
     read_columns,
     rebuild_chunks,
     status_codes,
@@ -170,7 +171,7 @@ class Store:
                 self._db, series.id, StoredEpoch(epoch, result, extra or {}, clock_trusted, 0)
             )
             self._insert_events(events)
-            if loose + 1 == CHUNK:
+            if loose + 1 >= CHUNK:
                 build_missing_chunks(self._db, series.id)
         self._ends[series.id] = (epoch.number, (loose + 1) % CHUNK)
 
@@ -321,12 +322,11 @@ class Store:
 
     def _end(self, series: StoredSeries) -> tuple[int, int]:
         """The last epoch number of a series (-1: none) and how many rows are in no chunk."""
-        ((last, count),) = self._query(
-            "SELECT ifnull(max(number), -1), count(*) FROM epoch "
-            "WHERE series_id = ? AND revision = 0",
-            (series.id,),
+        ((last,),) = self._query(
+            "SELECT ifnull(max(number), -1) FROM epoch WHERE series_id = ?", (series.id,)
         )
-        return int(last), int(count) % CHUNK
+        with self._lock, in_words(self.path, "the store cannot be read"):
+            return int(last), loose_rows(self._db, series.id)
 
     def _insert_events(self, events: Iterable[Event]) -> None:
         self._db.executemany(

@@ -71,8 +71,8 @@ _BASE = [
 _COLUMN_CHUNKS = [
     """CREATE TABLE column_chunk (
         id INTEGER PRIMARY KEY, series_id INTEGER NOT NULL REFERENCES series(id),
-        name TEXT NOT NULL, chunk INTEGER NOT NULL, last_number INTEGER NOT NULL,
-        data BLOB NOT NULL, UNIQUE (series_id, name, chunk))""",
+        name TEXT NOT NULL, first_row INTEGER NOT NULL, last_number INTEGER NOT NULL,
+        data BLOB NOT NULL, UNIQUE (series_id, name, first_row))""",
     "CREATE TABLE status_code (code INTEGER PRIMARY KEY, status TEXT NOT NULL UNIQUE)",
     "INSERT INTO status_code (status) SELECT DISTINCT status FROM epoch",
 ]

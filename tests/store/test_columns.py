@@ -1,0 +1,149 @@
+"""Columns come whole from chunks, tail, and later calibrations, and chunks can be rebuilt."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermocald.epoch import Epoch
+from thermocald.errors import StoreError
+from thermocald.store import columns, database
+from thermocald.store.database import Store
+from thermocald.store.row import EpochResult
+
+CHUNK = 16
+NAMES = ["epoch", "frame_time", "temperature", "c", "sd_c", "blur", "status"]
+
+
+@pytest.fixture(autouse=True)
+def small_chunks(monkeypatch):
+    monkeypatch.setattr(columns, "CHUNK", CHUNK)
+    monkeypatch.setattr(database, "CHUNK", CHUNK)
+
+
+def result(number: int) -> EpochResult:
+    status = "ok" if number % 5 else "weak"
+    return EpochResult(status, "", np.full(16, float(number)), np.eye(16) * number**2 + 1e-9)
+
+
+def epoch(number: int) -> Epoch:
+    return Epoch(number, 10.0 * number, 10.0 * number + 1, {"temperature": 20 + 0.1 * number})
+
+
+def expected(numbers) -> dict[str, list]:
+    return {
+        "epoch": [float(i) for i in numbers],
+        "frame_time": [10.0 * i for i in numbers],
+        "temperature": [20 + 0.1 * i for i in numbers],
+        "c": [float(i) for i in numbers],
+        "sd_c": [np.sqrt(i**2 + 1e-9) for i in numbers],
+        "blur": [0.5 * i for i in numbers],
+        "status": ["ok" if i % 5 else "weak" for i in numbers],
+    }
+
+
+def read(store: Store, series) -> dict[str, list]:
+    return {name: column.tolist() for name, column in store.series_columns(series, NAMES).items()}
+
+
+def chunks(store: Store) -> int:
+    return store._db.execute("SELECT count(DISTINCT first_row) FROM column_chunk").fetchone()[0]
+
+
+@pytest.fixture
+def store(store_path):
+    with Store.open(store_path, "append", durable=False) as opened:
+        yield opened
+
+
+@pytest.fixture
+def series(store, head, field):
+    return store.create_series(head, field)
+
+
+@pytest.mark.parametrize("size", [0, 1, CHUNK - 1, CHUNK, CHUNK + 1, 5 * CHUNK + 7])
+def test_any_length(store, series, size):
+    numbers = [3 * i for i in range(size)]  # numbers may have gaps
+    for i in numbers:
+        store.append(series, epoch(i), result(i), extra={"blur": 0.5 * i})
+    assert chunks(store) == size // CHUNK
+    assert read(store, series) == expected(numbers)
+
+
+def test_after_opening_again_chunks_go_on(store_path, head, field):
+    with Store.open(store_path, "append", durable=False) as store:
+        store.create_series(head, field)
+    for i in range(2 * CHUNK + 3):
+        with Store.open(store_path, "append", durable=False) as store:
+            series = store.find_series()
+            store.append(series, epoch(i), result(i), extra={"blur": 0.5 * i})
+    with Store.open(store_path) as store:
+        assert chunks(store) == 2
+        assert read(store, series) == expected(range(2 * CHUNK + 3))
+
+
+def test_later_calibrations_in_chunk_and_tail(store, series):
+    for i in range(CHUNK + 5):
+        store.append(series, epoch(i), None, extra={"blur": 0.5 * i})
+    for i in range(CHUNK + 5):
+        store.amend(series, i, result(i))
+    assert read(store, series) == expected(range(CHUNK + 5))
+    c_only = store.series_columns(series, ["c"])
+    assert c_only["c"].tolist() == list(range(CHUNK + 5))
+
+
+def test_two_series_do_not_mix(store, series, head, field):
+    from dataclasses import replace
+
+    other = store.create_series(replace(head, series="M2"), field)
+    for i in range(3 * CHUNK):
+        store.append(series, epoch(i), result(i), extra={"blur": 0.5 * i})
+        if i % 2:
+            store.append(other, epoch(100 + i), result(100 + i), extra={"blur": 50 + 0.5 * i})
+    assert read(store, series) == expected(range(3 * CHUNK))
+    assert read(store, other) == expected(range(101, 100 + 3 * CHUNK, 2))
+
+
+def test_a_column_that_comes_and_goes(store, series):
+    for i in range(4 * CHUNK):
+        there = CHUNK <= i < 2 * CHUNK or i >= 3 * CHUNK
+        store.append(series, epoch(i), result(i), extra={"contrast": float(i)} if there else {})
+    contrast = store.series_columns(series, ["contrast"])["contrast"]
+    want = np.arange(4.0 * CHUNK)
+    want[:CHUNK] = want[2 * CHUNK : 3 * CHUNK] = np.nan
+    assert np.array_equal(contrast, want, equal_nan=True)
+    assert np.isnan(store.series_columns(series, ["never"])["never"]).all()
+
+
+def test_chunks_can_be_rebuilt(store, series):
+    for i in range(3 * CHUNK + 2):
+        store.append(series, epoch(i), result(i), extra={"blur": 0.5 * i})
+    store.amend(series, 1, result(1))
+    before = read(store, series)
+    store._db.execute("UPDATE column_chunk SET data = zeroblob(length(data))")
+    assert read(store, series) != before
+    store.rebuild_columns(series)
+    assert read(store, series) == before
+
+
+def test_a_broken_chunk_is_an_error(store, series):
+    for i in range(CHUNK):
+        store.append(series, epoch(i), result(i))
+    store._db.execute("UPDATE column_chunk SET data = x'00'")
+    with pytest.raises(StoreError, match="rebuild"):
+        store.series_columns(series, ["c"])
+
+
+def test_another_chunk_length_later_on(store_path, head, field, monkeypatch):
+    """A newer program may choose other chunks; the file's are read as they are."""
+    with Store.open(store_path, "append", durable=False) as store:
+        series = store.create_series(head, field)
+        for i in range(2 * CHUNK + 5):
+            store.append(series, epoch(i), result(i), extra={"blur": 0.5 * i})
+    for module in (columns, database):
+        monkeypatch.setattr(module, "CHUNK", 7)
+    with Store.open(store_path, "append", durable=False) as store:
+        for i in range(2 * CHUNK + 5, 4 * CHUNK):
+            store.append(series, epoch(i), result(i), extra={"blur": 0.5 * i})
+        assert chunks(store) == 2 + (2 * CHUNK) // 7
+        assert read(store, series) == expected(range(4 * CHUNK))

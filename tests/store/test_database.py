@@ -1,0 +1,335 @@
+"""The store: what goes in comes out, nothing changes afterwards, errors say what to do."""
+
+from __future__ import annotations
+
+import sqlite3
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from thermocald.epoch import Epoch
+from thermocald.errors import StoreError, StoreVersionError
+from thermocald.photogrammetry.camera_model import PARAMETER_NAMES
+from thermocald.store.database import Store
+from thermocald.store.recording import read_recording, temperature_at_frame, write_recording
+from thermocald.store.row import NOT_CALIBRATED, EpochResult, Event
+
+
+def test_an_epoch_comes_back_as_it_was(filled, make_epoch, make_result):
+    store, series = filled
+    (stored,) = store.epochs(series, 7, 7)
+    epoch, result = make_epoch(7), make_result(7)
+    assert stored.epoch.number == 7
+    assert stored.epoch.frame_time == epoch.frame_time
+    assert stored.epoch.temperatures == epoch.temperatures
+    assert np.array_equal(stored.epoch.observations.targets, epoch.observations.targets)
+    assert np.array_equal(stored.epoch.observations.points, epoch.observations.points)
+    assert stored.epoch.observations.sigmas == pytest.approx(epoch.observations.sigmas, rel=1e-6)
+    assert np.array_equal(stored.result.values, result.values)
+    assert np.array_equal(stored.result.covariance, result.covariance)
+    assert np.array_equal(stored.result.sd, result.sd)
+    assert (stored.result.status, stored.result.rejected) == ("ok", (1, 5))
+    assert (stored.extra, stored.clock_trusted, stored.revision) == ({"blur": 3.5}, True, 0)
+
+
+def test_series_travels_with_the_data(filled, field, head):
+    store, series = filled
+    found = store.find_series("rpi", "M1")
+    assert (found.id, found.head, found.start) == (series.id, head, "cold")
+    assert found.identity == {"serial": "x1"}
+    assert found.testfield.names == field.names
+    assert np.array_equal(found.testfield.points, field.points)
+
+
+def test_columns_have_names_and_nan_where_nothing_is(filled, make_result):
+    store, series = filled
+    store.append(series, Epoch(30, 1.6e9 + 300, np.nan), EpochResult("too_few_targets", "only 2"))
+    names = ["epoch", "c", "sd_Z0", "X0", "x0", "temperature", "blur", "n_rejected", "status"]
+    columns = store.series_columns(series, names)
+    assert list(columns) == names
+    assert columns["epoch"].tolist() == [*range(1, 21), 30]
+    for i in (0, 12):
+        result = make_result(i + 1)
+        assert [columns[n][i] for n in ("c", "X0", "x0")] == result.values[[0, 13, 1]].tolist()
+        assert columns["sd_Z0"][i] == result.sd[15]
+    assert columns["temperature"][3] == 20.25
+    assert columns["n_rejected"].tolist() == [2] * 20 + [0]
+    assert columns["status"].tolist() == ["ok"] * 20 + ["too_few_targets"]
+    assert np.isnan([columns[n][-1] for n in ("c", "sd_Z0", "temperature", "blur")]).all()
+
+
+def test_fixed_parameters_have_no_sd(filled, make_result):
+    store, series = filled
+    covariance = make_result(1).covariance.copy()
+    covariance[8, :] = covariance[:, 8] = 0.0
+    store.append(series, Epoch(30, 0.0, 0.0), EpochResult("ok", "", np.ones(16), covariance))
+    columns = store.series_columns(series, ["C1", "sd_C1", "sd_C2"])
+    assert columns["C1"][-1] == 1.0
+    assert np.isnan(columns["sd_C1"][-1])
+    assert columns["sd_C2"][-1] > 0
+
+
+def test_temperatures_at_the_frames(filled):
+    store, series = filled
+    epochs = [stored.epoch for stored in store.epochs(series)]
+    found = store.temperatures_at_frame(series)
+    assert list(found) == ["temperature", "board_temperature"]
+    assert np.array_equal(found["temperature"], temperature_at_frame(epochs))
+
+
+def test_observations_and_covariances_by_number(filled, make_epoch, make_result):
+    store, series = filled
+    seen = list(store.observations(series, [3, 11]))
+    assert [s.points.tolist() for s in seen] == [
+        make_epoch(i).observations.points.tolist() for i in (3, 11)
+    ]
+    covariances = store.covariances(series, [3, 11, 99])
+    assert np.array_equal(covariances[1], make_result(11).covariance)
+    assert np.isnan(covariances[2]).all()
+    with pytest.raises(StoreError, match="has no epoch 99"):
+        list(store.observations(series, [99]))
+
+
+def test_resume_where_it_stopped(filled, store_path, head, field):
+    store, series = filled
+    assert store.last_epoch(series) == 20
+    other = store.create_series(replace(head, series="M2"), field)
+    assert store.last_epoch(other) is None
+    with Store.open(store_path, "append") as again:
+        assert again.last_epoch(again.find_series("rpi", "M1")) == 20
+
+
+@pytest.mark.parametrize("number", [20, 5])
+def test_numbers_must_increase(filled, make_epoch, number):
+    store, series = filled
+    with pytest.raises(StoreError, match=f"epoch {number} of series 'M1' comes after epoch 20"):
+        store.append(series, make_epoch(number))
+    assert store.last_epoch(series) == 20
+
+
+def test_a_later_calibration_replaces_what_is_read_but_not_what_is_kept(filled, make_result):
+    store, series = filled
+    store.append(series, Epoch(21, 1.6e9 + 210, np.nan, {"temperature": 30.0}), None)
+    assert store.series_columns(series, ["status"])["status"][-1] == NOT_CALIBRATED
+    store.amend(series, 21, make_result(21))
+    store.amend(series, 4, make_result(400))
+    store.amend(series, 4, make_result(401))
+    columns = store.series_columns(series, ["c", "status", "temperature", "blur"])
+    assert columns["c"][[3, 20]].tolist() == [make_result(i).values[0] for i in (401, 21)]
+    assert (columns["status"][-1], columns["temperature"][-1]) == ("ok", 30.0)
+    assert columns["blur"][3] == 2.0
+    (stored,) = store.epochs(series, 4, 4)
+    assert (stored.revision, len(stored.epoch.observations)) == (2, 12)
+    assert [s.epoch.number for s in store.epochs(series)] == list(range(1, 22))
+    with pytest.raises(StoreError, match="has no epoch 99"):
+        store.amend(series, 99, make_result(1))
+
+
+def test_several_cameras_and_series(filled, head, field, make_epoch, make_result):
+    store, first = filled
+    camera = replace(head.camera, name="phone")
+    second = store.create_series(replace(head, camera=camera), field)
+    for i in (1, 2):
+        store.append(second, make_epoch(i), make_result(100 + i))
+        store.append(first, make_epoch(20 + i), make_result(20 + i))
+    assert [(s.camera, s.name) for s in store.all_series()] == [("rpi", "M1"), ("phone", "M1")]
+    assert store.series_columns(second, ["c"])["c"].tolist() == [
+        make_result(i).values[0] for i in (101, 102)
+    ]
+    assert len(store.series_columns(first, ["c"])["c"]) == 22
+    with pytest.raises(StoreError, match=r"several series fit.*rpi/M1, phone/M1"):
+        store.find_series(name="M1")
+    with pytest.raises(StoreError, match="no such series"):
+        store.find_series("tablet")
+    with pytest.raises(StoreError, match="has a series 'M1' already"):
+        store.create_series(head, field)
+
+
+def test_events_stand_with_their_epoch(filled, make_epoch):
+    store, series = filled
+    knock = Event(1.6e9 + 211, "knock", "the camera moved", series.id, 21, {"chi2": 91.5})
+    store.append(series, make_epoch(21), events=[knock])
+    gone = Event(1.6e9 + 300, "device_gone", "lens thermometer unplugged")
+    store.add_event(gone)
+    assert store.events() == [knock, gone]
+    assert store.events(series) == [knock]
+    assert store.events(since_utc=1.6e9 + 250) == [gone]
+
+
+def test_untrusted_clock_is_remembered(filled, make_epoch):
+    store, series = filled
+    store.append(series, make_epoch(21), clock_trusted=False)
+    assert store.series_columns(series, ["clock_trusted"])["clock_trusted"].tolist() == [1] * 20 + [
+        0
+    ]
+
+
+@pytest.mark.parametrize("name", ["c", "epoch", "status", "sd_x0"])
+def test_names_that_are_taken(filled, head, field, make_epoch, name):
+    store, series = filled
+    with pytest.raises(StoreError, match=f"cannot be called '{name}'"):
+        store.append(series, make_epoch(21), extra={name: 1.0})
+    with pytest.raises(StoreError, match=f"cannot be called '{name}'"):
+        store.create_series(replace(head, series="M2", channels={name: None}), field)
+
+
+@pytest.mark.parametrize("table", ["epoch", "detail", "series", "event", "testfield"])
+@pytest.mark.parametrize("verb", ["UPDATE {} SET id = id + 1", "DELETE FROM {}"])
+def test_the_file_itself_refuses_changes(filled, store_path, table, verb):
+    store, _ = filled
+    store.add_event(Event(0.0, "note", "x"))
+    database = sqlite3.connect(store_path)
+    with pytest.raises(sqlite3.IntegrityError, match="append-only"):
+        database.execute(verb.format(table))
+    database.close()
+
+
+def test_a_failed_epoch_leaves_nothing(filled, make_epoch, make_result):
+    store, series = filled
+    before = list(store._db.iterdump())
+    wrong = replace(make_epoch(21), frame_time=np.nan)  # a column that must not be empty
+    with pytest.raises(StoreError, match="epoch 21 of series 'M1' was not kept"):
+        store.append(series, wrong, make_result(21), events=[Event(0.0, "note", "x")])
+    assert list(store._db.iterdump()) == before
+    store.append(series, make_epoch(21), make_result(21))
+
+
+def test_store_to_recording_and_back(filled, tmp_path, field):
+    store, series = filled
+    write_recording(
+        tmp_path / "r",
+        name=series.head.name,
+        series=series.name,
+        interval=series.head.interval,
+        camera=series.head.camera,
+        channels=series.head.channels,
+        testfield=series.testfield,
+        epochs=(stored.epoch for stored in store.epochs(series)),
+    )
+    stored = [s.epoch.observations for s in store.epochs(series)]
+    for epoch, seen in zip(read_recording(tmp_path / "r").epochs, stored, strict=True):
+        assert np.array_equal(epoch.observations.points, seen.points)
+
+
+def test_readers_see_committed_epochs_while_it_is_written(filled, store_path, make_epoch):
+    store, series = filled
+    with Store.open(store_path) as reader:
+        assert reader.last_epoch(series) == 20
+        store.append(series, make_epoch(21))
+        assert reader.last_epoch(series) == 21
+        with pytest.raises(StoreError, match="read-only"):
+            reader.append(series, make_epoch(22))
+
+
+def test_threads_share_a_store(filled, head, field, make_epoch, make_result):
+    store, _ = filled
+    kinds = [store.create_series(replace(head, series=f"T{i}"), field) for i in range(4)]
+
+    def work(series):
+        for i in range(25):
+            store.append(series, make_epoch(i), make_result(i))
+
+    threads = [threading.Thread(target=work, args=(series,)) for series in kinds]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert [store.last_epoch(series) for series in kinds] == [24] * 4
+
+
+def test_plain_sql_can_read_it(filled, store_path):
+    """Users look with the sqlite3 shell: parameters are columns, temperatures are JSON."""
+    with sqlite3.connect(store_path) as database:
+        row = database.execute(
+            "SELECT number, c, sd_c, centre_X0, json_extract(temperatures, '$.temperature') "
+            "FROM epoch WHERE number = 3"
+        ).fetchone()
+    database.close()
+    assert row[0] == 3
+    assert row[4] == 20.1875
+    assert all(isinstance(value, float) for value in row[1:])
+
+
+def test_parameters_in_the_schema_follow_the_model(filled):
+    store, series = filled
+    names = [*PARAMETER_NAMES, *(f"sd_{n}" for n in PARAMETER_NAMES)]
+    values = store.series_columns(series, names)
+    assert all(np.isfinite(values[name]).all() for name in names)
+
+
+def test_no_store(tmp_path):
+    with pytest.raises(StoreError, match="there is no such store"):
+        Store.open(tmp_path / "none.db")
+    with pytest.raises(StoreError, match="does its folder exist"):
+        Store.open(tmp_path / "nowhere" / "none.db", "append")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("mode", ["read", "append"])
+def test_not_ours(tmp_path, mode):
+    text = tmp_path / "notes.txt"
+    text.write_text("not a database, " * 100)
+    with pytest.raises(StoreError, match="it is no store"):
+        Store.open(text, mode)
+    assert text.read_text() == "not a database, " * 100
+    other = tmp_path / "other.db"
+    with sqlite3.connect(other) as database:
+        database.execute("CREATE TABLE recipes (id)")
+    database.close()
+    before = other.read_bytes()
+    with pytest.raises(StoreError, match="no thermocald store"):
+        Store.open(other, mode)
+    assert other.read_bytes() == before
+
+
+@pytest.mark.parametrize("mode", ["read", "append"])
+def test_a_newer_version_is_left_alone(filled, store_path, mode):
+    store, _ = filled
+    store.close()
+    with sqlite3.connect(store_path) as database:
+        database.execute("PRAGMA user_version = 99")
+    database.close()
+    with pytest.raises(StoreVersionError, match=r"version 99.*update thermocald"):
+        Store.open(store_path, mode)
+
+
+def test_empty_file(tmp_path):
+    path = tmp_path / "empty.db"
+    path.touch()
+    with pytest.raises(StoreError, match="is empty"):
+        Store.open(path)
+    with Store.open(path, "append") as store:
+        assert store.all_series() == []
+
+
+def test_damage_is_noticed(filled, store_path):
+    store, _ = filled
+    store.close()
+    data = bytearray(store_path.read_bytes())
+    for page in range(3, len(data) // 8192):
+        data[page * 8192 : page * 8192 + 64] = b"\xa5" * 64
+    store_path.write_bytes(data)
+
+    def read_all():
+        with Store.open(store_path) as broken:
+            broken.check()
+            list(broken.epochs(broken.find_series()))
+
+    with pytest.raises(StoreError):
+        read_all()
+
+
+def test_a_broken_blob_is_an_error(filled):
+    store, series = filled
+    store._db.execute("DROP TRIGGER detail_update")
+    store._db.execute("UPDATE detail SET data = x'0102'")
+    with pytest.raises(StoreError, match="broken"):
+        list(store.epochs(series))
+
+
+def test_close_twice(filled):
+    store, _ = filled
+    store.close()
+    store.close()

@@ -6,7 +6,7 @@
         device: /dev/v4l/by-id/usb-046d_HD_Pro_Webcam_C920_8A3F-video-index0 # serial: 8A3F
         width: 1920
         height: 1080
-        pixel_format: MJPG            # GREY, Y16, YUYV, UYVY, NV12, YU12, MJPG, Bayer (RG10, pRAA, …)
+        pixel_format: MJPG            # GREY, Y16, YUYV, NV12, MJPG, Bayer (RG10, pRAA) …
         exposure_s: 0.0156            # manual, read back at each frame
         gain: 0
         focus: 0                      # manual focus position of the camera

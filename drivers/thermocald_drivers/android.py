@@ -1,0 +1,329 @@
+"""Android phones over adb: the camera, and the phone's own thermometers.
+
+    cameras:
+      - name: pixel
+        driver: android
+        serial: 0A1B2C3D4E            # as `adb devices` lists it
+        trigger: camera               # camera (key 27), volume (key 24), tap (tap: [540, 2000])
+        folder: /sdcard/DCIM/Camera
+        width: 4032
+        height: 3024
+        delete: true                  # the photograph from the phone, after it is safely here
+        refuse_unlocked: false        # true: a frame whose focus or exposure moved is an error
+        timeout_s: 15
+    thermometers:
+      - {name: pixel, driver: android, serial: 0A1B2C3D4E,
+         sensors: {temperature: battery, skin: "thermal:skin", soc: "zone:cpu-0-0"}}
+
+Before the first frame: set the camera app to its manual (pro) mode, fix focus, ISO and exposure
+time. The driver wakes and unlocks the phone (not through a PIN), opens the camera app once and
+keeps it open, since a restart would focus anew. A photograph is the one new file of the folder; it
+is taken when its size stands, its bytes are all there and the JPEG ends. Its time is EXIF's, with
+the phone's clock compared to this machine's at each open, or the trigger's where EXIF has none.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+from thermocald.errors import (
+    BadReading,
+    ConfigurationError,
+    DeviceDenied,
+    DeviceGone,
+    DeviceTimeout,
+    PermanentDeviceError,
+    WrongDevice,
+)
+from thermocald.hal import Camera, Frame, Thermometer
+from thermocald_drivers import android_temperatures, photograph, pixel_formats, support
+from thermocald_drivers.android_phone import AdbPhone
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from thermocald.hal import Clock, Reading
+
+__all__ = ["AndroidCamera", "AndroidThermometer"]
+
+KEYS = {"camera": 27, "volume": 24}
+WAKE_KEY = 224
+OPEN_APP = "am start -a android.media.action.STILL_IMAGE_CAMERA"
+STATE = (
+    "dumpsys power | grep -m1 mWakefulness=; "
+    "dumpsys window | grep -m1 -E 'mShowingLockscreen=|mDreamingLockscreen=|isKeyguardShowing='; "
+    "dumpsys window | grep -m1 mCurrentFocus="
+)
+ZONES = 'for z in /sys/class/thermal/thermal_zone*; do echo "$(cat $z/type) $(cat $z/temp)"; done'
+POLL_S = 0.1
+CLOCKS_DIFFER_S = 5.0
+
+
+def _phone(
+    serial: object, host: object, port: object, timeout_s: float, start_server: object
+) -> AdbPhone:
+    return AdbPhone(
+        support.text("serial", serial),
+        support.text("host", host),
+        int(support.number("port", port, 1, 65535, whole=True)),
+        support.number("timeout_s", timeout_s, 0.1, 600, "s"),
+        bool(start_server),
+    )
+
+
+def _attached() -> list[str]:
+    """Serial numbers that a running adb server lists; none is started for a listing."""
+    adbutils = support.library("adbutils", "android")
+    phone = AdbPhone("", "127.0.0.1", 5037, 1.0, start_server=False)
+    try:
+        phone._server_is_there()
+        return [f"{d.serial} {d.state}" for d in adbutils.AdbClient(socket_timeout=1.0).list()]
+    except (OSError, adbutils.AdbError):
+        return []
+
+
+class AndroidCamera(Camera):
+    """A phone's camera app, triggered from here."""
+
+    def __init__(
+        self,
+        *,
+        clock: Clock,
+        serial: str,
+        width: int,
+        height: int,
+        trigger: str = "camera",
+        tap: Sequence[int] | None = None,
+        folder: str = "/sdcard/DCIM/Camera",
+        delete: bool = False,
+        refuse_unlocked: bool = False,
+        minimum_free_mb: float = 200.0,
+        timeout_s: float = 15.0,
+        host: str = "127.0.0.1",
+        port: int = 5037,
+        start_server: bool = True,
+    ) -> None:
+        self.clock = clock
+        self.timeout_s = support.number("timeout_s", timeout_s, 0.1, 600, "s")
+        self.phone = _phone(serial, host, port, self.timeout_s, start_server)
+        self.width = int(support.number("width", width, 64, 20000, "px", whole=True))
+        self.height = int(support.number("height", height, 64, 20000, "px", whole=True))
+        if support.choice("trigger", trigger, ["camera", "volume", "tap"]) == "tap":
+            if tap is None or len(tap) != 2:
+                raise ConfigurationError("trigger: tap needs tap: [x, y] of the shutter button, px")
+            x, y = (int(support.number("tap", value, 0, 20000, "px")) for value in tap)
+            self.command = f"input tap {x} {y}"
+        else:
+            self.command = f"input keyevent {KEYS[trigger]}"
+        self.folder = support.text("folder", folder).rstrip("/")
+        self.delete, self.refuse_unlocked = bool(delete), bool(refuse_unlocked)
+        self.minimum_free_mb = support.number("minimum_free_mb", minimum_free_mb, 0, 1e6, "MB")
+        self._first: dict[str, Any] | None = None
+        self._offset, self._zone, self._offset_sd = 0.0, "", 0.0
+
+    @classmethod
+    def attached(cls, sysfs: str = "/sys") -> list[dict[str, Any]]:  # noqa: ARG003
+        """Phones that the adb server lists, whatever their state."""
+        return [
+            {"options": {"serial": line.split()[0], "width": 4032, "height": 3024}, "about": line}
+            for line in _attached()
+        ]
+
+    def open(self) -> None:
+        self.phone.connect()
+        self._wake()
+        self._require_space()
+        self._offset, self._zone, self._offset_sd = self.phone.clock_offset()
+        self.phone.shell(OPEN_APP)
+
+    def close(self) -> None:
+        self.phone.disconnect()
+
+    def identity(self) -> Mapping[str, str]:
+        return {"serial": self.phone.serial}
+
+    def capture(self) -> Frame:
+        if "Awake" not in self.phone.shell(STATE):
+            self._wake()
+            self.phone.shell(OPEN_APP)
+        before = self.phone.listing(self.folder)
+        triggered = time.time()
+        self.phone.shell(self.command)
+        triggered = (triggered + time.time()) / 2.0
+        path, jpeg = self._new_photograph(set(before))
+        tags = photograph.exif(jpeg)
+        if (tags["width"], tags["height"]) != (self.width, self.height):
+            raise WrongDevice(
+                f"{self.phone.where}: the photograph has {tags['width']}×{tags['height']} px, "
+                f"not {self.width}×{self.height}; set the camera app to its full size"
+            )
+        tags |= photograph.focus_state(self.phone.shell("dumpsys media.camera"))
+        locked, why = self._lock(tags)
+        instant, source = self._instant(tags, triggered)
+        image, _ = pixel_formats.decode(memoryview(jpeg), "JPEG", self.width, self.height)
+        if self.delete:
+            self.phone.shell(f"rm -f '{path}'")
+        age = time.time() - instant - float(tags.get("exposure_s", 0.0)) / 2.0
+        metadata = {**tags, "file": path, "locked": locked, "locked_why": why, "time_from": source}
+        metadata["phone_clock_offset_s"] = self._offset
+        return Frame(
+            image=image,
+            encoded=jpeg,
+            monotonic=self.clock.monotonic() - age,
+            utc=self.clock.utc() - age,
+            exposure=tags.get("exposure_s"),
+            metadata=metadata,
+        )
+
+    def _wake(self) -> None:
+        """Screen on and past a lock that wants no PIN; DeviceDenied where one is wanted."""
+        self.phone.shell(f"input keyevent {WAKE_KEY}; wm dismiss-keyguard")
+        state = self.phone.shell(STATE)
+        if "Lockscreen=true" in state or "isKeyguardShowing=true" in state:
+            raise DeviceDenied(
+                f"{self.phone.where}: the screen is locked; unlock it and set the screen lock to "
+                "'None' (and 'Stay awake' in the developer options)"
+            )
+        if "mWakefulness=" in state and "Awake" not in state:
+            raise DeviceGone(f"{self.phone.where}: the screen does not come on")
+
+    def _require_space(self) -> None:
+        """PermanentDeviceError where the phone is full; a phone that does not tell is believed."""
+        lines = self.phone.shell(f"df -k '{self.folder}' 2>/dev/null || df -k /sdcard").split("\n")
+        fields = lines[-1 if lines[-1].strip() else -2].split() if len(lines) > 1 else []
+        if len(fields) >= 4 and fields[3].isdigit():
+            free_mb = int(fields[3]) / 1024.0
+            if free_mb < self.minimum_free_mb:
+                raise PermanentDeviceError(
+                    f"{self.phone.where}: its storage is full ({free_mb:.0f} MB left, "
+                    f"{self.minimum_free_mb:g} wanted); delete photographs or write delete: true"
+                )
+
+    def _new_photograph(self, before: set[str]) -> tuple[str, bytes]:
+        """(path, bytes) of the one photograph that was not there before, when it is complete."""
+        deadline = time.monotonic() + self.timeout_s
+        last_size, name, short = -1, "", ""
+        while time.monotonic() < deadline:
+            new = {
+                n: entry
+                for n, entry in self.phone.listing(self.folder).items()
+                if n not in before
+                and n.lower().endswith((".jpg", ".jpeg"))
+                and not n.startswith((".pending", ".trashed"))
+            }
+            if len(new) > 1:
+                raise BadReading(
+                    f"{self.phone.where}: {len(new)} new photographs ({', '.join(sorted(new))}); "
+                    "switch off burst, HDR and RAW+JPEG copies, and touch nothing"
+                )
+            for name, entry in new.items():
+                if entry.size > 0 and entry.size == last_size:
+                    jpeg = self.phone.pull(f"{self.folder}/{name}")
+                    if len(jpeg) == entry.size and pixel_formats.jpeg_end(jpeg):
+                        return f"{self.folder}/{name}", jpeg
+                    short = f"{name} has {len(jpeg)} of {entry.size} bytes and no end"
+                last_size = entry.size
+            time.sleep(POLL_S)
+        if short or name:
+            raise BadReading(f"{self.phone.where}: partial photograph, {short or name}")
+        self._require_space()
+        self._wake()
+        raise DeviceTimeout(
+            f"{self.phone.where}: no new photograph in {self.folder} {self.timeout_s:g} s after "
+            "the trigger; is the camera app open, is the trigger right (camera, volume, tap)?"
+        )
+
+    def _lock(self, tags: dict[str, Any]) -> tuple[bool | None, str]:
+        if self._first is None:
+            self._first = dict(tags)
+        locked, why = photograph.lock_verdict(self._first, tags)
+        if locked is False and self.refuse_unlocked:
+            raise BadReading(f"{self.phone.where}: focus or exposure moved, {why}")
+        return locked, why
+
+    def _instant(self, tags: Mapping[str, Any], triggered: float) -> tuple[float, str]:
+        """(s UTC on this machine's clock when the exposure began, where that comes from)."""
+        told = photograph.instant(tags, self._zone)
+        if told is None:
+            return triggered, "trigger"
+        begin = told.utc - self._offset
+        if abs(begin - triggered) > CLOCKS_DIFFER_S:
+            return triggered, f"trigger (EXIF is {begin - triggered:+.1f} s off)"
+        if told.resolution_s >= 1.0:  # whole seconds: the trigger, within that second
+            return min(max(triggered, begin), begin + 1.0), "trigger within EXIF's second"
+        return begin, "exif"
+
+
+class AndroidThermometer(Thermometer):
+    """Battery, thermal service and thermal zones of a phone, in one shell call each."""
+
+    def __init__(
+        self,
+        *,
+        clock: Clock,
+        serial: str,
+        sensors: Mapping[str, str] | None = None,
+        timeout_s: float = 5.0,
+        host: str = "127.0.0.1",
+        port: int = 5037,
+        start_server: bool = True,
+    ) -> None:
+        self.clock = clock
+        self.phone = _phone(serial, host, port, timeout_s, start_server)
+        self.sensors = dict(sensors or {"temperature": "battery"})
+        for channel, source in self.sensors.items():
+            kind, _, name = str(source).partition(":")
+            if kind not in ("battery", "thermal", "zone") or (kind != "battery") != bool(name):
+                raise ConfigurationError(
+                    f"sensors.{channel}: {source!r} is neither battery, thermal:NAME nor zone:TYPE"
+                )
+        self._scales: dict[str, float] = {}
+
+    @classmethod
+    def attached(cls, sysfs: str = "/sys") -> list[dict[str, Any]]:  # noqa: ARG003
+        """Phones that the adb server lists."""
+        return [{"options": {"serial": line.split()[0]}, "about": line} for line in _attached()]
+
+    def open(self) -> None:
+        self.phone.connect()
+
+    def close(self) -> None:
+        self.phone.disconnect()
+        self._scales.clear()
+
+    def identity(self) -> Mapping[str, str]:
+        return {"serial": self.phone.serial}
+
+    def read(self) -> Reading:
+        begin = self.clock.monotonic()
+        available = self._available({source.partition(":")[0] for source in self.sensors.values()})
+        values, missing = {}, {}
+        for channel, source in self.sensors.items():
+            value = available.get(source)
+            if value is None:
+                missing[channel] = f"{source}: not told by the phone"
+                continue
+            try:
+                values[channel] = support.believable(value, -30.0, 120.0, source)
+            except BadReading as error:
+                missing[channel] = str(error)
+        if not values:
+            raise BadReading(f"{self.phone.where}: {'; '.join(missing.values())}")
+        about = {"missing": missing} if missing else {}
+        return support.middle_reading(self.clock, values, begin, about)
+
+    def _available(self, kinds: set[str]) -> dict[str, float | None]:
+        """{source as configured: °C}."""
+        found: dict[str, float | None] = {}
+        if "battery" in kinds:
+            found["battery"] = android_temperatures.battery(self.phone.shell("dumpsys battery"))
+        if "thermal" in kinds:
+            text = self.phone.shell("dumpsys thermalservice")
+            for name, value in android_temperatures.thermalservice(text).items():
+                found[f"thermal:{name}"] = value
+        if "zone" in kinds:
+            for name, raw in android_temperatures.thermal_zones(self.phone.shell(ZONES)).items():
+                scale = self._scales.setdefault(name, android_temperatures.zone_scale(raw))
+                found[f"zone:{name}"] = raw * scale
+        return found

@@ -1,0 +1,186 @@
+"""A phone at the end of an adb server: state, shell, listing, pull; each fault its own error.
+
+Uses adbutils, which speaks the adb server's protocol (127.0.0.1:5037); the server is Android's own
+(`adb start-server`), and one server serves several phones by their serial numbers.
+"""
+
+from __future__ import annotations
+
+import socket
+import struct
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from thermocald.errors import (
+    BadReading,
+    DeviceDenied,
+    DeviceError,
+    DeviceGone,
+    DeviceNotFound,
+    DeviceTimeout,
+)
+from thermocald_drivers import support
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+__all__ = ["AdbPhone", "FileEntry"]
+
+DENIED = (
+    "unauthorized: unlock the phone and confirm 'Allow USB debugging' (tick 'always'); "
+    "if nothing is asked: developer options, 'Revoke USB debugging authorizations', re-plug"
+)
+OFFLINE = (
+    "offline: re-plug the cable, or `adb reconnect offline`; an unpowered hub is a common cause"
+)
+
+
+@dataclass(frozen=True)
+class FileEntry:
+    """One file of a listing: size in bytes."""
+
+    name: str
+    size: int
+
+
+class AdbPhone:
+    """One phone; `connect` before anything else, `seen` after it succeeded once."""
+
+    def __init__(
+        self, serial: str, host: str, port: int, timeout_s: float, start_server: bool
+    ) -> None:
+        self.serial = serial
+        self.where = f"phone {serial}"
+        self._host, self._port, self._timeout_s = host, port, timeout_s
+        self._start_server = start_server
+        self._device: Any = None
+        self._lines: list[Any] = []
+        self.seen = False
+
+    def connect(self) -> None:
+        """Find the phone among the server's; DeviceError says why it cannot be used."""
+        adbutils = support.library("adbutils", "android")
+        if not self._start_server:
+            self._server_is_there()
+        client = adbutils.AdbClient(self._host, self._port, socket_timeout=self._timeout_s)
+        connect = client.make_connection
+
+        def remembering(timeout: float | None = None) -> Any:
+            self._lines.append(connect(timeout))
+            return self._lines[-1]
+
+        client.make_connection = remembering
+        states = dict(self._call(lambda: [(d.serial, d.state) for d in client.list()]))
+        state = states.get(self.serial)
+        if state is None:
+            others = ", ".join(f"{s} ({state})" for s, state in states.items()) or "none"
+            raise support.absent(
+                f"{self.where}: not attached; adb lists {others}; is USB debugging on, "
+                "the cable one that carries data?",
+                seen=self.seen,
+            )
+        self._require(state)
+        self._device = client.device(serial=self.serial)
+        self.seen = True
+
+    def _require(self, state: str) -> None:
+        if state == "device":
+            return
+        if state == "unauthorized":
+            raise DeviceDenied(f"{self.where}: {DENIED}")
+        if state == "offline":
+            raise DeviceGone(f"{self.where}: {OFFLINE}")
+        if state.startswith("no"):  # "no permissions (…); see http…"
+            raise DeviceDenied(f"{self.where}: no permissions; see the udev rules in systemd/")
+        raise DeviceGone(f"{self.where}: is in the state {state!r}; let it boot")
+
+    def _server_is_there(self) -> None:
+        try:
+            socket.create_connection((self._host, self._port), timeout=self._timeout_s).close()
+        except OSError as error:
+            raise support.absent(
+                f"no adb server at {self._host}:{self._port} ({error}); run `adb start-server`",
+                seen=self.seen,
+            ) from error
+
+    def disconnect(self) -> None:
+        """Forget the phone; the server keeps running."""
+        self._device = None
+
+    def shell(self, command: str) -> str:
+        """The command's output (both streams); its exit status is not judged."""
+        device = self._connected()
+        answer = self._call(lambda: device.shell2(command, timeout=self._timeout_s, v2=True))
+        return str(answer.output)
+
+    def listing(self, folder: str) -> dict[str, FileEntry]:
+        """{name: entry} of the plain files of a folder."""
+        device = self._connected()
+        entries = self._call(lambda: list(device.sync.iter_directory(folder)))
+        return {e.path: FileEntry(e.path, e.size) for e in entries if e.mode & 0o170000 == 0o100000}
+
+    def pull(self, path: str) -> bytes:
+        """A file's bytes; BadReading if the phone ends it early."""
+        device = self._connected()
+        return bytes(self._call(lambda: device.sync.read_bytes(path)))
+
+    def clock_offset(self, tries: int = 5) -> tuple[float, str, float]:
+        """(phone minus this machine in s, the phone's time zone as +hhmm, uncertainty in s).
+
+        The shortest of some round trips: its middle is off by less than half of it.
+        """
+        found = [self._call(self._ask_clock) for _ in range(tries)]
+        offset, zone, half = min(found, key=lambda one: one[2])
+        return offset, zone, half
+
+    def _ask_clock(self) -> tuple[float, str, float]:
+        # the line is opened first: adbutils sleeps 10 ms while opening and closing one, on one side
+        # of the round trip only
+        line = self._connected().open_transport(timeout=self._timeout_s)
+        begin = time.time()
+        line.send_command("shell:date '+%s.%N %z'")
+        line.check_okay()
+        text = line.read_until_close().split()
+        end = time.time()
+        try:
+            phone = float(text[0])
+        except (ValueError, IndexError) as error:
+            raise BadReading(f"{self.where}: `date` says {' '.join(text)!r}") from error
+        return phone - (begin + end) / 2.0, "".join(text[1:2]), (end - begin) / 2.0
+
+    def _connected(self) -> Any:
+        if self._device is None:
+            raise DeviceGone(f"{self.where}: not open")
+        return self._device
+
+    def _call(self, action: Callable[[], Any]) -> Any:
+        """Adbutils' errors, told apart by what the server says, become ours."""
+        adbutils = support.library("adbutils", "android")
+        try:
+            return action()
+        except (adbutils.AdbTimeout, TimeoutError) as error:
+            raise DeviceTimeout(f"{self.where}: no answer in {self._timeout_s:g} s") from error
+        except adbutils.AdbError as error:
+            raise self._translated(str(error)) from error
+        except (EOFError, struct.error, ConnectionError) as error:
+            raise DeviceGone(f"{self.where}: the connection broke off ({error})") from error
+        except ValueError as error:
+            raise BadReading(f"{self.where}: the adb server answers nonsense ({error})") from error
+        finally:
+            for line in self._lines:  # adbutils leaves a connection open that the server refused
+                line.close()
+            self._lines.clear()
+
+    def _translated(self, message: str) -> DeviceError:
+        if "unauthorized" in message:
+            return DeviceDenied(f"{self.where}: {DENIED}")
+        if "offline" in message:
+            return DeviceGone(f"{self.where}: {OFFLINE}")
+        if "connect to adb server" in message or "No adb exe" in message:
+            return DeviceNotFound(f"no adb server at {self._host}:{self._port}: {message}")
+        if "not found" in message or "closed" in message or "Unknown data" in message:
+            return DeviceGone(f"{self.where}: {message}")
+        if "chunk missing" in message or "Invalid sync" in message:
+            return DeviceGone(f"{self.where}: a transfer broke off ({message})")
+        return BadReading(f"{self.where}: {message}")

@@ -1,0 +1,250 @@
+"""An adb server on loopback with phones behind it: the protocol that adbutils speaks.
+
+Source: packages/modules/adb, OVERVIEW.TXT, SERVICES.TXT, SYNC.TXT. The laboratory uses the real adb
+server and a real adbd.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import socket
+import struct
+import threading
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from PIL import Image
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+OFFLINE = "device offline"
+
+
+def photograph(
+    when: float,
+    *,
+    exposure=(1, 60),
+    iso=100,
+    distance=None,
+    subsecond="250",
+    size=(96, 64),
+    zone=None,
+) -> bytes:
+    """A JPEG with EXIF, exposed at `when` (s UTC; the phone's zone is UTC)."""
+    image = Image.fromarray(np.add.outer(np.arange(size[1]), np.arange(size[0])).astype(np.uint8))
+    tags = Image.Exif()
+    sub = tags.get_ifd(0x8769)
+    sub[0x829A], sub[0x8827] = exposure[0] / exposure[1], iso
+    sub[0x9003] = time.strftime("%Y:%m:%d %H:%M:%S", time.gmtime(when))
+    if subsecond is not None:
+        sub[0x9291] = subsecond
+    if zone is not None:
+        sub[0x9011] = zone
+    if distance is not None:
+        sub[0x9206] = distance
+    tags[0x010F], tags[0x0110] = "Acme", "Phone 4a"
+    out = io.BytesIO()
+    image.save(out, "JPEG", quality=95, exif=tags)
+    return out.getvalue()
+
+
+@dataclass
+class FakePhone:
+    """Files, answers of the shell, and the camera's behaviour; every field is a knob."""
+
+    state: str = "device"
+    folder: str = "/sdcard/DCIM/Camera"
+    clock_offset: float = 0.0
+    files: dict[str, bytes] = field(default_factory=dict)
+    growing: dict[str, tuple[float, float]] = field(default_factory=dict)
+    awake: bool = False
+    locked: bool = False
+    stays_locked: bool = False
+    free_kb: int = 5_000_000
+    trigger: str = "input keyevent 27"
+    shoot: Callable[[FakePhone], None] | None = None
+    battery: str = "  voltage: 4100\n  temperature: 287\n"
+    thermal: str = ""
+    zones: str = ""
+    media_camera: str = ""
+    hang: threading.Event | None = None
+    cut_transfer: bool = False
+    load: bool = False
+    commands: list[str] = field(default_factory=list)
+
+    def now(self) -> float:
+        return time.time() + self.clock_offset
+
+    def add(self, name: str, data: bytes, writing_s: float = 0.0) -> None:
+        self.files[name] = data
+        if writing_s:
+            self.growing[name] = (time.monotonic(), writing_s)
+
+    def content(self, name: str) -> bytes:
+        data = self.files[name]
+        if name in self.growing:
+            begin, takes = self.growing[name]
+            return data[: int(len(data) * min(1.0, (time.monotonic() - begin) / takes))]
+        return data
+
+    def shell(self, command: str) -> str:
+        self.commands.append(command)
+        if command.startswith("input keyevent 224"):
+            self.awake, self.locked = True, self.stays_locked
+        if command == self.trigger and self.shoot:
+            self.shoot(self)
+        if command.startswith("date"):
+            return f"{self.now():.9f} +0000\n"
+        if command.startswith("dumpsys power"):
+            return (
+                f"  mWakefulness={'Awake' if self.awake else 'Asleep'}\n"
+                f"  mShowingLockscreen={str(self.locked).lower()}\n"
+            )
+        if command.startswith("df"):
+            return f"Filesystem 1K-blocks Used Available Use% On\n/dev/x 9 9 {self.free_kb} 9% /\n"
+        if match := re.match(r"rm -f '(.*)'", command):
+            self.files.pop(match[1].rsplit("/", 1)[1], None)
+        if "thermal_zone*" in command:
+            return self.zones
+        if "thermocald_load" in command and command.startswith("timeout"):
+            self.load = True
+        if command.startswith("pkill"):
+            self.load = False
+        answers = {
+            "dumpsys battery": self.battery,
+            "dumpsys thermalservice": self.thermal,
+            "dumpsys media.camera": self.media_camera,
+        }
+        return answers.get(command, "")
+
+
+class AdbServer:
+    """`phones` by serial number."""
+
+    def __init__(self) -> None:
+        self.phones: dict[str, FakePhone] = {}
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.port = self._server.getsockname()[1]
+        self._lines: list[socket.socket] = []
+        self._threads = [threading.Thread(target=self._accept, name="adb")]
+        self._threads[0].start()
+
+    def close(self) -> None:
+        for phone in self.phones.values():
+            if phone.hang is not None:
+                phone.hang.set()
+        self._server.shutdown(socket.SHUT_RDWR)
+        self._server.close()
+        for line in self._lines:
+            with contextlib.suppress(OSError):
+                line.shutdown(socket.SHUT_RDWR)
+        for thread in self._threads:
+            thread.join(2.0)
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                line, _ = self._server.accept()
+            except OSError:
+                return
+            self._lines.append(line)
+            thread = threading.Thread(target=self._serve, args=(line,), name="adb-line")
+            self._threads.append(thread)
+            thread.start()
+
+    def _serve(self, line: socket.socket) -> None:
+        with line, contextlib.suppress(OSError, ValueError, struct.error):
+            self._host(line)
+
+    def _host(self, line: socket.socket) -> None:
+        request = _request(line)
+        if request == "host:version":
+            _block(line, "0029")
+        elif request == "host:devices":
+            _block(line, "".join(f"{s}\t{p.state}\n" for s, p in self.phones.items()))
+        elif match := re.fullmatch(r"host-serial:(.*):features", request):
+            if self._phone(line, match[1]):
+                _block(line, "shell_v2,cmd,stat_v2")
+        elif match := re.fullmatch(r"host:tport:serial:(.*)", request):
+            phone = self._phone(line, match[1])
+            if phone:
+                line.sendall(b"OKAY" + struct.pack("<Q", 1))
+                self._device(line, phone)
+
+    def _phone(self, line: socket.socket, serial: str) -> FakePhone | None:
+        phone = self.phones.get(serial)
+        if phone is None:
+            _fail(line, f"device '{serial}' not found")
+        elif phone.state != "device":
+            _fail(line, OFFLINE if phone.state == "offline" else f"device {phone.state}.")
+        elif phone.hang is not None:
+            phone.hang.wait()
+        else:
+            return phone
+        return None
+
+    def _device(self, line: socket.socket, phone: FakePhone) -> None:
+        request = _request(line)
+        line.sendall(b"OKAY")
+        if request.startswith("shell,v2:"):
+            text = phone.shell(request.removeprefix("shell,v2:")).encode()
+            if text:
+                line.sendall(struct.pack("<BI", 1, len(text)) + text)
+            line.sendall(struct.pack("<BIB", 3, 1, 0))
+        elif request.startswith("shell:"):
+            line.sendall(phone.shell(request.removeprefix("shell:")).encode())
+        elif request == "sync:":
+            self._sync(line, phone)
+
+    def _sync(self, line: socket.socket, phone: FakePhone) -> None:
+        command, size = struct.unpack("<4sI", _exactly(line, 8))
+        path = _exactly(line, size).decode()
+        if command == b"LIST":
+            entries = [(".", 0o040755, 0)]
+            if path == phone.folder:
+                entries += [(n, 0o100660, len(phone.content(n))) for n in list(phone.files)]
+            for name, mode, length in entries:
+                head = struct.pack("<4sIIII", b"DENT", mode, length, 1_700_000_000, len(name))
+                line.sendall(head + name.encode())
+            line.sendall(b"DONE" + bytes(16))
+        elif command == b"RECV":
+            name = path.rsplit("/", 1)[1]
+            if name not in phone.files:
+                message = b"open failed: No such file or directory"
+                line.sendall(b"FAIL" + struct.pack("<I", len(message)) + message)
+                return
+            data = phone.content(name)
+            for at in range(0, len(data), 1024):
+                chunk = data[at : at + 1024]
+                if phone.cut_transfer and at:
+                    line.sendall(b"DATA" + struct.pack("<I", len(chunk)) + chunk[:10])
+                    return
+                line.sendall(b"DATA" + struct.pack("<I", len(chunk)) + chunk)
+            line.sendall(b"DONE" + bytes(4))
+
+
+def _exactly(line: socket.socket, count: int) -> bytes:
+    data = b""
+    while len(data) < count:
+        piece = line.recv(count - len(data))
+        if not piece:
+            raise ConnectionError
+        data += piece
+    return data
+
+
+def _request(line: socket.socket) -> str:
+    return _exactly(line, int(_exactly(line, 4), 16)).decode()
+
+
+def _block(line: socket.socket, text: str) -> None:
+    line.sendall(b"OKAY" + f"{len(text):04x}{text}".encode())
+
+
+def _fail(line: socket.socket, text: str) -> None:
+    line.sendall(b"FAIL" + f"{len(text):04x}{text}".encode())

@@ -1,0 +1,97 @@
+"""A stand-in with picamera2's API: no pixels can be had without a Pi, so this is not libcamera."""
+
+from __future__ import annotations
+
+import time
+from types import ModuleType
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import threading
+
+
+class Request:
+    def __init__(self, camera: StandIn, metadata: dict, array: np.ndarray) -> None:
+        self.camera, self.metadata, self.array = camera, metadata, array
+        camera.requests_out += 1
+
+    def get_metadata(self) -> dict:
+        return self.metadata
+
+    def make_array(self, name: str) -> np.ndarray:
+        assert name == "main"
+        return self.array
+
+    def release(self) -> None:
+        self.camera.requests_out -= 1
+
+
+class StandIn:
+    """One camera; class attributes are the laboratory's knobs."""
+
+    cameras = ({"Model": "imx219", "Id": "/base/soc/i2c0mux/i2c@1/imx219@10"},)
+    sensor_resolution = (96, 64)
+    camera_controls: ClassVar[dict] = {"ExposureTime": (), "AnalogueGain": ()}
+    extra: ClassVar[dict] = {}
+    stale = 0
+    hang: threading.Event | None = None
+    busy = False
+    cut = False
+    instances: ClassVar[list] = []
+
+    @classmethod
+    def global_camera_info(cls):
+        return list(cls.cameras)
+
+    def __init__(self, number: int) -> None:
+        if type(self).busy:
+            raise RuntimeError("Camera __init__ sequence did not complete.")
+        self.requests_out, self.closed, self.started = 0, False, False
+        self._stale = type(self).stale
+        type(self).instances.append(self)
+
+    def create_still_configuration(self, *, main, controls, buffer_count):
+        assert main["format"] == "YUV420"
+        return {"main": main, "controls": controls}
+
+    def configure(self, configuration) -> None:
+        self.configuration = configuration
+
+    def start(self) -> None:
+        self.started = True
+
+    def capture_request(self) -> Request:
+        if type(self).hang is not None:
+            type(self).hang.wait()
+            raise RuntimeError("closed while waiting")
+        controls = self.configuration["controls"]
+        exposure = controls["ExposureTime"]
+        now = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+        if self._stale:
+            self._stale -= 1
+            stamp = now - 50_000_000
+        else:
+            time.sleep(exposure * 1e-6 + 0.002)
+            stamp = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+        metadata = {
+            "SensorTimestamp": stamp,
+            "ExposureTime": exposure,
+            "AnalogueGain": controls["AnalogueGain"],
+            "ScalerCrop": (0, 0, 96, 64),
+            **type(self).extra,
+        }
+        width, height = self.configuration["main"]["size"]
+        array = np.full((height * 3 // 2, width + 32), 128, np.uint8)  # rows padded to the stride
+        array[:height, :width] = np.add.outer(np.arange(height), np.arange(width)) % 251
+        return Request(self, metadata, array[: height // 2] if type(self).cut else array)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def module(camera: type[StandIn]) -> ModuleType:
+    stand_in = ModuleType("picamera2")
+    stand_in.Picamera2 = camera
+    return stand_in

@@ -1,0 +1,417 @@
+"""Phones through adbutils against an adb server on loopback; the laboratory uses a real adbd."""
+
+from __future__ import annotations
+
+import socket
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from tests.drivers.fakes.adb_server import AdbServer, FakePhone, photograph
+from thermocald.errors import (
+    BadReading,
+    ConfigurationError,
+    DeviceDenied,
+    DeviceGone,
+    DeviceNotFound,
+    DeviceTimeout,
+    DriverMissing,
+    PermanentDeviceError,
+    WrongDevice,
+)
+from thermocald.hal import SystemClock, VirtualClock, open_device
+
+SERIAL = "0A1B2C3D4E"
+FOCUS = """  android.lens.focusDistance (80007): float[1]
+        [0.25 ]
+"""
+
+
+@pytest.fixture
+def server():
+    server = AdbServer()
+    server.phones[SERIAL] = FakePhone(media_camera=FOCUS, shoot=shoot())
+    yield server
+    server.close()
+
+
+@pytest.fixture
+def phone(server):
+    return server.phones[SERIAL]
+
+
+def shoot(count=1, delay=0.0, writing_s=0.0, **tags):
+    """A camera app that writes `count` photographs per trigger."""
+
+    def action(phone):
+        time.sleep(delay)
+        for k in range(count):
+            name = f"IMG_{len(phone.files):04d}_{k}.jpg"
+            when = phone.now()
+            tags.setdefault("subsecond", f"{int(when % 1 * 1000):03d}")
+            phone.add(name, photograph(when, **tags), writing_s)
+            tags.pop("subsecond")
+
+    return action
+
+
+def options(server, **more):
+    return {"serial": SERIAL, "port": server.port, "start_server": False, "timeout_s": 1.0, **more}
+
+
+def camera(server, **more):
+    more = {"width": 96, "height": 64, **more}
+    return open_device("camera", "android", options(server, **more), SystemClock())
+
+
+def thermometer(server, **more):
+    return open_device("thermometer", "android", options(server, **more), SystemClock())
+
+
+def test_a_photograph(server, phone):
+    phone.add("IMG_old.jpg", b"old")
+    with camera(server) as device:
+        frame = device.capture()
+    expected = np.add.outer(np.arange(64), np.arange(96))
+    assert np.max(np.abs(frame.image.astype(int) - expected)) <= 3
+    assert frame.encoded[:2] == b"\xff\xd8"
+    assert frame.exposure == pytest.approx(1 / 60, rel=1e-4)
+    assert frame.metadata["locked"] is True
+    assert phone.awake
+    assert sum("STILL_IMAGE_CAMERA" in c for c in phone.commands) == 1
+
+
+@pytest.mark.parametrize(
+    ("trigger", "command"),
+    [
+        ({"trigger": "camera"}, "input keyevent 27"),
+        ({"trigger": "volume"}, "input keyevent 24"),
+        ({"trigger": "tap", "tap": [540, 2000]}, "input tap 540 2000"),
+    ],
+)
+def test_triggers_of_the_vendors(server, phone, trigger, command):
+    phone.trigger = command
+    with camera(server, **trigger) as device:
+        device.capture()
+        device.capture()
+    assert phone.commands.count(command) == 2
+    assert sum("STILL_IMAGE_CAMERA" in c for c in phone.commands) == 1  # the app stays open
+
+
+@pytest.mark.parametrize("offset", [0.0, 37.25, -7200.0])
+def test_the_time_is_exifs_with_the_phones_clock_compared(server, phone, offset):
+    phone.clock_offset = offset
+    exposed = []
+
+    def action(phone):
+        time.sleep(0.15)  # a shutter lag that the trigger's time does not know
+        exposed.append(time.time())
+        shoot()(phone)
+
+    phone.shoot = action
+    with camera(server) as device:
+        frame = device.capture()
+    assert frame.metadata["time_from"] == "exif"
+    assert frame.metadata["phone_clock_offset_s"] == pytest.approx(offset, abs=0.003)
+    assert frame.utc == pytest.approx(exposed[0] + 1 / 120, abs=0.005)
+
+
+def test_without_fractions_the_trigger_within_that_second(server, phone):
+    phone.shoot = shoot(subsecond=None)
+    with camera(server) as device:
+        called = time.time()
+        frame = device.capture()
+    assert "second" in frame.metadata["time_from"]
+    assert abs(frame.utc - called) < 1.0
+
+
+def test_a_phone_whose_clock_is_set_meanwhile(server, phone):
+    with camera(server) as device:
+        phone.clock_offset = 3600.0
+        frame = device.capture()
+    assert frame.metadata["time_from"].startswith("trigger (EXIF is +36")
+    assert abs(frame.utc - time.time()) < 1.0
+
+
+def test_a_file_that_grows_is_awaited(server, phone):
+    phone.shoot = shoot(writing_s=0.4)
+    with camera(server, timeout_s=3.0) as device:
+        frame = device.capture()
+    assert frame.encoded.endswith(b"\xff\xd9")
+
+
+def test_a_file_that_never_ends(server, phone):
+    phone.shoot = lambda phone: phone.add("IMG_1.jpg", photograph(time.time())[:-300])
+    with camera(server) as device, pytest.raises(BadReading, match="partial photograph, IMG_1"):
+        device.capture()
+
+
+def test_delete_only_when_told(server, phone):
+    with camera(server) as device:
+        device.capture()
+    assert len(phone.files) == 1
+    with camera(server, delete=True) as device:
+        device.capture()
+    assert len(phone.files) == 1
+
+
+def test_pending_files_and_raw_copies_are_not_photographs(server, phone):
+    def action(phone):
+        phone.add(".pending-1-IMG.jpg", b"half")
+        phone.add("IMG_2.dng", b"raw")
+        shoot()(phone)
+
+    phone.shoot = action
+    with camera(server) as device:
+        assert device.capture().metadata["file"].endswith("_0.jpg")
+
+
+def test_two_new_photographs(server, phone):
+    phone.shoot = shoot(count=2)
+    with camera(server) as device, pytest.raises(BadReading, match="2 new photographs"):
+        device.capture()
+
+
+def test_no_photograph(server, phone):
+    phone.shoot = None
+    with camera(server) as device, pytest.raises(DeviceTimeout, match="is the trigger right"):
+        device.capture()
+
+
+def test_exposure_that_moved_is_flagged_or_refused(server, phone):
+    for refuse in (False, True):
+        phone.shoot = shoot()
+        with camera(server, refuse_unlocked=refuse) as device:
+            device.capture()
+            phone.shoot = shoot(iso=200)
+            if refuse:
+                with pytest.raises(BadReading, match="iso was 100 and is 200"):
+                    device.capture()
+            else:
+                assert device.capture().metadata["locked"] is False
+
+
+def test_a_focus_that_nobody_tells_is_not_called_locked(server, phone):
+    phone.media_camera = ""
+    with camera(server) as device:
+        metadata = device.capture().metadata
+    assert metadata["locked"] is None
+    assert "focus" in metadata["locked_why"]
+
+
+def test_a_smaller_photograph(server, phone):
+    phone.shoot = shoot(size=(48, 32))
+    with camera(server) as device, pytest.raises(WrongDevice, match="has 48×32 px, not 96×64"):
+        device.capture()
+
+
+def test_a_locked_screen(server, phone):
+    phone.stays_locked = True
+    with pytest.raises(DeviceDenied, match="screen is locked"):
+        camera(server).open()
+
+
+def test_a_phone_that_fell_asleep_is_woken(server, phone):
+    with camera(server) as device:
+        phone.awake = False
+        device.capture()
+    assert phone.awake
+
+
+def test_a_full_phone(server, phone):
+    phone.free_kb = 10_000
+    with pytest.raises(PermanentDeviceError, match="storage is full"):
+        camera(server).open()
+
+
+def test_a_phone_that_fills_up(server, phone):
+    with camera(server) as device:
+        phone.shoot, phone.free_kb = None, 10_000
+        with pytest.raises(PermanentDeviceError, match="storage is full"):
+            device.capture()
+
+
+@pytest.mark.parametrize(
+    ("state", "error", "message"),
+    [
+        ("unauthorized", DeviceDenied, "Allow USB debugging"),
+        ("offline", DeviceGone, "re-plug"),
+        ("no", DeviceDenied, "udev"),
+        ("bootloader", DeviceGone, "boot"),
+    ],
+)
+def test_states_of_the_server(server, phone, state, error, message):
+    phone.state = state
+    for device in (camera(server), thermometer(server)):
+        with pytest.raises(error, match=message):
+            device.open()
+
+
+@pytest.mark.parametrize(
+    ("state", "error"), [("offline", DeviceGone), ("unauthorized", DeviceDenied)]
+)
+def test_states_that_come_later(server, phone, state, error):
+    with camera(server) as device:
+        phone.state = state
+        with pytest.raises(error):
+            device.capture()
+
+
+def test_not_attached_and_dropped_out(server, phone):
+    del server.phones[SERIAL]
+    device = camera(server)
+    with pytest.raises(DeviceNotFound, match="adb lists none"):
+        device.open()
+    server.phones[SERIAL] = phone
+    device.open()
+    del server.phones[SERIAL]
+    with pytest.raises(DeviceGone):
+        device.capture()
+    with pytest.raises(DeviceGone):
+        device.open()
+    server.phones[SERIAL] = phone
+    device.open()
+    device.capture()
+
+
+def test_a_transfer_that_breaks_off(server, phone):
+    phone.shoot = shoot(size=(96, 64))
+    with camera(server) as device:
+        phone.cut_transfer = True
+        with pytest.raises(DeviceGone, match="broke off"):
+            device.capture()
+
+
+def test_a_phone_that_hangs(server, phone):
+    with camera(server, timeout_s=0.3) as device:
+        phone.hang = threading.Event()
+        begin = time.monotonic()
+        with pytest.raises(DeviceTimeout):
+            device.capture()
+        assert time.monotonic() - begin < 1.5
+
+
+def test_no_server():
+    with socket.create_server(("127.0.0.1", 0)) as unused:
+        port = unused.getsockname()[1]
+    settings = {"serial": SERIAL, "port": port, "start_server": False}
+    with pytest.raises(DeviceNotFound, match="adb start-server"):
+        open_device("thermometer", "android", settings, SystemClock()).open()
+
+
+def test_without_adbutils(server, monkeypatch):
+    monkeypatch.setitem(sys.modules, "adbutils", None)
+    with pytest.raises(DriverMissing, match="android"):
+        camera(server).open()
+
+
+def test_temperatures(server, phone, shared):
+    phone.thermal = next((shared / "data/adb").glob("06_*")).read_text()
+    phone.zones = "cpu-0-0 37000\nbattery 370\n"
+    sensors = {
+        "temperature": "battery",
+        "ap": "thermal:AP",
+        "soc": "zone:cpu-0-0",
+        "usb": "thermal:USB",
+    }
+    with thermometer(server, sensors=sensors) as device:
+        reading = device.read()
+    assert reading.values == {"temperature": 28.7, "ap": 25.6, "soc": 37.0}
+    assert reading.metadata["missing"] == {"usb": "thermal:USB: not told by the phone"}
+
+
+def test_a_zones_unit_is_kept(server, phone):
+    phone.zones = "cpu 37000\n"
+    with thermometer(server, sensors={"cpu": "zone:cpu"}) as device:
+        device.read()
+        phone.zones = "cpu 900\n"  # 0.9 °C, and not 90 °C
+        assert device.read().values == {"cpu": pytest.approx(0.9)}
+
+
+def test_a_phone_without_a_battery_sensor(server, phone):
+    phone.battery = "  voltage: 0\n  temperature: 0\n"
+    with thermometer(server) as device, pytest.raises(BadReading, match="not told"):
+        device.read()
+
+
+def test_two_phones_by_their_serials(server, phone):
+    server.phones["SECOND"] = FakePhone(battery="  voltage: 4000\n  temperature: 301\n")
+    with thermometer(server) as one, thermometer(server, serial="SECOND") as two:
+        assert (one.read().values, two.read().values) == (
+            {"temperature": 28.7},
+            {"temperature": 30.1},
+        )
+
+
+@pytest.mark.parametrize("source", ["batery", "thermal", "zone:", "battery:x"])
+def test_a_source_that_does_not_exist(server, source):
+    with pytest.raises(ConfigurationError, match="neither battery"):
+        thermometer(server, sensors={"temperature": source})
+
+
+def test_tap_needs_its_place(server):
+    with pytest.raises(ConfigurationError, match="tap"):
+        camera(server, trigger="tap")
+
+
+def load(server, clock, **more):
+    programme = [{"seconds": 1000, "hold_c": 38.0}]
+    settings = options(server, limit_c=42, programme=programme, hysteresis_k=1.0, **more)
+    return open_device("output", "android_load", settings, clock)
+
+
+def heat(phone, celsius):
+    phone.battery = f"  voltage: 4000\n  temperature: {round(celsius * 10)}\n"
+
+
+def test_warm_up_by_load(server, phone):
+    clock = VirtualClock()
+    with load(server, clock) as output:
+        output.emit({})
+        assert phone.load
+        heat(phone, 38.6)
+        output.emit({})
+        assert not phone.load
+        heat(phone, 37.0)
+        output.emit({})
+        assert phone.load
+    assert not phone.load  # closing stops it
+
+
+def test_the_load_is_a_lease_that_is_renewed(server, phone):
+    clock = VirtualClock()
+    with load(server, clock, lease_s=30, processes=2) as output:
+        output.emit({})
+        started = [c for c in phone.commands if c.startswith("timeout 30 ")]
+        assert len(started) == 2
+        clock.advance(10)
+        output.emit({})
+        assert len([c for c in phone.commands if c.startswith("timeout 30 ")]) == 2
+        clock.advance(10)
+        output.emit({})
+        assert len([c for c in phone.commands if c.startswith("timeout 30 ")]) == 4
+
+
+def test_the_limit_stops_the_load_for_good(server, phone):
+    with load(server, VirtualClock()) as output:
+        output.emit({})
+        heat(phone, 42.0)
+        with pytest.raises(BadReading, match=r"battery 42\.00 °C reached the limit"):
+            output.emit({})
+        assert not phone.load
+        heat(phone, 20.0)
+        output.emit({})
+        assert not phone.load
+
+
+def test_a_limit_that_a_battery_does_not_survive(server):
+    with pytest.raises(ConfigurationError, match="limit_c: 60 °C"):
+        open_device(
+            "output",
+            "android_load",
+            options(server, limit_c=60, programme=[{"seconds": 9, "hold_c": 30}]),
+            VirtualClock(),
+        )

@@ -1,0 +1,165 @@
+"""picamera2 against a stand-in with its API, and the metadata of real cameras."""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+from thermocald_drivers.picamera import sensor_temperature
+
+from tests.drivers.fakes import picamera2_stand_in
+from thermocald.errors import (
+    BadReading,
+    DeviceDenied,
+    DeviceGone,
+    DeviceNotFound,
+    DeviceTimeout,
+    DriverMissing,
+    WrongDevice,
+)
+from thermocald.hal import SystemClock, open_device
+
+
+@pytest.fixture
+def pi(monkeypatch):
+    camera = type("Camera", (picamera2_stand_in.StandIn,), {"instances": []})
+    monkeypatch.setitem(sys.modules, "picamera2", picamera2_stand_in.module(camera))
+    return camera
+
+
+def camera(**options):
+    options = {"width": 96, "height": 64, "exposure_s": 0.004, "timeout_s": 1.0, **options}
+    return open_device("camera", "picamera2", options, SystemClock())
+
+
+def test_the_grey_plane_as_the_sensor_gave_it(pi):
+    with camera() as device:
+        called = time.monotonic()
+        frame = device.capture()
+    assert np.array_equal(frame.image, np.add.outer(np.arange(64), np.arange(96)) % 251)
+    assert frame.encoded is None
+    assert frame.exposure == 0.004
+    assert called <= frame.monotonic <= time.monotonic()
+    assert pi.instances[0].requests_out == 0
+    assert pi.instances[0].closed
+
+
+def test_manual_controls(pi):
+    pi.camera_controls = {"LensPosition": (0, 32, 1)}
+    pi.extra = {"LensPosition": 2.0}
+    with camera(gain=2.0, focus_dioptres=2.0) as device:
+        device.capture()
+    controls = pi.instances[0].configuration["controls"]
+    assert controls["AeEnable"] is False
+    assert controls["AwbEnable"] is False
+    assert (controls["ExposureTime"], controls["AnalogueGain"]) == (4000, 2.0)
+    assert (controls["AfMode"], controls["LensPosition"]) == (0, 2.0)
+
+
+def test_the_time_is_the_middle_of_the_exposure(pi):
+    with camera(exposure_s=0.1) as device:
+        frame = device.capture()
+    stamp = frame.metadata["SensorTimestamp"] * 1e-9
+    boot = time.clock_gettime(time.CLOCK_BOOTTIME) - time.monotonic()
+    assert frame.monotonic == pytest.approx(stamp - boot - 0.05, abs=0.002)
+
+
+def test_old_frames_are_thrown_away(pi):
+    pi.stale = 3
+    with camera() as device:
+        called = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+        frame = device.capture()
+    assert frame.metadata["SensorTimestamp"] - 4_000_000 >= called
+
+
+def test_every_real_metadata_is_stored_and_its_temperature_judged(shared):
+    lines = (shared / "data/libcamera/picamera2_metadata_real.jsonl").read_text().splitlines()
+    believed = [sensor_temperature(json.loads(line)) for line in lines]
+    # imx219 ×2: none; imx708: −20.0 (clamp), 65, 45; imx477: 0.0 (stuck), 29, none; ov5647: none
+    assert believed == [None, None, None, 65.0, 45.0, None, 29.0, None, None]
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        ({"ExposureTime": 1_064_891}, "ExposureTime was set to 4000 and is 1064891"),
+        ({"AnalogueGain": 4.0}, "AnalogueGain was set to 1 and is 4"),
+        ({"AnalogueGain": None}, "is None"),
+    ],
+)
+def test_a_camera_that_does_not_obey(pi, extra, message):
+    pi.extra = extra
+    if extra.get("ExposureTime"):
+        pi.extra = {**extra, "SensorTimestamp": time.clock_gettime_ns(time.CLOCK_BOOTTIME) + 10**10}
+    with camera() as device, pytest.raises(BadReading, match=message):
+        device.capture()
+
+
+def test_a_capture_that_hangs_and_the_camera_opened_again(pi):
+    pi.hang = threading.Event()
+    device = camera(timeout_s=0.2)
+    device.open()
+    begin = time.monotonic()
+    with pytest.raises(DeviceTimeout, match=r"a capture hangs, given up after 0\.2 s"):
+        device.capture()
+    assert time.monotonic() - begin < 1.0
+    assert pi.instances[0].closed
+    with pytest.raises(DeviceGone):
+        device.capture()
+    pi.hang.set()
+    pi.hang = None
+    device.open()
+    device.capture()
+    device.close()
+    assert len(pi.instances) == 2
+
+
+def test_a_partial_frame(pi):
+    pi.cut = True
+    with camera() as device, pytest.raises(BadReading, match="partial frame"):
+        device.capture()
+    assert pi.instances[0].requests_out == 0
+
+
+def test_no_camera_on_the_ribbon(pi):
+    pi.cameras = ()
+    with pytest.raises(DeviceNotFound, match="ribbon cable"):
+        camera().open()
+
+
+def test_another_sensor(pi):
+    with pytest.raises(WrongDevice, match="this is a imx219, not a imx477"):
+        camera(model="imx477").open()
+
+
+def test_a_scaled_image_is_refused(pi):
+    with pytest.raises(WrongDevice, match="another interior orientation"):
+        camera(width=64, height=64).open()
+
+
+@pytest.mark.parametrize("size", [(64, 64)])
+def test_failing_to_open_gives_the_camera_back(pi, size):
+    with pytest.raises(WrongDevice):
+        camera(width=size[0], height=size[1]).open()
+    assert [one.closed for one in pi.instances] == [True] * len(pi.instances)
+
+
+def test_a_lens_that_cannot_be_focused(pi):
+    with pytest.raises(WrongDevice, match="cannot be focused"):
+        camera(focus_dioptres=1.0).open()
+
+
+def test_a_camera_that_another_program_has(pi):
+    pi.busy = True
+    with pytest.raises(DeviceDenied, match="another program"):
+        camera().open()
+
+
+def test_without_picamera2(monkeypatch):
+    monkeypatch.setitem(sys.modules, "picamera2", None)
+    with pytest.raises(DriverMissing):
+        camera().open()

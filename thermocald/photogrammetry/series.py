@@ -15,7 +15,6 @@ Source: DESIGN idea 3; the test for standing still is Rao's score test (1948).
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -32,6 +31,7 @@ from thermocald.photogrammetry.camera_model import (
 from thermocald.photogrammetry.geometry import GeometryBounds, weaknesses
 from thermocald.photogrammetry.normals import ObservationGrid, linearise, series_residuals
 from thermocald.photogrammetry.series_system import SeriesSystem, snoop_series
+from thermocald.photogrammetry.target_noise import correlated_pairs, excess_scatter, noise_ratios
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -52,8 +52,6 @@ _SMALL = 0.03  # standard deviations: a last step that the partials carry to 1e-
 _ROUNDS = 8  # of data snooping
 _RELINEARISE_PX = 1.0  # movement of the mean that changes the partials by more than about 1e-3
 _ENOUGH_FOR_NOISE = 20  # epochs
-_PRIOR_FREEDOM = 8.0  # weight of the series' noise in a target's own
-_MEDIAN_CHI2_1 = 0.4549
 _FEW = 0.6  # share of a series' targets below which an epoch's geometry is looked at by itself
 
 
@@ -63,7 +61,8 @@ class SeriesSettings:
 
     exterior: `series` for a camera that stands still; free: IOP per epoch, the others are held;
     target_offsets: a constant offset per target, with the test field's sigmas as prior; target_noise:
-    each target's measuring noise from its own scatter, where the series is long enough; snooping_alpha, max_rejected, scale, bounds as in `AdjustmentSettings`.
+    the measuring noise, also its correlations within a marker and what neighbouring epochs scatter
+    beyond it, from the series' own scatter where it is long enough; snooping_alpha, max_rejected, scale, bounds as in `AdjustmentSettings`.
     """
 
     exterior: Literal["per_epoch", "series"] = "series"
@@ -97,7 +96,9 @@ class SeriesAdjustment:
     series; level_covariance (16, 16): common to all epochs; sigma0 (E,); redundancy (E,);
     observed, rejected (E, T); residuals (E, T, 2) px; offsets, offset_sds (T, 2) px, NaN where
     none was estimated; status, reasons: per epoch; stillness (E,): chi-square with 6 degrees of
-    freedom of the epoch's own EOP against the series', NaN where the EOP are per epoch.
+    freedom of the epoch's own EOP against the series', NaN where the EOP are per epoch; excess_sd
+    (16,): by how much neighbouring epochs scatter beyond their noise because the set-up trembles
+    or the light flickers; contained in the covariance, 0 where it is not significant.
     """
 
     settings: SeriesSettings
@@ -114,6 +115,7 @@ class SeriesAdjustment:
     status: tuple[str, ...]
     reasons: tuple[str, ...]
     stillness: Array
+    excess_sd: Array
 
     @property
     def sd(self) -> Array:
@@ -277,28 +279,20 @@ class _Series:
         return (self._snoop_together if shared else self._snoop_apart)(estimate, use)
 
     def with_target_noise(self, estimate: _Estimate, use: NDArray[np.bool_]) -> _Series:
-        """The series with every target's weights from the scatter of its own residuals.
-
-        Corners are measured better on a near, bright marker than on a far one, and a-priori sigmas
-        seldom know it. The scatter is robust (median of squares over the epochs, about zero) and
-        drawn to the series' own variance as far as few epochs leave it uncertain.
-        """
-        v2 = np.where(use[..., None], estimate.residuals**2, np.nan)
-        w = estimate.system.weights[..., :2]
-        with np.errstate(invalid="ignore"), warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # targets that were never seen
-            ratio = np.nanmedian(v2 * w, axis=0) / _MEDIAN_CHI2_1
-        n = use.sum(axis=0)[:, None]
-        freedom = 2 * use.sum() - len(self.s.per_epoch) * len(use)
-        ratio *= 2 * use.sum() / max(freedom, 1)  # what the parameters have taken from residuals
-        pooled = np.nanmedian(ratio)
-        ratio = np.where(np.isfinite(ratio), ratio, pooled)
-        # A median of n squares is worth about 0.37 n degrees of freedom of a mean.
-        drawn = (0.37 * n * ratio + _PRIOR_FREEDOM * pooled) / (0.37 * n + _PRIOR_FREEDOM)
+        """The series with every target's weights from the scatter of its own residuals."""
+        ratios = noise_ratios(
+            estimate.residuals, estimate.system.weights, use, self._redundancy_share(use)
+        )
         weights = self.grid.weights.copy()
-        weights[..., :2] /= drawn
-        weights[..., 2] /= np.sqrt(drawn.prod(axis=1))
+        weights[..., :2] /= ratios
+        weights[..., 2] /= np.sqrt(ratios.prod(axis=1))
         return replace(self, grid=ObservationGrid(self.grid.points, weights))
+
+    def _redundancy_share(self, use: NDArray[np.bool_]) -> float:
+        """Redundancy over observations: what the parameters have left of the residuals."""
+        n = 2 * int(use.sum())
+        own = len(self.s.per_epoch) * int(use.any(axis=1).sum())
+        return max((n - own) / max(n, 1), 0.05)
 
     def _snoop_together(
         self, estimate: _Estimate, use: NDArray[np.bool_]
@@ -398,6 +392,15 @@ class _Series:
         if s.scale == "posterior":
             relative *= np.nan_to_num(sigma0, nan=1.0)[:, None, None] ** 2
             level *= pooled
+        if s.target_noise and len(use) >= _ENOUGH_FOR_NOISE:
+            pairs = correlated_pairs(estimate.residuals, use, self._redundancy_share(use))
+            if len(pairs):
+                relative += system.correlated(pairs)
+        excess, own, sound = np.zeros(16), system.own, system.good
+        if s.target_noise:
+            variances = np.diagonal(relative, axis1=1, axis2=2)[:, own]
+            excess[own] = excess_scatter(estimate.values[sound][:, own], variances[sound])
+            relative[:, own, own] += excess[own] * sound[:, None]
         stillness = np.full(len(sigma0), np.nan)
         if s.exterior == "series":
             stillness = system.score(estimate.residuals, _EOP) / np.where(positive, sigma0**2, 1.0)
@@ -409,6 +412,7 @@ class _Series:
             s, values, relative, level, sigma0, redundancy, use, observed & ~use,
             estimate.residuals, estimate.offsets if self.has_offsets else estimate.offsets * np.nan,
             np.sqrt(system.offset_cofactors() * pooled), tuple(status), tuple(reasons), stillness,
+            np.sqrt(excess),
         )  # fmt: skip
 
     def _judge(

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.photogrammetry.normals import Partials
+    from thermocald.photogrammetry.target_noise import CorrelatedPairs
 
     Array = NDArray[np.float64]
     Mask = NDArray[np.bool_]
@@ -215,6 +216,17 @@ class SeriesSystem:
         relative[:, own[:, None], own] = cofactors
         relative[~self.good] = 0.0
         return relative, level
+
+    def correlated(self, pairs: CorrelatedPairs) -> Array:
+        """What correlated errors add to the covariance (E, 16, 16) of the epochs' own parameters."""
+        added = np.zeros((len(self.N), 16, 16))
+        extra = pairs.normal_matrices(self.weights, self.at.A[..., self.own])
+        own = self.Q @ extra @ self.Q
+        # A thresholded correlation matrix may be indefinite: no variance falls below a fifth.
+        floor = -0.8 * np.diagonal(self.Q, axis1=1, axis2=2)
+        sound = (np.diagonal(own, axis1=1, axis2=2) > floor).all(axis=1) & self.good
+        added[:, self.own[:, None], self.own] = np.where(sound[:, None, None], own, 0.0)
+        return added
 
     def offset_cofactors(self) -> Array:
         """Cofactors (T, 2) px² of the offsets in x and y; NaN without offsets."""

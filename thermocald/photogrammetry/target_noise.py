@@ -1,0 +1,144 @@
+"""The measuring noise of a series' targets, from the scatter of their own residuals.
+
+A-priori sigmas seldom know that a near, bright marker is measured better than a far one, nor that
+two corners of a marker share an edge and err together (corners from fitted edges correlate at -0.7
+along the edge they share). Over a series of a static camera both can be seen.
+
+Source: variance components as Förstner (1979); the covariance of least squares under
+correlated noise, Q (Aᵀ P C P A) Q, as Koch (1999), section 3.2.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+    Mask = NDArray[np.bool_]
+
+__all__ = ["CorrelatedPairs", "correlated_pairs", "excess_scatter", "noise_ratios"]
+
+_PRIOR_FREEDOM = 8.0  # weight of the series' noise in a target's own
+_MEDIAN_CHI2_1 = 0.4549
+_SIGNIFICANT = 4.6  # correlations of n pairs below 4.6/√n are noise: 1e-5 two-sided
+_FEWEST_PAIRS = 40
+_LEAST_CORRELATION = 0.3
+_SMOOTH = 15  # epochs
+_LARGEST_GROUP = 8  # targets: more hang together by chance or by something that is no noise
+
+
+def noise_ratios(residuals: Array, weights: Array, used: Mask, redundancy_share: float) -> Array:
+    """Variance (T, 2) of each target's coordinates in units of its a-priori variance.
+
+    residuals (E, T, 2) px; weights (E, T, 3) px⁻²; used (E, T); redundancy_share: redundancy over
+    observations. Robust: medians of squares, drawn to the series' own as far as few epochs leave a
+    target's uncertain.
+    """
+    squares = np.where(used[..., None], residuals**2 * weights[..., :2], np.nan)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # targets that take no part
+        ratio = np.nanmedian(squares, axis=0) / _MEDIAN_CHI2_1 / redundancy_share
+    n = used.sum(axis=0)[:, None]
+    pooled = float(np.nanmedian(ratio)) if np.isfinite(ratio).any() else 1.0
+    ratio = np.where(np.isfinite(ratio), ratio, pooled)
+    # A median of n squares is worth about 0.37 n degrees of freedom of a mean.
+    drawn: Array = (0.37 * n * ratio + _PRIOR_FREEDOM * pooled) / (0.37 * n + _PRIOR_FREEDOM)
+    return np.maximum(drawn, 1e-12)
+
+
+@dataclass(frozen=True, eq=False)
+class CorrelatedPairs:
+    """Pairs of image coordinates whose errors correlate.
+
+    i, j (m,): coordinates, 2·target + axis; covariance (m,) px².
+    """
+
+    i: NDArray[np.int64]
+    j: NDArray[np.int64]
+    covariance: Array
+
+    def __len__(self) -> int:
+        return len(self.i)
+
+    def normal_matrices(self, weights: Array, A: Array) -> Array:
+        """What the pairs add to Aᵀ P C P A: weights (E, T, 3), A (T, 2, p) → (E, p, p)."""
+        E, p = len(weights), A.shape[-1]
+        rows, columns = np.triu_indices(p)
+        flat = np.ascontiguousarray(A).reshape(-1, p)
+        w = weights[..., :2].reshape(E, -1)
+        together = w[:, self.i] * w[:, self.j] * self.covariance
+        a, b = flat[self.i], flat[self.j]
+        upper = together @ (a[:, rows] * b[:, columns] + b[:, rows] * a[:, columns])
+        out = np.empty((E, p, p))
+        out[:, rows, columns] = upper
+        out[:, columns, rows] = upper
+        return out
+
+
+def correlated_pairs(residuals: Array, used: Mask, redundancy_share: float) -> CorrelatedPairs:
+    """Pairs of coordinates of targets whose residuals correlate over a series.
+
+    residuals (E, T, 2) px; used (E, T). Targets are put together where any of their coordinates
+    correlate significantly (the corners of one marker), and within such a group every covariance
+    counts, the small ones too: leaving them out would understate the group's common error. Without
+    groups the result is empty.
+    """
+    E = len(residuals)
+    seen = np.repeat(used, 2, axis=1)
+    v = np.where(seen, residuals.reshape(E, -1), 0.0)
+    mean = v.sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
+    v = np.where(seen, v - mean, 0.0)
+    present = seen.astype(np.float64)
+    n = present.T @ present
+    covariance = (v.T @ v) / np.maximum(n, 1.0)
+    square = (v * v).T @ present / np.maximum(n, 1.0)  # variance of i over epochs shared with j
+    scale = np.sqrt(square * square.T)
+    r = np.divide(covariance, scale, out=np.zeros_like(covariance), where=scale > 0)
+    limit = np.maximum(_SIGNIFICANT / np.sqrt(np.maximum(n, 1.0)), _LEAST_CORRELATION)
+    linked = (np.abs(r) > limit) & (n >= _FEWEST_PAIRS)
+    targets = linked[::2, ::2] | linked[::2, 1::2] | linked[1::2, ::2] | linked[1::2, 1::2]
+    np.fill_diagonal(targets, False)
+    label = _groups(targets)
+    group = np.repeat(label, 2)
+    together = (group[:, None] == group) & (group >= 0) & (n > 0)
+    i, j = np.nonzero(np.triu(together, 1))
+    return CorrelatedPairs(i, j, covariance[i, j] / redundancy_share)
+
+
+def _groups(linked: Mask) -> NDArray[np.int64]:
+    """Label (T,) of each target's group, -1 for one that stands alone or in too large a group."""
+    from scipy.sparse.csgraph import connected_components
+
+    _, label = connected_components(linked, directed=False)
+    size = np.bincount(label)[label]
+    return np.where((size > 1) & (size <= _LARGEST_GROUP), label, -1).astype(np.int64)
+
+
+def excess_scatter(values: Array, variances: Array) -> Array:
+    """Variance (k,) by which epochs scatter about a smooth course beyond their variances.
+
+    values, variances (E, k) of consecutive epochs. The smooth course is a local cubic over 15
+    epochs, which leaves a drift with a time constant of 30 epochs its thousandth; 0 where the
+    excess is not significant (3 sd).
+    """
+    half = _SMOOTH // 2
+    if len(values) < 2 * _SMOOTH:
+        return np.zeros(values.shape[1])
+    x = np.arange(-half, half + 1) / half
+    smooth = np.linalg.pinv(np.vander(x, 4))[-1]  # weights of the cubic's value in the middle
+    inner = slice(half, len(values) - half)
+    windows = np.lib.stride_tricks.sliding_window_view(values, _SMOOTH, axis=0)
+    residual = values[inner] - windows @ smooth
+    left = 1.0 - smooth[half]
+    normed = residual**2 / left / variances[inner]
+    n = len(normed)
+    ratio = np.median(normed, axis=0) / _MEDIAN_CHI2_1
+    significant = ratio > 1 + 3 * np.sqrt(2 / (0.37 * left * n))
+    excess: Array = np.where(significant, (ratio - 1) * variances.mean(axis=0), 0.0)
+    return excess

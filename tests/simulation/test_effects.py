@@ -54,12 +54,27 @@ def column(name):
 
 
 def test_catalogue_is_complete():
-    wanted = set(
-        "thermal_lag time_offset nonlinear_expansion softening thermal_gradient permanent_set "
-        "hysteresis self_heating creep slip cyclic_interference second_heat_source defocus "
-        "housing_tilt radial_distortion_drift decentering_drift affinity_drift "
-        "test_field_expansion target_displacement".split()
-    )
+    wanted = {
+        "thermal_lag",
+        "time_offset",
+        "nonlinear_expansion",
+        "softening",
+        "thermal_gradient",
+        "permanent_set",
+        "hysteresis",
+        "self_heating",
+        "creep",
+        "slip",
+        "cyclic_interference",
+        "second_heat_source",
+        "defocus",
+        "housing_tilt",
+        "radial_distortion_drift",
+        "decentering_drift",
+        "affinity_drift",
+        "test_field_expansion",
+        "target_displacement",
+    }
     assert set(NAMES) == wanted
     assert all(effects.get(name).name == name for name in NAMES)
 

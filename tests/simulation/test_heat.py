@@ -1,0 +1,111 @@
+"""The heat network against closed-form solutions, and independence of how time is cut."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermocald.errors import ConfigurationError
+from thermocald.simulation.course import Course
+from thermocald.simulation.heat import HeatNetwork, Link
+
+AIR = {"ambient": Course.constant(22.0)}
+TIMES = np.arange(0.0, 1500.0, 7.3)
+
+
+def test_one_body_step_of_power():
+    network = HeatNetwork({"a": 150.0}, (Link("a", "ambient", 0.5),))
+    T = network.solve(TIMES, 22.0, {"a": Course.constant(5.0)}, AIR)["a"]
+    np.testing.assert_allclose(T, 22 + 10 * (1 - np.exp(-TIMES / 300)), rtol=0, atol=1e-9)
+
+
+def test_one_body_pulse_of_power():
+    """A jump in the middle, not at any instant that is asked for."""
+    network = HeatNetwork({"a": 150.0}, (Link("a", "ambient", 0.5),))
+    lamp = Course.steps([0.0, 511.11, 2000.0], [5.0, 0.0])
+    T = network.solve(TIMES, 22.0, {"a": lamp}, AIR)["a"]
+    peak = 10 * (1 - np.exp(-511.11 / 300))
+    expected = np.where(
+        TIMES <= 511.11,
+        10 * (1 - np.exp(-TIMES / 300)),
+        peak * np.exp(-(TIMES - 511.11) / 300),
+    )
+    np.testing.assert_allclose(T, 22 + expected, rtol=0, atol=1e-9)
+
+
+def test_one_body_ramp_of_the_air():
+    network = HeatNetwork({"a": 150.0}, (Link("a", "ambient", 0.5),))
+    air = {"ambient": Course.polygon([0.0, 1500.0], [22.0, 52.0])}
+    T = network.solve(TIMES, 22.0, {}, air)["a"]
+    expected = 22 + 0.02 * (TIMES - 300 * (1 - np.exp(-TIMES / 300)))
+    np.testing.assert_allclose(T, expected, rtol=0, atol=1e-9)
+
+
+def two_bodies():
+    return HeatNetwork({"a": 150.0, "b": 20.0}, (Link("a", "ambient", 0.5), Link("a", "b", 0.1)))
+
+
+def eigen_solution(t, T0, forcing):
+    """dT/dt = A T + f for two bodies, by the eigenvalues of the unsymmetric A."""
+    A = np.array([[-0.6 / 150, 0.1 / 150], [0.1 / 20, -0.1 / 20]])
+    rate, vectors = np.linalg.eig(A)
+    steady = -np.linalg.solve(A, forcing)
+    free = np.linalg.solve(vectors, T0 - steady)
+    return steady + (np.exp(np.outer(t, rate)) * free) @ vectors.T
+
+
+def test_two_bodies_step():
+    T = two_bodies().solve(TIMES, {"a": 22.0, "b": 80.0}, {"b": Course.constant(2.0)}, AIR)
+    expected = 22 + eigen_solution(TIMES, np.array([0.0, 58.0]), np.array([0.0, 2.0 / 20]))
+    np.testing.assert_allclose(np.stack([T["a"], T["b"]], axis=1), expected, rtol=0, atol=1e-9)
+
+
+def test_two_bodies_ramp():
+    """The derivative of the answer to a ramp is the answer to a step."""
+    ramp = {"ambient": Course.polygon([0.0, 1500.0], [0.0, 1500.0 * 0.02])}
+    T = two_bodies().solve(TIMES, 0.0, {}, ramp)
+    from scipy.integrate import quad
+
+    step = lambda s, k: eigen_solution(np.array([s]), np.zeros(2), np.array([0.02 * 0.5 / 150, 0]))[0, k]  # fmt: skip  # noqa: E501, E731
+    for k, name in enumerate("ab"):
+        for i in (10, 100, 205):
+            expected = quad(step, 0, TIMES[i], args=(k,), epsabs=1e-11)[0]
+            assert abs(T[name][i] - expected) < 1e-8
+
+
+def test_halving_the_step_changes_nothing():
+    air = {"ambient": Course.polygon([0.0, 400.0, 1600.0], [22.0, 35.0, 18.0])}
+    lamp = {"a": Course.steps([0.0, 123.4, 777.7, 1600.0], [0.0, 9.0, 1.0])}
+    coarse = two_bodies().solve(np.arange(0, 1500, 20.0), 22.0, lamp, air)
+    fine = two_bodies().solve(np.arange(0, 1500, 0.5), 22.0, lamp, air)
+    for name in "ab":
+        np.testing.assert_allclose(fine[name][::40], coarse[name], rtol=0, atol=1e-9)
+
+
+def test_energy_is_conserved():
+    """Two bodies alone in the world: what goes in stays in."""
+    network = HeatNetwork({"a": 30.0, "b": 7.0}, (Link("a", "b", 0.2),))
+    T = network.solve(TIMES, {"a": 20.0, "b": 60.0}, {"b": Course.constant(0.3)}, {})
+    energy = 30.0 * T["a"] + 7.0 * T["b"]
+    np.testing.assert_allclose(energy - 0.3 * TIMES, 30 * 20 + 7 * 60, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("capacities", "links", "says"),
+    [
+        ({"a": -3.0}, (), "capacity of -3 J/K"),
+        ({"a": 3.0}, (Link("a", "ambient", -0.1),), "conducts -0.1 W/K"),
+        ({"a": 3.0}, (Link("air", "ambient", 0.1),), "neither 'air' nor 'ambient'"),
+        ({}, (), "at least one body"),
+    ],
+)
+def test_impossible_networks(capacities, links, says):
+    with pytest.raises(ConfigurationError, match=says):
+        HeatNetwork(capacities, links)
+
+
+def test_unknown_source_and_missing_boundary():
+    with pytest.raises(ConfigurationError, match="'lamp', which is no body"):
+        two_bodies().solve(TIMES, 22.0, {"lamp": Course.constant(1.0)}, AIR)
+    with pytest.raises(ConfigurationError, match="'ambient' is not given"):
+        two_bodies().solve(TIMES, 22.0, {}, {})

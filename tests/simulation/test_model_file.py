@@ -1,0 +1,226 @@
+"""Model, camera and programme files: round trip, and one clear error for each way to be wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermocald.errors import ConfigurationError
+from thermocald.simulation.demonstration import demonstration_field, demonstration_model
+from thermocald.simulation.device import read_camera_device
+from thermocald.simulation.model import ModelEffect
+from thermocald.simulation.model_file import model_document, parse_model, read_model, write_model
+from thermocald.simulation.programme import read_programme
+from thermocald.yaml_file import dump_yaml
+
+
+def full_model():
+    from dataclasses import replace
+
+    model = demonstration_model(demonstration_field("circles"))
+    model = model.with_effect(ModelEffect("thermal_lag", {"tau": 84.0}, {"tau": 1.9}))
+    model = model.with_effect(
+        ModelEffect("second_heat_source", {"channel": "board", "c": 1e-5}, {"c": 1e-7})
+    )
+    model = model.with_effect(
+        ModelEffect("target_displacement", {"time": 60.0, "targets": ("x11", "x12"), "dX": 0.3})
+    )
+    return replace(
+        model,
+        sds={"interior.c": 1e-4, "rates.x0": 2e-6},
+        covariance_names=("interior.c", "thermal_lag.tau"),
+        covariance=((1e-8, 1e-6), (1e-6, 3.6)),
+        validity={"temperature": (20.0, 52.5)},
+        fitted_on=({"recording": "M1", "epochs": 150},),
+        evidence={"why": "a lag"},
+    )
+
+
+def test_round_trip(tmp_path):
+    model = full_model()
+    write_model(tmp_path / "m.yaml", model)
+    assert read_model(tmp_path / "m.yaml") == model
+    assert model.version == 4
+
+
+def change(document, path, value):
+    *parents, last = path
+    for key in parents:
+        document = document[key]
+    if value is None:
+        del document[last]
+    else:
+        document[last] = value
+
+
+BAD = [
+    (("format",), "thermocald-model/9", "this program reads 'thermocald-model/1'"),
+    (("effects", 0, "effect"), "thermal_leg", "did you mean 'thermal_lag'"),
+    (("effects", 0, "parameters"), {}, "'tau' .s. is missing"),
+    (("effects", 0, "parameters", "tau", "unit"), "min", "'min'; it must be 's'"),
+    (("effects", 0, "parameters", "tau", "value"), -5.0, "negative"),
+    (("effects", 0, "parameters", "tau", "value"), float("nan"), "not a finite number"),
+    (("effects", 0, "parameters", "tua"), 5.0, "did you mean 'tau'"),
+    (("rates", "x0", "unit"), "px/K", "it must be 'mm/K'"),
+    (("rates", "A1"), 1e-5, "unknown"),
+    (("rates", "x0", "sd"), -1e-5, "not negative"),
+    (("interior", "c"), None, "interior.c: is missing"),
+    (("camera", "width"), 3280.5, "whole number"),
+    (("camera", "pixel_pitch"), 1.12, "thousandths of a mm"),
+    (("reference_temperature",), {"value": 298.0, "unit": "K"}, "'K'; it must be 'degC'"),
+    (("exterior", "Z0"), None, "exterior.Z0: is missing"),
+    (("covariance", "matrix"), [[1.0]], "2 × 2"),
+    (("covariance", "matrix"), [[1.0, 2.0], [0.0, 1.0]], "not symmetric"),
+    (("validity", "temperature"), [50.0, 20.0], "begins at 50"),
+    (("efects",), [], "did you mean 'effects'"),
+]
+
+
+@pytest.mark.parametrize(("path", "value", "says"), BAD, ids=[str(b[0]) + b[2][:9] for b in BAD])
+def test_bad_models(path, value, says):
+    document = model_document(full_model())
+    change(document, path, value)
+    with pytest.raises(ConfigurationError, match=says) as error:
+        parse_model(document, "m.yaml")
+    assert "m.yaml" in str(error.value)
+
+
+def test_missing_and_broken_files(tmp_path):
+    with pytest.raises(ConfigurationError, match="cannot be read"):
+        read_model(tmp_path / "none.yaml")
+    (tmp_path / "m.yaml").write_text("format: [")
+    with pytest.raises(ConfigurationError, match=r"m\.yaml, line"):
+        read_model(tmp_path / "m.yaml")
+
+
+CAMERA = {
+    "format": "thermocald-camera/1",
+    "name": "mine",
+    "width": 1640,
+    "height": 1232,
+    "pixel_pitch": {"value": 0.00224, "unit": "mm"},
+    "distance": 900.0,
+    "measuring": {"sigma": 0.05, "missed": 0.1},
+    "look": {"blur": 1.1},
+    "heat": {
+        "bodies": {"lens": {"capacity": 2.0}, "board": {"capacity": 20.0}},
+        "links": [
+            {"between": ["lens", "board"], "conductance": 0.1},
+            {"between": ["board", "ambient"], "conductance": 0.2},
+        ],
+    },
+    "thermometers": {
+        "temperature": {"body": "lens", "lag": 5.0, "stuck": {"from": 100.0, "to": 200.0}},
+        "air": {"body": "ambient", "noise": 0.0},
+    },
+}
+
+
+def write(path, document):
+    path.write_text(dump_yaml(document))
+    return path
+
+
+def test_camera_file(tmp_path):
+    device = read_camera_device(write(tmp_path / "c.yaml", CAMERA))
+    assert device.reference == "temperature"
+    assert device.thermometers["temperature"].stuck == (100.0, 200.0)
+    assert device.measuring.missed == 0.1
+    assert device.look.blur_px == 1.1
+    assert device.network.boundaries == ("ambient",)
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "says"),
+    [
+        (("heat", "bodies", "lens", "capacity"), -2.0, "-2 J/K; it must be above 0"),
+        (("heat", "links", 0, "conductance"), 0.0, "0 W/K; it must be above 0"),
+        (("heat", "links", 0, "between"), ["lens"], "must be .one, other."),
+        (("heat", "links", 0, "between"), ["lens", "board", "air"], "must be .one, other."),
+        (("thermometers", "temperature", "body"), "lans", "is 'lans'; bodies are lens, board"),
+        (("thermometers", "air", "missing"), 1.0, "share below 1"),
+        (("measuring", "sigma"), 0.0, "above 0"),
+        (("look", "paper"), 300, "at most 255"),
+        (("pixel_pitch",), {"value": 2.24, "unit": "um"}, "'um'; it must be 'mm'"),
+        (("width",), None, "width: is missing"),
+    ],
+)
+def test_bad_cameras(tmp_path, path, value, says):
+    import copy
+
+    document = copy.deepcopy(CAMERA)
+    change(document, path, value)
+    with pytest.raises(ConfigurationError, match=says):
+        read_camera_device(write(tmp_path / "c.yaml", document))
+
+
+PROGRAMME = {
+    "format": "thermocald-programme/1",
+    "name": "lamp",
+    "epochs": 100,
+    "interval": 10.0,
+    "ambient": 21.0,
+    "sources": {
+        "lens": [
+            {"from": 0, "to": 100, "value": 0},
+            {"from": 100, "to": 400, "begin": 0, "end": 2.0},
+            {"from": 400, "to": 1000, "value": 0.5},
+        ]
+    },
+}
+
+
+def test_programme_file(tmp_path):
+    programme = read_programme(write(tmp_path / "p.yaml", PROGRAMME))
+    lamp = programme.sources["lens"]
+    np.testing.assert_allclose(lamp.after([50.0, 250.0, 400.0, 999.0]), [0, 1.0, 0.5, 0.5])
+    np.testing.assert_allclose(lamp.before([400.0]), [2.0])
+    assert programme.duration == 990.0
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "says"),
+    [
+        (("sources", "lens", 1, "from"), 130, "ends at 100 s: a gap"),
+        (("sources", "lens", 1, "from"), 90, "ends at 100 s: an overlap"),
+        (("sources", "lens", 2, "to"), 800, "covers 0 to 800 s; the programme lasts from 0 to 990"),
+        (("sources", "lens", 0, "to"), 0, "not after 0 s"),
+        (("ambient",), None, "ambient: is missing"),
+        (("ambient",), {"value": 294.0, "unit": "K"}, "'K'; it must be 'degC'"),
+        (("ambient",), {"log": "none.csv"}, "cannot be read"),
+        (("epochs",), 0, "at least 1"),
+        (("interval",), -1, "above 0"),
+        (("sources", "lens", 0, "value"), "bright", "not a finite number"),
+    ],
+)
+def test_bad_programmes(tmp_path, path, value, says):
+    import copy
+
+    document = copy.deepcopy(PROGRAMME)
+    change(document, path, value)
+    with pytest.raises(ConfigurationError, match=says):
+        read_programme(write(tmp_path / "p.yaml", document))
+
+
+@pytest.mark.parametrize(
+    ("rows", "says"),
+    [
+        ("0,20\n300,21\n1300,22\n", "line 4: a gap of 1000 s"),
+        ("0,20\n300,21\n200,22\n", "line 4: time runs backwards"),
+        ("0,20\n300,\n1300,22\n", "line 3: .* is no number"),
+        ("0,20\n", "two rows"),
+        ("0,20\n300,nan\n900,22\n", "not finite"),
+    ],
+)
+def test_logs_with_gaps(tmp_path, rows, says):
+    (tmp_path / "log.csv").write_text("time,temperature\n" + rows)
+    document = {**PROGRAMME, "ambient": {"log": "log.csv", "largest_gap": 500.0}}
+    with pytest.raises(ConfigurationError, match=says):
+        read_programme(write(tmp_path / "p.yaml", document))
+
+
+def test_a_log_is_played_in(tmp_path):
+    (tmp_path / "log.csv").write_text("t,air\n100,20\n600,30\n1100,25\n")
+    played = {"log": "log.csv", "time": "t", "value": "air"}
+    programme = read_programme(write(tmp_path / "p.yaml", {**PROGRAMME, "ambient": played}))
+    np.testing.assert_allclose(programme.boundaries["ambient"].after([0, 250, 1000]), [20, 25, 25])

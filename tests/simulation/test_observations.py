@@ -1,0 +1,180 @@
+"""Recordings: noise as stated, misses and gross errors as asked, readings of instruments."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from thermocald.errors import ConfigurationError, GeometryError
+from thermocald.photogrammetry.camera_model import Sensor
+from thermocald.simulation.course import Course
+from thermocald.simulation.demonstration import demonstration_field, demonstration_model
+from thermocald.simulation.device import CameraDevice, Measuring, default_heat
+from thermocald.simulation.model import ModelEffect
+from thermocald.simulation.observations import Simulation
+from thermocald.simulation.programme import Programme
+from thermocald.simulation.thermometer import SimulatedThermometer
+from thermocald.store.recording import read_recording
+
+
+def simulation(epochs=180, seed=1, effects=(), measuring=None, field=None, **changes):
+    test_field = field or demonstration_field("plain")
+    model = demonstration_model(test_field)
+    for effect in effects:
+        model = model.with_effect(effect)
+    network, thermometers = default_heat()
+    device = CameraDevice("rpi", model.sensor, network, thermometers)
+    if measuring:
+        device = replace(device, measuring=measuring)
+    programme = Programme(
+        "lamp",
+        epochs,
+        10.0,
+        {"ambient": Course.constant(22.0)},
+        {"board": Course.steps([0, 60, 900, 1e6], [0, 4.0, 0])},
+    )
+    return Simulation(model, device, test_field, replace(programme, **changes), seed)
+
+
+def test_noise_misses_and_gross_errors_are_as_asked():
+    s = simulation(epochs=300, measuring=Measuring(0.05, 0.1, 0.01, 5.0))
+    true = s.image_points(slice(0, 300))
+    rows = list(s.observations())
+    error = np.concatenate([o.points - true[e, o.targets] for e, o in enumerate(rows)])
+    visible = s.model.sensor.contains(true, 5.0).sum()
+    assert abs(len(error) / visible - 0.9) < 0.01
+    gross = np.abs(error).max(axis=1) > 6 * 0.05
+    # a gross error of 5 px is below 0.3 px in both coordinates in 1 of 400 cases
+    assert abs(gross.mean() - 0.01) < 0.003
+    good = error[~gross]
+    assert abs(good.std() / 0.05 - 1) < 0.02
+    assert np.abs(good.mean(axis=0)).max() < 0.001
+    assert all(np.all(o.sigmas == 0.05) for o in rows)
+
+
+def test_defocus_is_in_the_noise_alone():
+    s = simulation(effects=[ModelEffect("defocus", {"factor": 0.1})])
+    plain = simulation()
+    a, b = list(s.observations()), list(plain.observations())
+    true = plain.image_points(slice(0, 180))
+    k = int(np.argmax(s.truth.noise_factor))
+    ratio = (a[k].points - true[k, a[k].targets]) / (b[k].points - true[k, b[k].targets])
+    assert s.truth.noise_factor[k] > 1.5
+    good = np.abs(b[k].points - true[k, b[k].targets]) < 0.3
+    np.testing.assert_allclose(ratio[good], s.truth.noise_factor[k], rtol=1e-6)
+
+
+def test_thermometers_are_instruments():
+    rng = np.random.default_rng(0)
+    t = np.arange(0.0, 5000.0, 1.0)
+    T = 20.0 + 0.01 * t
+    at = np.arange(5.0, 4900.0, 1.3)
+    ideal = SimulatedThermometer("x", noise=0.0, resolution=0.0)
+    np.testing.assert_allclose(ideal.read(t, T, at, rng), 20 + 0.01 * at, atol=1e-12)
+    lagging = replace(ideal, lag=30.0, offset=0.5)
+    late = at > 400
+    expected = 20.5 + 0.01 * (at - 30.0)
+    np.testing.assert_allclose(lagging.read(t, T, at, rng)[late], expected[late], atol=1e-5)
+    noisy = replace(ideal, noise=0.2).read(t, T, at, rng) - 20 - 0.01 * at
+    assert abs(noisy.std() - 0.2) < 0.01
+    stepped = replace(ideal, resolution=0.0625).read(t, T, at, rng)
+    np.testing.assert_array_equal(np.mod(stepped, 0.0625), 0.0)
+    assert np.abs(stepped - 20 - 0.01 * at).max() <= 0.0625 / 2 + 1e-12
+    failing = replace(ideal, missing=0.1).read(t, T, at, rng)
+    assert abs(np.isnan(failing).mean() - 0.1) < 0.02
+    stuck = replace(ideal, stuck=(1000.0, 2000.0)).read(t, T, at, rng)
+    held = (at >= 1000) & (at < 2000)
+    assert len(set(stuck[held])) == 1
+    assert np.ptp(stuck[~held]) > 40
+
+
+def test_frames_and_readings_have_their_own_instants():
+    s = simulation(jitter=0.3, reading_offset=0.2, reading_spread=1.0)
+    shift = s.reading_times - s.frame_times
+    assert -0.8 <= shift.min() < -0.7
+    assert 1.1 < shift.max() <= 1.2
+    assert np.all(np.diff(s.frame_times) > 5)
+    assert 0.2 < np.diff(s.frame_times).std() / np.sqrt(2) < 0.4
+
+
+def test_written_and_read_again(tmp_path):
+    s = simulation(epochs=12)
+    done = []
+    s.write(tmp_path / "r", advance=done.append)
+    recording = read_recording(tmp_path / "r")
+    assert sum(done) == len(recording.epochs) == 12
+    assert list(recording.channels) == ["temperature", "board_temperature"]
+    assert recording.extra["simulated"]["seed"] == 1
+    for epoch, seen in zip(recording.epochs, s.observations(), strict=True):
+        np.testing.assert_allclose(epoch.observations.points, seen.points, atol=1e-5)
+        np.testing.assert_array_equal(epoch.observations.targets, seen.targets)
+    np.testing.assert_allclose(recording.testfield.points, s.field.points, rtol=0, atol=1e-9)
+
+
+def test_seed_decides_everything(tmp_path):
+    for name, seed in (("a", 4), ("b", 4), ("c", 5)):
+        simulation(epochs=5, seed=seed).write(tmp_path / name)
+    text = {n: (tmp_path / n / "observations.csv").read_bytes() for n in "abc"}
+    assert text["a"] == text["b"]
+    assert text["a"] != text["c"]
+
+
+def test_frames_can_be_measured(tmp_path):
+    from thermocald.photogrammetry.markers import measure_markers
+
+    field = demonstration_field("markers")
+    s = simulation(epochs=2, field=field)
+    s.write(tmp_path / "r", with_frames=True)
+    recording = read_recording(tmp_path / "r")
+    assert not recording.has_observations
+    import cv2
+
+    image = cv2.imread(str(recording.epochs[1].frame), cv2.IMREAD_GRAYSCALE)
+    seen = measure_markers(image, field)
+    error = seen.points - s.image_points(slice(1, 2))[0, seen.targets]
+    assert len(seen) > 150
+    assert np.sqrt(np.mean(error**2)) < 0.05
+
+
+def test_another_camera_is_refused():
+    s = simulation()
+    with pytest.raises(ConfigurationError, match="a model belongs to one camera"):
+        replace(s, device=replace(s.device, sensor=Sensor(640, 480, 0.005)))
+
+
+def test_nothing_in_sight_is_said():
+    s = simulation()
+    away = s.model.exterior.with_values(kappa=0.0, phi=3.0)
+    with pytest.raises(GeometryError, match="the camera sees 0 of 147 targets"):
+        next(replace(s, model=replace(s.model, exterior=away)).observations())
+
+
+@pytest.mark.slow
+def test_a_day(tmp_path):
+    """8,640 epochs of 147 targets in 10 s with their CSV; memory hardly grows with the length."""
+    import subprocess
+    import sys
+
+    code = (
+        "import resource, sys, time; from pathlib import Path; sys.path.insert(0, sys.argv[1]);"
+        "import numpy as np;"
+        "from thermocald.simulation.presets import preset_simulation;"
+        "from dataclasses import replace; from thermocald.simulation.course import Course;"
+        "s = preset_simulation('rpi-v2.1-heating');"
+        "p = replace(s.programme, epochs=int(sys.argv[2]));"
+        "p = replace(p, sources={'housing': Course.constant(4.)});"
+        "s = replace(s, programme=p); t = time.perf_counter(); s.write(Path(sys.argv[3]));"
+        "print(time.perf_counter() - t, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
+    )
+    found = {}
+    for epochs in (1080, 8640):
+        run = subprocess.run(
+            [sys.executable, "-c", code, ".", str(epochs), str(tmp_path / str(epochs))],
+            check=True, capture_output=True, text=True,
+        )  # fmt: skip
+        found[epochs] = [float(v) for v in run.stdout.split()]
+    assert found[8640][0] < 10.0
+    # the temperatures of a day are 12 MB; the observations, 160 MB of text, are nowhere
+    assert found[8640][1] - found[1080][1] < 40.0

@@ -1,0 +1,105 @@
+"""The presets against what the reference reports (Elias et al. 2020, sections 4.1 and 4.2)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermocald.errors import ConfigurationError
+from thermocald.simulation.presets import PRESETS, preset_names, preset_simulation
+
+# preset: principal point px, principal distance mm, where it goes (right, up), as the text has it
+REFERENCE = {
+    "nexus5-cold": (16, 0.007, (1, -1)),
+    "nexus5-warm": (8, 0.003, (1, -1)),
+    "galaxy-s8-cold": (40, 0.007, (-1, 1)),
+    "galaxy-s8-warm": (11, 0.003, (-1, 1)),
+    "rpi-v2.1-heating": (None, None, (-1, -1)),
+}
+
+
+def test_all_five():
+    assert set(preset_names()) == set(REFERENCE)
+    with pytest.raises(ConfigurationError, match="known are: nexus5-cold"):
+        preset_simulation("nexus6")
+
+
+@pytest.mark.parametrize("name", REFERENCE)
+def test_drift_is_the_references(name):
+    s = preset_simulation(name, seed=3)
+    assert s.programme.epochs == 150
+    assert s.programme.interval == 10.0
+    iop = s.truth.iop
+    hottest = int(np.argmax(s.true_history.temperature()))
+    moved = iop[hottest] - iop[0]
+    pixels, c_mm, towards = REFERENCE[name]
+    assert np.array_equal(np.sign(moved[1:3]), towards)
+    if pixels is not None:
+        assert hottest == 149
+        assert round(np.hypot(moved[1], moved[2]) / s.model.sensor.pixel_pitch) == pixels
+        assert round(moved[0], 3) == c_mm
+    for k in range(3):
+        r = np.corrcoef(s.readings["temperature"], iop[:, k])[0, 1]
+        assert abs(r) > 0.98
+
+
+@pytest.mark.parametrize("name", [n for n in REFERENCE if n != "rpi-v2.1-heating"])
+def test_phones_warm_with_a_time_constant_of_300_s(name):
+    s = preset_simulation(name)
+    T = s.true_history.temperature()
+    share = (T - T[0]) / (PRESETS[name].end_degc - T[0])
+    at = np.interp(1 - np.exp(-1), share, s.frame_times)
+    assert abs(at - 300.0) < 15.0
+    assert np.all(np.diff(T) > 0)
+
+
+def test_rpi_comes_back_along_a_line_but_not_fully():
+    s = preset_simulation("rpi-v2.1-heating")
+    path = s.truth.iop[:, 1:3] - s.truth.iop[0, 1:3]
+    length = np.linalg.norm(path, axis=1)
+    hottest = int(length.argmax())
+    along = path[hottest] / length[hottest]
+    across = path @ np.array([-along[1], along[0]])
+    assert np.abs(across).max() < 1e-3 * length[hottest]
+    # what the temperature alone would leave at the end, and what stays on top of it
+    T = s.true_history.temperature()
+    cooled = (T[-1] - T[0]) / (T.max() - T[0])
+    assert 0.02 < length[-1] / length[hottest] - cooled < 0.10
+    factor = s.truth.noise_factor
+    assert abs(factor.max() - 3.5) < 0.01
+    assert abs(factor[0] - 1.0) < 1e-12
+    assert int(factor.argmax()) == int(T.argmax())
+
+
+def object_errors(s, sets, rng):
+    """Distances cm at 10 m between nine image points' rays of drawn IOP and of the mean IOP."""
+    sd = s.truth.iop[:, :3].std(axis=0, ddof=1)
+    c = s.model.interior.c
+    sensor = s.model.sensor
+    half = np.array([sensor.width - 1, sensor.height - 1]) / 2 * sensor.pixel_pitch
+    gx, gy = (g.ravel() for g in np.meshgrid([-half[0], 0, half[0]], [-half[1], 0, half[1]]))
+    dc, dx, dy = (rng.normal(0, v, (sets, 1)) for v in sd)
+    x = ((gx - dx) / (c + dc) - gx / c) * 1000
+    y = ((gy - dy) / (c + dc) - gy / c) * 1000
+    return np.hypot(x, y)
+
+
+# share below 1.5 cm %, mean cm, mean of the nine maxima cm: reference table 7 and text of 4.4
+OBJECT_SPACE = {
+    "nexus5-cold": (67, 1.3, 6.2),
+    "nexus5-warm": (98, 0.6, 2.9),
+    "galaxy-s8-cold": (20, 3.0, 12.9),
+    "galaxy-s8-warm": (93, 0.8, 3.5),
+    "rpi-v2.1-heating": (None, 1.1, 4.5),
+}
+
+
+@pytest.mark.parametrize("name", REFERENCE)
+def test_object_space_errors_are_the_references(name):
+    """Shares within 3 points, means within 0.1 cm, mean maxima within 15 %."""
+    found = object_errors(preset_simulation(name), 50_000, np.random.default_rng(1))
+    share, mean, maximum = OBJECT_SPACE[name]
+    if share is not None:
+        assert abs((found < 1.5).mean() * 100 - share) < 3.0
+    assert abs(found.mean() - mean) < 0.1
+    assert abs(found.max(axis=0).mean() / maximum - 1) < 0.15

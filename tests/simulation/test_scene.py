@@ -1,0 +1,247 @@
+"""Rendered frames: where the targets are, how fast, and the same on every machine."""
+
+from __future__ import annotations
+
+import hashlib
+
+import cv2
+import numpy as np
+import pytest
+
+from thermocald.photogrammetry.camera_model import (
+    ExteriorOrientation,
+    InteriorOrientation,
+    Sensor,
+    project,
+)
+from thermocald.photogrammetry.markers import measure_markers
+from thermocald.photogrammetry.testfield import TestField
+from thermocald.simulation import portable
+from thermocald.simulation.demonstration import demonstration_field, demonstration_model
+from thermocald.simulation.raster import coverage, windows_around
+from thermocald.simulation.scene import Look, Scene
+from thermocald.simulation.shapes import surface_normals
+from thermocald.simulation.testfields import corner_field, corner_view
+
+SENSOR = Sensor(3280, 2464, 0.00112)
+CLEAN = Look(noise_dn=0.0, vignetting=0.0)
+
+
+def outline_centroid(field, normals, row, sensor, iop, eop):
+    """The centroid of the projected circle (Green's theorem), by the camera model itself."""
+    normal = normals[row]
+    u = np.cross(normal, [0.3, 0.5, 0.8])
+    u /= np.linalg.norm(u)
+    v = np.cross(normal, u)
+    a = np.linspace(0, 2 * np.pi, 4000, endpoint=False)[:, None]
+    circle = field.points[row] + field.diameters[row] / 2 * (np.cos(a) * u + np.sin(a) * v)
+    x, y = project(sensor, iop, eop, circle).T
+    cross = x * np.roll(y, -1) - np.roll(x, -1) * y
+    area = cross.sum() / 2
+    centroid = [((p + np.roll(p, -1)) * cross).sum() / 6 / area for p in (x, y)]
+    return np.array(centroid), abs(area)
+
+
+def test_centres_agree_with_the_projected_truth():
+    """No noise: intensity-weighted centroids against the projected outline, 0.01 px RMS."""
+    field = demonstration_field("plain")
+    model = demonstration_model(field)
+    iop, eop = model.interior.as_array(), model.exterior.as_array()
+    image = Scene(SENSOR, field, CLEAN).render(iop, eop)
+    error, areas, normals = [], [], surface_normals(field)
+    for row, (x, y) in enumerate(project(SENSOR, iop, eop, field.points)):
+        if not SENSOR.contains([x, y], 45):
+            continue
+        i, j = round(float(x)), round(float(y))
+        ink = 200.0 - image[j - 38 : j + 39, i - 38 : i + 39].astype(float)
+        grid = np.arange(-38, 39)
+        measured = np.array([(ink.sum(0) * grid).sum(), (ink.sum(1) * grid).sum()]) / ink.sum()
+        centroid, area = outline_centroid(field, normals, row, SENSOR, iop, eop)
+        error.append(measured + np.array([i, j]) - centroid)
+        areas.append(ink.sum() / 170.0 / area - 1.0)
+    assert len(error) >= 140
+    assert np.sqrt(np.mean(np.square(error))) < 0.002
+    assert np.abs(areas).max() < 2e-3
+
+
+def test_corners_agree_with_the_projected_truth():
+    """No noise, almost no distortion inside a marker: the corner fit of `markers`, 0.01 px RMS."""
+    field = demonstration_field("markers")
+    iop = InteriorOrientation(c=3.04, x0=0.012, y0=-0.018).as_array()
+    eop = corner_view(field, 1330.0).as_array()
+    image = Scene(SENSOR, field, CLEAN).render(iop, eop)
+    seen = measure_markers(image, field)
+    assert len(seen) >= 160
+    error = seen.points - project(SENSOR, iop, eop, field.points)[seen.targets]
+    assert np.sqrt(np.mean(error**2)) < 0.01
+
+
+def test_drift_moves_the_image():
+    """The same target half a pixel on: centroids move by what the camera model says."""
+    field = demonstration_field("plain")
+    model = demonstration_model(field)
+    eop = model.exterior.as_array()
+    scene = Scene(SENSOR, field, CLEAN)
+    first, second = model.interior, model.interior.with_values(x0=0.0123, c=3.0402)
+    a, b = (scene.render(i.as_array(), eop).astype(float) for i in (first, second))
+    pa, pb = (project(SENSOR, i.as_array(), eop, field.points) for i in (first, second))
+    row = field.index["x44"]
+    i, j = np.rint(pa[row]).astype(int)
+    window = np.s_[j - 40 : j + 41, i - 40 : i + 41]
+    grid = np.arange(-40, 41)
+    moved = [
+        ((200 - im[window]).sum(axis) * grid).sum() / (200 - im[window]).sum()
+        for axis in (0, 1)
+        for im in (a, b)
+    ]
+    measured = np.array([moved[1] - moved[0], moved[3] - moved[2]])
+    np.testing.assert_allclose(measured, (pb - pa)[row], atol=2e-3)
+
+
+def test_coverage_is_exact():
+    """A tilted square: its area in every pixel against clipping by hand."""
+    corners = np.array([[3.2, 4.1], [9.7, 5.3], [8.5, 11.8], [2.0, 10.6]])
+    (windows,) = windows_around(corners.min(0)[None], corners.max(0)[None], 2)
+    zeros = np.zeros(4, dtype=np.int64)
+    share = coverage(corners, np.roll(corners, -1, axis=0), np.ones(4), zeros, windows)
+    x, y = corners.T
+    area = 0.5 * abs(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
+    assert abs(share.sum() - area) < 1e-5
+    fine = 64
+    at = (np.arange(fine) + 0.5) / fine - 0.5
+    edges = np.roll(corners, -1, axis=0) - corners
+    for row, column in ((2, 3), (5, 5), (4, 2), (8, 7)):
+        px = windows.left[0] + column + at[None, :]
+        py = windows.top[0] + row + at[:, None]
+        inside = np.ones((fine, fine), dtype=bool)
+        for corner, edge in zip(corners, edges, strict=True):
+            inside &= edge[0] * (py - corner[1]) - edge[1] * (px - corner[0]) >= 0
+        assert abs(share[row, column] - inside.mean()) < 0.01
+
+
+def test_blur_noise_vignetting():
+    field = TestField.build(["a"], [[0.0, 0.0, 0.0]], diameters=20.0)
+    sensor = Sensor(641, 481, 0.005)
+    iop = InteriorOrientation(c=8.0).as_array()
+    eop = ExteriorOrientation(0, 0, 0, 200.0, 150.0, 1000.0).as_array()
+    look = Look(noise_dn=2.5, vignetting=0.3, blur_px=1.2)
+    image = Scene(sensor, field, look).render(iop, eop, seed=5).astype(float)
+    clean = Scene(sensor, field, Look(noise_dn=0, vignetting=0.3, blur_px=1.2)).render(iop, eop)
+    noise = (image - clean)[100:]
+    assert abs(noise.std() - np.hypot(2.5, 0.35)) < 0.1  # and the two roundings
+    assert abs(noise.mean()) < 0.04  # 1/64 DN keeps the clean frame off half-way values
+    r2 = ((np.arange(641) - 320.0) ** 2)[None] + ((np.arange(481) - 240.0) ** 2)[:, None]
+    expected = 200 * (1 - 0.3 * r2 / (320.0**2 + 240.0**2))
+    assert np.abs(clean[:250] - expected[:250]).max() < 1.0
+    # the edge of the disc: a normal distribution of the blur
+    from scipy.stats import norm
+
+    plain = Scene(sensor, field, Look(noise_dn=0, vignetting=0, blur_px=1.2)).render(iop, eop)
+    cx, cy = project(sensor, iop, eop, field.points)[0]
+    row = plain[round(cy), :].astype(float)
+    x = np.arange(641)
+    radius = 10.0 * 8 / 1000 / 0.005
+    profile = norm.cdf((radius - np.abs(x - cx)) / np.hypot(1.2, 12**-0.5))
+    assert np.abs((200 - row) / 170 - profile).max() < 0.02
+
+
+def test_out_of_sight():
+    """Behind the camera, beside the image, seen from the back: nothing is drawn, nothing breaks."""
+    field = corner_field("markers", 2, 200.0)
+    scene = Scene(SENSOR, field, CLEAN)
+    iop = InteriorOrientation(c=3.04).as_array()
+    for eop in (
+        ExteriorOrientation(0, 0, 0, 5e4, 0, 1000),
+        ExteriorOrientation(np.pi, 0, 0, 100, 100, 1000),
+        ExteriorOrientation(0, np.pi, 0, -500, -500, -900),
+    ):
+        assert np.all(scene.render(iop, eop.as_array()) == 200)
+    inside = ExteriorOrientation(0, 0, 0, 100.0, 100.0, 30.0).as_array()
+    assert scene.render(iop, inside).shape == (2464, 3280)
+
+
+def test_same_frame_from_the_same_seed():
+    """Bit for bit: these sums were found on x86-64 (AVX2); any other machine must find them too."""
+    field = corner_field("circles", 4, 150.0)
+    model = demonstration_model(field)
+    sensor = Sensor(820, 616, 0.00448)
+    scene = Scene(sensor, field)
+    frames = [
+        scene.render(model.interior.as_array(), model.exterior.as_array(), seed=s)
+        for s in (1, 1, 2)
+    ]
+    assert np.array_equal(frames[0], frames[1])
+    assert not np.array_equal(frames[0], frames[2])
+    digest = hashlib.sha256(frames[0].tobytes()).hexdigest()
+    assert digest[:16] == "0dc0ce6a9cf03c95"
+
+
+def test_portable_arithmetic_is_right():
+    angles = np.linspace(-9, 9, 2001)
+    s, c = portable.sin_cos(angles)
+    np.testing.assert_allclose(s, np.sin(angles), atol=4e-16)
+    np.testing.assert_allclose(c, np.cos(angles), atol=4e-16)
+    for sigma in (0.5, 0.8, 2.7):
+        k = portable.gaussian_kernel(sigma)
+        n = len(k) // 2
+        expected = np.exp(-0.5 * (np.arange(-n, n + 1) / sigma) ** 2)
+        np.testing.assert_allclose(k, expected / expected.sum(), rtol=1e-11)
+    field = corner_field("plain", 3, 200.0)
+    iop = np.array([3.04, 0.01, -0.02, -0.004, 5e-4, 1e-5, 1e-4, -2e-4, 3e-4, -2e-4])
+    eop = corner_view(field, 1200.0, roll_deg=13.0).as_array()
+    np.testing.assert_allclose(
+        portable.project(SENSOR, iop, eop, field.points),
+        project(SENSOR, iop, eop, field.points),
+        rtol=0,
+        atol=1e-9,
+    )
+
+
+def test_ring_codes_can_be_read():
+    """Drawn the way they are read: the detector of `detection` finds them where they are."""
+    from thermocald.photogrammetry.detection import find_circles, read_codes
+
+    field = demonstration_field("circles")
+    model = demonstration_model(field)
+    iop, eop = model.interior.as_array(), model.exterior.as_array()
+    image = Scene(SENSOR, field).render(iop, eop, seed=3)
+    found = read_codes(image, find_circles(image))
+    wanted = {code: row for row, code in enumerate(field.codes) if code}
+    truth = project(SENSOR, iop, eop, field.points)
+    named = {f"RING{bits}:{n}" for bits, n in zip(found.bits, found.numbers, strict=True)}
+    assert named <= set(wanted)
+    assert len(named) >= 0.9 * len(wanted)
+    assert np.isfinite(truth).all()
+
+
+def test_speed(capsys):
+    """An 8 MP frame of 147 targets in 4 × the time OpenCV needs to encode it as JPEG."""
+    import time
+
+    cv2.setNumThreads(1)
+    field = demonstration_field("plain")
+    model = demonstration_model(field)
+    iop, eop = model.interior.as_array(), model.exterior.as_array()
+    scene = Scene(SENSOR, field)
+    image = scene.render(iop, eop)
+
+    def best(run):
+        times = []
+        for _ in range(5):
+            begin = time.perf_counter()
+            run()
+            times.append(time.perf_counter() - begin)
+        return min(times)
+
+    ratio = best(lambda: scene.render(iop, eop)) / best(lambda: cv2.imencode(".jpg", image))
+    assert ratio < 4.0
+
+
+@pytest.mark.parametrize("kind", ["markers", "circles", "plain"])
+def test_corner_field(kind):
+    field = corner_field(kind, 4, 150.0)
+    assert len(field) == (192 if kind == "markers" else 48)
+    assert np.all(field.points.min(axis=1) == 0)
+    normals = np.abs(surface_normals(field))
+    planes = np.argmin(field.points, axis=1)
+    np.testing.assert_allclose(normals, np.eye(3)[planes], atol=1e-9)

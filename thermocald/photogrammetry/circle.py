@@ -100,7 +100,7 @@ def windows(
     coded: NDArray[np.bool_],
     blur: float = 0.9,
     reach: float = REACH_PX,
-    chunk_pixels: int = 20_000,
+    chunk_pixels: int = 40_000,
 ) -> Iterator[Windows]:
     """The pixels near each outline, targets of like size together.
 
@@ -108,26 +108,27 @@ def windows(
     """
     height, width = image.shape
     reach_px = max(reach, 4.0 * blur)
-    half = np.ceil(maps.half_extent.max(axis=1) + reach_px).astype(int)
-    order = np.argsort(half, kind="stable")
+    half = np.ceil(maps.half_extent + reach_px).astype(int)
+    pixels = np.prod(2 * half + 1, axis=1)
+    # Targets of like size and like shape share a window.
+    order = np.lexsort((half[:, 0], half.max(axis=1) // 3))
     flat = image.ravel()
     start = 0
     while start < len(order):
-        stop = start + 1
-        while (
-            stop < len(order)
-            and (stop + 1 - start) * (2 * half[order[stop]] + 1) ** 2 <= chunk_pixels
-            and half[order[stop]] <= 1.25 * half[order[start]] + 1
-        ):
-            stop += 1
+        stop, common = start + 1, half[order[start]]
+        while stop < len(order):
+            larger = np.maximum(common, half[order[stop]])
+            area = int(np.prod(2 * larger + 1))
+            if (stop + 1 - start) * area > chunk_pixels or area > 1.5 * pixels[order[start]]:
+                break
+            stop, common = stop + 1, larger
         rows = order[start:stop]
         start = stop
         # The ellipse alone is good enough to choose pixels by.
         part = maps.select(rows).without_eccentricity()
-        h = int(half[rows].max())
-        offset = np.arange(-h, h + 1)
+        ox, oy = (np.arange(-h, h + 1) for h in common.tolist())
+        lx, ly = np.tile(ox, len(oy))[None], np.repeat(oy, len(ox))[None]
         origin = np.rint(part.centre).astype(np.int64)
-        lx, ly = np.tile(offset, len(offset))[None], np.repeat(offset, len(offset))[None]
         centre = (part.centre - origin).astype(np.float32)
         x, y = lx.astype(np.float32) - centre[:, :1], ly.astype(np.float32) - centre[:, 1:]
         d, rho = edge_distance(part, x, y)
@@ -138,11 +139,7 @@ def windows(
                 ring = np.where(rho > 1, d * (RING_INNER - rho) / (1 - rho), np.inf)
             use &= ~coded[rows, None] | (ring >= _RING_CLEARANCE * blur)
         cut = np.zeros(len(rows), dtype=bool)
-        if (
-            np.any(origin < h)
-            or np.any(origin[:, 0] >= width - h)
-            or np.any(origin[:, 1] >= height - h)
-        ):
+        if np.any(origin < common) or np.any(origin + common >= (width, height)):
             ix, iy = lx + origin[:, :1], ly + origin[:, 1:]
             inside = (ix >= 0) & (ix < width) & (iy >= 0) & (iy < height)
             cut = np.any(~inside & (d > -2.0), axis=1)
@@ -153,13 +150,13 @@ def windows(
         where = np.flatnonzero(use)
         row = np.repeat(np.arange(len(rows)), count)
         place = np.arange(len(where)) + (k * np.arange(len(rows)) - (np.cumsum(count) - count))[row]
-        at = np.zeros(len(rows) * k, dtype=np.int64)
-        at[place] = where - row * use.shape[1]
-        weight = np.zeros(len(rows) * k, dtype=np.float32)
-        weight[place] = 1.0
-        distance = np.zeros(len(rows) * k, dtype=np.float32)
-        distance[place] = d.ravel()[where]
-        at, weight, distance = (v.reshape(-1, k) for v in (at, weight, distance))
+        shape = (len(rows), k)
+        at = np.zeros(shape, dtype=np.int64)
+        at.ravel()[place] = where - row * use.shape[1]
+        weight = np.zeros(shape, dtype=np.float32)
+        weight.ravel()[place] = 1.0
+        distance = np.zeros(shape, dtype=np.float32)
+        distance.ravel()[place] = d.ravel()[where]
         base = origin[:, 1:] * width + origin[:, :1]
         pixel = np.where(weight > 0, (ly * width + lx)[0].take(at) + base, 0)
         grey = flat.take(pixel).astype(np.float32)

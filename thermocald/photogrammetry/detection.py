@@ -138,39 +138,35 @@ def read_codes(
 
     A code that is read at two places is dropped: one of the two is not what it says.
     """
-    bits: list[int] = []
-    numbers: list[int] = []
-    rows: list[int] = []
     ring, passed = _ring_profiles(image, candidates)
-    places = np.nonzero(passed)[0]
-    if len(places):
-        readings = {n: _read_family(ring[places], n) for n in families}
-        for i, row in enumerate(places.tolist()):
-            valid = []
-            for n, (number, misfit) in readings.items():
-                code = ring_code.smallest_rotation(int(number[i]), n)
-                if misfit[i] < _MISFIT and code in _codes(n):
-                    valid.append((float(misfit[i]), n, code))
-            if not valid:
-                continue
-            valid.sort()
-            if len(valid) > 1 and valid[1][0] < 1.2 * valid[0][0] + 0.01:
-                continue  # fits both families: neither can be trusted
-            _, n, code = valid[0]
-            if known is None or (n, code) in known:
-                bits.append(n)
-                numbers.append(code)
-                rows.append(row)
-    count = Counter(zip(bits, numbers, strict=True))
-    keep = [i for i in range(len(rows)) if count[bits[i], numbers[i]] == 1]
-    return CodedTargets(
-        *(np.array([a[i] for i in keep], dtype=np.int64) for a in (bits, numbers, rows))
+    rows = np.nonzero(passed)[0]
+    raster = np.array(sorted(families), dtype=np.int64)
+    readings = [_read_family(ring[rows], n) for n in raster.tolist()]
+    numbers = np.array([r[0] for r in readings]).reshape(len(raster), len(rows))
+    misfits = np.array([r[1] for r in readings]).reshape(len(raster), len(rows))
+    misfits = np.where((numbers >= 0) & (misfits < _MISFIT), misfits, np.inf)
+    best, at = np.argmin(misfits, axis=0), np.arange(len(rows))
+    misfit, number, bits = misfits[best, at], numbers[best, at], raster[best]
+    others = misfits.copy()
+    others[best, at] = np.inf
+    # A ring that fits both families can be trusted with neither.
+    clear = others.min(axis=0) >= np.where(np.isfinite(misfit), 1.2 * misfit + 0.01, 0.0)
+    good = np.isfinite(misfit) & clear
+    found = list(zip(bits[good].tolist(), number[good].tolist(), strict=True))
+    count = Counter(found)
+    keep = np.array(
+        [i for i, c in enumerate(found) if count[c] == 1 and (known is None or c in known)],
+        dtype=np.int64,
     )
+    return CodedTargets(bits[good][keep], number[good][keep], rows[good][keep])
 
 
 @cache
-def _codes(bits: int) -> frozenset[int]:
-    return frozenset(ring_code.codes(bits))
+def _code_table(bits: int) -> NDArray[np.int64]:
+    """The code of each number of so many bits, -1 where it is none."""
+    codes = frozenset(ring_code.codes(bits))
+    smallest = (ring_code.smallest_rotation(number, bits) for number in range(1 << bits))
+    return np.array([code if code in codes else -1 for code in smallest], dtype=np.int64)
 
 
 def _ring_profiles(
@@ -212,7 +208,7 @@ def _ring_profiles(
 
 
 def _read_family(ring: NDArray[np.float32], bits: int) -> tuple[NDArray[np.int64], Array]:
-    """Numbers (n,) read with a raster of so many bits, and the misfit (n,) of that raster.
+    """Codes (n,) read with a raster of so many bits, -1 for none, and that raster's misfit (n,).
 
     The misfit is the RMS of the level against 0 or 1 in the middle part of each segment, infinite
     where a segment is neither.
@@ -233,4 +229,4 @@ def _read_family(ring: NDArray[np.float32], bits: int) -> tuple[NDArray[np.int64
         best_misfit = np.where(better, misfit, best_misfit)
         best = np.where(better[:, None], ones, best)
     numbers = best @ (1 << np.arange(bits - 1, -1, -1))
-    return numbers.astype(np.int64), best_misfit
+    return _code_table(bits)[numbers], best_misfit

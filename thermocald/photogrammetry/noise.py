@@ -24,9 +24,9 @@ _QUANTISATION = 1 / 12
 _CUT = 4.0  # robust standard deviations beyond which a residual is no noise
 _CUT_LOSS = 0.9989  # variance left of a normal distribution cut at 4 sd
 _FEWEST = 200
-_ENOUGH = 20_000
+_ENOUGH = 8_000
 _BINS = 6
-_CONSTANT = 1.15
+_CONSTANT = 1.3
 
 
 @dataclass(frozen=True, slots=True)

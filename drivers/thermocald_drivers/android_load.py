@@ -49,7 +49,8 @@ class AndroidLoadOutput(Output):
         host: str = "127.0.0.1",
         port: int = 5037,
         start_server: bool = True,
-        **options: Any,
+        unknown_s: float = 60.0,
+        hysteresis_k: float = 0.5,
     ) -> None:
         self.clock = clock
         self.phone = AdbPhone(
@@ -63,7 +64,11 @@ class AndroidLoadOutput(Output):
         self.processes = int(support.number("processes", processes, 1, 16, whole=True))
         self.lease_s = support.number("lease_s", lease_s, 2, 120, "s")
         self.programme = HeatingProgramme(
-            limit_c=limit_c, programme=programme, channel="battery", **options
+            limit_c=limit_c,
+            programme=programme,
+            channel="battery",
+            unknown_s=unknown_s,
+            hysteresis_k=hysteresis_k,
         )
 
     def open(self) -> None:

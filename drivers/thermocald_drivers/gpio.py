@@ -100,13 +100,21 @@ class RelayOutput(Output):
         programme: Sequence[Mapping[str, Any]],
         active_high: bool = True,
         watchdog_s: float = 30.0,
-        **options: Any,
+        channel: str = "temperature",
+        unknown_s: float = 60.0,
+        hysteresis_k: float = 0.5,
     ) -> None:
         self.clock = clock
         self.pin = int(support.number("pin", pin, 0, 53, whole=True))
         self.active_high = bool(active_high)
         self.watchdog_s = support.number("watchdog_s", watchdog_s, 0.05, 3600, "s")
-        self.programme = HeatingProgramme(limit_c=limit_c, programme=programme, **options)
+        self.programme = HeatingProgramme(
+            limit_c=limit_c,
+            programme=programme,
+            channel=channel,
+            unknown_s=unknown_s,
+            hysteresis_k=hysteresis_k,
+        )
         self._relay: Any = None
         self._lock = threading.Lock()
         self._watchdog: threading.Timer | None = None

@@ -241,8 +241,24 @@ class ThermalZoneThermometer(_KernelThermometer):
     prefix = "thermal_zone"
     name_file = "type"
 
-    def __init__(self, *, clock: Clock, zone: str, **options: Any) -> None:
-        super().__init__(clock=clock, chip=support.text("zone", zone), **options)
+    def __init__(
+        self,
+        *,
+        clock: Clock,
+        zone: str,
+        channels: Mapping[str, str] | None = None,
+        minimum_c: float = -55.0,
+        maximum_c: float = 125.0,
+        sysfs: str = "/sys",
+    ) -> None:
+        super().__init__(
+            clock=clock,
+            chip=support.text("zone", zone),
+            channels=channels,
+            minimum_c=minimum_c,
+            maximum_c=maximum_c,
+            sysfs=sysfs,
+        )
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[dict[str, Any]]:

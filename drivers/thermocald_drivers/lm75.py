@@ -52,13 +52,18 @@ class Lm75Thermometer(I2cThermometer):
     addresses = range(0x48, 0x50)
     range_c = (-55.0, 127.9375)
 
-    def __init__(self, *, clock: Clock, chip: str = "lm75", **options: Any) -> None:
-        super().__init__(clock=clock, **options)
+    def __init__(
+        self,
+        *,
+        clock: Clock,
+        chip: str = "lm75",
+        bus: int = 1,
+        address: int | None = None,
+        channel: str = "temperature",
+    ) -> None:
+        super().__init__(clock=clock, bus=bus, address=address, channel=channel)
         self.variant = VARIANTS[support.choice("chip", chip, sorted(VARIANTS))]
         self.name = chip
-        # The TMP102 keeps its shut-down bit in the first byte too, with the extended-mode bit in
-        # the second: both are read as a word there.
-        self.extended = False
 
     def _identify(self) -> Mapping[str, str]:
         unused = (1 << (16 - self.variant.bits)) - 1

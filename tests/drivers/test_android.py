@@ -145,7 +145,10 @@ def test_a_file_that_grows_is_awaited(server, phone):
 
 def test_a_file_that_never_ends(server, phone):
     phone.shoot = lambda phone: phone.add("IMG_1.jpg", photograph(time.time())[:-300])
-    with camera(server) as device, pytest.raises(BadReading, match="partial photograph, IMG_1"):
+    with (
+        camera(server, timeout_s=0.4) as device,
+        pytest.raises(BadReading, match="partial photograph, IMG_1"),
+    ):
         device.capture()
 
 
@@ -177,7 +180,10 @@ def test_two_new_photographs(server, phone):
 
 def test_no_photograph(server, phone):
     phone.shoot = None
-    with camera(server) as device, pytest.raises(DeviceTimeout, match="is the trigger right"):
+    with (
+        camera(server, timeout_s=0.4) as device,
+        pytest.raises(DeviceTimeout, match="is the trigger right"),
+    ):
         device.capture()
 
 
@@ -228,7 +234,7 @@ def test_a_full_phone(server, phone):
 
 
 def test_a_phone_that_fills_up(server, phone):
-    with camera(server) as device:
+    with camera(server, timeout_s=0.4) as device:
         phone.shoot, phone.free_kb = None, 10_000
         with pytest.raises(PermanentDeviceError, match="storage is full"):
             device.capture()

@@ -120,10 +120,10 @@ def test_coverage_is_exact():
 
 
 def test_blur_noise_vignetting():
-    field = TestField.build(["a"], [[0.0, 0.0, 0.0]], diameters=20.0)
+    field = TestField.build(["a"], [[0.0, 0.0, 0.0]], diameters=60.0)
     sensor = Sensor(641, 481, 0.005)
     iop = InteriorOrientation(c=8.0).as_array()
-    eop = ExteriorOrientation(0, 0, 0, 200.0, 150.0, 1000.0).as_array()
+    eop = ExteriorOrientation(0, 0, 0, 120.0, 90.0, 1000.0).as_array()
     look = Look(noise_dn=2.5, vignetting=0.3, blur_px=1.2)
     image = Scene(sensor, field, look).render(iop, eop, seed=5).astype(float)
     clean = Scene(sensor, field, Look(noise_dn=0, vignetting=0.3, blur_px=1.2)).render(iop, eop)
@@ -140,7 +140,7 @@ def test_blur_noise_vignetting():
     cx, cy = project(sensor, iop, eop, field.points)[0]
     row = plain[round(cy), :].astype(float)
     x = np.arange(641)
-    radius = 10.0 * 8 / 1000 / 0.005
+    radius = 30.0 * 8 / 1000 / 0.005
     profile = norm.cdf((radius - np.abs(x - cx)) / np.hypot(1.2, 12**-0.5))
     assert np.abs((200 - row) / 170 - profile).max() < 0.02
 

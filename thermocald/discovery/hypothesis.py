@@ -165,6 +165,20 @@ class Laboratory:
             self._drives[key] = (course, operator, history)
         return self._drives[key]
 
+    def drive_course(self, terms: Sequence[Term], series: int) -> Array:
+        """The course (E,) alone: for scanning, where no operator is needed."""
+        history = self.series[series].history
+        course = history.temperature()
+        drives = [t for t in terms if t.is_drive]
+        for position, term in enumerate(drives):
+            effect = catalogue.get(term.effect)
+            values = term.values(series) or {}
+            course = effect.drive(history, **values)
+            if position < len(drives) - 1:
+                at_readings = history.at(history.reading_times)
+                history = history.with_reference(effect.drive(at_readings, **values))
+        return course
+
     def courses(
         self, term: Term, series: int, terms: Sequence[Term] = ()
     ) -> tuple[Array, Array | None, str]:

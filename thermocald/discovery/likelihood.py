@@ -191,6 +191,7 @@ def prepare(
         O[:, starts[i] : starts[i + 1]] = item.operator @ channel.mixing
         operators.append(O)
     N, b, yy, logdet = _blurred(N, b, yy, carried)
+    N0 = N.sum(axis=0)
     dN = [np.einsum("p,epq->eq", item.direction, N) for item in carried]
     # the readings' own deviation from the smooth course, carried to the camera
     shift = np.zeros((len(N), P))

@@ -1,7 +1,7 @@
 """`thermocald devices`: what is attached, as configuration; and the probe of `thermocald check`.
 
-A driver class may have a class method `attached() -> list[{options, about, certain?}]`; an entry
-A driver class may have a class method `attached() -> list[{options, about, certain?}]`; an entry
+A driver class may have a class method `attached() -> list[{options, about, certain?}]`. An entry
+that is not certain (a serial port, an I2C bus: nobody knows what is on it) is shown as a comment.
 """
 
 from __future__ import annotations

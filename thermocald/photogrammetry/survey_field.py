@@ -1,0 +1,105 @@
+"""What a survey knows of its field on the way: where targets must be, how large they are."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.photogrammetry.outline import local_maps
+from thermocald.photogrammetry.planes import target_normals
+from thermocald.photogrammetry.testfield import TestField
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from thermocald.photogrammetry.network import Network
+
+    Array = NDArray[np.float64]
+
+__all__ = ["expected_field", "field_of_codes", "surveyed_field"]
+
+_ONE_SIZE = 0.15
+
+
+def expected_field(network: Network, nominal: TestField, *, trusted_only: bool) -> TestField:
+    """The nominal field where the network has put it: surveyed coordinates, and for all others the
+    nominal ones, moved as their surveyed neighbours were.
+
+    trusted_only leaves out what an earlier pass should have found and did not.
+    """
+    rows = np.array([nominal.index[name] for name in network.names])
+    points = nominal.points.copy()
+    others = np.setdiff1d(np.arange(len(nominal)), rows)
+    if len(others):
+        points[others] += _neighbours_shift(
+            nominal.points[rows], network.points - nominal.points[rows], nominal.points[others]
+        )
+    points[rows] = network.points
+    moved = TestField.build(
+        nominal.names, points, nominal.sigmas, nominal.diameters, nominal.kinds, nominal.codes
+    )
+    return moved.subset(np.sort(rows)) if trusted_only else moved
+
+
+def _neighbours_shift(known: Array, shifts: Array, wanted: Array) -> Array:
+    """The shifts (n, 3) mm at points between known ones: a local plane through the nearest.
+
+    Weighted by the inverse square of the distance, so that a fold in the paper stays one.
+    """
+    result = np.empty((len(wanted), 3))
+    for i, x in enumerate(wanted):
+        d = np.linalg.norm(known - x, axis=1)
+        near = np.argsort(d)[:12]
+        weight = 1.0 / (d[near] + 1e-3 * d[near].max()) ** 2
+        A = np.column_stack([np.ones(len(near)), known[near] - x])
+        # the ridge keeps slopes that the neighbours do not show (across a plane) at zero
+        AtW = A.T * weight
+        ridge = 1e-3 * np.trace(AtW @ A) / 4 * np.diag([0.0, 1, 1, 1])
+        result[i] = np.linalg.solve(AtW @ A + ridge, AtW @ shifts[near])[0]
+    return result
+
+
+def field_of_codes(
+    network: Network, codes: Mapping[str, str], radii: Mapping[tuple[str, str], float]
+) -> TestField:
+    """The coded targets of a network as a field.
+
+    codes: by target; radii: semi-major axes px by photograph and target, from which the diameters
+    are found: what a disc of 1 mm would measure there, lying as its neighbours do.
+    """
+    normals = target_normals(network.points)
+    ratios: dict[str, list[float]] = {name: [] for name in network.names}
+    interior = network.camera.interior.as_array()
+    for s in network.stations:
+        unit = local_maps(
+            network.camera.sensor, interior, s.exterior.as_array(), network.points, normals,
+            np.full(len(network.names), 0.5),
+        )  # fmt: skip
+        known = np.isfinite(unit.linear).all(axis=(1, 2))
+        for i, name in enumerate(network.names):
+            if (s.photo, name) in radii and known[i]:
+                axis = float(np.linalg.svd(unit.linear[i], compute_uv=False)[0])
+                ratios[name].append(radii[s.photo, name] / axis)
+    diameters = np.array([np.median(r) if r else np.nan for r in ratios.values()])
+    together = float(np.nanmedian(diameters)) if np.isfinite(diameters).any() else float("nan")
+    # one size for all where all agree, which is as they are printed
+    if np.nanmax(np.abs(diameters / together - 1), initial=0.0) < _ONE_SIZE:
+        diameters[:] = together
+    return TestField.build(
+        network.names, network.points, network.sigmas, diameters,
+        codes=[codes[name] for name in network.names],
+    )  # fmt: skip
+
+
+def surveyed_field(network: Network, template: TestField) -> TestField:
+    """The field of the network's targets: coordinates and sigmas surveyed, the rest as it was."""
+    order = np.argsort([template.index[name] for name in network.names])
+    rows = [template.index[network.names[i]] for i in order]
+    part = template.subset(rows)
+    return TestField.build(
+        part.names, network.points[order], network.sigmas[order], part.diameters, part.kinds,
+        part.codes,
+    )  # fmt: skip

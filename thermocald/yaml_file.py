@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 __all__ = ["dump_yaml", "read_yaml"]
 
+_MOST_VALUES = 100_000
+
 # What PyYAML's constructors let through on hostile scalars (`!!bool x`, `!!int ""`, 2020-99-99).
 _CONSTRUCTION = (ValueError, KeyError, IndexError, AttributeError, TypeError, OverflowError)
 
@@ -64,7 +66,20 @@ def read_yaml(path: Path, error: type[ThermocaldError] = ConfigurationError) -> 
     for key in document:
         if not isinstance(key, str):
             raise error(f"{path}: key {key!r} must be text")
+    if _is_too_large(document):
+        raise error(f"{path}: holds more than {_MOST_VALUES} values, or aliases without end")
     return document
+
+
+def _is_too_large(document: dict[str, Any]) -> bool:
+    """A few aliases (`*a`) can stand for billions of values, or for themselves."""
+    left, waiting = _MOST_VALUES, [document]
+    while waiting and left > 0:
+        value: Any = waiting.pop()
+        left -= 1
+        if isinstance(value, dict | list):
+            waiting.extend(value.values() if isinstance(value, dict) else value)
+    return left <= 0
 
 
 def dump_yaml(document: dict[str, Any]) -> str:

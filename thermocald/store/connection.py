@@ -6,7 +6,7 @@ import sqlite3
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Literal
 
-from thermocald.errors import StoreError, StoreVersionError
+from thermocald.errors import StoreError, StoreVersionError, ThermocaldError
 from thermocald.store.schema import APPLICATION_ID, PAGE_SIZE, VERSION, migrate
 
 if TYPE_CHECKING:
@@ -23,12 +23,21 @@ _MMAP_BYTES = 2**31 - 1
 
 
 @contextmanager
-def in_words(path: Path, doing: str) -> Iterator[None]:
-    """Turn SQLite's errors into a StoreError that says what to do."""
+def in_words(path: Path, doing: str, *, reading: bool = False) -> Iterator[None]:
+    """Turn SQLite's errors into a StoreError that says what to do.
+
+    reading: what was read may be no text or number of ours, which tells of damage as well.
+    """
     try:
         yield
+    except ThermocaldError:
+        raise
     except sqlite3.Error as cause:
         raise StoreError(f"{path}: {doing}: {_advice(cause)}") from cause
+    except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as cause:
+        if not reading:
+            raise
+        raise StoreError(f"{path}: {doing}: the store is damaged ({cause})") from cause
 
 
 def _advice(cause: sqlite3.Error) -> str:
@@ -55,10 +64,10 @@ def connect(path: Path, mode: Mode, *, durable: bool) -> sqlite3.Connection:
     """
     if mode == "read" and not path.is_file():
         raise StoreError(f"{path}: there is no such store")
-    with in_words(path, "the store cannot be opened"):
+    with in_words(path, "the store cannot be opened", reading=True):
         connection = _open(path, mode)
     try:
-        with in_words(path, "the store cannot be opened"):
+        with in_words(path, "the store cannot be opened", reading=True):
             version = _version(connection, path)
             if version == 0 and mode == "read":
                 raise StoreError(f"{path}: is empty, nothing was stored yet")

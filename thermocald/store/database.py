@@ -225,7 +225,7 @@ class Store:
 
         details: False leaves out observations and covariances, and is faster.
         """
-        with in_words(self.path, "epochs cannot be read"):
+        with in_words(self.path, "epochs cannot be read", reading=True):
             yield from select_epochs(self._db, series.id, first, last, details=details)
 
     def observations(
@@ -259,7 +259,7 @@ class Store:
         are float64, NaN where an epoch has none; `status` is text.
         """
         source = {name: _source(name, series) for name in names}
-        with self._lock, in_words(self.path, "columns cannot be read"):
+        with self._lock, in_words(self.path, "columns cannot be read", reading=True):
             columns: dict[str, NDArray[Any]] = dict(
                 read_columns(self._db, series.id, list(dict.fromkeys(source.values())))
             )
@@ -287,10 +287,11 @@ class Store:
             "AND series_id IS ifnull(?, series_id) ORDER BY id",
             (since_utc, None if series is None else series.id),
         )
-        return [
-            Event(utc, kind, text, series_id, epoch, json.loads(data))
-            for utc, kind, text, series_id, epoch, data in rows
-        ]
+        with in_words(self.path, "events cannot be read", reading=True):
+            return [
+                Event(utc, kind, text, series_id, epoch, json.loads(data))
+                for utc, kind, text, series_id, epoch, data in rows
+            ]
 
     def check(self) -> None:
         """Read the whole file; StoreError if it is damaged."""
@@ -307,25 +308,26 @@ class Store:
             "WHERE camera = ifnull(?, camera) AND name = ifnull(?, name) ORDER BY s.id",
             (camera, name),
         )
-        return [
-            StoredSeries(
-                number,
-                parse_head(json.loads(head), self.path),
-                parse_testfield(csv, self.path),
-                start,
-                json.loads(identity),
-                json.loads(settings),
-                created,
-            )
-            for number, head, csv, start, identity, settings, created in rows
-        ]
+        with in_words(self.path, "the series cannot be read", reading=True):
+            return [
+                StoredSeries(
+                    number,
+                    parse_head(json.loads(head), self.path),
+                    parse_testfield(csv, self.path),
+                    start,
+                    json.loads(identity),
+                    json.loads(settings),
+                    created,
+                )
+                for number, head, csv, start, identity, settings, created in rows
+            ]
 
     def _end(self, series: StoredSeries) -> tuple[int, int]:
         """The last epoch number of a series (-1: none) and how many rows are in no chunk."""
         ((last,),) = self._query(
             "SELECT ifnull(max(number), -1) FROM epoch WHERE series_id = ?", (series.id,)
         )
-        with self._lock, in_words(self.path, "the store cannot be read"):
+        with self._lock, in_words(self.path, "the store cannot be read", reading=True):
             return int(last), loose_rows(self._db, series.id)
 
     def _insert_events(self, events: Iterable[Event]) -> None:
@@ -338,7 +340,7 @@ class Store:
         )
 
     def _query(self, statement: str, values: Sequence[Any]) -> list[tuple[Any, ...]]:
-        with self._lock, in_words(self.path, "the store cannot be read"):
+        with self._lock, in_words(self.path, "the store cannot be read", reading=True):
             return self._db.execute(statement, values).fetchall()
 
     @contextmanager

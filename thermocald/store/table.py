@@ -95,11 +95,11 @@ class Table:
         names = [name.strip() for name in header]
         for name in names:
             if name and names.count(name) > 1:
-                raise self._error(f"{self.path}, line 1: column {name} stands twice")
+                raise self._error(f"{self.path}, line 1: column {name!r} stands twice")
         return names
 
     def _missing(self, name: str) -> str:
-        found = ", ".join(self.columns)
+        found = ", ".join(n if n.isprintable() else repr(n) for n in self.columns)
         hint = ""
         if len(self.columns) == 1 and any(mark in found for mark in ";\t"):
             hint = "; separate the columns with commas and write decimals with a point"

@@ -1,0 +1,137 @@
+"""Garbage in every file: only our own errors come out, and they name the file."""
+
+from __future__ import annotations
+
+import shutil
+import string
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from thermocald.errors import ThermocaldError
+from thermocald.store.database import Store
+from thermocald.store.recording import open_recording, read_recording, read_testfield
+
+FILES = ["recording.yaml", "epochs.csv", "testfield.csv", "observations.csv"]
+QUICK = settings(
+    max_examples=60,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+
+cells = st.one_of(
+    st.text(max_size=12),
+    st.sampled_from(
+        ["", "nan", "inf", "-1", "1e999", "0x10", "1_000", "t0", '"', "1", "2.5", "\x00"]
+    ),
+    st.floats().map(repr),
+    st.integers().map(str),
+)
+tables = st.lists(st.lists(cells, max_size=9).map(",".join), max_size=8).map("\n".join)
+yaml_like = st.recursive(
+    st.one_of(
+        st.text(string.printable, max_size=15),
+        st.sampled_from(
+            ["!!bool x", '!!int ""', "2020-99-99", "!!timestamp x", "*a", "&a [*a]", "{", "~"]
+        ),
+    ),
+    lambda inner: st.dictionaries(st.sampled_from("abcd"), inner, max_size=3).map(
+        lambda d: "{" + ", ".join(f"{k}: {v}" for k, v in d.items()) + "}"
+    ),
+    max_leaves=6,
+)
+
+
+def only_our_errors(path: Path, file: str) -> None:
+    try:
+        read_recording(path)
+        list(open_recording(path).iter_epochs())
+    except ThermocaldError as error:
+        message = str(error)
+    else:
+        return
+    assert file in message or "nothing to calibrate from" in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize("file", FILES)
+@QUICK
+@given(content=st.one_of(st.binary(max_size=300), tables.map(lambda t: t.encode(errors="ignore"))))
+def test_any_bytes(recording_path, file, content):
+    whole = (recording_path / file).read_bytes()
+    (recording_path / file).write_bytes(content)
+    only_our_errors(recording_path, file)
+    (recording_path / file).write_bytes(whole)
+
+
+@pytest.mark.parametrize("file", FILES)
+@QUICK
+@given(data=st.data())
+def test_any_bytes_within_a_good_file(recording_path, file, data):
+    whole = (recording_path / file).read_bytes()
+    at = data.draw(st.integers(0, len(whole)))
+    gone = data.draw(st.integers(0, 40))
+    put = data.draw(
+        st.one_of(st.binary(max_size=12), cells.map(lambda c: c.encode(errors="ignore")))
+    )
+    (recording_path / file).write_bytes(whole[:at] + put + whole[at + gone :])
+    try:
+        read_recording(recording_path)
+    except ThermocaldError as error:
+        message = str(error)
+        # a damaged table may show in the one that refers to it
+        assert any(name in message for name in FILES)
+    (recording_path / file).write_bytes(whole)
+
+
+@QUICK
+@given(value=yaml_like, key=st.sampled_from(["camera", "temperatures", "interval", "name", "x"]))
+def test_any_yaml(recording_path, value, key):
+    path = recording_path / "recording.yaml"
+    whole = path.read_text()
+    path.write_text(whole + f"\n{key}2: {value}\n" if key == "x" else f"{key}: {value}\n" + whole)
+    only_our_errors(recording_path, "recording.yaml")
+    path.write_text(whole)
+
+
+@QUICK
+@given(content=tables)
+def test_any_testfield(tmp_path, content):
+    path = tmp_path / "field.csv"
+    path.write_text("target,X,Y,Z,diameter,sX,sY,sZ\n" + content, newline="", errors="ignore")
+    message = ""
+    try:
+        assert len(read_testfield(path)) > 0
+    except ThermocaldError as error:
+        message = str(error)
+    assert not message or "field.csv" in message
+
+
+@QUICK
+@given(data=st.data())
+def test_any_damage_to_a_store(filled_file, tmp_path, data):
+    whole = filled_file.read_bytes()
+    at = data.draw(st.integers(0, len(whole) - 1))
+    put = data.draw(st.binary(min_size=1, max_size=200))
+    path = tmp_path / "damaged.db"
+    path.write_bytes(whole[:at] + put + whole[at + len(put) :])
+    message = ""
+    try:
+        with Store.open(path) as store:
+            for series in store.all_series():
+                store.series_columns(series, ["epoch", "c", "status", "temperature"])
+                list(store.epochs(series))
+            store.events()
+    except ThermocaldError as error:
+        message = str(error)
+    assert not message or any(word in message for word in ("damaged.db", "store", "broken"))
+
+
+@pytest.fixture
+def filled_file(filled, tmp_path):
+    store, _ = filled
+    store.close()
+    return Path(shutil.copy(store.path, tmp_path / "copy.db"))

@@ -1,0 +1,161 @@
+"""A killed writer loses at most the epoch in hand; a full disk loses nothing kept before."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+
+import numpy as np
+import pytest
+
+from thermocald.errors import StoreError
+from thermocald.store.database import Store
+
+# Appends for ever, and says after each commit what it has committed.
+WRITER = textwrap.dedent(
+    """
+    import sys
+    from pathlib import Path
+    import numpy as np
+    from thermocald.epoch import Epoch
+    from thermocald.photogrammetry.testfield import Observations
+    from thermocald.store.database import Store
+    from thermocald.store.row import EpochResult
+
+    with Store.open(Path(sys.argv[1]), "append", durable=False) as store:
+        series = store.find_series()
+        number = (store.last_epoch(series) or 0) + 1
+        while True:
+            seen = Observations(np.arange(12), np.full((12, 2), float(number)), np.ones((12, 2)))
+            result = EpochResult("ok", "", np.full(16, float(number)), np.eye(16))
+            store.append(series, Epoch(number, 10.0 * number, np.nan, observations=seen), result)
+            sys.stdout.write(f"{number}\\n")
+            sys.stdout.flush()
+            number += 1
+    """
+)
+
+
+def kill_after(path, epochs: int, delay_s: float) -> int:
+    """Run a writer, kill -9 it a little after some epochs; what it said it had committed."""
+    process = subprocess.Popen([sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE)
+    said = b""
+    for _ in range(epochs):
+        said = process.stdout.readline()
+    time.sleep(delay_s)
+    os.kill(process.pid, signal.SIGKILL)
+    rest = process.stdout.read().splitlines()
+    process.stdout.close()
+    process.wait()
+    return int(rest[-1] if rest else said)
+
+
+def test_a_killed_writer_loses_at_most_the_epoch_in_hand(store_path, head, field):
+    with Store.open(store_path, "append", durable=False) as store:
+        store.create_series(head, field)
+    rng = np.random.default_rng(5)
+    for _ in range(6):
+        said = kill_after(store_path, int(rng.integers(1, 30)), float(rng.uniform(0, 0.02)))
+        with Store.open(store_path) as store:
+            store.check()
+            series = store.find_series()
+            last = store.last_epoch(series)
+            assert last in (said, said + 1)  # committed, and perhaps not yet said
+            kept = [
+                (s.epoch.number, s.epoch.observations.points[0, 0]) for s in store.epochs(series)
+            ]
+            assert kept == [(i, float(i)) for i in range(1, last + 1)]
+            assert store.series_columns(series, ["c"])["c"].tolist() == list(range(1, last + 1))
+
+
+@pytest.fixture
+def small_disk():
+    """Files may not grow beyond 400 kB: what a full disk looks like to one process."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    signal.signal(signal.SIGXFSZ, handler)
+
+
+def fill(store, series, make_epoch, make_result) -> int:
+    """Append until it fails; the last epoch that was kept."""
+    number = 0
+
+    def append_for_ever():
+        nonlocal number
+        while number < 10_000:
+            store.append(series, make_epoch(number + 1), make_result(number + 1))
+            number += 1
+
+    with pytest.raises(StoreError, match="was not kept: the disk") as caught:
+        append_for_ever()
+    assert f"epoch {number + 1} " in str(caught.value)
+    return number
+
+
+def test_a_full_disk(store_path, head, field, make_epoch, make_result, request):
+    with Store.open(store_path, "append", durable=False) as store:
+        series = store.create_series(head, field)
+    request.getfixturevalue("small_disk")
+    with Store.open(store_path, "append", durable=False) as store:
+        last = fill(store, series, make_epoch, make_result)
+        assert store.last_epoch(series) == last > 10
+        with pytest.raises(StoreError, match="disk"):
+            store.append(series, make_epoch(last + 1), make_result(last + 1))
+        assert store.last_epoch(series) == last
+
+
+def test_space_again_after_a_full_disk(store_path, head, field, make_epoch, make_result):
+    """By SQLite's own bound, which gives the error of a full disk."""
+    with Store.open(store_path, "append", durable=False) as store:
+        series = store.create_series(head, field)
+        store._db.execute("PRAGMA max_page_count = 60")
+        last = fill(store, series, make_epoch, make_result)
+        store._db.execute("PRAGMA max_page_count = 100000")
+        for number in range(last + 1, last + 30):
+            store.append(series, make_epoch(number), make_result(number))
+        store.check()
+        found = store.series_columns(series, ["c"])["c"]
+        assert found.tolist() == [make_result(i).values[0] for i in range(1, last + 30)]
+
+
+def test_a_recording_on_a_full_disk_leaves_nothing(tmp_path, head, field, make_epoch, small_disk):
+    from thermocald.errors import RecordingError
+    from thermocald.store.recording import write_recording
+
+    with pytest.raises(RecordingError, match="cannot be written"):
+        write_recording(
+            tmp_path / "r",
+            name="r",
+            series="M1",
+            interval=1.0,
+            camera=head.camera,
+            channels=head.channels,
+            testfield=field,
+            epochs=map(make_epoch, range(10_000)),
+        )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_read_only_medium(store_path, head, field, make_epoch, make_result):
+    """Without permission for helper files the store can still be read (as root: by mode)."""
+    with Store.open(store_path, "append", durable=False) as store:
+        series = store.create_series(head, field)
+        store.append(series, make_epoch(1), make_result(1))
+    store_path.chmod(0o444)
+    store_path.parent.chmod(0o555)
+    try:
+        with Store.open(store_path) as store:
+            assert store.last_epoch(series) == 1
+        if os.geteuid() != 0:
+            with pytest.raises(StoreError, match="read-only"):
+                Store.open(store_path, "append")
+    finally:
+        store_path.parent.chmod(0o755)

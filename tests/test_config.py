@@ -1,0 +1,192 @@
+"""config.yaml: bounded, unknown keys are errors that suggest the nearest, paths from the file."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import get_args
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from thermocald import config as module
+from thermocald.config import Config, load_config, parse_config
+from thermocald.errors import ConfigurationError
+from thermocald.hal import option_names
+from thermocald.photogrammetry.adjustment import DEFAULT_FREE, AdjustmentSettings
+from thermocald.photogrammetry.camera_model import IOP_NAMES, PARAMETER_NAMES
+from thermocald.yaml_file import dump_yaml
+
+
+def document(**changes) -> dict:
+    camera = {"name": "river", "driver": "mock", "thermometers": ["lens"], "seed": 3}
+    return {
+        "cameras": [camera],
+        "thermometers": [{"name": "lens", "driver": "mock", "period_s": 5}],
+        **changes,
+    }
+
+
+def parse(doc: dict, **kwargs) -> Config:
+    return parse_config(doc, Path("/etc/thermocald/config.yaml"), **kwargs)
+
+
+def test_the_shipped_file_is_valid():
+    shipped = load_config(Path(__file__).parents[1] / "config.yaml", option_names)
+    assert [(c.name, c.driver) for c in shipped.cameras] == [("demo", "mock")]
+    assert shipped.cameras[0].options == {"testfield": "markers", "seed": 1}
+    assert shipped.frames == parse(document()).frames.model_copy(
+        update={"folder": shipped.frames.folder}
+    )
+
+
+def test_defaults():
+    config = parse(document())
+    assert config.store.durable
+    assert config.cameras[0].period_s == 10.0
+    assert config.calibration_of(config.cameras[0]) is config.calibration
+    assert config.dashboard.host == "127.0.0.1"
+
+
+def test_names_are_those_of_the_camera_model():
+    """config is a layer below photogrammetry and must repeat them."""
+    assert get_args(module.InteriorName) == IOP_NAMES
+    assert get_args(module.ParameterName) == PARAMETER_NAMES
+    assert parse(document()).calibration.free == DEFAULT_FREE
+    assert parse(document()).calibration.snooping_alpha == AdjustmentSettings().snooping_alpha
+
+
+def test_paths_are_relative_to_the_file(tmp_path):
+    (tmp_path / "field.csv").touch()
+    doc = document(store={"path": "data/x.db"}, dashboard={"token_file": "~/token"})
+    doc["cameras"][0] |= {
+        "testfield": "field.csv",
+        "recording": "./M1",
+        "plain": "M1",
+        "options": {"testfield": "../f.csv", "list": [{"a": "./b"}]},
+    }
+    config = parse_config(doc, tmp_path / "config.yaml")
+    assert config.store.path == tmp_path / "data" / "x.db"
+    assert config.frames.folder == tmp_path / "frames"
+    assert config.dashboard.token_file == Path("~/token").expanduser()
+    assert config.cameras[0].testfield == tmp_path / "field.csv"
+    assert config.cameras[0].options == {
+        "seed": 3,
+        "recording": str(tmp_path / "M1"),
+        "plain": "M1",
+        "testfield": str(tmp_path / "../f.csv"),
+        "list": [{"a": str(tmp_path / "b")}],
+    }
+
+
+def camera(**changes) -> dict:
+    doc = document()
+    doc["cameras"][0] |= changes
+    return doc
+
+
+BAD = [
+    ({}, "neither a camera nor a thermometer"),
+    ({"camera": []}, "camera: unknown; is 'cameras' meant?"),
+    (document(dashbord={}), "dashbord: unknown; is 'dashboard' meant?"),
+    (document(store={"pth": "x"}), "store.pth: unknown; is 'path' meant?"),
+    (document(store={"xyz": 1}), "store.xyz: unknown; known are: path, durable"),
+    (camera(perod_s=3), "cameras[0].perod_s: unknown; is 'period_s' meant?"),
+    (camera(period_s=0.01), "cameras[0].period_s: is 0.01; input should be greater"),
+    (camera(period_s="soon"), "cameras[0].period_s: is 'soon'; input should be a valid number"),
+    (camera(period_s=float("nan")), "cameras[0].period_s: is nan"),
+    (camera(name="a b"), "cameras[0].name: is 'a b'"),
+    (camera(name="../x"), "cameras[0].name: is '../x'"),
+    (camera(driver=None), "cameras[0].driver: is None"),
+    (camera(testfield="none.csv"), "cameras[0].testfield: there is no file /etc/thermocald/none"),
+    (camera(thermometers=["lense"]), "there is no thermometer 'lense'; is 'lens' meant?"),
+    (
+        camera(sensor={"width_px": 1, "height_px": 2464, "pixel_pitch_mm": 0.001}),
+        "cameras[0].sensor.width_px: is 1",
+    ),
+    (
+        camera(sensor={"width_px": 3280, "height_px": 2464, "pixel_pitch_mm": 1.12}),
+        "cameras[0].sensor.pixel_pitch_mm: is 1.12; input should be less than or equal to 0.1",
+    ),
+    (camera(sensor={"width_px": 3280}), "cameras[0].sensor.height_px: is missing"),
+    (camera(calibration={"fre": []}), "cameras[0].calibration.fre: unknown; is 'free' meant?"),
+    (document(calibration={"free": ["c", "f"]}), "calibration.free[1]: is 'f'"),
+    (document(calibration={"free": ["c", "c"]}), "names a parameter twice"),
+    (document(calibration={"fixed": {"c": 3.0}}), "c stands in `free` and in `fixed`"),
+    (document(calibration={"priors": {"c": {"value": 3, "sd": 0}}}), "calibration.priors.c.sd"),
+    (document(calibration={"exterior": "free"}), "'per_epoch' or 'series'"),
+    (document(frames={"keep": "some"}), "frames.keep: is 'some'"),
+    (document(frames={"max_size_gb": -1}), "frames.max_size_gb: is -1"),
+    (document(dashboard={"host": "0.0.0.0"}), "name a token_file too"),
+    (document(dashboard={"port": 70000}), "dashboard.port: is 70000"),
+    (document(logging={"level": "loud"}), "logging.level: is 'loud'"),
+    (document(cameras="none"), "cameras: is 'none'"),
+    (document(cameras=[{"name": "a", "driver": "m"}] * 2), "cameras: the name 'a' stands twice"),
+]
+
+
+@pytest.mark.parametrize(("doc", "message"), BAD)
+def test_what_is_wrong_is_named(doc, message):
+    with pytest.raises(ConfigurationError, match=re.escape(message)) as caught:
+        parse(doc)
+    assert str(caught.value).startswith("/etc/thermocald/config.yaml: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_options_are_checked_against_the_driver():
+    doc = camera(sed=4)
+    with pytest.raises(ConfigurationError, match=r"cameras\[0\].sed: unknown.* 'mock'; is 'seed'"):
+        parse(doc, option_names=lambda kind, driver: ["seed", "latency_s"])
+    with pytest.raises(ConfigurationError, match="no camera driver 'nikon'"):
+        parse(camera(driver="nikon"), option_names=option_names)
+
+
+def test_a_device_may_be_called_like_another_kind():
+    doc = document(outputs=[{"name": "river", "driver": "mock"}])
+    assert parse(doc).outputs[0].name == "river"
+
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(
+            st.sampled_from(["name", "driver", "period_s", "x", "path"]), inner, max_size=3
+        )
+    ),
+    max_leaves=8,
+)
+KEYS = st.sampled_from([*Config.model_fields, "camera", "x"])
+
+
+@settings(max_examples=300, deadline=None, derandomize=True)
+@given(changes=st.dictionaries(KEYS, VALUES, max_size=3))
+def test_any_values(changes):
+    try:
+        parse(document(**changes))
+    except ConfigurationError as error:
+        message = str(error)
+    else:
+        return
+    assert message.startswith("/etc/thermocald/config.yaml: ")
+
+
+@settings(
+    max_examples=200,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(at=st.integers(0, 400), put=st.binary(max_size=10))
+def test_any_damage_to_the_text(tmp_path, at, put):
+    path = tmp_path / "config.yaml"
+    text = dump_yaml(document()).encode()
+    path.write_bytes(text[: at % len(text)] + put + text[at % len(text) + len(put) :])
+    try:
+        load_config(path)
+    except ConfigurationError as error:
+        message = str(error)
+    else:
+        return
+    assert message.startswith(str(path))

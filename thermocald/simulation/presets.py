@@ -95,31 +95,31 @@ PRESETS: Mapping[str, Preset] = {
     for p in (
         Preset(
             "nexus5-cold", "LG Google Nexus 5, switched on cold, warms itself",
-            "nexus5", _NEXUS, _NEXUS_INTERIOR, 2.4, 1330.0,
+            "nexus5", _NEXUS, _NEXUS_INTERIOR, 2.4, 900.0,
             drift_px=16.0, direction_deg=-28.0, drift_c_mm=0.007, begin_degc=23.0, end_degc=40.0,
             distortion_drift=(2e-5, -2e-5, 1e-5),
         ),
         Preset(
             "nexus5-warm", "LG Google Nexus 5, warm already",
-            "nexus5", _NEXUS, _NEXUS_INTERIOR, 2.4, 1330.0,
+            "nexus5", _NEXUS, _NEXUS_INTERIOR, 2.4, 900.0,
             drift_px=8.0, direction_deg=-28.0, drift_c_mm=0.003, begin_degc=32.0, end_degc=40.0,
             distortion_drift=(1e-5, -1e-5, 0.5e-5),
         ),
         Preset(
             "galaxy-s8-cold", "Samsung Galaxy S8, switched on cold, warms itself",
-            "galaxy-s8", _S8, _S8_INTERIOR, 1.7, 1200.0,
+            "galaxy-s8", _S8, _S8_INTERIOR, 1.7, 900.0,
             drift_px=40.0, direction_deg=152.0, drift_c_mm=0.007, begin_degc=23.0, end_degc=45.0,
             noise_ratio=1.8, distortion_drift=(3e-5, 0.0, 0.0),
         ),
         Preset(
             "galaxy-s8-warm", "Samsung Galaxy S8, warm already",
-            "galaxy-s8", _S8, _S8_INTERIOR, 1.7, 1200.0,
+            "galaxy-s8", _S8, _S8_INTERIOR, 1.7, 900.0,
             drift_px=11.0, direction_deg=152.0, drift_c_mm=0.003, begin_degc=37.0, end_degc=43.0,
             noise_ratio=1.2, distortion_drift=(1e-5, 0.0, 0.0),
         ),
         Preset(
             "rpi-v2.1-heating", "Raspberry Pi camera v2.1, heated by a lamp, then left to cool",
-            "rpi-v2.1", _RPI, _RPI_INTERIOR, 2.0, 1330.0,
+            "rpi-v2.1", _RPI, _RPI_INTERIOR, 2.0, 900.0,
             drift_px=10.5, direction_deg=-150.0, drift_c_mm=0.005, begin_degc=25.0, end_degc=52.0,
             noise_ratio=3.5, set_share=0.06, lamp=True, distortion_drift=(2e-5, -2e-5, -2e-5),
         ),

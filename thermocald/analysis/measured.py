@@ -86,9 +86,7 @@ class MeasuredSeries:
     @property
     def free(self) -> tuple[str, ...]:
         """The IOP that were estimated, in their order."""
-        return tuple(
-            name for k, name in enumerate(IOP_NAMES) if bool(np.any(self.sds[:, k] > 0))
-        )
+        return tuple(name for k, name in enumerate(IOP_NAMES) if bool(np.any(self.sds[:, k] > 0)))
 
     @property
     def reference(self) -> Thermometer | None:

@@ -38,7 +38,7 @@ def corner_field(
                 coded = (i + 2 * j) % coded_every == 0
                 kinds.append(f"RING{bits}:{codes[number]}" if coded else "")
                 number += coded
-                names.append(f"{'XYZ'[plane]}{i}{j}")
+                names.append(f"{'XYZ'[plane]}{i}.{j}")
     field = TestField.build(names, points, 0.01, diameter, "circle", kinds)
     return field, np.array(normals)
 

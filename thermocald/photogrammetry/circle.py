@@ -43,8 +43,8 @@ _CONVERGED_PX = 0.03
 _ITERATIONS = 12
 _THIN = 3
 _RING_CLEARANCE = 2.6  # standard deviations of the blur between a used pixel and the code ring
-_MISFIT = 3.0  # residual sd over the frame's noise beyond which something covers the target
-_MISFIT_CONTRAST = 0.03
+_MISFIT = 2.0  # residual sd over the frame's noise beyond which something covers the target
+_MISFIT_CONTRAST = 0.015
 _FEWEST_PIXELS = 24
 _STEP_LIMITS = np.array([1.0, 1.0, 0.15, 0.15, 0.15, 0.5, np.inf, np.inf, 0.02, 0.02])
 

@@ -57,6 +57,9 @@ _LARGEST_TILT_COSINE = 0.2  # 78°: beyond, a sheet is seen edge-on
 _MARKER_NEIGHBOURHOOD = 2.0  # sides of the marker that names a circle
 _GROSS_SD = 8.0
 _GROSS_PX = 3.0
+_USUAL_BLUR_PX = 0.9
+_WIDE_BLUR_PX = 1.1
+_SETTLED_PX = 0.002
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,25 +216,25 @@ def _measure_circles(
         testfield.points[pairs], np.concatenate([corners.points, fit.points[good]]),
         fixed=interior is not None,
     )  # fmt: skip
+    blur = float(np.median(fit.parameters[good, 5])) if good.any() else _USUAL_BLUR_PX
     new_rows, new_maps = predicted_maps(testfield, better, eccentricity)
     same = len(new_rows) == len(rows) and bool(np.all(new_rows == rows))
-    # The outlines' asymmetry decides about the centres, the rest is estimated anyway.
-    if not same or np.abs(new_maps.second - maps.second).max(initial=0.0) > 0.002 or not good.all():
+    # The outlines' asymmetry decides about the centres, the rest is estimated anyway; and strong
+    # blur needs a wider window.
+    settled = (
+        same
+        and bool(good.all())
+        and blur < _WIDE_BLUR_PX
+        and float(np.abs(new_maps.second - maps.second).max(initial=0.0)) < _SETTLED_PX
+    )
+    if not settled:
         start = None
         if same:
-            start = np.where(good[:, None], fit.parameters, 0.0)
-            fresh = ~good
-            new_maps = LocalMap(
-                np.where(fresh[:, None], new_maps.centre, fit.points), new_maps.linear,
-                new_maps.second,
-            )  # fmt: skip
+            new_maps = new_maps.at(np.where(good[:, None], fit.points, new_maps.centre))
+            start = fit.parameters if good.all() else None
         rows, maps = new_rows, new_maps
         coded = np.array([ring_code.is_ring(testfield.codes[r]) for r in rows], dtype=bool)
-        blur = float(np.median(fit.parameters[good, 5])) if good.any() else 0.9
-        if start is not None and good.all():
-            fit = fit_circles(image, maps, coded, blur, fit.noise, start, iterations=2)
-        else:
-            fit = fit_circles(image, maps, coded, blur, fit.noise)
+        fit = fit_circles(image, maps, coded, blur, None, start)
     return (*_observations(rows, fit, testfield, better), better)
 
 

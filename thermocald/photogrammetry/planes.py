@@ -1,9 +1,11 @@
 """The plane that each target of a field lies in, from its neighbours.
 
-A test field's file has no normals. Targets are printed on sheets, so a target's plane is the one
-through it that holds most of its nearest neighbours, the flattest where two hold as many; in a
-corner a target near an edge has neighbours on two sheets, and the majority decides. A target whose
-neighbours agree on no plane has none: its eccentricity cannot be known, and is left out.
+A test field's file has no normals. Targets are printed on sheets, so sheets are looked for: of all
+planes through a target and two of its neighbours the one that holds most targets nearby is a sheet;
+its targets are taken away, and the search goes on. (Majorities among neighbours alone fail in a
+corner, where a plane across the edge holds the outermost rows of both sheets.) The normal is that
+of the plane through a target's nearest on its own sheet, so that a sheet may be bent a little. A
+target on no sheet has no normal: its eccentricity cannot be known, and is left out.
 """
 
 from __future__ import annotations
@@ -23,9 +25,10 @@ if TYPE_CHECKING:
 
 __all__ = ["field_normals", "target_normals"]
 
-_NEIGHBOURS = 10
-_FLATNESS = 0.03  # of the distance between neighbours: 2° of a plane's tilt
-_FEWEST = 3  # neighbours in the plane; two always are
+_NEIGHBOURS = 8
+_FLATNESS = 0.05  # of the distance between neighbours
+_FEWEST = 4  # targets on a sheet; three always are in a plane
+_LOCAL = 8
 
 
 @lru_cache(maxsize=16)
@@ -44,31 +47,54 @@ def target_normals(points: Array) -> Array:
     """Unit normals (n, 3), of either sign, of targets at points (n, 3) mm; NaN for no plane."""
     n = len(points)
     normals = np.full((n, 3), np.nan)
-    if n < _FEWEST + 1:
+    if n < _FEWEST:
         return normals
-    count = min(_NEIGHBOURS, n - 1)
-    pairs = np.array(list(combinations(range(count), 2)))
-    for i in range(n):
-        offset = points - points[i]
-        distance = np.linalg.norm(offset, axis=1)
-        near = np.argsort(distance, kind="stable")[1 : count + 1]
-        d, length = offset[near], distance[near]
-        if length[0] == 0:
-            continue
-        cross = np.cross(d[pairs[:, 0]], d[pairs[:, 1]])
-        size = np.linalg.norm(cross, axis=1)
-        usable = size > 0.2 * length[pairs[:, 0]] * length[pairs[:, 1]]
-        if not usable.any():
-            continue
-        candidates = cross[usable] / size[usable, None]
-        height = np.abs(candidates @ d.T) / length
-        flat = height < _FLATNESS
-        held = flat.sum(axis=1)
-        # Near neighbours count a little more: among planes that hold as many, theirs wins.
-        score = held + 0.5 * (flat / (1 + np.arange(count))).sum(axis=1) - height.mean(axis=1)
+    distance = np.linalg.norm(points[:, None] - points[None], axis=2)
+    near = np.argsort(distance, axis=1, kind="stable")[:, 1 : _NEIGHBOURS + 1]
+    spacing = float(np.median(np.take_along_axis(distance, near, 1)[:, 0]))
+    if spacing == 0:
+        return normals
+    tolerance = _FLATNESS * spacing
+    closeness = np.exp(-((distance / (3 * spacing)) ** 2))
+    seeds, planes = _planes_of_neighbours(points, near, spacing)
+    if len(seeds) == 0:
+        return normals
+    offset = np.sum(planes * points[seeds], axis=1)
+    holds = np.empty((len(seeds), n), dtype=bool)
+    for i in range(0, len(seeds), 4096):
+        s = slice(i, i + 4096)
+        holds[s] = np.abs(planes[s] @ points.T - offset[s, None]) < tolerance
+    left = np.ones(n, dtype=bool)
+    while left.sum() >= _FEWEST:
+        score = np.einsum("ij,ij->i", closeness[seeds], holds & left)
         best = int(np.argmax(score))
-        if held[best] < _FEWEST:
-            continue
-        plane = np.vstack([np.zeros(3), d[flat[best]]])
-        normals[i] = np.linalg.svd(plane - plane.mean(axis=0))[2][2]
+        sheet = np.nonzero(holds[best] & left)[0]
+        if len(sheet) < _FEWEST:
+            break
+        for row in sheet.tolist():
+            local = sheet[np.argsort(distance[row, sheet], kind="stable")[:_LOCAL]]
+            spread = points[local] - points[local].mean(axis=0)
+            _, size, axes = np.linalg.svd(spread)
+            # A single row of targets does not say how its sheet is turned about it.
+            normals[row] = axes[2] if size[1] > 0.1 * size[0] else planes[best]
+        left[sheet] = False
     return normals
+
+
+def _planes_of_neighbours(
+    points: Array, near: NDArray[np.int64], spacing: float
+) -> tuple[NDArray[np.int64], Array]:
+    """Planes through each point and two of its neighbours: the points, and unit normals (m, 3)."""
+    pairs = np.array(list(combinations(range(near.shape[1]), 2)), dtype=np.int64).reshape(-1, 2)
+    d = points[near] - points[:, None]
+    cross = np.cross(d[:, pairs[:, 0]], d[:, pairs[:, 1]])
+    size = np.linalg.norm(cross, axis=2)
+    length = np.linalg.norm(d, axis=2)
+    usable = size > 0.2 * np.maximum(length[:, pairs[:, 0]] * length[:, pairs[:, 1]], spacing**2)
+    seeds, which = np.nonzero(usable)
+    planes = cross[seeds, which] / size[seeds, which, None]
+    # The same plane comes from many pairs; a coarse raster of directions per point is enough.
+    sign = np.where(planes @ np.array([1.0, 1e-3, 1e-6]) < 0, -1.0, 1.0)[:, None]
+    key = np.column_stack([seeds, np.rint(planes * sign * 200).astype(np.int64)])
+    _, first = np.unique(key, axis=0, return_index=True)
+    return seeds[first], planes[first]

@@ -1,7 +1,7 @@
 """An output that keeps what it got.
 
 outputs:
-  - {name: kept, driver: mock, keep: 1000, faults: []}   # see thermocald_drivers/faults.py
+  - {name: kept, driver: mock, keep: 1000, timeout_s: 1, faults: []}   # see faults.py
 """
 
 from __future__ import annotations

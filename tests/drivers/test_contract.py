@@ -1,0 +1,236 @@
+"""The contract of `thermocald.hal`, for every registered driver, each on its laboratory's bench.
+
+The drivers are those of the entry points, never a list of ours: one that is registered without a
+laboratory fails.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import json
+import math
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thermocald.errors import ConfigurationError, DeviceError
+from thermocald.hal import (
+    Camera,
+    Output,
+    Thermometer,
+    driver_names,
+    load_driver,
+    open_device,
+    option_names,
+)
+
+KINDS = {"camera": Camera, "thermometer": Thermometer, "output": Output}
+REGISTERED = [(kind, name) for kind in KINDS for name in driver_names(kind)]
+
+RESULT = {
+    "epoch": 1,
+    "device": "river",
+    "state": "drifting",
+    "status": "ok",
+    "c": 3.04,
+    "sd_c": None,
+}
+
+
+@contextmanager
+def laboratory(kind, name, tmp_path, monkeypatch):
+    """The bench of one driver; a driver without one has not been tested at all."""
+    try:
+        module = importlib.import_module(f"tests.drivers.laboratory.{name}")
+        bench_of = getattr(module, kind)
+    except (ImportError, AttributeError) as error:
+        pytest.fail(
+            f"{kind} driver {name!r} is registered but has no laboratory: write {kind}() in "
+            f"tests/drivers/laboratory/{name}.py, see bench.py there ({error})"
+        )
+    with bench_of(tmp_path, monkeypatch) as bench:
+        yield bench
+
+
+@pytest.fixture
+def bench(kind, name, tmp_path, monkeypatch):
+    with laboratory(kind, name, tmp_path, monkeypatch) as one:
+        yield one
+
+
+@pytest.fixture
+def device(kind, name, bench):
+    made = open_device(kind, name, bench.options, bench.clock)
+    yield made
+    made.close()
+
+
+def use(kind, device):
+    """One capture, reading, or result."""
+    if kind == "camera":
+        return device.capture()
+    if kind == "thermometer":
+        return device.read()
+    return device.emit(RESULT)
+
+
+def test_something_is_registered():
+    """Without this, an installation without entry points would pass everything below."""
+    assert {kind for kind, _ in REGISTERED} == set(KINDS)
+    assert ("camera", "mock") in REGISTERED
+
+
+def test_every_laboratory_belongs_to_a_driver():
+    folder = Path(__file__).parent / "laboratory"
+    found = {path.stem for path in folder.glob("*.py")} - {"__init__", "bench"}
+    assert found <= {name for _, name in REGISTERED}
+
+
+each_driver = pytest.mark.parametrize(("kind", "name"), REGISTERED)
+
+
+@each_driver
+def test_driver_is_what_it_is_registered_as(kind, name):
+    driver = load_driver(kind, name)
+    assert issubclass(driver, KINDS[kind])
+    assert "clock" in inspect.signature(driver).parameters
+
+
+@each_driver
+def test_driver_explains_its_stanza(kind, name):
+    text = sys.modules[load_driver(kind, name).__module__].__doc__ or ""
+    assert f"driver: {name}" in text
+    for option in option_names(kind, name):
+        assert option in text, f"option {option} is not explained at the top of the file"
+
+
+@each_driver
+def test_driver_imports_no_device_library(kind, name):
+    """At its top a driver imports the standard library, numpy, thermocald and its own helpers."""
+    path = Path(inspect.getfile(load_driver(kind, name)))
+    allowed = {*sys.stdlib_module_names, "numpy", "thermocald", "thermocald_drivers"}
+    for module in _imported_at_the_top(path):
+        assert module.split(".")[0] in allowed
+
+
+def _imported_at_the_top(path: Path) -> list[str]:
+    found = []
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.Import):
+            found += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            found.append(node.module or "")
+    return found
+
+
+@each_driver
+def test_unknown_options_are_refused(kind, name, bench):
+    with pytest.raises(ConfigurationError):
+        open_device(kind, name, {**bench.options, "no_such_option": 1}, bench.clock)
+
+
+@each_driver
+def test_closed_device_refuses_and_close_never_fails(kind, device):
+    device.close()
+    with pytest.raises(DeviceError):
+        use(kind, device)
+    device.open()
+    use(kind, device)
+    device.close()
+    device.close()
+    with pytest.raises(DeviceError):
+        use(kind, device)
+
+
+@each_driver
+def test_identity_is_text(device):
+    with device:
+        identity = dict(device.identity())
+    assert all(isinstance(part, str) for item in identity.items() for part in item)
+
+
+@each_driver
+def test_opened_again_it_works(kind, device):
+    for _ in range(2):
+        with device:
+            use(kind, device)
+
+
+@each_driver
+def test_unplugged_and_back(kind, device, bench):
+    device.open()
+    use(kind, device)
+    bench.unplug()
+    with pytest.raises(DeviceError):
+        use_until_it_fails(kind, device)
+    device.close()
+    bench.plug()
+    device.open()
+    use(kind, device)
+
+
+def use_until_it_fails(kind, device) -> None:
+    """What had been buffered or read ahead may still come: a few uses at most."""
+    for _ in range(3):
+        use(kind, device)
+        device.close()
+        device.open()
+
+
+CAMERAS = [pair for pair in REGISTERED if pair[0] == "camera"]
+THERMOMETERS = [pair for pair in REGISTERED if pair[0] == "thermometer"]
+OUTPUTS = [pair for pair in REGISTERED if pair[0] == "output"]
+
+
+@pytest.mark.parametrize(("kind", "name"), CAMERAS)
+def test_frames_keep_the_contract(device, bench):
+    with device:
+        frames = [device.capture() for _ in range(3)]
+    for frame in frames:
+        assert frame.image is not None or frame.encoded or "observations" in frame.metadata
+        if frame.image is not None:
+            assert frame.image.ndim == 2
+            assert frame.image.dtype in (np.uint8, np.uint16)
+            assert not frame.image.flags.writeable
+        assert math.isfinite(frame.monotonic)
+        assert frame.monotonic <= bench.clock.monotonic() + 1e-6
+        assert math.isfinite(frame.utc)
+        assert frame.exposure is None or frame.exposure > 0
+        json.dumps(dict(frame.metadata))
+    instants = [frame.monotonic for frame in frames]
+    assert instants == sorted(set(instants)), "every frame has its own, later instant"
+    numbers = [frame.sequence for frame in frames if frame.sequence is not None]
+    assert numbers == sorted(set(numbers))
+
+
+@pytest.mark.parametrize(("kind", "name"), THERMOMETERS)
+def test_readings_keep_the_contract(device, bench):
+    with device:
+        readings = [device.read() for _ in range(3)]
+    for reading in readings:
+        assert reading.values
+        for channel, value in reading.values.items():
+            assert isinstance(channel, str)
+            assert channel
+            assert math.isfinite(value)
+            assert -100 < value < 200
+        assert reading.monotonic <= bench.clock.monotonic() + 1e-6
+        assert math.isfinite(reading.utc)
+        json.dumps(dict(reading.metadata))
+    assert [r.monotonic for r in readings] == sorted(r.monotonic for r in readings)
+
+
+@pytest.mark.parametrize(("kind", "name"), OUTPUTS)
+def test_outputs_take_any_result_in_time(device):
+    results = [RESULT, {**RESULT, "c": math.nan, "status": "too_few_targets"}, {}]
+    with device:
+        begin = time.monotonic()
+        for result in results:
+            device.emit(result)
+        assert time.monotonic() - begin < 3 * getattr(device, "timeout_s", 5.0)

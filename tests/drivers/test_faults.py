@@ -1,0 +1,114 @@
+"""Faults on demand: the mocks fail as hardware fails, and come back."""
+
+from __future__ import annotations
+
+import pytest
+from thermocald_drivers.faults import Faults
+
+from thermocald.errors import BadReading, ConfigurationError, DeviceGone, DeviceTimeout
+from thermocald.hal import VirtualClock, open_device
+
+
+@pytest.fixture
+def clock() -> VirtualClock:
+    return VirtualClock()
+
+
+def outcomes(device, calls: int) -> list[str]:
+    """What each reading came to."""
+    found = []
+    for _ in range(calls):
+        try:
+            device.read()
+        except (DeviceTimeout, DeviceGone, BadReading) as error:
+            found.append(type(error).__name__)
+        else:
+            found.append("ok")
+    return found
+
+
+@pytest.mark.parametrize(
+    ("kind", "error"),
+    [
+        ("timeout", "DeviceTimeout"),
+        ("unplugged", "DeviceGone"),
+        ("truncated", "BadReading"),
+        ("wrong_size", "BadReading"),
+        ("stuck", "ok"),
+    ],
+)
+def test_by_call(clock, kind, error):
+    faults = [{"kind": kind, "at": 2, "count": 3}]
+    with open_device("thermometer", "mock", {"faults": faults}, clock) as device:
+        assert outcomes(device, 6) == ["ok", error, error, error, "ok", "ok"]
+
+
+def test_by_time_and_open_fails_too(clock):
+    faults = [{"kind": "unplugged", "at_s": 60, "for_s": 30}]
+    device = open_device("thermometer", "mock", {"faults": faults, "conversion_s": 0}, clock)
+    device.open()
+    assert outcomes(device, 1) == ["ok"]
+    clock.sleep_until(60.0)
+    assert outcomes(device, 2) == ["DeviceGone"] * 2
+    device.close()
+    with pytest.raises(DeviceGone):
+        device.open()
+    clock.sleep_until(90.0)
+    device.open()
+    assert outcomes(device, 1) == ["ok"]
+    device.close()
+
+
+def test_a_timeout_takes_its_time(clock):
+    options = {"faults": [{"kind": "timeout"}], "timeout_s": 2.5}
+    with open_device("thermometer", "mock", options, clock) as device:
+        assert outcomes(device, 1) == ["DeviceTimeout"]
+    assert clock.monotonic() == 2.5
+
+
+def test_stuck_repeats_the_value_with_new_instants(clock):
+    options = {"faults": [{"kind": "stuck", "at": 3, "count": 3}]}
+    with open_device("thermometer", "mock", options, clock) as device:
+        readings = []
+        for _ in range(7):
+            readings.append(device.read())
+            clock.advance(20.0)
+    values = [reading.values["temperature"] for reading in readings]
+    assert values[1:5] == [values[1]] * 4
+    assert len({values[0], values[1], values[5], values[6]}) == 4
+    assert len({reading.monotonic for reading in readings}) == 7
+
+
+def test_injected_while_it_runs(clock):
+    with open_device("thermometer", "mock", {}, clock) as device:
+        assert outcomes(device, 1) == ["ok"]
+        device.faults.inject("timeout", 2)
+        assert outcomes(device, 3) == ["DeviceTimeout", "DeviceTimeout", "ok"]
+        device.faults.inject("unplugged", 1000)
+        assert outcomes(device, 1) == ["DeviceGone"]
+        device.faults.clear()
+        assert outcomes(device, 1) == ["ok"]
+
+
+@pytest.mark.parametrize(
+    ("plan", "message"),
+    [
+        ([{"kind": "explode"}], "is none of timeout, unplugged"),
+        ([{"kind": "timeout", "att": 3}], "a fault has no 'att'"),
+        ([{"kind": "timeout", "at": 0}], "is not within 1"),
+        ([{"kind": "timeout", "at": 1.5}], "not a whole number"),
+        ([{"kind": "timeout", "at_s": -1}], "not within"),
+        (["timeout"], "must be a list of"),
+    ],
+)
+def test_a_wrong_plan_is_refused(clock, plan, message):
+    with pytest.raises(ConfigurationError, match=message):
+        Faults("mock", clock, plan)
+
+
+def test_an_output_that_fails_keeps_nothing(clock):
+    with open_device("output", "mock", {"faults": [{"kind": "timeout"}]}, clock) as output:
+        with pytest.raises(DeviceTimeout):
+            output.emit({"epoch": 1})
+        output.emit({"epoch": 2})
+    assert list(output.results) == [{"epoch": 2}]

@@ -1,0 +1,92 @@
+"""The mock thermometer: programme, lag, offset, noise, quantisation, all seeded."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from thermocald_drivers.mock_thermometer import lagged
+
+from thermocald.errors import ConfigurationError
+from thermocald.hal import VirtualClock, open_device
+
+QUIET = {"noise_k": 0.0, "resolution_k": 0.0}
+
+
+def read(options, times):
+    """Readings of all channels at instants of a fresh clock, {channel: (n,)}."""
+    clock = VirtualClock()
+    rows = []
+    with open_device("thermometer", "mock", {"conversion_s": 0.0, **options}, clock) as device:
+        for time in times:
+            clock.sleep_until(time)
+            rows.append(device.read().values)
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+
+def test_programme_is_followed_and_held():
+    options = {"programme": [[0, 20], [100, 40], [200, 30]], "channels": {"t": QUIET}}
+    assert read(options, [0, 50, 100, 150, 500])["t"].tolist() == [20, 30, 40, 35, 30]
+
+
+def test_lag_against_the_differential_equation():
+    times, values, lag = np.array([0.0, 100.0, 250.0]), np.array([20.0, 50.0, 30.0]), 40.0
+    instants = np.linspace(0, 600, 61)
+    solved = solve_ivp(
+        lambda t, y: (np.interp(t, times, values) - y) / lag,
+        (0, 600),
+        [20.0],
+        t_eval=instants,
+        rtol=1e-10,
+        atol=1e-10,
+        max_step=5.0,
+    )
+    ours = [lagged(times, values, lag, t) for t in instants]
+    assert ours == pytest.approx(solved.y[0], abs=1e-6)
+
+
+def test_offset_gain_and_quantisation():
+    channels = {
+        "plain": QUIET,
+        "off": {**QUIET, "offset_k": 1.5},
+        "board": {**QUIET, "gain": 2.0},
+        "coarse": {"noise_k": 0.0, "resolution_k": 0.5},
+    }
+    found = read({"programme": [[0, 20], [100, 30]], "channels": channels}, np.arange(0, 100, 7.0))
+    assert found["off"] == pytest.approx(found["plain"] + 1.5)
+    assert found["board"] == pytest.approx(20 + 2 * (found["plain"] - 20))
+    assert np.array_equal(found["coarse"], np.round(found["plain"] * 2) / 2)
+
+
+def test_noise_has_the_stated_size_and_is_seeded():
+    options = {
+        "programme": [[0, 25]],
+        "channels": {"a": {"noise_k": 0.05, "resolution_k": 0}, "b": {"noise_k": 0.05}},
+        "seed": 4,
+    }
+    times = np.arange(4000.0)
+    first = read(options, times)
+    assert first["a"].std() == pytest.approx(0.05, rel=0.05)
+    assert abs(first["a"].mean() - 25) < 4 * 0.05 / np.sqrt(4000)
+    assert abs(np.corrcoef(first["a"], first["b"])[0, 1]) < 0.08
+    assert np.array_equal(first["a"], read(options, times)["a"])
+    # the noise hangs on the instant, not on how often it was read before
+    assert np.array_equal(first["a"][::2], read(options, times[::2])["a"])
+    assert not np.array_equal(first["a"], read({**options, "seed": 5}, times)["a"])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"programme": [[0, 20], [0, 30]]}, "times must increase"),
+        ({"programme": [0, 20]}, "list of"),
+        ({"programme": "warm"}, "list of"),
+        ({"channels": {"t": {"lag": 3}}}, "channels.t: there is no 'lag'"),
+        ({"channels": {"t": {"noise_k": -1}}}, "channels.t.noise_k: -1 K is not within"),
+        ({"seed": 1.5}, "seed: 1.5 is not a whole number"),
+        ({"conversion_s": -1}, "conversion_s"),
+    ],
+)
+def test_wrong_options_are_refused(options, message):
+    with pytest.raises(ConfigurationError, match=message):
+        open_device("thermometer", "mock", options, VirtualClock())

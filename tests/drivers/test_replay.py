@@ -1,0 +1,135 @@
+"""Replay: frames, measurements and readings come with the instants at which they were taken."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from thermocald_drivers.replay import RecordingEndedError
+
+from thermocald.epoch import Epoch
+from thermocald.errors import BadReading, ConfigurationError, DeviceNotFound, PermanentDeviceError
+from thermocald.hal import VirtualClock, open_device
+from thermocald.photogrammetry.camera_model import Sensor
+from thermocald.photogrammetry.exchange import observations_from_lists
+from thermocald.photogrammetry.testfield import Observations, TestField
+from thermocald.store.head import CameraSpec, Channel, Head
+from thermocald.store.recording import RecordingWriter, read_recording
+
+BEGIN = 1.6e9
+IMAGE = np.arange(48 * 64, dtype=np.uint8).reshape(48, 64)
+
+
+@pytest.fixture
+def write(tmp_path):
+    head = Head("M1", "M1", 10.0, CameraSpec("c", Sensor(64, 48, 0.001)), {"lens": Channel()})
+    field = TestField.build(["a", "b", "c"], np.eye(3) * 1000)
+
+    def write_epochs(*epochs):
+        with RecordingWriter(tmp_path / "M1", head, field) as writer:
+            for epoch, image in epochs:
+                writer.append(epoch, image=image)
+        return str(tmp_path / "M1")
+
+    return write_epochs
+
+
+def epoch(i: int, temperature: float = 20.0, seen: Observations | None = None) -> Epoch:
+    time = BEGIN + 10 * i
+    return Epoch(i, time, time + 1.5, {"lens": temperature + i}, observations=seen)
+
+
+def test_frames_keep_their_instants_and_bytes(write):
+    jpeg = b"\xff\xd8 not decoded here"
+    path = write((epoch(1), IMAGE), (epoch(2), jpeg))
+    clock = VirtualClock(utc=BEGIN + 100.0, monotonic=7.0)
+    with open_device("camera", "replay", {"recording": path}, clock) as camera:
+        first, second = camera.capture(), camera.capture()
+    assert np.array_equal(first.image, IMAGE)
+    assert (second.image, second.encoded) == (None, jpeg)
+    assert [f.utc - BEGIN for f in (first, second)] == [10.0, 20.0]
+    assert [f.monotonic for f in (first, second)] == pytest.approx([7.0 - 90.0, 7.0 - 80.0])
+    assert [f.sequence for f in (first, second)] == [1, 2]
+
+
+def test_measurements_come_without_a_picture(write):
+    seen = Observations(
+        np.array([2, 0]),
+        np.array([[1.5, 2.5], [3.25, 4.0]]),
+        np.full((2, 2), 0.04),
+        np.array([1e-4, -1e-4]),
+    )
+    path = write((epoch(1, seen=seen), None))
+    with open_device("camera", "replay", {"recording": path}, VirtualClock()) as camera:
+        frame = camera.capture()
+    field = TestField.build(["c", "b", "a"], np.eye(3))  # another order: names count, not rows
+    found = observations_from_lists(frame.metadata["observations"], field)
+    assert frame.image is None
+    assert found.targets.tolist() == [0, 2]
+    assert np.array_equal(found.points, seen.points)
+    assert np.array_equal(found.covariances, seen.covariances)
+
+
+def test_readings_keep_their_own_instants(write):
+    path = write((epoch(1), IMAGE), (epoch(2, np.nan), IMAGE), (epoch(3), IMAGE))
+    with open_device("thermometer", "replay", {"recording": path}, VirtualClock()) as device:
+        first = device.read()
+        with pytest.raises(BadReading, match="epoch 2 has no temperature"):
+            device.read()
+        third = device.read()
+    assert [dict(r.values) for r in (first, third)] == [{"lens": 21.0}, {"lens": 23.0}]
+    assert [r.utc - BEGIN for r in (first, third)] == [11.5, 31.5]
+
+
+def test_the_end_is_permanent(write):
+    path = write((epoch(1), IMAGE))
+    with open_device("camera", "replay", {"recording": path}, VirtualClock()) as camera:
+        camera.capture()
+        with pytest.raises(RecordingEndedError, match="has ended"):
+            camera.capture()
+    assert issubclass(RecordingEndedError, PermanentDeviceError)
+
+
+def test_loop_goes_on_in_time(write):
+    path = write((epoch(1), IMAGE), (epoch(2), IMAGE))
+    options = {"recording": path, "loop": True}
+    with open_device("camera", "replay", options, VirtualClock()) as camera:
+        assert [camera.capture().utc - BEGIN for _ in range(5)] == [10, 20, 30, 40, 50]
+
+
+def test_closed_and_opened_it_goes_on(write):
+    path = write(*((epoch(i), IMAGE) for i in (1, 2, 3)))
+    camera = open_device("camera", "replay", {"recording": path}, VirtualClock())
+    numbers = []
+    for _ in range(3):
+        with camera:
+            numbers.append(camera.capture().metadata["epoch"])
+    assert numbers == [1, 2, 3]
+
+
+def test_what_is_broken_is_a_bad_reading(write, tmp_path):
+    path = write((epoch(1), IMAGE), (epoch(2), IMAGE), (epoch(3), None))
+    (tmp_path / "M1" / "frames" / "000001.png").write_bytes(b"")
+    (tmp_path / "M1" / "frames" / "000002.png").write_bytes(b"no picture")
+    with open_device("camera", "replay", {"recording": path}, VirtualClock()) as camera:
+        for message in ("is no image", "is no image", "epoch 3 has no frame"):
+            with pytest.raises(BadReading, match=message):
+                camera.capture()
+
+
+def test_no_recording(tmp_path):
+    options = {"recording": str(tmp_path / "none")}
+    with pytest.raises(DeviceNotFound, match="no such recording"):
+        open_device("camera", "replay", options, VirtualClock()).open()
+    with pytest.raises(ConfigurationError):
+        open_device("camera", "replay", {}, VirtualClock())
+
+
+def test_a_real_recording(shared):
+    path = shared / "data" / "aviary-cam1"
+    recording = read_recording(path)
+    with open_device("camera", "replay", {"recording": str(path)}, VirtualClock()) as camera:
+        for expected in recording.epochs:
+            frame = camera.capture()
+            found = observations_from_lists(frame.metadata["observations"], recording.testfield)
+            assert frame.utc == expected.frame_time
+            assert np.array_equal(found.points, expected.observations.points)

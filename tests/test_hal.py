@@ -1,0 +1,115 @@
+"""The hardware abstraction: its data, its clocks, its look-up by entry point."""
+
+from __future__ import annotations
+
+import inspect
+import threading
+import time
+from importlib.metadata import EntryPoint
+
+import numpy as np
+import pytest
+
+from thermocald import errors, hal
+from thermocald.errors import ConfigurationError, DriverMissing, ThermocaldError
+from thermocald.hal import Frame, SystemClock, VirtualClock, load_driver, open_device, option_names
+
+
+def test_a_frame_cannot_be_changed():
+    frame = Frame(np.zeros((4, 5), dtype=np.uint8), 1.0, 2.0)
+    with pytest.raises(ValueError, match="read-only"):
+        frame.image[0, 0] = 1
+    with pytest.raises(AttributeError):
+        frame.utc = 3.0
+
+
+def test_a_frame_holds_something():
+    with pytest.raises(ValueError, match="needs an image"):
+        Frame(None, 1.0, 2.0)
+    assert Frame(None, 1.0, 2.0, encoded=b"\xff\xd8").image is None
+    assert Frame(None, 1.0, 2.0, metadata={"observations": {}}).image is None
+
+
+def test_virtual_clock_jumps_and_never_goes_back():
+    clock = VirtualClock(utc=1000.0, monotonic=5.0)
+    begin = time.monotonic()
+    assert clock.sleep_until(3605.0)
+    assert time.monotonic() - begin < 1.0
+    assert (clock.monotonic(), clock.utc()) == (3605.0, 4600.0)
+    clock.sleep_until(10.0)
+    assert clock.monotonic() == 3605.0
+
+
+def test_a_step_of_utc_leaves_monotonic_alone():
+    clock = VirtualClock(utc=1000.0)
+    clock.step_utc(-3600.0)
+    clock.advance(2.0)
+    assert (clock.monotonic(), clock.utc()) == (2.0, -2598.0)
+
+
+@pytest.mark.parametrize("clock", [VirtualClock(), SystemClock()], ids=["virtual", "system"])
+def test_clocks_keep_one_contract(clock):
+    assert isinstance(clock, hal.Clock)
+    begin, utc = clock.monotonic(), clock.utc()
+    assert clock.sleep_until(begin + 0.02)
+    assert clock.monotonic() >= begin + 0.02
+    assert clock.utc() - utc == pytest.approx(clock.monotonic() - begin, abs=0.01)
+    assert clock.sleep_until(begin)  # what is past needs no waiting
+    wake = threading.Event()
+    wake.set()
+    assert not clock.sleep_until(clock.monotonic() + 60.0, wake)
+
+
+def test_system_clock_is_woken():
+    clock, wake = SystemClock(), threading.Event()
+    timer = threading.Timer(0.05, wake.set)
+    timer.start()
+    begin = time.monotonic()
+    assert not clock.sleep_until(begin + 30.0, wake)
+    assert time.monotonic() - begin < 5.0
+    timer.join()
+
+
+@pytest.mark.parametrize("kind", ["camera", "thermometer", "output"])
+def test_look_up_names_what_there_is(kind):
+    assert "mock" in hal.driver_names(kind)
+    with pytest.raises(ConfigurationError, match=f"no {kind} driver 'none'; installed are: .*mock"):
+        load_driver(kind, "none")
+
+
+def test_options_of_a_driver():
+    assert "clock" not in option_names("thermometer", "mock")
+    assert {"programme", "seed", "faults"} <= set(option_names("thermometer", "mock"))
+
+
+def test_options_that_do_not_fit():
+    with pytest.raises(ConfigurationError, match=r"thermometer driver 'mock'.*'sed'"):
+        open_device("thermometer", "mock", {"sed": 1}, VirtualClock())
+
+
+def test_a_driver_that_cannot_be_imported(monkeypatch):
+    point = EntryPoint("lost", "thermocald_drivers.no_such_module:Lost", "thermocald.cameras")
+    monkeypatch.setattr(hal, "entry_points", lambda group: [point])
+    with pytest.raises(DriverMissing, match="'lost' cannot be imported"):
+        load_driver("camera", "lost")
+
+
+def test_a_device_is_closed_at_the_end_of_the_block():
+    device = open_device("output", "mock", {}, VirtualClock())
+    with device:
+        device.emit({"epoch": 1})
+    with pytest.raises(errors.DeviceError):
+        device.emit({"epoch": 2})
+
+
+def test_errors_are_one_tree_and_leaves_are_the_built_in_they_are():
+    tree = [c for _, c in inspect.getmembers(errors, inspect.isclass)]
+    assert all(issubclass(leaf, ThermocaldError) for leaf in tree)
+    assert set(errors.__all__) == {leaf.__name__ for leaf in tree}
+    assert {leaf.exit_status for leaf in tree} == {1, 2, 3}
+    for leaf in tree:
+        if leaf is not ThermocaldError:
+            assert issubclass(leaf, ValueError | OSError)
+    transient, permanent = errors.TransientDeviceError, errors.PermanentDeviceError
+    devices = {leaf for leaf in tree if issubclass(leaf, errors.DeviceError)} - {errors.DeviceError}
+    assert all(issubclass(leaf, transient) != issubclass(leaf, permanent) for leaf in devices)

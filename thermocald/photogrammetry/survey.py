@@ -149,7 +149,7 @@ def _provisional(
     seen = np.zeros(len(names), dtype=int)
     for photo in photos:
         seen[photo.observations.targets] += 1
-    often = {names[row] for row in np.flatnonzero(seen > 2)}
+    often = {names[int(row)] for row in np.flatnonzero(seen > 2)}
     found = [d for d in distances if d.a in often and d.b in often]
     if found or nominal is None or len(often) < 2 or not distances:
         return found or distances

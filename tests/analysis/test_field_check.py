@@ -1,0 +1,167 @@
+"""The check of a planned test field against real adjustments of what it would give."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermocald.analysis.field_check import (
+    FREE,
+    check_field,
+    precision,
+    station_at,
+    usual_station,
+)
+from thermocald.errors import GeometryError
+from thermocald.output.testfield_layout import Design, field_of, lay_out, paper_size
+from thermocald.photogrammetry.adjustment import AdjustmentSettings, adjust
+from thermocald.photogrammetry.camera_model import (
+    IOP_NAMES,
+    CameraModel,
+    ExteriorOrientation,
+    InteriorOrientation,
+    Sensor,
+)
+from thermocald.photogrammetry.testfield import Observations, TestField
+from thermocald.simulation.testfields import corner_field
+
+CAMERA = CameraModel(
+    Sensor(3280, 2464, 0.00112), InteriorOrientation(c=3.04, x0=0.01, y0=-0.02, A1=-2e-3)
+)
+_COLUMNS = [IOP_NAMES.index(name) for name in FREE]
+
+
+def _printed(paper, sheets=1, diameter=12.0):
+    return field_of(lay_out(Design(paper_size(paper, landscape=True), diameter, sheets=sheets)))
+
+
+@pytest.mark.parametrize("exact", [True, False], ids=["image noise alone", "field uncertain too"])
+def test_predicted_are_the_standard_deviations_of_an_adjustment(exact):
+    """`adjust` of one simulated image with the same stochastic model: its a-priori covariance."""
+    field = corner_field(sigma_mm=1e-9 if exact else 0.05)
+    station = usual_station(CAMERA, field)
+    check = check_field(CAMERA, field, station, 0.04)
+    rng = np.random.default_rng(0)
+    image = CAMERA.project(station, field.points)
+    seen = Observations(
+        np.arange(len(field)), image + rng.normal(0, 0.04, image.shape), np.full(image.shape, 0.04)
+    )
+    result = adjust(
+        CAMERA.sensor, field, seen, CAMERA.interior, station,
+        AdjustmentSettings(free=FREE, scale="prior", snooping_alpha=0.0),
+    )  # fmt: skip
+    assert result.status == "ok"
+    stated = np.sqrt(np.diag(result.covariance))[_COLUMNS]
+    predicted = check.precision.epoch if exact else check.precision.level
+    # the adjustment linearises at its own estimate, the check at the plan
+    assert predicted == pytest.approx(stated, rel=0.03)
+
+
+def test_design_figures_of_the_corner_field():
+    """DESIGN idea 3: 147 targets, 0.04 px: sd(x0) 0.3 px per image, 0.005 px in a series."""
+    field = corner_field()
+    check = check_field(CAMERA, field, usual_station(CAMERA, field), 0.04)
+    epoch, series, _ = check.precision.pixels(CAMERA.sensor.pixel_pitch)["x0"]
+    assert 0.2 < epoch < 0.6
+    assert 0.003 < series < 0.007
+
+
+def test_usual_station_fills_the_image_and_looks_from_inside_the_corner():
+    field = corner_field()
+    station = usual_station(CAMERA, field)
+    image = CAMERA.project(station, field.points)
+    assert CAMERA.sensor.contains(image).all()
+    reach = np.abs(image - CAMERA.sensor.centre).max(axis=0) / CAMERA.sensor.centre
+    assert 0.85 < reach.max() < 0.95
+    assert station.centre.min() > field.points.max()
+    flat = _printed("A2")
+    station = usual_station(CAMERA, flat)
+    assert station.centre[2] > 0
+    assert station.rotation[:, 2] == pytest.approx([0, 0, 1], abs=1e-6)
+
+
+def test_hidden_targets_have_reasons():
+    names = ["seen1", "seen2", "seen3", "seen4", "aside", "behind", "tiny", "coin"]
+    points = [[-50, -50, 0], [50, -50, 0], [50, 50, 0], [-50, 50, 0], [2000, 0, 0], [0, 0, 900],
+              [0, 20, 0], [0, -20, 0]]  # fmt: skip
+    field = TestField.build(names, points, 0.1, [8] * 6 + [0.5, 8])
+    station = station_at(np.array([0, 0, 500.0]), np.zeros(3))
+    check = check_field(CAMERA, field, station)
+    assert [field.names[i] for i in check.visible] == ["seen1", "seen2", "seen3", "seen4", "coin"]
+    assert check.hidden == {
+        "aside": "outside of the image", "behind": "behind the camera", "tiny": "smaller than 8 px",
+    }  # fmt: skip
+    assert check.sizes == pytest.approx(np.full(5, 8 * 3.04 / 500 / 0.00112), rel=0.03)
+
+
+def test_edge_on_targets_are_hidden():
+    field = _printed("A3")
+    low = station_at(np.array([900.0, 150.0, 60.0]), np.array([200.0, 140.0, 0.0]))
+    with pytest.raises(GeometryError, match=r"targets are visible from there: .*edge-on"):
+        check_field(CAMERA, field, low)
+
+
+@pytest.mark.parametrize("aside_deg", [0, 20, 40])
+def test_a_plane_field_never_tells_all_in_one_image_and_needs_depth(aside_deg):
+    """Eight numbers of a homography cannot tell nine unknowns apart, wherever it is taken from."""
+    field = _printed("A2")
+    centre, angle = field.points.mean(axis=0), np.radians(aside_deg)
+    place = centre + 700 * np.array([np.sin(angle), 0.1, np.cos(angle)])
+    check = check_field(CAMERA, field, station_at(place, centre, 0.3))
+    assert np.isinf(check.precision.epoch[0])
+    assert np.isfinite(check.precision.series[:3]).all()
+    assert "in front of the field" in check.advice[0]
+    assert "not determined" in check.advice[0]
+    assert any("one plane" in note for note in check.advice)
+
+
+def test_proposed_targets_bring_what_is_said():
+    """The promised standard deviation is that of the field with the proposed targets in it."""
+    field = corner_field()
+    station = usual_station(CAMERA, field)
+    check = check_field(CAMERA, field, station)
+    (note,) = [n for n in check.advice if "in front of the field" in n]
+    name = note.split("sd(")[1].split(")")[0]
+    promised = float(note.split("→ ")[1].split(" px")[0])
+    u, v = np.meshgrid((np.arange(4) + 0.5) / 4 * 3280 - 0.5, (np.arange(2) + 0.5) / 2 * 2464 - 0.5)
+    rays = CAMERA.rays(np.column_stack([u.ravel(), v.ravel()]))
+    depth = 0.75 * check.distance
+    added = station.centre + (rays * (depth / -rays[:, 2:])) @ station.rotation.T
+    points = np.concatenate([field.points, added])
+    then = precision(CAMERA, station, points, np.full(points.shape, 0.02), 0.03)
+    assert then.epoch[FREE.index(name)] / 0.00112 == pytest.approx(promised, rel=0.05)
+    assert promised < 0.85 * check.precision.epoch[FREE.index(name)] / 0.00112
+
+
+def test_empty_parts_and_unsurveyed_print_are_named():
+    field = _printed("A3", sheets=3)
+    check = check_field(CAMERA, field, usual_station(CAMERA, field))
+    assert (check.cells == 0).sum() > 0
+    assert any("empty parts of the image" in note for note in check.advice)
+    assert any("testfield survey" in note for note in check.advice)
+    surveyed = TestField.build(
+        field.names, field.points, 0.002, field.diameters, field.kinds, field.codes
+    )
+    again = check_field(CAMERA, surveyed, usual_station(CAMERA, surveyed))
+    assert not any("testfield survey" in note for note in again.advice)
+
+
+def test_small_targets_are_told_to_be_larger():
+    field = corner_field(size_mm=6.0)
+    check = check_field(CAMERA, field, usual_station(CAMERA, field))
+    assert any("come nearer or print larger" in note for note in check.advice)
+
+
+def test_roll_turns_the_image_and_not_the_axis():
+    a = station_at(np.array([0, 0, 500.0]), np.zeros(3))
+    b = station_at(np.array([0, 0, 500.0]), np.zeros(3), np.pi / 2)
+    assert b.rotation[:, 2] == pytest.approx(a.rotation[:, 2])
+    assert b.rotation[:, 0] == pytest.approx(a.rotation[:, 1])
+    with pytest.raises(GeometryError, match="stands where it looks at"):
+        station_at(np.zeros(3), np.zeros(3))
+
+
+def test_a_camera_that_looks_away_sees_nothing():
+    away = ExteriorOrientation(0, 0, 0, 0, 0, -500)
+    with pytest.raises(GeometryError, match="0 of 147 targets"):
+        check_field(CAMERA, corner_field(), away)

@@ -57,7 +57,7 @@ def advise(camera: CameraModel, field: TestField, check: FieldCheck, sigma_px: f
         middles = np.array([((c + 0.5) / CELLS[0], (r + 0.5) / CELLS[1]) for c, r in empty])
         size = np.array([camera.sensor.width, camera.sensor.height])
         propose(
-            _along(camera, check.station, middles * size - 0.5, check.distance),
+            _on_plane(camera, check, middles * size - 0.5, points),
             f"{len(empty)} targets in the empty parts of the image ({_where(empty)})",
         )
     if len(points) < _FEW:
@@ -127,6 +127,21 @@ def _along(
     rays = camera.rays(image_points)
     placed: Array = station.centre + (rays * (depth / -rays[:, 2:])) @ station.rotation.T
     return placed
+
+
+def _on_plane(camera: CameraModel, check: FieldCheck, image_points: Array, points: Array) -> Array:
+    """Object points (n, 3) mm that appear at image points on the field's best plane, where that is
+    in view there, else in the field's mean depth.
+    """
+    placed = _along(camera, check.station, image_points, check.distance)
+    centre = points.mean(axis=0)
+    normal = np.linalg.svd(points - centre, full_matrices=False)[2][2]
+    rays = placed - check.station.centre
+    with np.errstate(divide="ignore"):
+        reach = ((centre - check.station.centre) @ normal) / (rays @ normal)
+    sensible = (reach > 0.4) & (reach < 2.5)
+    result: Array = check.station.centre + rays * np.where(sensible, reach, 1.0)[:, None]
+    return result
 
 
 def _where(empty: list[tuple[int, int]]) -> str:

@@ -10,7 +10,11 @@
         height: 3024
         delete: true                  # the photograph from the phone, after it is safely here
         refuse_unlocked: false        # true: a frame whose focus or exposure moved is an error
+        minimum_free_mb: 200          # less free storage is an error
         timeout_s: 15
+        host: 127.0.0.1               # the adb server's, and its
+        port: 5037
+        start_server: true            # where none runs
     thermometers:
       - {name: pixel, driver: android, serial: 0A1B2C3D4E,
          sensors: {temperature: battery, skin: "thermal:skin", soc: "zone:cpu-0-0"}}

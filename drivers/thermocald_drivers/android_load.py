@@ -7,6 +7,13 @@
         limit_c: 42                   # of the battery, read here and now: off, and off for good
         programme: [{seconds: 600, hold_c: null}, {seconds: 1800, hold_c: 38}]
         processes: 4
+        lease_s: 30
+        unknown_s: 60                 # no temperature for so long: off
+        hysteresis_k: 0.5
+        timeout_s: 5
+        host: 127.0.0.1               # the adb server's, and its
+        port: 5037
+        start_server: true            # where none runs
 
 For cold/warm experiments. The load ends by itself `lease_s` after it was last renewed, so that a
 phone whose cable falls out cools down. See `heating` for the programme.

@@ -1,7 +1,7 @@
 """Bosch BME280 (temperature, humidity, pressure), I2C 0x76 and 0x77.
 
     thermometers:
-      - {name: air, driver: bme280, bus: 1, address: 0x76}
+      - {name: air, driver: bme280, bus: 1, address: 0x76, channel: air}
 
 The identity register must read 0x60. Each reading is a forced measurement whose end is awaited, so
 that no old value is read; 0x80000, the value of a channel that was not measured, is refused. The

@@ -1,16 +1,19 @@
 """A status LED and a relay on the Raspberry Pi's pins, through gpiozero.
 
     outputs:
-      - {name: status, driver: led, pin: 17}       # BCM number; steady: ok, blinking: no result
+      - {name: status, driver: led, pin: 17, blink_s: 0.25}   # BCM number
       - name: lamp
         driver: relay
         pin: 27
         active_high: false                         # most relay boards switch at low
         limit_c: 60
         watchdog_s: 30                             # no epoch for so long: off
+        unknown_s: 60                              # no temperature for so long: off
+        channel: temperature                       # of the epoch's result
+        hysteresis_k: 0.5
         programme: [{seconds: 600, hold_c: null}, {seconds: 1500, hold_c: 45}]
 
-The relay fails safe: it is off before the first result, after the last, at the limit (for good),
+The LED is steady while epochs have results and blinks while they have none. The relay fails safe: it is off before the first result, after the last, at the limit (for good),
 without a temperature, when no result comes for `watchdog_s`, when the program closes it, and, since
 the kernel releases the pins of a process that dies, after a crash (choose the relay's wiring so
 that a released pin is off). See `heating` for the programme.

@@ -1,7 +1,7 @@
 """The LM75 family without an identity register: LM75, LM75B, TMP75, TMP102; I2C 0x48–0x4f.
 
     thermometers:
-      - {name: lens, driver: lm75, chip: tmp102, bus: 1, address: 0x48}
+      - {name: lens, driver: lm75, chip: tmp102, bus: 1, address: 0x48, channel: lens}
 
 These chips cannot say who they are. What can be checked is: the bits of the temperature register
 that the chip leaves at zero, and that its limit registers hold values of the same grid. A chip in

@@ -1,7 +1,7 @@
 """Microchip MCP9808, ±0.25 °C, 0.0625 K, I2C 0x18–0x1f.
 
     thermometers:
-      - {name: lens, driver: mcp9808, bus: 1, address: 0x18}
+      - {name: lens, driver: mcp9808, bus: 1, address: 0x18, channel: lens}
 
 Manufacturer 0x0054 and device 0x04 are checked. Bits 15–13 of the temperature register are alert
 flags and bit 12 the sign: they are taken off before the value is computed. A chip in shut-down

@@ -8,6 +8,8 @@
         username: thermocald                 # and password_file: /etc/thermocald/mqtt-password
         topic: thermocald                    # thermocald/<device>/result and …/available
         discovery: homeassistant             # null: none
+        device: thermocald                   # the name where a result has none
+        timeout_s: 5
 
 Each result is one JSON object with QoS 1; `emit` waits for the broker's acknowledgement, at most
 `timeout_s`, so that nothing is lost unnoticed. The last will sets the device to `offline`.

@@ -4,7 +4,9 @@
       - name: field
         driver: ds18b20
         sensors: {camera: 28-000000bfe244, air: 28-00000a1b2c3d}   # {channel: ROM id}
-        timeout_s: 3                                               # one conversion: 0.75 s
+        timeout_s: 3                    # one conversion takes 0.75 s
+        attempts: 2                     # a reading that is not believed is made once more
+        sysfs: /sys
 
 What this driver does not believe: a CRC that fails (computed here too, over the printed bytes), all
 zeros (a shorted or unplugged line: the CRC of zeros is zero), a `t=` that does not fit its bytes,
@@ -101,6 +103,7 @@ class Ds18b20Thermometer(Thermometer):
         self.attempts = int(support.number("attempts", attempts, 1, 10, whole=True))
         self.root = Path(support.text("sysfs", sysfs)) / "bus/w1/devices"
         self._seen = False
+        self._open = False
         self._pending: dict[str, Future[float]] = {}
         self._neighbour: dict[str, tuple[float, float]] = {}
 
@@ -127,15 +130,18 @@ class Ds18b20Thermometer(Thermometer):
                 "is dtoverlay=w1-gpio set and the sensor wired?",
                 seen=self._seen,
             )
-        self._seen = True
+        self._seen = self._open = True
 
     def close(self) -> None:
+        self._open = False
         self._neighbour.clear()
 
     def identity(self) -> Mapping[str, str]:
         return {"sensors": ", ".join(self.sensors.values())}
 
     def read(self) -> Reading:
+        if not self._open:
+            raise DeviceGone("1-wire: not open")
         begin = self.clock.monotonic()
         for channel in self.sensors:
             self._start(channel)

@@ -6,9 +6,14 @@ r"""Thermometers on a serial line that speak in lines of text.
         driver: serial
         port: /dev/serial/by-id/usb-FTDI_FT232R_A50285BI-if00-port0   # lasts over re-plugs
         baud: 9600
+        framing: 8N1                            # data bits, parity (N, E, O), stop bits
         command: "T?\\r\\n"                      # sent for each reading; empty: it speaks by itself
         pattern: 'T=(?P<temperature>[-+]?\\d+\\.\\d+)F\\*(?P<checksum>[0-9A-F]{2})'
-        unit: F                                # C (default), F, K
+        unit: F                                 # C (default), F, K
+        scale: 1.0                              # times the number, then
+        offset: 0.0                             # added
+        timeout_s: 2
+        minimum_c: -100                         # and maximum_c: what is believed
         checksum: xor                                    # of the text before it: xor, sum8, nmea
 
 Each named group of `pattern` is a channel, scaled and offset, then brought to °C by `unit`. The

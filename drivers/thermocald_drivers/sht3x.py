@@ -1,7 +1,7 @@
 """Sensirion SHT30, SHT31, SHT35, I2C 0x44 and 0x45; every word carries a CRC.
 
     thermometers:
-      - {name: air, driver: sht3x, bus: 1, address: 0x44}
+      - {name: air, driver: sht3x, bus: 1, address: 0x44, channel: air}
 
 The serial number is read as identity and the status register checked. Each reading is a single shot
 with high repeatability (15 ms); both CRCs must be right. The relative humidity goes into the

@@ -1,7 +1,7 @@
 """Texas Instruments TMP117, ±0.1 °C, 0.0078125 K, I2C 0x48–0x4b.
 
     thermometers:
-      - {name: lens, driver: tmp117, bus: 1, address: 0x48}
+      - {name: lens, driver: tmp117, bus: 1, address: 0x48, channel: lens}
 
 The device identity 0x117 is checked. Every read starts a one-shot conversion (8 averages, 0.125 s)
 and waits for its Data_Ready flag, so that a value is never read twice; 0x8000 (−256 °C) stands in

@@ -12,13 +12,15 @@
         focus: 0                      # manual focus position of the camera
         white_balance_k: 4600
         controls: {power_line_frequency: 1, sharpness: 0}     # any other, named as v4l2-ctl does
+        card: C920                    # refuses a camera that does not call itself so
         timeout_s: 5
+        backend: auto                 # linuxpy, opencv; auto: what is installed
+        dev: /dev                     # where the nodes are
 
 Every control is set, read back, and read again with each frame: a camera that does not obey, or
 that falls back to automatic, is an error and not a frame (`strict: false` stores it in the frame's
 metadata instead). The frame's time is that of its buffer, brought to the middle of the exposure;
-frames that were exposed before `capture` was called are thrown away. `backend: opencv` (or `auto`
-without linuxpy) uses OpenCV.
+frames that were exposed before `capture` was called are thrown away.
 """
 
 from __future__ import annotations

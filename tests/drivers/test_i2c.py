@@ -9,6 +9,18 @@ import smbus2
 from thermocald_drivers.bme280 import Compensation
 from thermocald_drivers.sht3x import crc8
 
+from tests.drivers.fakes.chips import (
+    ADC_P,
+    ADC_T,
+    CALIBRATION,
+    CHIPS,
+    HUMIDITY,
+    bme280,
+    lm75,
+    mcp9808,
+    sht3x,
+    tmp117,
+)
 from tests.drivers.fakes.smbus import Bus, Chip
 from thermocald.errors import (
     BadReading,
@@ -28,94 +40,6 @@ def bus(monkeypatch):
     monkeypatch.setattr(smbus2, "SMBus", adapter)
     yield adapter
     assert adapter.opened == 0  # every driver gives the bus back
-
-
-def mcp9808(raw=0xC190, configuration=0x0000):
-    chip = Chip()
-    for register, value in ((1, configuration), (5, raw), (6, 0x0054), (7, 0x0400)):
-        chip.word(register, value)
-    return chip
-
-
-def tmp117(raw=0x0C80, ready=True):
-    chip = Chip()
-    chip.word(0x0F, 0x0117)
-    chip.word(0x01, 0x0220)
-    chip.word(0x00, 0x8000)
-
-    def convert(self, register, data):
-        self.word(0x01, int.from_bytes(data, "big") | (0x2000 if ready else 0))
-        self.word(0x00, raw)
-
-    chip.on_write = convert
-    return chip
-
-
-def lm75(raw=0x1900, configuration=0x00):
-    chip = Chip({1: bytes([configuration])})
-    for register, value in ((0, raw), (2, 0x4B00), (3, 0x5000)):
-        chip.word(register, value)
-    return chip
-
-
-def sht3x(temperature=0x6666, humidity=0x8000, damage=0):
-    chip = Chip()
-
-    def words(*values):
-        data = b"".join(v.to_bytes(2, "big") + bytes([crc8(v.to_bytes(2, "big"))]) for v in values)
-        return bytes([data[0] ^ damage]) + data[1:]
-
-    def answer(self, register, data):
-        command = register << 8 | data[0]
-        if command == 0x3780:
-            self.reply = words(0x0BAD, 0xCAFE)
-        elif command == 0x2400:
-            self.reply = words(temperature, humidity)
-
-    chip.on_write = answer
-    return chip
-
-
-# Calibration and raw values of the worked example of the BMP280 data sheet (BST-BMP280-DS001, 3.12)
-CALIBRATION = (
-    (27504).to_bytes(2, "little")
-    + (26435).to_bytes(2, "little", signed=True)
-    + (-1000).to_bytes(2, "little", signed=True)
-    + b"".join(
-        value.to_bytes(2, "little", signed=k > 0)
-        for k, value in enumerate((36477, -10685, 3024, 2855, 140, -7, 15500, -14600, 6000))
-    )
-    + bytes([0, 75])
-)
-HUMIDITY = (361).to_bytes(2, "little") + bytes([0, 20, 0x50 | 3, 3, 30])
-ADC_T, ADC_P, ADC_H = 519888, 415148, 30000
-
-
-def bme280(adc_t=ADC_T, identity=0x60, status=0, humidity=ADC_H):
-    def block(first, data):
-        chip.registers.update({first + k: bytes([byte]) for k, byte in enumerate(data)})
-
-    chip = Chip({0xD0: bytes([identity]), 0xF3: bytes([status])})
-    block(0x88, CALIBRATION)
-    block(0xE1, HUMIDITY)
-    block(0xF7, bytes(8))
-
-    def measure(self, register, data):
-        if register == 0xF4 and data[0] & 3:
-            raw = (ADC_P << 4).to_bytes(3, "big") + (adc_t << 4).to_bytes(3, "big")
-            block(0xF7, raw + humidity.to_bytes(2, "big"))
-
-    chip.on_write = measure
-    return chip
-
-
-CHIPS = {
-    "mcp9808": (0x18, mcp9808, 25.0),
-    "tmp117": (0x48, tmp117, 25.0),
-    "lm75": (0x48, lm75, 25.0),
-    "sht3x": (0x44, sht3x, -45.0 + 175.0 * 0x6666 / 0xFFFF),
-    "bme280": (0x76, bme280, 25.08),
-}
 
 
 def thermometer(name, **options):

@@ -12,13 +12,13 @@ import threading
 class Broker:
     """`messages` holds (topic, payload, retain); the will of a line that broke is in it too."""
 
-    def __init__(self) -> None:
+    def __init__(self, port: int = 0) -> None:
         self.messages: list[tuple[str, bytes, bool]] = []
         self.refuse = 0
         self.acknowledge = True
         self.answer_connect = True
         self.credentials: tuple[str, str] | None = None
-        self._server = socket.create_server(("127.0.0.1", 0))
+        self._server = socket.create_server(("127.0.0.1", port))
         self.port = self._server.getsockname()[1]
         self._lines: list[socket.socket] = []
         self._threads = [threading.Thread(target=self._accept, name="broker")]

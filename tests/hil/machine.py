@@ -1,0 +1,181 @@
+"""The laboratory's virtual machine: boot, wait until it answers, run, unplug, cut the power."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shlex
+import socket
+import subprocess
+import time
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+__all__ = ["Machine", "Qmp"]
+
+BOOT_S = 240.0
+
+
+class Qmp:
+    """QEMU's monitor: devices in and out."""
+
+    def __init__(self, path: Path) -> None:
+        self._socket = socket.socket(socket.AF_UNIX)
+        self._socket.settimeout(20.0)
+        self._socket.connect(str(path))
+        self._file = self._socket.makefile("rw")
+        self._file.readline()
+        self("qmp_capabilities")
+
+    def __call__(self, command: str, **arguments: object) -> object:
+        self._file.write(json.dumps({"execute": command, "arguments": arguments}) + "\n")
+        self._file.flush()
+        while True:
+            answer = json.loads(self._file.readline())
+            if "error" in answer:
+                raise RuntimeError(f"{command}: {answer['error']}")
+            if "return" in answer:
+                return answer["return"]
+
+    def wait_for(self, event: str) -> None:
+        """Until QEMU reports an event, at most as long as the socket's time-out."""
+        while json.loads(self._file.readline()).get("event") != event:
+            continue
+
+    def close(self) -> None:
+        self._file.close()
+        self._socket.close()
+
+
+class Machine:
+    """A guest on a disk that is thrown away; `serial` is where an instrument plugs in."""
+
+    def __init__(self, built: Path, folder: Path, accelerator: str = "tcg,thread=multi") -> None:
+        self.built, self.folder, self.accelerator = built, folder, accelerator
+        folder.mkdir(parents=True, exist_ok=True)
+        self.disk = folder / "disk.qcow2"
+        self.share = folder / "share"
+        self.share.mkdir(exist_ok=True)
+        self.serial = folder / "serial.sock"
+        self.process: subprocess.Popen[bytes] | None = None
+        self.port = 0
+        self.boot_s = 0.0
+
+    def boot(self) -> None:
+        """Start it and wait until a command can be run in it."""
+        if not self.disk.exists():
+            base = (self.built / "root.ext4").resolve()
+            subprocess.run(
+                ["qemu-img", "create", "-q", "-f", "qcow2", "-F", "raw", "-b", base, self.disk],
+                check=True,
+            )
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            self.port = free.getsockname()[1]
+        for path in (self.folder / "qmp.sock", self.serial):
+            path.unlink(missing_ok=True)
+        begin = time.monotonic()
+        with (self.folder / "qemu.log").open("ab") as log:
+            self.process = subprocess.Popen(
+                self._command(), stdin=subprocess.DEVNULL, stdout=log, stderr=log
+            )
+        while time.monotonic() - begin < BOOT_S:
+            if self.process.poll() is not None:
+                raise RuntimeError(f"QEMU ended: {(self.folder / 'qemu.log').read_text()[-500:]}")
+            if self.run("true", check=False, timeout_s=20).returncode == 0:
+                self.boot_s = time.monotonic() - begin
+                return
+            time.sleep(0.5)
+        raise RuntimeError(f"the guest did not answer in {BOOT_S:g} s; see {self.folder}/console")
+
+    def _command(self) -> list[str]:
+        kernel_line = (
+            "console=ttyS0 root=/dev/vda rw quiet loglevel=4 mitigations=off net.ifnames=0 "
+            "systemd.show_status=0"
+        )
+        return [
+            *("qemu-system-x86_64", "-M", "q35", "-accel", self.accelerator, "-cpu", "max"),
+            *("-smp", "2", "-m", "1536", "-nodefaults", "-no-user-config", "-display", "none"),
+            *("-kernel", str(self.built / "kernel"), "-initrd", str(self.built / "initrd")),
+            *("-append", kernel_line),
+            *("-drive", f"file={self.disk},if=virtio,format=qcow2,cache=writeback"),
+            *("-netdev", f"user,id=n,restrict=on,hostfwd=tcp:127.0.0.1:{self.port}-:22"),
+            *("-device", "virtio-net-pci,netdev=n,romfile="),
+            *("-virtfs", f"local,path={self.share},mount_tag=host,security_model=none"),
+            *("-device", "virtio-rng-pci", "-device", "qemu-xhci,id=usb"),
+            *("-chardev", f"socket,id=line,path={self.serial},server=on,wait=off"),
+            *("-device", "usb-serial,chardev=line,bus=usb.0,id=adapter"),
+            *("-qmp", f"unix:{self.folder / 'qmp.sock'},server=on,wait=off"),
+            *("-serial", f"file:{self.folder / 'console'}"),
+        ]
+
+    def run(
+        self, command: str, *, check: bool = True, timeout_s: float = 120.0
+    ) -> subprocess.CompletedProcess[str]:
+        """A shell command in the guest, as root."""
+        ssh = [
+            *("ssh", "-q", "-i", str(self.built / "key"), "-p", str(self.port)),
+            *("-o", "StrictHostKeyChecking=no", "-o", "UserKnownHostsFile=/dev/null"),
+            *("-o", "ConnectTimeout=10", "-o", "BatchMode=yes", "root@127.0.0.1", command),
+        ]
+        try:
+            done = subprocess.run(
+                ssh,
+                capture_output=True,
+                text=True,
+                timeout=timeout_s,
+                stdin=subprocess.DEVNULL,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            if check:
+                raise
+            return subprocess.CompletedProcess(ssh, 124, "", "timed out")
+        if check and done.returncode:
+            raise RuntimeError(f"{command}: status {done.returncode}\n{done.stdout}{done.stderr}")
+        return done
+
+    def python(self, script: str, *arguments: object, timeout_s: float = 300.0) -> object:
+        """Run a script of tests/hil/guest in the guest; its last line of output is JSON."""
+        words = " ".join(shlex.quote(str(a)) for a in arguments)
+        out = self.run(f"python3 /mnt/host/guest/{script} {words}", timeout_s=timeout_s).stdout
+        return json.loads(out.strip().splitlines()[-1])
+
+    def wait(self, command: str, timeout_s: float = 60.0) -> str:
+        """Until a command succeeds in the guest; its output."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            done = self.run(command, check=False)
+            if done.returncode == 0:
+                return done.stdout
+            if time.monotonic() > deadline:
+                raise RuntimeError(f"not in {timeout_s:g} s: {command}\n{done.stdout}{done.stderr}")
+            time.sleep(0.2)
+
+    def monitor(self) -> Qmp:
+        return Qmp(self.folder / "qmp.sock")
+
+    def unplug(self) -> None:
+        """Pull the serial adapter's plug."""
+        with contextlib.closing(self.monitor()) as qmp:
+            qmp("device_del", id="adapter")
+
+    def plug(self) -> None:
+        """Put it in again."""
+        with contextlib.closing(self.monitor()) as qmp:
+            qmp("device_add", driver="usb-serial", chardev="line", bus="usb.0", id="adapter")
+
+    def cut_power(self) -> None:
+        """No shutdown, no flush by the guest; what the host already has survives."""
+        if self.process is not None:
+            self.process.kill()
+            self.process.wait()
+            self.process = None
+
+    def close(self) -> None:
+        self.cut_power()
+        for path in (self.disk, self.folder / "qmp.sock", self.serial):
+            with contextlib.suppress(OSError):
+                os.unlink(path)

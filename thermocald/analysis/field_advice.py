@@ -57,7 +57,7 @@ def advise(camera: CameraModel, field: TestField, check: FieldCheck, sigma_px: f
         middles = np.array([((c + 0.5) / CELLS[0], (r + 0.5) / CELLS[1]) for c, r in empty])
         size = np.array([camera.sensor.width, camera.sensor.height])
         propose(
-            _on_plane(camera, check, middles * size - 0.5, points),
+            _beside(camera, check, middles * size - 0.5, points),
             f"{len(empty)} targets in the empty parts of the image ({_where(empty)})",
         )
     if len(points) < _FEW:
@@ -129,11 +129,13 @@ def _along(
     return placed
 
 
-def _on_plane(camera: CameraModel, check: FieldCheck, image_points: Array, points: Array) -> Array:
-    """Object points (n, 3) mm that appear at image points on the field's best plane, where that is
-    in view there, else in the field's mean depth.
+def _beside(camera: CameraModel, check: FieldCheck, image_points: Array, points: Array) -> Array:
+    """Object points (n, 3) mm that appear at image points: on the field's plane if it is one (and
+    is in view there), else in its mean depth.
     """
     placed = _along(camera, check.station, image_points, check.distance)
+    if check.flatness >= _FLAT:
+        return placed
     centre = points.mean(axis=0)
     normal = np.linalg.svd(points - centre, full_matrices=False)[2][2]
     rays = placed - check.station.centre

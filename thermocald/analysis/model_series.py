@@ -46,6 +46,7 @@ N_PARAMETERS = 22
 """16 parameters of the camera, 3 scales of the object coordinates, 3 of a displacement (mm)."""
 
 _ENOUGH = 20  # image points without which an epoch says too little
+_GROSS = 4.5  # standard deviations
 _WARM_EPOCHS = 40  # a sample of epochs that tells the mean orientation
 
 
@@ -109,9 +110,7 @@ class ModelSeries:
         still = self.field.points
         points = prediction.points(still) if prediction.moves_points else still
         predicted = project(self.sensor, prediction.iop, prediction.eop, points)
-        found: Array = np.where(
-            self.grid.observed[..., None], self.grid.points - predicted, np.nan
-        )
+        found: Array = np.where(self.grid.observed[..., None], self.grid.points - predicted, np.nan)
         return found
 
 
@@ -161,7 +160,7 @@ def model_series(recording: Recording, keep_targets: tuple[str, ...] = ()) -> Mo
         ExteriorOrientation.from_array(mean[10:]),
         settings,
     )
-    rejected = adjusted.rejected.copy()
+    rejected = _gross(adjusted.residuals)
     rejected[:, [field.index[t] for t in keep_targets if t in field.index]] = False
     offsets = np.nan_to_num(adjusted.offsets)
     clean = ObservationGrid(grid.points - offsets, grid.weights).reject(rejected)
@@ -201,6 +200,19 @@ def _mean_orientation(
         raise DataError(f"no epoch could be adjusted: {adjusted.reasons[0]}")
     mean: Array = adjusted.values[adjusted.ok].mean(axis=0)
     return mean
+
+
+def _gross(residuals: Array) -> NDArray[np.bool_]:
+    """Gross errors (E, T): beyond 4.5 times their own epoch's noise.
+
+    The adjustment's data snooping measures all epochs by one sigma; where heat defocuses, it would
+    cut off the hot epochs' tails and make them look better than they are.
+    """
+    size = np.abs(residuals)
+    noise = 1.4826 * np.nanmedian(size.reshape(len(size), -1), axis=1)
+    with np.errstate(invalid="ignore"):
+        gross: NDArray[np.bool_] = (size > _GROSS * noise[:, None, None]).any(axis=2)
+    return gross
 
 
 def _reduced(series: ModelSeries, displaced: NDArray[np.int64]) -> ModelSeries:

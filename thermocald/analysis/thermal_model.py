@@ -4,10 +4,10 @@ Unknown are the interior orientation at T₀, its rates, the parameters of the e
 exterior orientation per series. The thermometers' errors are unknown too, one per reading, with
 their standard deviation as prior: carried through each effect's own operator and eliminated, they
 take from the epochs what the thermometer does not know. Their size is estimated with the rest
-(variance components), as is that of the image noise.
+(variance components), and so is that of the image noise.
 
 The covariance holds image noise, thermometer noise, and the coordinates of the test field. It does
-not hold what the model lacks: the test for that is the chi-square of a series that was left out.
+not hold what the model lacks: the test for that is a series that was left out (`predicted_error`).
 
 Source: DESIGN ideas 2, 3 and 5; variance components: Koch, K.-R. (1999): Parameter Estimation and
 Hypothesis Testing in Linear Models, 2nd ed., section 3.6.
@@ -15,63 +15,63 @@ Hypothesis Testing in Linear Models, 2nd ed., section 3.6.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.model_series import N_PARAMETERS, ModelSeries
+from thermocald.analysis.model_system import Share, jacobian, share, unknowns_of
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera_model import (
     EOP_NAMES,
-    IOP_NAMES,
     ExteriorOrientation,
     InteriorOrientation,
 )
+from thermocald.photogrammetry.normals import linearise
 from thermocald.simulation import effects
 from thermocald.simulation.model import RATED, ModelEffect, ThermalModel
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
-    from scipy.sparse import csr_array
+
+    from thermocald.analysis.model_series import ModelSeries
 
     Array = NDArray[np.float64]
 
-__all__ = ["FittedModel", "SeriesFit", "fit_thermal_model", "predicted_error", "start_model"]
+__all__ = ["FittedModel", "SeriesFit", "fit_thermal_model"]
 
 _FREE_INTERIOR = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2")
 _ITERATIONS = 30
-_CONVERGED = 1e-3  # of a standard deviation
+_CONVERGED = 1e-2  # of a standard deviation
 _GRID = 33  # trial values of a non-linear parameter
+_NOISE_K = 0.03  # of a thermometer, to begin with
 
 
 @dataclass(frozen=True, slots=True)
 class SeriesFit:
-    """How well one series is explained: rms px, chi2 reduced, and its thermometers' noise K."""
+    """How well one series is explained: RMS px of the image points, thermometers' noise K."""
 
     name: str
     epochs: int
     rms_px: float
-    chi2_reduced: float
     thermometer_sd: float
 
 
 @dataclass(frozen=True, eq=False)
 class FittedModel:
-    """A fitted model with what the fit says about itself.
+    """A fitted model and what the fit says about itself.
 
     names (p,): of the unknowns, as `ThermalModel.covariance_names` writes them, the exterior
-    orientation of series k as `exterior.X0@k`; values, covariance; chi2_reduced: of everything
-    together; sigma0: of image points against their stated sigmas.
+    orientation of series k as `exterior.X0@k`; covariance (p, p); sigma0: of the image points
+    against their stated sigmas.
     """
 
     model: ThermalModel
     names: tuple[str, ...]
-    values: Array
     covariance: Array
     sigma0: float
-    chi2_reduced: float
     series: tuple[SeriesFit, ...]
 
     def sd(self, name: str) -> float:
@@ -80,77 +80,61 @@ class FittedModel:
         return float(np.sqrt(self.covariance[i, i]))
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
 class _State:
-    """The unknowns of a fit and where they go in a model."""
+    """A model and the exterior orientation of each series."""
 
     model: ThermalModel
-    exteriors: list[Array]
-    free: tuple[str, ...]
-    fixed: frozenset[str]
-    names: list[str] = field(init=False)
-
-    def __post_init__(self) -> None:
-        names = [f"interior.{n}" for n in self.free] + [f"rates.{n}" for n in RATED]
-        for effect in self.model.effects:
-            kind = effects.get(effect.name)
-            for key, value in effect.values.items():
-                name = f"{effect.name}.{key}"
-                if isinstance(value, int | float) and name not in self.fixed:
-                    if effect.name == "defocus":
-                        continue  # in the noise, not in the positions
-                    if key in kind.linear or key not in kind.fresh or key == "phase":
-                        names.append(name)
-        self.names = names + [f"exterior.{n}@{k}" for k in range(len(self.exteriors)) for n in EOP_NAMES]
+    exteriors: tuple[Array, ...]
+    fixed: frozenset[str] = frozenset()
 
     def of_series(self, k: int) -> ThermalModel:
         return replace(self.model, exterior=ExteriorOrientation.from_array(self.exteriors[k]))
 
+    @property
+    def names(self) -> list[str]:
+        names = [f"interior.{n}" for n in _FREE_INTERIOR] + [f"rates.{n}" for n in RATED]
+        for effect in self.model.effects:
+            names += [f"{effect.name}.{key}" for key in unknowns_of(effect)]
+        names = [n for n in names if n not in self.fixed]
+        return names + [f"exterior.{n}@{k}" for k in range(len(self.exteriors)) for n in EOP_NAMES]
+
+    def columns(self, k: int) -> NDArray[np.int64]:
+        """Where the unknowns of series k stand among all."""
+        common = len(self.names) - 6 * len(self.exteriors)
+        return np.concatenate([np.arange(common), common + 6 * k + np.arange(6)])
+
     def moved(self, step: Array) -> _State:
-        """The state after a step (p,)."""
         change = dict(zip(self.names, step, strict=True))
-        interior = self.model.interior.with_values(
-            **{n: getattr(self.model.interior, n) + change[f"interior.{n}"] for n in self.free}
+        interior = self.model.interior
+        interior = interior.with_values(
+            **{n: getattr(interior, n) + change[f"interior.{n}"] for n in _FREE_INTERIOR}
         )
         rates = {n: self.model.rates.get(n, 0.0) + change[f"rates.{n}"] for n in RATED}
-        listed = tuple(_changed(e, change) for e in self.model.effects)
-        exteriors = [
+        listed = tuple(_moved_effect(e, change) for e in self.model.effects)
+        exteriors = tuple(
             x + np.array([change[f"exterior.{n}@{k}"] for n in EOP_NAMES])
             for k, x in enumerate(self.exteriors)
-        ]
+        )
         model = replace(self.model, interior=interior, rates=rates, effects=listed)
-        return _State(model, exteriors, self.free, self.fixed)
+        return _State(model, exteriors, self.fixed)
 
 
-def _changed(effect: ModelEffect, change: dict[str, float]) -> ModelEffect:
+def _moved_effect(effect: ModelEffect, change: dict[str, float]) -> ModelEffect:
     values = dict(effect.values)
     kind = effects.get(effect.name)
-    for key, value in effect.values.items():
-        step = change.get(f"{effect.name}.{key}")
-        if step is None:
+    for key in unknowns_of(effect):
+        name = f"{effect.name}.{key}"
+        if name not in change:
             continue
-        values[key] = value + step
-        if key in kind.nonlinear:
-            p = kind.nonlinear[key]
+        value = float(values[key]) + change[name]
+        if key in kind.nonlinear and key != "phase":
+            p, old = kind.nonlinear[key], float(values[key])
             # a step across the range is a step too far
-            values[key] = float(np.clip(values[key], max(p.low, value / 3 if p.log else p.low),
-                                        min(p.high, value * 3 if p.log else p.high)))  # fmt: skip
+            low, high = (max(p.low, old / 2), min(p.high, old * 2)) if p.log else (p.low, p.high)
+            value = float(np.clip(value, low, high))
+        values[key] = value
     return replace(effect, values=values)
-
-
-def start_model(series: Sequence[ModelSeries], T0: float | None = None) -> ThermalModel:
-    """The base model to start from: mean orientation, no rates, T₀ the mean temperature."""
-    temperatures = np.concatenate([s.history.temperature() for s in series])
-    first = series[0]
-    return ThermalModel(
-        first.camera,
-        first.sensor,
-        round(float(temperatures.mean()), 1) if T0 is None else T0,
-        InteriorOrientation.from_array(first.start[:10]),
-        dict.fromkeys(RATED, 0.0),
-        name=first.camera,
-        version=0,
-    )
 
 
 def fit_thermal_model(
@@ -163,28 +147,42 @@ def fit_thermal_model(
     """Fit the base model and some effects to all series together.
 
     listed: effects with start values; with `search` their non-linear parameters are looked for over
-    their whole range first; fixed: names such as `thermal_lag.tau` that keep their start values.
-    Raises DataError for series of different cameras, or of one temperature.
+    their whole range first; fixed: names such as `thermal_lag.tau` that keep their start values;
+    T0 °C: by default the mean temperature. Raises DataError for series of different cameras, or of
+    one temperature.
     """
     checked = _checked(series, listed)
-    base = start_model(checked, T0)
-    state = _State(base, [s.start[10:].copy() for s in checked], _FREE_INTERIOR, frozenset(fixed))
-    state, _ = _solve(checked, state)
+    temperatures = np.concatenate([s.history.temperature() for s in checked])
+    reference = round(float(temperatures.mean()), 1) if T0 is None else T0
+    checked = [replace(s, history=replace(s.history, T0=reference)) for s in checked]
+    model = ThermalModel(
+        checked[0].camera,
+        checked[0].sensor,
+        reference,
+        InteriorOrientation.from_array(checked[0].start[:10]),
+        dict.fromkeys(RATED, 0.0),
+        name=checked[0].camera,
+        version=0,
+    )
+    state = _State(model, tuple(s.start[10:].copy() for s in checked), frozenset(fixed))
+    fit = _Fit(checked)
+    state = fit.solve(state)
     for effect in listed:
-        effect = _started(effect)
-        state.model = replace(state.model, effects=(*state.model.effects, effect))
-        state = _State(state.model, state.exteriors, state.free, state.fixed)
-        if search:
-            state = _searched(checked, state, effect)
+        begun = replace(state.model, effects=(*state.model.effects, _started(effect)))
+        state = replace(state, model=begun)
+        if search and effect.name != "defocus":
+            state = fit.search(state)
     if listed:
-        state, _ = _solve(checked, state)
-    state = _defocused(checked, state)
-    return _result(checked, *_solve(checked, state))
+        state = fit.solve(state)
+    if any(e.name == "defocus" for e in listed):
+        for _ in range(3):
+            state = fit.solve(fit.defocus(state))
+    return fit.result(state)
 
 
 def _checked(series: Sequence[ModelSeries], listed: Sequence[ModelEffect]) -> list[ModelSeries]:
     if not series:
-        raise DataError("no series to fit a model to")
+        raise DataError("there is no series to fit a model to")
     first = series[0]
     for s in series:
         if s.camera != first.camera or s.sensor != first.sensor:
@@ -206,57 +204,249 @@ def _checked(series: Sequence[ModelSeries], listed: Sequence[ModelEffect]) -> li
 
 
 def _started(effect: ModelEffect) -> ModelEffect:
-    """An effect with all its usual coefficients, 0 where nothing was given."""
+    """An effect with its usual coefficients, small where nothing was given."""
     kind = effects.get(effect.name)
-    given = [n for n in kind.linear if n in effect.values]
     values = dict(effect.values)
-    if not any(values[n] for n in given):
-        values |= {n: values.get(n, 0.0) for n in kind.usual}
+    if kind.linear and not any(values.get(n, 0.0) for n in kind.linear):
+        values |= dict.fromkeys(kind.usual, 0.0)
     return replace(effect, values=values)
 
 
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """What one series adds: normal matrix M (q, q) of its unknowns (columns), gradient g, cost."""
+class _Fit:
+    """Gauss-Newton over all series, with variance components that last from step to step."""
 
-    columns: NDArray[np.int64]
-    M: Array
-    g: Array
-    cost: float
-    image_cost: float
-    errors: Array
-    error_redundancy: float
-    J: Array
+    def __init__(self, series: list[ModelSeries]) -> None:
+        self.series = series
+        self.variance = 1.0
+        self.error_sds = [
+            float(np.hypot(_NOISE_K, s.resolution.get(s.history.reference, 0.0) / np.sqrt(12.0)))
+            for s in series
+        ]
+        self.noise: list[Array | None] = [None] * len(series)
+        self.image_points = 2 * sum(int(s.count.sum()) for s in series)
+        self.Q = np.zeros((0, 0))
+        self.shares: list[Share] = []
+        self.cost = np.inf
 
+    def step(self, state: _State) -> tuple[Array, float]:
+        """One step (p,), its largest part in standard deviations; renews the variances."""
+        names = state.names
+        M, g = np.zeros((len(names), len(names))), np.zeros(len(names))
+        self.shares = []
+        for k, s in enumerate(self.series):
+            model = state.of_series(k)
+            _, J = jacobian(s, model, _FREE_INTERIOR, state.fixed)
+            part = share(s, model, J, self.variance, self.error_sds[k], self.noise[k])
+            columns = state.columns(k)
+            M[np.ix_(columns, columns)] += part.M
+            g[columns] += part.g
+            self.shares.append(part)
+        self.Q = _inverse(M)
+        step: Array = self.Q @ g
+        sd = np.sqrt(np.maximum(np.diag(self.Q), 1e-300))
+        self._renew(state, step)
+        return step, float(np.max(np.abs(step) / sd))
 
-def _solve(series: list[ModelSeries], state: _State) -> tuple[_State, list[Any]]:
-    """Gauss-Newton with variance components; returns the state and [parts, sigma0, thermometers]."""
-    variance = 1.0
-    thermometers = [_first_guess(s) for s in series]
-    n = sum(int(s.count.sum()) for s in series) * 2
-    best = np.inf
-    for _ in range(_ITERATIONS):
-        parts = [_part(s, state, k, variance, t) for k, (s, t) in enumerate(zip(series, thermometers, strict=True))]
+    def _renew(self, state: _State, step: Array) -> None:
+        image, used, penalty = 0.0, 0.0, 0.0
+        for k, part in enumerate(self.shares):
+            columns = state.columns(k)
+            cost, errors, redundancy = part.settle(
+                step[columns], self.Q[np.ix_(columns, columns)], self.noise[k]
+            )
+            image += cost
+            used += redundancy
+            penalty += float(errors @ errors) / self.error_sds[k] ** 2
+            if redundancy > 5:
+                # a quantised thermometer is no better than a quarter of its step
+                floor = 0.25 * self.series[k].resolution.get(self.series[k].history.reference, 0.0)
+                found = float(np.sqrt(errors @ errors / redundancy))
+                self.error_sds[k] = max(found, floor, 1e-3)
+        self.cost = image / self.variance + penalty
+        self.variance = image / max(self.image_points - len(step) - used, 1.0)
+
+    def solve(self, state: _State) -> _State:
+        """Iterate until no unknown moves by more than a hundredth of its standard deviation."""
+        for _ in range(_ITERATIONS):
+            before = self.variance
+            step, size = self.step(state)
+            state = state.moved(step)
+            if size < _CONVERGED and abs(self.variance / before - 1.0) < 1e-3:
+                break
+        return state
+
+    def search(self, state: _State) -> _State:
+        """Try the last effect's non-linear parameters over their range, keep what fits best."""
+        effect = state.model.effects[-1]
+        kind = effects.get(effect.name)
+        trials = [effect]
+        for key, p in kind.nonlinear.items():
+            if p.text or key == "phase" or f"{effect.name}.{key}" in state.fixed:
+                continue
+            grid = self._grid(key, p.low, p.high, p.log)
+            trials = [
+                replace(t, values={**t.values, key: float(value)}) for t in trials for value in grid
+            ]
+        if "phase" in kind.nonlinear:
+            trials = [
+                replace(t, values={**t.values, "phase": phase, kind.usual[0]: 1e-9})
+                for t in trials
+                for phase in (0.0, np.pi / 2)
+            ]
+        if len(trials) == 1:
+            return state
+        variance, sds = self.variance, list(self.error_sds)
+        held = frozenset(f"{effect.name}.{key}" for key in kind.nonlinear)
+        best, chosen = np.inf, state
+        for trial in trials:
+            listed = (*state.model.effects[:-1], trial)
+            tried = _State(
+                replace(state.model, effects=listed), state.exteriors, held | state.fixed
+            )
+            self.variance, self.error_sds = variance, list(sds)
+            step, _ = self.step(tried)
+            # what is left with the variances held: comparable between trials
+            if self.cost < best:
+                best, chosen = self.cost, replace(tried.moved(step), fixed=state.fixed)
+        self.variance, self.error_sds = variance, list(sds)
+        return chosen
+
+    def _grid(self, key: str, low: float, high: float, log: bool) -> Array:
+        times = np.concatenate([s.history.times for s in self.series])
+        temperatures = np.concatenate([s.history.temperature() for s in self.series])
+        if key == "time":
+            frames = np.unique(times)
+            return 0.5 * (frames[1:] + frames[:-1])
+        if key == "T_k":
+            low, high = np.quantile(temperatures, [0.05, 0.95])
+        if key == "half_width":
+            high = min(high, 0.5 * float(np.ptp(temperatures)))
+        if key == "P":
+            span = float(np.ptp(times))
+            # equal steps in frequency, fine enough that no period is jumped over
+            return 1.0 / np.arange(1.5 / span, 1.0 / (2.2 * _interval(times)), 0.4 / span)
+        if key in ("tau",):
+            high = min(high, 2.0 * float(np.ptp(times)))
+        return np.geomspace(low, high, _GRID) if log else np.linspace(low, high, 2 * _GRID)
+
+    def defocus(self, state: _State) -> _State:
+        """The noise factor per kelvin from each epoch's own misfit, by weighted least squares."""
+        rise, spread, count = [], [], []
+        for k, s in enumerate(self.series):
+            warm = s.history.temperature() - state.model.T0
+            delta = s.corrections(state.of_series(k).predict(s.history, s.field))
+            # each epoch's own parameters take up what the temperature's error does
+            rest = s.b - np.einsum("eij,ej->ei", s.N, delta)
+            N, own = s.N[:, :3, :3], rest[:, :3]
+            cost = s.lPl - 2 * np.sum(s.b * delta, 1) + np.einsum("ei,eij,ej->e", delta, s.N, delta)
+            cost -= np.einsum("ei,ei->e", own, np.linalg.solve(N, own[..., None])[..., 0])
+            rise.append(warm)
+            spread.append(np.sqrt(np.maximum(cost, 0.0) / (2.0 * s.count - 3.0)))
+            count.append(2.0 * s.count - 3.0)
+        x, y, n = np.concatenate(rise), np.concatenate(spread), np.concatenate(count)
+        A = np.stack([np.ones_like(x), x], axis=1)
+        factor = np.ones_like(x)
+        for _ in range(5):
+            w = 2.0 * n / (y.mean() * factor) ** 2
+            cofactor = np.linalg.inv(A.T @ (w[:, None] * A))
+            level, slope = cofactor @ (A.T @ (w * y))
+            factor = np.maximum(1.0 + slope / level * x, 0.1)
+            w = 2.0 * n / (level * factor) ** 2
+        cofactor = np.linalg.inv(A.T @ (w[:, None] * A))
+        lever = np.array([-slope / level**2, 1.0 / level])
+        sd = float(np.sqrt(lever @ cofactor @ lever))
+        found = ModelEffect("defocus", {"factor": float(slope / level)}, {"factor": sd})
+        ends = np.cumsum([len(s) for s in self.series])
+        self.noise = list(np.split(factor, ends[:-1]))
+        listed = tuple(found if e.name == "defocus" else e for e in state.model.effects)
+        return replace(state, model=replace(state.model, effects=listed))
+
+    def result(self, state: _State) -> FittedModel:
+        """The model with standard deviations, the test field's coordinates included."""
+        names = state.names
+        covariance = self.Q + self._field_covariance(state)
+        sd = dict(zip(names, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True))
+        listed = tuple(_with_sds(e, sd, self.series) for e in state.model.effects)
+        kept = [i for i, n in enumerate(names) if not n.startswith("exterior.")]
+        sigma = float(np.sqrt(self.variance))
+        stated = np.concatenate([s.grid.weights[s.grid.observed][:, 0] for s in self.series])
+        fits = tuple(
+            SeriesFit(s.name, len(s), _rms(s, state.of_series(k)), self.error_sds[k])
+            for k, s in enumerate(self.series)
+        )
+        channels = dict.fromkeys(c for s in self.series for c in s.history.readings)
+        model = replace(
+            state.model,
+            effects=listed,
+            exterior=ExteriorOrientation.from_array(state.exteriors[0]),
+            image_sigma=sigma / float(np.sqrt(np.median(stated))),
+            sds={n: s for n, s in sd.items() if n.split(".")[0] in ("interior", "rates")},
+            covariance_names=tuple(names[i] for i in kept),
+            covariance=tuple(tuple(row) for row in covariance[np.ix_(kept, kept)].tolist()),
+            validity={c: _span(self.series, c) for c in channels},
+            fitted_on=tuple(
+                {"series": s.name, "recording": s.source, "epochs": len(s),
+                 "rms_px": round(f.rms_px, 5), "thermometer_sd_K": round(f.thermometer_sd, 5)}
+                for s, f in zip(self.series, fits, strict=True)
+            ),
+            version=1,
+        )  # fmt: skip
+        return FittedModel(model, tuple(names), covariance, sigma, fits)
+
+    def _field_covariance(self, state: _State) -> Array:
+        """Q K Σ Kᵀ Q: what errors of the targets' coordinates do to the unknowns."""
+        field = self.series[0].field
         p = len(state.names)
-        M, g = np.zeros((p, p)), np.zeros(p)
-        for part in parts:
-            M[np.ix_(part.columns, part.columns)] += part.M
-            g[part.columns] += part.g
-        Q = _inverse(M)
-        step = Q @ g
-        size = float(np.max(np.abs(step) / np.sqrt(np.maximum(np.diag(Q), 1e-300))))
-        cost = sum(part.cost for part in parts)
-        for k, part in enumerate(parts):
-            if part.error_redundancy > 1:
-                floor = [r / np.sqrt(12.0) * 0.5 for r in series[k].resolution.values()]
-                found = np.sqrt(float(part.errors @ part.errors) / part.error_redundancy)
-                thermometers[k] = max(found, max(floor, default=0.0), 1e-3)
-        redundancy = n - p - sum(part.error_redundancy for part in parts)
-        image = sum(part.image_cost for part in parts)
-        previous, variance = variance, image / max(n - p - sum(len(q.errors) - q.error_redundancy for q in parts), 1.0)
-        del redundancy, cost, best
-        best = image
-        state = state.moved(step)
-        if size < _CONVERGED and abs(variance / previous - 1) < 1e-3:
-            break
-    return state, [parts, variance, thermometers, Q]
+        lever = np.zeros((p, len(field) * 3))
+        for k, (s, part) in enumerate(zip(self.series, self.shares, strict=True)):
+            at = linearise(s.sensor, s.field, s.start[:10], s.start[10:])
+            weight = s.grid.weights[..., 0] / self.variance
+            if self.noise[k] is not None:
+                weight = weight / self.noise[k][:, None] ** 2  # type: ignore[index]
+            J = part.J[:, :16]
+            sums = np.tensordot(weight, J, axes=(0, 0))  # (T, 16, q)
+            A = np.einsum("tcp,tpq->tcq", at.A, sums)
+            lever[state.columns(k)] += np.einsum("tcq,tcx->qtx", A, at.B).reshape(J.shape[2], -1)
+        moved = self.Q @ (lever * field.sigmas.ravel())
+        result: Array = moved @ moved.T
+        return result
+
+
+def _interval(times: Array) -> float:
+    steps = np.diff(np.unique(times))
+    return float(np.median(steps[steps > 1e-3]))
+
+
+def _span(series: list[ModelSeries], channel: str) -> tuple[float, float]:
+    readings = [s.history.readings[channel] for s in series if channel in s.history.readings]
+    values = np.concatenate(readings)
+    return round(float(np.nanmin(values)), 2), round(float(np.nanmax(values)), 2)
+
+
+def _rms(series: ModelSeries, model: ThermalModel) -> float:
+    residuals = series.residuals(model.predict(series.history, series.field))
+    return float(np.sqrt(np.nanmean(residuals**2)))
+
+
+def _with_sds(effect: ModelEffect, sd: dict[str, float], series: list[ModelSeries]) -> ModelEffect:
+    if effect.name == "defocus":
+        return effect
+    found = {k: sd[f"{effect.name}.{k}"] for k in effect.values if f"{effect.name}.{k}" in sd}
+    values = dict(effect.values)
+    if "phase" in values:
+        values["phase"] = float(np.angle(np.exp(1j * values["phase"])))
+    if "time" in values:
+        # an instant between two frames: uniform over the interval
+        found["time"] = _interval(series[0].history.times) / np.sqrt(12.0)
+    return ModelEffect(effect.name, values, found)
+
+
+def _inverse(M: Array) -> Array:
+    """The inverse of a normal matrix whose unknowns differ by powers of ten."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(M), 1e-300))
+    scaled = M * np.outer(scale, scale)
+    values, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))
+    # directions that the data do not fix stay where they are
+    inverse = np.where(values > 1e-13 * values.max(), 1.0 / np.maximum(values, 1e-300), 0.0)
+    result: Array = (vectors * inverse) @ vectors.T * np.outer(scale, scale)
+    return result

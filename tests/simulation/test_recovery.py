@@ -1,0 +1,124 @@
+"""Every effect's parameters are found again in a noisy recording of it, within 3 sd.
+
+The recording is written and read as a user's would be: 0.04 px image noise, 2 % of targets missed,
+0.2 % gross errors, a thermometer of 0.04 K noise and 0.0625 K steps read up to 1 s beside the
+frame. The fit is the one users have (`analysis.thermal_model`), which searches the non-linear
+parameters over their whole range; start values are not given to it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from thermocald.analysis.model_series import model_series
+from thermocald.analysis.thermal_model import fit_thermal_model
+from thermocald.simulation import effects
+from thermocald.simulation.course import Course
+from thermocald.simulation.demonstration import demonstration_field, demonstration_model
+from thermocald.simulation.device import CameraDevice, default_heat
+from thermocald.simulation.model import ModelEffect
+from thermocald.simulation.observations import Simulation
+from thermocald.simulation.programme import Programme
+from thermocald.store.recording import read_recording
+
+PX = 0.00112
+
+# effect: true values of about a third of a pixel, and what the fit is told beforehand
+CASES = {
+    "thermal_lag": ({"tau": 84.0}, {"tau": 10.0}),
+    "time_offset": ({"d": 12.0}, {"d": 0.0}),
+    "hysteresis": ({"half_width": 0.8}, {"half_width": 0.1}),
+    "nonlinear_expansion": ({"c": 1e-6, "x0": 4e-6, "y0": -3e-6}, {}),
+    "softening": ({"T_k": 36.0, "c": 2e-5, "x0": 8e-5, "y0": 4e-5}, {"T_k": 25.0}),
+    "thermal_gradient": ({"c": 2e-3, "x0": 8e-3, "y0": -5e-3}, {}),
+    "permanent_set": ({"c": 1e-5, "x0": 4e-5, "y0": 3e-5}, {}),
+    "self_heating": ({"tau": 260.0, "c": 2e-4, "x0": 6e-4, "y0": -4e-4}, {"tau": 1000.0}),
+    "creep": ({"c": 1e-7, "x0": 4e-7, "y0": -2e-7}, {}),
+    "slip": ({"time": 803.0, "c": 1e-4, "x0": 6e-4, "y0": 2e-4}, {"time": 100.0}),
+    "cyclic_interference": (
+        {"P": 143.0, "phase": 0.9, "c": 5e-5, "x0": 4e-4, "y0": -2e-4},
+        {"P": 30.0, "phase": 0.0},
+    ),
+    "second_heat_source": (
+        {"channel": "board_temperature", "c": 2e-5, "x0": 8e-5, "y0": -5e-5},
+        {"channel": "board_temperature"},
+    ),
+    "defocus": ({"factor": 0.08}, {}),
+    "housing_tilt": ({"omega": 4e-6, "phi": -6e-6, "kappa": 3e-6}, {}),
+    "radial_distortion_drift": ({"A1": 6e-6}, {}),
+    "decentering_drift": ({"B1": 4e-6, "B2": -3e-6}, {}),
+    "affinity_drift": ({"C1": 6e-6, "C2": -4e-6}, {}),
+    "test_field_expansion": ({"X": 1.2e-5, "Y": 2e-5, "Z": -1e-5}, {}),
+    "target_displacement": (
+        {"time": 905.0, "targets": ("x33", "y52"), "dX": 0.15, "dY": -0.1, "dZ": 0.2},
+        {"time": 100.0, "targets": ("x33", "y52")},
+    ),
+}
+
+
+def record(tmp_path, effect, seed=7):
+    """A lamp twice on and off, 180 epochs of 10 s."""
+    field = demonstration_field("plain")
+    model = demonstration_model(field).with_effect(effect)
+    network, thermometers = default_heat()
+    device = CameraDevice("rpi", model.sensor, network, thermometers)
+    lamp = Course.steps([0, 100, 600, 1000, 1400, 1e4], [0.0, 12.0, 0.0, 15.0, 0.0])
+    board = Course.steps([0, 300, 500, 900, 1300, 1e4], [0.5, 3.0, 0.5, 4.0, 1.0])
+    programme = Programme(
+        "lamp", 180, 10.0, {"ambient": Course.constant(23.0)}, {"housing": lamp, "board": board}
+    )
+    simulation = Simulation(model, device, field, programme, seed)
+    simulation.write(tmp_path / "M1")
+    return simulation, read_recording(tmp_path / "M1")
+
+
+def test_every_effect_is_here():
+    assert set(CASES) == set(effects.names())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_parameters_are_found_again(tmp_path, name):
+    true, known = CASES[name]
+    simulation, recording = record(tmp_path, ModelEffect(name, true))
+    targets = true.get("targets", ())
+    series = model_series(recording, keep_targets=targets)
+    kind = effects.get(name)
+    start = {**dict.fromkeys(kind.usual, 0.0), **known}
+    fitted = fit_thermal_model([series], [ModelEffect(name, start)], T0=simulation.model.T0)
+    (found,) = fitted.model.effects
+    for key, value in true.items():
+        if isinstance(value, str | tuple):
+            continue
+        sd = found.sds[key]
+        assert 0 < sd < np.inf
+        # an event lies anywhere between two frames: ± half an interval, √12/2 of its sd
+        limit = np.sqrt(3.0) * sd * (1 + 1e-9) if key == "time" else 3 * sd
+        assert abs(found.values[key] - value) <= limit, (key, found.values[key], value, sd)
+    for key in ("c", "x0", "y0"):
+        error = fitted.model.rates[key] - simulation.model.rates[key]
+        assert abs(error) < 3 * fitted.sd(f"rates.{key}"), key
+    assert abs(fitted.sigma0 - 1.0) < 0.03 or name == "defocus"
+
+
+def test_a_lag_is_found_again(tmp_path):
+    """The quick one of the above."""
+    true = ModelEffect("thermal_lag", {"tau": 84.0})
+    simulation, recording = record(tmp_path, true, seed=11)
+    series = model_series(recording)
+    fitted = fit_thermal_model(
+        [series], [ModelEffect("thermal_lag", {"tau": 10.0})], T0=simulation.model.T0
+    )
+    (found,) = fitted.model.effects
+    assert abs(found.values["tau"] - 84.0) < 3 * found.sds["tau"] < 10.0
+    # the thermometer's noise and steps together, from the image points alone: a lag of 8 epochs
+    # lets some 180 / 8 independent values of it through, so 3 sd are 45 %
+    assert abs(fitted.series[0].thermometer_sd / np.hypot(0.04, 0.0625 / 12**0.5) - 1) < 0.45
+    exact = replace(simulation.model, exterior=simulation.exterior)
+    predicted = fitted.model.predict(simulation.true_history)
+    truth = exact.predict(simulation.true_history)
+    drift = lambda p: p.iop[:, 1:3] - p.iop[0, 1:3]  # noqa: E731
+    assert np.abs(drift(predicted) - drift(truth)).max() < 0.05 * PX

@@ -15,7 +15,7 @@ from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera_model import PARAMETER_NAMES, partials, project
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
     from numpy.typing import NDArray
 
@@ -178,13 +178,13 @@ def cofactor_root(N: Array, unknowns: NDArray[np.int64], damping: float = 0.0) -
 
 
 def solve(problem: Problem, start: Array, use: Mask) -> Solution:
-    """Gauss-Newton, with Levenberg-Marquardt damping only where a step does not improve.
+    """Gauss-Newton, with shorter or damped steps only where a whole one does not improve.
 
     start (16,); use (n,) the observations that take part. The last step re-uses the partials: a
     warm epoch needs them once. Raises NoConvergenceError, GeometryError.
     """
     u, sensor = problem.unknowns, problem.sensor
-    values, damping = start, 0.0
+    values = start
     observed = problem.observations.points.T
     for _ in range(_ITERATIONS):
         predicted, A, B = partials(sensor, values[:10], values[10:], problem.points)
@@ -200,26 +200,40 @@ def solve(problem: Problem, start: Array, use: Mask) -> Solution:
         root = cofactor_root(N, u)
         cost = problem.cost(vu, values)
         gradient = problem.gradient(flat, vu, values)
-        while True:
-            damped = root if damping == 0 else cofactor_root(N, u, damping)
+        for step, whole in _trial_steps(N, u, root, gradient):
             trial = values.copy()
-            trial[u] += damped @ (damped.T @ gradient)
+            trial[u] += step
             residuals = observed - project(sensor, trial[:10], trial[10:], problem.points).T
             v = _whiten(covariance, residuals)
             _, vu = _used(None, v, use)
             new = problem.cost(vu, trial)
             if np.isfinite(new) and new <= cost * (1 + 1e-9) + 1e-12:
                 break
-            damping = max(10 * damping, 1e-3)
-            if damping > 1e9:
-                raise NoConvergenceError("the adjustment does not converge from its start values")
-        damping = 0.0 if damping <= 1e-3 else damping / 10
+        else:
+            raise NoConvergenceError("the adjustment does not converge from its start values")
         values = trial
         gradient = problem.gradient(flat, vu, values)
         half = root.T @ gradient
-        if damping == 0 and float(half @ half) < _CONVERGED**2:
+        if whole and float(half @ half) < _CONVERGED**2:
             return _moved(Solution(values, J, v, rows, residuals, root), u, root @ half)
     raise NoConvergenceError(f"the adjustment did not converge in {_ITERATIONS} iterations")
+
+
+def _trial_steps(
+    N: Array, u: NDArray[np.int64], root: Array, gradient: Array
+) -> Iterator[tuple[Array, bool]]:
+    """Steps to try in turn, and whether each is the whole Gauss-Newton step.
+
+    First along its direction, which follows the narrow valleys of correlated parameters, then
+    damped (Levenberg-Marquardt).
+    """
+    whole = root @ (root.T @ gradient)
+    yield whole, True
+    for shortened in (0.5, 0.25, 0.1, 0.03):
+        yield shortened * whole, False
+    for damping in (1e-6, 1e-4, 1e-2, 1.0, 1e2, 1e4, 1e6):
+        damped = cofactor_root(N, u, damping)
+        yield damped @ (damped.T @ gradient), False
 
 
 def resolve(problem: Problem, solution: Solution, use: Mask) -> Solution:

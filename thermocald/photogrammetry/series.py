@@ -69,7 +69,7 @@ class SeriesSettings:
     free: tuple[str, ...] = DEFAULT_FREE
     target_offsets: bool = True
     target_noise: bool = True
-    snooping_alpha: float = 0.001
+    snooping_alpha: float = 0.002
     max_rejected: float = 0.35
     scale: Literal["posterior", "prior"] = "posterior"
     bounds: GeometryBounds = field(default_factory=GeometryBounds)

@@ -30,6 +30,7 @@ _SIGNIFICANT = 4.6  # correlations of n pairs below 4.6/√n are noise: 1e-5 two
 _FEWEST_PAIRS = 40
 _LEAST_CORRELATION = 0.3
 _SMOOTH = 15  # epochs
+_CLIP = 60.0  # times the median square: beyond it is no scatter but a jump
 _LARGEST_GROUP = 8  # targets: more hang together by chance or by something that is no noise
 
 
@@ -125,7 +126,7 @@ def excess_scatter(values: Array, variances: Array) -> Array:
 
     values, variances (E, k) of consecutive epochs. The smooth course is a local cubic over 15
     epochs, which leaves a drift with a time constant of 30 epochs its thousandth; 0 where the
-    excess is not significant (3 sd).
+    excess is not significant (5 %).
     """
     half = _SMOOTH // 2
     if len(values) < 2 * _SMOOTH:
@@ -138,7 +139,8 @@ def excess_scatter(values: Array, variances: Array) -> Array:
     left = 1.0 - smooth[half]
     normed = residual**2 / left / variances[inner]
     n = len(normed)
-    ratio = np.median(normed, axis=0) / _MEDIAN_CHI2_1
-    significant = ratio > 1 + 3 * np.sqrt(2 / (0.37 * left * n))
+    # Epochs in which a passer-by hides half of the targets scatter more than others, and count.
+    ratio = np.minimum(normed, _CLIP * np.median(normed, axis=0)).mean(axis=0)
+    significant = ratio > 1 + 1.65 * np.sqrt(2 / (left * n))
     excess: Array = np.where(significant, (ratio - 1) * variances.mean(axis=0), 0.0)
     return excess

@@ -19,7 +19,7 @@ from thermocald.errors import GeometryError
 from thermocald.photogrammetry import ring_code
 from thermocald.photogrammetry.camera_model import CameraModel, Sensor
 from thermocald.photogrammetry.circle import fit_circles
-from thermocald.photogrammetry.detection import Candidates, find_circles, read_codes
+from thermocald.photogrammetry.detection import Candidates, find_circles
 from thermocald.photogrammetry.frame_status import OK, FrameStatus, inspect_frame
 from thermocald.photogrammetry.identification import Orientation, orient, refine
 from thermocald.photogrammetry.markers import (
@@ -33,6 +33,7 @@ from thermocald.photogrammetry.markers import (
 )
 from thermocald.photogrammetry.outline import LocalMap, local_maps
 from thermocald.photogrammetry.planes import field_normals
+from thermocald.photogrammetry.ring_reading import read_codes
 from thermocald.photogrammetry.testfield import Observations
 
 if TYPE_CHECKING:

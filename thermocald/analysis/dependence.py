@@ -119,16 +119,19 @@ def correlation_matrix(columns: Sequence[Array]) -> Array:
     """
     k = len(columns)
     matrix = np.full((k, k), np.nan)
+    finite = [np.isfinite(column) for column in columns]
+    whole = [bool(f.all()) for f in finite]
     for i in range(k):
         for j in range(i, k):
-            both = np.isfinite(columns[i]) & np.isfinite(columns[j])
-            if np.count_nonzero(both) < 3:
+            a, b = columns[i], columns[j]
+            if not (whole[i] and whole[j]):
+                both = finite[i] & finite[j]
+                a, b = a[both], b[both]
+            if len(a) < 3 or not (np.ptp(a) > 0 and np.ptp(b) > 0):
                 continue
-            a, b = columns[i][both], columns[j][both]
             a, b = a - a.mean(), b - b.mean()
-            scale = float(np.sqrt(np.dot(a, a) * np.dot(b, b)))
-            if scale > 0:
-                matrix[i, j] = matrix[j, i] = np.clip(np.dot(a, b) / scale, -1.0, 1.0)
+            r = np.dot(a, b) / np.sqrt(np.dot(a, a) * np.dot(b, b))
+            matrix[i, j] = matrix[j, i] = np.clip(r, -1.0, 1.0)
     return matrix
 
 

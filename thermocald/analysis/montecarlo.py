@@ -88,7 +88,9 @@ def draw_root(sds: Array, correlation: Array) -> Array:
     free = np.flatnonzero(sds > 0)
     r = correlation[np.ix_(free, free)]
     values, vectors = np.linalg.eigh(0.5 * (r + r.T))
-    factor = vectors * np.sqrt(np.maximum(values, 0.0))
+    # The symmetric root: unlike other roots it hangs neither on the signs nor on the order of the
+    # eigenvectors, so that nearly the same matrix gives nearly the same draws.
+    factor = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
     factor /= np.linalg.norm(factor, axis=1, keepdims=True)
     root = np.zeros((len(free), len(sds)))
     root[:, free] = (factor * sds[free, None]).T

@@ -247,7 +247,7 @@ def _significance(
             float(np.median(test.degrees_sd)),
             float(np.median(test.critical)),
             float(np.median(test.ratio)),
-            course[:: max(1, -(-len(course) // _COURSE))],
+            course[:: max(1, -(-len(course) // _COURSE))].copy(),
             drift,
         )
     return result
@@ -256,7 +256,9 @@ def _significance(
 def _channel(series: MeasuredSeries, thermometer: Thermometer) -> ChannelStudy:
     """All parameters against one thermometer, or why there is nothing to say."""
     name, sd = thermometer.name, thermometer.sd
-    have = np.isfinite(thermometer.values)
+    finite = np.isfinite(thermometer.values)
+    # No copies of a year of epochs where none is missing.
+    have = slice(None) if finite.all() else finite
     t = thermometer.values[have]
     reason = ""
     if len(t) < _LEAST_DEPENDENCE:

@@ -129,8 +129,9 @@ def sds_over_time(series: Sequence[MeasuredSeries]) -> Array:
     squares, degrees = np.zeros(10), 0
     for one in series:
         if len(one) > 1:
-            held = np.array([name not in one.free for name in IOP_NAMES])
-            squares += np.where(held, 0.0, np.var(one.values, axis=0) * len(one))
+            for name in one.free:
+                k = IOP_NAMES.index(name)
+                squares[k] += np.var(one.values[:, k]) * len(one)
             degrees += len(one) - 1
     return np.asarray(np.sqrt(squares / max(degrees, 1)))
 

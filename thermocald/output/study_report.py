@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from thermocald import __version__
+from thermocald.errors import DataError
 from thermocald.output import study_figures as figures
 from thermocald.output import study_tables as tables
 from thermocald.output.clips import clip_png, cut_clip, data_uri
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from thermocald.analysis.study import CameraStudy, Study
     from thermocald.output.study_tables import Table
 
-__all__ = ["render_report", "save_figures"]
+__all__ = ["render_report", "save_figures", "write_report"]
 
 _TEMPLATES = Path(__file__).parent / "templates"
 _CLIP_PX = 96
@@ -102,6 +103,17 @@ def render_report(study: Study, title: str = "Thermal study of a camera") -> str
     )
 
 
+def write_report(path: Path, html: str) -> None:
+    """Write the file whole or not at all; DataError if it cannot be."""
+    temporary = path.with_name(f".{path.name}.part")
+    try:
+        temporary.write_text(html, encoding="utf-8")
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise DataError(f"{path}: the report cannot be written: {error.strerror}") from None
+
+
 def _packed(script: str) -> str:
     """A script as base64 of its gzip: a third of the size, unpacked by the reader's browser."""
     return base64.b64encode(gzip.compress(script.encode(), 9, mtime=0)).decode("ascii")
@@ -109,7 +121,10 @@ def _packed(script: str) -> str:
 
 def save_figures(study: Study, folder: Path) -> list[Path]:
     """Every figure as SVG and PNG in `folder`, which is made; returns the files."""
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"{folder}: the figures cannot be written: {error.strerror}") from None
     paths = []
     for camera in study.cameras:
         prefix = _file_name(camera.label) + "-" if len(study.cameras) > 1 else ""

@@ -1,0 +1,223 @@
+"""`thermocald study`: statistics, significance, Monte-Carlo, and the report of measured series."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from thermocald.errors import DataError, UsageError
+
+if TYPE_CHECKING:
+    from thermocald.analysis.measured import MeasuredSeries
+    from thermocald.analysis.reference import Comparison
+    from thermocald.analysis.study import Study, StudySettings
+
+__all__ = ["register"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("study")(study)
+
+
+def study(
+    inputs: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[LABEL=]RECORDING_OR_STORE…",
+            help="Recordings (folders) and stores (files). Series with one label are one camera; "
+            "the label is the camera's name unless given.",
+        ),
+    ] = None,
+    json: Annotated[
+        str | None, typer.Option("--json", help="Write all numbers as JSON; - for standard output.")
+    ] = None,
+    report: Annotated[
+        Path | None, typer.Option("--report", help="Write the report, one HTML file.")
+    ] = None,
+    figures: Annotated[
+        Path | None, typer.Option("--figures", help="Write all figures as SVG and PNG here.")
+    ] = None,
+    title: Annotated[
+        str, typer.Option("--title", help="Of the report.")
+    ] = "Thermal study of a camera",
+    window: Annotated[
+        int, typer.Option("--window", min=3, help="Epochs in the F-test's window, odd.")
+    ] = 31,
+    alpha: Annotated[
+        float, typer.Option("--alpha", min=1e-6, max=0.5, help="Level of the F-test.")
+    ] = 0.05,
+    sets: Annotated[
+        int, typer.Option("--sets", min=2, help="Interior orientations drawn (Monte-Carlo).")
+    ] = 50_000,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of all random numbers.")] = 0,
+    distance: Annotated[
+        float, typer.Option("--distance", min=0.01, help="Of the object plane, m.")
+    ] = 10.0,
+    raster: Annotated[
+        int, typer.Option("--raster", min=2, max=9, help="Image points per row and column.")
+    ] = 3,
+    focus: Annotated[
+        float, typer.Option("--focus", min=0.01, help="Focus distance for the depth of field, m.")
+    ] = 1.0,
+    f_number: Annotated[float, typer.Option("--f-number", min=0.1, help="Of the lens.")] = 2.0,
+    confusion: Annotated[
+        float | None,
+        typer.Option("--confusion", min=1e-6, help="Circle of confusion, mm [diagonal/2000]."),
+    ] = None,
+    thermometer_sd: Annotated[
+        float | None,
+        typer.Option("--thermometer-sd", min=0.0, help="Noise of the thermometers, K [estimated]."),
+    ] = None,
+    reference: Annotated[
+        bool,
+        typer.Option("--reference", help="Study the presets instead, beside the reference study."),
+    ] = False,
+) -> None:
+    """How the camera changes with its temperature, whether that is significant, what it does.
+
+    Example: thermocald study M1 M2 --report study.html --json study.json
+    """
+    from thermocald.analysis.study import StudySettings
+
+    if reference == bool(inputs):
+        raise UsageError(
+            "give recordings or stores to study, or --reference"
+            if not inputs
+            else "--reference studies the presets; give no recordings with it"
+        )
+    if window % 2 == 0:
+        raise UsageError(f"--window is {window}; it must be odd, so that it has a centre")
+    settings = StudySettings(
+        window=window,
+        alpha=alpha,
+        sets=sets,
+        seed=seed,
+        distance_mm=1000 * distance,
+        raster=raster,
+        focus_mm=1000 * focus,
+        f_number=f_number,
+        confusion_mm=confusion,
+        thermometer_sd=thermometer_sd,
+    )
+    # Refused before the work, not after it.
+    for path in (report, figures):
+        if path is not None and not path.resolve().parent.is_dir():
+            raise UsageError(f"{path}: the folder {path.resolve().parent} does not exist")
+    comparisons: list[Comparison] = []
+    if reference:
+        result, comparisons = _reference(settings)
+    else:
+        result = _study(inputs or [], settings)
+    _write(result, comparisons, json, report, figures, title)
+
+
+def _study(inputs: list[str], settings: StudySettings) -> Study:
+    from thermocald.analysis.study import study as run
+    from thermocald.cli.common import progress
+
+    series: list[MeasuredSeries] = []
+    with progress(len(inputs), "reading and adjusting") as advance:
+        for text in inputs:
+            series += _load(text, settings.thermometer_sd)
+            advance(1)
+    cameras = len({one.label for one in series})
+    with progress(settings.sets * cameras, "simulating") as advance:
+        return run(series, settings, advance)
+
+
+def _load(text: str, thermometer_sd: float | None) -> list[MeasuredSeries]:
+    from thermocald.analysis.study_input import load_series
+
+    label, equals, rest = text.partition("=")
+    # A path may hold "="; what exists as it stands is a path.
+    if not equals or Path(text).exists():
+        label, rest = "", text
+    path = Path(rest)
+    if not path.exists():
+        raise DataError(f"{path}: does not exist; give a recording (folder) or a store (file)")
+    return load_series(path, label or None, thermometer_sd)
+
+
+def _reference(settings: StudySettings) -> tuple[Study, list[Comparison]]:
+    from thermocald.analysis.reference import QUOTED, SERIES, compare, reference_studies
+    from thermocald.analysis.study import Study
+    from thermocald.cli.common import progress
+
+    with progress(len(QUOTED) * len(SERIES), "simulating, adjusting, studying") as advance:
+        cameras = reference_studies(settings, advance=advance)
+    return Study(settings, tuple(cameras)), [c for camera in cameras for c in compare(camera)]
+
+
+def _write(
+    result: Study,
+    comparisons: list[Comparison],
+    json: str | None,
+    report: Path | None,
+    figures: Path | None,
+    title: str,
+) -> None:
+    from thermocald.cli.common import write_json
+    from thermocald.output.study_document import study_document
+
+    if json is not None:
+        document = study_document(result)
+        if comparisons:
+            document["reference"] = [_comparison(c) for c in comparisons]
+        write_json(document, json)
+    written = []
+    if report is not None:
+        from thermocald.output.study_report import render_report, write_report
+
+        write_report(report, render_report(result, title))
+        written.append(str(report))
+    if figures is not None:
+        from thermocald.output.study_report import save_figures
+
+        written.append(f"{len(save_figures(result, figures))} figures in {figures}")
+    if json == "-":
+        return
+    if comparisons:
+        _print_comparisons(comparisons)
+    else:
+        _print_summary(result)
+    for line in written:
+        typer.echo(f"written: {line}")
+
+
+def _comparison(c: Comparison) -> dict[str, Any]:
+    return {
+        "camera": c.camera,
+        "quantity": c.quantity,
+        "unit": c.unit,
+        "reference": c.text,
+        "ours": c.ours,
+        "reproduced": c.reproduced,
+    }
+
+
+def _print_comparisons(comparisons: list[Comparison]) -> None:
+    """Reference beside ours, one line per figure."""
+    typer.echo(f"{'camera':18}{'quantity':42}{'reference':>10}{'ours':>10}  reproduced")
+    for c in comparisons:
+        unit = f" {c.unit}" if c.unit else ""
+        typer.echo(
+            f"{c.camera:18}{c.quantity + unit:42}{c.text:>10}{c.ours:>10.4g}  "
+            f"{'yes' if c.reproduced else 'NO'}"
+        )
+
+
+def _print_summary(result: Study) -> None:
+    from thermocald.output.study_summary import summary
+
+    for camera in result.cameras:
+        typer.echo(camera.label)
+        for sentence in summary(camera):
+            typer.echo(f"  {sentence}")
+        for study_of_series in camera.series:
+            for note in study_of_series.notes:
+                typer.echo(f"  note, {study_of_series.series.name}: {note}")
+        for note in camera.notes:
+            typer.echo(f"  note: {note}")

@@ -1,0 +1,1 @@
+"""Acquisition: from devices to epochs, and from epochs to calibrated ones."""

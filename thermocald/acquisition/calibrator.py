@@ -1,0 +1,159 @@
+"""The calibrator of one camera before one test field: epochs in, adjusted epochs out.
+
+It keeps what one epoch knows for the next: where the targets are, and the orientation to start
+from. Without that, or when a start fails (a knock), it begins from nothing by itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.photogrammetry.adjustment import Adjustment, AdjustmentSettings, adjust, failed
+from thermocald.photogrammetry.cold_start import cold_start, pose_only
+from thermocald.photogrammetry.image_file import decode_grey
+from thermocald.photogrammetry.measurement import Prior
+from thermocald.photogrammetry.tracking import Tracker
+
+if TYPE_CHECKING:
+    from typing import Any
+
+    from numpy.typing import NDArray
+
+    from thermocald.epoch import Epoch
+    from thermocald.photogrammetry.camera_model import InteriorOrientation, Sensor
+    from thermocald.photogrammetry.testfield import Observations, TestField
+
+__all__ = ["CalibratedEpoch", "Calibrator"]
+
+_WRONG_START = 5.0  # times the usual sigma0: the camera has been knocked
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibratedEpoch:
+    """An epoch with its observations and its adjustment.
+
+    extra: columns for the store: `blur_px`, `contrast`, `grey`, `saturation` of the frame, medians
+    over the targets; searched: why the whole frame was searched, empty where it was not.
+    """
+
+    epoch: Epoch
+    adjustment: Adjustment
+    extra: dict[str, float]
+    searched: str = ""
+
+
+class Calibrator:
+    """Measures and adjusts the epochs of one camera, one after the other.
+
+    nominal_c mm: from the data sheet; interior: an earlier calibration, the start and the value of
+    what is held. sigma_floor_px: added in quadrature to the sigmas of image points.
+    """
+
+    def __init__(
+        self,
+        sensor: Sensor,
+        testfield: TestField,
+        settings: AdjustmentSettings | None = None,
+        *,
+        nominal_c: float | None = None,
+        interior: InteriorOrientation | None = None,
+        sigma_floor_px: float = 0.0,
+    ) -> None:
+        self.sensor = sensor
+        self.testfield = testfield
+        self.settings = settings or AdjustmentSettings()
+        self._nominal_c = nominal_c
+        self._interior = interior
+        self._floor = sigma_floor_px
+        self._tracker = Tracker(
+            testfield, Prior(sensor, interior=interior, principal_distance=nominal_c)
+        )
+        self._last: Adjustment | None = None
+        self._usual = float("nan")
+
+    def reset(self) -> None:
+        """Forget where the camera was."""
+        self._last = None
+        self._tracker.reset()
+
+    def calibrate(self, epoch: Epoch, image: NDArray[Any] | None = None) -> CalibratedEpoch:
+        """Measure the epoch's frame where that is still to be done, and adjust.
+
+        image: the frame as grey values; by default the file that the epoch names. Never raises for
+        data: an epoch without a result has a status and a reason.
+        """
+        extra: dict[str, float] = {}
+        searched = ""
+        observations = epoch.observations
+        if observations is None:
+            if image is None:
+                if epoch.frame is None:
+                    why = epoch.note or "neither a frame nor observations"
+                    return CalibratedEpoch(epoch, failed("no_frame", why), extra)
+                try:
+                    image = decode_grey(epoch.frame)
+                except ValueError as error:
+                    return CalibratedEpoch(epoch, failed("bad_frame", str(error)), extra)
+            measured = self._tracker.measure(image)
+            searched = measured.searched
+            observations = measured.observations
+            epoch = replace(epoch, observations=observations)
+            extra = _frame_figures(observations)
+            if not measured.status.ok:
+                bad = failed(measured.status.word, measured.status.reason, observations)
+                return CalibratedEpoch(epoch, bad, extra, searched)
+        return CalibratedEpoch(epoch, self.adjust(observations), extra, searched)
+
+    def adjust(self, observations: Observations) -> Adjustment:
+        """Adjust one epoch's observations, warm where the last epoch fits."""
+        if self._floor > 0:
+            sigmas = np.hypot(observations.sigmas, self._floor)
+            observations = replace(observations, sigmas=sigmas)
+        last = self._last
+        if last is not None and last.interior is not None and last.exterior is not None:
+            result = adjust(
+                self.sensor,
+                self.testfield,
+                observations,
+                last.interior,
+                last.exterior,
+                self.settings,
+            )
+            lost = {"no_convergence", "too_many_rejected"}
+            if result.status not in lost and not result.sigma0 > _WRONG_START * self._usual:
+                return self._keep(result)
+        return self._keep(self._cold(observations))
+
+    def _cold(self, observations: Observations) -> Adjustment:
+        if not self.settings.free and self._interior is not None:
+            return pose_only(
+                self.sensor, self.testfield, observations, self._interior, self.settings
+            )
+        return cold_start(
+            self.sensor,
+            self.testfield,
+            observations,
+            self.settings,
+            self._nominal_c,
+            self._interior,
+        )
+
+    def _keep(self, result: Adjustment) -> Adjustment:
+        if result.ok:
+            self._last = result
+            self._usual = result.sigma0
+        return result
+
+
+def _frame_figures(observations: Observations) -> dict[str, float]:
+    """Medians over the targets of what tells focus and light."""
+    names = {"blur": "blur_px", "contrast": "contrast", "grey": "grey", "saturation": "saturation"}
+    figures = {}
+    for quality, column in names.items():
+        values = observations.quality.get(quality)
+        if values is not None and np.isfinite(values).any():
+            figures[column] = float(np.nanmedian(values))
+    return figures

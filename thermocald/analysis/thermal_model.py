@@ -316,7 +316,7 @@ class _Fit:
         temperatures = np.concatenate([s.history.temperature() for s in self.series])
         if key == "time":
             frames = np.unique(times)
-            return 0.5 * (frames[1:] + frames[:-1])
+            return np.asarray(0.5 * (frames[1:] + frames[:-1]))
         if key == "T_k":
             low, high = np.quantile(temperatures, [0.05, 0.95])
         if key == "half_width":
@@ -324,10 +324,12 @@ class _Fit:
         if key == "P":
             span = float(np.ptp(times))
             # equal steps in frequency, fine enough that no period is jumped over
-            return 1.0 / np.arange(1.5 / span, 1.0 / (2.2 * _interval(times)), 0.4 / span)
+            frequencies = np.arange(1.5 / span, 1.0 / (2.2 * _interval(times)), 0.4 / span)
+            return np.asarray(1.0 / frequencies)
         if key in ("tau",):
             high = min(high, 2.0 * float(np.ptp(times)))
-        return np.geomspace(low, high, _GRID) if log else np.linspace(low, high, 2 * _GRID)
+        grid: Array = np.geomspace(low, high, _GRID) if log else np.linspace(low, high, 2 * _GRID)
+        return grid
 
     def defocus(self, state: _State) -> _State:
         """The noise factor per kelvin from each epoch's own misfit, by weighted least squares."""

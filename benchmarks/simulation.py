@@ -1,0 +1,108 @@
+"""The simulation's speed: a rendered frame against encoding it, a day of observations, an effect.
+
+Run: python -m benchmarks.simulation   (--check: exit status 1 where a bound is missed)
+Bounds: an 8 MP frame of 147 targets (blur, noise, vignetting) ≤ 4 × OpenCV's JPEG encoder at its
+usual quality (95) on the same frame; simplejpeg at its usual quality (85, which throws the noise
+away) stands beside it. 8,640 epochs × 147 targets ≤ 10 s, the CSV recording included.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import simplejpeg
+
+from thermocald.simulation import effects
+from thermocald.simulation.course import Course
+from thermocald.simulation.demonstration import demonstration_field, demonstration_model
+from thermocald.simulation.history import History
+from thermocald.simulation.presets import preset_simulation
+from thermocald.simulation.scene import Scene
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+FRAME_BOUND = 4.0
+DAY_BOUND_S = 10.0
+
+
+def best(run: Callable[[], object], rounds: int = 15) -> float:
+    times = []
+    for _ in range(rounds):
+        begin = time.perf_counter()
+        run()
+        times.append(time.perf_counter() - begin)
+    return min(times)
+
+
+def frames() -> bool:
+    passed = True
+    for kind in ("plain", "circles", "markers"):
+        field = demonstration_field(kind)
+        model = demonstration_model(field)
+        iop, eop = model.interior.as_array(), model.exterior.as_array()
+        scene = Scene(model.sensor, field)
+        image = scene.render(iop, eop)
+        pixels = np.ascontiguousarray(image[:, :, None])
+        rendered = best(partial(scene.render, iop, eop))
+        encoded = best(partial(cv2.imencode, ".jpg", image))
+        simple = best(partial(simplejpeg.encode_jpeg, pixels, colorspace="GRAY"))
+        print(
+            f"frame of {len(field)} targets ({kind}): {rendered * 1e3:.0f} ms, "
+            f"{rendered / encoded:.2f} × cv2.imencode, {rendered / simple:.2f} × simplejpeg"
+        )
+        if kind == "plain":
+            passed = rendered / encoded <= FRAME_BOUND
+    return passed
+
+
+def day() -> bool:
+    s = preset_simulation("rpi-v2.1-heating")
+    programme = replace(s.programme, epochs=8640, sources={"housing": Course.constant(4.0)})
+    s = replace(s, programme=programme)
+    with tempfile.TemporaryDirectory() as folder:
+        begin = time.perf_counter()
+        s.write(Path(folder) / "day")
+        took = time.perf_counter() - begin
+    print(f"a day at 10 s, {len(s.field)} targets, written: {took:.1f} s")
+    return took <= DAY_BOUND_S
+
+
+def courses() -> None:
+    print("an effect's time course, and its matrix of sensitivity (180 and 8,640 epochs), ms")
+    for name in effects.names():
+        effect = effects.get(name)
+        values = {k: p.default for k, p in effect.nonlinear.items() if not p.text}
+        values.pop("phase", None)
+        row = []
+        for epochs in (180, 8640):
+            t = np.arange(epochs) * 10.0
+            T = 25 + np.sin(t / 500)
+            history = History(t, t + 0.3, {"a": T, "b": T}, "a", 25.0)
+            row.append(best(lambda h=history, e=effect, v=values: e._course(h, **v), 5) * 1e3)
+            row.append(best(lambda h=history, e=effect, v=values: e.sensitivity(h, **v), 3) * 1e3)
+        print(f"  {name:<24}{row[0]:8.3f}{row[1]:8.3f}{row[2]:8.2f}{row[3]:8.2f}")
+
+
+def main() -> int:
+    cv2.setNumThreads(1)
+    passed = [frames(), day()]
+    courses()
+    return 0 if all(passed) or "--check" not in sys.argv else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

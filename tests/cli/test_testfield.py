@@ -1,0 +1,218 @@
+"""`thermocald testfield` and `thermocald camera` as a user runs them."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from tests.photogrammetry import network_cases as cases
+from thermocald.cli import camera, testfield
+from thermocald.errors import ConfigurationError, GeometryError, ThermocaldError, UsageError
+from thermocald.photogrammetry.camera_model import CameraModel, InteriorOrientation, Sensor
+from thermocald.photogrammetry.testfield import TestField
+from thermocald.simulation.scene import Scene
+from thermocald.store.testfield_file import read_testfield
+
+
+@pytest.fixture(scope="module")
+def run():
+    """Run a command; returns its result, raises what the program would report."""
+    app = typer.Typer()
+    testfield.register(app)
+    camera.register(app)
+
+    def call(*arguments):
+        result = CliRunner().invoke(app, [str(a) for a in arguments])
+        if isinstance(result.exception, ThermocaldError):
+            raise result.exception
+        return result
+
+    return call
+
+
+def test_print_writes_files_and_says_what_to_measure(run, tmp_path):
+    result = run("testfield", "print", "--paper", "A4", "--corner", "--out", tmp_path / "field")
+    assert result.exit_code == 0, result.output
+    assert sorted(p.name for p in (tmp_path / "field").iterdir()) == [
+        "testfield-1.svg", "testfield-2.svg", "testfield-3.svg", "testfield.csv", "testfield.pdf",
+    ]  # fmt: skip
+    assert result.stdout.count("for --scale R") == 3
+    field = read_testfield(tmp_path / "field" / "testfield.csv")
+    assert f"{sum(bool(c) for c in field.codes)} coded" in result.stdout
+
+
+def test_print_json_is_the_only_thing_on_standard_output(run, tmp_path):
+    result = run(
+        "testfield", "print", "--paper", "200x150", "--diameter", 5, "--markers",
+        "DICT_4X4_50", "--no-plain", "--out", tmp_path, "--json", "-",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    document = json.loads(result.stdout)
+    assert document["format"] == "thermocald-testfield-print/1"
+    assert document["plain"] == 0
+    assert document["markers"] > 0
+    assert document["targets"] == document["coded"] + 4 * document["markers"]
+
+
+def test_print_that_cannot_be_is_refused(run, tmp_path):
+    with pytest.raises(UsageError, match="smaller discs"):
+        run("testfield", "print", "--diameter", 100, "--out", tmp_path / "x")
+    assert run("testfield", "print", "--paper", "A4").exit_code == 2
+
+
+@pytest.fixture(scope="module")
+def photographs(run, tmp_path_factory):
+    """A printed A3 sheet, a little bent, as JPEG photographs in a folder."""
+    folder = tmp_path_factory.mktemp("survey")
+    run("testfield", "print", "--paper", "A3", "--landscape", "--diameter", 12, "--out", folder)
+    nominal = read_testfield(folder / "testfield.csv")
+    points = nominal.points.copy()
+    points[:, 2] = 3e-5 * (points[:, 0] - 200) ** 2
+    truth = TestField.build(
+        nominal.names, points, 0.0, nominal.diameters, nominal.kinds, nominal.codes
+    )
+    model = CameraModel(Sensor(1640, 1232, 0.00224), InteriorOrientation(3.05, 0.02, -0.01, -2e-3))
+    scene = Scene(model.sensor, truth)
+    (folder / "photos").mkdir()
+    for i, station in enumerate(cases.convergent_stations(points, 8, distance=440.0)):
+        frame = scene.render(model.interior.as_array(), station.as_array(), seed=i)
+        cv2.imwrite(str(folder / "photos" / f"{i}.jpg"), frame, [cv2.IMWRITE_JPEG_QUALITY, 95])
+    a, b = "R65", next(n for n, p in zip(truth.names, points, strict=True)
+                       if n.startswith("R") and p[0] > 300 and p[1] < 80)  # fmt: skip
+    length = np.linalg.norm(points[truth.index[a]] - points[truth.index[b]])
+    return folder, truth, model, (a, b, f"{length:.4f}")
+
+
+def test_survey_writes_the_field_and_everything_about_it(run, photographs, tmp_path):
+    folder, truth, model, scale = photographs
+    out, camera_file = tmp_path / "surveyed.csv", tmp_path / "camera.json"
+    result = run(
+        "testfield", "survey", folder / "photos", "--field", folder / "testfield.csv", "--scale",
+        *scale, "--scale-sd", 0.01, "--pixel-pitch", 0.00224, "--out", out, "--camera-out",
+        camera_file, "--json", tmp_path / "survey.json",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    assert "datum: inner constraints over" in result.stdout
+    surveyed = read_testfield(out)
+    known = truth.points[[truth.index[name] for name in surveyed.names]]
+    moved, _ = cases.onto(surveyed.points, known)
+    # JPEG: its errors are the image's, not the program's
+    assert np.sqrt(np.mean((moved - known) ** 2)) < 490 / 20_000
+    document = json.loads((tmp_path / "survey.json").read_text())
+    assert document["format"] == "thermocald-survey/1"
+    assert len(document["targets"]) == len(surveyed)
+    assert len(document["stations"]) == 8
+    first = document["targets"][0]
+    assert np.sqrt(np.diag(first["covariance"])) == pytest.approx(
+        [first["sd_X"], first["sd_Y"], first["sd_Z"]]
+    )
+    assert document["relative_accuracy"] < 1 / 20_000
+    assert document["camera"]["c"] == pytest.approx(model.interior.c, rel=2e-4)
+    from thermocald.output import camera_files
+
+    found = camera_files.read(camera_file)
+    assert found.model.interior.c == document["camera"]["c"]
+    assert found.covariance[0, 0] == pytest.approx(document["camera"]["sd_c"] ** 2)
+
+
+def test_survey_with_a_known_camera_held(run, photographs, tmp_path):
+    from thermocald.output import camera_files
+
+    folder, _, model, scale = photographs
+    camera_files.write(model, tmp_path / "camera.xml", "metashape")
+    (tmp_path / "distances.csv").write_text(
+        f"a,b,length,sigma\n{scale[0]},{scale[1]},{scale[2]},0.02\n"
+    )
+    result = run(
+        "testfield", "survey", *sorted((folder / "photos").glob("*.jpg")), "--distances",
+        tmp_path / "distances.csv", "--camera", tmp_path / "camera.xml", "--hold-camera", "--out",
+        tmp_path / "s.csv", "--json", "-",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    document = json.loads(result.stdout)
+    assert document["camera"]["free"] == []
+    assert document["camera"]["sd_c"] == 0.0
+    assert document["camera"]["c"] == model.interior.c
+    # without a nominal field: the coded targets alone
+    assert all(row["target"].startswith("R") for row in document["targets"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "reason"),
+    [
+        (["PHOTOS"], UsageError, "the scale is missing"),
+        (["PHOTOS", "--scale", "R65", "R65", "100"], UsageError, "is no distance"),
+        (["PHOTOS", "--scale", "R65", "R71", "-3"], UsageError, "is no distance"),
+        (["NOWHERE", "--scale", "R65", "R71", "100"], UsageError, "no such file"),
+        (["PHOTOS", "--scale", "R65", "X", "100"], GeometryError, "X"),
+        (["PHOTOS", "--scale", "R65", "R71", "100", "--hold-camera"], UsageError, "needs --camera"),
+        (["CSV", "--scale", "R65", "R71", "100"], ThermocaldError, "no picture"),
+    ],
+)
+def test_wrong_surveys_are_refused_and_write_nothing(
+    run, photographs, tmp_path, arguments, error, reason
+):
+    folder = photographs[0]
+    places = {"PHOTOS": folder / "photos", "NOWHERE": folder / "no.jpg",
+              "CSV": folder / "testfield.csv"}  # fmt: skip
+    out = tmp_path / "out.csv"
+    with pytest.raises(error, match=reason):
+        run("testfield", "survey", *(places.get(a, a) for a in arguments), "--out", out)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_wrong_distances_file_names_the_row(run, photographs, tmp_path):
+    (tmp_path / "d.csv").write_text("a,b,length,sigma\nR65,R71,100,0.1\nR65,R75,much,0.1\n")
+    with pytest.raises(UsageError, match=r"d\.csv, row 3"):
+        run("testfield", "survey", photographs[0] / "photos", "--distances", tmp_path / "d.csv",
+            "--out", tmp_path / "o.csv")  # fmt: skip
+
+
+def test_check_says_what_is_seen_and_what_to_add(run, photographs):
+    result = run("testfield", "check", photographs[0] / "testfield.csv")
+    assert result.exit_code == 0, result.output
+    assert "standard deviations in px" in result.stdout
+    assert "better: " in result.stdout
+    assert "one plane" in result.stdout
+    assert "Raspberry Pi camera v2.1" in result.stderr
+
+
+def test_check_json_from_a_place(run, photographs):
+    result = run(
+        "testfield", "check", photographs[0] / "testfield.csv", "--from", 700, 150, 400, "--roll",
+        20, "--json", "-",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    document = json.loads(result.stdout)
+    assert document["format"] == "thermocald-testfield-check/1"
+    assert document["epoch"]["sd_c"] is None  # a plane: nothing finite to say
+    assert document["series"]["sd_c"] > 0
+    assert document["station"]["X0"] == 700
+    assert len(document["visible"]) + len(document["hidden"]) == document["targets"]
+    with pytest.raises(GeometryError, match="visible from there"):
+        run("testfield", "check", photographs[0] / "testfield.csv", "--from", 200, 150, -400,
+            "--at", 200, 150, -900)  # fmt: skip
+
+
+def test_camera_convert(run, tmp_path):
+    model = CameraModel(Sensor(640, 480, 0.003), InteriorOrientation(2.0, 0.01, 0.02, -1e-2))
+    from thermocald.output import camera_files
+
+    camera_files.write(model, tmp_path / "a.cameramodel", "mrcal")
+    result = run("camera", "convert", tmp_path / "a.cameramodel", "--to", "colmap", "--out",
+                 tmp_path / "cameras.txt", "--json", "-")  # fmt: skip
+    assert result.exit_code == 0, result.output
+    document = json.loads(result.stdout)
+    assert (document["source_format"], document["out_format"]) == ("mrcal", "colmap")
+    assert document["statement"].startswith("exact")
+    assert document["c"] == pytest.approx(2.0)
+    assert "converted from a.cameramodel" in (tmp_path / "cameras.txt").read_text()
+    with pytest.raises(UsageError, match="there are opencv"):
+        run("camera", "convert", tmp_path / "a.cameramodel", "--to", "x", "--out", tmp_path / "y")
+    with pytest.raises(ConfigurationError, match=r"none\.xml"):
+        run("camera", "convert", tmp_path / "none.xml", "--to", "ros", "--out", tmp_path / "y")

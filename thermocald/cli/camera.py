@@ -1,0 +1,77 @@
+"""`thermocald camera convert`: a camera file of one program for another."""
+
+from __future__ import annotations
+
+from pathlib import Path  # noqa: TC003  typer reads the annotations
+from typing import Annotated
+
+import typer
+
+__all__ = ["register"]
+
+_FORMATS = "opencv, ros, colmap, mrcal, kalibr, metashape, aicon, json"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the group of commands."""
+    group = typer.Typer(help="Camera files of other programs.", no_args_is_help=True)
+    group.callback()(_group)
+    group.command("convert")(convert)
+    app.add_typer(group, name="camera")
+
+
+def _group() -> None:
+    """Camera files of other programs."""
+
+
+def convert(
+    source: Annotated[Path, typer.Argument(metavar="FILE", help="A camera file.")],
+    to: Annotated[str, typer.Option("--to", help=f"Format to write: {_FORMATS}.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The file to write.")],
+    from_: Annotated[
+        str | None, typer.Option("--from", help="Format of FILE; default: told by its content.")
+    ] = None,
+    pixel_pitch: Annotated[
+        float | None,
+        typer.Option("--pixel-pitch", help="Size of a pixel in mm, where FILE does not say it."),
+    ] = None,
+    json: Annotated[
+        str | None, typer.Option("--json", help="Write the result as JSON; - for standard output.")
+    ] = None,
+) -> None:
+    """Convert a camera file, exactly where the conventions allow, else by a fit whose residual is
+    stated.
+
+    Example: thermocald camera convert calibration.xml --to opencv --out camera.yaml
+    """
+    from thermocald.cli.common import write_json
+    from thermocald.output import camera_files
+
+    camera = camera_files.read(source, from_, pixel_pitch)
+    read = "exact" if camera.exact else f"fitted, largest residual {camera.largest_px:.3g} px"
+    statement = camera_files.write(
+        camera.model, out, to, camera.covariance,
+        f"converted from {source.name} ({camera.format}, {read})", camera.name,
+    )  # fmt: skip
+    interior = camera.model.interior
+    if json is not None:
+        sensor = camera.model.sensor
+        document = {
+            "format": "thermocald-camera-conversion/1",
+            "source": str(source),
+            "source_format": camera.format,
+            "exact_import": camera.exact,
+            "largest_px": camera.largest_px,
+            "rms_px": camera.rms_px,
+            "out": str(out),
+            "out_format": to,
+            "statement": statement,
+            "width": sensor.width,
+            "height": sensor.height,
+            "pixel_pitch": sensor.pixel_pitch,
+            **{name: getattr(interior, name) for name in type(interior).__dataclass_fields__},
+        }
+        write_json(document, json)
+    if json != "-":
+        typer.echo(f"{source} ({camera.format}): {read}")
+        typer.echo(f"{out} ({to}): {statement}")

@@ -1,0 +1,130 @@
+"""`thermocald testfield check`: what a camera would get out of a field."""
+
+from __future__ import annotations
+
+from pathlib import Path  # noqa: TC003  typer reads the annotations
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from thermocald.cli.testfield_options import CameraFile, Json, PixelPitch, say
+
+if TYPE_CHECKING:
+    from thermocald.analysis.field_check import FieldCheck
+    from thermocald.photogrammetry.camera_model import CameraModel
+    from thermocald.photogrammetry.testfield import TestField
+
+__all__ = ["check"]
+
+# What most people point at a test field: the Raspberry Pi camera v2.1.
+_USUAL = {"width": 3280, "height": 2464, "pixel_pitch": 0.00112, "c": 3.04}
+_EOP = ("omega", "phi", "kappa", "X0", "Y0", "Z0")
+
+
+def check(
+    field: Annotated[Path, typer.Argument(metavar="FIELD", help="A testfield.csv.")],
+    camera: CameraFile = None,
+    pixel_pitch: PixelPitch = None,
+    place: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option("--from", metavar="X Y Z", help="Where the camera stands, mm."),
+    ] = None,
+    at: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option("--at", metavar="X Y Z", help="What it looks at; default the field's middle."),
+    ] = None,
+    roll: Annotated[float, typer.Option("--roll", help="Turned about its axis, degrees.")] = 0.0,
+    sigma: Annotated[
+        float, typer.Option("--sigma", min=1e-4, help="Of an image coordinate, px.")
+    ] = 0.03,
+    json: Json = None,
+) -> None:
+    """Judge a test field: what a camera sees of it, how well it would be calibrated, what to add.
+
+    Without --from the camera stands where the field just fills its image; without --camera it is a
+    Raspberry Pi camera v2.1.
+
+    Example: thermocald testfield check field/testfield.csv --from 900 900 700
+    """
+    import numpy as np
+
+    from thermocald.analysis.field_check import check_field, station_at, usual_station
+    from thermocald.cli.common import write_json
+    from thermocald.store.testfield_file import read_testfield
+
+    targets = read_testfield(field)
+    model = _camera(camera, pixel_pitch)
+    middle = (targets.points.min(axis=0) + targets.points.max(axis=0)) / 2
+    look_at = middle if at is None else np.array(at)
+    if place is None:
+        stand = usual_station(model, targets)
+        if at is not None or roll:
+            stand = station_at(stand.centre, look_at, np.radians(roll))
+    else:
+        stand = station_at(np.array(place), look_at, np.radians(roll))
+    result = check_field(model, targets, stand, sigma)
+    if json is not None:
+        write_json(_check_document(result, targets, model, sigma), json)
+    if json != "-":
+        _show_check(result, targets, model)
+
+
+def _camera(file: Path | None, pixel_pitch: float | None) -> CameraModel:
+    from thermocald.output import camera_files
+    from thermocald.photogrammetry.camera_model import CameraModel, InteriorOrientation, Sensor
+
+    if file is not None:
+        return camera_files.read(file, pixel_pitch=pixel_pitch).model
+    say("no --camera: a Raspberry Pi camera v2.1 (3280 × 2464 px of 1.12 µm, 3.04 mm) is assumed")
+    sensor = Sensor(int(_USUAL["width"]), int(_USUAL["height"]), _USUAL["pixel_pitch"])
+    return CameraModel(sensor, InteriorOrientation(c=_USUAL["c"]))
+
+
+def _check_document(
+    result: FieldCheck, field: TestField, model: CameraModel, sigma: float
+) -> dict[str, Any]:
+    from thermocald.analysis.field_check import FREE
+
+    def finite(value: float) -> float | None:
+        return float(value) if value < 1e300 else None
+
+    sds = {}
+    for kind in ("epoch", "series", "level"):
+        values = getattr(result.precision, kind)
+        sds[kind] = {f"sd_{n}": finite(v) for n, v in zip(FREE, values, strict=True)}
+    return {
+        "format": "thermocald-testfield-check/1",
+        "targets": len(field),
+        "visible": [field.names[i] for i in result.visible],
+        "hidden": result.hidden,
+        "station": dict(zip(_EOP, result.station.as_array().tolist(), strict=True)),
+        "distance": result.distance,
+        "depth_relief": result.depth_relief,
+        "coverage": result.coverage,
+        "cells": result.cells.tolist(),
+        "median_size_px": float(sorted(result.sizes)[len(result.sizes) // 2])
+        if len(result.sizes)
+        else None,
+        "sigma_px": sigma,
+        "pixel_pitch": model.sensor.pixel_pitch,
+        **sds,
+        "advice": list(result.advice),
+    }
+
+
+def _show_check(result: FieldCheck, field: TestField, model: CameraModel) -> None:
+    X, Y, Z = result.station.centre
+    typer.echo(
+        f"{len(result.visible)} of {len(field)} targets visible from ({X:.0f}, {Y:.0f}, {Z:.0f}) "
+        f"mm, {result.distance:.0f} mm away; they cover {result.coverage:.0%} of the image, depth "
+        f"relief {result.depth_relief:.0%} of the distance"
+    )
+    reasons = list(result.hidden.values())
+    for reason in sorted(set(reasons)):
+        typer.echo(f"  {reasons.count(reason)} {reason}")
+    typer.echo("  standard deviations in px    one image    in a series    with the field's own")
+    for name, row in result.precision.pixels(model.sensor.pixel_pitch).items():
+        cells = [f"{v:.3g}" if v < 1e300 else "none" for v in row]
+        typer.echo(f"    {name:<24} {cells[0]:>12} {cells[1]:>14} {cells[2]:>20}")
+    for note in result.advice:
+        typer.echo(f"  better: {note}")

@@ -1,1 +1,66 @@
-"""The commands."""
+"""The commands. Each module of this package adds its own to one application.
+
+Exit status: 0 done, 1 the data do not allow it, 2 wrong usage or configuration, 3 a device failed.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import sys
+from typing import Annotated
+
+import typer
+
+from thermocald import __version__
+from thermocald.cli.common import log_to_stderr, say
+from thermocald.errors import ThermocaldError
+
+__all__ = ["application", "main"]
+
+_INTERRUPTED = 130
+
+
+def application() -> typer.Typer:
+    """The application with every command of the modules beside this file."""
+    app = typer.Typer(
+        help="Thermal calibration of low-cost cameras: live, with true standard deviations.",
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+    )
+    app.callback()(_options)
+    for module in sorted(pkgutil.iter_modules(__path__), key=lambda m: m.name):
+        register = getattr(importlib.import_module(f"{__name__}.{module.name}"), "register", None)
+        if register is not None:
+            register(app)
+    return app
+
+
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", help="Say the version and stop.", is_eager=True)
+    ] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log more.")] = False,
+) -> None:
+    log_to_stderr("INFO" if verbose else "WARNING")
+    if version:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+def main() -> None:
+    """Run the command line; every foreseen error is one line, none is a traceback."""
+    try:
+        application()()
+    except ThermocaldError as error:
+        say(f"error: {error}")
+        sys.exit(error.exit_status)
+    except KeyboardInterrupt:
+        say("interrupted")
+        sys.exit(_INTERRUPTED)
+    except BrokenPipeError:
+        # The reader of our output has gone, as `head` does.
+        sys.stderr.close()
+        sys.exit(0)

@@ -1,0 +1,111 @@
+"""What all commands share: where output goes, progress, and errors in one line."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.errors import DataError, UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+__all__ = ["jsonable", "log_to_stderr", "progress", "say", "write_json", "write_text"]
+
+_LINES = 10  # progress lines where there is no terminal
+
+
+def say(text: str) -> None:
+    """A line for a person, on standard error: standard output belongs to results."""
+    print(text, file=sys.stderr, flush=True)  # noqa: T201
+
+
+def log_to_stderr(level: str = "WARNING") -> None:
+    """Let the program's log be seen."""
+    logging.basicConfig(
+        level=level, stream=sys.stderr, format="%(levelname)s %(name)s: %(message)s", force=True
+    )
+
+
+@contextmanager
+def progress(total: int | None, label: str) -> Iterator[Callable[[int], None]]:
+    """Yield a function that counts steps: a bar on a terminal, some lines otherwise."""
+    if sys.stderr.isatty():
+        from rich.console import Console
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            Progress,
+            TextColumn,
+            TimeRemainingColumn,
+        )
+
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+        )
+        with Progress(*columns, console=Console(stderr=True)) as bar:
+            task = bar.add_task(label, total=total)
+            yield lambda steps: bar.advance(task, steps)
+        return
+    done, shown = 0, 0
+
+    def advance(steps: int) -> None:
+        nonlocal done, shown
+        done += steps
+        part = done * _LINES // total if total else done // 1000
+        if part > shown:
+            shown = part
+            say(f"{label}: {done} of {total}" if total else f"{label}: {done}")
+
+    yield advance
+
+
+def jsonable(value: Any) -> Any:
+    """A value as JSON has it: arrays as lists, NaN and infinity as null, paths as text."""
+    if isinstance(value, dict):
+        return {str(key): jsonable(inner) for key, inner in value.items()}
+    if isinstance(value, np.ndarray):
+        return jsonable(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [jsonable(inner) for inner in value]
+    if isinstance(value, np.generic):
+        return jsonable(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Path):
+        return str(value)
+    return value
+
+
+def write_json(document: Any, destination: str) -> None:
+    """Write one JSON document to a file, or to standard output for `-`."""
+    write_text(json.dumps(jsonable(document), indent=1, allow_nan=False) + "\n", destination)
+
+
+def write_text(text: str, destination: str | Path) -> None:
+    """Write text to a file, whole or not at all, or to standard output for `-`."""
+    if str(destination) == "-":
+        sys.stdout.write(text)
+        sys.stdout.flush()
+        return
+    path = Path(destination)
+    if not path.absolute().parent.is_dir():
+        raise UsageError(f"{path}: the folder {path.absolute().parent} does not exist")
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        partial.write_text(text, encoding="utf-8")
+        os.replace(partial, path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise DataError(f"{path}: cannot be written: {error.strerror or error}") from error

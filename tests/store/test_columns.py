@@ -12,12 +12,14 @@ from thermocald.store.database import Store
 from thermocald.store.row import EpochResult
 
 CHUNK = 16
+MERGED = 4
 NAMES = ["epoch", "frame_time", "temperature", "c", "sd_c", "blur", "status"]
 
 
 @pytest.fixture(autouse=True)
 def small_chunks(monkeypatch):
     monkeypatch.setattr(columns, "CHUNK", CHUNK)
+    monkeypatch.setattr(columns, "MERGED", MERGED)
     monkeypatch.setattr(database, "CHUNK", CHUNK)
 
 
@@ -61,12 +63,14 @@ def series(store, head, field):
     return store.create_series(head, field)
 
 
-@pytest.mark.parametrize("size", [0, 1, CHUNK - 1, CHUNK, CHUNK + 1, 5 * CHUNK + 7])
+@pytest.mark.parametrize(
+    "size", [0, 1, CHUNK - 1, CHUNK, CHUNK + 1, 3 * CHUNK, 4 * CHUNK, 9 * CHUNK + 7]
+)
 def test_any_length(store, series, size):
     numbers = [3 * i for i in range(size)]  # numbers may have gaps
     for i in numbers:
         store.append(series, epoch(i), result(i), extra={"blur": 0.5 * i})
-    assert chunks(store) == size // CHUNK
+    assert chunks(store) == size // CHUNK // MERGED + size // CHUNK % MERGED
     assert read(store, series) == expected(numbers)
 
 
@@ -145,5 +149,5 @@ def test_another_chunk_length_later_on(store_path, head, field, monkeypatch):
     with Store.open(store_path, "append", durable=False) as store:
         for i in range(2 * CHUNK + 5, 4 * CHUNK):
             store.append(series, epoch(i), result(i), extra={"blur": 0.5 * i})
-        assert chunks(store) == 2 + (2 * CHUNK) // 7
+        assert chunks(store) == 2 + (2 * CHUNK) // 7 // MERGED
         assert read(store, series) == expected(range(4 * CHUNK))

@@ -1,0 +1,207 @@
+"""The store: bytes per epoch, columns against np.load, a replay end to end against its adjustments.
+
+Run: python -m benchmarks.store [--check] [--epochs 1000000]
+Bounds: file ≤ 1.4 × payload (raw observations of 18 bytes, parameters, covariance as float64);
+columns of a million epochs × 9 into NumPy ≤ 3 × np.load of the same; read + adjust + store ≤ 4 ×
+the adjustments alone. --check: exit status 1 where a bound is missed.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import argparse
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.epoch import Epoch
+from thermocald.photogrammetry.camera_model import Sensor
+from thermocald.photogrammetry.testfield import Observations, TestField
+from thermocald.store.columns import build_missing_chunks
+from thermocald.store.database import Store
+from thermocald.store.epoch_table import StoredEpoch, insert_epoch
+from thermocald.store.head import CameraSpec, Channel, Head
+from thermocald.store.recording import RecordingWriter, open_recording
+from thermocald.store.row import EpochResult
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+BYTES_PER_OBSERVATION = 18  # row uint16, x, y int32, sx, sy float32: see store/blob.py
+BYTES_PER_RESULT = 16 * 8 + 136 * 8  # parameters, upper triangle of their covariance
+COLUMNS = [
+    "epoch",
+    "frame_time",
+    "temperature",
+    "c",
+    "sd_c",
+    "x0",
+    "y0",
+    "sigma0",
+    "n_observations",
+]
+BOUNDS = {"size": 1.4, "columns": 3.0, "end to end": 4.0}
+
+HEAD = Head(
+    "benchmark",
+    "M1",
+    10.0,
+    CameraSpec("rpi", Sensor(3280, 2464, 0.00112), 3.04),
+    {"temperature": Channel(), "board": Channel()},
+)
+
+
+def field_of(targets: int) -> TestField:
+    rng = np.random.default_rng(1)
+    names = [str(i) for i in range(targets)]
+    return TestField.build(names, rng.uniform(0, 2000, (targets, 3)), 0.02, 20.0)
+
+
+def result_of(rng: np.random.Generator) -> EpochResult:
+    a = rng.normal(size=(30, 16))
+    return EpochResult("ok", "", rng.normal(size=16), a.T @ a * 1e-6, 1.0, 250, 300)
+
+
+def size_ratio(folder: Path, targets: int, epochs: int) -> float:
+    """Bytes on disk, everything included, over the payload."""
+    rng = np.random.default_rng(2)
+    path = folder / f"size{targets}.db"
+    with Store.open(path, "append", durable=False) as store:
+        series = store.create_series(HEAD, field_of(targets))
+        for i in range(epochs):
+            points, sigmas = (
+                rng.uniform(0, 2400, (targets, 2)),
+                rng.uniform(0.01, 0.1, (targets, 2)),
+            )
+            seen = Observations(np.arange(targets), points, sigmas)
+            temperatures = {"temperature": 20 + 0.0625 * (i % 400), "board": 40.0}
+            epoch = Epoch(i, 1.6e9 + 10 * i, 1.6e9 + 10 * i + 0.7, temperatures, observations=seen)
+            store.append(series, epoch, result_of(rng), extra={"blur": 0.8, "contrast": 120.0})
+    size = sum(file.stat().st_size for file in folder.glob(f"{path.name}*"))
+    return size / (epochs * (targets * BYTES_PER_OBSERVATION + BYTES_PER_RESULT))
+
+
+def fill_columns(path: Path, epochs: int) -> None:
+    """Epochs without observations; in one transaction, since only reading is measured."""
+    rng = np.random.default_rng(3)
+    values = rng.normal(size=(epochs, 16))
+    with Store.open(path, "append", durable=False) as store:
+        series = store.create_series(HEAD, field_of(10))
+        store._db.execute("BEGIN")
+        for i in range(epochs):
+            epoch = Epoch(i, 10.0 * i, 10.0 * i + 0.7, {"temperature": 20.0, "board": 40.0})
+            result = EpochResult("ok", "", values[i], np.diag(values[i] ** 2), 1.0, 250, 300)
+            stored = StoredEpoch(epoch, EpochResult("ok", "", result.values), {}, True, 0)
+            insert_epoch(store._db, series.id, stored)
+        build_missing_chunks(store._db, series.id)
+        store._db.execute("COMMIT")
+
+
+def columns_ratio(folder: Path, epochs: int) -> tuple[float, float, float]:
+    """(ratio, our time s, np.load's time s): best of several, each after a first one."""
+    fill_columns(folder / "columns.db", epochs)
+    with Store.open(folder / "columns.db") as store:
+        series = store.find_series()
+        columns = store.series_columns(series, COLUMNS)
+        assert columns["epoch"].tolist() == list(range(epochs))
+        np.save(folder / "columns.npy", np.stack(list(columns.values())))
+        del columns
+        ours = theirs = float("inf")
+        for _ in range(15):  # in turn, so that what else the machine does meets both
+            ours = min(ours, best(lambda: store.series_columns(series, COLUMNS), 2))
+            theirs = min(theirs, best(lambda: np.load(folder / "columns.npy"), 2))
+    return ours / theirs, ours, theirs
+
+
+def end_to_end(folder: Path, epochs: int) -> tuple[float, dict[str, float]]:
+    """Ratio of read + adjust + store to the adjustments alone, and ms per epoch of each."""
+    from benchmarks.adjustment import EXTERIOR, INTERIOR, SENSOR, corner_field, observe
+    from thermocald.photogrammetry.adjustment import adjust
+
+    field = corner_field()
+    rng = np.random.default_rng(4)
+    path = folder / "M1"
+    with RecordingWriter(path, HEAD, field) as writer:
+        for i in range(epochs):
+            epoch = Epoch(i, 10.0 * i, 10.0 * i, {}, observations=observe(field, rng))
+            writer.append(epoch)
+
+    def adjusted(epoch: Epoch) -> EpochResult:
+        return EpochResult.from_adjustment(
+            adjust(SENSOR, field, epoch.observations, INTERIOR, EXTERIOR)
+        )
+
+    loaded = list(open_recording(path).iter_epochs())
+    file = folder / "replayed.db"
+
+    def replay() -> None:
+        for old in folder.glob("replayed.db*"):
+            old.unlink()
+        with Store.open(file, "append", durable=False) as store:
+            recording = open_recording(path)
+            series = store.create_series(recording.head, recording.testfield)
+            for epoch in recording.iter_epochs():
+                store.append(series, epoch, adjusted(epoch))
+
+    def store_only() -> None:
+        with Store.open(folder / f"only{time.monotonic_ns()}.db", "append", durable=False) as store:
+            series = store.create_series(HEAD, field)
+            for epoch in loaded:
+                store.append(series, epoch, kept)
+
+    kept = adjusted(loaded[0])
+    times = {
+        "read": best(lambda: list(open_recording(path).iter_epochs()), 3),
+        "adjust": best(lambda: [adjusted(epoch) for epoch in loaded], 3),
+        "store": best(store_only, 3),
+        "replay": best(replay, 3),
+    }
+    ratio = times["replay"] / times["adjust"]
+    return ratio, {name: 1e3 * seconds / epochs for name, seconds in times.items()}
+
+
+def best(work: Callable[[], object], rounds: int = 7) -> float:
+    times = []
+    for _ in range(rounds):
+        begin = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - begin)
+    return min(times)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--check", action="store_true")
+    parser.add_argument("--epochs", type=int, default=1_000_000, help="for the columns")
+    options = parser.parse_args()
+    missed = []
+
+    def report(bound: str, what: str, ratio: float) -> None:
+        print(f"{what:58s} {ratio:6.2f}   bound {BOUNDS[bound]:.1f}", flush=True)
+        if ratio > BOUNDS[bound]:
+            missed.append(what)
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for targets in (50, 150, 400):
+            ratio = size_ratio(folder, targets, 6000)
+            report("size", f"file over payload, {targets} targets", ratio)
+        ratio, times = end_to_end(folder, 300)
+        report("end to end", "read + adjust + store over adjust, 150 targets", ratio)
+        print("   ms per epoch: " + ", ".join(f"{n} {t:.3f}" for n, t in times.items()))
+        ratio, ours, theirs = columns_ratio(folder, options.epochs)
+        report("columns", f"{options.epochs} epochs × 9 columns over np.load", ratio)
+        print(f"   ours {1e3 * ours:.1f} ms, np.load {1e3 * theirs:.1f} ms")
+    return 1 if options.check and missed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -37,7 +37,15 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["COLUMNS", "Evidence", "SeriesInput", "gather"]
+__all__ = [
+    "COLUMNS",
+    "FIELD_SCALES",
+    "Evidence",
+    "SeriesInput",
+    "gather",
+    "reweighted",
+    "without_targets",
+]
 
 FIELD_SCALES = ("scale_X", "scale_Y", "scale_Z")
 COLUMNS = PARAMETER_NAMES + FIELD_SCALES
@@ -360,8 +368,41 @@ def _reduce(
     return Evidence(
         source, times, history, channels, at, scale,
         N / variance, b / variance, yy / variance, values, v, w / variance, offsets,
-        count, sigma0 / np.sqrt(variance), variance, 1.0, int(bad.sum()), columns=A,
+        count, sigma0 / np.sqrt(variance), variance, _slowness(v), int(bad.sum()), columns=A,
     )  # fmt: skip
+
+
+def _slowness(v: Array, lags: int = 20) -> float:
+    """By how much slow variances exceed those of white noise: 1 + 2 Σ autocorrelations.
+
+    From the residuals of all targets together; the mean of each target has been taken out.
+    """
+    E = len(v)
+    lags = min(lags, E // 4)
+    x = v - np.nan_to_num(np.nanmean(v)) if np.isfinite(v).any() else v
+    filled = np.nan_to_num(x)
+    there = np.isfinite(x).astype(float)
+    power = float(np.sum(filled**2) / max(there.sum(), 1.0))
+    total = 1.0
+    for k in range(1, lags + 1):
+        pairs = float(np.sum(there[k:] * there[:-k]))
+        if pairs > 0 and power > 0:
+            r = float(np.sum(filled[k:] * filled[:-k])) / pairs / power
+            total += 2.0 * (r + 1.0 / E)
+    return max(total, 1.0) if total > 1.08 else 1.0
+
+
+def reweighted(evidence: Evidence, noise: Array) -> Evidence:
+    """The same series when the measuring noise of each epoch is `noise` (E,) times the usual."""
+    factor = 1.0 / noise**2
+    return replace(
+        evidence,
+        N=evidence.N * factor[:, None, None],
+        b=evidence.b * factor[:, None],
+        yy=evidence.yy * factor,
+        weights=evidence.weights * factor[:, None, None],
+        sigma0=evidence.sigma0 / noise,
+    )
 
 
 def without_targets(evidence: Evidence, rows: NDArray[np.int64]) -> Evidence:

@@ -1,0 +1,108 @@
+"""The absolute test: does a model leave smooth courses in any parameter, or in the noise level?
+
+An improvement is not honesty: a flexible surrogate improves M1 and even M2. What tells it from the
+cause is what it leaves. Cosines of growing order are offered to every independent combination of
+the camera's parameters, under the same covariance as the fit, in each series by itself.
+
+Source: the smooth goodness-of-fit test of Neyman (1937), Skandinavisk Aktuarietidskrift 20,
+149-199, in the parameters of the camera.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.discovery.evidence import COLUMNS
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from thermocald.discovery.hypothesis import Fit, Laboratory
+
+    Array = NDArray[np.float64]
+
+__all__ = ["Adequacy", "examine"]
+
+ORDERS = 14
+# a smooth misfit below this is not worth a name: a tenth of what targets are measured to
+NEGLIGIBLE_PX = 0.004
+
+
+@dataclass(frozen=True, eq=False)
+class Adequacy:
+    """What a model leaves in one series.
+
+    scores (ORDERS, D): unit normal where nothing is left; directions (P, D): combinations of
+    px-scaled columns; excess: χ² beyond its expectation; significance: in standard deviations;
+    misfit_px: RMS over image coordinates of the smooth rest.
+    """
+
+    scores: Array
+    directions: Array
+    courses: Array
+    excess: float
+    significance: float
+    misfit_px: float
+
+    @property
+    def adequate(self) -> bool:
+        """Nothing significant is left, or nothing that matters."""
+        return self.significance < 6.0 or self.misfit_px < NEGLIGIBLE_PX
+
+
+def cosines(times: Array, orders: int) -> Array:
+    """Smooth courses (orders, E) over a series, order 1 being half a wave."""
+    u = (times - times[0]) / max(float(times[-1] - times[0]), 1e-9)
+    rows: Array = np.cos(np.pi * np.arange(1, orders + 1)[:, None] * u[None])
+    return rows - rows.mean(axis=1, keepdims=True)
+
+
+def examine(laboratory: Laboratory, fit: Fit, series: int, inflation: float = 1.0) -> Adequacy:
+    """Test one series; `inflation` ≥ 1: by how much correlated noise raises slow variances."""
+    evidence, weighting = laboratory.series[series], fit.weightings[series]
+    C, V, index = fit.designs[series]
+    x = fit.coefficients[index]
+    size, U = np.linalg.eigh(evidence.N.mean(axis=0))
+    keep = size > 1e-4 * np.median(size)
+    directions = U[:, keep] / np.sqrt(size[keep])
+    courses = cosines(evidence.times, ORDERS)
+    A, c, B = weighting.scan(courses[:, :, None], directions, (C, V))
+    rest = c - B @ x
+    scores = np.zeros(rest.shape)
+    for j in range(ORDERS):
+        # whitened, so that directions that share the thermometer's error count once
+        L = np.linalg.cholesky(A[j] + 1e-9 * np.eye(len(A[j])) * np.trace(A[j]) / len(A[j]))
+        scores[j] = np.linalg.solve(L, rest[j])
+    scores = scores / np.sqrt(inflation)
+    total = float(np.sum(scores**2))
+    free = scores.size
+    excess = max(total - free, 0.0)
+    coordinates = 2.0 * float(evidence.n.sum())
+    sigma = _mean_sigma(evidence)
+    return Adequacy(
+        scores,
+        directions,
+        courses,
+        excess,
+        (total - free) / np.sqrt(2.0 * free),
+        sigma * float(np.sqrt(excess * inflation / coordinates)),
+    )
+
+
+def _mean_sigma(evidence: object) -> float:
+    """The noise of an image coordinate in px as the evidence weighs it."""
+    weights = getattr(evidence, "weights")[..., :2]  # noqa: B009
+    return float(1.0 / np.sqrt(np.mean(weights[weights > 0])))
+
+
+def names_of(directions: Array, scores: Array) -> list[tuple[str, float]]:
+    """Which parameters the rest is seen in, with their share, largest first."""
+    power = np.sum(scores**2, axis=0) - len(scores)
+    power = np.maximum(power, 0.0)
+    share = (directions**2) @ power
+    total = float(share.sum()) or 1.0
+    order = np.argsort(-share)
+    return [(COLUMNS[i], float(share[i]) / total) for i in order if share[i] > 0.02 * total]

@@ -1,0 +1,136 @@
+"""The examination: from evidence to the effects that explain it, or to none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.discovery.adequacy import Adequacy, examine
+from thermocald.discovery.evidence import reweighted
+from thermocald.discovery.hypothesis import Laboratory
+from thermocald.discovery.image_space import (
+    Displaced,
+    NoiseGrowth,
+    displaced_targets,
+    noise_growth,
+)
+from thermocald.discovery.search import Search, Solution
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from thermocald.discovery.evidence import Evidence
+
+__all__ = ["Examination", "examine_series"]
+
+MAX_EFFECTS = 3
+# how much worse a solution may score and still not be excluded
+BAND = 14.0
+# a model that leaves less than this share of what the base left has the cause
+_LEFT = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Examination:
+    """What the search found.
+
+    laboratory: the series as examined, displaced targets out and noise weighted; base, best:
+    solutions; path: solutions after each accepted effect, the base first; ranking: singles by
+    score; rivals: solutions that cannot be excluded; adequacy: of best, per series.
+    """
+
+    laboratory: Laboratory
+    base: Solution
+    best: Solution
+    path: tuple[Solution, ...]
+    ranking: tuple[Solution, ...]
+    rivals: tuple[Solution, ...]
+    base_adequacy: tuple[Adequacy, ...]
+    adequacy: tuple[Adequacy, ...]
+    displaced: tuple[tuple[Displaced, ...], ...]
+    defocus: NoiseGrowth | None
+    adequate: bool
+    original: tuple[Evidence, ...] = field(default=())
+
+
+def examine_series(
+    series: Sequence[Evidence], progress: Callable[[str], None] | None = None
+) -> Examination:
+    """Examine one series, or M1 with M2, which share their physical constants."""
+    say = progress or (lambda _: None)
+    say("targets that moved")
+    displaced, cleaned = [], []
+    for e in series:
+        groups, without = displaced_targets(e)
+        displaced.append(tuple(groups))
+        cleaned.append(without)
+    say("measuring noise")
+    growth = noise_growth(cleaned)
+    if growth is not None:
+        cleaned = [reweighted(e, n) for e, n in zip(cleaned, growth.noise, strict=True)]
+    laboratory = Laboratory(cleaned)
+    say("base model")
+    search = Search(laboratory, say)
+    base = search.base()
+    base_adequacy = _adequacies(laboratory, base)
+
+    best, ranking = base, []
+    frontier = [base]
+    seen: list[Solution] = []
+    for level in range(1, MAX_EFFECTS + 1):
+        grown: list[Solution] = []
+        for solution in frontier:
+            say(f"effect {level}: beside {', '.join(solution.names) or 'the base'}")
+            grown += [search.shrink(s) for s in search.expand(solution, 6 if level == 1 else 4)]
+        if level == 1:
+            ranking = sorted(grown, key=lambda s: s.score)
+        seen += grown
+        if not grown:
+            break
+        champion = min(grown, key=lambda s: s.score)
+        if champion.score >= best.score:
+            break
+        best = champion
+        if _adequate(_adequacies(laboratory, best), base_adequacy):
+            break
+        frontier = _frontier(grown)
+    adequacy = _adequacies(laboratory, best)
+    adequate = _adequate(adequacy, base_adequacy)
+    rivals = []
+    for s in sorted(seen, key=lambda s: s.score):
+        different = sorted(s.names) != sorted(best.names)
+        if different and s.score < best.score + BAND and s.names not in [r.names for r in rivals]:
+            rivals.append(s)
+    return Examination(
+        laboratory, base, best, (base, best), tuple(ranking), tuple(rivals), base_adequacy,
+        adequacy, tuple(displaced), growth, adequate, tuple(series),
+    )  # fmt: skip
+
+
+def _frontier(grown: list[Solution], width: int = 4) -> list[Solution]:
+    """The best solutions of a level, one per set of names."""
+    out: list[Solution] = []
+    for s in sorted(grown, key=lambda s: s.score):
+        if all(sorted(s.names) != sorted(o.names) for o in out):
+            out.append(s)
+    return out[:width]
+
+
+def _adequacies(laboratory: Laboratory, solution: Solution) -> tuple[Adequacy, ...]:
+    return tuple(
+        examine(laboratory, solution.fit, s, e.correlation)
+        for s, e in enumerate(laboratory.series)
+    )
+
+
+def _adequate(now: Sequence[Adequacy], base: Sequence[Adequacy]) -> bool:
+    return all(
+        a.adequate or a.misfit_px < _LEFT * b.misfit_px for a, b in zip(now, base, strict=True)
+    )
+
+
+def rms(values: Sequence[float]) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -1,0 +1,86 @@
+"""The bounds of issue 2 for store and recordings: size, speed, memory (benchmarks/store.py)."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+import time
+
+import numpy as np
+import pytest
+
+from benchmarks import store as benchmark
+from thermocald.epoch import Epoch
+from thermocald.photogrammetry.testfield import Observations
+from thermocald.store.recording import RecordingWriter
+
+DAY = 8640
+
+
+@pytest.mark.parametrize("targets", [60, 150, 300, 500])
+def test_the_file_is_little_more_than_its_payload(tmp_path, targets):
+    """Of a day's third; the empty tables are 0.1 MB on top of it."""
+    assert benchmark.size_ratio(tmp_path, targets, 3000) <= benchmark.BOUNDS["size"]
+
+
+@pytest.mark.slow
+def test_the_file_stays_small_when_chunks_merge(tmp_path):
+    assert benchmark.size_ratio(tmp_path, 150, 16_500) <= benchmark.BOUNDS["size"]
+
+
+@pytest.mark.slow
+def test_columns_of_a_million_epochs(tmp_path):
+    ratio, ours, theirs = benchmark.columns_ratio(tmp_path, 1_000_000)
+    print(f"ours {1e3 * ours:.1f} ms, np.load {1e3 * theirs:.1f} ms, ratio {ratio:.2f}")
+    assert ratio <= benchmark.BOUNDS["columns"]
+
+
+@pytest.mark.slow
+def test_replay_end_to_end(tmp_path):
+    ratio, times = benchmark.end_to_end(tmp_path, 300)
+    print(f"ratio {ratio:.2f}, ms per epoch {times}")
+    assert ratio <= benchmark.BOUNDS["end to end"]
+
+
+READ = textwrap.dedent(
+    """
+    import sys
+    from pathlib import Path
+    import thermocald.store.recording as module
+
+    def peak_mb():
+        status = Path("/proc/self/status").read_text()
+        return int(status.split("VmHWM:")[1].split()[0]) / 1024
+
+    before = peak_mb()
+    if sys.argv[2] == "stream":
+        module._STREAMED_ABOVE_BYTES = 0
+        epochs = module.open_recording(Path(sys.argv[1])).iter_epochs()
+    else:
+        epochs = module.read_recording(Path(sys.argv[1])).epochs
+    count = sum(len(epoch.observations) for epoch in epochs)
+    print(count, peak_mb() - before)
+    """
+)
+
+
+@pytest.mark.slow
+def test_a_day_is_written_and_read_in_bounded_memory(tmp_path):
+    rng = np.random.default_rng(6)
+    n, rows = 150, np.arange(150)
+    points, sigmas = rng.uniform(0, 2400, (50, n, 2)), np.full((n, 2), 0.04)
+    begin = time.perf_counter()
+    with RecordingWriter(tmp_path / "day", benchmark.HEAD, benchmark.field_of(n)) as writer:
+        for i in range(DAY):
+            seen = Observations(rows, points[i % 50], sigmas)
+            writer.append(Epoch(i, 10.0 * i, 10.0 * i, {"temperature": 20.0}, observations=seen))
+    print(f"written in {time.perf_counter() - begin:.1f} s")
+    for how, bound_mb in (("load", 250), ("stream", 20)):
+        command = [sys.executable, "-c", READ, str(tmp_path / "day"), how]
+        begin = time.perf_counter()
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        count, grown_mb = done.stdout.split()
+        print(f"{how}: {time.perf_counter() - begin:.1f} s, {float(grown_mb):.0f} MB more")
+        assert int(count) == DAY * n
+        assert float(grown_mb) < bound_mb

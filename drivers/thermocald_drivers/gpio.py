@@ -13,7 +13,9 @@
         hysteresis_k: 0.5
         programme: [{seconds: 600, hold_c: null}, {seconds: 1500, hold_c: 45}]
 
-The LED is steady while epochs have results and blinks while they have none. The relay fails safe: it is off before the first result, after the last, at the limit (for good),
+The LED is steady while epochs have results and blinks while they have none.
+
+The relay fails safe: it is off before the first result, after the last, at the limit (for good),
 without a temperature, when no result comes for `watchdog_s`, when the program closes it, and, since
 the kernel releases the pins of a process that dies, after a crash (choose the relay's wiring so
 that a released pin is off). See `heating` for the programme.

@@ -8,8 +8,9 @@
 
 `channels` maps our channel names to the kernel's input (`temp1`, `in_temp_ambient`) or its label;
 without it every temperature input is read, a single one as `temperature`. `minimum_c`/`maximum_c`
-bound what is believed (a broken diode reads 127 °C); `sysfs` (/sys) is where the kernel's files are. The kernel numbers its devices anew at every
-plug: they are looked up by name at each open, and the name is checked again at each read.
+bound what is believed (a broken diode reads 127 °C); `sysfs` (/sys) is where the files are. The
+kernel numbers its devices anew at every plug: they are looked up by name at each open, and the name
+is checked again at each read.
 Source: Documentation/hwmon/sysfs-interface, ABI/testing/sysfs-bus-iio, driver-api/thermal.
 """
 

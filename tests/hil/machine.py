@@ -1,10 +1,8 @@
-"""The laboratory's virtual machine: boot, wait until it answers, run, unplug, cut the power."""
+"""The laboratory's virtual machine: boot, wait until it answers, run, cut the power."""
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
 import shlex
 import socket
 import subprocess
@@ -14,44 +12,17 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = ["Machine", "Qmp"]
+__all__ = ["Machine"]
 
 BOOT_S = 240.0
 
 
-class Qmp:
-    """QEMU's monitor: devices in and out."""
-
-    def __init__(self, path: Path) -> None:
-        self._socket = socket.socket(socket.AF_UNIX)
-        self._socket.settimeout(20.0)
-        self._socket.connect(str(path))
-        self._file = self._socket.makefile("rw")
-        self._file.readline()
-        self("qmp_capabilities")
-
-    def __call__(self, command: str, **arguments: object) -> object:
-        self._file.write(json.dumps({"execute": command, "arguments": arguments}) + "\n")
-        self._file.flush()
-        while True:
-            answer = json.loads(self._file.readline())
-            if "error" in answer:
-                raise RuntimeError(f"{command}: {answer['error']}")
-            if "return" in answer:
-                return answer["return"]
-
-    def wait_for(self, event: str) -> None:
-        """Until QEMU reports an event, at most as long as the socket's time-out."""
-        while json.loads(self._file.readline()).get("event") != event:
-            continue
-
-    def close(self) -> None:
-        self._file.close()
-        self._socket.close()
-
-
 class Machine:
-    """A guest on a disk that is thrown away; `serial` is where an instrument plugs in."""
+    """A guest on a disk that is thrown away.
+
+    `serial` is a socket behind a USB serial adapter: QEMU plugs the adapter in while somebody is
+    connected to it, and pulls it when he leaves. `share` is /mnt/host in the guest.
+    """
 
     def __init__(self, built: Path, folder: Path, accelerator: str = "tcg,thread=multi") -> None:
         self.built, self.folder, self.accelerator = built, folder, accelerator
@@ -61,6 +32,7 @@ class Machine:
         self.share.mkdir(exist_ok=True)
         self.serial = folder / "serial.sock"
         self.process: subprocess.Popen[bytes] | None = None
+        self._master: subprocess.Popen[bytes] | None = None
         self.port = 0
         self.boot_s = 0.0
 
@@ -74,8 +46,7 @@ class Machine:
             )
         with socket.create_server(("127.0.0.1", 0)) as free:
             self.port = free.getsockname()[1]
-        for path in (self.folder / "qmp.sock", self.serial):
-            path.unlink(missing_ok=True)
+        self.serial.unlink(missing_ok=True)
         begin = time.monotonic()
         with (self.folder / "qemu.log").open("ab") as log:
             self.process = subprocess.Popen(
@@ -86,6 +57,7 @@ class Machine:
                 raise RuntimeError(f"QEMU ended: {(self.folder / 'qemu.log').read_text()[-500:]}")
             if self.run("true", check=False, timeout_s=20).returncode == 0:
                 self.boot_s = time.monotonic() - begin
+                self._share_a_connection()
                 return
             time.sleep(0.5)
         raise RuntimeError(f"the guest did not answer in {BOOT_S:g} s; see {self.folder}/console")
@@ -107,27 +79,35 @@ class Machine:
             *("-device", "virtio-rng-pci", "-device", "qemu-xhci,id=usb"),
             *("-chardev", f"socket,id=line,path={self.serial},server=on,wait=off"),
             *("-device", "usb-serial,chardev=line,bus=usb.0,id=adapter"),
-            *("-qmp", f"unix:{self.folder / 'qmp.sock'},server=on,wait=off"),
             *("-serial", f"file:{self.folder / 'console'}"),
         ]
+
+    def _ssh(self, *more: str) -> list[str]:
+        return [
+            *("ssh", "-q", "-i", str(self.built / "key"), "-p", str(self.port)),
+            *("-o", "StrictHostKeyChecking=no", "-o", "UserKnownHostsFile=/dev/null"),
+            *("-o", "ConnectTimeout=10", "-o", "BatchMode=yes", "-S", str(self.folder / "ssh")),
+            *(*more, "root@127.0.0.1"),
+        ]
+
+    def _share_a_connection(self) -> None:
+        """One connection for all commands: a key exchange takes two seconds in there."""
+        quiet = subprocess.DEVNULL
+        self._master = subprocess.Popen(
+            self._ssh("-M", "-N"), stdin=quiet, stdout=quiet, stderr=quiet
+        )
+        while not (self.folder / "ssh").exists() and self._master.poll() is None:
+            time.sleep(0.05)
 
     def run(
         self, command: str, *, check: bool = True, timeout_s: float = 120.0
     ) -> subprocess.CompletedProcess[str]:
         """A shell command in the guest, as root."""
-        ssh = [
-            *("ssh", "-q", "-i", str(self.built / "key"), "-p", str(self.port)),
-            *("-o", "StrictHostKeyChecking=no", "-o", "UserKnownHostsFile=/dev/null"),
-            *("-o", "ConnectTimeout=10", "-o", "BatchMode=yes", "root@127.0.0.1", command),
-        ]
+        quiet = subprocess.DEVNULL
+        ssh = [*self._ssh(), command]
         try:
             done = subprocess.run(
-                ssh,
-                capture_output=True,
-                text=True,
-                timeout=timeout_s,
-                stdin=subprocess.DEVNULL,
-                check=False,
+                ssh, capture_output=True, text=True, timeout=timeout_s, stdin=quiet, check=False
             )
         except subprocess.TimeoutExpired:
             if check:
@@ -154,28 +134,16 @@ class Machine:
                 raise RuntimeError(f"not in {timeout_s:g} s: {command}\n{done.stdout}{done.stderr}")
             time.sleep(0.2)
 
-    def monitor(self) -> Qmp:
-        return Qmp(self.folder / "qmp.sock")
-
-    def unplug(self) -> None:
-        """Pull the serial adapter's plug."""
-        with contextlib.closing(self.monitor()) as qmp:
-            qmp("device_del", id="adapter")
-
-    def plug(self) -> None:
-        """Put it in again."""
-        with contextlib.closing(self.monitor()) as qmp:
-            qmp("device_add", driver="usb-serial", chardev="line", bus="usb.0", id="adapter")
-
     def cut_power(self) -> None:
         """No shutdown, no flush by the guest; what the host already has survives."""
-        if self.process is not None:
-            self.process.kill()
-            self.process.wait()
-            self.process = None
+        for process in (self.process, self._master):
+            if process is not None:
+                process.kill()
+                process.wait()
+        self.process = self._master = None
+        (self.folder / "ssh").unlink(missing_ok=True)
 
     def close(self) -> None:
         self.cut_power()
-        for path in (self.disk, self.folder / "qmp.sock", self.serial):
-            with contextlib.suppress(OSError):
-                os.unlink(path)
+        for path in (self.disk, self.serial):
+            path.unlink(missing_ok=True)

@@ -1,0 +1,131 @@
+"""Fixtures of the laboratory; what was not built is skipped, with what would build it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import threading
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from tests.hil.machine import Machine
+from tests.hil.phone import Phone
+
+HERE = Path(__file__).parent
+BUILT = Path(os.environ.get("THERMOCALD_LABORATORY", HERE.parents[1] / "build" / "hil"))
+
+
+def pytest_collection_modifyitems(items):
+    for item in items:
+        if HERE in item.path.parents:
+            item.add_marker(pytest.mark.hil)
+
+
+@pytest.fixture(scope="session")
+def report(request):
+    """A line at the end of the run, for figures that were measured."""
+    lines: list[str] = []
+    yield lines.append
+    path = BUILT / "measured.txt"
+    with path.open("a") as file:
+        file.writelines(f"{line}\n" for line in lines)
+
+
+@pytest.fixture(scope="session")
+def machine(tmp_path_factory):
+    """The booted guest with this checkout's thermocald in it."""
+    if not (BUILT / "guest" / "built").exists():
+        pytest.skip("the laboratory's guest is not built: make hil")
+    guest = Machine(BUILT / "guest", tmp_path_factory.mktemp("guest"))
+    (wheel,) = sorted((BUILT / "wheel").glob("thermocald-*.whl"))
+    with zipfile.ZipFile(wheel) as file:
+        file.extractall(guest.share / "thermocald")
+    shutil.copytree(HERE / "guest", guest.share / "guest")
+    (guest.share / "tests_hil").mkdir()
+    shutil.copy(HERE / "bars.py", guest.share / "tests_hil")
+    shutil.copytree(HERE.parents[1] / "systemd", guest.share / "systemd")
+    try:
+        guest.boot()
+        guest.run("mkdir -p /opt/thermocald && cp -r /mnt/host/thermocald/. /opt/thermocald/")
+        yield guest
+    finally:
+        guest.close()
+
+
+@pytest.fixture(scope="session")
+def video(machine):
+    """v4l2loopback at /dev/video40 and vivid at /dev/video0."""
+    machine.run("modprobe v4l2loopback video_nr=40 card_label=laboratory exclusive_caps=1")
+    machine.run("modprobe vivid n_devs=1 vid_cap_nr=0 vid_out_nr=1")
+    machine.wait("test -c /dev/video40 && test -c /dev/video0")
+    return machine
+
+
+@pytest.fixture(scope="session")
+def i2c_bus(machine):
+    """The number of an SMBus with an LM75 at 0x48 and 0x49 and an MCP9808 at 0x18."""
+    machine.run("modprobe i2c-dev; modprobe i2c-stub chip_addr=0x48,0x49,0x18; modprobe lm75")
+    return int(
+        machine.wait(
+            "grep -l 'SMBus stub' /sys/class/i2c-dev/*/name | sed 's/.*i2c-\\([0-9]*\\).*/\\1/' "
+            "| grep ."
+        )
+    )
+
+
+class Instrument:
+    """A thermometer at the far end of the guest's USB serial adapter: answers `T?` with T=…"""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.celsius = path, 21.25
+        self._socket: socket.socket | None = None
+        self._thread: threading.Thread | None = None
+
+    def plug(self) -> None:
+        self._socket = socket.socket(socket.AF_UNIX)
+        self._socket.connect(str(self.path))
+        self._thread = threading.Thread(target=self._serve, args=(self._socket,), name="instrument")
+        self._thread.start()
+
+    def _serve(self, line: socket.socket) -> None:
+        pending = b""
+        while data := line.recv(256):
+            pending += data
+            while b"\n" in pending:
+                command, pending = pending.split(b"\n", 1)
+                if command.strip() == b"T?":
+                    line.sendall(f"T={self.celsius:+.3f}\r\n".encode())
+
+    def pull(self) -> None:
+        if self._socket is not None:
+            self._socket.shutdown(socket.SHUT_RDWR)
+            self._socket.close()
+            self._thread.join()
+            self._socket = None
+
+
+@pytest.fixture
+def instrument(machine):
+    """The instrument, plugged in, and `port`: its lasting name in the guest."""
+    machine.run("modprobe xhci-pci; modprobe ftdi_sio")
+    one = Instrument(machine.serial)
+    one.plug()
+    one.port = machine.wait("ls /dev/serial/by-id/*", 60).split()[0]
+    yield one
+    one.pull()
+
+
+@pytest.fixture
+def phone(tmp_path):
+    """A real adbd behind the real adb server; both in a network of their own."""
+    if not (BUILT / "phone" / "built").exists():
+        pytest.skip("the laboratory's phone is not built: make hil")
+    if os.environ.get("THERMOCALD_NETWORK") != "own":
+        pytest.skip("adbd listens on all interfaces: make hil runs this in a network namespace")
+    one = Phone(BUILT / "phone" / "root")
+    one.start()
+    yield one
+    one.stop()

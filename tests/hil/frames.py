@@ -1,0 +1,43 @@
+"""The laboratory's subject: a heating camera before a test field."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.photogrammetry.camera_model import Sensor
+from thermocald.simulation.demonstration import demonstration_field, demonstration_model
+from thermocald.simulation.history import History
+from thermocald.simulation.scene import Scene
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from thermocald.photogrammetry.testfield import TestField
+    from thermocald.simulation.model import ThermalModel
+
+__all__ = ["heating", "subject"]
+
+
+def subject(width: int, height: int) -> tuple[TestField, ThermalModel]:
+    """The demonstration's field and camera, on a sensor of this many pixels."""
+    field = demonstration_field("markers")
+    model = demonstration_model(field)
+    pitch = model.sensor.pixel_pitch * model.sensor.width / width
+    return field, replace(model, sensor=Sensor(width, height, pitch))
+
+
+def heating(
+    width: int, height: int, count: int, low_c: float = 25.0, high_c: float = 45.0
+) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """(frames (count, height, width), temperatures (count,) in °C) of an even warm-up."""
+    field, model = subject(width, height)
+    temperatures = np.linspace(low_c, high_c, count)
+    times = np.arange(count, dtype=np.float64)
+    history = History(times, times, {"temperature": temperatures}, "temperature", model.T0)
+    truth = model.predict(history, field)
+    scene = Scene(model.sensor, field)
+    images = [scene.render(truth.iop[k], truth.eop[k], seed=k) for k in range(count)]
+    return np.stack(images), temperatures

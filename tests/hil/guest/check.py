@@ -1,0 +1,363 @@
+"""Scenarios of drivers on real kernel drivers, run in the guest: check.py NAME [ARGUMENTS]
+
+Each prints one line of JSON: what the driver gave or which error it raised. The judgement is the
+test's, on the host.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+sys.path.insert(0, "/mnt/host")
+
+from thermocald.errors import ThermocaldError
+from thermocald.hal import SystemClock, open_device
+
+FEED = ["python3", "/mnt/host/guest/feed.py"]
+LOG = "/run/feed.log"
+
+
+def outcome(action):
+    """What an action gave, or the error's name and text, and how long it took."""
+    begin = time.monotonic()
+    try:
+        value, error, text = action(), None, ""
+    except ThermocaldError as problem:
+        value, error, text = None, type(problem).__name__, str(problem)
+    return {"value": value, "error": error, "text": text, "took_s": time.monotonic() - begin}
+
+
+def described(frame):
+    from tests_hil.bars import number_of
+
+    return {
+        "number": number_of(frame.image),
+        "monotonic": frame.monotonic,
+        "sequence": frame.sequence,
+        "shape": list(frame.image.shape),
+        "stale": frame.metadata.get("stale_frames_dropped"),
+        "timestamp": frame.metadata.get("timestamp"),
+    }
+
+
+def camera(device, width, height, pixel_format, **more):
+    options = {"device": device, "width": width, "height": height, "pixel_format": pixel_format}
+    return open_device("camera", "v4l2", {**options, **more}, SystemClock())
+
+
+@contextlib.contextmanager
+def feeder(width, height, pixel_format, fps=10.0):
+    import numpy as np
+
+    frames = np.zeros((1, height, width), np.uint8)
+    frames[:] = np.add.outer(np.arange(height), np.arange(width)) // 8 % 200
+    np.save("/run/frames.npy", frames)
+    np.save("/run/temperatures.npy", np.array([20.0]))
+    arguments = ["/dev/video40", "/run/frames.npy", "/run/temperatures.npy", LOG]
+    more = ["--fps", str(fps), "--format", pixel_format]
+    with contextlib.suppress(FileNotFoundError):
+        os.unlink(LOG)
+    process = subprocess.Popen([*FEED, *arguments, *more])
+    deadline = time.monotonic() + 60
+    while not (os.path.exists(LOG) and os.path.getsize(LOG)):
+        if process.poll() is not None or time.monotonic() > deadline:
+            raise SystemExit("the feeder does not run")
+        time.sleep(0.05)
+    try:
+        yield process
+    finally:
+        process.send_signal(signal.SIGCONT)
+        process.kill()
+        process.wait()
+
+
+def times(pixel_format, width, height, backend="linuxpy"):
+    """Frames of the loopback, with the instants at which each was really written."""
+    width, height = int(width), int(height)
+    with (
+        feeder(width, height, pixel_format),
+        camera("/dev/video40", width, height, pixel_format, backend=backend) as device,
+    ):
+        captured = []
+        for _ in range(12):
+            called = time.monotonic()
+            frame = device.capture()
+            captured.append(
+                {"called": called, "took_s": time.monotonic() - called, **described(frame)}
+            )
+            time.sleep(0.35)  # longer than the queue: old frames must not come
+    written = {}
+    with open(LOG) as log:
+        for line in log:
+            number, before, after, _ = line.split()
+            written[int(number)] = (float(before), float(after))
+    for frame in captured:
+        frame["written"] = written.get(frame["number"])
+    return captured
+
+
+def stalls(backend):
+    """A feeder that stops, goes on, and dies; then another one."""
+    result = {}
+    with feeder(320, 240, "GREY") as process:
+        device = camera("/dev/video40", 320, 240, "GREY", timeout_s=1.5, backend=backend)
+        device.open()
+        device.capture()
+        process.send_signal(signal.SIGSTOP)
+        result["stopped"] = outcome(lambda: described(device.capture()))
+        process.send_signal(signal.SIGCONT)
+        device.close()
+        result["continued"] = outcome(lambda: (device.open(), described(device.capture()))[1])
+        process.kill()
+        process.wait()
+        result["killed"] = outcome(lambda: described(device.capture()))
+        device.close()
+    with feeder(320, 240, "GREY"):
+        result["again"] = outcome(lambda: (device.open(), described(device.capture()))[1])
+        device.close()
+    return result
+
+
+VIVID = "/sys/bus/platform/drivers/vivid"
+
+
+def write(path, text):
+    with open(path, "w") as file:
+        file.write(text)
+
+
+def vivid():
+    """Real kernel faults: controls, an error flag, a fatal error, an unplug and a plug."""
+    result = {}
+    device = camera("/dev/video0", 640, 360, "GREY", timeout_s=3.0)
+    result["opened"] = outcome(device.open)
+    result["captured"] = outcome(lambda: list(device.capture().image.shape))
+    asked = camera("/dev/video0", 640, 360, "GREY", controls={"brightness": 77, "contrast": 100})
+    device.close()
+    with asked:
+        result["controls"] = outcome(lambda: dict(asked.capture().metadata["controls"]))
+    result["no_control"] = outcome(
+        camera("/dev/video0", 640, 360, "GREY", controls={"zoomiest": 1}).open
+    )
+    result["no_size"] = outcome(camera("/dev/video0", 641, 360, "GREY").open)
+    result["output_node"] = outcome(camera("/dev/video1", 640, 360, "GREY").open)
+    device.open()
+    other = camera("/dev/video0", 640, 360, "GREY")
+    result["busy"] = outcome(other.open)
+    other.close()
+    for name in ("inject_v4l2_buf_flag_error", "inject_fatal_streaming_error"):
+        push(name)
+        result[name] = outcome(lambda: list(device.capture().image.shape))
+        device.close()
+        result[f"after {name}"] = outcome(
+            lambda: (device.open(), list(device.capture().image.shape))[1]
+        )
+    write(f"{VIVID}/unbind", "vivid.0")
+    result["unplugged"] = outcome(lambda: list(device.capture().image.shape))
+    device.close()
+    result["still unplugged"] = outcome(device.open)
+    write(f"{VIVID}/bind", "vivid.0")
+    result["plugged"] = until_open(device)
+    result["captured again"] = outcome(lambda: list(device.capture().image.shape))
+    device.close()
+    return result
+
+
+def push(name):
+    """Press one of vivid's fault buttons."""
+    from linuxpy.video import device as video
+    from thermocald_drivers.v4l2_stream import _plain_name
+
+    with open("/dev/video0", "r+b", buffering=0) as file:
+        for control in video.iter_read_controls(file):
+            if _plain_name(control.name.decode()) == name:
+                video.set_control(file, control.id, 1)
+                return
+    raise SystemExit(f"vivid has no control {name}")
+
+
+def until_open(device):
+    """Open again as the daemon does: until it works, udev makes the node a little later."""
+    deadline = time.monotonic() + 20
+    while True:
+        last = outcome(device.open)
+        if last["error"] is None or time.monotonic() > deadline:
+            return last
+        time.sleep(0.1)
+
+
+def thermometer(name, **options):
+    return open_device("thermometer", name, options, SystemClock())
+
+
+def repeated(device, count=20):
+    """Values of some readings and the time that each took."""
+    values, took = [], []
+    for _ in range(count):
+        begin = time.monotonic()
+        reading = device.read()
+        took.append(time.monotonic() - begin)
+        values.append(dict(reading.values))
+    return {"values": values, "took_s": took}
+
+
+def swapped(value):
+    return (value & 0xFF) << 8 | value >> 8
+
+
+def i2c(bus):
+    """The kernel's lm75 over i2c-stub, and our register drivers beside it."""
+    import smbus2
+
+    bus = int(bus)
+    result = {}
+    with smbus2.SMBus(bus, force=True) as wire:
+
+        def put(address, register, value):
+            wire.write_word_data(address, register, swapped(value))
+
+        for address in (0x48, 0x49):
+            put(address, 2, 0x4B00)
+            put(address, 3, 0x5000)
+            put(address, 0, 0x1910)
+            wire.write_byte_data(address, 1, 0)
+        put(0x18, 6, 0x0054)
+        put(0x18, 7, 0x0400)
+        put(0x18, 1, 0)
+        put(0x18, 5, 0xC191)
+        if not os.path.exists(f"/sys/bus/i2c/devices/{bus}-0048"):
+            write(f"/sys/bus/i2c/devices/i2c-{bus}/new_device", "tmp75 0x48")
+        with thermometer("hwmon", chip="tmp75") as device:
+            result["kernel"] = repeated(device)
+            put(0x48, 0, 0xE6F0)  # below freezing point; the kernel reads at most every 0.1 s
+            time.sleep(1.5)
+            result["kernel cold"] = outcome(lambda: dict(device.read().values))
+            put(0x48, 0, 0x1910)
+        with thermometer("lm75", chip="tmp75", bus=bus, address=0x49) as device:
+            result["registers"] = repeated(device)
+            put(0x49, 0, 0xFFFF)
+            result["0xffff"] = outcome(device.read)
+        with thermometer("mcp9808", bus=bus, address=0x18) as device:
+            result["mcp9808"] = repeated(device)
+            put(0x18, 5, 0x1FFF)
+            result["mcp9808 cold"] = outcome(lambda: dict(device.read().values))
+        put(0x18, 7, 0x0500)
+        result["another chip"] = outcome(thermometer("mcp9808", bus=bus, address=0x18).open)
+        busy = thermometer("lm75", chip="tmp75", bus=bus, address=0x48)
+        result["kernel has it"] = outcome(busy.open)
+        result["nobody"] = outcome(thermometer("tmp117", bus=bus, address=0x4A).open)
+        result["no bus"] = outcome(thermometer("tmp117", bus=99).open)
+        with thermometer("hwmon", chip="tmp75") as device:
+            write(f"/sys/bus/i2c/devices/i2c-{bus}/delete_device", "0x48")
+            result["unbound"] = outcome(device.read)
+            write(f"/sys/bus/i2c/devices/i2c-{bus}/new_device", "tmp75 0x48")
+            device.close()
+            result["bound"] = outcome(lambda: (device.open(), dict(device.read().values))[1])
+    return result
+
+
+def serial_line(port, count=20):
+    """A real USB serial adapter's tty; the instrument is on the host."""
+    options = {"port": port, "pattern": r"T=(?P<temperature>[-+]?\d+\.\d+)", "command": "T?\r\n"}
+    with thermometer("serial", timeout_s=2.0, **options) as device:
+        return repeated(device, int(count))
+
+
+def serial_unplug(port):
+    """Reads until the adapter is pulled, then until it is back."""
+    options = {"port": port, "pattern": r"T=(?P<temperature>[-+]?\d+\.\d+)", "command": "T?\r\n"}
+    device = thermometer("serial", timeout_s=2.0, **options)
+    device.open()
+    result = {"before": outcome(lambda: dict(device.read().values))}
+    write("/run/serial-ready", "pull")
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        last = outcome(lambda: dict(device.read().values))
+        if last["error"]:
+            break
+        time.sleep(0.05)
+    result["pulled"] = last
+    device.close()
+    result["gone"] = outcome(device.open)
+    write("/run/serial-ready", "plug")
+    while time.monotonic() < deadline:
+        last = outcome(lambda: (device.open(), dict(device.read().values))[1])
+        if not last["error"]:
+            break
+        device.close()
+        time.sleep(0.1)
+    result["back"] = last
+    device.close()
+    return result
+
+
+def mqtt():
+    """A real broker: delivery, Home Assistant's discovery, the last will of a killed process."""
+    import paho.mqtt.client as client_module
+
+    subprocess.run(["systemctl", "start", "mosquitto"], check=True)
+    received = []
+    client = client_module.Client(client_module.CallbackAPIVersion.VERSION2)
+    client.on_message = lambda _c, _d, m: received.append((m.topic, m.payload.decode(), m.retain))
+    deadline = time.monotonic() + 20
+    while True:
+        try:
+            client.connect("127.0.0.1")
+            break
+        except OSError:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.1)
+    client.subscribe("#", qos=1)
+    client.loop_start()
+    process = subprocess.Popen(
+        [sys.executable, __file__, "mqtt_publisher"], stdout=subprocess.PIPE, text=True
+    )
+    took = json.loads(process.stdout.readline())
+    process.kill()
+    process.wait()
+    while time.monotonic() < deadline + 40 and not any(p == "offline" for _, p, _ in received):
+        time.sleep(0.05)
+    client.disconnect()
+    client.loop_stop()
+    return {"received": received, "took_s": took}
+
+
+def mqtt_publisher():
+    device = open_device("output", "mqtt", {"host": "127.0.0.1"}, SystemClock())
+    device.open()
+    took = []
+    for epoch in range(5):
+        begin = time.monotonic()
+        device.emit({"device": "thermocald", "epoch": epoch, "c": 3.04, "status": "ok"})
+        took.append(time.monotonic() - begin)
+    print(json.dumps(took), flush=True)
+    time.sleep(600)
+
+
+def jsonl_full():
+    """A 1 MB file system that fills up in mid-line."""
+    subprocess.run("mkdir -p /run/small && mount -t tmpfs -o size=64k none /run/small", shell=True,
+                   check=True)  # fmt: skip
+    device = open_device("output", "jsonl", {"path": "/run/small/r.jsonl"}, SystemClock())
+    device.open()
+    last = {}
+    for epoch in range(2000):
+        last = outcome(lambda epoch=epoch: device.emit({"epoch": epoch, "text": "x" * 97}))
+        if last["error"]:
+            break
+    device.close()
+    with open("/run/small/r.jsonl") as file:
+        whole = [json.loads(line)["epoch"] for line in file.read().splitlines()]
+    subprocess.run("umount /run/small", shell=True, check=True)
+    return {"last": last, "whole": len(whole), "consecutive": whole == list(range(len(whole)))}
+
+
+if __name__ == "__main__":
+    print(json.dumps(globals()[sys.argv[1]](*sys.argv[2:])))

@@ -1,0 +1,71 @@
+"""Feeds rendered frames into a v4l2loopback device and their temperatures into an I2C register.
+
+feed.py DEVICE FRAMES.npy TEMPERATURES.npy LOG --fps F [--hold N] [--format GREY|YUYV|MJPG] [--bus B]
+
+Writes frame n at n/F s: its image and temperature are those of n // hold, the bars of its number in
+the top rows. Each line of LOG is: n, CLOCK_MONOTONIC before and after the write, temperature.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+
+import numpy as np
+
+sys.path.insert(0, "/mnt/host")
+
+from linuxpy.video import device as video
+from tests_hil.bars import stamp
+
+SENSOR = 0x48
+
+
+def encode(image, fourcc):
+    if fourcc == "GREY":
+        return image.tobytes()
+    if fourcc == "YUYV":
+        return np.stack([image, np.full_like(image, 128)], -1).tobytes()
+    import simplejpeg
+
+    grey = np.ascontiguousarray(image[..., None])
+    return simplejpeg.encode_jpeg(grey, quality=92, colorspace="GRAY")
+
+
+def main():
+    options = argparse.ArgumentParser()
+    for name in ("device", "frames", "temperatures", "log"):
+        options.add_argument(name)
+    options.add_argument("--fps", type=float, default=5.0)
+    options.add_argument("--hold", type=int, default=1)
+    options.add_argument("--format", default="GREY")
+    options.add_argument("--bus", type=int)
+    options.add_argument("--count", type=int, default=1 << 30)
+    given = options.parse_args()
+    frames = np.load(given.frames, mmap_mode="r")
+    temperatures = np.load(given.temperatures)
+    height, width = frames.shape[1:]
+    bus = None
+    if given.bus is not None:
+        import smbus2
+
+        bus = smbus2.SMBus(given.bus, force=True)
+    with open(given.device, "r+b", buffering=0) as out, open(given.log, "w", buffering=1) as log:
+        video.set_format(out, video.BufferType.VIDEO_OUTPUT, width, height, given.format)
+        begin, last = time.monotonic(), None
+        for n in range(given.count):
+            k = min(n // given.hold, len(frames) - 1)
+            celsius = round(float(temperatures[k]) * 16) / 16
+            if bus is not None and celsius != last:
+                raw = round(celsius * 16) << 4
+                bus.write_word_data(SENSOR, 0, (raw & 0xFF) << 8 | raw >> 8)
+                last = celsius
+            data = encode(stamp(np.asarray(frames[k]), n), given.format)
+            time.sleep(max(0.0, begin + n / given.fps - time.monotonic()))
+            before = time.monotonic()
+            out.write(data)
+            log.write(f"{n} {before:.6f} {time.monotonic():.6f} {celsius:.4f}\n")
+
+
+main()

@@ -1,0 +1,118 @@
+"""The laboratory's phone: Debian's adbd in a chroot, with a scripted camera and dumpsys."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import signal
+import subprocess
+import time
+from typing import TYPE_CHECKING
+
+from PIL import Image
+
+from tests.hil.bars import stamp
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import numpy as np
+
+__all__ = ["ADB_PORT", "PHONE_PORT", "Phone"]
+
+# not 5555 to 5585: the adb server takes those for emulators
+PHONE_PORT = 5600
+ADB_PORT = 5037
+ADBD = "/usr/lib/android-sdk/platform-tools/adbd"
+
+
+class Phone:
+    """`state` is the folder that its scripts look into; see tests/hil/handset/bin."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.state = root / "phone"
+        self.camera_folder = root / "sdcard" / "DCIM" / "Camera"
+        self.serial = f"127.0.0.1:{PHONE_PORT}"
+        self._adbd: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        """As it comes out of the drawer: no photographs, asleep; attached to the adb server."""
+        for folder in (self.state, self.camera_folder):
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir(parents=True)
+        (self.state / "photographs").mkdir()
+        self.say("dumpsys.battery", "  voltage: 4100\n  temperature: 287\n")
+        self.focus(0.25)
+        self.plug()
+
+    def plug(self) -> None:
+        """Begin to answer, and tell the adb server."""
+        # a mount namespace of its own: nothing of /dev and /proc stays behind
+        script = (
+            f"mount --rbind /dev {self.root}/dev && mount -t proc proc {self.root}/proc && "
+            f"ADBD_PORT={PHONE_PORT} exec chroot {self.root} {ADBD}"
+        )
+        quiet = subprocess.DEVNULL
+        self._adbd = subprocess.Popen(
+            ["unshare", "-m", "sh", "-c", script], stdin=quiet, stdout=quiet, stderr=quiet
+        )
+        self.attach()
+
+    def attach(self, timeout_s: float = 30.0) -> None:
+        """`adb connect` until the phone is listed as a device."""
+        deadline = time.monotonic() + timeout_s
+        while time.monotonic() < deadline:
+            self.adb("connect", self.serial)
+            if f"{self.serial}\tdevice" in self.adb("devices"):
+                return
+            time.sleep(0.1)
+        raise RuntimeError(f"adb does not see the phone: {self.adb('devices')}")
+
+    def adb(self, *arguments: str) -> str:
+        done = subprocess.run(
+            ["adb", *arguments], capture_output=True, text=True, timeout=30, check=False
+        )
+        return done.stdout + done.stderr
+
+    def pull(self) -> None:
+        """The cable falls out."""
+        if self._adbd is not None:
+            self._adbd.send_signal(signal.SIGKILL)
+            self._adbd.wait()
+            self._adbd = None
+
+    def stop(self) -> None:
+        self.adb("disconnect", self.serial)
+        self.adb("kill-server")
+        self.pull()
+        shutil.rmtree(self.state, ignore_errors=True)
+        self.state.mkdir()
+
+    def say(self, name: str, text: str) -> None:
+        (self.state / name).write_text(text)
+
+    def unsay(self, name: str) -> None:
+        with contextlib.suppress(FileNotFoundError):
+            (self.state / name).unlink()
+
+    def focus(self, dioptres: float) -> None:
+        self.say(
+            "dumpsys.media.camera",
+            f"  android.lens.focusDistance (80007): float[1]\n        [{dioptres} ]\n",
+        )
+
+    def load(self, images: np.ndarray, first: int = 1) -> None:
+        """Put photographs in: what the camera shows at its next exposures, numbered from `first`."""
+        for k, image in enumerate(images):
+            tags = Image.Exif()
+            sub = tags.get_ifd(0x8769)
+            sub[0x829A], sub[0x8827] = 0.01, 100
+            sub[0x9003], sub[0x9291] = "2000:01:01 00:00:00", "999"
+            path = self.state / "photographs" / f"{first + k:05d}.jpg"
+            Image.fromarray(stamp(image, first + k)).save(path, "JPEG", quality=92, exif=tags)
+
+    def exposures(self) -> dict[int, float]:
+        """{number: s UTC} when each was really exposed."""
+        lines = (self.state / "exposures").read_text().splitlines()
+        return {int(n): float(t) for n, t in (line.split() for line in lines)}

@@ -1,0 +1,147 @@
+"""Drivers on real kernel drivers in the guest: v4l2loopback, vivid, i2c-stub, lm75, ftdi_sio."""
+
+from __future__ import annotations
+
+import statistics
+
+import pytest
+
+STAMP_S = 0.005
+
+
+def check(machine, name, *arguments, timeout_s=300.0):
+    return machine.python("check.py", name, *arguments, timeout_s=timeout_s)
+
+
+def milliseconds(seconds):
+    return f"median {1e3 * statistics.median(seconds):.1f} ms, largest {1e3 * max(seconds):.1f} ms"
+
+
+@pytest.mark.parametrize(
+    ("pixel_format", "width", "height", "backend"),
+    [
+        ("GREY", 640, 480, "linuxpy"),
+        ("YUYV", 640, 480, "linuxpy"),
+        ("MJPG", 640, 480, "linuxpy"),
+        ("YUYV", 640, 480, "opencv"),
+    ],
+)
+def test_v4l2_frames_are_new_and_their_times_right(
+    video, report, pixel_format, width, height, backend
+):
+    """Each frame carries its number; the feeder logged when each was written."""
+    frames = check(video, "times", pixel_format, width, height, backend)
+    numbers = [frame["number"] for frame in frames]
+    assert numbers == sorted(set(numbers))
+    errors = []
+    for frame in frames:
+        assert frame["shape"] == [height, width]
+        assert frame["timestamp"] == "buffer"
+        before, after = frame["written"]
+        errors.append(max(before - frame["monotonic"], frame["monotonic"] - after, 0.0))
+        assert frame["monotonic"] >= frame["called"]  # exposed after the call
+    assert max(errors) < STAMP_S
+    report(
+        f"v4l2 {pixel_format} {width}x{height} {backend}: trigger to frame in memory "
+        f"{milliseconds([f['took_s'] for f in frames])} (camera at 10 frames/s); "
+        f"time stamps off by at most {1e3 * max(errors):.2f} ms"
+    )
+
+
+@pytest.mark.parametrize("backend", ["linuxpy", "opencv"])
+def test_v4l2_feeder_that_stops_and_dies(video, backend):
+    result = check(video, "stalls", backend)
+    stopped = result["stopped"]
+    assert stopped["error"] == "DeviceTimeout"
+    assert stopped["took_s"] < 2.5  # the driver's 1.5 s, and not OpenCV's 10 s
+    assert result["continued"]["error"] is None
+    assert result["killed"]["error"] in ("DeviceTimeout", "BadReading", "DeviceGone")
+    assert result["again"]["error"] is None
+
+
+def test_v4l2_faults_of_the_kernel(video, report):
+    result = check(video, "vivid")
+    assert result["opened"]["error"] is None, result["opened"]["text"]
+    assert result["captured"]["value"] == [360, 640]
+    assert result["controls"]["value"] == {"brightness": 77, "contrast": 100}
+    assert result["no_control"]["error"] == "WrongDevice"
+    assert result["no_size"]["error"] == "WrongDevice"
+    assert result["output_node"]["error"] == "WrongDevice"
+    assert result["busy"]["error"] == "DeviceDenied"
+    # one frame with the error flag is skipped, the next is good
+    assert result["inject_v4l2_buf_flag_error"]["value"] == [360, 640]
+    fatal = result["inject_fatal_streaming_error"]
+    assert fatal["error"] in ("BadReading", "DeviceGone", "DeviceTimeout"), fatal
+    assert result["after inject_fatal_streaming_error"]["value"] == [360, 640]
+    assert result["unplugged"]["error"] == "DeviceGone"
+    assert result["still unplugged"]["error"] == "DeviceGone"
+    assert result["plugged"]["error"] is None, result["plugged"]["text"]
+    assert result["captured again"]["value"] == [360, 640]
+    report(f"v4l2 vivid: an unplug is noticed after {result['unplugged']['took_s'] * 1e3:.0f} ms")
+
+
+def test_i2c(machine, i2c_bus, report):
+    result = check(machine, "i2c", i2c_bus)
+    for name in ("kernel", "registers"):
+        assert result[name]["values"] == [{"temperature": 25.0625}] * 20
+    assert result["mcp9808"]["values"] == [{"temperature": 25.0625}] * 20
+    assert result["kernel cold"]["value"] == {"temperature": pytest.approx(-25.062, abs=1e-3)}
+    assert result["mcp9808 cold"]["value"] == {"temperature": -0.0625}
+    assert (result["0xffff"]["error"], result["another chip"]["error"]) == (
+        "BadReading",
+        "WrongDevice",
+    )
+    assert result["kernel has it"]["error"] == "DeviceDenied"
+    assert result["nobody"]["error"] == "DeviceNotFound"
+    assert result["no bus"]["error"] == "DeviceNotFound"
+    assert result["unbound"]["error"] == "DeviceGone"
+    assert result["bound"]["value"] == {"temperature": 25.062}
+    for name in ("kernel", "registers", "mcp9808"):
+        driver = {"kernel": "hwmon (lm75 in the kernel)", "registers": "lm75"}.get(name, name)
+        report(f"{driver}: read to value {milliseconds(result[name]['took_s'])}")
+
+
+def test_serial(machine, instrument, report):
+    instrument.celsius = -12.375
+    result = check(machine, "serial_line", instrument.port)
+    assert result["values"] == [{"temperature": -12.375}] * 20
+    report(f"serial (ftdi_sio): read to value {milliseconds(result['took_s'])}")
+
+
+def test_serial_unplugged_and_plugged_again(machine, instrument):
+    machine.run("rm -f /run/serial-ready")
+    machine.run(
+        f"nohup python3 /mnt/host/guest/check.py serial_unplug {instrument.port} "
+        ">/run/serial-result 2>/run/serial-errors </dev/null &"
+    )
+    machine.wait("grep -q pull /run/serial-ready")
+    instrument.pull()
+    machine.wait("grep -q plug /run/serial-ready")
+    instrument.celsius = 30.5
+    instrument.plug()
+    import json
+
+    machine.wait("test -s /run/serial-result || test -s /run/serial-errors", 90)
+    result = json.loads(machine.run("cat /run/serial-result").stdout)
+    assert result["before"]["value"] == {"temperature": 21.25}
+    assert result["pulled"]["error"] == "DeviceGone"
+    assert result["gone"]["error"] == "DeviceGone"
+    assert result["back"]["value"] == {"temperature": 30.5}
+
+
+def test_mqtt_with_a_real_broker(machine, report):
+    result = check(machine, "mqtt")
+    received = result["received"]
+    results = [p for topic, p, _ in received if topic == "thermocald/thermocald/result"]
+    assert len(results) == 5
+    assert sum(topic.startswith("homeassistant/sensor/") for topic, _, _ in received) == 8
+    available = [p for topic, p, _ in received if topic == "thermocald/thermocald/available"]
+    assert available == ["online", "offline"]  # killed: the broker speaks the last will
+    report(f"mqtt (mosquitto): result to acknowledgement {milliseconds(result['took_s'][1:])}")
+
+
+def test_json_lines_on_a_full_disk(machine):
+    result = check(machine, "jsonl_full")
+    assert "disk is full" in result["last"]["text"]
+    assert result["whole"] > 100
+    assert result["consecutive"]

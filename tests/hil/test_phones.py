@@ -1,0 +1,157 @@
+"""The android drivers with the real adb server and a real adbd (Debian's), over TCP."""
+
+from __future__ import annotations
+
+import statistics
+import time
+
+import pytest
+
+from tests.hil.bars import number_of
+from tests.hil.frames import heating
+from thermocald.errors import (
+    BadReading,
+    DeviceDenied,
+    DeviceGone,
+    DeviceTimeout,
+    PermanentDeviceError,
+)
+from thermocald.hal import SystemClock, VirtualClock, open_device
+
+WIDTH, HEIGHT, EPOCHS = 640, 480, 12
+
+
+@pytest.fixture(scope="module")
+def subject():
+    return heating(WIDTH, HEIGHT, EPOCHS)
+
+
+def camera(phone, **more):
+    options = {"serial": phone.serial, "width": WIDTH, "height": HEIGHT, "timeout_s": 8.0, **more}
+    return open_device("camera", "android", options, SystemClock())
+
+
+def thermometer(phone, **more):
+    return open_device("thermometer", "android", {"serial": phone.serial, **more}, SystemClock())
+
+
+def test_a_heating_series(phone, subject, report):
+    """Frame numbers, temperatures and times of every epoch; photographs deleted from the phone."""
+    images, temperatures = subject
+    phone.load(images)
+    phone.say("shutter_lag", "0.12")
+    took, read, errors = [], [], []
+    sensors = {"temperature": "battery"}
+    with camera(phone, delete=True) as device, thermometer(phone, sensors=sensors) as sensor:
+        for epoch in range(EPOCHS):
+            tenths = round(temperatures[epoch] * 10)
+            phone.say("dumpsys.battery", f"  voltage: 4100\n  temperature: {tenths}\n")
+            begin = time.monotonic()
+            frame = device.capture()
+            took.append(time.monotonic() - begin)
+            begin = time.monotonic()
+            reading = sensor.read()
+            read.append(time.monotonic() - begin)
+            assert number_of(frame.image) == epoch + 1
+            assert reading.values == {"temperature": tenths / 10}
+            assert frame.metadata["locked"] is True
+            assert frame.metadata["time_from"] == "exif"
+            errors.append(frame.utc - (phone.exposures()[epoch + 1] + 0.005))
+    assert max(abs(error) for error in errors) < 0.005  # exposure 0.01 s: its middle
+    assert list(phone.camera_folder.iterdir()) == []
+    activities = (phone.state / "activities").read_text().splitlines()
+    assert sum("STILL_IMAGE_CAMERA" in line for line in activities) == 1
+    report(
+        f"android (adbd 34, {WIDTH}x{HEIGHT}): trigger to frame in memory median "
+        f"{statistics.median(took):.2f} s (shutter lag 0.12 s, file written for 0.3 s), "
+        f"times off by at most {1e3 * max(map(abs, errors)):.1f} ms; read to value median "
+        f"{1e3 * statistics.median(read):.0f} ms"
+    )
+
+
+def test_a_file_that_never_ends(phone, subject):
+    phone.load(subject[0][:1])
+    phone.say("never_ends", "")
+    with camera(phone, timeout_s=3.0) as device, pytest.raises(BadReading, match="partial"):
+        device.capture()
+
+
+def test_no_camera_app(phone):
+    phone.say("no_camera", "")
+    with camera(phone, timeout_s=2.0) as device, pytest.raises(DeviceTimeout, match="trigger"):
+        device.capture()
+
+
+def test_focus_that_moved(phone, subject):
+    phone.load(subject[0][:2])
+    with camera(phone) as device:
+        device.capture()
+        phone.focus(0.31)
+        metadata = device.capture().metadata
+    assert metadata["locked"] is False
+    assert "focus_distance_dioptres was 0.25 and is 0.31" in metadata["locked_why"]
+
+
+def test_a_locked_screen(phone):
+    phone.say("locked", "")
+    with pytest.raises(DeviceDenied, match="screen is locked"):
+        camera(phone).open()
+
+
+def test_a_full_phone(phone):
+    with pytest.raises(PermanentDeviceError, match="storage is full"):
+        camera(phone, minimum_free_mb=1e6).open()
+
+
+def test_the_cable_falls_out_and_is_put_back(phone, subject):
+    """adbd is killed in the middle of a capture; nothing truncated comes of it."""
+    phone.load(subject[0][:2])
+    phone.say("write_lag", "30")
+    device = camera(phone, timeout_s=5.0)
+    device.open()
+    import threading
+
+    killer = threading.Timer(0.8, phone.pull)
+    killer.start()
+    with pytest.raises((DeviceGone, DeviceTimeout)):
+        device.capture()
+    killer.join()
+    device.close()
+    with pytest.raises(DeviceGone):
+        device.open()
+    phone.unsay("write_lag")
+    phone.plug()
+    device.open()
+    assert number_of(device.capture().image) == 2
+    device.close()
+
+
+def test_warm_up_by_processor_load(phone):
+    """Real processes on the phone, gone at the limit and when the lease ends."""
+    programme = [{"seconds": 1000, "hold_c": 38.0}]
+    options = {"serial": phone.serial, "limit_c": 42, "programme": programme, "processes": 2}
+    clock = VirtualClock()
+
+    def running():
+        # adbd's own line carries the command too; only the loops' shells count
+        return phone.adb(
+            "-s", phone.serial, "shell", "pgrep -fc '^sh -c [t]hermocald_load'"
+        ).strip()
+
+    with open_device("output", "android_load", {**options, "lease_s": 4}, clock) as output:
+        output.emit({})
+        assert running() == "2"
+        phone.say("dumpsys.battery", "  voltage: 4100\n  temperature: 425\n")
+        with pytest.raises(BadReading, match="reached the limit"):
+            output.emit({})
+        assert running() == "0"
+    phone.say("dumpsys.battery", "  voltage: 4100\n  temperature: 300\n")
+    output = open_device("output", "android_load", {**options, "lease_s": 2}, clock)
+    output.open()
+    output.emit({})
+    assert running() == "2"
+    deadline = time.monotonic() + 10  # nobody renews: it ends by itself
+    while running() != "0" and time.monotonic() < deadline:
+        time.sleep(0.2)
+    assert running() == "0"
+    output.close()

@@ -13,20 +13,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.errors import DataError
-from thermocald.photogrammetry.camera_model import (
-    IOP_NAMES,
-    PARAMETER_NAMES,
-    ExteriorOrientation,
-    InteriorOrientation,
-    Sensor,
-    project,
-)
+from thermocald.photogrammetry.camera_model import PARAMETER_NAMES, project
 from thermocald.photogrammetry.normals import (
     ObservationGrid,
     linearise,
     normal_matrices,
     right_hand_sides,
 )
+from thermocald.photogrammetry.orientation import approximate_orientation
+from thermocald.photogrammetry.series import SeriesSettings, adjust_series
 from thermocald.simulation.history import History
 
 if TYPE_CHECKING:
@@ -34,20 +29,29 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.epoch import Epoch
+    from thermocald.photogrammetry.camera_model import (
+        ExteriorOrientation,
+        InteriorOrientation,
+        Sensor,
+    )
+    from thermocald.photogrammetry.normals import Partials
     from thermocald.photogrammetry.testfield import TestField
     from thermocald.simulation.model import Prediction
+    from thermocald.store.head import Head
     from thermocald.store.recording import Recording
 
     Array = NDArray[np.float64]
 
-__all__ = ["N_PARAMETERS", "ModelSeries", "load_model_series", "model_series"]
+__all__ = ["N_PARAMETERS", "ModelSeries", "load_model_series", "model_series", "reduce_series"]
 
 N_PARAMETERS = 22
 """16 parameters of the camera, 3 scales of the object coordinates, 3 of a displacement (mm)."""
 
 _ENOUGH = 20  # image points without which an epoch says too little
 _GROSS = 4.5  # standard deviations
-_WARM_EPOCHS = 40  # a sample of epochs that tells the mean orientation
+_SAMPLE = 40  # epochs that tell the mean orientation
+_ROUNDS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,59 +118,79 @@ class ModelSeries:
         return found
 
 
-def load_model_series(path: Path) -> ModelSeries:
-    """Reduce a recording; DataError where it has no observations or no temperature."""
-    from thermocald.store.recording import read_recording
+def load_model_series(path: Path) -> list[ModelSeries]:
+    """Reduce the series of a recording (a folder) or of a store (a file).
 
-    recording = read_recording(path)
-    if not recording.has_observations:
-        raise DataError(
-            f"{path}: holds frames, not measurements; measure them first: thermocald replay {path}"
-        )
-    if not recording.channels:
-        raise DataError(f"{path}: has no temperature column; a thermal model needs one")
-    return model_series(recording)
+    DataError where there are no measurements or no temperature.
+    """
+    if path.is_dir():
+        from thermocald.store.recording import read_recording
+
+        recording = read_recording(path)
+        if not recording.has_observations:
+            raise DataError(
+                f"{path}: holds frames, not measurements; measure them into a store first: "
+                f"thermocald replay {path}"
+            )
+        return [model_series(recording)]
+    from thermocald.store.database import Store
+
+    with Store.open(path) as store:
+        found = [
+            reduce_series(
+                s.head, s.testfield, [e.epoch for e in store.epochs(s)], f"{path}: {s.name}"
+            )
+            for s in store.all_series()
+        ]
+    if not found:
+        raise DataError(f"{path}: the store holds no series")
+    return found
 
 
 def model_series(recording: Recording, keep_targets: tuple[str, ...] = ()) -> ModelSeries:
-    """Find the mean orientation and the gross errors, and reduce every epoch.
+    """Reduce a recording; see `reduce_series`."""
+    return reduce_series(
+        recording.head,
+        recording.testfield,
+        list(recording.epochs),
+        str(recording.path),
+        keep_targets,
+    )
 
-    keep_targets: targets that data snooping must not throw out, because they are thought to move.
+
+def reduce_series(
+    head: Head,
+    field: TestField,
+    epochs: list[Epoch],
+    source: str,
+    keep_targets: tuple[str, ...] = (),
+) -> ModelSeries:
+    """Find the mean orientation, the gross errors and the targets' offsets, and reduce every epoch.
+
+    keep_targets: targets that must not be thrown out, because they are thought to move.
     """
-    from thermocald.photogrammetry.orientation import approximate_orientation
-    from thermocald.photogrammetry.series import SeriesSettings, adjust_series
-
-    field, sensor = recording.testfield, recording.camera.sensor
-    reference = next(iter(recording.channels))
-    epochs = list(recording.epochs)
+    if not head.channels:
+        raise DataError(f"{source}: has no temperature column; a thermal model needs one")
+    sensor = head.camera.sensor
     whole = ObservationGrid.from_observations(field, [e.observations for e in epochs])
     enough = whole.observed.sum(axis=1) >= _ENOUGH
     if enough.sum() < 3:
-        raise DataError(f"{recording.path}: fewer than 3 epochs show {_ENOUGH} targets or more")
+        raise DataError(f"{source}: fewer than 3 epochs show {_ENOUGH} targets or more")
     epochs = [e for e, ok in zip(epochs, enough, strict=True) if ok]
     grid = ObservationGrid(whole.points[enough], whole.weights[enough])
     most = int(grid.observed.sum(axis=1).argmax())
     seen = grid.observed[most]
     interior, exterior, _ = approximate_orientation(
-        sensor, field.points[seen], grid.points[most, seen], recording.camera.principal_distance
+        sensor, field.points[seen], grid.points[most, seen], head.camera.principal_distance
     )
     mean = _mean_orientation(sensor, field, grid, interior, exterior)
-    settings = SeriesSettings(exterior="per_epoch", free=IOP_NAMES, target_noise=False)
-    adjusted = adjust_series(
-        sensor,
-        field,
-        grid,
-        InteriorOrientation.from_array(mean[:10]),
-        ExteriorOrientation.from_array(mean[10:]),
-        settings,
-    )
-    rejected = _gross(adjusted.residuals)
-    rejected[:, [field.index[t] for t in keep_targets if t in field.index]] = False
-    offsets = np.nan_to_num(adjusted.offsets)
-    clean = ObservationGrid(grid.points - offsets, grid.weights).reject(rejected)
+    at = linearise(sensor, field, mean[:10], mean[10:])
+    kept = [field.index[t] for t in keep_targets if t in field.index]
+    offsets, gross = _offsets_and_gross_errors(grid, at, kept)
+    clean = ObservationGrid(grid.points - offsets, grid.weights).reject(gross)
     series = ModelSeries(
-        recording.series,
-        recording.camera.name,
+        head.series,
+        head.camera.name,
         sensor,
         field,
         clean,
@@ -175,9 +199,9 @@ def model_series(recording: Recording, keep_targets: tuple[str, ...] = ()) -> Mo
         np.empty(0),
         np.zeros(len(epochs)),
         clean.observed.sum(axis=1),
-        History.from_epochs(epochs, reference, 0.0),
-        {name: c.resolution or 0.0 for name, c in recording.channels.items()},
-        str(recording.path),
+        History.from_epochs(epochs, next(iter(head.channels)), 0.0),
+        {name: c.resolution or 0.0 for name, c in head.channels.items()},
+        source,
     )
     return _reduced(series, np.zeros(0, dtype=np.int64))
 
@@ -189,10 +213,8 @@ def _mean_orientation(
     interior: InteriorOrientation,
     exterior: ExteriorOrientation,
 ) -> Array:
-    """The mean (16,) of some epochs, each adjusted by itself."""
-    from thermocald.photogrammetry.series import SeriesSettings, adjust_series
-
-    sample = np.unique(np.linspace(0, len(grid.points) - 1, _WARM_EPOCHS).astype(int))
+    """The mean (16,) of some epochs adjusted together."""
+    sample = np.unique(np.linspace(0, len(grid.points) - 1, _SAMPLE).astype(int))
     some = ObservationGrid(grid.points[sample], grid.weights[sample])
     settings = SeriesSettings(exterior="series", target_noise=False)
     adjusted = adjust_series(sensor, field, some, interior, exterior, settings)
@@ -202,17 +224,36 @@ def _mean_orientation(
     return mean
 
 
-def _gross(residuals: Array) -> NDArray[np.bool_]:
-    """Gross errors (E, T): beyond 4.5 times their own epoch's noise.
+def _offsets_and_gross_errors(
+    grid: ObservationGrid, at: Partials, keep: list[int]
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Constant offsets of the targets (T, 2) px, and gross errors (E, T).
 
-    The adjustment's data snooping measures all epochs by one sigma; where heat defocuses, it would
-    cut off the hot epochs' tails and make them look better than they are.
+    Every epoch is given all 16 parameters of its own. A gross error is beyond 4.5 times the noise
+    of its own epoch: one sigma for all would cut off the tails of epochs that heat defocuses, and
+    make them look better than they are.
     """
-    size = np.abs(residuals)
-    noise = 1.4826 * np.nanmedian(size.reshape(len(size), -1), axis=1)
-    with np.errstate(invalid="ignore"):
-        gross: NDArray[np.bool_] = (size > _GROSS * noise[:, None, None]).any(axis=2)
-    return gross
+    observed = grid.observed
+    misclosure = grid.points - at.predicted
+    offsets = np.zeros(at.predicted.shape)
+    use = observed
+    for _ in range(_ROUNDS):
+        weights = np.where(use[..., None], grid.weights, 0.0)
+        N = normal_matrices(weights, at.A)
+        b, _ = right_hand_sides(weights, misclosure - offsets, at.A)
+        scale = 1.0 / np.sqrt(np.maximum(np.diagonal(N, axis1=1, axis2=2), 1e-300))
+        # a weak field determines some parameters badly: those are held, not blown up
+        scaled = N * scale[:, :, None] * scale[:, None, :] + 1e-10 * np.eye(N.shape[1])
+        step = scale * np.linalg.solve(scaled, (scale * b)[..., None])[..., 0]
+        left = misclosure - offsets - np.einsum("tcp,ep->etc", at.A, step)
+        size = np.where(observed[..., None], np.abs(left), np.nan)
+        noise = 1.4826 * np.nanmedian(size.reshape(len(size), -1), axis=1)
+        use = observed & (np.nan_to_num(size) <= _GROSS * noise[:, None, None]).all(axis=2)
+        use[:, keep] = observed[:, keep]
+        count = np.maximum(use.sum(axis=0), 1)[:, None]
+        offsets = offsets + np.where(use[..., None], left, 0.0).sum(axis=0) / count
+        offsets[keep] = 0.0  # what moves has no constant offset
+    return offsets, observed & ~use
 
 
 def _reduced(series: ModelSeries, displaced: NDArray[np.int64]) -> ModelSeries:

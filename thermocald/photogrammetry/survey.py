@@ -18,12 +18,13 @@ from thermocald.errors import GeometryError, ImageError
 from thermocald.photogrammetry import ring_code
 from thermocald.photogrammetry.camera_model import IOP_NAMES, Sensor
 from thermocald.photogrammetry.circle import fit_circles
-from thermocald.photogrammetry.detection import find_circles, read_codes
+from thermocald.photogrammetry.detection import find_circles
 from thermocald.photogrammetry.frame_status import inspect_frame
 from thermocald.photogrammetry.markers import locate_markers, measure_corners, to_8_bit
 from thermocald.photogrammetry.measurement import Prior, circle_observations, join, measure
 from thermocald.photogrammetry.network import Distance, Network, Photo, adjust_network
 from thermocald.photogrammetry.outline import LocalMap
+from thermocald.photogrammetry.ring_reading import read_codes
 from thermocald.photogrammetry.survey_field import expected_field, field_of_codes, surveyed_field
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-__all__ = ["CameraFile", "Json", "PixelPitch", "say"]
+__all__ = ["CameraFile", "Json", "PixelPitch"]
 
 Json = Annotated[
     str | None, typer.Option("--json", help="Write the result as JSON; - for standard output.")
@@ -19,8 +19,3 @@ CameraFile = Annotated[
 PixelPitch = Annotated[
     float | None, typer.Option("--pixel-pitch", help="Size of a pixel in mm.", min=1e-5, max=1.0)
 ]
-
-
-def say(message: str) -> None:
-    """Tell a person what is being done, on standard error."""
-    typer.echo(message, err=True)

@@ -7,7 +7,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from thermocald.cli.testfield_options import CameraFile, Json, PixelPitch, say
+from thermocald.cli.common import say
+from thermocald.cli.testfield_options import (  # noqa: TC001  typer reads them
+    CameraFile,
+    Json,
+    PixelPitch,
+)
 from thermocald.errors import UsageError
 
 if TYPE_CHECKING:

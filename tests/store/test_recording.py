@@ -217,3 +217,14 @@ def test_real_recordings_are_read_and_survive_a_round_trip(shared, tmp_path, cam
     for a, b in zip(read_recording(copy).epochs, recording.epochs, strict=True):
         assert same(a.observations, b.observations)
         assert a.frame_time == b.frame_time
+
+
+@pytest.mark.parametrize("column", ["frame_time", "temperature_time"])
+def test_writer_refuses_what_could_not_be_read_again(tmp_path, field, head, make_epoch, column):
+    late = replace(make_epoch(2), **{column: 1.0})
+    with RecordingWriter(tmp_path / "r", head, field) as writer:
+        writer.append(make_epoch(1))
+        with pytest.raises(RecordingError, match=r"epoch 2: the time of its .* runs backwards"):
+            writer.append(late)
+        writer.append(make_epoch(3))
+    assert [e.number for e in read_recording(tmp_path / "r").epochs] == [1, 3]

@@ -27,7 +27,12 @@ from thermocald.store.columns import (
     status_codes,
 )
 from thermocald.store.connection import Mode, connect, in_words
-from thermocald.store.epoch_table import StoredEpoch, insert_epoch, select_epochs
+from thermocald.store.epoch_table import (
+    StoredEpoch,
+    insert_epoch,
+    select_covariance,
+    select_epochs,
+)
 from thermocald.store.head import Head, head_document, parse_head
 from thermocald.store.readings import interpolate_readings
 from thermocald.store.row import NOT_CALIBRATED, EpochResult, Event, StoredSeries
@@ -241,10 +246,11 @@ class Store:
     def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
         """(E, 16, 16) covariances of some epochs, NaN for those without a result."""
         result = np.full((len(numbers), 16, 16), np.nan)
-        for i, number in enumerate(numbers):
-            stored = next(self.epochs(series, number, number), None)
-            if stored is not None and stored.result.covariance is not None:
-                result[i] = stored.result.covariance
+        with self._lock, in_words(self.path, "covariances cannot be read", reading=True):
+            for i, number in enumerate(numbers):
+                covariance = select_covariance(self._db, series.id, int(number))
+                if covariance is not None:
+                    result[i] = covariance
         return result
 
     def column_names(self, series: StoredSeries) -> list[str]:

@@ -26,9 +26,13 @@ if TYPE_CHECKING:
     import sqlite3
     from collections.abc import Iterator, Mapping
 
+    from numpy.typing import NDArray
+
     from thermocald.photogrammetry.testfield import Observations
 
-__all__ = ["StoredEpoch", "insert_epoch", "select_epochs"]
+    Array = NDArray[np.float64]
+
+__all__ = ["StoredEpoch", "insert_epoch", "select_covariance", "select_epochs"]
 
 _PARTS = 1024  # detail.id = epoch.id * _PARTS + part; part 0 is the covariance
 _PART_BYTES = 1100  # seven to a page
@@ -142,6 +146,16 @@ def select_epochs(
             if row[10] is not None:
                 measured = row[0]
         yield _epoch(connection, latest, measured, details)
+
+
+def select_covariance(connection: sqlite3.Connection, series: int, number: int) -> Array | None:
+    """The (16, 16) covariance of an epoch's latest calibration, None if there is none."""
+    row = connection.execute(
+        "SELECT id FROM epoch WHERE series_id = ? AND number = ? ORDER BY revision DESC LIMIT 1",
+        (series, number),
+    ).fetchone()
+    data = b"" if row is None else _detail(connection, row[0], 0, 1)
+    return unpack_covariance(data) if data else None
 
 
 def _epoch(

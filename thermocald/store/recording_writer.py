@@ -45,8 +45,8 @@ class RecordingWriter:
         self._partial = path.absolute().with_name(f".{path.absolute().name}.partial")
         self._epochs: TextIO | None = None
         self._observations: TextIO | None = None
-        self._count = 0
-        self._last: int | None = None
+        self._last: Epoch | None = None
+        self._last_reading = -math.inf
 
     def __enter__(self) -> Self:
         if reserved := _RESERVED & set(self._head.channels):
@@ -79,10 +79,7 @@ class RecordingWriter:
         """
         if self._epochs is None:
             raise RecordingError(f"{self.path}: the writer is not open")
-        if self._last is not None and epoch.number <= self._last:
-            raise RecordingError(
-                f"{self.path}: epoch {epoch.number} comes after {self._last}; numbers must increase"
-            )
+        self._refuse_backwards(epoch)
         try:
             frame = self._keep_frame(epoch, image)
             row: list[object] = [epoch.number, f"{epoch.frame_time:.6f}"]
@@ -93,8 +90,9 @@ class RecordingWriter:
                 self._write_observations(epoch.number, epoch.observations)
         except OSError as cause:
             raise self._failed(cause) from cause
-        self._last = epoch.number
-        self._count += 1
+        self._last = epoch
+        if math.isfinite(epoch.temperature_time):
+            self._last_reading = epoch.temperature_time
 
     def __exit__(
         self,
@@ -115,6 +113,18 @@ class RecordingWriter:
         except OSError as cause:
             self._abandon()
             raise self._failed(cause) from cause
+
+    def _refuse_backwards(self, epoch: Epoch) -> None:
+        """What could not be read again is not written."""
+        where = f"{self.path}: epoch {epoch.number}"
+        if self._last is not None and epoch.number <= self._last.number:
+            raise RecordingError(f"{where} comes after {self._last.number}; numbers must increase")
+        if not math.isfinite(epoch.frame_time):
+            raise RecordingError(f"{where}: its frame has no time")
+        if self._last is not None and epoch.frame_time < self._last.frame_time:
+            raise RecordingError(f"{where}: the time of its frame runs backwards")
+        if epoch.temperature_time < self._last_reading:
+            raise RecordingError(f"{where}: the time of its temperature runs backwards")
 
     def _new(self, name: str) -> TextIO:
         return (self._partial / name).open("w", encoding="utf-8", newline="")

@@ -1,0 +1,59 @@
+"""Archiving: a series of the store becomes a recording that reads as it was taken."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from thermocald.store.archive import archive_series, clock_corrections
+from thermocald.store.recording import read_recording
+
+
+def test_a_series_becomes_a_recording(filled, tmp_path, make_epoch):
+    store, series = filled
+    archive_series(store, series, tmp_path / "M1")
+    recording = read_recording(tmp_path / "M1")
+    assert recording.head == series.head
+    assert recording.testfield.names == series.testfield.names
+    for epoch, made in zip(recording.epochs, map(make_epoch, range(1, 21)), strict=True):
+        assert (epoch.number, epoch.temperatures) == (made.number, made.temperatures)
+        assert epoch.frame_time == pytest.approx(made.frame_time, abs=1e-6)
+        assert np.array_equal(epoch.observations.points, made.observations.points)
+
+
+def test_frames_that_are_left_are_taken_along(filled, tmp_path, make_epoch):
+    store, series = filled
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    (frames / "21.jpg").write_bytes(b"\xff\xd8 21")
+    for i in (21, 22):
+        store.append(series, replace(make_epoch(i), frame=type(frames)(f"{i}.jpg")))
+    archive_series(store, series, tmp_path / "M1", frames)
+    kept = {e.number: e.frame for e in read_recording(tmp_path / "M1").epochs if e.frame}
+    assert list(kept) == [21]
+    assert kept[21].read_bytes() == b"\xff\xd8 21"
+
+
+def test_a_clock_that_was_set_back_is_mended(filled, tmp_path, make_epoch):
+    store, series = filled
+    for i in range(21, 31):
+        epoch = make_epoch(i)
+        times = (epoch.frame_time - 3600, epoch.temperature_time - 3600)
+        store.append(series, replace(epoch, frame_time=times[0], temperature_time=times[1]))
+    archive_series(store, series, tmp_path / "M1")
+    recording = read_recording(tmp_path / "M1")
+    assert np.diff(recording.columns.frame_time) == pytest.approx(10.0)
+    assert recording.columns.frame_time[-1] == make_epoch(30).frame_time - 3600
+    (step,) = recording.extra["clock_set_back"]
+    assert step == {"epoch": 21, "seconds": pytest.approx(-3600.0)}
+    ahead = recording.columns.temperature_time - recording.columns.frame_time
+    assert ahead == pytest.approx(0.75)
+
+
+def test_corrections_of_several_steps():
+    times = np.array([100.0, 110, 50, 60, 0, 10])
+    corrected = times + clock_corrections(times, 10.0)
+    assert corrected.tolist() == [-40, -30, -20, -10, 0, 10]
+    assert not clock_corrections(np.array([0.0, 10, 500]), 10.0).any()

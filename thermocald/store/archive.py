@@ -1,0 +1,77 @@
+"""A series of the store as a recording."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.store.recording_writer import RecordingWriter
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from thermocald.epoch import Epoch
+    from thermocald.store.database import Store
+    from thermocald.store.row import StoredSeries
+
+    Array = NDArray[np.float64]
+
+__all__ = ["archive_series", "clock_corrections"]
+
+
+def clock_corrections(frame_time: Array, interval: float) -> Array:
+    """Seconds (E,) to add to times (E,) so that they never run backwards.
+
+    Where the clock was set back, what was taken before is moved to end one interval earlier than
+    what follows: the later setting is the better known one. Zero where nothing was set back.
+    """
+    corrections = np.zeros(len(frame_time))
+    for last in np.flatnonzero(np.diff(frame_time) < 0)[::-1]:
+        corrections[: last + 1] += frame_time[last + 1] - interval - frame_time[last]
+    return corrections
+
+
+def archive_series(
+    store: Store, series: StoredSeries, path: Path, frames: Path | None = None
+) -> None:
+    """Write a series as a recording, in constant memory.
+
+    frames: the folder that relative paths of frames refer to; a frame that was not kept is left
+    out. Times that ran backwards are mended (`clock_corrections`), the head then holds
+    `clock_set_back` [{epoch, seconds}]. Raises RecordingError, StoreError.
+    """
+    columns = store.series_columns(series, ["epoch", "frame_time"])
+    corrections = clock_corrections(columns["frame_time"], series.head.interval)
+    head = series.head
+    if set_back := np.flatnonzero(np.diff(corrections)).tolist():
+        steps = [
+            {
+                "epoch": int(columns["epoch"][i + 1]),
+                "seconds": float(corrections[i] - corrections[i + 1]),
+            }
+            for i in set_back
+        ]
+        head = replace(head, extra={**head.extra, "clock_set_back": steps})
+    by_number = dict(zip(columns["epoch"].tolist(), corrections.tolist(), strict=True))
+    with RecordingWriter(path, head, series.testfield) as writer:
+        for stored in store.epochs(series):
+            epoch = _with_frame(stored.epoch, frames)
+            shift = by_number[epoch.number]
+            if shift:
+                epoch = replace(
+                    epoch,
+                    frame_time=epoch.frame_time + shift,
+                    temperature_time=epoch.temperature_time + shift,
+                )
+            writer.append(epoch)
+
+
+def _with_frame(epoch: Epoch, frames: Path | None) -> Epoch:
+    if epoch.frame is None:
+        return epoch
+    path = epoch.frame if frames is None else frames / epoch.frame
+    return replace(epoch, frame=path if path.is_file() else None)

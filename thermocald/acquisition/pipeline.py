@@ -19,16 +19,16 @@ why there is none. A tick in which the camera fails for the moment gives no epoc
 
 from __future__ import annotations
 
-import logging
 import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from thermocald.acquisition.calibrator import CalibratedEpoch
+from thermocald.acquisition.link import Link
 from thermocald.acquisition.pairing import pair_readings
 from thermocald.acquisition.scheduler import Schedule
 from thermocald.epoch import Epoch
-from thermocald.errors import DataError, TransientDeviceError
+from thermocald.errors import DataError
 from thermocald.photogrammetry.adjustment import failed
 from thermocald.photogrammetry.exchange import observations_from_lists
 from thermocald.photogrammetry.image_file import decode_grey
@@ -38,13 +38,11 @@ if TYPE_CHECKING:
 
     from thermocald.acquisition.calibrator import Calibrator
     from thermocald.acquisition.pairing import PairedReadings
-    from thermocald.hal import Camera, Clock, Device, Frame, Reading, Thermometer
+    from thermocald.hal import Camera, Clock, Frame, Thermometer
 
     Sink = Callable[[CalibratedEpoch, Frame], None]
 
 __all__ = ["Pipeline", "calibrate_frame", "make_epoch"]
-
-log = logging.getLogger(__name__)
 
 
 def make_epoch(number: int, frame: Frame, paired: PairedReadings) -> Epoch:
@@ -84,6 +82,11 @@ class Pipeline:
         self.lost = 0
         self._camera = camera
         self._thermometers = dict(thermometers)
+        self._camera_link = Link("camera", "camera", camera, clock, period_s=period_s, is_open=True)
+        self._thermometer_links = {
+            name: Link("thermometer", name, device, clock, period_s=period_s, is_open=True)
+            for name, device in thermometers.items()
+        }
         self._calibrator = calibrator
         self._schedule = Schedule(clock, period_s)
         self._sinks = list(sinks)
@@ -92,17 +95,25 @@ class Pipeline:
     def run(self, epochs: int | None = None) -> Iterator[tuple[CalibratedEpoch, Frame]]:
         """Run until so many epochs are there (None: for ever); yields each after the sinks had it.
 
-        A PermanentDeviceError of the camera ends the run.
+        A recording that has been played ends the run; what else no retry can mend is raised, as a
+        PermanentDeviceError.
         """
         done = 0
         while epochs is None or done < epochs:
             if self._schedule.wait() is None:
                 return
-            frame = self._capture()
+            frame = self._camera_link.call(self._camera.capture)
             if frame is None:
+                if self._camera_link.state == "finished":
+                    return
+                if self._camera_link.error is not None:
+                    raise self._camera_link.error
                 self.lost += 1
                 continue
-            readings = {name: self._read(name) for name in self._thermometers}
+            readings = {
+                name: self._thermometer_links[name].call(device.read)
+                for name, device in self._thermometers.items()
+            }
             epoch = make_epoch(self._number, frame, pair_readings(readings, frame.monotonic))
             calibrated = self._calibrate(epoch, frame)
             self._number += 1
@@ -120,29 +131,3 @@ class Pipeline:
         if math.isfinite(skew):
             calibrated = replace(calibrated, extra={**calibrated.extra, "skew_s": skew})
         return calibrated
-
-    def _capture(self) -> Frame | None:
-        try:
-            return self._camera.capture()
-        except TransientDeviceError as error:
-            log.warning("no frame: %s", error)
-            _reopen(self._camera)
-            return None
-
-    def _read(self, name: str) -> Reading | None:
-        thermometer = self._thermometers[name]
-        try:
-            return thermometer.read()
-        except TransientDeviceError as error:
-            log.warning("thermometer %s: no reading: %s", name, error)
-            _reopen(thermometer)
-            return None
-
-
-def _reopen(device: Device) -> None:
-    """Close and open after a fault; still gone is no news, the next tick tries again."""
-    device.close()
-    try:
-        device.open()
-    except TransientDeviceError as error:
-        log.debug("not back yet: %s", error)

@@ -228,3 +228,13 @@ def test_writer_refuses_what_could_not_be_read_again(tmp_path, field, head, make
             writer.append(late)
         writer.append(make_epoch(3))
     assert [e.number for e in read_recording(tmp_path / "r").epochs] == [1, 3]
+
+
+def test_unknown_keys_are_what_a_store_would_keep(recording_path):
+    """A replay is resumed if the store's head equals the recording's."""
+    path = recording_path / "recording.yaml"
+    path.write_text(path.read_text() + "date: 2020-09-13\nwhere: {1: a, lamps: [60, null]}\n")
+    assert read_recording(recording_path).extra == {
+        "date": "2020-09-13",
+        "where": {"1": "a", "lamps": [60, None]},
+    }

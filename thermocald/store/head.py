@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -141,8 +142,17 @@ def parse_head(document: Mapping[str, Any], path: Path) -> Head:
         interval=top.positive("interval", "s"),
         camera=_camera(top),
         channels=_channels(top) if "temperatures" in document else {},
-        extra={key: value for key, value in document.items() if key not in known},
+        extra=_plain(top, {key: value for key, value in document.items() if key not in known}),
     )
+
+
+def _plain(top: _Reader, extra: Mapping[str, Any]) -> dict[str, Any]:
+    """Unknown keys as JSON would keep them: a date of YAML becomes text, as it will in a store."""
+    try:
+        plain: dict[str, Any] = json.loads(json.dumps(extra, default=str))
+    except TypeError as cause:
+        raise top.fail(next(iter(extra)), f"or another unknown key: {cause}") from cause
+    return plain
 
 
 def _camera(top: _Reader) -> CameraSpec:

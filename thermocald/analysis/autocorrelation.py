@@ -66,24 +66,20 @@ class Autocorrelation:
 
 
 def noise_autocorrelation(
-    y: Array, x: Array | None = None, *, variance: float | None = None
+    y: Array, x: Array | None = None, *, fitted: bool = False, variance: float | None = None
 ) -> Autocorrelation:
     """Autocorrelation of y (n,) about its mean, or about its straight line on x (n,).
 
-    Finite values, evenly spaced; n ≥ 4; variance: of y, where it is known beforehand. Without x,
-    `n_effective` is that of the mean. Gaps must be closed up by the caller: values on both sides of
-    a gap then count as neighbours.
+    Finite values, evenly spaced; n ≥ 4; fitted: y is what an estimated line on x left already;
+    variance: of y, where it is known beforehand. Without x, `n_effective` is that of the mean. Gaps
+    must be closed up by the caller: values on both sides of a gap then count as neighbours.
     """
     from scipy.fft import dct
 
     n = len(y)
     v = dct(y - y.mean(), norm="ortho")[1:]
     frequency = np.pi * np.arange(1, n) / n
-    if x is None:
-        u = np.zeros_like(v)
-    else:
-        centred = x - x.mean()
-        u = dct(centred / np.sqrt(np.mean(centred**2)), norm="ortho")[1:]
+    u = np.zeros_like(v) if x is None else dct(x - x.mean(), norm="ortho")[1:]
     count, frequency, uu, uv, vv = _pool(frequency, u * u, u * v, v * v)
     phi, coloured, spectrum = _spectra(frequency)
 
@@ -92,10 +88,11 @@ def noise_autocorrelation(
     degrees = n - 1
     restricted = np.log(spectrum) @ count
     if x is not None:
-        sxx = weight @ uu
-        residual = residual - (weight @ uv) ** 2 / sxx
+        information = weight @ uu
         degrees -= 1
-        restricted = restricted + np.log(sxx)
+        restricted = restricted + np.log(information)
+        if not fitted:
+            residual = residual - (weight @ uv) ** 2 / information
     if variance is None:
         deviance = degrees * np.log(np.maximum(residual, np.finfo(float).tiny)) + restricted
     else:
@@ -108,10 +105,11 @@ def noise_autocorrelation(
         inflation = coloured * (1 + phi) / (1 - phi) + 1 - coloured
     else:
         inflation = spectrum @ uu / uu.sum()
+    # Geometric: models that a short series cannot exclude would rule an arithmetic mean.
     best = int(np.argmin(deviance))
     return Autocorrelation(
         n,
-        float(n / max(1.0, plausible @ inflation)),
+        float(n / max(1.0, np.exp(plausible @ np.log(inflation)))),
         float(phi[best]),
         float(coloured[best]),
         phi,

@@ -33,6 +33,8 @@ __all__ = [
 ]
 
 _LEAST_EFFECTIVE = 3.0
+_CHANCE = 0.01
+_NOISY = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,23 +74,32 @@ def dependence(values: Array, sds: Array, temperature: Array, temperature_sd: fl
     All finite, in order of time; temperature_sd: noise of the thermometer, K. Raises ValueError for
     fewer than 4 epochs, or where values or temperature are constant.
     """
+    from scipy.stats import chi2
+
     n = len(values)
     if n < 4 or not np.ptp(values) > 0 or not np.ptp(temperature) > 0:
         raise ValueError("a dependence needs four epochs, values and a temperature that vary")
     x, y = temperature - temperature.mean(), values - values.mean()
     r = float(np.clip(np.dot(x, y) / np.sqrt(np.dot(x, x) * np.dot(y, y)), -1.0, 1.0))
-    noise = noise_autocorrelation(values, temperature)
 
     line = fit_straight_line(temperature, values, temperature_sd, sds)
     misfit = line.misfit
-    if misfit > 1:
-        # What the line does not explain is scatter of the parameter, not of the thermometer.
+    if line.chi2 > chi2.isf(_CHANCE, line.degrees):
+        # What the line does not explain is scatter of the parameter, not of the thermometer. Not
+        # done for what is chance: weight taken from the thermometer's noise flattens the line.
         unexplained = (misfit**2 - 1) * float(
             np.mean(np.square(sds)) + (line.slope * temperature_sd) ** 2
         )
         line = fit_straight_line(
             temperature, values, temperature_sd, sds, float(np.sqrt(unexplained))
         )
+    if temperature_sd**2 < _NOISY * float(np.var(temperature)):
+        noise = noise_autocorrelation(values, temperature)
+    else:
+        # The line fitted with each model of the noise would be flattened by the thermometer's, and
+        # what it leaves of the dependence would look like slow noise.
+        residual = values - line.slope * temperature
+        noise = noise_autocorrelation(residual, temperature, fitted=True)
     return Dependence(
         n,
         r,

@@ -235,9 +235,7 @@ def _significance(
         test = moving_f_test(
             values, sds, series.redundancy, series.time_s, settings.window, settings.alpha
         )
-        drift = drift_test(
-            values, sds, series.redundancy, series.time_s, settings.window, seed=settings.seed
-        )
+        drift = drift_test(values, sds, series.redundancy, seed=settings.seed)
         course = np.column_stack([series.time_s[test.index], test.ratio])
         result[name] = Significance(
             test.success_ratio,

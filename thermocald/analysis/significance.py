@@ -4,8 +4,8 @@ The reference (Elias et al. 2020, section 4.1) compares the two-sided moving var
 over n consecutive measurements with the two-sided moving average of its squared standard deviations
 by an F-test at each instant, and gives the share of instants at which it succeeds. Neighbouring
 windows share n-1 of n measurements, so these tests are not independent and their share has no
-p-value. `drift_test` gives one: it compares the mean variance ratio of all windows with the ratios
-of driftless series of the same standard deviations and the same autocorrelation.
+p-value. `drift_test` gives one for the whole series: it compares its variance with those of
+driftless series of the same standard deviations and the same autocorrelation.
 """
 
 from __future__ import annotations
@@ -35,8 +35,9 @@ __all__ = [
 _CHUNK = 1 << 15
 # A window is broken by gaps when it lasts this much longer than n regular measurements.
 _STRETCH = 1.5
-_LONG_SERIES = 6000
-_SURROGATE_VALUES = 1_500_000
+_MOST_VALUES = 1500  # epochs of a long series that the drift test uses
+_LEAST_VALUES = 8
+_SURROGATES_AT_ONCE = 111
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,16 +77,16 @@ class MovingFTest:
 
 @dataclass(frozen=True, slots=True)
 class DriftTest:
-    """One p-value for the whole series, whatever the windows share.
+    """One p-value for the whole series, without windows.
 
-    statistic: mean variance ratio of the windows; p_value: share of driftless surrogates that reach
-    it; surrogates: how many; windows: how many windows the mean is over.
+    statistic: variance of the series over its mean squared sd; p_value: share of driftless
+    surrogates that reach it; surrogates: how many; epochs: how many were used.
     """
 
     statistic: float
     p_value: float
     surrogates: int
-    windows: int
+    epochs: int
 
 
 def moving_mean(values: Array, window: int) -> Array:
@@ -162,69 +163,31 @@ def moving_f_test(
 
 
 def drift_test(
-    values: Array,
-    sds: Array,
-    redundancy: Array,
-    time_s: Array,
-    window: int = 31,
-    surrogates: int = 999,
-    seed: int = 0,
+    values: Array, sds: Array, redundancy: Array, surrogates: int = 999, seed: int = 0
 ) -> DriftTest | None:
     """Whether the series varies more than its standard deviations explain: one p-value.
 
-    Arguments as `moving_f_test`. The surrogates are noise of the stated standard deviations (drawn
-    as their redundancy lets them be uncertain) with the autocorrelation that the series itself has,
-    drift included, which makes the test cautious. Long series are tested on evenly spaced stretches
-    that do not overlap. None where no window is unbroken.
+    values, sds, redundancy (n,) as for `moving_f_test`. The variance of the series over its mean
+    squared sd is compared with that of driftless surrogates: noise of the stated sds (as uncertain
+    as their redundancy makes them) with the autocorrelation that is plausible for the series
+    itself, its drift included, which makes the test cautious. Of a long series evenly spaced epochs
+    are used. None for fewer than 8 epochs.
     """
-    starts = unbroken_windows(time_s, window)
-    if not len(starts):
+    step = -(-len(values) // _MOST_VALUES)
+    values, sds, redundancy = values[::step], sds[::step], redundancy[::step]
+    if len(values) < _LEAST_VALUES:
         return None
     noise = noise_autocorrelation((values - values.mean()) / sds, variance=1.0)
     rng = np.random.default_rng(seed)
-    if len(values) <= _LONG_SERIES:
-        stretches = [slice(int(a), int(b)) for a, b in _runs(starts, window)]
-        statistic_windows = len(starts)
-    else:
-        spaced = starts[np.linspace(0, len(starts) - 1, _LONG_SERIES // window).astype(int)]
-        stretches = [slice(int(a), int(a) + window) for a in spaced]
-        statistic_windows = len(spaced)
-    length = sum(s.stop - s.start for s in stretches)
-    count = int(np.clip(_SURROGATE_VALUES // length, 99, surrogates))
-    observed = 0.0
-    drawn = np.zeros(count)
-    for stretch in stretches:
-        sd = sds[stretch]
-        mean_square = moving_mean(sd**2, window)
-        observed += float(np.sum(moving_variance(values[stretch], window) / mean_square))
-        noise_sd = sd * np.sqrt(_chi_square_factor(rng, redundancy[stretch], count))
-        series = noise_sd * noise.surrogates(rng, count, len(sd))
-        drawn += np.sum(_row_variances(series, window) / mean_square, axis=1)
-    reached = int(np.sum(drawn >= observed))
-    p_value = (reached + 1) / (count + 1)
-    return DriftTest(observed / statistic_windows, p_value, count, statistic_windows)
-
-
-def _chi_square_factor(rng: np.random.Generator, redundancy: Array, count: int) -> Array:
-    """True over stated variance (count, n), given the redundancy of the stated one."""
     degrees = np.maximum(redundancy, 1.0)
-    return np.asarray(degrees / rng.chisquare(degrees, size=(count, len(degrees))))
-
-
-def _row_variances(series: Array, window: int) -> Array:
-    """Moving variances of many short series (k, n) → (k, n - window + 1)."""
-    # Unit-variance noise without drift: running sums are exact enough here.
-    padded = np.concatenate([np.zeros((len(series), 1)), series], axis=1)
-    first = np.cumsum(padded, axis=1)
-    second = np.cumsum(padded**2, axis=1)
-    total = first[:, window:] - first[:, :-window]
-    squares = second[:, window:] - second[:, :-window]
-    return np.asarray((squares - total**2 / window) / (window - 1))
-
-
-def _runs(starts: NDArray[np.int64], window: int) -> list[tuple[int, int]]:
-    """Stretches of measurements (first, end) that unbroken neighbouring windows cover."""
-    breaks = np.flatnonzero(np.diff(starts) > 1)
-    first = np.concatenate([starts[:1], starts[breaks + 1]])
-    last = np.concatenate([starts[breaks], starts[-1:]])
-    return [(int(a), int(b) + window) for a, b in zip(first, last, strict=True)]
+    mean_square = float(np.mean(sds**2))
+    observed = float(np.var(values, ddof=1)) / mean_square
+    reached = done = 0
+    while done < surrogates:
+        count = min(_SURROGATES_AT_ONCE, surrogates - done)
+        # The true variance over the stated one, given the redundancy of the stated one.
+        factor = degrees / rng.chisquare(degrees, size=(count, len(degrees)))
+        series = sds * np.sqrt(factor) * noise.surrogates(rng, count, len(sds))
+        reached += int(np.sum(np.var(series, axis=1, ddof=1) / mean_square >= observed))
+        done += count
+    return DriftTest(observed, (reached + 1) / (surrogates + 1), surrogates, len(values))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 __all__ = [
-    "coefficient",
     "UNITS",
+    "coefficient",
     "p_text",
     "parameter_label",
     "percent",

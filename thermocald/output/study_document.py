@@ -121,10 +121,10 @@ def _significance(test: Significance) -> dict[str, Any]:
         "drift_test": None
         if test.drift is None
         else {
-            "mean_ratio": test.drift.statistic,
+            "variance_ratio": test.drift.statistic,
             "p": test.drift.p_value,
             "surrogates": test.drift.surrogates,
-            "windows": test.drift.windows,
+            "epochs": test.drift.epochs,
         },
     }
 

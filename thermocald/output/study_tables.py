@@ -10,6 +10,7 @@ import numpy as np
 
 from thermocald.output.numbers import (
     UNITS,
+    coefficient,
     p_text,
     parameter_label,
     percent,
@@ -194,8 +195,8 @@ def significance_table(camera: CameraStudy, settings: StudySettings) -> Table | 
         f"Neighbouring windows share {settings.window - 1} of {settings.window} epochs, so "
         "their tests are not independent and the success ratio is no probability; of a parameter "
         "that does not drift, about α of the instants succeed by chance. The last column is a "
-        "probability: it compares the mean variance ratio with those of simulated series that do "
-        "not drift but have the same standard deviations and autocorrelation.",
+        "probability: it compares the variance of the whole series with those of simulated series "
+        "that do not drift but have the same standard deviations and autocorrelation.",
     )
 
 

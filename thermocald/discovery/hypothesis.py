@@ -436,12 +436,15 @@ def _bounded(effect: str, name: str, old: float, new: float) -> float:
 
 
 def _solve(A: Array, c: Array) -> Array:
-    d = np.sqrt(np.maximum(np.diag(A), 1e-300))
+    empty = np.diag(A) <= 0  # columns of series that take no part
+    A = A + np.diag(empty.astype(float))
+    d = np.sqrt(np.diag(A))
     x: Array = np.linalg.solve(A / np.outer(d, d) + 1e-12 * np.eye(len(A)), c / d) / d
     return x
 
 
 def _inverse(A: Array) -> Array:
-    d = np.sqrt(np.maximum(np.diag(A), 1e-300))
+    A = A + np.diag((np.diag(A) <= 0).astype(float))
+    d = np.sqrt(np.diag(A))
     x: Array = np.linalg.inv(A / np.outer(d, d) + 1e-12 * np.eye(len(A))) / np.outer(d, d)
     return x

@@ -1,0 +1,198 @@
+"""Scoring of the discovery on blind recordings: the confusion matrix, and what goes with it.
+
+    python -m tests.blind.score [--seeds 5] [--part single-0.3 …] [--write docs/reference/discovery-confusion.md]
+
+Runs in memory through `examine_series`, the same function the command calls.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from itertools import combinations
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+
+from tests.blind.bridge import series_input
+from tests.blind.generator import OUTSIDE, SINGLE, Case, generate
+from thermocald.discovery.evidence import gather
+from thermocald.discovery.result import Discovery, discover_series
+
+NUMBERS = {
+    "thermal_lag": ("tau",), "time_offset": ("d",), "hysteresis": ("half_width",),
+    "softening": ("T_k",), "self_heating": ("tau",), "cyclic_interference": ("P",),
+    "slip": ("time",), "target_displacement": ("time",),
+}  # fmt: skip
+
+
+@dataclass
+class Outcome:
+    case: Case
+    found: tuple[str, ...]
+    verdict: str
+    listed: tuple[str, ...]
+    right: bool
+    right_or_listed: bool
+    pulls: dict[str, float] = field(default_factory=dict)
+    gap_closed: float | None = None
+    seconds: float = 0.0
+    misfit_px: float = 0.0
+
+
+def examine_case(case: Case) -> tuple[Discovery, dict, float]:
+    series, truth = generate(case)
+    begin = time.perf_counter()
+    first = gather(series_input(series[0]))
+    rest = [gather(series_input(s), first.T0, first.scale) for s in series[1:]]
+    discovery = discover_series([first, *rest])
+    return discovery, truth, time.perf_counter() - begin
+
+
+def judge(case: Case) -> Outcome:
+    discovery, truth, seconds = examine_case(case)
+    found = tuple(sorted(e.effect for e in discovery.effects))
+    listed = tuple(a for e in discovery.effects for a in e.alternative_names)
+    hidden = tuple(sorted(case.effects))
+    if hidden == (OUTSIDE,):
+        right = discovery.verdict == "unexplained" and found == ("unnamed",)
+        close = right
+    else:
+        right = found == hidden
+        close = right
+        if not right and len(found) == len(hidden):
+            wrong = [h for h in hidden if h not in found]
+            close = all(any(w in a.split("+") for a in listed) for w in wrong)
+    out = Outcome(
+        case, found, discovery.verdict, listed, right, close, seconds=seconds,
+        misfit_px=max(a.misfit_px for a in discovery.examination.adequacy),
+    )  # fmt: skip
+    if right and hidden and hidden != (OUTSIDE,):
+        out.pulls = dict(_pulls(discovery, truth))
+        out.gap_closed = discovery.excess_closed()
+    return out
+
+
+def _pulls(discovery: Discovery, truth: dict) -> Iterator[tuple[str, float]]:
+    """(estimate - truth) / sd of every parameter that the truth knows."""
+    by_name = {e["effect"]: e for e in truth["effects"][0]}
+    for effect in discovery.effects:
+        true = by_name.get(effect.effect, {})
+        for key, estimate in effect.estimates.items():
+            if key in true and isinstance(estimate["value"], float):
+                value = float(true[key])
+                if key == "time":
+                    value -= 5.0  # the generator counts from five seconds before the first frame
+                yield f"{effect.effect}.{key}", (estimate["value"] - value) / estimate["sd"]
+
+
+def cases(part: str, seeds: Iterable[int]) -> Iterator[Case]:
+    kind, _, px = part.partition("-")
+    strength = float(px) if px else 0.3
+    for seed in seeds:
+        if kind == "single":
+            yield from (Case((e,), strength, seed) for e in SINGLE)
+        elif kind == "hard":
+            yield from (Case((e,), strength, seed, hard=True) for e in SINGLE)
+        elif kind == "pair":
+            rng = np.random.default_rng(seed)
+            every = list(combinations(SINGLE, 2))
+            for i in rng.permutation(len(every))[:19]:
+                yield Case(every[i], strength, seed * 1000 + int(i))
+        elif kind == "outside":
+            yield from (Case((OUTSIDE,), strength, seed * 10 + k) for k in range(10))
+        elif kind == "none":
+            yield from (Case((), 0.3, seed * 20 + k) for k in range(20))
+        elif kind == "none2":
+            yield from (Case((), 0.3, seed * 20 + k, thermometer_k=0.08) for k in range(20))
+        elif kind == "nonehard":
+            yield from (Case((), 0.3, seed * 20 + k, hard=True) for k in range(20))
+        else:
+            raise SystemExit(f"no such part: {part}")
+
+
+PARTS = (
+    "single-0.3", "single-0.1", "single-0.03", "single-0.01", "pair-0.3", "hard-0.3",
+    "outside-0.3", "outside-0.1", "none", "none2", "nonehard",
+)  # fmt: skip
+
+
+def run(part: str, seeds: Iterable[int], show: bool = False) -> list[Outcome]:
+    outcomes = []
+    for case in cases(part, seeds):
+        o = judge(case)
+        outcomes.append(o)
+        if show and not o.right:
+            print(f"  {part} seed {case.seed} hidden {'+'.join(case.effects) or 'none'}: "
+                  f"{'+'.join(o.found) or 'none'} ({o.verdict}), listed {o.listed}, "
+                  f"left {o.misfit_px:.4f} px", flush=True)  # fmt: skip
+    return outcomes
+
+
+def summary(outcomes: list[Outcome]) -> dict[str, float]:
+    pulls = [abs(p) for o in outcomes for p in o.pulls.values()]
+    closed = [o.gap_closed for o in outcomes if o.gap_closed is not None]
+    return {
+        "cases": len(outcomes),
+        "exact": float(np.mean([o.right for o in outcomes])),
+        "exact_or_listed": float(np.mean([o.right_or_listed for o in outcomes])),
+        "lists": float(np.mean([bool(o.listed) for o in outcomes])),
+        "within_3_sd": float(np.mean([p <= 3 for p in pulls])) if pulls else float("nan"),
+        "gap_closed_90": float(np.mean([c >= 0.9 for c in closed])) if closed else float("nan"),
+        "median_s": float(np.median([o.seconds for o in outcomes])),
+    }
+
+
+def confusion(outcomes: list[Outcome]) -> str:
+    """Rows: what was hidden; columns: what was said."""
+    rows: dict[str, Counter[str]] = {}
+    for o in outcomes:
+        rows.setdefault("+".join(o.case.effects) or "none", Counter())[
+            "+".join(o.found) or "none"
+        ] += 1
+    said = sorted({c for r in rows.values() for c in r})
+    lines = ["| hidden | right | said instead |", "|---|---|---|"]
+    for name in rows:
+        own = "unnamed" if name == OUTSIDE else "+".join(sorted(name.split("+")))
+        wrong = ", ".join(f"{c} × {rows[name][c]}" for c in said if rows[name][c] and c != own)
+        lines.append(f"| `{name}` | {rows[name][own]} of {rows[name].total()} | {wrong} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--part", action="append")
+    parser.add_argument("--write", type=Path)
+    a = parser.parse_args()
+    seeds = range(a.first, a.first + a.seeds)
+    table = ["| part | cases | exact | exact or listed | lists | parameters within 3 sd | "
+             "gap on M2 closed ≥ 90 % | median s |", "|---|---|---|---|---|---|---|---|"]  # fmt: skip
+    matrices = []
+    for part in a.part or PARTS:
+        outcomes = run(part, seeds, show=True)
+        s = summary(outcomes)
+        line = (f"| {part} | {s['cases']:.0f} | {s['exact']:.1%} | {s['exact_or_listed']:.1%} | "
+                f"{s['lists']:.1%} | {s['within_3_sd']:.1%} | {s['gap_closed_90']:.1%} | "
+                f"{s['median_s']:.2f} |")  # fmt: skip
+        print(line, flush=True)
+        table.append(line)
+        matrices.append(f"## {part}\n\n{confusion(outcomes)}\n")
+    if a.write:
+        a.write.write_text(
+            "# How well discovery names hidden effects\n\n"
+            "Written by `python -m tests.blind.score --write …`: blind recordings from a generator "
+            "that shares no code with the program; the part's number is the strength in px.\n\n"
+            + "\n".join(table) + "\n\n" + "\n".join(matrices)
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,209 @@
+"""The gap between simulation and measurement, as CONVENTIONS §4 prints it.
+
+rms_px: image points measured minus simulated. chi2_reduced: the same over its noise, image noise and
+what the thermometers' noise does to the prediction; 1 is the floor. object_mm_at_10m: rms_px on a
+plane at 10 m.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.discovery.hypothesis import OSCILLATIONS, Laboratory
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from thermocald.discovery.evidence import Evidence
+    from thermocald.discovery.hypothesis import Fit, Term
+    from thermocald.discovery.image_space import Displaced
+
+    Array = NDArray[np.float64]
+
+__all__ = ["Gap", "carried_over", "fit_first", "gap_of", "left_out"]
+
+_DISTANCE_MM = 10_000.0
+
+
+@dataclass(frozen=True)
+class Gap:
+    """One G of CONVENTIONS §4."""
+
+    rms_px: float
+    chi2_reduced: float
+    object_mm_at_10m: float
+
+    def as_json(self) -> dict[str, float]:
+        """As the document has it."""
+        return {
+            "rms_px": self.rms_px,
+            "chi2_reduced": self.chi2_reduced,
+            "object_mm_at_10m": self.object_mm_at_10m,
+        }
+
+
+def fit_first(laboratory: Laboratory, terms: Sequence[Term]) -> Fit:
+    """Fit a hypothesis to the first series alone and carry its constants to the others."""
+    fit = laboratory.refine(laboratory.fit(terms, only=[0]), only=[0])
+    return carried_over(laboratory, fit)
+
+
+def carried_over(laboratory: Laboratory, fit: Fit) -> Fit:
+    """Constants as the first series gave them; what a series has of its own is estimated anew.
+
+    Of an oscillation that is the phase, of a slip its instant and height.
+    """
+    x = fit.coefficients.copy()
+    for block in fit.blocks:
+        if block.series in (None, 0):
+            continue
+        assert block.series is not None
+        _, _, index = fit.designs[block.series]
+        reduced = fit.reduced[block.series]
+        inside = (index >= block.start) & (index < block.stop)
+        A = reduced.A[np.ix_(inside, inside)]
+        right = reduced.c[inside] - reduced.A[np.ix_(inside, ~inside)] @ x[index[~inside]]
+        own = index[inside]
+        if block.term >= 0 and fit.terms[block.term].effect in OSCILLATIONS:
+            model = next(b for b in fit.blocks if b.term == block.term and b.series == 0)
+            pair = x[model.start : model.stop].reshape(2, -1)
+            u, s, v = np.linalg.svd(pair, full_matrices=False)
+            amplitude = s[0] * v[0]
+            del u
+            angles = np.linspace(0, 2 * np.pi, 720, endpoint=False)
+            trial = np.stack(
+                [np.outer(np.cos(angles), amplitude), np.outer(np.sin(angles), amplitude)], axis=1
+            ).reshape(len(angles), -1)
+            cost = np.einsum("ai,ij,aj->a", trial, A, trial) - 2 * trial @ right
+            x[own] = trial[int(np.argmin(cost))]
+        else:
+            d = np.sqrt(np.maximum(np.diag(A), 1e-12))
+            x[own] = np.linalg.solve(A / np.outer(d, d) + 1e-9 * np.eye(len(A)), right / d) / d
+    return replace(fit, coefficients=x)
+
+
+def image_chi2(
+    evidence: Evidence, fit: Fit, series: int, epochs: NDArray[np.bool_] | None = None
+) -> float:
+    """Σ of squared parameter misfits in the metric of the image points, levels estimated anew."""
+    C, V, index = fit.designs[series]
+    model = (C * fit.coefficients[index]) @ V.T
+    r = evidence.values - model
+    N = evidence.N if epochs is None else evidence.N[epochs]
+    r = r if epochs is None else r[epochs]
+    level = np.linalg.lstsq(N.sum(axis=0), np.einsum("epq,eq->p", N, r), rcond=1e-12)[0]
+    r = r - level
+    return float(np.einsum("ep,epq,eq->", r, N, r))
+
+
+def gap_of(
+    laboratory: Laboratory,
+    fit: Fit,
+    series: int,
+    displaced: Sequence[Displaced] = (),
+    displacement_known: bool = True,
+    noise: Array | None = None,
+    noise_known: bool = True,
+    explained: float = 0.0,
+) -> Gap:
+    """The gap of one series at a fit.
+
+    displaced: targets taken out, and whether the model knows of their steps; noise: the epochs'
+    noise factor the evidence is weighted by, and whether the model knows it; explained: χ² that
+    a bridge takes up beside the model.
+    """
+    e = laboratory.series[series]
+    residuals = np.nan_to_num(e.residuals)
+    within = float(np.sum(e.weights[..., :2] * residuals**2))
+    coordinates = 2.0 * float(e.n.sum())
+    targets = float((e.n.sum() > 0) * np.sum(e.weights[..., 0].any(axis=0)))
+    free = max(coordinates - 2.0 * targets - _rank(e), 1.0)
+    total = within + max(fit.chi2_of(series) - explained, 0.0)
+    image = within + max(image_chi2(e, fit, series) - explained, 0.0)
+    weights = e.weights[..., :2]
+    sigma2 = 1.0 / float(np.mean(weights[weights > 0]))
+    moved, count = _moved(e, displaced, displacement_known)
+    total, image, free = total + moved, image + moved, free + count
+    chi2 = total / free
+    if noise is not None:
+        power = float(np.mean(noise**2))
+        sigma2 = sigma2 * 1.0
+        if not noise_known:
+            chi2 *= power / float(np.min(noise) ** 2)
+    rms = float(np.sqrt(sigma2 * image / free))
+    return Gap(rms, chi2, _object_mm(e, rms))
+
+
+def _rank(evidence: Evidence) -> float:
+    """Levels that the series determines."""
+    size = np.linalg.eigvalsh(evidence.N.sum(axis=0))
+    return float(np.sum(size > 1e-9 * size[-1]))
+
+
+def _object_mm(evidence: Evidence, rms: float) -> float:
+    c = float(evidence.at.iop[0])
+    return rms * evidence.source.sensor.pixel_pitch / c * _DISTANCE_MM
+
+
+def _moved(evidence: Evidence, displaced: Sequence[Displaced], known: bool) -> tuple[float, float]:
+    """χ² of the displaced targets about the camera of the others, and its degrees of freedom."""
+    total = count = 0.0
+    w = evidence.weights[..., 0]
+    weight = float(np.mean(w[w > 0]))
+    for group in displaced:
+        A = evidence.columns[group.rows]
+        l = evidence.source.grid.points[:, group.rows] - evidence.at.predicted[group.rows]
+        v = l - np.einsum("ek,tik->eti", evidence.values, A)
+        after = evidence.times >= group.time
+        if known:
+            v = np.where(after[:, None, None], v - group.steps, v)
+        middle = np.nanmedian(v, axis=0)
+        v = v - middle
+        spread = 1.4826 * np.nanmedian(np.abs(v), axis=0)
+        inside = np.abs(v) < np.maximum(8.0 * spread, 1e-9)
+        inside &= (evidence.n > 0)[:, None, None]
+        total += weight * float(np.sum(np.where(inside, v, 0.0) ** 2))
+        count += float(np.sum(inside))
+    return total, count
+
+
+def left_out(laboratory: Laboratory, fit: Fit, blocks: int = 6) -> tuple[float, float]:
+    """Parameter χ² per degree of freedom on blocks of M1 that the fit did not see, and on M1.
+
+    Non-linear parameters stay; coefficients are fitted without the block, which has its own level.
+    """
+    e = laboratory.series[0]
+    edges = np.linspace(0, len(e.times), blocks + 1).astype(int)
+    outside = inside = 0.0
+    for begin, end in zip(edges[:-1], edges[1:], strict=True):
+        block = np.zeros(len(e.times), dtype=bool)
+        block[begin:end] = True
+        x = Laboratory([_only(e, ~block)])
+        x.thermometer_factor = laboratory.thermometer_factor
+        terms = tuple(replace(t, fresh=t.fresh[:1]) for t in fit.terms)
+        trained = x.fit(terms, turns=2)
+        y = Laboratory([_only(e, block)])
+        y.thermometer_factor = laboratory.thermometer_factor
+        tested = y.fit(terms, trained.coefficients, turns=1)
+        outside += tested.chi2_of(0, trained.coefficients)
+        inside += tested.chi2_of(0, fit.coefficients[: len(trained.coefficients)])
+    rank = _rank(e)
+    free = max(rank * float((e.n > 0).sum()) - blocks * rank, 1.0)
+    return outside / free, inside / free
+
+
+def _only(evidence: Evidence, epochs: NDArray[np.bool_]) -> Evidence:
+    """The series with the weight of some epochs alone."""
+    w = epochs.astype(float)
+    return replace(
+        evidence,
+        N=evidence.N * w[:, None, None],
+        b=evidence.b * w[:, None],
+        yy=evidence.yy * w,
+        n=evidence.n * epochs,
+    )

@@ -1,0 +1,343 @@
+"""The result of a discovery: verdict, effects with sentences and evidence, gaps, alternatives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.discovery.adequacy import names_of
+from thermocald.discovery.estimates import (
+    acts_on,
+    displacement_estimates,
+    growth_estimates,
+    term_estimates,
+)
+from thermocald.discovery.examination import Examination, examine_series
+from thermocald.discovery.gap import Gap, fit_first, gap_of, left_out
+from thermocald.discovery.unnamed import describe_unnamed
+from thermocald.simulation import effects as catalogue
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from thermocald.discovery.evidence import Evidence
+    from thermocald.discovery.hypothesis import Fit, Term
+    from thermocald.discovery.search import Solution
+
+    Array = NDArray[np.float64]
+
+__all__ = ["Discovery", "EffectFound", "Stage", "discover_series"]
+
+
+@dataclass(frozen=True, eq=False)
+class EffectFound:
+    """One entry of `effects` in CONVENTIONS §4."""
+
+    effect: str
+    statement: str
+    where: dict[str, Any]
+    estimates: dict[str, dict[str, Any]]
+    evidence: dict[str, Any]
+    alternatives: list[dict[str, Any]]
+    gap_before: Gap
+    gap_after: Gap
+    term: Term | None = None
+
+    @property
+    def alternative_names(self) -> list[str]:
+        """Effects that the data cannot exclude."""
+        return [a["effect"] for a in self.alternatives if not a.get("resembles")]
+
+    def as_json(self) -> dict[str, Any]:
+        """As the document has it."""
+        return {
+            "effect": self.effect,
+            "statement": self.statement,
+            "where": self.where,
+            "estimates": self.estimates,
+            "evidence": self.evidence,
+            "alternatives": self.alternatives,
+            "gap_before": self.gap_before.as_json(),
+            "gap_after": self.gap_after.as_json(),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """One step of the staircase: what was added, and the gap then, on M1 and on M2."""
+
+    added: str
+    fit: Gap
+    verify: Gap | None
+
+
+@dataclass(frozen=True, eq=False)
+class Discovery:
+    """Verdict, effects, the staircase of the gap; fits: base and final, constants from M1 alone."""
+
+    verdict: str
+    effects: tuple[EffectFound, ...]
+    stages: tuple[Stage, ...]
+    examination: Examination
+    base_fit: Fit
+    final_fit: Fit
+    left_out: tuple[float, float]
+
+    def excess_closed(self) -> float | None:
+        """Share of the excess of reduced χ² over the floor that is closed on M2."""
+        before, after = self.stages[0].verify, self.stages[-1].verify
+        if before is None or after is None or before.chi2_reduced - 1.0 < 0.02:
+            return None
+        return 1.0 - (after.chi2_reduced - 1.0) / (before.chi2_reduced - 1.0)
+
+    def as_json(self, model: str | None) -> dict[str, Any]:
+        """CONVENTIONS §4, exactly."""
+        first, last = self.stages[0], self.stages[-1]
+        verify = None
+        if first.verify is not None and last.verify is not None:
+            verify = {"before": first.verify.as_json(), "after": last.verify.as_json()}
+        return {
+            "format": "thermocald-discovery/1",
+            "verdict": self.verdict,
+            "effects": [e.as_json() for e in self.effects],
+            "gap": {
+                "fit": {"before": first.fit.as_json(), "after": last.fit.as_json()},
+                "verify": verify,
+            },
+            "model": model,
+        }
+
+
+def discover_series(
+    series: Sequence[Evidence], progress: Callable[[str], None] | None = None
+) -> Discovery:
+    """Examine M1, or M1 and M2, and put what was found into words and numbers."""
+    x = examine_series(series, progress)
+    return conclude(x)
+
+
+def conclude(x: Examination) -> Discovery:
+    """Words and numbers for an examination."""
+    terms = x.best.terms if x.adequate else ()
+    fits = [fit_first(x.laboratory, terms[:k]) for k in range(len(terms) + 1)]
+    found = _image_space(x, fits[0])
+    stages = [Stage("", _gap(x, fits[0], 0, 0), _verify(x, fits[0], 0))]
+    for k, entry in enumerate(found):
+        stages.append(Stage(entry.effect, _gap(x, fits[0], 0, k + 1), _verify(x, fits[0], k + 1)))
+        entry = replace(entry, gap_before=stages[-2].fit, gap_after=stages[-1].fit)
+        found[k] = entry
+    n = len(found)
+    if not x.adequate:
+        return _unexplained(x, fits[0], stages, n)
+    for k in range(len(terms)):
+        fit = fits[k + 1]
+        stages.append(Stage(terms[k].effect, _gap(x, fit, 0, n), _verify(x, fit, n)))
+        found.append(_entry(x, fits[-1], k, stages[-2].fit, stages[-1].fit, len(found) == n))
+    blocks = left_out(x.laboratory, fits[-1]) if terms else (float("nan"), float("nan"))
+    verdict = "effects_found" if found else "adequate"
+    return Discovery(verdict, tuple(found), tuple(stages), x, fits[0], fits[-1], blocks)
+
+
+def _verify(x: Examination, fit: Fit, known: int) -> Gap | None:
+    return _gap(x, fit, 1, known) if len(x.laboratory.series) > 1 else None
+
+
+def _gap(x: Examination, fit: Fit, series: int, known: int, explained: float = 0.0) -> Gap:
+    """The gap when the first `known` effects of image space are in the model."""
+    order = _image_names(x)[:known]
+    noise = x.defocus.noise[series] if x.defocus else None
+    return gap_of(
+        x.laboratory, fit, series,
+        x.displaced[series], "target_displacement" in order,
+        noise, "defocus" in order, explained,
+    )  # fmt: skip
+
+
+def _image_names(x: Examination) -> list[str]:
+    names = ["target_displacement"] if x.displaced[0] else []
+    return [*names, "defocus"] if x.defocus else names
+
+
+def _image_space(x: Examination, fit: Fit) -> list[EffectFound]:
+    e = x.laboratory.series[0]
+    names = e.source.field.names
+    zero = _gap(x, fit, 0, 0)
+    out = []
+    if x.displaced[0]:
+        group = max(x.displaced[0], key=lambda g: g.gain)
+        estimates = displacement_estimates(group, names)
+        points = e.at.predicted[group.rows]
+        first = int(np.searchsorted(e.times, group.time))
+        out.append(
+            EffectFound(
+                "target_displacement",
+                catalogue.get("target_displacement").sentence(estimates),
+                {
+                    "parameters": [],
+                    "targets": [names[r] for r in group.rows],
+                    "epochs": [int(e.source.numbers[first]), int(e.source.numbers[-1])],
+                    "image_region": [
+                        *(float(v) for v in points.min(axis=0)),
+                        *(float(v) for v in points.max(axis=0)),
+                    ],
+                },
+                estimates,
+                {
+                    "chi2_gain": float(group.gain),
+                    "steps_px": group.steps.tolist(),
+                    "others": [
+                        {"targets": [names[r] for r in g.rows], "time": g.time}
+                        for g in x.displaced[0]
+                        if g is not group
+                    ],
+                    "note": "displacements are across the rays; along them one camera sees nothing",
+                },
+                [], zero, zero,
+            )  # fmt: skip
+        )
+    if x.defocus:
+        estimates = growth_estimates(x.defocus)
+        out.append(
+            EffectFound(
+                "defocus",
+                catalogue.get("defocus").sentence(estimates),
+                {
+                    "parameters": ["sigma0"],
+                    "epochs": [int(e.source.numbers[0]), int(e.source.numbers[-1])],
+                    "image_region": None,
+                },
+                estimates,
+                {
+                    "log_likelihood_gain": x.defocus.gain,
+                    "next_best_course": x.defocus.other,
+                    "next_best_gain": x.defocus.other_gain,
+                },
+                [], zero, zero,
+            )  # fmt: skip
+        )
+    return out
+
+
+def _entry(
+    x: Examination, fit: Fit, k: int, before: Gap, after: Gap, first: bool
+) -> EffectFound:
+    term = fit.terms[k]
+    e = x.laboratory.series[0]
+    effect = catalogue.get(term.effect)
+    estimates = term_estimates(fit, k, e)
+    without = _score_without(x, k)
+    evidence: dict[str, Any] = {
+        "score_gain": without,
+        "penalty": x.best.penalties[k],
+        "absolute_test": [
+            {"sigmas": float(a.significance), "misfit_px": float(a.misfit_px)} for a in x.adequacy
+        ],
+        "inflation_for_correlated_noise": e.correlation,
+    }
+    if len(x.adequacy) < 2:
+        evidence["note"] = "one series only: the constants were not verified on another"
+    return EffectFound(
+        term.effect,
+        effect.sentence(estimates),
+        {
+            "parameters": acts_on(term.parameters),
+            "epochs": _when(x, fit, k),
+            "image_region": None,
+        },
+        estimates, evidence, _alternatives(x, term, first), before, after, term,
+    )  # fmt: skip
+
+
+def _score_without(x: Examination, k: int) -> float:
+    """By how much the score worsens without one effect, the others fitted again."""
+    terms = tuple(t for i, t in enumerate(x.best.terms) if i != k)
+    fit = x.laboratory.refine(x.laboratory.fit(terms))
+    score = fit.objective + sum(p for i, p in enumerate(x.best.penalties) if i != k)
+    return float(score - x.best.score)
+
+
+def _when(x: Examination, fit: Fit, k: int) -> list[int]:
+    """First and last epoch in which the effect moves the image by a quarter of its most."""
+    e = x.laboratory.series[0]
+    C, V, index = fit.designs[0]
+    model = (C * fit.coefficients[index]) @ V.T
+    fewer = tuple(t for i, t in enumerate(fit.terms) if i != k)
+    other = x.laboratory.fit(fewer, only=[0])
+    C, V, index = other.designs[0]
+    r = model - (C * other.coefficients[index]) @ V.T
+    level = np.linalg.lstsq(e.N.sum(axis=0), np.einsum("epq,eq->p", e.N, r), rcond=1e-12)[0]
+    size = np.sqrt(np.maximum(np.einsum("ep,epq,eq->e", r - level, e.N, r - level), 0))
+    large = np.flatnonzero(size > 0.25 * size.max())
+    return [int(e.source.numbers[large[0]]), int(e.source.numbers[large[-1]])]
+
+
+def _alternatives(x: Examination, term: Term, first: bool) -> list[dict[str, Any]]:
+    """Solutions that the data cannot exclude, told at the effect that they replace."""
+    out = []
+    for rival in x.rivals:
+        mine, theirs = list(x.best.names), list(rival.names)
+        replaced = [n for n in mine if n not in theirs]
+        instead = [n for n in theirs if n not in mine]
+        if not instead or (term.effect not in replaced and not (first and not replaced)):
+            continue
+        out.append(_alternative(term.effect, rival, instead, rival.score - x.best.score))
+    return out
+
+
+def _alternative(
+    name: str, rival: Solution, instead: list[str], difference: float
+) -> dict[str, Any]:
+    effect = catalogue.get(name)
+    searched = {
+        k: v for t in rival.terms if t.effect in instead for k, v in t.nonlinear
+    }
+    return {
+        "effect": "+".join(instead),
+        "score_difference": float(difference),
+        "values": searched,
+        "experiment": effect.experiment_against(catalogue.get(instead[0])),
+    }
+
+
+def _unexplained(x: Examination, base: Fit, stages: list[Stage], known: int) -> Discovery:
+    """What the catalogue does not explain: described, bridged, not named."""
+    description = describe_unnamed(x)
+    bridge = sum(a.excess for a in x.base_adequacy[:1])
+    before = _gap(x, base, 0, known)
+    after = _gap(x, base, 0, known, bridge)
+    stages.append(Stage("unnamed", after, _verify(x, base, known)))
+    resembling = [
+        {
+            "effect": s.names[0],
+            "resembles": True,
+            "score_difference": float(s.score - x.best.score),
+            "misfit_px_left": None,
+        }
+        for s in x.ranking[:4]
+    ]
+    entry = EffectFound(
+        "unnamed", description.statement, description.where, description.estimates,
+        {
+            **description.evidence,
+            "absolute_test_of_best_combination": {
+                "effects": list(x.best.names),
+                "sigmas": [float(a.significance) for a in x.adequacy],
+                "misfit_px": [float(a.misfit_px) for a in x.adequacy],
+            },
+            "image_space": [e.effect for e in _image_space(x, base)],
+        },
+        resembling, before, after,
+    )  # fmt: skip
+    return Discovery(
+        "unexplained", (entry,), tuple(stages), x, base, base, (float("nan"), float("nan"))
+    )
+
+
+def leading_parameters(x: Examination, series: int = 0) -> list[tuple[str, float]]:
+    """Parameters in which the base model's rest is seen, with shares."""
+    a = x.base_adequacy[series]
+    return names_of(a.directions, a.scores)

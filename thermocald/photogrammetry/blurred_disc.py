@@ -104,13 +104,13 @@ def _plane(maps: LocalMap, m: Array, ex: Single, ey: Single) -> tuple[Single, ..
 
 
 def blurred_disc(
-    maps: LocalMap, parameters: Array, x: Single, y: Single, derivatives: bool = True
+    maps: LocalMap, parameters: Array, x: Single, y: Single, out: Single | None = None
 ) -> tuple[Single, Single]:
     """Grey values (n, k) and derivatives (n, 10, k) of n discs at their pixels x, y (n, k) px.
 
     Only shape and curvature are taken from `maps`; the centres are the parameters (n, 10), in the
     coordinates of x and y, which should be small. The derivatives by centre and shape leave out
-    how |∇ρ| and κ change: they vanish on the outline.
+    how |∇ρ| and κ change: they vanish on the outline. out: where to put the derivatives.
     """
     p = parameters.astype(np.float32)
     ex, ey = x - p[:, 0, None], y - p[:, 1, None]
@@ -128,9 +128,7 @@ def blurred_disc(
     light = _ONE + p[:, 8, None] * ex + p[:, 9, None] * ey
     reflect = b + a * phi
     value = reflect * light
-    if not derivatives:
-        return value, np.empty((len(p), 0, 0), dtype=np.float32)
-    j = np.empty((len(p), 10, x.shape[1]), dtype=np.float32)
+    j = np.empty((len(p), 10, x.shape[1]), dtype=np.float32) if out is None else out
     z *= z
     z *= -_HALF
     edge = np.exp(z, out=z)

@@ -40,6 +40,8 @@ _LARGEST_SATURATION = 0.05
 _LARGEST_MOVE = 0.6  # of the minor semi-axis, and at least two px
 _LARGEST_SHAPE = 0.35
 _CONVERGED_PX = 0.03
+_FLAT = 0.003  # of the contrast per px of movement
+_FEWEST_FOR_LEVEL = 8
 _ITERATIONS = 12
 _THIN = 3
 _RING_CLEARANCE = 2.6  # standard deviations of the blur between a used pixel and the code ring
@@ -93,6 +95,13 @@ class Windows:
     begin: Array
     cut: NDArray[np.bool_]
 
+    def thinned(self) -> Windows:
+        """The same with every third pixel."""
+        x, y, grey, weight = (
+            np.ascontiguousarray(a[:, ::_THIN]) for a in (self.x, self.y, self.grey, self.weight)
+        )
+        return replace(self, x=x, y=y, grey=grey, weight=weight)
+
 
 def windows(
     image: Image,
@@ -109,24 +118,25 @@ def windows(
     height, width = image.shape
     reach_px = max(reach, 4.0 * blur)
     half = np.ceil(maps.half_extent + reach_px).astype(int)
-    pixels = np.prod(2 * half + 1, axis=1)
     # Targets of like size and like shape share a window.
     order = np.lexsort((half[:, 0], half.max(axis=1) // 3))
+    sizes = half[order].tolist()
     flat = image.ravel()
     start = 0
     while start < len(order):
-        stop, common = start + 1, half[order[start]]
+        stop, (hx, hy) = start + 1, sizes[start]
+        largest = 1.5 * (2 * hx + 1) * (2 * hy + 1)
         while stop < len(order):
-            larger = np.maximum(common, half[order[stop]])
-            area = int(np.prod(2 * larger + 1))
-            if (stop + 1 - start) * area > chunk_pixels or area > 1.5 * pixels[order[start]]:
+            wider, higher = max(hx, sizes[stop][0]), max(hy, sizes[stop][1])
+            area = (2 * wider + 1) * (2 * higher + 1)
+            if (stop + 1 - start) * area > chunk_pixels or area > largest:
                 break
-            stop, common = stop + 1, larger
+            stop, hx, hy = stop + 1, wider, higher
         rows = order[start:stop]
         start = stop
         # The ellipse alone is good enough to choose pixels by.
         part = maps.select(rows).without_eccentricity()
-        ox, oy = (np.arange(-h, h + 1) for h in common.tolist())
+        ox, oy = np.arange(-hx, hx + 1), np.arange(-hy, hy + 1)
         lx, ly = np.tile(ox, len(oy))[None], np.repeat(oy, len(ox))[None]
         origin = np.rint(part.centre).astype(np.int64)
         centre = (part.centre - origin).astype(np.float32)
@@ -139,7 +149,8 @@ def windows(
                 ring = np.where(rho > 1, d * (RING_INNER - rho) / (1 - rho), np.inf)
             use &= ~coded[rows, None] | (ring >= _RING_CLEARANCE * blur)
         cut = np.zeros(len(rows), dtype=bool)
-        if np.any(origin < common) or np.any(origin + common >= (width, height)):
+        reach_xy = np.array([hx, hy])
+        if np.any(origin < reach_xy) or np.any(origin + reach_xy >= (width, height)):
             ix, iy = lx + origin[:, :1], ly + origin[:, 1:]
             inside = (ix >= 0) & (ix < width) & (iy >= 0) & (iy < height)
             cut = np.any(~inside & (d > -2.0), axis=1)
@@ -155,23 +166,32 @@ def windows(
         at.ravel()[place] = where - row * use.shape[1]
         weight = np.zeros(shape, dtype=np.float32)
         weight.ravel()[place] = 1.0
-        distance = np.zeros(shape, dtype=np.float32)
-        distance.ravel()[place] = d.ravel()[where]
         base = origin[:, 1:] * width + origin[:, :1]
         pixel = np.where(weight > 0, (ly * width + lx)[0].take(at) + base, 0)
         grey = flat.take(pixel).astype(np.float32)
-        outside, inside = weight * (distance < -1.5), weight * (distance > 1.0)
         begin = np.zeros((len(rows), 10))
         begin[:, :2] = part.centre
         begin[:, 5] = blur
-        begin[:, 6] = np.sum(outside * grey, axis=1) / np.maximum(outside.sum(axis=1), 1)
-        begin[:, 7] = np.sum(inside * grey, axis=1) / np.maximum(inside.sum(axis=1), 1)
-        begin[:, 7] -= begin[:, 6]
-        begin[:, 7] += np.abs(begin[:, 7]) < 1
+        begin[:, 6:8] = _background_and_contrast(image, part)
         yield Windows(
             rows, pixel, origin.astype(float), lx[0].astype(np.float32).take(at),
             ly[0].astype(np.float32).take(at), grey, weight, begin, cut,
         )  # fmt: skip
+
+
+def _background_and_contrast(image: Image, maps: LocalMap) -> Array:
+    """Both (n, 2) DN, from the centre and from eight points a little outside of the outline."""
+    turn = np.arange(8) * (np.pi / 4)
+    out = 1 + np.minimum(2.5 / maps.semi_axes[:, 1], 0.5)
+    around = (maps.linear @ np.stack([np.cos(turn), np.sin(turn)])) * out[:, None, None]
+    at = np.concatenate([np.zeros((len(maps), 2, 1)), around], axis=2) + maps.centre[:, :, None]
+    high = np.array([image.shape[1] - 1, image.shape[0] - 1])[:, None]
+    x, y = np.moveaxis(np.clip(np.rint(at), 0, high).astype(np.int64), 1, 0)
+    grey = image[y, x].astype(float)
+    background = np.median(grey[:, 1:], axis=1)
+    contrast = grey[:, 0] - background
+    contrast += np.abs(contrast) < 1
+    return np.stack([background, contrast], axis=1)
 
 
 def fit_circles(
@@ -192,53 +212,45 @@ def fit_circles(
     n = len(maps)
     coded = np.zeros(n, dtype=bool) if coded is None else coded
     parts = list(windows(image, maps, coded, blur)) if n else []
-    fits = []
+    parameters = np.zeros((n, 10))
+    work = np.empty((2, 10 * max((w.x.size for w in parts), default=0)), dtype=np.float32)
+    greys, residuals = [np.zeros(0, dtype=np.float32)], [np.zeros(0, dtype=np.float32)]
+    # One step with a third of the pixels brings the fit near, and its residuals where the image is
+    # flat tell how the noise grows with the light; all pixels then finish it.
     for w in parts:
         begin = w.begin if start is None else start[w.rows]
-        fits.append(_gauss_newton(w, maps.select(w.rows), begin, noise, iterations))
+        thin = w.thinned()
+        f = _gauss_newton(thin, maps.select(w.rows), begin, noise, 1, _CONVERGED_PX, work)
+        parameters[w.rows] = f.parameters
+        flat = (thin.weight > 0) & (f.edge < _FLAT * np.abs(f.parameters[:, 7, None]))
+        greys.append(f.value[flat])
+        residuals.append(f.residual[flat])
+    given = noise is not None
     if noise is None:
-        pairs = list(zip(parts, fits, strict=True))
-        greys = [f.value[:, ::_THIN][w.weight[:, ::_THIN] > 0] for w, f in pairs]
-        residuals = [f.residual[:, ::_THIN][w.weight[:, ::_THIN] > 0] for w, f in pairs]
-        empty = [np.zeros(0, dtype=np.float32)]
-        noise = estimate_noise(
-            np.concatenate(greys or empty), np.concatenate(residuals or empty), 10 * n // _THIN
-        )
-    parameters = np.zeros((n, 10))
+        noise = estimate_noise(np.concatenate(greys), np.concatenate(residuals), 3 * n)
     normal = np.zeros((n, 10, 10))
     pixels, square, saturation, last_step = (np.zeros(n) for _ in range(4))
     cut = np.zeros(n, dtype=bool)
     top = np.iinfo(image.dtype).max
-    for w, f in zip(parts, fits, strict=True):
-        p, N, residual, weight = f.parameters, f.normal, f.residual, w.weight
-        if not f.weighted and noise.is_constant(f.value):
-            weight, N = weight / noise.variance(f.value.mean()), N / noise.variance(f.value.mean())
-        elif not f.weighted:
-            # One more step with the frame's own noise; so small that the partials still hold.
-            weight = weight / noise.variance(f.value)
-            jw = f.partials * weight[:, None, :]
-            N = (jw @ np.swapaxes(f.partials, 1, 2)).astype(float)
-            delta = _limited(N, (jw @ residual[..., None])[..., 0])
-            change = np.swapaxes(f.partials, 1, 2) @ delta[..., None].astype(np.float32)
-            p, residual = p + delta, residual - change[..., 0]
-        else:
-            weight = weight / noise.variance(f.value)
-        parameters[w.rows] = p
-        normal[w.rows] = N
-        last_step[w.rows] = f.step
+    for w in parts:
+        begin = parameters[w.rows]
+        f = _gauss_newton(w, maps.select(w.rows), begin, noise, iterations, _CONVERGED_PX, work)
+        parameters[w.rows], normal[w.rows], last_step[w.rows] = f.parameters, f.normal, f.step
         pixels[w.rows] = w.weight.sum(axis=1)
-        square[w.rows] = np.sum(weight * residual * residual, axis=1)
+        weight = w.weight / noise.variance(f.value)
+        square[w.rows] = np.sum(weight * f.residual * f.residual, axis=1)
         saturation[w.rows] = np.sum(w.weight * (w.grey >= top), axis=1)
         cut[w.rows] = w.cut
     saturation /= np.maximum(pixels, 1)
-    misfit = np.sqrt(square / np.maximum(pixels - 10, 1))
-    covariances = (
-        _centre_covariance(normal)
-        * np.maximum(
-            1.0, np.where(misfit**2 > 1 + 4 * np.sqrt(2 / np.maximum(pixels, 1)), misfit**2, 1.0)
-        )[:, None, None]
-    )
-    fit = CircleFit(parameters, covariances, misfit, saturation, ("",) * n, noise)
+    variance = square / np.maximum(pixels - 10, 1)
+    if not given and n >= _FEWEST_FOR_LEVEL:
+        # Its level is that of all residuals: paper and compression make noise at edges too.
+        level = float(np.median(variance))
+        noise, variance, normal = noise.scaled(level), variance / level, normal / level
+    # A target that is noisier than the frame by more than chance has its own noise.
+    own = np.where(variance > 1 + 4 * np.sqrt(2 / np.maximum(pixels, 1)), variance, 1.0)
+    covariances = _centre_covariance(normal) * np.maximum(own, 1.0)[:, None, None]
+    fit = CircleFit(parameters, covariances, np.sqrt(variance), saturation, ("",) * n, noise)
     return replace(fit, reasons=_reasons(fit, maps, cut, pixels, last_step))
 
 
@@ -247,38 +259,46 @@ class _Fit:
     parameters: Array
     value: Single
     residual: Single
-    partials: Single
     normal: Array
     step: Array
-    weighted: bool
+    edge: Single
 
 
 def _gauss_newton(
-    w: Windows, maps: LocalMap, begin: Array, noise: NoiseModel | None, rounds: int
+    w: Windows,
+    maps: LocalMap,
+    begin: Array,
+    noise: NoiseModel | None,
+    rounds: int,
+    tolerance_px: float,
+    work: Single,
 ) -> _Fit:
-    """Iterate until the centres stand; value and residual are those after the last step."""
+    """Iterate until the centres stand; value and residual are those after the last step.
+
+    work (2, m): memory for the partials; asking the system for it anew costs more than the sums.
+    """
     p = begin.copy()
     p[:, :2] -= w.origin
-    step = np.full(len(p), np.inf)
-    for k in range(max(rounds, 1)):
-        # The first step only has to come near: a third of the pixels will do.
-        thin = slice(None, None, _THIN if k == 0 and rounds > 1 else None)
-        x, y, mask = w.x[:, thin], w.y[:, thin], w.weight[:, thin]
-        value, j = blurred_disc(maps, p, x, y)
-        weight = mask if noise is None else mask / noise.variance(value)
-        jw = j * weight[:, None, :]
-        residual = w.grey[:, thin] - value
+    shape = (len(p), 10, w.x.shape[1])
+    j, jw = (row[: np.prod(shape)].reshape(shape) for row in work)
+    for _ in range(max(rounds, 1)):
+        value, _ = blurred_disc(maps, p, w.x, w.y, out=j)
+        weight = w.weight if noise is None else w.weight / noise.variance(value)
+        np.multiply(j, weight[:, None, :], out=jw)
+        residual = w.grey - value
         N = (jw @ np.swapaxes(j, 1, 2)).astype(float)
         delta = _limited(N, (jw @ residual[..., None])[..., 0])
         p = p + delta
         p[:, 5] = np.clip(p[:, 5], 0.2, 6.0)
         p[:, 2:5] = np.clip(p[:, 2:5], -0.6, 0.6)
         step = np.abs(delta[:, :2]).max(axis=1)
-        if thin.step is None and bool(np.all(step < _CONVERGED_PX)):
+        if bool(np.all(step < tolerance_px)):
             break
     change = (np.swapaxes(j, 1, 2) @ delta[..., None].astype(np.float32))[..., 0]
     p[:, :2] += w.origin
-    return _Fit(p, value + change, residual - change, j, N, step, noise is not None)
+    # How much a px of movement would change each grey value.
+    edge = np.maximum(np.abs(j[:, 0]), np.abs(j[:, 1]))
+    return _Fit(p, value + change, residual - change, N, step, edge)
 
 
 def _limited(N: Array, rhs: NDArray[np.floating[Any]]) -> Array:

@@ -141,20 +141,22 @@ def refine(
         scale = max(1.4826 * float(np.median(np.abs(r))), _LEAST_SD_PX)
         weight = np.minimum(1.0, _CUT * scale / np.maximum(distance, 1e-9)) / scale**2
         weight[distance > 12 * scale] *= 1e-3
-        design = np.nan_to_num(A[:, :, free])
-        N = np.einsum("nik,n,nil->kl", design, weight, design) + np.diag(prior)
-        b = np.einsum("nik,n,ni->k", design, weight, r) - prior * (p - nominal)[free]
+        design = np.nan_to_num(A[:, :, free]).reshape(-1, len(free))
+        weighted = design * np.repeat(weight, 2)[:, None]
+        N = design.T @ weighted + np.diag(prior)
+        b = weighted.T @ r.ravel() - prior * (p - nominal)[free]
         d = np.sqrt(np.maximum(np.diag(N), 1e-30))
         step = np.linalg.solve(N / np.outer(d, d) + damping * np.eye(len(free)), b / d) / d
         p[free] += step
         if p[0] <= 0 or not np.isfinite(p).all():
             p = nominal.copy()
+            uv, A, _ = partials(sensor, p[:10], p[10:], points)
             break
         uv, A, _ = partials(sensor, p[:10], p[10:], points)
-        if abs(last - scale) < 0.01 * scale and float(np.abs(step * d).max()) < 0.5:
+        # A standard deviation from the end is near enough for a prediction.
+        if abs(last - scale) < 0.1 * scale and float(np.abs(step * d).max()) < 1.0:
             break
         last = scale
-    uv, _, _ = partials(sensor, p[:10], p[10:], points)
     return Orientation(
         CameraModel(sensor, InteriorOrientation.from_array(p[:10])),
         ExteriorOrientation.from_array(p[10:]),

@@ -26,7 +26,6 @@ _CUT_LOSS = 0.9989  # variance left of a normal distribution cut at 4 sd
 _FEWEST = 200
 _ENOUGH = 8_000
 _BINS = 6
-_CONSTANT = 1.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,10 +42,9 @@ class NoiseModel:
         v: NDArray[np.floating[Any]] = np.maximum(self.floor + self.gain * grey, _QUANTISATION)
         return v
 
-    def is_constant(self, grey: NDArray[np.floating[Any]]) -> bool:
-        """Whether the variance over these grey values differs by less than a weighting is worth."""
-        low, high = self.variance(np.array([grey.min(initial=1e9), grey.max(initial=-1e9)]))
-        return bool(max(low, high) < _CONSTANT * min(low, high))
+    def scaled(self, factor: float) -> NoiseModel:
+        """The same with every variance times a factor."""
+        return NoiseModel(self.floor * factor, self.gain * factor)
 
 
 def estimate_noise(

@@ -58,8 +58,10 @@ class LocalMap:
     @property
     def semi_axes(self) -> Array:
         """Semi-axes of the ellipses (n, 2) px, the major one first."""
-        axes: Array = np.asarray(np.linalg.svd(self.linear, compute_uv=False), dtype=float)
-        return axes
+        # In closed form: numpy's decomposition takes ten times as long for 2 × 2.
+        a, b, c, d = (self.linear[:, i, k] for i in (0, 1) for k in (0, 1))
+        mean, difference = np.hypot(a + d, b - c) / 2, np.hypot(a - d, b + c) / 2
+        return np.stack([mean + difference, np.abs(mean - difference)], axis=1)
 
     @property
     def half_extent(self) -> Array:

@@ -189,10 +189,10 @@ def _read_family(level: Single, maps: LocalMap, bits: int) -> tuple[NDArray[np.i
     which = np.minimum(position.astype(np.int64), bits - 1)
     within = position - which
     middle = np.abs(within - 0.5) < 0.3
-    ones = np.zeros((n, bits), dtype=bool)
-    for i in range(bits):
-        mine = middle & (which == i)
-        ones[:, i] = np.sum(ring * mine, axis=1) > 0.5 * np.sum(mine, axis=1)
+    segment = (np.arange(n)[:, None] * bits + which)[middle]
+    ink = np.bincount(segment, ring[middle], n * bits)
+    samples = np.bincount(segment, minlength=n * bits)
+    ones = (ink > 0.5 * samples).reshape(n, bits)
     codes = _code_table(bits)[ones @ (1 << np.arange(bits - 1, -1, -1))]
     readable = on_raster & (codes >= 0)
     misfit = np.full(n, np.inf)

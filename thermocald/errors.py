@@ -8,6 +8,7 @@
      │    ├── TestFieldError                  a test field is broken
      │    ├── ImageError                      an image cannot be read or used
      │    ├── StoreError                      a store is broken, foreign, or cannot be written
+     │    │    ├── StoreFullError             the disk has no room for it
      │    │    └── StoreVersionError          a store of a newer program
      │    └── GeometryError                   too little geometry for what was asked
      └── DeviceError (OSError)                exit 3: a device failed
@@ -20,6 +21,8 @@
                ├── DeviceDenied (PermissionError)   permission, unauthorized, busy for good
                ├── WrongDevice                      identity, size or capability does not fit
                └── DriverMissing                    an optional library is not installed
+
+Leaves also are the built-in exception that they mean.
 """
 
 from __future__ import annotations
@@ -39,6 +42,7 @@ __all__ = [
     "PermanentDeviceError",
     "RecordingError",
     "StoreError",
+    "StoreFullError",
     "StoreVersionError",
     "TestFieldError",
     "ThermocaldError",
@@ -84,6 +88,10 @@ class ImageError(DataError):
 
 class StoreError(DataError):
     """A store is broken, is not ours, or cannot be written."""
+
+
+class StoreFullError(StoreError):
+    """There is no room on the disk; what was stored before is not lost."""
 
 
 class StoreVersionError(StoreError):

@@ -333,3 +333,19 @@ def test_close_twice(filled):
     store, _ = filled
     store.close()
     store.close()
+
+
+def test_checkpoint_empties_the_wal(filled, store_path, make_epoch):
+    store, series = filled
+    wal = store_path.with_name(f"{store_path.name}-wal")
+    assert wal.stat().st_size > 0
+    assert store.checkpoint()
+    assert wal.stat().st_size == 0
+    with Store.open(store_path) as reader:
+        epochs = reader.epochs(series)
+        next(epochs)  # a reader in the middle of it
+        store._db.execute("PRAGMA busy_timeout = 50")
+        store.append(series, make_epoch(21))
+        assert not store.checkpoint()
+        epochs.close()
+    assert store.checkpoint()

@@ -13,7 +13,7 @@ import time
 import numpy as np
 import pytest
 
-from thermocald.errors import StoreError
+from thermocald.errors import StoreError, StoreFullError
 from thermocald.store.database import Store
 
 # Appends for ever, and says after each commit what it has committed.
@@ -94,7 +94,7 @@ def fill(store, series, make_epoch, make_result) -> int:
             store.append(series, make_epoch(number + 1), make_result(number + 1))
             number += 1
 
-    with pytest.raises(StoreError, match="was not kept: the disk") as caught:
+    with pytest.raises(StoreFullError, match="was not kept: the disk") as caught:
         append_for_ever()
     assert f"epoch {number + 1} " in str(caught.value)
     return number

@@ -6,7 +6,7 @@ import sqlite3
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Literal
 
-from thermocald.errors import StoreError, StoreVersionError, ThermocaldError
+from thermocald.errors import StoreError, StoreFullError, StoreVersionError, ThermocaldError
 from thermocald.store.schema import APPLICATION_ID, PAGE_SIZE, VERSION, migrate
 
 if TYPE_CHECKING:
@@ -18,6 +18,8 @@ __all__ = ["Mode", "connect", "in_words"]
 Mode = Literal["read", "append"]
 
 _BUSY_S = 10.0
+# A quota or a limit on the size of files shows as an error of writing or growing a file.
+_NO_ROOM = ("SQLITE_FULL", "SQLITE_IOERR_WRITE", "SQLITE_IOERR_TRUNCATE", "SQLITE_IOERR_SHMSIZE")
 _WAL_LIMIT_BYTES = 4_000_000
 _MMAP_BYTES = 2**31 - 1
 
@@ -33,15 +35,22 @@ def in_words(path: Path, doing: str, *, reading: bool = False) -> Iterator[None]
     except ThermocaldError:
         raise
     except sqlite3.Error as cause:
-        raise StoreError(f"{path}: {doing}: {_advice(cause)}") from cause
+        full = _name(cause).startswith(_NO_ROOM)
+        kind = StoreFullError if full else StoreError
+        raise kind(f"{path}: {doing}: {_advice(cause)}") from cause
     except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as cause:
         if not reading:
             raise
         raise StoreError(f"{path}: {doing}: the store is damaged ({cause})") from cause
 
 
+def _name(cause: sqlite3.Error) -> str:
+    """SQLite's name of the error, such as SQLITE_IOERR_WRITE; empty where Python raised it."""
+    return getattr(cause, "sqlite_errorname", "") or ""
+
+
 def _advice(cause: sqlite3.Error) -> str:
-    name = getattr(cause, "sqlite_errorname", "") or ""
+    name = _name(cause)
     if name.startswith("SQLITE_FULL"):
         return "the disk is full; free some space, nothing that was stored before is lost"
     if name.startswith("SQLITE_IOERR"):
@@ -96,7 +105,7 @@ def _open(path: Path, mode: Mode) -> sqlite3.Connection:
     except sqlite3.OperationalError as cause:
         connection.close()
         # On a read-only medium WAL's helper files cannot be made; nobody can write there either.
-        if not (cause.sqlite_errorname or "").startswith(("SQLITE_CANTOPEN", "SQLITE_READONLY")):
+        if not _name(cause).startswith(("SQLITE_CANTOPEN", "SQLITE_READONLY")):
             raise
         return _connect(path, "ro&immutable=1")
     except BaseException:

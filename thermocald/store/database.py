@@ -159,8 +159,8 @@ class Store:
         """Keep one epoch, its result and what happened meanwhile, in one transaction.
 
         result: None if it is to be calibrated later, by `amend`. extra: further columns such as
-        blur. Raises StoreError, and keeps nothing of the epoch, if its number does not come after
-        the last one or the disk is full.
+        blur. Keeps nothing of the epoch and raises StoreError if its number does not come after the
+        last one, StoreFullError if the disk is full: an epoch without observations is smaller.
         """
         if taken := {*FIXED, *_DERIVED, *series.head.channels} & set(extra or ()):
             raise StoreError(f"an extra column cannot be called {min(taken)!r}")
@@ -298,6 +298,11 @@ class Store:
                 Event(utc, kind, text, series_id, epoch, json.loads(data))
                 for utc, kind, text, series_id, epoch, data in rows
             ]
+
+    def checkpoint(self) -> bool:
+        """Move what is in the -wal file into the store; False if a reader was in the way."""
+        ((busy, _, _),) = self._query("PRAGMA wal_checkpoint(TRUNCATE)", ())
+        return not busy
 
     def check(self) -> None:
         """Read the whole file; StoreError if it is damaged."""

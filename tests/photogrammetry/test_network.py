@@ -47,6 +47,7 @@ def test_bent_sheet_from_twelve_rolled_stations(with_nominal):
     assert np.all(np.abs(interior) < 3.5 * np.sqrt(np.diag(network.interior_covariance)))
 
 
+@pytest.mark.slow
 def test_standard_deviations_are_true():
     """Scatter over stated sd of targets and interior orientation, 100 seeded repetitions.
 
@@ -77,6 +78,7 @@ def test_standard_deviations_are_true():
     assert abs(np.mean(sigma0) - 1) < 0.01
 
 
+@pytest.mark.slow
 def test_full_covariance_predicts_distances():
     """The stated sd of distances between targets uses the correlations: normalised errors are 1.
 

@@ -27,7 +27,7 @@ from thermocald.photogrammetry.camera_model import (
 )
 from thermocald.photogrammetry.network_covariance import Covariance, covariance
 from thermocald.photogrammetry.network_datum import Datum, Distance, bring_to_datum
-from thermocald.photogrammetry.network_snooping import compact, snoop
+from thermocald.photogrammetry.network_snooping import MIN_RAYS, compact, snoop
 from thermocald.photogrammetry.network_start import approximate
 
 if TYPE_CHECKING:
@@ -143,7 +143,7 @@ def adjust_network(
     from thermocald.photogrammetry.network_checks import refuse_before, refuse_weak
 
     rays, left_out = _collect(photos, len(names), names)
-    refuse_before(rays, distances, names)
+    refuse_before(len(photos), rays, distances, names)
     free_rows = np.array([IOP_NAMES.index(name) for name in free], dtype=int)
     bundle, kept, used = (
         approximate(sensor, rays, len(names), interior, nominal, free_rows)
@@ -162,7 +162,7 @@ def adjust_network(
     bundle = nb.Bundle(bundle.interior, bundle.rotations, bundle.centres, bundle.points[targets])
     for row in sorted(set(range(len(names))) - set(targets.tolist())):
         if row in rays.target:
-            left_out[names[row]] = "fewer than two photographs agree on it"
+            left_out[names[row]] = "fewer than three photographs agree on it"
 
     v = nb.residuals(sensor, bundle, final)
     unknowns = len(free_rows) + 6 * len(kept) + 3 * len(targets) - 7
@@ -181,14 +181,14 @@ def adjust_network(
         tuple(free), left_out,
         _rejections(photos, names, kept, used, rejected_rows, tests, sensor, bundle, numbers),
     )  # fmt: skip
-    refuse_weak(network, final_cofactors.weakest, distances)
+    refuse_weak(network, final_cofactors.weakest)
     return network
 
 
 def _collect(
     photos: Sequence[Photo], m: int, names: Sequence[str]
 ) -> tuple[ImageRays, dict[str, str]]:
-    """All rays of targets that at least two photographs show, and what was left out."""
+    """All rays of targets that enough photographs show, and what was left out."""
     photo, target, points, whitening = [], [], [], []
     for i, p in enumerate(photos):
         o = p.observations
@@ -205,8 +205,11 @@ def _collect(
         np.concatenate(whitening),
     )  # fmt: skip
     seen = np.bincount(rays.target, minlength=m)
-    left_out = {names[int(t)]: "only one photograph shows it" for t in np.flatnonzero(seen == 1)}
-    return rays.select(seen[rays.target] >= 2), left_out
+    left_out = {
+        names[int(t)]: "fewer than three photographs show it"
+        for t in np.flatnonzero((seen > 0) & (seen < MIN_RAYS))
+    }
+    return rays.select(seen[rays.target] >= MIN_RAYS), left_out
 
 
 def _resume(

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.errors import GeometryError
+from thermocald.photogrammetry.network_snooping import MIN_RAYS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -31,17 +32,18 @@ def _refuse(reasons: list[str]) -> None:
         raise GeometryError("the network cannot carry a survey: " + "; ".join(reasons))
 
 
-def refuse_before(rays: ImageRays, distances: Sequence[Distance], names: Sequence[str]) -> None:
+def refuse_before(
+    photos: int, rays: ImageRays, distances: Sequence[Distance], names: Sequence[str]
+) -> None:
     """Refuse what no adjustment can mend: photographs, targets, or the scale are missing."""
     reasons = []
-    photos = len(np.unique(rays.photo))
     targets = len(np.unique(rays.target))
     if photos < MIN_PHOTOS:
-        reasons.append(
-            f"{photos} photographs share targets, {MIN_PHOTOS} are the least and 8 to 12 are good"
+        _refuse(
+            [f"{photos} photographs show targets, {MIN_PHOTOS} are the least and 8 to 12 are good"]
         )
     if targets < MIN_TARGETS:
-        reasons.append(f"{targets} targets are seen twice, {MIN_TARGETS} are the least")
+        reasons.append(f"{targets} targets are seen {MIN_RAYS} times, {MIN_TARGETS} are the least")
     if not distances:
         reasons.append("no distance gives the scale: --scale A B MM")
     seen = {names[t] for t in np.unique(rays.target)}
@@ -49,16 +51,14 @@ def refuse_before(rays: ImageRays, distances: Sequence[Distance], names: Sequenc
         missing = [name for name in (d.a, d.b) if name not in seen]
         if missing:
             reasons.append(
-                f"the scale needs target {' and '.join(missing)} in at least two photographs"
+                f"the scale needs target {' and '.join(missing)} in at least {MIN_RAYS} photographs"
             )
         if not d.length > 0:
             reasons.append(f"the distance {d.a}–{d.b} is {d.length:g} mm, it must be positive")
     _refuse(reasons)
 
 
-def refuse_weak(
-    network: Network, weakest: tuple[float, tuple[str, ...]], distances: Sequence[Distance]
-) -> None:
+def refuse_weak(network: Network, weakest: tuple[float, tuple[str, ...]]) -> None:
     """Refuse a result whose geometry or residuals say that it is not worth its digits."""
     reasons = []
     if len(network.stations) < MIN_PHOTOS:
@@ -90,26 +90,16 @@ def refuse_weak(
             f"residuals are {network.sigma0:.1f} times their stated sigmas: another camera or "
             "focus among the photographs, a field that moved, or wrong identifications"
         )
-    ends = {name for d in distances for name in (d.a, d.b)}
-    weak = [
-        name
-        for name, n in zip(network.names, network.n_rays, strict=True)
-        if name in ends and n < 3
-    ]
-    if weak:
-        reasons.append(
-            f"the scale stands on target {' and '.join(weak)} with two rays, which control nothing"
-        )
     _refuse(reasons)
 
 
 def advice(network: Network) -> list[str]:
     """What would make an accepted network better, as sentences."""
     notes = []
-    two = [name for name, n in zip(network.names, network.n_rays, strict=True) if n == 2]
-    if two:
-        shown = ", ".join(two[:8]) + (", …" if len(two) > 8 else "")
-        notes.append(f"{len(two)} targets have two rays only, uncontrolled: {shown}")
+    three = [name for name, n in zip(network.names, network.n_rays, strict=True) if n == MIN_RAYS]
+    if three:
+        shown = ", ".join(three[:8]) + (", …" if len(three) > 8 else "")
+        notes.append(f"{len(three)} targets have {MIN_RAYS} rays only, the least: {shown}")
     if _roll_span(network) < MIN_ROLL:
         notes.append(
             "the camera was never turned about its axis: turn it by 90° in some photographs, which "

@@ -94,7 +94,7 @@ def _scaled(
         if missing:
             raise GeometryError(
                 f"the distance {d.a}–{d.b} cannot give the scale: target {' and '.join(missing)} "
-                "was not determined; at least two photographs must show both of its ends"
+                "was not determined; at least three photographs must show both of its ends"
             )
         a, b = index[d.a], index[d.b]
         e = points[b] - points[a]

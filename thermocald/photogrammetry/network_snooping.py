@@ -25,7 +25,10 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
     Index = NDArray[np.int64]
 
-__all__ = ["compact", "snoop"]
+__all__ = ["MIN_RAYS", "compact", "snoop"]
+
+MIN_RAYS = 3
+"""Rays that a target needs: of two a wrong one cannot be told, and along one of them not seen."""
 
 _FAMILY_ERROR = 0.05
 _MEDIAN_CHI2 = 1.386  # of two degrees of freedom
@@ -46,7 +49,7 @@ def snoop(
     rejected |= v2 > 10 * limit * max(float(np.median(v2)) / _MEDIAN_CHI2, 1e-12)
     tests = np.zeros(len(rays))
     for _round in range(30):
-        _drop_single_rays(rejected, rays)
+        _drop_uncontrolled(rejected, rays)
         bundle, _ = nb.solve(sensor, bundle, rays, free, weights=(~rejected).astype(float))
         tests = _point_tests(sensor, bundle, rays, free, rejected)
         tests /= limit
@@ -62,10 +65,10 @@ def snoop(
     return bundle, rejected, tests
 
 
-def _drop_single_rays(rejected: NDArray[np.bool_], rays: ImageRays) -> None:
-    """A target that only one ray is left of is no target (in place)."""
+def _drop_uncontrolled(rejected: NDArray[np.bool_], rays: ImageRays) -> None:
+    """A target that too few rays are left of is no target (in place)."""
     left = np.bincount(rays.target[~rejected], minlength=int(rays.target.max()) + 1)
-    rejected |= left[rays.target] < 2
+    rejected |= left[rays.target] < MIN_RAYS
 
 
 def _point_tests(

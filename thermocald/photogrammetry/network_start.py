@@ -41,6 +41,7 @@ _TRIAL_DISTANCES = (0.75, 1.0, 1.35, 0.55, 2.0, 3.0)
 # A plane field has a second, false relative orientation per pair: three good pairs are tried.
 _GOOD_PAIRS, _PAIRS = 3, 12
 _GOOD_MEDIAN_PX = 0.5
+_GOOD_MISSING = 4  # twentieths of the image points that may be left out of a good start
 
 
 class _Start:
@@ -269,7 +270,7 @@ def approximate(
             if best is None or (missing, median) < best[:2]:
                 best = (missing, median, bundle, photos, used)
             good += 1
-            if best[0] == 0 and best[1] < _GOOD_MEDIAN_PX:
+            if best[0] <= _GOOD_MISSING and best[1] < _GOOD_MEDIAN_PX:
                 return best[2:]
             if good == _GOOD_PAIRS:
                 break

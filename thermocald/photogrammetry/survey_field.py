@@ -19,9 +19,70 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["expected_field", "field_of_codes", "surveyed_field"]
+__all__ = [
+    "expected_field",
+    "field_of_codes",
+    "sheet_labels",
+    "sheet_normals",
+    "surveyed_field",
+]
 
 _ONE_SIZE = 0.15
+_NEIGHBOURS = 8
+_SAME_SHEET_COSINE = 0.97  # between the normals of neighbours on one sheet, which may be bent
+_SAME_SHEET_STEP = 0.1  # of their distance: how far one may lie off the other's plane
+
+
+def sheet_labels(points: Array) -> NDArray[np.int64]:
+    """The sheet (n,) that each target at points (n, 3) mm belongs to, -1 for none.
+
+    Sheets grow from neighbour to neighbour, so one may be bent, and two may meet in a corner.
+    """
+    normals = target_normals(points)
+    labels = np.full(len(points), -1)
+    distance = np.linalg.norm(points[:, None] - points[None], axis=2)
+    near = np.argsort(distance, axis=1)[:, 1 : _NEIGHBOURS + 1]
+    step = np.abs(np.einsum("njk,nk->nj", points[near] - points[:, None], normals))
+    alike = np.abs(np.einsum("njk,nk->nj", normals[near], normals)) > _SAME_SHEET_COSINE
+    linked = alike & (step < _SAME_SHEET_STEP * np.take_along_axis(distance, near, axis=1))
+    for first in range(len(points)):
+        if labels[first] >= 0 or not np.isfinite(normals[first, 0]):
+            continue
+        labels[first] = labels.max() + 1
+        waiting = [first]
+        while waiting:
+            row = waiting.pop()
+            for other in near[row, linked[row]]:
+                if labels[other] < 0:
+                    labels[other] = labels[first]
+                    waiting.append(int(other))
+    # what has found no plane of its own belongs to its nearest neighbour's, if it lies in it
+    placed = labels >= 0
+    for row in np.flatnonzero(~placed) if placed.any() else ():
+        other = int(np.argmin(np.where(placed, distance[row], np.inf)))
+        off = abs(float((points[row] - points[other]) @ normals[other]))
+        if off < _SAME_SHEET_STEP * distance[row, other]:
+            labels[row] = labels[other]
+    return labels
+
+
+def sheet_normals(points: Array, labels: NDArray[np.int64]) -> Array:
+    """Unit normals (n, 3), of either sign, of targets by their nearest on the same sheet; NaN for
+    those on none.
+    """
+    normals = np.full((len(points), 3), np.nan)
+    for label in np.unique(labels[labels >= 0]):
+        rows = np.flatnonzero(labels == label)
+        if len(rows) < 4:
+            continue
+        whole = np.linalg.svd(points[rows] - points[rows].mean(axis=0))[2][2]
+        for row in rows:
+            order = np.argsort(np.linalg.norm(points[rows] - points[row], axis=1))
+            near = points[rows[order[: _NEIGHBOURS + 1]]]
+            _, size, axes = np.linalg.svd(near - near.mean(axis=0))
+            # a single line of targets does not say how the paper is turned about it
+            normals[row] = axes[2] if size[1] > 0.1 * size[0] else whole
+    return normals
 
 
 def expected_field(network: Network, nominal: TestField, *, trusted_only: bool) -> TestField:
@@ -70,7 +131,7 @@ def field_of_codes(
     codes: by target; radii: semi-major axes px by photograph and target, from which the diameters
     are found: what a disc of 1 mm would measure there, lying as its neighbours do.
     """
-    normals = target_normals(network.points)
+    normals = sheet_normals(network.points, sheet_labels(network.points))
     ratios: dict[str, list[float]] = {name: [] for name in network.names}
     interior = network.camera.interior.as_array()
     for s in network.stations:

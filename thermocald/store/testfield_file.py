@@ -38,11 +38,16 @@ def read_testfield(path: Path) -> TestField:
     Raises TestFieldError, naming file, line and column, where a column is missing, a number is
     none, a target stands twice or the coordinates look like metres.
     """
-    return _read(Table(path, _REQUIRED, TestFieldError))
+    field = _read(Table(path, _REQUIRED, TestFieldError))
+    require_millimetres(field, str(path))
+    return field
 
 
 def parse_testfield(text: str, path: Path) -> TestField:
-    """A test field from the text of a `testfield.csv`; `path` is for the messages."""
+    """A test field that was accepted before, from the text of a `testfield.csv`.
+
+    path: for the messages. Errors as `read_testfield`.
+    """
     return _read(Table(path, _REQUIRED, TestFieldError, text))
 
 
@@ -78,7 +83,7 @@ def _read(table: Table) -> TestField:
         codes.extend(code.strip() for code in found)
     if not names:
         raise TestFieldError(f"{table.path}: holds no targets")
-    field = TestField.build(
+    return TestField.build(
         names,
         np.array([columns["X"], columns["Y"], columns["Z"]]).T,
         np.array([columns["sX"], columns["sY"], columns["sZ"]]).T,
@@ -86,8 +91,6 @@ def _read(table: Table) -> TestField:
         kinds,
         codes,
     )
-    require_millimetres(field, str(table.path))
-    return field
 
 
 def require_millimetres(

@@ -131,15 +131,15 @@ def correlation_matrix(columns: Sequence[Array]) -> Array:
     k = len(columns)
     matrix = np.full((k, k), np.nan)
     finite = [np.isfinite(column) for column in columns]
-    whole = [bool(f.all()) for f in finite]
+    whole = [bool(f.all()) and np.ptp(c) > 0 for f, c in zip(finite, columns, strict=True)]
     for i in range(k):
         for j in range(i, k):
             a, b = columns[i], columns[j]
             if not (whole[i] and whole[j]):
                 both = finite[i] & finite[j]
                 a, b = a[both], b[both]
-            if len(a) < 3 or not (np.ptp(a) > 0 and np.ptp(b) > 0):
-                continue
+                if len(a) < 3 or not (np.ptp(a) > 0 and np.ptp(b) > 0):
+                    continue
             a, b = a - a.mean(), b - b.mean()
             r = np.dot(a, b) / np.sqrt(np.dot(a, a) * np.dot(b, b))
             matrix[i, j] = matrix[j, i] = np.clip(r, -1.0, 1.0)

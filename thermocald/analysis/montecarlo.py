@@ -128,7 +128,9 @@ def simulate_errors(
     done = folded = 0
     while done < sets:
         size = min(_CHUNK, sets - done)
-        dx, dy, ok = project(iop + rng.standard_normal((size, len(root))) @ root)
+        sets_of_iop = iop + rng.standard_normal((size, len(root))) @ root
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            dx, dy, ok = project(sets_of_iop)  # a set that folds the image may run away
         if not ok.all():
             folded += int(np.count_nonzero(~ok))
             dx, dy = dx[:, ok], dy[:, ok]

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["StraightLine", "fit_straight_line"]
 
 _ITERATIONS = 100
-_TOLERANCE = 1e-12
+_CONVERGED = 1e-7  # of the slope's standard deviation
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ def fit_straight_line(
         beta = weight * (u * var_y + slope * v * var_x)
         wb = weight * beta
         previous, slope = slope, float(np.dot(wb, v) / np.dot(wb, u))
-        if abs(slope - previous) <= _TOLERANCE * abs(slope):
+        if abs(slope - previous) <= _CONVERGED / np.sqrt(float(np.dot(weight, u**2))):
             break
     weight = np.broadcast_to(1.0 / (var_y + slope**2 * var_x), x.shape)
     adjusted = xb + beta

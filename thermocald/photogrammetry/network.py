@@ -140,7 +140,7 @@ def adjust_network(
     determined; start: an earlier result for the same photographs, whose orientation is begun with.
     Raises GeometryError where the network cannot carry it, with the reasons.
     """
-    from thermocald.photogrammetry.network_checks import refuse_before, refuse_weak
+    from thermocald.photogrammetry.network_checks import refuse_before, refuse_narrow, refuse_weak
 
     rays, left_out = _collect(photos, len(names), names)
     refuse_before(len(photos), rays, distances, names)
@@ -164,6 +164,7 @@ def adjust_network(
         if row in rays.target:
             left_out[names[row]] = "fewer than three photographs agree on it"
 
+    refuse_narrow(_intersection_angles(bundle, final))
     v = nb.residuals(sensor, bundle, final)
     unknowns = len(free_rows) + 6 * len(kept) + 3 * len(targets) - 7
     redundancy = 2 * len(final) - unknowns

@@ -12,11 +12,15 @@ from thermocald.photogrammetry.network_snooping import MIN_RAYS
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from numpy.typing import NDArray
+
     from thermocald.photogrammetry.network import Network
     from thermocald.photogrammetry.network_bundle import ImageRays
     from thermocald.photogrammetry.network_datum import Distance
 
-__all__ = ["advice", "refuse_before", "refuse_weak"]
+    Array = NDArray[np.float64]
+
+__all__ = ["advice", "refuse_before", "refuse_narrow", "refuse_weak"]
 
 MIN_PHOTOS = 3
 MIN_TARGETS = 8
@@ -58,6 +62,18 @@ def refuse_before(
     _refuse(reasons)
 
 
+def refuse_narrow(angles: Array) -> None:
+    """Refuse rays that hardly intersect, given the largest angle at each target (m,) rad."""
+    angle = float(np.median(angles)) if len(angles) else 0.0
+    if angle < MIN_ANGLE:
+        _refuse(
+            [
+                f"the rays meet at {np.degrees(angle):.0f}° (median), {np.degrees(MIN_ANGLE):.0f}° "
+                "are the least: take photographs from further to the left, right, above, and below"
+            ]
+        )
+
+
 def refuse_weak(network: Network, weakest: tuple[float, tuple[str, ...]]) -> None:
     """Refuse a result whose geometry or residuals say that it is not worth its digits."""
     reasons = []
@@ -67,12 +83,6 @@ def refuse_weak(network: Network, weakest: tuple[float, tuple[str, ...]]) -> Non
         )
     if network.redundancy < 10:
         reasons.append(f"{network.redundancy} redundant observations control nothing")
-    angle = float(np.median(network.angles))
-    if angle < MIN_ANGLE:
-        reasons.append(
-            f"the rays meet at {np.degrees(angle):.0f}° (median), {np.degrees(MIN_ANGLE):.0f}° are "
-            "the least: take photographs from further to the left, right, above, and below"
-        )
     c, sd_c = network.camera.interior.c, float(np.sqrt(network.interior_covariance[0, 0]))
     if "c" in network.free and sd_c > MAX_RELATIVE_SD_C * c:
         reasons.append(

@@ -164,7 +164,11 @@ _SPOT = _BENT.mean(axis=0)
     ("field", "stations", "reason"),
     [
         (_BENT, cases.convergent_stations(_BENT)[:2], "2 photographs"),
-        (_FLAT, _parallel(_FLAT, (-250, 0, 250), (-180, 180)), "principal distance is uncertain"),
+        (
+            _FLAT,
+            _parallel(_FLAT, (-180, 0, 180), (-130, 0, 130)),
+            "principal distance is uncertain",
+        ),
         (
             _BENT,
             [

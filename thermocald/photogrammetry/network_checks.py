@@ -68,8 +68,10 @@ def refuse_narrow(angles: Array) -> None:
     if angle < MIN_ANGLE:
         _refuse(
             [
-                f"the rays meet at {np.degrees(angle):.0f}° (median), {np.degrees(MIN_ANGLE):.0f}° "
-                "are the least: take photographs from further to the left, right, above, and below"
+                (
+                    f"the rays meet at {np.degrees(angle):.0f}° (median), {np.degrees(MIN_ANGLE):.0f}° "
+                    "are the least: take photographs from further to the left, right, above, and below"
+                )
             ]
         )
 

@@ -162,7 +162,7 @@ def test_a_read_only_medium(store_path, head, field, make_epoch, make_result):
         store_path.parent.chmod(0o755)
 
 
-# On a file system of 1 MB with a filler of 300 kB: fill the store, remove the filler, go on.
+# On a file system of 2 MB with a filler of 0.6 MB: fill the store, remove the filler, go on.
 FULL = textwrap.dedent(
     """
     import sys
@@ -177,7 +177,7 @@ FULL = textwrap.dedent(
     from thermocald.store.row import EpochResult
 
     disk = Path(sys.argv[1])
-    (disk / "filler").write_bytes(bytes(300_000))
+    (disk / "filler").write_bytes(bytes(600_000))
     points = np.random.default_rng(1).uniform(size=(50, 3))
     field = TestField.build([str(i) for i in range(50)], points)
     head = Head("a", "M1", 1.0, CameraSpec("c", Sensor(99, 99, 0.001)))
@@ -213,7 +213,7 @@ def test_a_file_system_without_room(tmp_path):
     """A real ENOSPC, on a tmpfs in a mount namespace of its own."""
     disk = tmp_path / "disk"
     disk.mkdir()
-    mount = f'mount -t tmpfs -o size=1m tmpfs \'{disk}\' && exec "$0" "$@"'
+    mount = f'mount -t tmpfs -o size=2m tmpfs \'{disk}\' && exec "$0" "$@"'
     namespace = ["unshare", "-rm", "sh", "-c", mount]
     if not shutil.which("unshare") or subprocess.run([*namespace, "true"], check=False).returncode:
         pytest.skip("no file system can be mounted here: unshare -rm is not permitted")

@@ -20,7 +20,8 @@ Mode = Literal["read", "append"]
 _BUSY_S = 10.0
 # A quota or a limit on the size of files shows as an error of writing or growing a file.
 _NO_ROOM = ("SQLITE_FULL", "SQLITE_IOERR_WRITE", "SQLITE_IOERR_TRUNCATE", "SQLITE_IOERR_SHMSIZE")
-_WAL_LIMIT_BYTES = 4_000_000
+# A small card must not be full of what waits to be moved; a replay need not sync so often.
+_WAL_LIMIT_BYTES = {True: 1_000_000, False: 4_000_000}  # durable or not
 _MMAP_BYTES = 2**31 - 1
 
 
@@ -85,8 +86,9 @@ def connect(path: Path, mode: Mode, *, durable: bool) -> sqlite3.Connection:
             if mode == "append":
                 # with FULL, what is committed survives a power cut; with NORMAL, a killed process
                 connection.execute(f"PRAGMA synchronous = {'FULL' if durable else 'NORMAL'}")
-                connection.execute(f"PRAGMA journal_size_limit = {_WAL_LIMIT_BYTES}")
-                connection.execute(f"PRAGMA wal_autocheckpoint = {_WAL_LIMIT_BYTES // PAGE_SIZE}")
+                limit = _WAL_LIMIT_BYTES[durable]
+                connection.execute(f"PRAGMA journal_size_limit = {limit}")
+                connection.execute(f"PRAGMA wal_autocheckpoint = {limit // PAGE_SIZE}")
             else:
                 connection.execute(f"PRAGMA mmap_size = {_MMAP_BYTES}")
             connection.execute("PRAGMA foreign_keys = ON")

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from thermocald.errors import StoreError
+from thermocald.errors import StoreError, StoreFullError
 from thermocald.store.columns import (
     CHUNK,
     FIXED,
@@ -164,7 +164,19 @@ class Store:
         """
         if taken := {*FIXED, *_DERIVED, *series.head.channels} & set(extra or ()):
             raise StoreError(f"an extra column cannot be called {min(taken)!r}")
-        result = result or EpochResult(NOT_CALIBRATED)
+        stored = StoredEpoch(
+            epoch, result or EpochResult(NOT_CALIBRATED), extra or {}, clock_trusted, 0
+        )
+        happened = list(events)
+        try:
+            self._append(series, stored, happened)
+        except StoreFullError:
+            # what waits in the -wal file may be the room that is missing
+            self.checkpoint()
+            self._append(series, stored, happened)
+
+    def _append(self, series: StoredSeries, stored: StoredEpoch, events: list[Event]) -> None:
+        epoch = stored.epoch
         with self._transaction(f"epoch {epoch.number} of series {series.name!r} was not kept"):
             last, loose = self._ends.get(series.id) or self._end(series)
             if epoch.number <= last:
@@ -172,9 +184,7 @@ class Store:
                     f"{self.path}: epoch {epoch.number} of series {series.name!r} comes after "
                     f"epoch {last}; numbers must increase"
                 )
-            insert_epoch(
-                self._db, series.id, StoredEpoch(epoch, result, extra or {}, clock_trusted, 0)
-            )
+            insert_epoch(self._db, series.id, stored)
             self._insert_events(events)
             if loose + 1 >= CHUNK:
                 build_missing_chunks(self._db, series.id)
@@ -300,8 +310,11 @@ class Store:
             ]
 
     def checkpoint(self) -> bool:
-        """Move what is in the -wal file into the store; False if a reader was in the way."""
-        ((busy, _, _),) = self._query("PRAGMA wal_checkpoint(TRUNCATE)", ())
+        """Move what is in the -wal file into the store; False if a reader or the disk forbids."""
+        try:
+            ((busy, _, _),) = self._query("PRAGMA wal_checkpoint(TRUNCATE)", ())
+        except StoreFullError:
+            return False
         return not busy
 
     def check(self) -> None:

@@ -61,3 +61,32 @@ def station(distance: float = 750.0, target=(200.0, 200.0, 200.0), roll: float =
     """Before the corner, looking in along its diagonal."""
     direction = np.ones(3) / np.sqrt(3)
     return look_at(np.array(target) + distance * direction, np.array(target), roll)
+
+
+SMALL_SENSOR = Sensor(1640, 1232, 0.00224)
+SMALL_CAMERA = CameraModel(SMALL_SENSOR, PI_CAMERA.interior)
+
+
+def small_field(bits: int = 14) -> tuple[TestField, np.ndarray]:
+    """108 targets of 15 mm, for the binned camera."""
+    return corner_field(per_side=6, spacing=75.0, diameter=15.0, bits=bits)
+
+
+def draw_marker(
+    scene: Scene, dictionary: str, number: int, corners: np.ndarray, markers: dict
+) -> None:
+    """A marker whose outer corners (4, 3) mm are in OpenCV's order; noted in `markers`."""
+    import cv2
+
+    d = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+    cells = d.markerSize + 2
+    image = cv2.aruco.generateImageMarker(d, number, cells)
+    a, b, _, e = corners
+    for row in range(cells):
+        # Black runs in one piece: no seams between their cells.
+        dark = np.flatnonzero(np.diff(np.r_[0, image[row] < 128, 0]))
+        for begin, end in zip(dark[::2], dark[1::2], strict=True):
+            u = np.array([begin, end, end, begin])[:, None] / cells
+            v = np.array([row, row, row + 1, row + 1])[:, None] / cells
+            scene.patch(a + u * (b - a) + v * (e - a))
+    markers[(dictionary, number)] = corners

@@ -26,8 +26,11 @@ if TYPE_CHECKING:
 __all__ = ["field_normals", "target_normals"]
 
 _NEIGHBOURS = 8
-_FLATNESS = 0.05  # of the distance between neighbours
-_FEWEST = 4  # targets on a sheet; three always are in a plane
+_FLATNESS = 0.03  # of the distance between neighbours
+_FEWEST = 6  # targets on a sheet; three always are in a plane, five sometimes by chance
+_PLATE = 4  # targets of a small plate, or at the rim of a sheet
+_LOOSE = 0.03  # flatness of a target with its nearest where no sheet was found
+_COMPACT = 1.6  # how much farther than the nearest the others may be for that
 _LOCAL = 8
 
 
@@ -47,7 +50,7 @@ def target_normals(points: Array) -> Array:
     """Unit normals (n, 3), of either sign, of targets at points (n, 3) mm; NaN for no plane."""
     n = len(points)
     normals = np.full((n, 3), np.nan)
-    if n < _FEWEST:
+    if n < _PLATE:
         return normals
     distance = np.linalg.norm(points[:, None] - points[None], axis=2)
     near = np.argsort(distance, axis=1, kind="stable")[:, 1 : _NEIGHBOURS + 1]
@@ -78,6 +81,18 @@ def target_normals(points: Array) -> Array:
             # A single row of targets does not say how its sheet is turned about it.
             normals[row] = axes[2] if size[1] > 0.1 * size[0] else planes[best]
         left[sheet] = False
+    for row in np.nonzero(left)[0].tolist():
+        # The rim of a sheet that bends, or a small plate of its own.
+        local = np.argsort(distance[row], kind="stable")[:_PLATE]
+        spread = points[local] - points[local].mean(axis=0)
+        _, size, axes = np.linalg.svd(spread)
+        compact = distance[row, local[-1]] < _COMPACT * distance[row, local[1]]
+        if (
+            compact
+            and size[1] > 0.1 * size[0]
+            and np.abs(spread @ axes[2]).max() < _LOOSE * spacing
+        ):
+            normals[row] = axes[2]
     return normals
 
 

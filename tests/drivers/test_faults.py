@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-import pytest
-from thermocald_drivers.faults import Faults
+from typing import get_args
 
+import numpy as np
+import pytest
+from thermocald_drivers.faults import Faults, Kind
+
+from thermocald import hal
 from thermocald.errors import BadReading, ConfigurationError, DeviceGone, DeviceTimeout
 from thermocald.hal import VirtualClock, open_device
 
@@ -14,12 +18,22 @@ def clock() -> VirtualClock:
     return VirtualClock()
 
 
+def use(device) -> None:
+    """One capture, reading or result."""
+    if isinstance(device, hal.Camera):
+        device.capture()
+    elif isinstance(device, hal.Thermometer):
+        device.read()
+    else:
+        device.emit({"epoch": 1})
+
+
 def outcomes(device, calls: int) -> list[str]:
-    """What each reading came to."""
+    """What each use came to."""
     found = []
     for _ in range(calls):
         try:
-            device.read()
+            use(device)
         except (DeviceTimeout, DeviceGone, BadReading) as error:
             found.append(type(error).__name__)
         else:
@@ -27,20 +41,25 @@ def outcomes(device, calls: int) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize(
-    ("kind", "error"),
-    [
-        ("timeout", "DeviceTimeout"),
-        ("unplugged", "DeviceGone"),
-        ("truncated", "BadReading"),
-        ("wrong_size", "BadReading"),
-        ("stuck", "ok"),
-    ],
-)
-def test_by_call(clock, kind, error):
-    faults = [{"kind": kind, "at": 2, "count": 3}]
-    with open_device("thermometer", "mock", {"faults": faults}, clock) as device:
-        assert outcomes(device, 6) == ["ok", error, error, error, "ok", "ok"]
+KINDS = {
+    "timeout": "DeviceTimeout",
+    "unplugged": "DeviceGone",
+    "truncated": "BadReading",
+    "wrong_size": "BadReading",
+    "stuck": "ok",
+}
+
+
+def test_every_kind_is_tested():
+    assert set(KINDS) == set(get_args(Kind))
+
+
+@pytest.mark.parametrize(("kind", "error"), KINDS.items())
+@pytest.mark.parametrize("device", ["camera", "thermometer", "output"])
+def test_by_call(clock, device, kind, error):
+    options = {"faults": [{"kind": kind, "at": 2, "count": 3}]}
+    with open_device(device, "mock", options, clock) as mock:
+        assert outcomes(mock, 6) == ["ok", error, error, error, "ok", "ok"]
 
 
 def test_by_time_and_open_fails_too(clock):
@@ -77,6 +96,16 @@ def test_stuck_repeats_the_value_with_new_instants(clock):
     assert values[1:5] == [values[1]] * 4
     assert len({values[0], values[1], values[5], values[6]}) == 4
     assert len({reading.monotonic for reading in readings}) == 7
+
+
+def test_a_stuck_camera_shows_the_same_picture(clock):
+    options = {"faults": [{"kind": "stuck", "at": 2, "count": 1}]}
+    with open_device("camera", "mock", options, clock) as device:
+        frames = [device.capture() for _ in range(3)]
+    first, second, third = (frame.image for frame in frames)
+    assert np.array_equal(first, second)
+    assert not np.array_equal(second, third)  # noise alone makes every picture another
+    assert frames[1].monotonic > frames[0].monotonic
 
 
 def test_injected_while_it_runs(clock):

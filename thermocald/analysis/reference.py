@@ -18,7 +18,7 @@ import numpy as np
 from thermocald.analysis.study import StudySettings, study_camera
 from thermocald.analysis.study_input import from_recording
 from thermocald.simulation.presets import PRESETS, preset_simulation
-from thermocald.store.recording import read_recording
+from thermocald.store.recording import open_recording
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -92,7 +92,7 @@ def reference_series(
         for name, seed in SERIES:
             path = Path(folder) / name
             preset_simulation(preset, seed, name).write(path)
-            one = from_recording(read_recording(path), preset)
+            one = from_recording(open_recording(path), preset)
             # The folder is gone when the study is read.
             measured.append(replace(one, source=f"preset {preset}, series {name}, seed {seed}"))
             advance(1)

@@ -1,66 +1,131 @@
-"""Measured series for the study: from a store's columns, or from a recording adjusted on the spot.
+"""Measured series for the study, from recordings and stores.
 
-A year of epochs is read column by column, and only a sample of its covariance matrices; a recording
-is adjusted as one series with one exterior orientation.
+With `exterior="series"` all epochs are adjusted together from their observations, one exterior
+orientation for the camera that stood still. A series too long for that, or `exterior="per_epoch"`
+from a store, is read as it was stored, column by column, with a sample of its covariance matrices.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.acquisition.calibrator import Calibrator
 from thermocald.analysis.correlations import correlations_of
 from thermocald.analysis.dependence import thermometer_noise
 from thermocald.analysis.measured import Clip, MeasuredSeries, Thermometer
+from thermocald.analysis.series_table import (
+    calibrate_epochs,
+    settings_for_series,
+    table_of_series,
+)
+from thermocald.analysis.stored_series import stored_table
 from thermocald.errors import DataError
+from thermocald.photogrammetry.adjustment import DEFAULT_FREE, AdjustmentSettings
 from thermocald.photogrammetry.camera_model import IOP_NAMES
-from thermocald.photogrammetry.orientation import approximate_orientation
-from thermocald.photogrammetry.series import SeriesSettings, adjust_series
+from thermocald.store.database import Store
 from thermocald.store.readings import interpolate_readings
+from thermocald.store.recording import open_recording
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from thermocald.epoch import Epoch
-    from thermocald.photogrammetry.series import SeriesAdjustment
+    from thermocald.analysis.series_table import SeriesTable
     from thermocald.photogrammetry.testfield import Observations
-    from thermocald.store.database import Store
     from thermocald.store.head import Head
     from thermocald.store.recording import Recording
     from thermocald.store.row import StoredSeries
 
     Array = NDArray[np.float64]
 
-__all__ = ["adjusted_recording", "from_adjustment", "from_recording", "from_store", "load_series"]
+__all__ = ["from_recording", "from_store", "load_series"]
 
 _MOST_MATRICES = 5000
-_MOST_EPOCHS = 50_000
+_MOST_TOGETHER = 50_000  # epochs
 
 
 def load_series(
-    path: Path, label: str | None = None, thermometer_sd: float | None = None
+    path: Path,
+    label: str | None = None,
+    thermometer_sd: float | None = None,
+    exterior: str = "series",
+    free: Sequence[str] = DEFAULT_FREE,
+    advance: Callable[[int], None] | None = None,
 ) -> list[MeasuredSeries]:
     """Every series of a recording (a folder) or a store (a file).
 
-    label: what the study treats as one camera, by default the camera's name; thermometer_sd: K, by
-    default from the readings. Raises DataError where nothing can be studied.
+    label: what the study treats as one camera, by default the camera's name, in a store with the
+    start condition; thermometer_sd: K, by default from the readings; free: IOP to estimate, for a
+    recording (a store knows its own); advance: told how many epochs of a recording are done.
+    Raises DataError where nothing can be studied.
     """
     if path.is_dir():
-        from thermocald.store.recording import read_recording
-
-        return [from_recording(read_recording(path), label, thermometer_sd)]
-    from thermocald.store.database import Store
-
+        recording = open_recording(path)
+        return [from_recording(recording, label, thermometer_sd, exterior, free, advance)]
     with Store.open(path) as store:
-        found = [from_store(store, s, label, thermometer_sd) for s in store.all_series()]
+        found = [
+            from_store(store, one, label, thermometer_sd, exterior) for one in store.all_series()
+        ]
     if not found:
         raise DataError(f"{path}: the store holds no series")
     return found
+
+
+def from_recording(
+    recording: Recording,
+    label: str | None = None,
+    thermometer_sd: float | None = None,
+    exterior: str = "series",
+    free: Sequence[str] = DEFAULT_FREE,
+    advance: Callable[[int], None] | None = None,
+) -> MeasuredSeries:
+    """A recording, its frames measured where they are not, adjusted as one series."""
+    columns, camera = recording.columns, recording.camera
+    settings = AdjustmentSettings(free=tuple(free))
+    calibrator = Calibrator(
+        camera.sensor,
+        recording.testfield,
+        settings,
+        nominal_c=camera.principal_distance,
+        interior=camera.interior,
+    )
+    apart, observations = calibrate_epochs(recording.iter_epochs(), calibrator, {}, advance)
+    table = table_of_series(
+        recording.head,
+        recording.testfield,
+        apart,
+        observations,
+        settings_for_series(settings, exterior),
+    )
+    thermometers = [
+        _thermometer(
+            name,
+            columns.frame_time,
+            columns.temperature_time,
+            columns.temperatures[name],
+            channel.resolution,
+            thermometer_sd,
+        )
+        for name, channel in recording.channels.items()
+    ]
+    framed = [i for i, ok in enumerate(table.ok) if ok and columns.frames[i]]
+    clip = None
+    if len(framed) > 1:
+        first, last = framed[0], framed[-1]
+        clip = _clip(
+            (recording.path / columns.frames[first], recording.path / columns.frames[last]),
+            (int(columns.numbers[first]), int(columns.numbers[last])),
+            (observations[first], observations[last]),
+            recording.testfield.names,
+            camera.sensor.centre,
+        )
+    return _from_table(
+        recording.head, str(recording.path), table, thermometers, label or camera.name, clip
+    )
 
 
 def from_store(
@@ -68,8 +133,28 @@ def from_store(
     series: StoredSeries,
     label: str | None = None,
     thermometer_sd: float | None = None,
+    exterior: str = "series",
 ) -> MeasuredSeries:
     """One series of a store; DataError where no epoch has a result."""
+    start = f"-{series.start}" if series.start else ""
+    label = label or series.camera + start
+    count = len(store.series_columns(series, ["epoch"])["epoch"])
+    if exterior == "series" and 0 < count <= _MOST_TOGETHER:
+        free = tuple(series.settings.get("free", DEFAULT_FREE))
+        table = stored_table(
+            store.path, f"{series.camera}/{series.name}", AdjustmentSettings(free=free), "series"
+        )
+        thermometers = _stored_thermometers(store, series, table.frame_time, thermometer_sd)
+        source = f"{store.path}: {series.camera}/{series.name}"
+        clip = _stored_clip(store, series, table.number[table.ok])
+        return _from_table(series.head, source, table, thermometers, label, clip)
+    return _from_columns(store, series, label, thermometer_sd)
+
+
+def _from_columns(
+    store: Store, series: StoredSeries, label: str, thermometer_sd: float | None
+) -> MeasuredSeries:
+    """A series as it was stored; one column at a time, for a year of epochs must fit."""
 
     def column(name: str) -> Array:
         values: Array = store.series_columns(series, [name])[name]
@@ -85,33 +170,19 @@ def from_store(
         values[:, k] = column(name)[ok]
         sds[:, k] = column(f"sd_{name}")[ok]
     number = column("epoch")[ok].astype(np.int64)
-    time_s = column("frame_time")[ok]
-    begin = time_s[0]
-    time_s -= begin
+    frame_time = column("frame_time")[ok]
     rows = _spread(count, _MOST_MATRICES)
     covariances = store.covariances(series, number[rows].tolist())[:, :10, :10]
     have = np.isfinite(covariances).all(axis=(1, 2))
-    reading_time = column("temperature_time")
-    thermometers = []
-    for name, channel in series.head.channels.items():
-        readings = column(name)
-        thermometers.append(
-            Thermometer(
-                name,
-                interpolate_readings(time_s + begin, reading_time, readings),
-                thermometer_sd or thermometer_noise(readings, channel.resolution),
-            )
-        )
-    start = f"-{series.start}" if series.start else ""
     return MeasuredSeries(
-        label or series.camera + start,
+        label,
         series.name,
         series.camera,
         series.head.camera.sensor,
         source,
         number,
-        time_s,
-        tuple(thermometers),
+        frame_time - frame_time[0],
+        tuple(_stored_thermometers(store, series, frame_time, thermometer_sd)),
         values,
         sds,
         column("sigma0")[ok],
@@ -124,112 +195,72 @@ def from_store(
     )
 
 
-def from_recording(
-    recording: Recording, label: str | None = None, thermometer_sd: float | None = None
-) -> MeasuredSeries:
-    """A recording, adjusted as one series; DataError where it cannot be."""
-    adjustment = adjusted_recording(recording)
-    columns = recording.columns
-    thermometers = [
-        Thermometer(
-            name,
-            columns.at_frame(name),
-            thermometer_sd or thermometer_noise(columns.temperatures[name], channel.resolution),
-        )
-        for name, channel in recording.channels.items()
-    ]
-    clip = None
-    if any(columns.frames):
-        rows = [i for i, frame in enumerate(columns.frames) if frame and adjustment.ok[i]]
-        clip = _clip(
-            [recording.epochs[i] for i in rows[:1] + rows[-1:]],
-            recording.testfield.names,
-            recording.camera.sensor.centre,
-            recording.path,
-        )
-    return from_adjustment(
-        recording.head,
-        str(recording.path),
-        columns.numbers,
-        columns.frame_time,
-        thermometers,
-        adjustment,
-        label,
-        clip,
-    )
-
-
-def adjusted_recording(recording: Recording) -> SeriesAdjustment:
-    """All epochs of a recording adjusted together, from approximate values of its best epoch."""
-    if not recording.has_observations:
-        raise DataError(
-            f"{recording.path}: the frames are not measured yet; run `thermocald replay "
-            f"{recording.path} --store FILE` and study the store"
-        )
-    if len(recording.columns) > _MOST_EPOCHS:
-        raise DataError(
-            f"{recording.path}: {len(recording.columns)} epochs are too many to be adjusted at "
-            f"once (at most {_MOST_EPOCHS}); replay the recording into a store and study that"
-        )
-    observations = [epoch.observations for epoch in recording.epochs]
-    best = max((o for o in observations if o is not None), key=len, default=None)
-    if best is None:
-        raise DataError(f"{recording.path}: no epoch has observations")
-    interior, exterior, _ = approximate_orientation(
-        recording.camera.sensor,
-        recording.testfield.points[best.targets],
-        best.points,
-        recording.camera.principal_distance,
-        recording.camera.interior,
-    )
-    return adjust_series(
-        recording.camera.sensor,
-        recording.testfield,
-        observations,
-        interior,
-        exterior,
-        SeriesSettings(),
-    )
-
-
-def from_adjustment(
+def _from_table(
     head: Head,
     source: str,
-    number: NDArray[np.int64],
-    frame_time: Array,
-    thermometers: Iterable[Thermometer],
-    adjustment: SeriesAdjustment,
-    label: str | None = None,
-    clip: Clip | None = None,
+    table: SeriesTable,
+    thermometers: Sequence[Thermometer],
+    label: str,
+    clip: Clip | None,
 ) -> MeasuredSeries:
-    """A series that was adjusted as one; rows are epochs, thermometers at the frames' instants."""
-    ok, lost = _judged(np.array(adjustment.status))
+    """A series that was adjusted together; thermometers at the instants of all its epochs."""
+    adjustment = table.adjustment
+    assert adjustment is not None  # table_of_series always has one
+    ok, lost = _judged(np.array(table.status))
     if not ok.any():
-        reasons = Counter(r for r in adjustment.reasons if r).most_common(1)
-        why = reasons[0][0] if reasons else _in_words(lost)
+        why = next((reason for reason in table.reasons if reason), _in_words(lost))
         raise DataError(f"{source}: no epoch has a result: {why}")
-    time_s = frame_time[ok]
     rows = _spread(int(ok.sum()), _MOST_MATRICES)
     covariances = adjustment.covariance[np.flatnonzero(ok)[rows]][:, :10, :10]
+    time_s = table.frame_time[ok]
     return MeasuredSeries(
-        label or head.camera.name,
+        label,
         head.series,
         head.camera.name,
         head.camera.sensor,
         source,
-        number[ok],
+        table.number[ok],
         time_s - time_s[0],
         tuple(Thermometer(t.name, t.values[ok], t.sd) for t in thermometers),
-        np.asfortranarray(adjustment.values[ok, :10]),
-        np.asfortranarray(adjustment.sd[ok, :10]),
-        adjustment.sigma0[ok],
+        np.asfortranarray(table.values[ok, :10]),
+        np.asfortranarray(table.sd[ok, :10]),
+        table.sigma0[ok],
         adjustment.redundancy[ok],
         correlations_of(covariances),
         rows,
-        adjustment.settings.exterior,
+        table.exterior,
         lost,
         clip,
     )
+
+
+def _thermometer(
+    name: str,
+    frame_time: Array,
+    reading_time: Array,
+    readings: Array,
+    resolution: float | None,
+    sd: float | None,
+) -> Thermometer:
+    values = interpolate_readings(frame_time, reading_time, readings)
+    return Thermometer(name, values, thermometer_noise(readings, resolution) if sd is None else sd)
+
+
+def _stored_thermometers(
+    store: Store, series: StoredSeries, frame_time: Array, sd: float | None
+) -> list[Thermometer]:
+    reading_time = store.series_columns(series, ["temperature_time"])["temperature_time"]
+    return [
+        _thermometer(
+            name,
+            frame_time,
+            reading_time,
+            store.series_columns(series, [name])[name],
+            channel.resolution,
+            sd,
+        )
+        for name, channel in series.head.channels.items()
+    ]
 
 
 def _judged(status: NDArray[np.str_]) -> tuple[NDArray[np.bool_], dict[str, int]]:
@@ -249,41 +280,34 @@ def _spread(count: int, most: int) -> NDArray[np.int64]:
 
 
 def _stored_clip(store: Store, series: StoredSeries, number: NDArray[np.int64]) -> Clip | None:
-    ends = [next(store.epochs(series, int(n), int(n))).epoch for n in (number[0], number[-1])]
-    return _clip(ends, series.testfield.names, series.head.camera.sensor.centre, store.path.parent)
-
-
-def _clip(ends: Sequence[Epoch], names: Sequence[str], centre: Array, folder: Path) -> Clip | None:
-    """A clip about the target nearest to the image centre that both ends show; None without."""
-    if len(ends) < 2 or any(e.frame is None or e.observations is None for e in ends):
+    first, last = (next(store.epochs(series, int(n), int(n))).epoch for n in number[[0, -1]])
+    if first.frame is None or last.frame is None:
         return None
-    first, last = ends
-    assert first.observations is not None
-    assert last.observations is not None
-    assert first.frame is not None
-    assert last.frame is not None
-    if not (folder / first.frame).is_file() or not (folder / last.frame).is_file():
-        return None
-    point = _nearest(first.observations, last.observations, centre)
-    if point is None:
-        return None
-    target, (x, y) = point
-    return Clip(
-        names[target],
-        folder / first.frame,
-        folder / last.frame,
-        first.number,
-        last.number,
-        (x, y),
+    folder = store.path.parent
+    return _clip(
+        (folder / first.frame, folder / last.frame),
+        (first.number, last.number),
+        (first.observations, last.observations),
+        series.testfield.names,
+        series.head.camera.sensor.centre,
     )
 
 
-def _nearest(
-    first: Observations, last: Observations, centre: Array
-) -> tuple[int, tuple[float, float]] | None:
+def _clip(
+    frames: tuple[Path, Path],
+    numbers: tuple[int, int],
+    observations: tuple[Observations | None, Observations | None],
+    names: Sequence[str],
+    centre: Array,
+) -> Clip | None:
+    """A clip about the target nearest to the image centre that both ends show; None without."""
+    first, last = observations
+    if first is None or last is None or not all(path.is_file() for path in frames):
+        return None
     both = np.isin(first.targets, last.targets)
     if not both.any():
         return None
     points = first.points[both]
     k = int(np.argmin(np.linalg.norm(points - centre, axis=1)))
-    return int(first.targets[both][k]), (float(points[k, 0]), float(points[k, 1]))
+    target = names[int(first.targets[both][k])]
+    return Clip(target, *frames, *numbers, (float(points[k, 0]), float(points[k, 1])))

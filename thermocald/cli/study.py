@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from thermocald.cli.common import progress, write_json
+from thermocald.cli.options import DEFAULT_FREE_TEXT, FreeOption, free_names
 from thermocald.errors import DataError, UsageError
 
 if TYPE_CHECKING:
@@ -71,6 +73,14 @@ def study(
         float | None,
         typer.Option("--thermometer-sd", min=0.0, help="Noise of the thermometers, K [estimated]."),
     ] = None,
+    exterior: Annotated[
+        str,
+        typer.Option(
+            "--exterior",
+            help="series: the camera stood still; per_epoch: every epoch its own orientation.",
+        ),
+    ] = "series",
+    free: FreeOption = DEFAULT_FREE_TEXT,
     reference: Annotated[
         bool,
         typer.Option("--reference", help="Study the presets instead, beside the reference study."),
@@ -102,6 +112,8 @@ def study(
         confusion_mm=confusion,
         thermometer_sd=thermometer_sd,
     )
+    if exterior not in ("per_epoch", "series"):
+        raise UsageError(f"--exterior {exterior}: must be per_epoch or series")
     # Refused before the work, not after it.
     for path in (report, figures):
         if path is not None and not path.resolve().parent.is_dir():
@@ -110,27 +122,37 @@ def study(
     if reference:
         result, comparisons = _reference(settings)
     else:
-        result = _study(inputs or [], settings)
+        result = _study(inputs or [], settings, exterior, free_names(free))
     _write(result, comparisons, json, report, figures, title)
 
 
-def _study(inputs: list[str], settings: StudySettings) -> Study:
+def _study(
+    inputs: list[str], settings: StudySettings, exterior: str, free: tuple[str, ...]
+) -> Study:
     from thermocald.analysis.study import study as run
-    from thermocald.cli.common import progress
+    from thermocald.analysis.study_input import load_series
 
     series: list[MeasuredSeries] = []
-    with progress(len(inputs), "reading and adjusting") as advance:
-        for text in inputs:
-            series += _load(text, settings.thermometer_sd)
-            advance(1)
+    for text in inputs:
+        label, path = _labelled(text)
+        with progress(_epochs(path), f"calibrating {path.name}") as advance:
+            series += load_series(path, label, settings.thermometer_sd, exterior, free, advance)
     cameras = len({one.label for one in series})
     with progress(settings.sets * cameras, "simulating") as advance:
         return run(series, settings, advance)
 
 
-def _load(text: str, thermometer_sd: float | None) -> list[MeasuredSeries]:
-    from thermocald.analysis.study_input import load_series
+def _epochs(path: Path) -> int | None:
+    """How many epochs a recording has; None for a store, which is read at once."""
+    if not path.is_dir():
+        return None
+    from thermocald.store.recording import open_recording
 
+    return len(open_recording(path).columns)
+
+
+def _labelled(text: str) -> tuple[str | None, Path]:
+    """`LABEL=PATH` or `PATH`; DataError where there is nothing at the path."""
     label, equals, rest = text.partition("=")
     # A path may hold "="; what exists as it stands is a path.
     if not equals or Path(text).exists():
@@ -138,13 +160,12 @@ def _load(text: str, thermometer_sd: float | None) -> list[MeasuredSeries]:
     path = Path(rest)
     if not path.exists():
         raise DataError(f"{path}: does not exist; give a recording (folder) or a store (file)")
-    return load_series(path, label or None, thermometer_sd)
+    return label or None, path
 
 
 def _reference(settings: StudySettings) -> tuple[Study, list[Comparison]]:
     from thermocald.analysis.reference import QUOTED, SERIES, compare, reference_studies
     from thermocald.analysis.study import Study
-    from thermocald.cli.common import progress
 
     with progress(len(QUOTED) * len(SERIES), "simulating, adjusting, studying") as advance:
         cameras = reference_studies(settings, advance=advance)
@@ -159,7 +180,6 @@ def _write(
     figures: Path | None,
     title: str,
 ) -> None:
-    from thermocald.cli.common import write_json
     from thermocald.output.study_document import study_document
 
     if json is not None:

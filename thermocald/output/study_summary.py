@@ -40,12 +40,18 @@ def _change(study: SeriesStudy) -> str:
     words = []
     if "x0" in d and "y0" in d:
         pitch = s.sensor.pixel_pitch
-        moved = np.hypot(d["x0"].change, d["y0"].change) / pitch
-        sd = np.hypot(d["x0"].sd_change, d["y0"].sd_change) / pitch
-        if moved > 3 * sd:
-            words.append(f"the principal point moved by {plain(float(moved), 'px', 3)}")
+        way = np.hypot(*((s.values[:, k] - s.values[0, k]) / pitch for k in (1, 2)))
+        moved, farthest = float(way[-1]), float(way.max())
+        sd = float(np.hypot(d["x0"].sd_change, d["y0"].sd_change)) / pitch
+        if farthest > max(1.5 * moved, 6 * sd):
+            words.append(
+                f"the principal point moved by up to {plain(farthest, 'px', 3)} and ended "
+                f"{plain(moved, 'px', 3)} from where it began"
+            )
+        elif moved > 3 * sd:
+            words.append(f"the principal point moved by {plain(moved, 'px', 3)}")
         else:
-            words.append(f"the principal point stayed within {plain(float(3 * sd), 'px', 2)}")
+            words.append(f"the principal point stayed within {plain(3 * sd, 'px', 2)}")
     if "c" in d:
         c = d["c"]
         if abs(c.change) > 3 * c.sd_change:

@@ -21,6 +21,8 @@ from thermocald.simulation import effects
 from thermocald.simulation.model import RATED, ModelEffect, ThermalModel
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
@@ -32,6 +34,8 @@ if TYPE_CHECKING:
 __all__ = ["Share", "error_operators", "jacobian", "share", "unknowns_of"]
 
 _PROBES = 24  # random vectors that tell a trace
+_NEGLIGIBLE = 1e-3
+_DENSE = 3000  # readings
 _SCALE_NAMES = ("X", "Y", "Z")
 _SHIFT_NAMES = ("dX", "dY", "dZ")
 
@@ -48,7 +52,7 @@ class Share:
     delta: Array
     operators: tuple[tuple[Array, csr_array], ...]
     series: ModelSeries
-    inverse: object
+    inverse: Callable[[Array], Array] | None
     h: Array
     C: Array
     variance: float
@@ -58,9 +62,9 @@ class Share:
         self, step: Array, Q: Array, noise: Array | None = None
     ) -> tuple[float, Array, float]:
         """After the step (q,) with covariance Q: image cost, ε̂ (R,), redundancy of the readings."""
-        if not len(self.h):
+        if self.inverse is None:
             return self._image_cost(self.delta + self.J @ step, noise), np.zeros(0), 0.0
-        solve = self.inverse.solve  # type: ignore[attr-defined]
+        solve = self.inverse
         errors = solve(self.h - self.C.T @ step)
         delta = self.delta + self.J @ step
         for c, S in self.operators:
@@ -75,7 +79,7 @@ class Share:
 
     def _image_cost(self, delta: Array, noise: Array | None) -> float:
         s = self.series
-        quadratic = np.einsum("ei,eij,ej->e", delta, s.N, delta)
+        quadratic = np.sum(delta * (s.N @ delta[:, :, None])[:, :, 0], axis=1)
         cost = s.lPl - 2.0 * np.sum(s.b * delta, axis=1) + quadratic
         return float(np.sum(cost if noise is None else cost / noise**2))
 
@@ -213,7 +217,34 @@ def _drive_operator(history: History, model: ThermalModel) -> csr_array:
         chain = S if chain is None else S @ chain
         history = history.with_reference(kind.drive(inner, **effect.values))
     last = effects.get(drives[-1].name).sensitivity(history, **drives[-1].values)
-    return last if chain is None else last @ chain
+    whole = last if chain is None else last @ chain
+    # a thousandth of a reading's error is nobody's business, and the far past costs time
+    whole.data[np.abs(whole.data) < _NEGLIGIBLE] = 0.0
+    whole.eliminate_zeros()
+    return whole
+
+
+def _factorised(H: csr_array) -> Callable[[Array], Array]:
+    """Solves H x = b: banded where readings touch near epochs alone, dense where not."""
+    from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
+
+    entries = H.tocoo()
+    rows, columns = entries.coords
+    n = H.shape[0]
+    width = int(np.max(rows - columns, initial=0))
+    if width < n // 4:
+        band = np.zeros((width + 1, n))
+        lower = rows >= columns
+        np.add.at(band, (rows[lower] - columns[lower], columns[lower]), entries.data[lower])
+        factor = cholesky_banded(band, lower=True)
+        return lambda b: np.asarray(cho_solve_banded((factor, True), b))
+    if n <= _DENSE:
+        dense = cho_factor(H.toarray(), lower=True, overwrite_a=True)
+        return lambda b: np.asarray(cho_solve(dense, b))
+    from scipy.sparse.linalg import splu
+
+    sparse = splu(H.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+    return lambda b: np.asarray(sparse.solve(b))
 
 
 def share(
@@ -230,12 +261,11 @@ def share(
     the image noise of each epoch.
     """
     from scipy.sparse import diags_array, eye_array
-    from scipy.sparse.linalg import splu
 
     delta = series.corrections(model.predict(series.history, series.field))
     weight = np.full(len(series), 1.0 / variance) if noise is None else 1.0 / (variance * noise**2)
     N = series.N * weight[:, None, None]
-    gradient = series.b * weight[:, None] - np.einsum("eij,ej->ei", N, delta)
+    gradient = series.b * weight[:, None] - (N @ delta[:, :, None])[:, :, 0]
     NJ = N @ J
     q = J.shape[2]
     flat = J.reshape(-1, q)
@@ -249,12 +279,12 @@ def share(
     H = eye_array(readings, format="csc") / error_sd**2
     C, h = np.zeros((q, readings)), np.zeros(readings)
     for c, S in operators:
-        C += (S.T @ np.einsum("epq,p->eq", NJ, c)).T
+        C += (S.T @ (c @ NJ)).T
         h += S.T @ (gradient @ c)
         for d, R in operators:
-            H = H + S.T @ diags_array(np.einsum("i,eij,j->e", c, N, d)) @ R
-    inverse = splu(H.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-    solved = inverse.solve(np.column_stack([h, C.T]))
+            H = H + S.T @ diags_array((N @ d) @ c) @ R
+    inverse = _factorised(H)
+    solved = inverse(np.column_stack([h, C.T]))
     M = M - C @ solved[:, 1:]
     g = g - C @ solved[:, 0]
     return Share(J, M, g, delta, operators, series, inverse, h, C, variance, error_sd)

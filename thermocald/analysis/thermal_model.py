@@ -46,6 +46,7 @@ _FREE_INTERIOR = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2")
 _ITERATIONS = 30
 _CONVERGED = 1e-2  # of a standard deviation
 _GRID = 33  # trial values of a non-linear parameter
+_SEARCHED = 2  # series in which they are tried
 _NOISE_K = 0.03  # of a thermometer, to begin with
 
 
@@ -171,7 +172,7 @@ def fit_thermal_model(
         begun = replace(state.model, effects=(*state.model.effects, _started(effect)))
         state = replace(state, model=begun)
         if search and effect.name != "defocus":
-            state = fit.search(state)
+            state = _searched(checked, state)
     if listed:
         state = fit.solve(state)
     if any(e.name == "defocus" for e in listed):
@@ -201,6 +202,19 @@ def _checked(series: Sequence[ModelSeries], listed: Sequence[ModelEffect]) -> li
             targets = effect.values["targets"]
             moved = (targets,) if isinstance(targets, str) else tuple(targets)
     return [s.displacing(moved) if moved else s for s in series]
+
+
+def _searched(series: list[ModelSeries], state: _State) -> _State:
+    """The last effect's non-linear parameters where they fit best, in the series that say most."""
+    spans = [float(np.ptp(s.history.temperature())) for s in series]
+    most = sorted(np.argsort(spans)[::-1][:_SEARCHED].tolist())
+    some = _Fit([series[k] for k in most])
+    before = replace(state.model, effects=state.model.effects[:-1])
+    part = _State(before, tuple(state.exteriors[k] for k in most), state.fixed)
+    part = some.solve(part)
+    part = some.search(replace(part, model=replace(part.model, effects=state.model.effects)))
+    listed = (*state.model.effects[:-1], part.model.effects[-1])
+    return replace(state, model=replace(state.model, effects=listed))
 
 
 def _started(effect: ModelEffect) -> ModelEffect:
@@ -267,11 +281,15 @@ class _Fit:
 
     def solve(self, state: _State) -> _State:
         """Iterate until no unknown moves by more than a hundredth of its standard deviation."""
+        still = 0
         for _ in range(_ITERATIONS):
             before = self.variance
             step, size = self.step(state)
             state = state.moved(step)
-            if size < _CONVERGED and abs(self.variance / before - 1.0) < 1e-3:
+            change = abs(self.variance / before - 1.0)
+            # an unknown at the end of its range wants to move on and on, and changes nothing
+            still = still + 1 if change < 1e-6 else 0
+            if (size < _CONVERGED and change < 1e-3) or still >= 3:
                 break
         return state
 
@@ -326,8 +344,8 @@ class _Fit:
             # equal steps in frequency, fine enough that no period is jumped over
             frequencies = np.arange(1.5 / span, 1.0 / (2.2 * _interval(times)), 0.4 / span)
             return np.asarray(1.0 / frequencies)
-        if key in ("tau",):
-            high = min(high, 2.0 * float(np.ptp(times)))
+        if key == "tau":
+            high = min(high, float(np.ptp(times)))
         grid: Array = np.geomspace(low, high, _GRID) if log else np.linspace(low, high, 2 * _GRID)
         return grid
 

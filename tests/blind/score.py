@@ -128,6 +128,10 @@ def run(part: str, seeds: Iterable[int], show: bool = False) -> list[Outcome]:
     for case in cases(part, seeds):
         o = judge(case)
         outcomes.append(o)
+        if show:
+            for name, pull in o.pulls.items():
+                if abs(pull) > 3:
+                    print(f"    {part} seed {case.seed}: {name} off by {pull:.1f} sd", flush=True)
         if show and not o.right:
             print(f"  {part} seed {case.seed} hidden {'+'.join(case.effects) or 'none'}: "
                   f"{'+'.join(o.found) or 'none'} ({o.verdict}), listed {o.listed}, "

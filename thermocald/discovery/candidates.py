@@ -123,14 +123,16 @@ def _grid(key: str, parameter: Parameter, series: Sequence[Evidence]) -> Array:
     if parameter.unit == "degC":
         return np.linspace(low + 0.03 * (high - low), high - 0.03 * (high - low), 32)
     if parameter.unit == "K":
-        return np.geomspace(max(parameter.low, 0.05), max(0.45 * (high - low), 0.2), 28)
+        return np.geomspace(max(0.2 * parameter.low, 0.01), max(0.45 * (high - low), 0.2), 36)
     if parameter.unit == "s" and parameter.log:
-        return np.geomspace(max(parameter.low, 0.3 * step), 2.0 * duration, 36)
+        return np.geomspace(max(0.2 * parameter.low, 0.05 * step), 2.0 * duration, 44)
     if parameter.unit == "s" and key == "time":
         return first.times[1:]
     if parameter.unit == "s":
         reach = min(parameter.high, 0.25 * duration)
-        return np.arange(max(parameter.low, -reach), reach, min(0.5 * step, reach / 20)) + 0.1
+        coarse = np.arange(max(parameter.low, -reach), reach, min(0.5 * step, reach / 20)) + 0.1
+        fine = np.linspace(-step, step, 21) + 0.001 * step  # small delays are the usual ones
+        return np.unique(np.concatenate([coarse, fine]))
     if parameter.log:
         return np.geomspace(parameter.low, parameter.high, 40)
     return np.linspace(parameter.low, parameter.high, 40)

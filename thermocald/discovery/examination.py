@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +20,8 @@ from thermocald.discovery.search import Search, Solution
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
 
     from thermocald.discovery.evidence import Evidence
 
@@ -70,7 +72,7 @@ def examine_series(
     growth = noise_growth(cleaned)
     if growth is not None:
         cleaned = [reweighted(e, n) for e, n in zip(cleaned, growth.noise, strict=True)]
-    laboratory = Laboratory(cleaned)
+    laboratory = Laboratory(calibrated_thermometers(cleaned))
     say("base model")
     search = Search(laboratory, say)
     base = search.base()
@@ -96,6 +98,8 @@ def examine_series(
         if _adequate(_adequacies(laboratory, best), base_adequacy):
             break
         frontier = _frontier(grown)
+    if best.terms:
+        best, seen = _contest(search, best, seen)
     adequacy = _adequacies(laboratory, best)
     adequate = _adequate(adequacy, base_adequacy)
     rivals = []
@@ -107,6 +111,69 @@ def examine_series(
         laboratory, base, best, (base, best), tuple(ranking), tuple(rivals), base_adequacy,
         adequacy, tuple(displaced), growth, adequate, tuple(series),
     )  # fmt: skip
+
+
+def calibrated_thermometers(series: Sequence[Evidence]) -> list[Evidence]:
+    """The series with the noise of the reference thermometer as the images confirm it.
+
+    The images tell the temperature too, through the linear terms: with an unknown slow error, but
+    sharper than most thermometers. Both estimates can only err upwards, by switched lamps here,
+    by fast effects there; the smaller one counts, and one thermometer has one noise.
+    """
+    laboratory = Laboratory(series)
+    fit = laboratory.fit(())
+    d = fit.direction(fit.blocks[0])[0]
+    variances, weights = [], []
+    for s, e in enumerate(series):
+        instrument = e.channels[e.history.reference]
+        precision = np.einsum("p,epq,q->e", d, e.N, d)
+        ok = precision > 0
+        own = instrument.noise**2
+        if ok.sum() > 20:
+            course, operator, _ = laboratory.drive((), s)
+            shown = course + (operator @ instrument.mixing) @ instrument.deviation
+            # what the image says of T beyond its level, in K
+            rest = (e.b @ d)[ok] / precision[ok] - shown[ok]
+            second = np.diff(rest, 2)
+            image = 6.0 * float(np.mean(1.0 / precision[ok]))
+            own = min(own, max((_clipped(second) ** 2 - image) / 6.0, (0.5 * instrument.noise) ** 2))
+        variances.append(own)
+        weights.append(float(ok.sum()))
+    noise = float(np.sqrt(np.average(variances, weights=weights)))
+    out = []
+    for e in series:
+        name = e.history.reference
+        old = e.channels[name]
+        ratio = noise / old.noise
+        channels = {**e.channels, name: replace(old, sd=old.sd * ratio, noise=noise)}
+        out.append(replace(e, channels=channels))
+    return out
+
+
+def _clipped(values: NDArray[np.float64]) -> float:
+    """Standard deviation of a normal distribution whose tails are spoiled."""
+    scale = float(np.sqrt(np.mean(values**2)))
+    for _ in range(20):
+        kept = values[np.abs(values) <= 2.2 * scale]
+        scale = float(np.sqrt(np.mean(kept**2))) / 0.9162 if len(kept) > 5 else scale
+    return scale
+
+
+def _contest(
+    search: Search, best: Solution, seen: list[Solution]
+) -> tuple[Solution, list[Solution]]:
+    """Near ties again, each under the thermometer noise that suits it best."""
+    close = {s.terms: s for s in seen if s.score < best.score + 60.0}
+    if len({s.names for s in close.values()}) < 2:
+        return best, seen
+    laboratory = search.laboratory
+    again: list[Solution] = []
+    for s in sorted(close.values(), key=lambda s: s.score)[:6]:
+        _, objective = laboratory.thermometer_scale(s.fit)
+        again.append(replace(s, fit=replace(s.fit, logdet=objective - s.fit.chi2)))
+    again.sort(key=lambda s: s.score)
+    others = [s for s in seen if s.terms not in close]
+    return again[0], [*again, *others]
 
 
 def _frontier(grown: list[Solution], width: int = 4) -> list[Solution]:

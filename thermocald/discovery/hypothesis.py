@@ -31,6 +31,8 @@ __all__ = ["BASE", "Fit", "Laboratory", "Term"]
 BASE = ("c", "x0", "y0")
 # effects whose whole size may differ between series: an event, not a constant of the camera
 EVENTS = ("slip",)
+# relative standard deviation with which the readings themselves tell their noise
+_NOISE_KNOWN = 0.05
 OSCILLATIONS = ("cyclic_interference",)
 
 
@@ -335,6 +337,28 @@ class Laboratory:
             logdet=sum(reduced[s].logdet for s in chosen),
         )
 
+    def thermometer_scale(self, fit: Fit) -> tuple[float, float]:
+        """The factor of the readings' noise that makes a hypothesis most likely, and the objective
+        there. Hypotheses that smooth the readings more than others are else told apart by nothing
+        but an error of the noise.
+        """
+        from scipy.optimize import minimize_scalar
+
+        kept = self.thermometer_factor
+
+        def objective(log_factor: float) -> float:
+            self.thermometer_factor = kept * float(np.exp(log_factor))
+            here = self.fit(fit.terms, fit.coefficients, 1).objective
+            return here + (log_factor / _NOISE_KNOWN) ** 2
+
+        try:
+            found = minimize_scalar(
+                objective, bounds=(-0.5, 0.5), method="bounded", options={"xatol": 0.02}
+            )
+        finally:
+            self.thermometer_factor = kept
+        return kept * float(np.exp(found.x)), float(found.fun)
+
     # -- non-linear parameters ------------------------------------------------------------
 
     def searched(self, terms: Sequence[Term]) -> list[tuple[int, str]]:
@@ -431,7 +455,8 @@ def _step(effect: str, name: str, value: float) -> float:
 def _bounded(effect: str, name: str, old: float, new: float) -> float:
     parameter = catalogue.get(effect).nonlinear[name]
     if parameter.log:
-        new = float(np.clip(new, old / 2.0, old * 2.0))
+        # the bounds are of what a simulation makes sense of; data may ask for less
+        return float(np.clip(np.clip(new, old / 2.0, old * 2.0), 0.1 * parameter.low, parameter.high))
     return float(np.clip(new, parameter.low, parameter.high))
 
 

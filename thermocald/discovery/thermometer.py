@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Channel", "extend", "latent_times", "reading_noise", "smooth_channel"]
 
-_FIFTH = np.array([1.0, -3.0, 3.0, -1.0])  # third difference
+_THIRD = np.array([1.0, -3.0, 3.0, -1.0])
 _SMOOTHING = np.logspace(-1, 5, 19)
 
 
@@ -62,24 +62,24 @@ class Channel:
 def reading_noise(readings: Array, resolution: float | None) -> float:
     """Standard deviation in K of one reading, quantisation included.
 
-    From third differences, clipped at three sigma again and again, so that a switched lamp does
-    not count as noise. A thermometer that repeats one step for long has the error of the step.
+    From third differences, cut at 2.2 sigma again and again, so that a switched lamp, which spoils
+    four of them, does not count as noise. A thermometer that repeats one step for long has the error of the step.
     """
     values = readings[np.isfinite(readings)]
     floor = (resolution or 0.0) / np.sqrt(12.0)
     if len(values) < 8:
         return max(floor, 1e-6)
-    d = np.convolve(values, _FIFTH, mode="valid")
+    d = np.convolve(values, _THIRD, mode="valid")
     kept = np.ones(len(d), dtype=bool)
     scale = 0.0
     for _ in range(20):
         scale = float(np.sqrt(np.mean(d[kept] ** 2)))
-        now = np.abs(d) <= max(3.0 * scale, 1e-12)
+        scale /= 0.9162  # what a normal distribution cut at 2.2 sigma has left
+        now = np.abs(d) <= max(2.2 * scale, 1e-12)
         if np.array_equal(now, kept):
             break
         kept = now
-    # a normal distribution cut at three sigma has 0.9865 of its standard deviation left
-    noise = scale / np.sqrt(20.0) / 0.9865
+    noise = scale / np.sqrt(20.0)
     return max(noise, floor, 1e-6)
 
 

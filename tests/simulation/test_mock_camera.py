@@ -1,0 +1,99 @@
+"""The rendering mock camera: it sees what its truth says, and fails as hardware fails."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermocald.errors import BadReading, ConfigurationError, DeviceGone, DeviceTimeout
+from thermocald.hal import VirtualClock, load_driver
+from thermocald.photogrammetry.camera_model import project
+from thermocald.photogrammetry.markers import measure_markers
+from thermocald.simulation.model import ModelEffect
+from thermocald.simulation.model_file import write_model
+
+MockCamera = load_driver("camera", "mock")
+
+
+@pytest.fixture
+def camera():
+    device = MockCamera(clock=VirtualClock())
+    device.open()
+    yield device
+    device.close()
+
+
+def test_frame_shows_the_known_drift(camera):
+    first = camera.capture()
+    camera.clock.advance(650.0)
+    hot = camera.capture()
+    assert hot.image.shape == (2464, 3280)
+    assert hot.utc - first.utc == pytest.approx(hot.monotonic - first.monotonic)
+    a, b = camera.truth(first.monotonic), camera.truth(hot.monotonic)
+    moved = (b.iop[0] - a.iop[0]) / camera.model.sensor.pixel_pitch
+    assert -12.0 < moved[1] < -9.0
+    seen = measure_markers(hot.image, camera.field)
+    assert len(seen) >= 100
+    expected = project(camera.model.sensor, b.iop[0], b.eop[0], camera.field.points)
+    assert np.sqrt(np.mean((seen.points - expected[seen.targets]) ** 2)) < 0.04
+
+
+def test_same_instant_same_frame():
+    frames = []
+    for _ in range(2):
+        clock = VirtualClock()
+        with MockCamera(clock=clock, testfield="circles", seed=4) as device:
+            clock.advance(33.0)
+            frames.append(device.capture().image)
+    assert np.array_equal(frames[0], frames[1])
+
+
+def test_own_model_and_field(tmp_path, camera):
+    model = camera.model.with_effect(ModelEffect("slip", {"time": 100.0, "x0": 0.00112}))
+    write_model(tmp_path / "m.yaml", model)
+    clock = VirtualClock()
+    with MockCamera(clock=clock, model=str(tmp_path / "m.yaml"),
+                    programme=[[0, 25.0]], testfield="plain") as device:  # fmt: skip
+        before, after = device.truth(clock.monotonic() + 99), device.truth(clock.monotonic() + 101)
+    assert after.iop[0, 1] - before.iop[0, 1] == pytest.approx(0.00112)
+
+
+def test_faults(camera):
+    camera.faults.inject("timeout")
+    with pytest.raises(DeviceTimeout):
+        camera.capture()
+    camera.faults.clear()
+    for kind in ("truncated", "wrong_size"):
+        camera.faults.inject(kind)
+        with pytest.raises(BadReading):
+            camera.capture()
+        camera.faults.clear()
+    camera.faults.inject("unplugged", 2)
+    with pytest.raises(DeviceGone):
+        camera.capture()
+    with pytest.raises(DeviceGone):
+        camera.open()
+    camera.faults.clear()
+    camera.open()
+    a = camera.capture()
+    camera.faults.inject("stuck")
+    b = camera.capture()
+    assert np.array_equal(a.image, b.image)
+    assert b.monotonic > a.monotonic
+    camera.close()
+    with pytest.raises(DeviceGone):
+        camera.capture()
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"programme": [[0, 20], [0, 30]]}, "times must increase"),
+        ({"programme": "hot"}, r"list of \[seconds, °C\]"),
+        ({"exposure_s": -1}, "exposure_s"),
+        ({"faults": [{"kind": "bored"}]}, "none of timeout"),
+    ],
+)
+def test_bad_options(options, says):
+    with pytest.raises(ConfigurationError, match=says):
+        MockCamera(clock=VirtualClock(), **options)

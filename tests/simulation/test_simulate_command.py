@@ -1,0 +1,96 @@
+"""`thermocald simulate`, as a user calls it."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from thermocald.cli import application
+from thermocald.errors import ThermocaldError
+from thermocald.simulation.presets import preset_names, preset_simulation
+from thermocald.store.recording import read_recording
+from thermocald.yaml_file import dump_yaml
+
+PROGRAMME = {
+    "format": "thermocald-programme/1",
+    "name": "short",
+    "series": "M7",
+    "epochs": 4,
+    "interval": 10.0,
+    "ambient": 21.0,
+    "sources": {"board": 3.0},
+}
+
+
+def run(*arguments):
+    return CliRunner().invoke(application(), ["simulate", *(str(a) for a in arguments)])
+
+
+def test_list():
+    result = run("--list")
+    assert result.exit_code == 0
+    for name in (*preset_names(), "thermal_lag", "target_displacement"):
+        assert name in result.output
+    listed = json.loads(run("--list", "--json", "-").stdout)
+    assert len(listed["effects"]) == 19
+
+
+def test_preset_to_recording_and_json(tmp_path):
+    result = run("--preset", "nexus5-cold", "--out", tmp_path / "r", "--seed", 5, "--json", "-",
+                 "--model-out", tmp_path / "m.yaml")  # fmt: skip
+    assert result.exit_code == 0
+    summary = json.loads(result.stdout)
+    assert summary["epochs"] == 150
+    assert round(summary["drift"]["principal_point_px"]) == 16
+    recording = read_recording(tmp_path / "r")
+    expected = next(preset_simulation("nexus5-cold", seed=5).observations())
+    np.testing.assert_allclose(recording.epochs[0].observations.points, expected.points, atol=1e-5)
+    # the model that was written, run again, gives the same recording
+    again = run("--preset", "nexus5-cold", "--model", tmp_path / "m.yaml", "--out", tmp_path / "s",
+                "--seed", 5)  # fmt: skip
+    assert again.exit_code == 0
+    files = [(tmp_path / n / "observations.csv").read_bytes() for n in "rs"]
+    assert files[0] == files[1]
+
+
+def test_model_and_programme(tmp_path):
+    run("--preset", "rpi-v2.1-heating", "--out", tmp_path / "r", "--model-out", tmp_path / "m.yaml")
+    (tmp_path / "p.yaml").write_text(dump_yaml(PROGRAMME))
+    result = run(
+        "--model", tmp_path / "m.yaml", "--programme", tmp_path / "p.yaml",
+        "--testfield", tmp_path / "r" / "testfield.csv", "--out", tmp_path / "s",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.exception
+    recording = read_recording(tmp_path / "s")
+    assert recording.series == "M7"
+    assert len(recording.epochs) == 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--preset", "nexus6", "--out", "r"], "unknown preset"),
+        (["--preset", "nexus5-cold"], "--out is missing"),
+        (["--out", "r"], "give --preset"),
+        (["--model", "none.yaml", "--programme", "p.yaml", "--out", "r"], "cannot be read"),
+    ],
+)
+def test_wrong_usage(tmp_path, monkeypatch, arguments, says):
+    monkeypatch.chdir(tmp_path)
+    result = run(*arguments)
+    assert isinstance(result.exception, ThermocaldError)
+    assert result.exception.exit_status == 2
+    assert says in str(result.exception)
+    assert not (tmp_path / "r").exists()
+
+
+def test_existing_recording_is_not_overwritten(tmp_path):
+    (tmp_path / "r").mkdir()
+    (tmp_path / "r" / "mine.txt").write_text("mine")
+    result = run("--preset", "nexus5-cold", "--out", tmp_path / "r")
+    assert isinstance(result.exception, ThermocaldError)
+    assert "exists already" in str(result.exception)
+    assert [p.name for p in tmp_path.iterdir()] == ["r"]

@@ -40,7 +40,14 @@ from thermocald.errors import (
 )
 from thermocald.hal import Camera, Frame
 from thermocald_drivers import pixel_formats, support
-from thermocald_drivers.v4l2_stream import Grab, LinuxpyStream, OpenCvStream, Stream
+from thermocald_drivers.v4l2_stream import (
+    BUFFERS,
+    OLDEST_S,
+    Grab,
+    LinuxpyStream,
+    OpenCvStream,
+    Stream,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -55,7 +62,7 @@ FOCUS_AUTO, FOCUS = 0x009A090C, 0x009A090A
 WHITE_AUTO, WHITE = 0x0098090C, 0x0098091A
 MANUAL_EXPOSURE = 1
 EXPOSURE_UNIT_S = 1e-4
-FUTURE_S = 0.1
+FUTURE_S = 1.0
 """A stamp may lie this far ahead (vivid: up to a frame); beyond it is not CLOCK_MONOTONIC."""
 
 
@@ -181,7 +188,7 @@ class V4l2Camera(Camera):
         middle = stamp + (0.5 if grab.start_of_exposure else -0.5) * (exposure or 0.0)
         monotonic, utc = support.on_clock(self.clock, middle)
         metadata: dict[str, Any] = {
-            "timestamp": "buffer" if grab.stamp is not None else "call",
+            "timestamp": "buffer" if stamp == grab.stamp else "arrival",
             "stale_frames_dropped": dropped,
             "controls": {self._names[c]: value for c, value in self._asked.items()},
         }
@@ -203,15 +210,20 @@ class V4l2Camera(Camera):
         """(frame, its stamp in s, stale frames dropped): exposed after the call."""
         dropped = 0
         broken: BadReading | None = None
+        arrived = 0.0
 
         def accept(stamp: float | None, start_of_exposure: bool) -> bool:
-            now = time.monotonic()
-            stamp = now if stamp is None else stamp
-            if not now - 3600.0 < stamp < now + FUTURE_S:
+            nonlocal arrived
+            arrived = time.monotonic()
+            if stamp is not None and not arrived - OLDEST_S < stamp < arrived + FUTURE_S:
                 raise WrongDevice(
                     f"{self.where}: the frame's stamp {stamp:.3f} s is not of this machine's "
-                    f"monotonic clock ({now:.3f} s)"
+                    f"monotonic clock ({arrived:.3f} s)"
                 )
+            if stamp is None or stamp > arrived:
+                return (
+                    dropped >= BUFFERS
+                )  # it tells nothing: take the first that cannot have waited
             return stamp - (0.0 if start_of_exposure else exposure or 0.0) >= called
 
         while True:
@@ -230,7 +242,8 @@ class V4l2Camera(Camera):
                     f"{self.where}: no new frame in {self.timeout_s:g} s{after}"
                 ) from error
             if grab is not None:
-                return grab, time.monotonic() if grab.stamp is None else grab.stamp, dropped
+                stamp = arrived if grab.stamp is None else grab.stamp
+                return grab, min(stamp, arrived), dropped
             dropped += 1
 
     def _path(self) -> str:

@@ -25,9 +25,10 @@ if TYPE_CHECKING:
 
     Accept = Callable[[float | None, bool], bool]
 
-__all__ = ["Control", "Grab", "LinuxpyStream", "OpenCvStream", "Stream"]
+__all__ = ["BUFFERS", "OLDEST_S", "Control", "Grab", "LinuxpyStream", "OpenCvStream", "Stream"]
 
-ERROR, TYPE_MASK, MONOTONIC, COPY, START_OF_EXPOSURE = 0x40, 0xE000, 0x2000, 0x4000, 0x10000
+ERROR, TYPE_MASK, START_OF_EXPOSURE = 0x40, 0xE000, 0x10000
+OLDEST_S = 3600.0
 BUFFERS = 3
 OPENCV_PROPERTIES = {
     # V4L2 control: OpenCV's property
@@ -136,8 +137,8 @@ class LinuxpyStream:
     def grab(self, deadline: float, accept: Accept) -> Grab | None:
         buffer = self._dequeue(deadline)
         stamp: float | None = buffer.timestamp.secs + buffer.timestamp.usecs * 1e-6
-        if not stamp or buffer.flags & TYPE_MASK not in (MONOTONIC, COPY):
-            stamp = None
+        if not stamp or (not buffer.flags & TYPE_MASK and abs(stamp - time.monotonic()) > OLDEST_S):
+            stamp = None  # none, or (drivers that do not say which clock) not the monotonic one
         at_start = bool(buffer.flags & START_OF_EXPOSURE)
         try:
             if not accept(stamp, at_start):

@@ -59,8 +59,9 @@ def machine(tmp_path_factory):
 def video(machine):
     """v4l2loopback at /dev/video40 and vivid at /dev/video0."""
     machine.run("modprobe v4l2loopback video_nr=40 card_label=laboratory exclusive_caps=1")
-    machine.run("modprobe vivid n_devs=1 vid_cap_nr=0 vid_out_nr=1")
-    machine.wait("test -c /dev/video40 && test -c /dev/video0")
+    machine.run("modprobe vivid n_devs=1")
+    node = "/dev/v4l/by-path/platform-vivid.0-video-index0"
+    machine.wait(f"test -c /dev/video40 && test -e {node}")
     return machine
 
 

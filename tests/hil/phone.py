@@ -103,7 +103,7 @@ class Phone:
         )
 
     def load(self, images: np.ndarray, first: int = 1) -> None:
-        """Put photographs in: what the camera shows at its next exposures, numbered from `first`."""
+        """Put photographs in: what the camera shows at its next exposures, numbered."""
         for k, image in enumerate(images):
             tags = Image.Exif()
             sub = tags.get_ifd(0x8769)

@@ -115,6 +115,11 @@ class FakeCamera:
     def _streamoff(self, _a) -> None:
         self.streaming = False
 
+    def made_by(self, now: float) -> int:
+        """The number of the first frame that the camera makes after an instant."""
+        self._make_frames()
+        return self._sequence + max(0, int((now - self._next_at) / self.period_s))
+
     def _make_frames(self) -> None:
         while not self.stalled and self._next_at <= time.monotonic():
             if self._queued:

@@ -77,15 +77,19 @@ def feeder(width, height, pixel_format, fps=10.0):
         process.wait()
 
 
-def times(pixel_format, width, height, backend="linuxpy"):
+def times(*cases):
+    """{case: frames} of the loopback; a case is format:backend."""
+    return {case: written_and_captured(*case.split(":"), 640, 480) for case in cases}
+
+
+def written_and_captured(pixel_format, backend, width, height):
     """Frames of the loopback, with the instants at which each was really written."""
-    width, height = int(width), int(height)
     with (
         feeder(width, height, pixel_format),
         camera("/dev/video40", width, height, pixel_format, backend=backend) as device,
     ):
         captured = []
-        for _ in range(12):
+        for _ in range(10):
             called = time.monotonic()
             frame = device.capture()
             captured.append(
@@ -113,7 +117,8 @@ def stalls(backend):
         result["stopped"] = outcome(lambda: described(device.capture()))
         process.send_signal(signal.SIGCONT)
         device.close()
-        result["continued"] = outcome(lambda: (device.open(), described(device.capture()))[1])
+        result["opened"] = until_open(device)  # OpenCV gives the node back up to 10 s later
+        result["continued"] = outcome(lambda: described(device.capture()))
         process.kill()
         process.wait()
         result["killed"] = outcome(lambda: described(device.capture()))
@@ -125,6 +130,8 @@ def stalls(backend):
 
 
 VIVID = "/sys/bus/platform/drivers/vivid"
+NODE = "/dev/v4l/by-path/platform-vivid.0-video-index0"  # /dev/videoN changes at each plug
+OUTPUT_NODE = "/dev/v4l/by-path/platform-vivid.0-video-index1"
 
 
 def write(path, text):
@@ -135,20 +142,20 @@ def write(path, text):
 def vivid():
     """Real kernel faults: controls, an error flag, a fatal error, an unplug and a plug."""
     result = {}
-    device = camera("/dev/video0", 640, 360, "GREY", timeout_s=3.0)
+    device = camera(NODE, 640, 360, "GREY", timeout_s=3.0)
     result["opened"] = outcome(device.open)
     result["captured"] = outcome(lambda: list(device.capture().image.shape))
-    asked = camera("/dev/video0", 640, 360, "GREY", controls={"brightness": 77, "contrast": 100})
+    asked = camera(NODE, 640, 360, "GREY", controls={"brightness": 77, "contrast": 100})
     device.close()
     with asked:
         result["controls"] = outcome(lambda: dict(asked.capture().metadata["controls"]))
     result["no_control"] = outcome(
-        camera("/dev/video0", 640, 360, "GREY", controls={"zoomiest": 1}).open
+        camera(NODE, 640, 360, "GREY", controls={"zoomiest": 1}).open
     )
-    result["no_size"] = outcome(camera("/dev/video0", 641, 360, "GREY").open)
-    result["output_node"] = outcome(camera("/dev/video1", 640, 360, "GREY").open)
+    result["no_size"] = outcome(camera(NODE, 641, 360, "GREY").open)
+    result["output_node"] = outcome(camera(OUTPUT_NODE, 640, 360, "GREY").open)
     device.open()
-    other = camera("/dev/video0", 640, 360, "GREY")
+    other = camera(NODE, 640, 360, "GREY")
     result["busy"] = outcome(other.open)
     other.close()
     for name in ("inject_v4l2_buf_flag_error", "inject_fatal_streaming_error"):
@@ -174,7 +181,7 @@ def push(name):
     from linuxpy.video import device as video
     from thermocald_drivers.v4l2_stream import _plain_name
 
-    with open("/dev/video0", "r+b", buffering=0) as file:
+    with open(NODE, "r+b", buffering=0) as file:
         for control in video.iter_read_controls(file):
             if _plain_name(control.name.decode()) == name:
                 video.set_control(file, control.id, 1)

@@ -116,9 +116,12 @@ class Scene:
         iop (10,), eop (6,); points (n, 3) mm: where the targets are now (default: the field's);
         seed: of the noise; blur_factor: how much the blur has grown.
         """
+        # what comes from outside may differ in its last bits; what is rounded away is below 1e-5 px
+        iop, eop = np.round(iop, 10), np.concatenate([np.round(eop[:3], 10), np.round(eop[3:], 6)])
+        where = self.field.points if points is None else np.round(points, 6)
         look = self.look
         canvas = _paper(self.sensor, look.paper_dn, look.vignetting).copy()
-        self._draw(canvas, iop, eop, self.field.points if points is None else points, blur_factor)
+        self._draw(canvas, iop, eop, where, blur_factor)
         if look.noise_dn > 0:
             even, odd = _noise_tables(look.noise_dn)
             size = canvas.size

@@ -40,6 +40,7 @@ _LARGEST_SATURATION = 0.05
 _LARGEST_MOVE = 0.6  # of the minor semi-axis, and at least two px
 _LARGEST_SHAPE = 0.35
 _CONVERGED_PX = 0.03
+_BLUR_SETTLED_PX = 0.1
 _FLAT = 0.003  # of the contrast per px of movement
 _FEWEST_FOR_LEVEL = 8
 _ITERATIONS = 12
@@ -292,7 +293,7 @@ def _gauss_newton(
         p[:, 5] = np.clip(p[:, 5], 0.2, 6.0)
         p[:, 2:5] = np.clip(p[:, 2:5], -0.6, 0.6)
         step = np.abs(delta[:, :2]).max(axis=1)
-        if bool(np.all(step < tolerance_px)):
+        if bool(np.all(step < tolerance_px) and np.all(np.abs(delta[:, 5]) < _BLUR_SETTLED_PX)):
             break
     change = (np.swapaxes(j, 1, 2) @ delta[..., None].astype(np.float32))[..., 0]
     p[:, :2] += w.origin

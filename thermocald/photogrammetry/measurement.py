@@ -207,7 +207,11 @@ def _measure_circles(
     """Fit every circle in view, improve the orientation with them, and fit once more if needed."""
     rows, maps = predicted_maps(testfield, orientation, eccentricity)
     coded = np.array([ring_code.is_ring(testfield.codes[r]) for r in rows], dtype=bool)
-    fit = fit_circles(image, maps, coded)
+    fit = fit_circles(image, maps, coded, _USUAL_BLUR_PX)
+    blur = float(np.median(fit.parameters[:, 5])) if len(rows) else _USUAL_BLUR_PX
+    if blur > _WIDE_BLUR_PX:
+        # The windows were too narrow for this frame.
+        fit = fit_circles(image, maps, coded, blur)
     good = fit.good
     if good.sum() + len(corners) < _FEWEST:
         return _nothing(), dict(zip(rows.tolist(), fit.reasons, strict=True)), orientation
@@ -217,15 +221,12 @@ def _measure_circles(
         testfield.points[pairs], np.concatenate([corners.points, fit.points[good]]),
         fixed=interior is not None,
     )  # fmt: skip
-    blur = float(np.median(fit.parameters[good, 5])) if good.any() else _USUAL_BLUR_PX
     new_rows, new_maps = predicted_maps(testfield, better, eccentricity)
     same = len(new_rows) == len(rows) and bool(np.all(new_rows == rows))
-    # The outlines' asymmetry decides about the centres, the rest is estimated anyway; and strong
-    # blur needs a wider window.
+    # The outlines' asymmetry decides about the centres, the rest is estimated anyway.
     settled = (
         same
         and bool(good.all())
-        and blur < _WIDE_BLUR_PX
         and float(np.abs(new_maps.second - maps.second).max(initial=0.0)) < _SETTLED_PX
     )
     if not settled:

@@ -1,0 +1,180 @@
+"""Frames on disk: which are kept, for how long, and what goes first when the disk fills up.
+
+`<folder>/<camera>/<series>/<thousands>/<epoch>.jpg` or `.png`. A JPEG is kept as the camera gave
+it, grey values as PNG. A file appears as a whole or not at all.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import shutil
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from thermocald.config import FramesConfig
+    from thermocald.hal import Frame
+
+__all__ = ["Deleted", "FrameFolder"]
+
+log = logging.getLogger(__name__)
+
+_DAY_S = 86400.0
+_GB = 1e9
+_PER_FOLDER = 1000
+_FAST_PNG = 1  # of 9: what takes longer makes it hardly smaller
+
+
+@dataclass(frozen=True, slots=True)
+class Deleted:
+    """What a pass of retention deleted: how many frames, bytes, and why."""
+
+    frames: int
+    size: int
+    why: str
+
+    @property
+    def text(self) -> str:
+        """The pass in a sentence."""
+        return f"{self.frames} frames ({self.size / 1e6:.1f} MB) were deleted: {self.why}"
+
+
+class FrameFolder:
+    """Writes frames of all cameras, and deletes the oldest; threads may share it."""
+
+    def __init__(self, config: FramesConfig) -> None:
+        self.config = config
+        self.root = config.folder
+        self.paused = ""  # why no frame is written just now
+
+    def wanted(self, number: int, eventful: bool) -> bool:
+        """Whether the configuration wants the frame of an epoch."""
+        match self.config.keep:
+            case "all":
+                return True
+            case "every_n":
+                return number % self.config.every_n == 0
+            case "events":
+                return eventful
+        return False
+
+    def keep(self, camera: str, series: str, number: int, frame: Frame) -> Path | None:
+        """Write a frame; its path relative to the folder, None if the disk does not take it.
+
+        `paused` then says why; it is cleared by the next frame that can be written.
+        """
+        if frame.image is None and frame.encoded is None:
+            return None
+        free = self.free_bytes()
+        if free < self.config.min_free_gb * _GB:
+            self._pause(
+                f"{self.root}: {free / 1e6:.0f} MB are free, less than min_free_gb "
+                f"{self.config.min_free_gb:g}; no frames are kept"
+            )
+            return None
+        data = frame.encoded
+        if data is None:
+            import cv2
+
+            assert frame.image is not None
+            done, png = cv2.imencode(".png", frame.image, [cv2.IMWRITE_PNG_COMPRESSION, _FAST_PNG])
+            if not done:
+                return None
+            data = png.tobytes()
+        suffix = ".jpg" if data[:2] == b"\xff\xd8" else ".png"
+        relative = Path(camera, series, f"{number // _PER_FOLDER:04d}", f"{number:07d}{suffix}")
+        try:
+            self._write(self.root / relative, data)
+        except OSError as error:
+            self._pause(f"{self.root}: {error.strerror or error}; no frames are kept")
+            return None
+        if self.paused:
+            log.info("%s: frames are kept again", self.root)
+            self.paused = ""
+        return relative
+
+    def delete(self, relative: Path) -> None:
+        """Delete one frame; not being there is no error."""
+        with contextlib.suppress(OSError):
+            (self.root / relative).unlink()
+
+    def free_bytes(self) -> int:
+        """Free space of the disk; nothing where it cannot be asked."""
+        folder = self.root
+        while not folder.exists() and folder != folder.parent:
+            folder = folder.parent
+        try:
+            return shutil.disk_usage(folder).free
+        except OSError:
+            return 0
+
+    def enforce(self, now_utc: float | None = None) -> list[Deleted]:
+        """Delete what is too old, then the oldest of what is too much."""
+        config = self.config
+        files = sorted(self._files())
+        deleted: list[Deleted] = []
+        if config.max_age_days is not None:
+            limit = (time.time() if now_utc is None else now_utc) - config.max_age_days * _DAY_S
+            old = [f for f in files if f[0] < limit]
+            files = files[len(old) :]
+            why = f"older than {config.max_age_days:g} days"
+            deleted += self._delete(old, why)
+        surplus, why = 0, ""
+        if config.max_size_gb is not None:
+            surplus = int(sum(size for _, size, _ in files) - config.max_size_gb * _GB)
+            why = f"more than {config.max_size_gb:g} GB"
+        missing = int(config.min_free_gb * _GB) - self.free_bytes()
+        if missing > surplus:
+            surplus, why = missing, f"less than {config.min_free_gb:g} GB of the disk were free"
+        victims = []
+        for file in files:
+            if surplus <= 0:
+                break
+            victims.append(file)
+            surplus -= file[1]
+        deleted += self._delete(victims, why)
+        for one in deleted:
+            log.info(one.text, extra={"event": "frames_deleted"})
+        return deleted
+
+    def _delete(self, files: list[tuple[float, int, str]], why: str) -> list[Deleted]:
+        count = size = 0
+        for _, bytes_, path in files:
+            with contextlib.suppress(OSError):
+                os.unlink(path)
+                count += 1
+                size += bytes_
+        return [Deleted(count, size, why)] if count else []
+
+    def _files(self) -> Iterator[tuple[float, int, str]]:
+        """(time of change s, bytes, path) of all frames, and of pieces left by a crash."""
+        for folder, _, names in os.walk(self.root):
+            for name in names:
+                if not name.endswith((".jpg", ".png", ".partial")):
+                    continue
+                path = os.path.join(folder, name)
+                with contextlib.suppress(OSError):
+                    found = os.stat(path)
+                    yield found.st_mtime, found.st_size, path
+
+    def _write(self, path: Path, data: bytes) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_name(path.name + ".partial")
+        try:
+            partial.write_bytes(data)
+            os.replace(partial, path)
+        except OSError:
+            with contextlib.suppress(OSError):
+                partial.unlink()
+            raise
+
+    def _pause(self, why: str) -> None:
+        if not self.paused:
+            log.warning(why, extra={"event": "frames_paused"})
+        self.paused = why

@@ -1,0 +1,258 @@
+"""One camera's frames on their way to the store, in bounded memory: calibration may be dropped,
+acquisition not.
+
+    submit (the camera's thread) ─► waiting ─► calibrated ─► kept, in the order of their numbers
+                                      └─► too many wait: kept uncalibrated, with the frame, and
+                                          calibrated when there is time
+
+Two threads, one calibrates and one keeps, so that a slow disk or a slow adjustment never holds the
+camera up.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Literal, Protocol
+
+from thermocald.acquisition.calibrator import CalibratedEpoch
+from thermocald.acquisition.pipeline import calibrate_frame, make_epoch
+from thermocald.photogrammetry.adjustment import failed
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from thermocald.acquisition.calibrator import Calibrator
+    from thermocald.acquisition.pairing import Readings
+    from thermocald.epoch import Epoch
+    from thermocald.hal import Clock, Frame
+
+__all__ = ["AcquiredEpoch", "Keeper", "LivePipeline"]
+
+log = logging.getLogger(__name__)
+
+_DEPTH = 3
+_PATIENCE_S = 2.0
+_IDLE_S = 0.5
+
+
+@dataclass(eq=False)
+class AcquiredEpoch:
+    """An epoch on its way: the frame, and what became of it so far.
+
+    calibrated: None while it waits, and for good if calibration was dropped.
+    """
+
+    number: int
+    frame: Frame
+    clock_trusted: bool
+    epoch: Epoch | None = None
+    skew_s: float = float("nan")
+    calibrated: CalibratedEpoch | None = None
+    state: Literal["waiting", "calibrating", "done", "dropped"] = field(default="waiting")
+
+
+class Keeper(Protocol):
+    """Who keeps epochs; called by one thread, in the order of their numbers."""
+
+    def keep(self, acquired: AcquiredEpoch) -> None:
+        """Keep an epoch; `acquired.epoch` is set."""
+
+    def amend(self, calibrated: CalibratedEpoch) -> None:
+        """Keep the calibration of an epoch that was kept without."""
+
+    def backlog(self, below: int) -> Epoch | None:
+        """An epoch numbered below, kept without calibration, with the path of its frame."""
+
+
+class LivePipeline:
+    """The queue, the calibrating and the keeping thread of one camera.
+
+    calibrator: None if epochs are only acquired. observe: told every calibrated epoch in order,
+    returns further columns. depth: epochs that may wait. patience_s: to wait for a reading that is
+    being taken, at most half a period.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        calibrator: Calibrator | None,
+        readings: Readings,
+        thermometers: Sequence[str],
+        keeper: Keeper,
+        clock: Clock,
+        *,
+        first: int = 1,
+        period_s: float = 10.0,
+        depth: int = _DEPTH,
+        patience_s: float | None = None,
+        trusted: Callable[[], bool] = lambda: True,
+        observe: Callable[[CalibratedEpoch], dict[str, float]] = lambda _: {},
+    ) -> None:
+        self.name = name
+        self.calibrator = calibrator
+        self.dropped = 0  # epochs whose calibration was put off
+        self.caught_up = 0
+        self.lost = 0  # frames that could not even be kept: the disk is slower than the camera
+        self.next_number = first
+        self._readings = readings
+        self._thermometers = list(thermometers)
+        self._keeper = keeper
+        self._clock = clock
+        self._patience_s = min(_PATIENCE_S, 0.5 * period_s) if patience_s is None else patience_s
+        self._depth = depth
+        self._trusted = trusted
+        self._observe = observe
+        self._items: deque[AcquiredEpoch] = deque()
+        self._amended: deque[CalibratedEpoch] = deque()
+        self._changed = threading.Condition()
+        self._stopping = False
+        self._busy_since: dict[str, float] = {}
+        self._threads = [
+            threading.Thread(target=self._calibrate_all, name=f"calibrate {name}", daemon=True),
+            threading.Thread(target=self._keep_all, name=f"keep {name}", daemon=True),
+        ]
+
+    def start(self) -> None:
+        """Start both threads."""
+        for thread in self._threads:
+            thread.start()
+
+    def submit(self, frame: Frame) -> None:
+        """Take a frame over; returns at once."""
+        with self._changed:
+            if len(self._items) > 2 * self._depth:
+                self.lost += 1
+                log.error("camera %s: a frame was lost: it cannot be kept fast enough", self.name)
+                return
+            self._items.append(AcquiredEpoch(self.next_number, frame, self._trusted()))
+            self.next_number += 1
+            self._changed.notify_all()
+
+    def wait_for_room(self, timeout_s: float) -> bool:
+        """Wait until nothing need be put off for one more epoch: for what can be replayed."""
+        with self._changed:
+            return self._changed.wait_for(lambda: len(self._items) < self._depth, timeout_s)
+
+    def stop(self, grace_s: float) -> bool:
+        """Finish the epoch in hand, keep the others as they are; False if that took too long."""
+        with self._changed:
+            self._stopping = True
+            self._changed.notify_all()
+        deadline = self._clock.monotonic() + grace_s
+        for thread in self._threads:
+            thread.join(max(0.0, deadline - self._clock.monotonic()))
+        return not any(thread.is_alive() for thread in self._threads)
+
+    def waiting(self) -> int:
+        """How many epochs are on their way."""
+        return len(self._items)
+
+    def busy_s(self) -> float:
+        """For how long a thread has not finished one thing; 0 if none is busy."""
+        now = self._clock.monotonic()
+        return max((now - since for since in list(self._busy_since.values())), default=0.0)
+
+    def _calibrate_all(self) -> None:
+        while (item := self._next_to_calibrate()) is not None:
+            self._busy_since["calibrate"] = self._clock.monotonic()
+            if isinstance(item, AcquiredEpoch):
+                self._calibrate(item)
+            else:
+                result = self._safely(item, None)
+                with self._changed:
+                    self._amended.append(result)
+                    self.caught_up += 1
+                    self._changed.notify_all()
+            self._busy_since.pop("calibrate", None)
+
+    def _next_to_calibrate(self) -> AcquiredEpoch | Epoch | None:
+        """The oldest that waits; if there is none, one that was put off; None at the end."""
+        while True:
+            with self._changed:
+                if self._stopping:
+                    return None
+                item = next((i for i in self._items if i.state == "waiting"), None)
+                if item is not None:
+                    item.state = "calibrating"
+                    return item
+                idle = not self._items and not self._amended
+                below = self.next_number
+            if idle and self.calibrator is not None:
+                old = self._keeper.backlog(below)
+                if old is not None:
+                    return old
+            with self._changed:
+                if not self._stopping and not any(i.state == "waiting" for i in self._items):
+                    self._changed.wait(_IDLE_S)
+
+    def _calibrate(self, item: AcquiredEpoch) -> None:
+        self._pair(item, self._patience_s)
+        assert item.epoch is not None
+        result = self._safely(item.epoch, item.frame)
+        with self._changed:
+            if item.state == "dropped":  # it took so long that it was kept without
+                self._amended.append(result)
+                self.caught_up += 1
+            else:
+                extra = {**result.extra, **self._observe(result)}
+                if item.skew_s == item.skew_s:
+                    extra["skew_s"] = item.skew_s
+                item.calibrated = replace(result, extra=extra)
+                item.state = "done"
+            self._changed.notify_all()
+
+    def _safely(self, epoch: Epoch, frame: Frame | None) -> CalibratedEpoch:
+        """Calibrate from the frame, or from the file that the epoch names."""
+        if self.calibrator is None:
+            why = failed("not_measured", "no test field is configured for this camera")
+            return CalibratedEpoch(epoch, why, {})
+        try:
+            if frame is None:
+                return self.calibrator.calibrate(epoch)
+            return calibrate_frame(self.calibrator, epoch, frame)
+        except Exception as error:
+            # one epoch that breaks the program must not end months of acquisition
+            log.exception("camera %s: epoch %d was not calibrated", self.name, epoch.number)
+            self.calibrator.reset()
+            return CalibratedEpoch(epoch, failed("program_error", str(error)), {})
+
+    def _pair(self, item: AcquiredEpoch, patience_s: float) -> None:
+        paired = self._readings.around(self._thermometers, item.frame.monotonic, patience_s)
+        item.epoch = make_epoch(item.number, item.frame, paired)
+        item.skew_s = paired.skew_s
+
+    def _keep_all(self) -> None:
+        while (item := self._next_to_keep()) is not None:
+            self._busy_since["keep"] = self._clock.monotonic()
+            try:
+                if isinstance(item, CalibratedEpoch):
+                    self._keeper.amend(item)
+                else:
+                    if item.epoch is None:
+                        self._pair(item, 0.0)
+                    self._keeper.keep(item)
+            except Exception:
+                log.exception("camera %s: an epoch was not kept", self.name)
+            self._busy_since.pop("keep", None)
+
+    def _next_to_keep(self) -> AcquiredEpoch | CalibratedEpoch | None:
+        with self._changed:
+            while True:
+                if self._amended:
+                    return self._amended.popleft()
+                if self._items:
+                    first = self._items[0]
+                    put_off = len(self._items) > self._depth
+                    put_off |= self._stopping and first.state == "waiting"
+                    if put_off and first.state != "done":
+                        first.state = "dropped"
+                        self.dropped += 1
+                    if first.state in ("done", "dropped"):
+                        self._changed.notify_all()
+                        return self._items.popleft()
+                elif self._stopping and not self._threads[0].is_alive():
+                    return None
+                self._changed.wait(_IDLE_S)

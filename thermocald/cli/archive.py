@@ -1,0 +1,76 @@
+"""`thermocald archive`: the store's series as recordings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from thermocald.cli.common import say, write_json
+from thermocald.cli.options import JsonOption  # noqa: TC001  typer reads the annotations
+from thermocald.errors import UsageError
+
+__all__ = ["register"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("archive")(archive)
+
+
+def archive(
+    store: Annotated[
+        Path | None, typer.Argument(help="The store; may be in use by a daemon.")
+    ] = None,
+    folder: Annotated[
+        Path, typer.Option("--to", help="The folder in which recordings are written.")
+    ] = Path(),
+    config: Annotated[
+        Path | None, typer.Option("--config", "-c", help="Store and frames of this configuration.")
+    ] = None,
+    frames: Annotated[
+        Path | None, typer.Option("--frames", help="The daemon's folder of frames.")
+    ] = None,
+    series: Annotated[
+        str | None, typer.Option("--series", help="CAMERA/SERIES or SERIES; default: all.")
+    ] = None,
+    skip_existing: Annotated[
+        bool, typer.Option("--skip-existing", help="Pass over recordings that are there already.")
+    ] = False,
+    json: JsonOption = None,
+) -> None:
+    """Write every series as a recording `<camera>-<series>`, a folder that replays anywhere.
+
+    Example: thermocald archive thermocald.db --to recordings
+    """
+    from thermocald.config import load_config
+    from thermocald.store.archive import archive_series
+    from thermocald.store.database import Store
+
+    if config is not None:
+        read = load_config(config)
+        store, frames = store or read.store.path, frames or read.frames.folder
+    if store is None:
+        raise UsageError("which store? give its file, or --config FILE")
+    camera, _, name = (series or "").rpartition("/")
+    written: list[dict[str, Any]] = []
+    with Store.open(store) as opened:
+        chosen = (
+            opened.all_series()
+            if series is None
+            else [opened.find_series(camera or None, name or None)]
+        )
+        folder.mkdir(parents=True, exist_ok=True)
+        for one in chosen:
+            path = folder / f"{one.camera}-{one.name}"
+            last = opened.last_epoch(one)
+            if last is None or (skip_existing and path.exists()):
+                continue
+            archive_series(opened, one, path, frames)
+            say(f"{path}: epochs to {last}")
+            written.append(
+                {"camera": one.camera, "series": one.name, "path": path, "last_epoch": last}
+            )
+    if json is not None:
+        write_json({"format": "thermocald-archive/1", "recordings": written}, json)

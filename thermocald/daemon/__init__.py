@@ -1,0 +1,1 @@
+"""The daemon: what a configuration names, acquired, calibrated and kept, for months."""

@@ -1,0 +1,223 @@
+"""One camera's epochs into the store: frame first, then the row, then the outputs are told."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from thermocald.daemon.plan import check_series, series_head
+from thermocald.daemon.store_guard import Row
+from thermocald.errors import StoreError
+from thermocald.photogrammetry.camera_model import PARAMETER_NAMES
+from thermocald.store.row import NOT_CALIBRATED, EpochResult, Event
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from thermocald.acquisition.calibrator import CalibratedEpoch
+    from thermocald.acquisition.frame_folder import FrameFolder
+    from thermocald.acquisition.live_pipeline import AcquiredEpoch
+    from thermocald.daemon.plan import CameraPlan
+    from thermocald.daemon.store_guard import StoreGuard
+    from thermocald.epoch import Epoch
+    from thermocald.store.row import StoredSeries
+
+__all__ = ["EpochKeeper", "result_row"]
+
+log = logging.getLogger(__name__)
+
+_CATCH_UP_BATCH = 200
+
+
+class EpochKeeper:
+    """The Keeper of a camera's pipeline.
+
+    on_kept: told every epoch after it was stored (or refused), with its row as outputs get it.
+    identity: what the camera says it is, asked when the series begins.
+    """
+
+    def __init__(
+        self,
+        plan: CameraPlan,
+        guard: StoreGuard,
+        frames: FrameFolder,
+        on_kept: Callable[[AcquiredEpoch, dict[str, Any]], None],
+        identity: Callable[[], Mapping[str, Any]] = dict,
+        *,
+        start: str = "",
+    ) -> None:
+        self.plan = plan
+        self.stored = 0
+        self.kept_frames = 0
+        self._guard = guard
+        self._frames = frames
+        self._on_kept = on_kept
+        self._identity = identity
+        self._start = start
+        self._series: StoredSeries | None = self._existing()
+        self._backlog: list[Epoch] = []
+        self._searched_to = 0
+
+    def _existing(self) -> StoredSeries | None:
+        found = [
+            s
+            for s in self._guard.store.all_series()
+            if (s.camera, s.name) == (self.plan.name, self.plan.config.series)
+        ]
+        if not found:
+            return None
+        check_series(self.plan, found[0].testfield)
+        return found[0]
+
+    @property
+    def series(self) -> StoredSeries | None:
+        """The series in the store; None before its first epoch."""
+        return self._series
+
+    @property
+    def first_number(self) -> int:
+        """The number with which acquisition goes on."""
+        if self._series is None:
+            return 1
+        return (self._guard.store.last_epoch(self._series) or 0) + 1
+
+    def keep(self, acquired: AcquiredEpoch) -> None:
+        """Keep an epoch; a calibration that was put off is made up for later from its frame."""
+        assert acquired.epoch is not None
+        calibrated = acquired.calibrated
+        series = self._begin_series(acquired)
+        epoch = acquired.epoch if calibrated is None else calibrated.epoch
+        put_off = calibrated is None and self.plan.calibrator is not None
+        eventful = calibrated is not None and not calibrated.adjustment.ok
+        result, extra = None, {}
+        path = None
+        if self._frames.wanted(epoch.number, eventful) or put_off:
+            path = self._frames.keep(
+                self.plan.name, self.plan.config.series, epoch.number, acquired.frame
+            )
+            self.kept_frames += path is not None
+        if calibrated is not None:
+            result = EpochResult.from_adjustment(calibrated.adjustment)
+            extra = calibrated.extra
+        elif put_off and path is None:
+            result = EpochResult("frame_not_kept", "calibration was put off and the frame not kept")
+        epoch = replace(epoch, frame=path)
+        values = result_row(self.plan, epoch, result, extra)
+
+        def told(stored: bool) -> None:
+            self.stored += stored
+            self._on_kept(acquired, {**values, "stored": stored})
+
+        self._guard.append(Row(series, epoch, result, extra, acquired.clock_trusted, told))
+
+    def amend(self, calibrated: CalibratedEpoch) -> None:
+        """Keep a calibration made later; a frame that was kept only for it is deleted."""
+        if self._series is None:
+            return
+        epoch = calibrated.epoch
+        result = EpochResult.from_adjustment(calibrated.adjustment)
+        try:
+            self._guard.store.amend(
+                self._series,
+                epoch.number,
+                result,
+                observations=None if self._guard.thin else epoch.observations,
+                extra=calibrated.extra,
+            )
+        except StoreError as error:
+            log.warning("the calibration of epoch %d waits: %s", epoch.number, error)
+            self._searched_to = min(self._searched_to, epoch.number - 1)
+            return
+        wanted = self._frames.wanted(epoch.number, not calibrated.adjustment.ok)
+        stored = next(self._guard.store.epochs(self._series, epoch.number, epoch.number), None)
+        if not wanted and stored is not None and stored.epoch.frame is not None:
+            self._frames.delete(stored.epoch.frame)
+            self.kept_frames -= 1
+
+    def backlog(self, below: int) -> Epoch | None:
+        """The oldest epoch that was kept uncalibrated and whose frame is still there."""
+        if self._series is None:
+            return None
+        try:
+            while not self._backlog and self._search(below):
+                pass
+        except StoreError as error:
+            log.warning("what is still to be calibrated cannot be read: %s", error)
+        return self._backlog.pop(0) if self._backlog else None
+
+    def _search(self, below: int) -> bool:
+        """Look through the next epochs of the store, each once; False if there are no more."""
+        assert self._series is not None
+        first = self._searched_to + 1
+        if first >= below:
+            return False
+        end = min(below - 1, self._guard.store.last_epoch(self._series) or 0)
+        if end < first:
+            return False
+        last = min(end, first + _CATCH_UP_BATCH - 1)
+        for stored in self._guard.store.epochs(self._series, first, last, details=False):
+            frame = stored.epoch.frame
+            if stored.result.status == NOT_CALIBRATED and frame is not None:
+                path = self._frames.root / frame
+                if path.is_file():
+                    self._backlog.append(replace(stored.epoch, frame=path))
+        self._searched_to = last
+        return True
+
+    def _begin_series(self, acquired: AcquiredEpoch) -> StoredSeries:
+        if self._series is None:
+            assert acquired.epoch is not None
+            channels = list(acquired.epoch.temperatures) or list(self.plan.config.thermometers)
+            head, field, settings = series_head(self.plan, acquired.frame, channels)
+            self._series = self._guard.store.create_series(
+                head,
+                field,
+                start=self._start,
+                identity=self._identity(),
+                settings=settings,
+                created_utc=acquired.frame.utc,
+            )
+            self._guard.event(
+                Event(
+                    acquired.frame.utc,
+                    "series_begun",
+                    f"camera {self.plan.name}: series {self.plan.config.series} begins",
+                    self._series.id,
+                    acquired.number,
+                )
+            )
+        return self._series
+
+
+def result_row(
+    plan: CameraPlan, epoch: Epoch, result: EpochResult | None, extra: Mapping[str, float]
+) -> dict[str, Any]:
+    """One epoch as outputs get it: the columns of the CSV export, `device`, `series`, channels.
+
+    temperature: °C, the reference's as read at `temperature_time`; numbers are NaN where there is
+    none.
+    """
+    reference = next(iter(epoch.temperatures.values()), math.nan)
+    row: dict[str, Any] = {
+        "device": plan.name,
+        "series": plan.config.series,
+        "epoch": epoch.number,
+        "frame_time": epoch.frame_time,
+        "temperature_time": epoch.temperature_time,
+        **epoch.temperatures,
+        "temperature": reference,
+    }
+    kept = result or EpochResult(NOT_CALIBRATED)
+    row.update(zip(PARAMETER_NAMES, kept.values.tolist(), strict=True))
+    row.update(zip((f"sd_{n}" for n in PARAMETER_NAMES), kept.sd.tolist(), strict=True))
+    row.update(
+        sigma0=kept.sigma0,
+        n_observations=kept.n_observations,
+        n_rejected=len(kept.rejected),
+        status=kept.status,
+        reason=kept.reason,
+        **extra,
+    )
+    return row

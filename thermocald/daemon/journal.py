@@ -1,0 +1,76 @@
+"""The log in systemd's journal, with fields: THERMOCALD_DEVICE, THERMOCALD_EVENT, CODE_FILE …
+
+Try: journalctl THERMOCALD_EVENT=device_out
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import struct
+import sys
+
+__all__ = ["JournalHandler", "set_up_logging"]
+
+_SOCKET = "/run/systemd/journal/socket"
+_PRIORITIES = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
+_FIELDS = {"device": "THERMOCALD_DEVICE", "event": "THERMOCALD_EVENT"}
+
+
+class JournalHandler(logging.Handler):
+    """Sends records to the journal's native socket (systemd.journal-fields(7))."""
+
+    def __init__(self, path: str = _SOCKET) -> None:
+        super().__init__()
+        self._path = path
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        priority = next((p for level, p in _PRIORITIES if record.levelno >= level), 7)
+        fields = {
+            "MESSAGE": self.format(record),
+            "PRIORITY": str(priority),
+            "SYSLOG_IDENTIFIER": "thermocald",
+            "THERMOCALD_LOGGER": record.name,
+            "THERMOCALD_THREAD": record.threadName or "",
+            "CODE_FILE": record.pathname,
+            "CODE_LINE": str(record.lineno),
+        }
+        for attribute, name in _FIELDS.items():
+            if (value := getattr(record, attribute, None)) is not None:
+                fields[name] = str(value)
+        message = b"".join(_encoded(name, value) for name, value in fields.items())
+        try:
+            self._socket.sendto(message, self._path)
+        except OSError:
+            # no journal, or a message too long for a datagram: stderr is read by systemd too
+            print(self.format(record), file=sys.stderr)  # noqa: T201
+
+    def close(self) -> None:
+        self._socket.close()
+        super().close()
+
+
+def _encoded(name: str, value: str) -> bytes:
+    data = value.encode()
+    if b"\n" not in data:
+        return name.encode() + b"=" + data + b"\n"
+    return name.encode() + b"\n" + struct.pack("<Q", len(data)) + data + b"\n"
+
+
+def set_up_logging(level: str) -> None:
+    """Log to the journal under systemd, to standard error otherwise."""
+    root = logging.getLogger()
+    root.setLevel(level.upper())
+    for old in list(root.handlers):
+        root.removeHandler(old)
+        old.close()
+    handler: logging.Handler
+    if os.environ.get("JOURNAL_STREAM") and os.path.exists(_SOCKET):
+        handler = JournalHandler()
+        handler.setFormatter(logging.Formatter("%(message)s"))
+    else:
+        handler = logging.StreamHandler(sys.stderr)
+        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    root.addHandler(handler)

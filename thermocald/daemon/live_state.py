@@ -1,0 +1,166 @@
+"""What the daemon shows of itself: a folder of small files that others read and it never does.
+
+`status.json` (format thermocald-status/1); per camera `<camera>.json`, the last epoch with image
+points and residuals, and `<camera>.jpg`, its frame made small. Under systemd the folder lies in
+memory (RUNTIME_DIRECTORY), otherwise beside the store.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.errors import DataError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from thermocald.acquisition.calibrator import CalibratedEpoch
+    from thermocald.hal import Frame
+    from thermocald.photogrammetry.testfield import TestField
+
+__all__ = ["LiveState", "find_state", "plain", "read_state"]
+
+log = logging.getLogger(__name__)
+
+FORMAT = "thermocald-status/1"
+_PREVIEW_PX = 1280
+_PREVIEW_QUALITY = 80
+
+
+class LiveState:
+    """Writes the folder; a disk that does not take it is logged once and otherwise ignored."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._failed = False
+
+    @classmethod
+    def beside(cls, store: Path) -> LiveState:
+        """The folder of the daemon that writes this store."""
+        runtime = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]
+        return cls(Path(runtime) if runtime else _beside(store))
+
+    def write_status(self, status: Mapping[str, Any]) -> None:
+        """Replace status.json."""
+        self._write("status.json", json.dumps(plain({"format": FORMAT, **status})).encode())
+
+    def write_epoch(
+        self, camera: str, row: Mapping[str, Any], calibrated: CalibratedEpoch | None,
+        field: TestField | None,
+    ) -> None:  # fmt: skip
+        """Replace a camera's last epoch: its row, targets and residuals."""
+        document: dict[str, Any] = {"row": row}
+        if calibrated is not None and field is not None:
+            document["targets"] = _targets(calibrated, field)
+        self._write(f"{camera}.json", json.dumps(plain(document)).encode())
+
+    def write_frame(self, camera: str, frame: Frame) -> None:
+        """Replace a camera's last frame, at most 1280 px wide."""
+        data = frame.encoded
+        if frame.image is not None or (data is not None and data[:2] == b"\xff\xd8"):
+            data = _preview(frame)
+        if data is not None:
+            self._write(f"{camera}.jpg", data)
+
+    def remove(self) -> None:
+        """Take status.json away: nobody runs here any more."""
+        try:
+            (self.folder / "status.json").unlink(missing_ok=True)
+        except OSError as error:
+            log.debug("%s: %s", self.folder, error)
+
+    def _write(self, name: str, data: bytes) -> None:
+        partial = self.folder / f".{name}.partial"
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            partial.write_bytes(data)
+            os.replace(partial, self.folder / name)
+            self._failed = False
+        except OSError as error:
+            if not self._failed:
+                log.warning("%s: the status cannot be written: %s", self.folder, error)
+            self._failed = True
+
+
+def _beside(store: Path) -> Path:
+    return store.with_name(store.name + ".live")
+
+
+def _preview(frame: Frame) -> bytes | None:
+    import cv2
+
+    from thermocald.photogrammetry.image_file import decode_grey
+
+    try:
+        image = frame.image if frame.image is not None else decode_grey(frame.encoded or b"")
+    except DataError:
+        return None
+    if image.dtype == np.uint16:
+        image = (image >> 8).astype(np.uint8)
+    scale = min(1.0, _PREVIEW_PX / image.shape[1])
+    size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    done, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _PREVIEW_QUALITY])
+    return data.tobytes() if done else None
+
+
+def _targets(calibrated: CalibratedEpoch, field: TestField) -> dict[str, Any]:
+    """Lists over the measured targets: name, x, y px, residuals px, whether it was rejected."""
+    seen, result = calibrated.epoch.observations, calibrated.adjustment
+    if seen is None or len(seen) != len(result.targets):
+        return {}
+    rejected = set(result.rejected)
+    return {
+        "name": [field.names[t] for t in seen.targets.tolist()],
+        "x": seen.points[:, 0].round(3).tolist(),
+        "y": seen.points[:, 1].round(3).tolist(),
+        "vx": result.residuals[:, 0].round(4).tolist(),
+        "vy": result.residuals[:, 1].round(4).tolist(),
+        "rejected": [t in rejected for t in seen.targets.tolist()],
+    }
+
+
+def plain(value: Any) -> Any:
+    """As JSON has it: what is not a number becomes null."""
+    if isinstance(value, dict):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Path):
+        return str(value)
+    return value
+
+
+def find_state(store: Path) -> Path:
+    """The folder of the daemon that writes a store, running or not."""
+    beside = _beside(store)
+    if (beside / "status.json").exists():
+        return beside
+    wanted = str(store.absolute())
+    for base in (Path("/run/thermocald"), Path("/run")):
+        for found in sorted(base.glob("thermocald*/status.json")) + sorted(
+            base.glob("status.json")
+        ):
+            if read_state(found.parent).get("store", {}).get("path") == wanted:
+                return found.parent
+    return beside
+
+
+def read_state(folder: Path) -> dict[str, Any]:
+    """status.json of a folder; empty if nobody runs there."""
+    try:
+        document = json.loads((folder / "status.json").read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return document if isinstance(document, dict) else {}

@@ -1,0 +1,152 @@
+"""A configuration made into objects: devices, calibrators, the head of a series."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.acquisition.calibrator import Calibrator
+from thermocald.errors import ConfigurationError
+from thermocald.hal import open_device
+from thermocald.photogrammetry.adjustment import AdjustmentSettings
+from thermocald.photogrammetry.camera_model import InteriorOrientation, Sensor
+from thermocald.photogrammetry.geometry import GeometryBounds
+from thermocald.photogrammetry.testfield import TestField
+from thermocald.store.head import CameraSpec, Channel, Head
+from thermocald.store.recording import read_testfield
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from thermocald.config import CalibrationConfig, CameraConfig, Config
+    from thermocald.hal import Camera, Clock, Frame
+
+__all__ = ["CameraPlan", "adjustment_settings", "check_series", "plan_cameras", "series_head"]
+
+_UNKNOWN_PITCH_MM = 0.001
+
+
+@dataclass(frozen=True, eq=False)
+class CameraPlan:
+    """One camera of the configuration, ready to be started.
+
+    sensor, testfield, calibrator: None if its epochs are only acquired.
+    """
+
+    config: CameraConfig
+    calibration: CalibrationConfig
+    camera: Camera
+    sensor: Sensor | None
+    testfield: TestField | None
+    calibrator: Calibrator | None
+
+    @property
+    def name(self) -> str:
+        return self.config.name
+
+
+def plan_cameras(config: Config, clock: Clock) -> list[CameraPlan]:
+    """Build the cameras; nothing is opened. Raises ConfigurationError."""
+    return [_plan(config, camera, clock) for camera in config.cameras]
+
+
+def _plan(config: Config, one: CameraConfig, clock: Clock) -> CameraPlan:
+    camera = open_device("camera", one.driver, one.options, clock)
+    calibration = config.calibration_of(one)
+    sensor, field = _sensor(one), None
+    if one.testfield is not None:
+        field = read_testfield(one.testfield)
+        if sensor is None:
+            raise ConfigurationError(
+                f"camera {one.name!r}: a test field needs `sensor: {{width_px: …, height_px: …, "
+                "pixel_pitch_mm: …}}` too"
+            )
+    elif hasattr(camera, "field") and hasattr(camera, "model"):
+        # a rendered camera knows what it looks at
+        field, sensor = camera.field, sensor or camera.model.sensor
+    calibrator = None
+    if field is not None and sensor is not None:
+        calibrator = Calibrator(
+            sensor,
+            field,
+            adjustment_settings(calibration),
+            nominal_c=one.principal_distance_mm,
+            interior=_held(one, calibration),
+            sigma_floor_px=calibration.sigma_floor_px,
+        )
+    return CameraPlan(one, calibration, camera, sensor, field, calibrator)
+
+
+def _sensor(one: CameraConfig) -> Sensor | None:
+    if one.sensor is None:
+        return None
+    return Sensor(one.sensor.width_px, one.sensor.height_px, one.sensor.pixel_pitch_mm)
+
+
+def adjustment_settings(calibration: CalibrationConfig) -> AdjustmentSettings:
+    """The settings of an epoch's adjustment."""
+    return AdjustmentSettings(
+        free=tuple(calibration.free),
+        priors={name: (prior.value, prior.sd) for name, prior in calibration.priors.items()},
+        snooping_alpha=calibration.snooping_alpha,
+        bounds=GeometryBounds(correlation=calibration.correlation_bound),
+    )
+
+
+def _held(one: CameraConfig, calibration: CalibrationConfig) -> InteriorOrientation | None:
+    """Start values where something is held at a value."""
+    if not calibration.fixed:
+        return None
+    values: dict[str, float] = dict(calibration.fixed.items())
+    if "c" not in values:
+        if one.principal_distance_mm is None:
+            raise ConfigurationError(
+                f"camera {one.name!r}: `fixed` needs principal_distance_mm too, or c among it"
+            )
+        values["c"] = one.principal_distance_mm
+    return InteriorOrientation.from_mapping(values)
+
+
+def series_head(
+    plan: CameraPlan, frame: Frame, channels: Iterable[str]
+) -> tuple[Head, TestField, dict[str, Any]]:
+    """(head, test field, settings) of the series that begins with a frame."""
+    extra: dict[str, Any] = {}
+    sensor = plan.sensor
+    if sensor is None:
+        # nothing is computed from it: the series is acquired only
+        height, width = (1, 1) if frame.image is None else frame.image.shape
+        sensor = Sensor(int(width), int(height), _UNKNOWN_PITCH_MM)
+        extra["pixel_pitch_unknown"] = True
+    spec = CameraSpec(plan.name, sensor, plan.config.principal_distance_mm, None)
+    head = Head(
+        name=f"{plan.name}-{plan.config.series}",
+        series=plan.config.series,
+        interval=plan.config.period_s,
+        camera=spec,
+        channels={name: Channel() for name in channels},
+        extra=extra,
+    )
+    field = plan.testfield or TestField.build([], np.empty((0, 3)))
+    return head, field, _settings(plan.calibration)
+
+
+def _settings(calibration: CalibrationConfig) -> dict[str, Any]:
+    settings: Mapping[str, Any] = calibration.model_dump(mode="json")
+    return dict(settings)
+
+
+def _same_field(a: TestField, b: TestField) -> bool:
+    """Whether two test fields have the same targets at the same places."""
+    return a.names == b.names and np.array_equal(a.points, b.points)
+
+
+def check_series(plan: CameraPlan, field: TestField) -> None:
+    """Raise ConfigurationError if a series that goes on would change its test field."""
+    if plan.testfield is not None and not _same_field(plan.testfield, field):
+        raise ConfigurationError(
+            f"camera {plan.name!r}: series {plan.config.series!r} was begun with another test "
+            "field; give the series another name"
+        )

@@ -1,0 +1,286 @@
+"""The process: signals, systemd, reload, status; the work is the station's.
+
+SIGTERM and SIGINT finish the epoch in hand; SIGHUP reads the configuration anew, or says why not
+and goes on with the old one.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from thermocald import __version__
+from thermocald.acquisition.steady_clock import SteadyClock
+from thermocald.config import load_config
+from thermocald.daemon.live_state import LiveState
+from thermocald.daemon.notify import (
+    notify,
+    notify_ready,
+    notify_reloading,
+    watchdog_interval_s,
+)
+from thermocald.daemon.station import Station
+from thermocald.daemon.store_guard import StoreGuard
+from thermocald.errors import ThermocaldError
+from thermocald.hal import option_names
+from thermocald.store.row import Event
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from thermocald.config import Config
+
+__all__ = ["Service"]
+
+log = logging.getLogger(__name__)
+
+_TURN_S = 0.25
+_STATUS_EVERY_S = 1.0
+_GRACE_S = 20.0
+_SWITCH_INTERVAL_S = 0.0005  # of the interpreter: a tick must not wait 5 ms for a calculation
+
+
+class Service:
+    """One daemon in this process.
+
+    path: of the configuration, which SIGHUP reads again; until_finished: end when all recordings
+    have been played or all epochs taken. Other arguments as `Station`.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        path: Path | None = None,
+        *,
+        fast: bool = False,
+        epochs: int = 0,
+        until_finished: bool = False,
+        hang_after_s: float = 60.0,
+        start_condition: str = "",
+        on_turn: Callable[[Station], None] | None = None,
+    ) -> None:
+        self.config = config
+        self.clock = SteadyClock()
+        self.live = LiveState.beside(config.store.path)
+        self._path = path
+        self._options: dict[str, Any] = {
+            "fast": fast,
+            "epochs": epochs,
+            "hang_after_s": hang_after_s,
+            "start_condition": start_condition,
+        }
+        self._until_finished = until_finished
+        self._on_turn = on_turn
+        self._started = self.clock.utc()
+        self._wake = threading.Event()
+        self._end = False
+        self._reload = False
+        self._complained: list[str] = []
+        self._dashboard: subprocess.Popen[bytes] | None = None
+        self._dashboard_at = 0.0
+
+    def run(self) -> bool:
+        """Work until told to end; True if everything let go, False if a device hangs.
+
+        Raises ThermocaldError for what prevents the start.
+        """
+        sys.setswitchinterval(_SWITCH_INTERVAL_S)
+        self._guard = StoreGuard(self.config.store.path, durable=self.config.store.durable)
+        done = False
+        try:
+            self._station = self._build(self.config)
+            with self._signals():
+                self._station.start()
+                log.info("thermocald %s runs", __version__, extra={"event": "started"})
+                self._tell("started", f"thermocald {__version__} started")
+                notify_ready(self._line())
+                try:
+                    self._loop()
+                finally:
+                    notify("STOPPING=1")
+                    done = self._station.stop(_GRACE_S)
+                    self._stop_dashboard()
+                    self._tell("stopped", "thermocald stopped")
+        finally:
+            self._guard.close()
+            self.live.remove()
+        return done
+
+    def _build(self, config: Config) -> Station:
+        return Station(config, self._guard, self.clock, self.live, **self._options)
+
+    def _loop(self) -> None:
+        interval = watchdog_interval_s()
+        turn_s = _TURN_S if interval is None else min(_TURN_S, interval)
+        fed = written = float("-inf")
+        while not self._end:
+            self._wake.wait(turn_s)
+            now = time.monotonic()
+            if self._reload:
+                self._reload = False
+                self._reload_configuration()
+            if (step := self.clock.check()) is not None:
+                data = {"seconds": step.seconds, "adopted": step.adopted}
+                self._guard.event(Event(step.utc, "clock_step", step.text, data=data))
+            if self._station.preview:
+                self._keep_dashboard()
+            stalled = self._station.stalled()
+            self._complain(stalled)
+            if interval is not None and not stalled and now - fed >= min(interval, 1.0):
+                fed = now
+                notify("WATCHDOG=1")
+            if now - written >= _STATUS_EVERY_S:
+                written = now
+                self._guard.flush()
+                self.live.write_status(self.status())
+                notify(f"STATUS={self._line()}")
+            if self._on_turn is not None:
+                self._on_turn(self._station)
+            if self._until_finished and self._station.finished:
+                break
+
+    def status(self) -> dict[str, Any]:
+        """What `thermocald status` shows."""
+        return {
+            "version": __version__,
+            "pid": os.getpid(),
+            "started": self._started,
+            "utc": self.clock.utc(),
+            "configuration": None if self._path is None else str(self._path.absolute()),
+            "clock": {"trusted": self.clock.trusted(), "error_s": self.clock.error_s},
+            "store": {**self._guard.status(), "path": str(self.config.store.path.absolute())},
+            "stalled": self._station.stalled(),
+            **self._station.status(),
+        }
+
+    def _line(self) -> str:
+        """The status line of `systemctl status`."""
+        parts = []
+        for camera in self._station.cameras:
+            last = camera.last
+            if camera.link.state != "open" or not last:
+                parts.append(f"{camera.plan.name}: {camera.link.why or camera.link.state}")
+                continue
+            text = f"{camera.plan.name}: epoch {last['epoch']}, {last['temperature']:.1f} °C"
+            if last["status"] == "ok":
+                text += f", c {last['c']:.4f} mm, {last['state']}"
+            else:
+                text += f", {last['status']}"
+            parts.append(text)
+        if self._guard.away:
+            parts.append(f"store: {self._guard.away}")
+        return "; ".join(parts)[:500]
+
+    def _reload_configuration(self) -> None:
+        notify_reloading()
+        try:
+            self._change_to(self._read_again())
+        except ThermocaldError as error:
+            log.error(
+                "the configuration was not read anew, the old one stays: %s", error,
+                extra={"event": "reload_failed"},
+            )  # fmt: skip
+            self._tell("reload_failed", str(error))
+        notify_ready(self._line())
+
+    def _read_again(self) -> Config:
+        if self._path is None:
+            return self.config
+        config = load_config(self._path, option_names)
+        if config.store != self.config.store:
+            log.warning("another store needs a restart; the old one is still used")
+            config = config.model_copy(update={"store": self.config.store})
+        return config
+
+    def _change_to(self, config: Config) -> None:
+        if config == self.config:
+            log.info("the configuration has not changed", extra={"event": "reloaded"})
+            return
+        new = self._build(config)  # what is wrong with it shows before the old one ends
+        if not self._station.stop(_GRACE_S):
+            log.error("a device does not let go; it may not be there for a while")
+        # numbers go on after what the old station kept to its end
+        new = self._build(config)
+        logging.getLogger().setLevel(config.logging.level.upper())
+        self.config, self._station = config, new
+        new.start()
+        log.info("the configuration was read anew", extra={"event": "reloaded"})
+        self._tell("reloaded", "the configuration was read anew")
+
+    def _complain(self, stalled: list[str]) -> None:
+        for text in stalled:
+            if text not in self._complained:
+                log.error(text, extra={"event": "hung"})
+                self._tell("hung", text)
+        for text in self._complained:
+            if text not in stalled:
+                log.info("%s no more", text, extra={"event": "hung_no_more"})
+        self._complained = stalled
+
+    def _tell(self, kind: str, text: str) -> None:
+        self._guard.event(Event(self.clock.utc(), kind, text))
+
+    def _keep_dashboard(self) -> None:
+        """The page runs in a process of its own; it is started again, at most every 10 s."""
+        child = self._dashboard
+        if child is not None and child.poll() is None:
+            return
+        if time.monotonic() < self._dashboard_at:
+            return
+        if child is not None:
+            log.warning("the dashboard ended (%s); it is started again", child.returncode)
+        self._dashboard_at = time.monotonic() + 10.0
+        command = [sys.executable, "-m", "thermocald", "dashboard"]
+        command += ["--store", str(self.config.store.path.absolute())]
+        command += ["--live", str(self.live.folder.absolute())]
+        dashboard = self.config.dashboard
+        command += ["--host", dashboard.host, "--port", str(dashboard.port)]
+        if dashboard.token_file is not None:
+            command += ["--token-file", str(dashboard.token_file)]
+        environment = {k: v for k, v in os.environ.items() if k not in _PRIVATE}
+        try:
+            self._dashboard = subprocess.Popen(command, env=environment)
+        except OSError as error:
+            log.error("the dashboard cannot be started: %s", error)
+
+    def _stop_dashboard(self) -> None:
+        child = self._dashboard
+        if child is None or child.poll() is not None:
+            return
+        child.terminate()
+        try:
+            child.wait(3.0)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.wait()
+
+    @contextmanager
+    def _signals(self) -> Iterator[None]:
+        def end(*_: object) -> None:
+            self._end = True
+            self._wake.set()
+
+        def reload(*_: object) -> None:
+            self._reload = True
+
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        wanted = {signal.SIGTERM: end, signal.SIGINT: end, signal.SIGHUP: reload}
+        before = {number: signal.signal(number, action) for number, action in wanted.items()}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+_PRIVATE = {"NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC"}

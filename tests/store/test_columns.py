@@ -7,7 +7,7 @@ import pytest
 
 from thermocald.epoch import Epoch
 from thermocald.errors import StoreError
-from thermocald.store import columns, database
+from thermocald.store import columns
 from thermocald.store.database import Store
 from thermocald.store.row import EpochResult
 
@@ -20,7 +20,6 @@ NAMES = ["epoch", "frame_time", "temperature", "c", "sd_c", "blur", "status"]
 def small_chunks(monkeypatch):
     monkeypatch.setattr(columns, "CHUNK", CHUNK)
     monkeypatch.setattr(columns, "MERGED", MERGED)
-    monkeypatch.setattr(database, "CHUNK", CHUNK)
 
 
 def result(number: int) -> EpochResult:
@@ -144,10 +143,28 @@ def test_another_chunk_length_later_on(store_path, head, field, monkeypatch):
         series = store.create_series(head, field)
         for i in range(2 * CHUNK + 5):
             store.append(series, epoch(i), result(i), extra={"blur": 0.5 * i})
-    for module in (columns, database):
-        monkeypatch.setattr(module, "CHUNK", 7)
+    monkeypatch.setattr(columns, "CHUNK", 7)
     with Store.open(store_path, "append", durable=False) as store:
         for i in range(2 * CHUNK + 5, 4 * CHUNK):
             store.append(series, epoch(i), result(i), extra={"blur": 0.5 * i})
         assert chunks(store) == 2 + (2 * CHUNK) // 7 // MERGED
         assert read(store, series) == expected(range(4 * CHUNK))
+
+
+def late(store: Store) -> int:
+    return store._db.execute("SELECT count(*) FROM late_epoch").fetchone()[0]
+
+
+def test_only_calibrations_after_their_chunk_are_looked_up(store, series):
+    """A daemon that is a little late must not make every later reading slow."""
+    for i in range(3 * CHUNK):
+        store.append(series, epoch(i), None, extra={"blur": 0.5 * i})
+        if i >= 3:
+            store.amend(series, i - 3, result(i - 3))
+    for i in range(3 * CHUNK - 3, 3 * CHUNK):
+        store.amend(series, i, result(i))
+    assert read(store, series) == expected(range(3 * CHUNK))
+    assert late(store) == 3 * 4  # of each chunk, the three waiting and the one in hand
+    store.rebuild_columns(series)
+    assert late(store) == 0
+    assert read(store, series) == expected(range(3 * CHUNK))

@@ -25,6 +25,7 @@ def version_1(store_path, field, head, make_epoch, make_result, monkeypatch):
     with sqlite3.connect(store_path) as database:
         database.execute("DROP TABLE column_chunk")
         database.execute("DROP TABLE status_code")
+        database.execute("DROP TABLE late_epoch")
         database.execute("PRAGMA user_version = 1")
     database.close()
     return store_path

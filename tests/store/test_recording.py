@@ -238,3 +238,18 @@ def test_unknown_keys_are_what_a_store_would_keep(recording_path):
         "date": "2020-09-13",
         "where": {"1": "a", "lamps": [60, None]},
     }
+
+
+def test_files_as_windows_writes_them(recording_path):
+    """A byte order mark, CR LF, and a missing end of the last line."""
+    expected = read_recording(recording_path)
+    for name in ("recording.yaml", "epochs.csv", "testfield.csv", "observations.csv"):
+        text = (recording_path / name).read_text()
+        (recording_path / name).write_bytes(
+            b"\xef\xbb\xbf" + text.rstrip("\n").replace("\n", "\r\n").encode()
+        )
+    found = read_recording(recording_path)
+    assert found.head == expected.head
+    assert found.testfield.names == expected.testfield.names
+    for a, b in zip(found.epochs, expected.epochs, strict=True):
+        assert same(a.observations, b.observations)

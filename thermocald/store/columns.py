@@ -4,23 +4,18 @@ SQLite hands out rows at some microseconds each; a million epochs would take sec
 CHUNK epochs of a series have accumulated, each of their columns is written once more as one blob
 of float64, in the transaction of the last of them; and when MERGED such chunks have accumulated,
 they become one, since long blobs are read twice as fast. Reading joins the chunks and takes the
-tail, and the epochs that were calibrated anew, from the rows. Chunks are derived and can be
-rebuilt.
-
-Sources of columns are: `number`, times and counts; the parameters and `sd_<parameter>`;
-`temperatures.<channel>` as read; `extra.<name>`; `status` as a code of the table status_code.
+tail, and the epochs that were calibrated after their chunk was written, from the rows. Chunks are
+derived and can be rebuilt.
 """
 
 from __future__ import annotations
 
-import json
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermocald.errors import StoreError
-from thermocald.photogrammetry.camera_model import PARAMETER_NAMES
-from thermocald.store.schema import sql_name
+from thermocald.store.epoch_columns import FIELDS, late_columns, latest_columns
 
 if TYPE_CHECKING:
     import sqlite3
@@ -32,88 +27,81 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CHUNK",
-    "FIXED",
     "MERGED",
     "build_missing_chunks",
     "loose_rows",
+    "note_amended",
     "read_columns",
     "rebuild_chunks",
-    "status_codes",
 ]
 
 CHUNK = 1024
 MERGED = 16
 
-FIXED = (
-    "number",
-    "frame_time",
-    "temperature_time",
-    "clock_trusted",
-    "sigma0",
-    "redundancy",
-    "n_observations",
-    "n_rejected",
-    *PARAMETER_NAMES,
-    *(f"sd_{name}" for name in PARAMETER_NAMES),
-)
-_JSON = ("temperatures", "extra")
-_FIELDS = (*FIXED, "status", *_JSON)
-
 
 def read_columns(
     connection: sqlite3.Connection, series: int, names: Sequence[str]
 ) -> dict[str, Array]:
-    """Columns by their source names, (E,) float64 each, NaN where an epoch has none.
+    """Columns by their source names (see `epoch_columns`), (E,) each, NaN where there is none.
 
     Raises StoreError if a chunk does not fit the others.
     """
-    # named, since the planner would walk all epochs in the index of numbers
-    (amended,) = connection.execute(
-        "SELECT EXISTS (SELECT 1 FROM epoch INDEXED BY epoch_amended "
-        "WHERE series_id = ? AND revision > 0)",
-        (series,),
-    ).fetchone()
-    wanted = list(dict.fromkeys([*names, "number"] if amended else names))
+    fields = [name.split(".")[0] for name in names]
     chunks = _Chunks(connection, series)
-    tail = _rows(connection, series, wanted, "number > ? AND revision = 0", chunks.last_number)
+    tail = latest_columns(connection, series, fields, chunks.last_number)
+    late = late_columns(connection, series, fields)
+    rows = np.empty(0, dtype=np.int64)
+    if late["number"].size:
+        numbers = np.empty(chunks.rows)
+        chunks.fill("number", numbers)
+        rows = np.searchsorted(numbers, late["number"])
     columns = {}
-    for name in wanted:
-        columns[name] = np.empty(chunks.rows + len(tail[name]))
-        chunks.fill(name, columns[name][: chunks.rows])
-        columns[name][chunks.rows :] = tail[name]
-    if amended:
-        changes = _rows(connection, series, wanted, "revision > ?", 0, order="id")
-        rows = np.searchsorted(columns["number"], changes["number"])
-        for name in wanted:
-            columns[name][rows] = changes[name]
-    return {name: columns[name] for name in names}
+    for name in names:
+        column = columns[name] = np.empty(chunks.rows + tail["number"].size)
+        chunks.fill(name, column[: chunks.rows])
+        column[chunks.rows :] = tail.get(name, np.nan)
+        column[rows] = late.get(name, np.nan)
+    return columns
 
 
 def loose_rows(connection: sqlite3.Connection, series: int) -> int:
     """How many epochs of a series are in no chunk yet."""
-    last = _Chunks(connection, series).last_number
     (count,) = connection.execute(
         "SELECT count(*) FROM epoch WHERE series_id = ? AND revision = 0 AND number > ?",
-        (series, last),
+        (series, _Chunks(connection, series).last_number),
     ).fetchone()
     return int(count)
+
+
+def note_amended(connection: sqlite3.Connection, series: int, number: int, epoch_id: int) -> None:
+    """Remember a later calibration if its epoch is in a chunk; within the caller's transaction."""
+    if number <= _Chunks(connection, series).last_number:
+        connection.execute(
+            "INSERT INTO late_epoch (epoch_id, series_id) VALUES (?, ?)", (epoch_id, series)
+        )
 
 
 def build_missing_chunks(connection: sqlite3.Connection, series: int) -> None:
     """Write the chunks that the rows allow; within the caller's transaction."""
     chunks = _Chunks(connection, series)
     first_row, last = chunks.rows, chunks.last_number
-    while True:
-        rows = _select(
-            connection, series, _FIELDS, "number > ? AND revision = 0", last, limit=CHUNK
-        )
-        if len(rows) < CHUNK:
-            return
-        columns = _columns(connection, _FIELDS, rows)
-        last = int(columns["number"][-1])
+    while end := connection.execute(
+        "SELECT number FROM epoch WHERE series_id = ? AND number > ? AND revision = 0 "
+        "ORDER BY number LIMIT 1 OFFSET ?",
+        (series, last, CHUNK - 1),
+    ).fetchone():
+        columns = latest_columns(connection, series, FIELDS, last, end[0])
+        last = end[0]
         _insert(connection, series, first_row, last, columns)
         first_row += CHUNK
         _merge(connection, series)
+
+
+def rebuild_chunks(connection: sqlite3.Connection, series: int) -> None:
+    """Derive the chunks of a series anew from its rows; within the caller's transaction."""
+    connection.execute("DELETE FROM column_chunk WHERE series_id = ?", (series,))
+    connection.execute("DELETE FROM late_epoch WHERE series_id = ?", (series,))
+    build_missing_chunks(connection, series)
 
 
 def _merge(connection: sqlite3.Connection, series: int) -> None:
@@ -148,12 +136,6 @@ def _insert(
         "VALUES (?, ?, ?, ?, ?)",
         [(series, name, first_row, last, v.tobytes()) for name, v in columns.items()],
     )
-
-
-def rebuild_chunks(connection: sqlite3.Connection, series: int) -> None:
-    """Derive the chunks of a series anew from its rows; within the caller's transaction."""
-    connection.execute("DELETE FROM column_chunk WHERE series_id = ?", (series,))
-    build_missing_chunks(connection, series)
 
 
 class _Chunks:
@@ -199,60 +181,3 @@ class _Chunks:
             target[8 * first : 8 * first + len(data)] = data
             done = first + len(data) // 8
         column[done:] = np.nan
-
-
-def _rows(
-    connection: sqlite3.Connection,
-    series: int,
-    names: Sequence[str],
-    where: str,
-    value: int,
-    order: str = "number",
-) -> dict[str, Array]:
-    """Columns by their source names from the rows themselves."""
-    fields = list(dict.fromkeys(name.split(".")[0] for name in names))
-    rows = _select(connection, series, fields, where, value, order)
-    found = _columns(connection, fields, rows)
-    missing = np.full(len(rows), np.nan)
-    return {name: found.get(name, missing) for name in names}
-
-
-def _select(
-    connection: sqlite3.Connection,
-    series: int,
-    fields: Sequence[str],
-    where: str,
-    value: int,
-    order: str = "number",
-    limit: int = -1,
-) -> list[tuple[Any, ...]]:
-    return connection.execute(
-        f"SELECT {', '.join(map(sql_name, fields))} FROM epoch WHERE series_id = ? AND {where} "
-        f"ORDER BY {order} LIMIT ?",
-        (series, value, limit),
-    ).fetchall()
-
-
-def _columns(
-    connection: sqlite3.Connection, fields: Sequence[str], rows: list[tuple[Any, ...]]
-) -> dict[str, Array]:
-    """Rows of `epoch` → columns; temperatures and extra become one column per name in them."""
-    columns: dict[str, Array] = {}
-    values = zip(*rows, strict=True) if rows else [()] * len(fields)
-    for field, column in zip(fields, values, strict=True):
-        if field == "status":
-            codes = {status: code for code, status in status_codes(connection)}
-            columns[field] = np.array([codes[status] for status in column], dtype=np.float64)
-        elif field in _JSON:
-            found = [json.loads(text) for text in column]
-            for name in dict.fromkeys(name for mapping in found for name in mapping):
-                columns[f"{field}.{name}"] = np.array(
-                    [mapping.get(name) for mapping in found], dtype=np.float64
-                )
-        else:
-            columns[field] = np.array(column, dtype=np.float64)  # None, SQL's NULL, becomes NaN
-    return columns
-
-
-def status_codes(connection: sqlite3.Connection) -> list[tuple[int, str]]:
-    return connection.execute("SELECT code, status FROM status_code").fetchall()

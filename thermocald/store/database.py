@@ -7,8 +7,6 @@ revision, and triggers in the file refuse everything else.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import threading
 from contextlib import contextmanager
 from dataclasses import replace
@@ -17,26 +15,23 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from thermocald.errors import StoreError, StoreFullError
-from thermocald.store.columns import (
-    CHUNK,
-    FIXED,
-    build_missing_chunks,
-    loose_rows,
-    read_columns,
-    rebuild_chunks,
-    status_codes,
-)
+from thermocald.store import columns as column_chunks
 from thermocald.store.connection import Mode, connect, in_words
+from thermocald.store.epoch_columns import FIXED, status_codes
 from thermocald.store.epoch_table import (
     StoredEpoch,
     insert_epoch,
     select_covariance,
     select_epochs,
 )
-from thermocald.store.head import Head, head_document, parse_head
 from thermocald.store.readings import interpolate_readings
 from thermocald.store.row import NOT_CALIBRATED, EpochResult, Event, StoredSeries
-from thermocald.store.testfield_file import parse_testfield, testfield_csv
+from thermocald.store.series_table import (
+    insert_events,
+    insert_series,
+    select_events,
+    select_series,
+)
 
 if TYPE_CHECKING:
     import sqlite3
@@ -48,6 +43,7 @@ if TYPE_CHECKING:
 
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.testfield import Observations, TestField
+    from thermocald.store.head import Head
 
     Array = NDArray[np.float64]
 
@@ -101,30 +97,14 @@ class Store:
         """Begin a series; StoreError if the camera has one of this name already."""
         if taken := {*FIXED, *_DERIVED} & set(head.channels):
             raise StoreError(f"a temperature channel cannot be called {min(taken)!r}")
-        csv = testfield_csv(testfield)
-        digest = hashlib.sha256(csv.encode()).hexdigest()
         with self._transaction(f"series {head.series!r} was not begun"):
             if self._select_series(head.camera.name, head.series):
                 raise StoreError(
                     f"{self.path}: camera {head.camera.name!r} has a series {head.series!r} "
                     "already; choose another name"
                 )
-            self._db.execute(
-                "INSERT OR IGNORE INTO testfield (digest, csv) VALUES (?, ?)", (digest, csv)
-            )
-            self._db.execute(
-                "INSERT INTO series (camera, name, start, created_utc, head, identity, settings, "
-                "testfield_id) SELECT ?, ?, ?, ?, ?, ?, ?, id FROM testfield WHERE digest = ?",
-                (
-                    head.camera.name,
-                    head.series,
-                    start,
-                    created_utc,
-                    json.dumps(head_document(head), default=str),
-                    json.dumps(dict(identity or {}), default=str),
-                    json.dumps(dict(settings or {}), default=str),
-                    digest,
-                ),
+            insert_series(
+                self._db, head, testfield, start, identity or {}, settings or {}, created_utc
             )
         return self.find_series(head.camera.name, head.series)
 
@@ -185,10 +165,11 @@ class Store:
                     f"epoch {last}; numbers must increase"
                 )
             insert_epoch(self._db, series.id, stored)
-            self._insert_events(events)
-            if loose + 1 >= CHUNK:
-                build_missing_chunks(self._db, series.id)
-        self._ends[series.id] = (epoch.number, (loose + 1) % CHUNK)
+            insert_events(self._db, events)
+            full = loose + 1 >= column_chunks.CHUNK
+            if full:
+                column_chunks.build_missing_chunks(self._db, series.id)
+        self._ends[series.id] = (epoch.number, 0 if full else loose + 1)
 
     def amend(
         self,
@@ -211,17 +192,18 @@ class Store:
                 then.clock_trusted,
                 then.revision + 1,
             )
-            insert_epoch(self._db, series.id, stored)
+            epoch_id = insert_epoch(self._db, series.id, stored)
+            column_chunks.note_amended(self._db, series.id, number, epoch_id)
 
     def add_event(self, event: Event) -> None:
         """Log something that happened apart from an epoch."""
         with self._transaction("an event was not kept"):
-            self._insert_events([event])
+            insert_events(self._db, [event])
 
     def rebuild_columns(self, series: StoredSeries) -> None:
         """Derive the column chunks anew: after many `amend`s reading is faster for it."""
         with self._transaction("the columns were not rebuilt"):
-            rebuild_chunks(self._db, series.id)
+            column_chunks.rebuild_chunks(self._db, series.id)
 
     def last_epoch(self, series: StoredSeries) -> int | None:
         """The number of the last epoch kept, None if there is none: where to resume."""
@@ -277,10 +259,12 @@ class Store:
         source = {name: _source(name, series) for name in names}
         with self._lock, in_words(self.path, "columns cannot be read", reading=True):
             columns: dict[str, NDArray[Any]] = dict(
-                read_columns(self._db, series.id, list(dict.fromkeys(source.values())))
+                column_chunks.read_columns(
+                    self._db, series.id, list(dict.fromkeys(source.values()))
+                )
             )
             if "status" in columns:
-                codes = dict(status_codes(self._db))
+                codes = status_codes(self._db)
                 words = np.array([codes.get(i, "") for i in range(max(codes, default=0) + 1)])
                 columns["status"] = words[columns["status"].astype(np.int64)]
         return {name: columns[source[name]] for name in names}
@@ -298,16 +282,8 @@ class Store:
 
     def events(self, series: StoredSeries | None = None, since_utc: float = 0.0) -> list[Event]:
         """What happened, oldest first; of one series, or all."""
-        rows = self._query(
-            "SELECT utc, kind, text, series_id, epoch, data FROM event WHERE utc >= ? "
-            "AND series_id IS ifnull(?, series_id) ORDER BY id",
-            (since_utc, None if series is None else series.id),
-        )
-        with in_words(self.path, "events cannot be read", reading=True):
-            return [
-                Event(utc, kind, text, series_id, epoch, json.loads(data))
-                for utc, kind, text, series_id, epoch, data in rows
-            ]
+        with self._lock, in_words(self.path, "events cannot be read", reading=True):
+            return select_events(self._db, None if series is None else series.id, since_utc)
 
     def checkpoint(self) -> bool:
         """Move what is in the -wal file into the store; False if a reader or the disk forbids."""
@@ -326,25 +302,8 @@ class Store:
     def _select_series(
         self, camera: str | None = None, name: str | None = None
     ) -> list[StoredSeries]:
-        rows = self._query(
-            "SELECT s.id, head, csv, start, identity, settings, created_utc FROM series s "
-            "JOIN testfield t ON t.id = testfield_id "
-            "WHERE camera = ifnull(?, camera) AND name = ifnull(?, name) ORDER BY s.id",
-            (camera, name),
-        )
-        with in_words(self.path, "the series cannot be read", reading=True):
-            return [
-                StoredSeries(
-                    number,
-                    parse_head(json.loads(head), self.path),
-                    parse_testfield(csv, self.path),
-                    start,
-                    json.loads(identity),
-                    json.loads(settings),
-                    created,
-                )
-                for number, head, csv, start, identity, settings, created in rows
-            ]
+        with self._lock, in_words(self.path, "the series cannot be read", reading=True):
+            return select_series(self._db, self.path, camera, name)
 
     def _end(self, series: StoredSeries) -> tuple[int, int]:
         """The last epoch number of a series (-1: none) and how many rows are in no chunk."""
@@ -352,16 +311,7 @@ class Store:
             "SELECT ifnull(max(number), -1) FROM epoch WHERE series_id = ?", (series.id,)
         )
         with self._lock, in_words(self.path, "the store cannot be read", reading=True):
-            return int(last), loose_rows(self._db, series.id)
-
-    def _insert_events(self, events: Iterable[Event]) -> None:
-        self._db.executemany(
-            "INSERT INTO event (utc, kind, text, series_id, epoch, data) VALUES (?, ?, ?, ?, ?, ?)",
-            [
-                (e.utc, e.kind, e.text, e.series, e.epoch, json.dumps(dict(e.data), default=str))
-                for e in events
-            ],
-        )
+            return int(last), column_chunks.loose_rows(self._db, series.id)
 
     def _query(self, statement: str, values: Sequence[Any]) -> list[tuple[Any, ...]]:
         with self._lock, in_words(self.path, "the store cannot be read", reading=True):

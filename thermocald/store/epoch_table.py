@@ -81,8 +81,8 @@ class StoredEpoch:
     revision: int
 
 
-def insert_epoch(connection: sqlite3.Connection, series: int, stored: StoredEpoch) -> None:
-    """Insert one epoch with its details; within the caller's transaction."""
+def insert_epoch(connection: sqlite3.Connection, series: int, stored: StoredEpoch) -> int:
+    """Insert one epoch with its details and return its id; within the caller's transaction."""
     epoch, result, seen = stored.epoch, stored.result, stored.epoch.observations
     connection.execute("INSERT OR IGNORE INTO status_code (status) VALUES (?)", (result.status,))
     cursor = connection.execute(
@@ -122,6 +122,7 @@ def insert_epoch(connection: sqlite3.Connection, series: int, stored: StoredEpoc
             raise StoreError(f"epoch {epoch.number}: {len(seen)} observations are too many to keep")
         parts += [(first + 1 + i, data[c : c + _PART_BYTES]) for i, c in enumerate(cuts)]
     connection.executemany("INSERT INTO detail (id, data) VALUES (?, ?)", parts)
+    return cursor.lastrowid
 
 
 def select_epochs(

@@ -58,7 +58,6 @@ _BASE = [
         temperatures TEXT NOT NULL, extra TEXT NOT NULL, rejected TEXT NOT NULL,
         frame TEXT NOT NULL, note TEXT NOT NULL, reason TEXT NOT NULL,
         UNIQUE (series_id, number, revision))""",
-    "CREATE INDEX epoch_amended ON epoch (series_id, id) WHERE revision > 0",
     # id = epoch.id * 1024 + part: covariance and observations, cut so that pages fill
     "CREATE TABLE detail (id INTEGER PRIMARY KEY, data BLOB NOT NULL)",
     """CREATE TABLE event (
@@ -73,6 +72,8 @@ _COLUMN_CHUNKS = [
         id INTEGER PRIMARY KEY, series_id INTEGER NOT NULL REFERENCES series(id),
         name TEXT NOT NULL, first_row INTEGER NOT NULL, last_number INTEGER NOT NULL,
         data BLOB NOT NULL, UNIQUE (series_id, name, first_row))""",
+    # calibrations of epochs whose chunk had been written before
+    "CREATE TABLE late_epoch (epoch_id INTEGER PRIMARY KEY, series_id INTEGER NOT NULL)",
     "CREATE TABLE status_code (code INTEGER PRIMARY KEY, status TEXT NOT NULL UNIQUE)",
     "INSERT INTO status_code (status) SELECT DISTINCT status FROM epoch",
 ]

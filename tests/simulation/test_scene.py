@@ -197,21 +197,20 @@ def test_portable_arithmetic_is_right():
     )
 
 
-def test_ring_codes_can_be_read():
-    """Drawn the way they are read: the detector of `detection` finds them where they are."""
-    from thermocald.photogrammetry.detection import find_circles, read_codes
+def test_a_coded_field_is_measured_from_nothing():
+    """Drawn the way it is read: found by ring codes, measured with the true centres' sigmas."""
+    from thermocald.photogrammetry.measurement import Prior, measure
 
     field = demonstration_field("circles")
     model = demonstration_model(field)
     iop, eop = model.interior.as_array(), model.exterior.as_array()
     image = Scene(SENSOR, field).render(iop, eop, seed=3)
-    found = read_codes(image, find_circles(image))
-    wanted = {code: row for row, code in enumerate(field.codes) if code}
-    truth = project(SENSOR, iop, eop, field.points)
-    named = {f"RING{bits}:{n}" for bits, n in zip(found.bits, found.numbers, strict=True)}
-    assert named <= set(wanted)
-    assert len(named) >= 0.9 * len(wanted)
-    assert np.isfinite(truth).all()
+    found = measure(image, field, Prior(SENSOR, principal_distance=3.04))
+    assert found.status.ok, found.status
+    seen = found.observations
+    assert len(seen) >= 140
+    error = (seen.points - project(SENSOR, iop, eop, field.points)[seen.targets]) / seen.sigmas
+    assert np.sqrt(np.mean(error**2)) < 1.3
 
 
 def test_speed(capsys):

@@ -6,7 +6,7 @@ were stored; with `exterior="series"` all epochs are adjusted together from thei
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -57,7 +57,8 @@ class SeriesTable:
     number, frame_time (E,); temperature (E,) °C of the reference at the frame's instant; values,
     sd (E, 16), NaN where there is none; sigma0, n_observations, n_rejected (E,); status, reasons:
     E words and sentences; exterior: `series` or `per_epoch`; level_sd (16,): what all epochs have
-    in common, NaN where it is not told apart; adjustment: the series', None epoch by epoch.
+    in common, NaN where it is not told apart; adjustment: the series', None epoch by epoch; groups: {name: rows of the test field} of what belongs together;
+    without: the values (E, 16) that the series has without some targets (rows).
     """
 
     number: NDArray[np.int64]
@@ -73,6 +74,8 @@ class SeriesTable:
     exterior: str
     level_sd: Array = field(default_factory=lambda: np.full(16, np.nan))
     adjustment: SeriesAdjustment | None = None
+    groups: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
+    without: Callable[[NDArray[np.int64]], Array] | None = None
 
     @property
     def ok(self) -> NDArray[np.bool_]:
@@ -168,7 +171,47 @@ def table_of_series(
         settings.exterior,
         result.level_sd,
         result,
+        _groups(testfield, result),
+        _adjusted_without(head, testfield, observations, result, start),
     )
+
+
+def _groups(testfield: TestField, result: SeriesAdjustment) -> dict[str, NDArray[np.int64]]:
+    """The groups of targets that take part, by the name of their first."""
+    seen = result.observed.any(axis=0)
+    rows: dict[int, list[int]] = {}
+    for row in np.flatnonzero(seen):
+        rows.setdefault(int(testfield.groups[row]), []).append(int(row))
+    return {testfield.names[members[0]]: np.array(members) for members in rows.values()}
+
+
+def _adjusted_without(
+    head: Head,
+    testfield: TestField,
+    observations: Sequence[Observations | None],
+    result: SeriesAdjustment,
+    start: Array,
+) -> Callable[[NDArray[np.int64]], Array]:
+    """A function that adjusts the series again, from the same observations less some targets."""
+    quick = replace(result.settings, snooping_alpha=0.0, target_noise=False)
+
+    def without(rows: NDArray[np.int64]) -> Array:
+        left = [
+            None
+            if o is None
+            else o.select(result.observed[e, o.targets] & ~np.isin(o.targets, rows))
+            for e, o in enumerate(observations)
+        ]
+        return adjust_series(
+            head.camera.sensor,
+            testfield,
+            left,
+            InteriorOrientation.from_array(start[:10]),
+            ExteriorOrientation.from_array(start[10:]),
+            quick,
+        ).values
+
+    return without
 
 
 def settings_for_series(settings: AdjustmentSettings, exterior: str) -> SeriesSettings:

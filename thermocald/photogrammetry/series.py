@@ -31,7 +31,12 @@ from thermocald.photogrammetry.camera_model import (
 from thermocald.photogrammetry.geometry import GeometryBounds, weaknesses
 from thermocald.photogrammetry.normals import ObservationGrid, linearise, series_residuals
 from thermocald.photogrammetry.series_system import SeriesSystem, snoop_series
-from thermocald.photogrammetry.target_noise import correlated_pairs, excess_scatter, noise_ratios
+from thermocald.photogrammetry.target_noise import (
+    correlated_pairs,
+    excess_scatter,
+    noise_ratios,
+    slow_errors,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -98,7 +103,9 @@ class SeriesAdjustment:
     none was estimated; status, reasons: per epoch; stillness (E,): chi-square with 6 degrees of
     freedom of the epoch's own EOP against the series', NaN where the EOP are per epoch; excess_sd
     (16,): by how much neighbouring epochs scatter beyond their noise because the set-up trembles
-    or the light flickers; contained in the covariance, 0 where it is not significant.
+    or the light flickers; contained in the covariance, 0 where it is not significant; trend_sd
+    (16,): what a straight line from the first epoch to the last owes to targets: their coordinates'
+    uncertainty where the visible ones changed on the way, and slow errors of their own.
     """
 
     settings: SeriesSettings
@@ -116,6 +123,7 @@ class SeriesAdjustment:
     reasons: tuple[str, ...]
     stillness: Array
     excess_sd: Array
+    trend_sd: Array
 
     @property
     def sd(self) -> Array:
@@ -387,15 +395,18 @@ class _Series:
         positive = redundancy > 0
         sigma0 = np.sqrt(vPv / np.where(positive, redundancy, 1.0))
         sigma0[~positive] = np.nan
-        relative, level = system.covariances()
+        relative, level, trend = system.covariances()
         pooled = self.variance(estimate)
         if s.scale == "posterior":
             relative *= np.nan_to_num(sigma0, nan=1.0)[:, None, None] ** 2
             level *= pooled
+        trend *= pooled
         if s.target_noise and len(use) >= _ENOUGH_FOR_NOISE:
-            pairs = correlated_pairs(estimate.residuals, use, self._redundancy_share(use))
+            group = self.testfield.groups
+            pairs = correlated_pairs(estimate.residuals, use, group, self._redundancy_share(use))
             if len(pairs):
                 relative += system.correlated(pairs)
+            trend += system.slow(slow_errors(estimate.residuals, use), group)
         excess, own, sound = np.zeros(16), system.own, system.good
         if s.target_noise:
             variances = np.diagonal(relative, axis1=1, axis2=2)[:, own]
@@ -412,7 +423,7 @@ class _Series:
             s, values, relative, level, sigma0, redundancy, use, observed & ~use,
             estimate.residuals, estimate.offsets if self.has_offsets else estimate.offsets * np.nan,
             np.sqrt(system.offset_cofactors() * pooled), tuple(status), tuple(reasons), stillness,
-            np.sqrt(excess),
+            np.sqrt(excess), np.sqrt(np.diag(trend)),
         )  # fmt: skip
 
     def _judge(

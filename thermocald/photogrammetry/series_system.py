@@ -187,8 +187,9 @@ class SeriesSystem:
         )
         return float(q + 2 * T - held)
 
-    def covariances(self) -> tuple[Array, Array]:
-        """Cofactors (E, 16, 16) relative to the series, and (16, 16) of what all have in common.
+    def covariances(self) -> tuple[Array, Array, Array]:
+        """Cofactors (E, 16, 16) relative to the series, (16, 16) of what all epochs have in common,
+        and (16, 16) of what the common unknowns do to a straight line from first to last epoch.
 
         An epoch's parameters depend on the common unknowns by -G; what of G is the same in all
         epochs cancels in differences within the series, the rest is the epoch's own.
@@ -196,14 +197,19 @@ class SeriesSystem:
         E, own, common = len(self.N), self.own, self.common
         relative = np.zeros((E, 16, 16))
         cofactors = self.Q.copy()
-        level = np.zeros((16, 16))
+        level, trend = np.zeros((16, 16)), np.zeros((16, 16))
         width = len(self.Q_common)
         if width:
-            mean = np.zeros((len(own), width))
+            mean, tilt = np.zeros((len(own), width)), np.zeros((len(own), width))
+            line = _line_weights(self.good)
             for part, C in self.couplings():
-                mean += (self.Q[part] @ C).sum(axis=0)
+                G = self.Q[part] @ C
+                mean += G.sum(axis=0)
+                tilt += np.tensordot(line[part], G, axes=1)
             mean /= max(int(self.good.sum()), 1)
             root = _root(self.Q_common)
+            own_tilt = tilt @ root
+            trend[own[:, None], own] = own_tilt @ own_tilt.T
             for part, C in self.couplings():
                 deviation = (self.Q[part] @ C - mean) @ root
                 cofactors[part] += deviation @ np.swapaxes(deviation, 1, 2)
@@ -215,17 +221,51 @@ class SeriesSystem:
             level[common[:, None], own] = level[own[:, None], common].T
         relative[:, own[:, None], own] = cofactors
         relative[~self.good] = 0.0
-        return relative, level
+        return relative, level, trend
+
+    def slow(self, errors: Array, group: NDArray[np.int64]) -> Array:
+        """Covariance (16, 16) of a straight line over the series from targets' slow errors.
+
+        errors (T, 2) px: seen in the residuals, of which a group of targets that errs together has
+        already pulled a part into the parameters; as in the jackknife (HC3) that is put back:
+        Σ Q Aᵀ W (I - H)⁻¹ e eᵀ (I - H)⁻¹ W A Q over the groups.
+        """
+        out = np.zeros((16, 16))
+        w = np.sqrt(self.weights[self.good].mean(axis=0)[:, :2]) if self.good.any() else None
+        if w is None:
+            return out
+        J = self.at.A[..., self.own] * w[..., None]
+        inverse, good = _invert(np.einsum("tkp,tkq->pq", J, J)[None])
+        if not good[0]:
+            return out
+        total = np.zeros((len(self.own), len(self.own)))
+        for label in np.unique(group):
+            rows = group == label
+            e = (errors[rows] * w[rows]).ravel()
+            if not e.any():
+                continue
+            Jg = J[rows].reshape(len(e), -1)
+            left = np.eye(len(e)) - Jg @ inverse[0] @ Jg.T
+            values, vectors = np.linalg.eigh(left)
+            # What a group determines alone cannot be told from its residuals at all.
+            back = vectors @ ((vectors.T @ e) / np.maximum(values, 0.1))
+            pull = inverse[0] @ (Jg.T @ back)
+            total += np.outer(pull, pull)
+        out[self.own[:, None], self.own] = total
+        return out
 
     def correlated(self, pairs: CorrelatedPairs) -> Array:
         """What correlated errors add to the covariance (E, 16, 16) of the epochs' own parameters."""
         added = np.zeros((len(self.N), 16, 16))
         extra = pairs.normal_matrices(self.weights, self.at.A[..., self.own])
         own = self.Q @ extra @ self.Q
-        # A thresholded correlation matrix may be indefinite: no variance falls below a fifth.
-        floor = -0.8 * np.diagonal(self.Q, axis1=1, axis2=2)
-        sound = (np.diagonal(own, axis1=1, axis2=2) > floor).all(axis=1) & self.good
-        added[:, self.own[:, None], self.own] = np.where(sound[:, None, None], own, 0.0)
+        # Covariances from epochs that do not see the same targets may be indefinite together: drawn
+        # in so that they take at most three fifths off the variance of any combination.
+        root = np.linalg.inv(np.linalg.cholesky(self.Q))
+        least = np.linalg.eigvalsh(root @ own @ np.swapaxes(root, 1, 2))[:, 0]
+        drawn = np.where(self.good, np.minimum(1.0, 0.6 / np.maximum(-least, 1e-9)), 0.0)
+        drawn[least >= 0] = 1.0
+        added[:, self.own[:, None], self.own] = drawn[:, None, None] * own
         return added
 
     def offset_cofactors(self) -> Array:
@@ -261,6 +301,16 @@ def snoop_series(tests: Array, offered: Mask, used: Mask, unknowns: int, alpha: 
     suspicious = used & (tests > limit) & (tests >= 0.5 * worst)
     keep: Mask = offered & (used | (tests <= limit)) & ~suspicious
     return keep
+
+
+def _line_weights(good: Mask) -> Array:
+    """Weights (E,) that give the change of a least-squares line from the first epoch to the last."""
+    t = np.flatnonzero(good).astype(np.float64)
+    weights = np.zeros(len(good))
+    if len(t) > 1:
+        centred = t - t.mean()
+        weights[good] = centred / (centred @ centred) * (t[-1] - t[0])
+    return weights
 
 
 def _common_matrix(system: SeriesSystem) -> Array:

@@ -22,16 +22,21 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
     Mask = NDArray[np.bool_]
 
-__all__ = ["CorrelatedPairs", "correlated_pairs", "excess_scatter", "noise_ratios"]
+__all__ = [
+    "CorrelatedPairs",
+    "correlated_pairs",
+    "excess_scatter",
+    "noise_ratios",
+    "slow_errors",
+]
 
 _PRIOR_FREEDOM = 8.0  # weight of the series' noise in a target's own
 _MEDIAN_CHI2_1 = 0.4549
-_SIGNIFICANT = 4.6  # correlations of n pairs below 4.6/√n are noise: 1e-5 two-sided
+_SIGNIFICANT = 4.0  # correlations of n pairs below 4/√n are noise: 6e-5 two-sided
 _FEWEST_PAIRS = 40
 _LEAST_CORRELATION = 0.3
 _SMOOTH = 15  # epochs
 _CLIP = 60.0  # times the median square: beyond it is no scatter but a jump
-_LARGEST_GROUP = 8  # targets: more hang together by chance or by something that is no noise
 
 
 def noise_ratios(residuals: Array, weights: Array, used: Mask, redundancy_share: float) -> Array:
@@ -82,43 +87,67 @@ class CorrelatedPairs:
         return out
 
 
-def correlated_pairs(residuals: Array, used: Mask, redundancy_share: float) -> CorrelatedPairs:
-    """Pairs of coordinates of targets whose residuals correlate over a series.
+def correlated_pairs(
+    residuals: Array, used: Mask, group: NDArray[np.int64], redundancy_share: float
+) -> CorrelatedPairs:
+    """Pairs of coordinates of one group whose residuals correlate over a series.
 
-    residuals (E, T, 2) px; used (E, T). Targets are put together where any of their coordinates
-    correlate significantly (the corners of one marker), and within such a group every covariance
-    counts, the small ones too: leaving them out would understate the group's common error. Without
-    groups the result is empty.
+    residuals (E, T, 2) px; used (E, T); group (T,): what each target belongs to. In a group with a
+    significant correlation every covariance counts, the small ones too: leaving them out would
+    understate the group's common error. Without such groups the result is empty.
     """
     E = len(residuals)
     seen = np.repeat(used, 2, axis=1)
     v = np.where(seen, residuals.reshape(E, -1), 0.0)
     mean = v.sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
     v = np.where(seen, v - mean, 0.0)
-    present = seen.astype(np.float64)
-    n = present.T @ present
-    covariance = (v.T @ v) / np.maximum(n, 1.0)
-    square = (v * v).T @ present / np.maximum(n, 1.0)  # variance of i over epochs shared with j
-    scale = np.sqrt(square * square.T)
-    r = np.divide(covariance, scale, out=np.zeros_like(covariance), where=scale > 0)
-    limit = np.maximum(_SIGNIFICANT / np.sqrt(np.maximum(n, 1.0)), _LEAST_CORRELATION)
-    linked = (np.abs(r) > limit) & (n >= _FEWEST_PAIRS)
-    targets = linked[::2, ::2] | linked[::2, 1::2] | linked[1::2, ::2] | linked[1::2, 1::2]
-    np.fill_diagonal(targets, False)
-    label = _groups(targets)
-    group = np.repeat(label, 2)
-    together = (group[:, None] == group) & (group >= 0) & (n > 0)
-    i, j = np.nonzero(np.triu(together, 1))
-    return CorrelatedPairs(i, j, covariance[i, j] / redundancy_share)
+    left, right, covariances = [], [], []
+    for label in np.flatnonzero(np.bincount(group) > 1):
+        targets = np.flatnonzero(group == label)
+        columns = np.stack([2 * targets, 2 * targets + 1], axis=1).ravel()
+        part, present = v[:, columns], seen[:, columns].astype(np.float64)
+        n = present.T @ present
+        covariance = (part.T @ part) / np.maximum(n, 1.0)
+        square = (part * part).T @ present / np.maximum(n, 1.0)  # of i over epochs shared with j
+        scale = np.sqrt(square * square.T)
+        r = np.divide(covariance, scale, out=np.zeros_like(covariance), where=scale > 0)
+        limit = np.maximum(_SIGNIFICANT / np.sqrt(np.maximum(n, 1.0)), _LEAST_CORRELATION)
+        i, j = np.nonzero(np.triu(n > 0, 1))
+        if ((np.abs(r) > limit) & (n >= _FEWEST_PAIRS))[i, j].any():
+            left.append(columns[i])
+            right.append(columns[j])
+            covariances.append(covariance[i, j])
+    if not left:
+        none = np.empty(0, dtype=np.int64)
+        return CorrelatedPairs(none, none, np.empty(0))
+    return CorrelatedPairs(
+        np.concatenate(left),
+        np.concatenate(right),
+        np.concatenate(covariances) / redundancy_share,
+    )
 
 
-def _groups(linked: Mask) -> NDArray[np.int64]:
-    """Label (T,) of each target's group, -1 for one that stands alone or in too large a group."""
-    from scipy.sparse.csgraph import connected_components
+def slow_errors(residuals: Array, used: Mask) -> Array:
+    """What each target's error changes by from the first epoch to the last, (T, 2) px.
 
-    _, label = connected_components(linked, directed=False)
-    size = np.bincount(label)[label]
-    return np.where((size > 1) & (size <= _LARGEST_GROUP), label, -1).astype(np.int64)
+    residuals (E, T, 2) px; used (E, T). Light that wanders over a marker, or a board that gives
+    way, moves single targets slowly; each one's own line through its residuals tells by how much.
+    Its noise is taken off: 0 where the line is not steeper than that.
+    """
+    E = len(residuals)
+    t = np.linspace(-0.5, 0.5, E)[:, None, None]
+    w = used[..., None].astype(np.float64)
+    n = np.maximum(w.sum(axis=0), 1.0)
+    x = (t - (w * t).sum(axis=0) / n) * w
+    v = np.where(used[..., None], residuals, 0.0)
+    v = (v - v.sum(axis=0) / n) * w
+    sxx = np.maximum((x * x).sum(axis=0), 1e-12)
+    slope = (x * v).sum(axis=0) / sxx
+    variance = ((v - slope * x) ** 2).sum(axis=0) / np.maximum(n - 2, 1.0) / sxx
+    enough = (n > 10) & (sxx > 0.01 * E)
+    left = np.sqrt(np.maximum(1 - variance / np.maximum(slope**2, 1e-300), 0.0))
+    slow: Array = np.where(enough, slope * left, 0.0)
+    return slow
 
 
 def excess_scatter(values: Array, variances: Array) -> Array:

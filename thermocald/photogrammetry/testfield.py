@@ -79,6 +79,23 @@ class TestField:
         """Row of each target by its name."""
         return {name: i for i, name in enumerate(self.names)}
 
+    @cached_property
+    def groups(self) -> NDArray[np.int64]:
+        """Label (n,) of what each target belongs to: the corners of one marker err together.
+
+        By the code without its corner number, or the name without what follows its last point.
+        """
+        labels: dict[str, int] = {}
+        out = np.empty(len(self), dtype=np.int64)
+        for i, (name, kind, code) in enumerate(
+            zip(self.names, self.kinds, self.codes, strict=True)
+        ):
+            key = name
+            if kind == "marker_corner":
+                key = code.rpartition(":")[0] if code.count(":") > 1 else name.rpartition(".")[0]
+            out[i] = labels.setdefault(key or name, len(labels))
+        return out
+
     def subset(self, rows: ArrayLike) -> TestField:
         """The targets of some rows (indices)."""
         r = np.asarray(rows, dtype=int)

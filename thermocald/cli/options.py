@@ -1,0 +1,106 @@
+"""Options that several commands share: which camera, what is free."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path  # noqa: TC003  typer reads the annotations
+from typing import Annotated
+
+import typer
+
+from thermocald.errors import ConfigurationError, UsageError
+from thermocald.photogrammetry.adjustment import DEFAULT_FREE, AdjustmentSettings
+from thermocald.photogrammetry.camera_model import IOP_NAMES, InteriorOrientation, Sensor
+from thermocald.yaml_file import read_yaml
+
+__all__ = ["CameraFile", "ExteriorOption", "FreeOption", "JsonOption", "free_names", "read_camera"]
+
+JsonOption = Annotated[
+    str | None, typer.Option("--json", help="Write the result as JSON; - for standard output.")
+]
+FreeOption = Annotated[
+    str,
+    typer.Option(
+        "--free", help="Interior orientation to estimate, separated by commas; the rest is held."
+    ),
+]
+ExteriorOption = Annotated[
+    str,
+    typer.Option(
+        "--exterior",
+        help="per_epoch: every epoch has its own orientation; series: the camera stood still.",
+    ),
+]
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFile:
+    """A camera as a YAML file describes it: sensor, nominal c mm, interior orientation if known."""
+
+    name: str
+    sensor: Sensor
+    principal_distance: float | None
+    interior: InteriorOrientation | None
+
+
+def free_names(text: str) -> tuple[str, ...]:
+    """Names of IOP from a comma-separated list; `none` frees nothing."""
+    if text.strip().lower() in ("", "none"):
+        return ()
+    names = tuple(name.strip() for name in text.split(","))
+    for name in names:
+        if name not in IOP_NAMES:
+            raise UsageError(f"--free: {name!r} is no IOP; there are {', '.join(IOP_NAMES)}, none")
+    return tuple(name for name in IOP_NAMES if name in names)
+
+
+def adjustment_settings(free: str) -> AdjustmentSettings:
+    """The settings of an epoch's adjustment from `--free`."""
+    return AdjustmentSettings(free=free_names(free))
+
+
+DEFAULT_FREE_TEXT = ",".join(DEFAULT_FREE)
+
+
+def read_camera(path: Path) -> CameraFile:
+    """Read a camera file: name, width, height, pixel_pitch, principal_distance, interior.
+
+    With `interior:` (c, x0, y0 mm, A1 … C2; CONVENTIONS §2) the camera counts as calibrated.
+    """
+    document = read_yaml(path, ConfigurationError)
+    if not isinstance(document, dict):
+        raise ConfigurationError(f"{path}: is no camera file; it must hold `width: …` and so on")
+    camera = document.get("camera", document)
+
+    def number(key: str, required: bool = True) -> float | None:
+        value = camera.get(key)
+        if value is None and not required:
+            return None
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
+            raise ConfigurationError(f"{path}: {key} must be a number > 0, it is {value!r}")
+        return float(value)
+
+    width, height, pitch = number("width"), number("height"), number("pixel_pitch")
+    assert width is not None
+    assert height is not None
+    assert pitch is not None
+    nominal = number("principal_distance", required=False)
+    interior = None
+    given = camera.get("interior")
+    if given is not None:
+        unknown = set(given) - set(IOP_NAMES) if isinstance(given, dict) else {str(given)}
+        if unknown or "c" not in given:
+            raise ConfigurationError(
+                f"{path}: interior must hold c and any of {', '.join(IOP_NAMES[1:])}"
+                + (f"; {min(unknown)!r} is none of them" if unknown else "")
+            )
+        try:
+            interior = InteriorOrientation(**{k: float(v) for k, v in given.items()})
+        except (TypeError, ValueError) as error:
+            raise ConfigurationError(f"{path}: interior: {error}") from error
+    return CameraFile(
+        str(camera.get("name", path.stem)),
+        Sensor(int(width), int(height), pitch),
+        nominal,
+        interior,
+    )

@@ -1,0 +1,262 @@
+"""`thermocald replay` and `thermocald export`: a recording calibrated, a series as a table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import typer
+
+from thermocald.cli.common import progress, say, write_json, write_text
+from thermocald.cli.options import (
+    DEFAULT_FREE_TEXT,
+    ExteriorOption,
+    FreeOption,
+    JsonOption,
+    adjustment_settings,
+)
+from thermocald.errors import DataError, UsageError
+
+if TYPE_CHECKING:
+    from thermocald.analysis.series_table import SeriesTable
+    from thermocald.photogrammetry.adjustment import AdjustmentSettings
+
+__all__ = ["register"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    app.command("replay")(replay)
+    app.command("export")(export)
+
+
+def replay(
+    recording: Annotated[Path, typer.Argument(help="The recording's folder.")],
+    store: Annotated[
+        Path | None,
+        typer.Option("--store", help="Keep all in this store; an interrupted replay goes on."),
+    ] = None,
+    exterior: ExteriorOption = "per_epoch",
+    free: FreeOption = DEFAULT_FREE_TEXT,
+    json: JsonOption = None,
+) -> None:
+    """Calibrate every epoch of a recording, and say what the series is worth.
+
+    Example: thermocald replay rpi-heating-M1 --store thermocald.db
+    """
+    from thermocald.store.recording import open_recording
+
+    _check_exterior(exterior)
+    settings = adjustment_settings(free)
+    opened = open_recording(_existing(recording))
+    if store is not None:
+        from thermocald.analysis.stored_series import replay_into
+
+        with progress(len(opened.columns), "calibrating") as advance:
+            table = replay_into(store, opened, settings, exterior, advance)
+    else:
+        table = _recording_table(recording, settings, exterior)
+    document = _summary(recording, store, table)
+    if json is not None:
+        write_json(document, json)
+    if json != "-":
+        _tell(document)
+    if not table.ok.any():
+        raise DataError(f"{recording}: no epoch has a result: {_commonest(table)}")
+
+
+def export(
+    source: Annotated[Path, typer.Argument(help="A recording (folder) or a store (file).")],
+    format_: Annotated[str, typer.Option("--format", help="csv, or json.")] = "csv",
+    output: Annotated[
+        str, typer.Option("--output", "-o", help="File; - is standard output.")
+    ] = "-",
+    exterior: ExteriorOption = "per_epoch",
+    free: FreeOption = DEFAULT_FREE_TEXT,
+    series: Annotated[
+        str | None, typer.Option("--series", help="Which of a store: CAMERA/SERIES or SERIES.")
+    ] = None,
+) -> None:
+    """One row per epoch: parameters, standard deviations, sigma0, status.
+
+    Example: thermocald export rpi-heating-M1 --format csv > M1.csv
+    """
+    from thermocald.analysis.series_table import CSV_COLUMNS, csv_text
+
+    _check_exterior(exterior)
+    if format_ not in ("csv", "json"):
+        raise UsageError(f"--format {format_}: csv and json are written")
+    settings = adjustment_settings(free)
+    if _existing(source).is_dir():
+        table = _recording_table(source, settings, exterior)
+    else:
+        from thermocald.analysis.stored_series import stored_table
+
+        table = stored_table(source, series, settings, exterior)
+    if format_ == "csv":
+        write_text("".join(csv_text(table)), output)
+    else:
+        lines = [line.rstrip("\n").split(",") for line in csv_text(table)][1:]
+        rows = [dict(zip(CSV_COLUMNS, line, strict=True)) for line in lines]
+        write_json([{k: _value(k, v) for k, v in row.items()} for row in rows], output)
+    for sentence in sorted({r for r in table.reasons if r}):
+        say(f"{table.reasons.count(sentence)} epochs without a result: {sentence}")
+
+
+def _value(name: str, text: str) -> Any:
+    if name == "status":
+        return text
+    return float(text) if text else None
+
+
+def _existing(path: Path) -> Path:
+    if not path.exists():
+        raise DataError(f"{path}: does not exist; give a recording (folder) or a store (file)")
+    return path
+
+
+def _check_exterior(exterior: str) -> None:
+    if exterior not in ("per_epoch", "series"):
+        raise UsageError(f"--exterior {exterior}: must be per_epoch or series")
+
+
+def _recording_table(path: Path, settings: AdjustmentSettings, exterior: str) -> SeriesTable:
+    """Calibrate a recording in memory: its epochs one by one, then the series."""
+    from thermocald.acquisition.calibrator import Calibrator
+    from thermocald.analysis.series_table import (
+        calibrate_epochs,
+        frame_temperatures,
+        settings_for_series,
+        table_of_series,
+    )
+    from thermocald.store.recording import open_recording
+
+    recording = open_recording(path)
+    columns, camera = recording.columns, recording.camera
+    calibrator = Calibrator(
+        camera.sensor,
+        recording.testfield,
+        settings,
+        nominal_c=camera.principal_distance,
+        interior=camera.interior,
+    )
+    reference = columns.temperatures[next(iter(recording.channels))]
+    temperature = frame_temperatures(
+        columns.numbers, columns.frame_time, columns.temperature_time, reference
+    )
+    with progress(len(columns), "calibrating") as advance:
+        apart, observations = calibrate_epochs(
+            recording.iter_epochs(), calibrator, temperature, advance
+        )
+    return table_of_series(
+        recording.head,
+        recording.testfield,
+        apart,
+        observations,
+        settings_for_series(settings, exterior),
+    )
+
+
+def _summary(recording: Path, store: Path | None, table: SeriesTable) -> dict[str, Any]:
+    from thermocald.analysis.drift import courses
+
+    ok = table.ok
+    found = courses(table)
+    document: dict[str, Any] = {
+        "format": "thermocald-replay/1",
+        "recording": recording,
+        "store": store,
+        "exterior": table.exterior,
+        "epochs": len(table.number),
+        "ok": int(ok.sum()),
+        "sigma0": float(np.median(table.sigma0[ok])) if ok.any() else None,
+        "rejected": int(table.n_rejected.sum()),
+        "parameters": [
+            {
+                "name": c.name,
+                "mean": c.mean,
+                "sd_mean_level": float(table.level_sd[("c", "x0", "y0").index(c.name)]),
+                "scatter": c.scatter,
+                "stated_sd": c.sd,
+                "scatter_over_sd": c.scatter / c.sd,
+                "change": c.change,
+                "sd_change": c.sd_change,
+                "p": c.p,
+                "drift": c.drifts,
+                "rests_on": c.rests_on or None,
+            }
+            for c in found
+        ],
+        "without_result": [
+            {"epoch": int(n), "status": word, "reason": why}
+            for n, word, why in zip(table.number, table.status, table.reasons, strict=True)
+            if word != "ok"
+        ],
+    }
+    result = table.adjustment
+    if result is not None and table.exterior == "series":
+        document["stood_still"] = _stood_still(result.stillness)
+    return document
+
+
+def _stood_still(stillness: np.ndarray[Any, Any]) -> dict[str, Any]:
+    """Whether single epochs had another exterior orientation (chi-square, 6 degrees of freedom)."""
+    from scipy.stats import chi2
+
+    values = stillness[np.isfinite(stillness)]
+    limit = float(chi2.ppf(1 - 0.01 / max(len(values), 1), 6))
+    moved = int((values > limit).sum())
+    return {
+        "epochs_that_moved": moved,
+        "largest_chi2": float(values.max(initial=0.0)),
+        "bound": limit,
+    }
+
+
+def _commonest(table: SeriesTable) -> str:
+    reasons = [r for r in table.reasons if r]
+    return max(set(reasons), key=reasons.count) if reasons else "there is no epoch"
+
+
+def _no_drift(parameter: dict[str, Any]) -> str:
+    rests_on = parameter["rests_on"]
+    return f"none (only target {rests_on} moves)" if rests_on else "none"
+
+
+def _tell(document: dict[str, Any]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    console.print(
+        f"{document['ok']} of {document['epochs']} epochs calibrated, exterior orientation "
+        f"{'per epoch' if document['exterior'] == 'per_epoch' else 'of the series'}, "
+        f"{document['rejected']} gross errors",
+        highlight=False,
+    )
+    table = Table(box=None, pad_edge=False)
+    for title in ("", "mean mm", "scatter mm", "stated sd mm", "ratio", "change mm", "drift"):
+        table.add_column(title, justify="left" if not title else "right")
+    for p in document["parameters"]:
+        table.add_row(
+            p["name"],
+            f"{p['mean']:.5f}",
+            f"{p['scatter']:.6f}",
+            f"{p['stated_sd']:.6f}",
+            f"{p['scatter_over_sd']:.2f}",
+            f"{p['change']:+.6f} ± {p['sd_change']:.6f}",
+            f"yes (p {p['p']:.1g})" if p["drift"] else _no_drift(p),
+        )
+    if document["parameters"]:
+        console.print(table, highlight=False)
+    reasons = [f"{w['status']}: {w['reason']}" for w in document["without_result"]]
+    for text in sorted(set(reasons)):
+        console.print(f"{reasons.count(text)} × {text}", highlight=False)
+    still = document.get("stood_still")
+    if still and still["epochs_that_moved"]:
+        console.print(
+            f"the camera did not stand still in {still['epochs_that_moved']} epochs (chi-square up "
+            f"to {still['largest_chi2']:.0f}, bound {still['bound']:.0f}): use --exterior per_epoch",
+            highlight=False,
+        )

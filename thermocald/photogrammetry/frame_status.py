@@ -21,7 +21,8 @@ Word = Literal[
     "nothing_found", "other_field", "too_few",
 ]  # fmt: skip
 
-_LEAST_CONTRAST = 8.0  # DN of 255 between the darkest and brightest percentile
+_LEAST_CONTRAST = 8.0  # DN of 255 between the darkest and the brightest
+_PERCENTILES = (0.02, 99.98)  # a single target must be enough, a hot pixel must not
 _HALF_SHARE = 0.15
 _STRIDE = 4
 _HALVINGS = 2
@@ -69,13 +70,13 @@ def inspect_frame(image: NDArray[Any], size: tuple[int, int] | None = None) -> F
     for _ in range(_HALVINGS):
         if min(sample.shape) >= 2:
             sample = cv2.resize(sample, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    low, high = (int(v) for v in np.percentile(sample, (0.5, 99.5), method="nearest"))
+    low, high = (int(v) for v in np.percentile(sample, _PERCENTILES, method="nearest"))
     top = 255 if image.dtype == np.uint8 else max(int(sample.max()), 1023)
     if high - low < _LEAST_CONTRAST / 255 * top:
         if high < 0.12 * top:
-            return FrameStatus("black", f"the frame is black (99 % of it at most {high} DN)")
+            return FrameStatus("black", f"the frame is black (grey values up to {high} DN)")
         if low > 0.88 * top:
-            return FrameStatus("white", f"the frame is white (99 % of it at least {low} DN)")
+            return FrameStatus("white", f"the frame is white (grey values from {low} DN)")
         return FrameStatus("flat", f"the frame shows nothing (grey values {low} to {high} DN)")
     broken = _constant_rows(image)
     if broken >= _HALF_SHARE * height and _noise(image[: height - broken : 4, ::4]) > 0:

@@ -1,0 +1,311 @@
+"""A frame in, observations out: found, identified, measured, or a status with a reason."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.photogrammetry.exact_rendering import look_at, noisy
+from tests.photogrammetry.fields import (
+    SMALL_CAMERA,
+    SMALL_SENSOR,
+    corner_field,
+    draw,
+    draw_marker,
+    small_field,
+    station,
+)
+from thermocald.errors import TestFieldError
+from thermocald.photogrammetry.measurement import Prior, measure
+from thermocald.photogrammetry.outline import local_maps
+from thermocald.photogrammetry.testfield import TestField
+
+FIELD, NORMALS = small_field()
+STATION = station(800.0)
+
+
+@pytest.fixture(scope="module")
+def clean() -> np.ndarray:
+    return draw(FIELD, NORMALS).render(SMALL_CAMERA, STATION)
+
+
+@pytest.fixture
+def frame(clean) -> np.ndarray:
+    return noisy(clean, np.random.default_rng(7))
+
+
+def _truth(exterior=STATION, field: TestField = FIELD) -> np.ndarray:
+    return SMALL_CAMERA.project(exterior, field.points)
+
+
+def _z(observations, truth) -> np.ndarray:
+    return (observations.points - truth[observations.targets]) / observations.sigmas
+
+
+def test_all_targets_from_nothing(frame):
+    found = measure(frame, FIELD)
+    assert found.status.ok
+    assert len(found.observations) == SMALL_SENSOR.contains(_truth(), 15).sum()
+    assert set(found.missed.values()) <= {"cut off by the image's edge"}
+    z = _z(found.observations, _truth())
+    assert 0.85 <= np.sqrt(np.mean(z**2)) <= 1.15  # 200 values: 5 %
+    assert np.abs(z).max() < 5
+
+
+def test_quality_tells_blur_contrast_and_light(frame):
+    quality = measure(frame, FIELD).observations.quality
+    assert np.median(quality["blur"]) == pytest.approx(0.8, abs=0.03)
+    assert np.median(quality["contrast"]) == pytest.approx(-150, abs=2)
+    assert np.median(quality["grey"]) == pytest.approx(190, abs=2)
+    assert np.median(quality["noise"]) == pytest.approx(2.02, abs=0.1)
+    assert np.all(quality["saturation"] == 0)
+
+
+def test_the_eccentricity_can_be_switched_off(frame):
+    on, off = (measure(frame, FIELD, eccentricity=e).observations for e in (True, False))
+    assert np.array_equal(on.targets, off.targets)
+    shift = np.abs(on.points - off.points).max(axis=1)
+    assert 0.01 < shift.max() < 0.3
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("upside down", lambda image: np.ascontiguousarray(image[::-1, ::-1])),
+        ("16 bit", lambda image: image.astype(np.uint16) * 257),
+        ("12 bit in 16", lambda image: image.astype(np.uint16) * 16),
+        ("negative", lambda image: 255 - image),
+        ("dim", lambda image: image // 4),
+    ],
+)
+def test_unusual_frames_are_measured_all_the_same(frame, name, change):
+    found = measure(change(frame), FIELD)
+    assert found.status.ok, name
+    assert len(found.observations) >= 0.99 * len(measure(frame, FIELD).observations)
+
+
+@pytest.mark.parametrize(
+    ("word", "change"),
+    [
+        ("no_image", lambda image: image[:0]),
+        ("not_grey", lambda image: np.dstack([image] * 3)),
+        ("not_grey", lambda image: image.astype(float)),
+        ("wrong_size", lambda image: image[:-2]),
+        ("wrong_size", lambda image: np.ascontiguousarray(image.T)),
+        ("black", lambda image: np.random.default_rng(1).poisson(2, image.shape).astype(np.uint8)),
+        ("white", lambda image: np.full_like(image, 254)),
+        ("flat", lambda image: np.full_like(image, 120)),
+        ("half", lambda image: np.vstack([image[:616], np.full_like(image[616:], 128)])),
+        ("half", lambda image: np.vstack([image[:616], np.zeros_like(image[616:])])),
+        ("nothing_found", lambda image: cv2.GaussianBlur(image, (0, 0), 30) // 2 + image % 60),
+    ],
+)
+def test_useless_frames_have_a_status_and_a_reason(frame, word, change):
+    found = measure(change(frame), FIELD, Prior(SMALL_SENSOR))
+    assert found.status.word == word
+    assert len(found.status.reason) > 15
+    assert len(found.observations) == 0
+
+
+def test_another_field_is_told(frame):
+    other, _ = small_field(bits=12)
+    found = measure(frame, other)
+    assert found.status.word == "other_field"
+    assert len(found.observations) == 0
+
+
+def test_the_same_codes_elsewhere_are_another_field(frame):
+    rng = np.random.default_rng(2)
+    moved = TestField.build(
+        FIELD.names, rng.permutation(FIELD.points), 0.01, FIELD.diameters, "circle", FIELD.codes
+    )
+    found = measure(frame, moved)
+    assert found.status.word == "other_field"
+    assert "not where" in found.status.reason
+
+
+def test_plain_circles_alone_cannot_be_told_apart(frame):
+    plain = TestField.build(FIELD.names, FIELD.points, 0.01, FIELD.diameters)
+    found = measure(frame, plain)
+    assert found.status.word == "nothing_found"
+    assert "coded" in found.status.reason
+
+
+def test_plain_circles_are_measured_where_the_camera_is_known(frame):
+    plain = TestField.build(FIELD.names, FIELD.points, 0.01, FIELD.diameters)
+    found = measure(frame, plain, Prior(SMALL_SENSOR, SMALL_CAMERA.interior, STATION))
+    assert found.status.ok
+    assert np.abs(_z(found.observations, _truth())).max() < 5
+
+
+def test_a_prior_that_is_wrong_does_no_harm(frame):
+    elsewhere = station(900.0, roll=0.2)
+    found = measure(frame, FIELD, Prior(SMALL_SENSOR, SMALL_CAMERA.interior, elsewhere))
+    assert found.status.ok
+    assert np.abs(_z(found.observations, _truth())).max() < 5
+
+
+def test_two_targets_are_too_few(clean):
+    image = np.full(clean.shape, 190.0)
+    for name in ("X0.0", "Y0.0"):
+        x, y = np.rint(_truth()[FIELD.index[name]]).astype(int)
+        part = (slice(y - 45, y + 45), slice(x - 45, x + 45))
+        image[part] = clean[part]
+    found = measure(noisy(image, np.random.default_rng(3)), FIELD)
+    assert found.status.word == "too_few"
+    assert {FIELD.names[t] for t in found.observations.targets} <= {"X0.0", "Y0.0"}
+
+
+def test_hidden_targets_are_missed_with_a_reason(clean):
+    covered = clean.copy()
+    covered[500:700, 700:900] = 120
+    found = measure(noisy(covered, np.random.default_rng(4)), FIELD)
+    inside = np.all((_truth() > (705, 505)) & (_truth() < (895, 695)), axis=1)
+    assert inside.sum() >= 3
+    for row in np.nonzero(inside)[0]:
+        assert found.missed[int(row)]
+    assert np.abs(_z(found.observations, _truth())).max() < 6
+
+
+def test_codes_that_do_not_exist_are_an_error(frame):
+    wrong = TestField.build(["a"], [[0, 0, 0]], diameters=10, codes="RING14:1")
+    with pytest.raises(TestFieldError, match="RING14:1"):
+        measure(frame, wrong)
+
+
+@pytest.fixture(scope="module")
+def mixed():
+    """Plain circles among markers: some corners named, and circles that a marker names."""
+    field, normals = corner_field(per_side=4, spacing=110.0, diameter=15.0, inset=60.0)
+    names, points = list(field.names), list(field.points)
+    kinds, codes = ["circle"] * len(field), [""] * len(field)
+    plain = TestField.build(names, points, 0.01, 15.0)
+    scene = draw(plain, normals)
+    markers: dict = {}
+    number = 0
+    for plane in range(3):
+        u, v = np.eye(3)[(plane + 1) % 3], np.eye(3)[(plane + 2) % 3]
+        for i, j in ((0, 0), (1, 2), (2, 1)):
+            at = (60.0 + 110 * i + 35) * u + (60.0 + 110 * j + 35) * v
+            # The viewer looks against the normal u × v: u to the right, v up; OpenCV's order is
+            # clockwise from the top left.
+            corners = np.array([at + 40 * v, at + 40 * u + 40 * v, at + 40 * u, at])
+            draw_marker(scene, "DICT_APRILTAG_36h11", number, corners, markers)
+            if number % 3:
+                for k in range(4):
+                    names.append(f"M{number}.{k}")
+                    points.append(corners[k])
+                    kinds.append("marker_corner")
+                    codes.append(f"DICT_APRILTAG_36h11:{number}:{k}")
+            number += 1
+    diameters = [15.0] * len(field) + [np.nan] * (len(names) - len(field))
+    whole = TestField.build(names, points, 0.01, diameters, kinds, codes)
+    return whole, scene.render(SMALL_CAMERA, STATION)
+
+
+def test_plain_circles_are_identified_through_markers(mixed):
+    field, image = mixed
+    found = measure(noisy(image, np.random.default_rng(5)), field)
+    assert found.status.ok
+    truth = _truth(field=field)
+    kinds = np.array(field.kinds)[found.observations.targets]
+    visible = SMALL_SENSOR.contains(truth, 20)
+    for kind in ("circle", "marker_corner"):
+        assert (kinds == kind).sum() == (visible & (np.array(field.kinds) == kind)).sum()
+        z = _z(found.observations, truth)[kinds == kind]
+        assert 0.75 <= np.sqrt(np.mean(z**2)) <= 1.25
+        assert np.abs(z).max() < 5.5
+
+
+def test_circles_that_a_marker_names(mixed):
+    """DICT_…:17 without a corner: the circle nearest to that marker."""
+    whole, image = mixed
+    circles = whole.subset(np.arange(48))
+    codes = list(circles.codes)
+    for plane in range(3):
+        for k, (i, j) in enumerate(((0, 0), (1, 2), (2, 1))):
+            codes[16 * plane + 4 * i + j] = f"DICT_APRILTAG_36h11:{3 * plane + k}"
+    field = TestField.build(circles.names, circles.points, 0.01, 15.0, "circle", codes)
+    # A fourth of a side nearer to the lower left than to the other three circles about it.
+    found = measure(noisy(image, np.random.default_rng(6)), field)
+    assert found.status.ok, found.status.reason
+    assert np.abs(_z(found.observations, _truth(field=field))).max() < 5.5
+
+
+@pytest.mark.slow
+def test_what_a_person_would_call_visible_is_found(capsys):
+    """Random stations, 60° and more, both inks, blur, uneven light, things in front, highlights."""
+    visible = found = wrong = 0
+    causes: Counter[str] = Counter()
+    z = []
+    for seed in range(40):
+        case = _random_case(seed)
+        measured = measure(case["frame"], case["field"], Prior(SMALL_SENSOR))
+        seen = np.isin(np.arange(len(case["field"])), measured.observations.targets)
+        visible += int(case["visible"].sum())
+        found += int((seen & case["visible"]).sum())
+        for row in np.nonzero(case["visible"] & ~seen)[0]:
+            causes[measured.missed.get(int(row), measured.status.word)] += 1
+        error = np.abs(measured.observations.points - case["truth"][measured.observations.targets])
+        wrong += int((error.max(axis=1, initial=0.0) > 1.0).sum())
+        mask = case["visible"][measured.observations.targets]
+        z.append(_z(measured.observations, case["truth"])[mask])
+    with capsys.disabled():
+        print(f"\n{found} of {visible} visible targets found; missed: {dict(causes)}")
+    assert wrong == 0
+    assert found >= 0.99 * visible
+    assert 0.9 <= np.sqrt(np.mean(np.concatenate(z) ** 2)) <= 1.1
+
+
+def _random_case(seed: int) -> dict:
+    rng = np.random.default_rng(seed)
+    diameter, bits = float(rng.uniform(12, 18)), int(rng.choice([12, 14]))
+    field, normals = corner_field(per_side=6, spacing=75.0, diameter=diameter, bits=bits)
+    direction = np.abs(np.ones(3) / np.sqrt(3) + rng.uniform(-0.35, 0.35, 3))
+    direction /= np.linalg.norm(direction)
+    target = np.full(3, 180.0) + rng.uniform(-100, 100, 3)
+    exterior = look_at(
+        target + direction * rng.uniform(600, 1000), target, rng.uniform(-np.pi, np.pi)
+    )
+    paper, ink = (150.0, 35.0) if rng.random() < 0.6 else (40.0, 150.0)
+    blur = rng.uniform(0.6, 1.5)
+    light = tuple(rng.uniform(-3e-4, 3e-4, 2))
+    image = draw(field, normals, paper=paper, ink=ink, light=light).render(
+        SMALL_CAMERA, exterior, blur=blur
+    )
+    spoilt = np.zeros(image.shape, dtype=bool)
+    if rng.random() < 0.5:
+        x, y, size = rng.integers(0, 1400), rng.integers(0, 1000), rng.integers(40, 200)
+        image[y : y + size, x : x + 60] = rng.uniform(20, 200)
+        spoilt[y : y + size, x : x + 60] = True
+    if rng.random() < 0.5:
+        x, y, radius = rng.uniform(0, 1640), rng.uniform(0, 1232), rng.uniform(20, 60)
+        v, u = np.mgrid[:1232, :1640]
+        highlight = 250 * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * radius**2))
+        image = image + highlight
+        spoilt |= highlight > 30
+    maps = local_maps(
+        SMALL_SENSOR, SMALL_CAMERA.interior.as_array(), exterior.as_array(), field.points, normals,
+        field.diameters / 2,
+    )  # fmt: skip
+    view = exterior.centre - field.points
+    cosine = np.sum(view * normals, axis=1) / np.linalg.norm(view, axis=1)
+    reach = maps.half_extent + 5
+    low, high = np.floor(maps.centre - reach), np.ceil(maps.centre + reach)
+    visible = (
+        np.all((low > 0) & (high < (1639, 1231)), axis=1)
+        & (cosine > 0.45)  # 63°
+        & (maps.semi_axes[:, 1] > 3)
+    )
+    for i in np.nonzero(visible)[0]:
+        (x0, y0), (x1, y1) = low[i].astype(int), high[i].astype(int)
+        visible[i] = not spoilt[y0:y1, x0:x1].any()
+    return {
+        "field": field,
+        "frame": noisy(image, rng, rng.uniform(1, 4)),
+        "truth": maps.centre,
+        "visible": visible,
+    }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -58,9 +58,14 @@ class Examination:
 
 
 def examine_series(
-    series: Sequence[Evidence], progress: Callable[[str], None] | None = None
+    series: Sequence[Evidence],
+    progress: Callable[[str], None] | None = None,
+    given: Sequence[tuple[str, dict[str, Any]]] = (),
 ) -> Examination:
-    """Examine one series, or M1 with M2, which share their physical constants."""
+    """Examine one series, or M1 with M2, which share their physical constants.
+
+    given: effects that the model has already, with their values; they are fitted again and stay.
+    """
     say = progress or (lambda _: None)
     say("targets that moved")
     displaced, cleaned = [], []
@@ -75,7 +80,7 @@ def examine_series(
     laboratory = Laboratory(calibrated_thermometers(cleaned))
     say("base model")
     search = Search(laboratory, say)
-    base = search.base()
+    base = search.base(given)
     base_adequacy = _adequacies(laboratory, base)
 
     best, ranking = base, []
@@ -85,7 +90,9 @@ def examine_series(
         grown: list[Solution] = []
         for solution in frontier:
             say(f"effect {level}: beside {', '.join(solution.names) or 'the base'}")
-            grown += [search.shrink(s) for s in search.expand(solution, 6 if level == 1 else 4)]
+            wide = 6 if level == 1 else 4
+            kept = len(base.terms)
+            grown += [search.shrink(s, kept) for s in search.expand(solution, wide)]
         if level == 1:
             ranking = sorted(grown, key=lambda s: s.score)
         seen += grown
@@ -98,7 +105,7 @@ def examine_series(
         if _adequate(_adequacies(laboratory, best), base_adequacy):
             break
         frontier = _frontier(grown)
-    if best.terms:
+    if len(best.terms) > len(base.terms):
         best, seen = _contest(search, best, seen)
     adequacy = _adequacies(laboratory, best)
     adequate = _adequate(adequacy, base_adequacy)

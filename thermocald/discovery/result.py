@@ -113,17 +113,20 @@ class Discovery:
 
 
 def discover_series(
-    series: Sequence[Evidence], progress: Callable[[str], None] | None = None
+    series: Sequence[Evidence],
+    progress: Callable[[str], None] | None = None,
+    given: Sequence[tuple[str, dict[str, Any]]] = (),
 ) -> Discovery:
     """Examine M1, or M1 and M2, and put what was found into words and numbers."""
-    x = examine_series(series, progress)
+    x = examine_series(series, progress, given)
     return conclude(x)
 
 
 def conclude(x: Examination) -> Discovery:
     """Words and numbers for an examination."""
-    terms = x.best.terms if x.adequate else ()
-    fits = [fit_first(x.laboratory, terms[:k]) for k in range(len(terms) + 1)]
+    terms = x.best.terms if x.adequate else x.base.terms
+    known = len(x.base.terms)
+    fits = [fit_first(x.laboratory, terms[:k]) for k in range(known, len(terms) + 1)]
     found = _image_space(x, fits[0])
     stages = [Stage("", _gap(x, fits[0], 0, 0), _verify(x, fits[0], 0))]
     for k, entry in enumerate(found):
@@ -133,11 +136,11 @@ def conclude(x: Examination) -> Discovery:
     n = len(found)
     if not x.adequate:
         return _unexplained(x, fits[0], stages, n)
-    for k in range(len(terms)):
-        fit = fits[k + 1]
+    for k in range(known, len(terms)):
+        fit = fits[k + 1 - known]
         stages.append(Stage(terms[k].effect, _gap(x, fit, 0, n), _verify(x, fit, n)))
         found.append(_entry(x, fits[-1], k, stages[-2].fit, stages[-1].fit, len(found) == n))
-    blocks = left_out(x.laboratory, fits[-1]) if terms else (float("nan"), float("nan"))
+    blocks = left_out(x.laboratory, fits[-1]) if found else (float("nan"), float("nan"))
     verdict = "effects_found" if found else "adequate"
     return Discovery(verdict, tuple(found), tuple(stages), x, fits[0], fits[-1], blocks)
 

@@ -14,13 +14,14 @@ European Physical Journal C 70, 525-530 (look-elsewhere effect).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermocald.discovery.candidates import Candidate, candidates
-from thermocald.discovery.evidence import COLUMNS
-from thermocald.discovery.hypothesis import BASE, OSCILLATIONS, Fit, Laboratory, Term
+from thermocald.discovery.evidence import COLUMNS, FIELD_SCALES
+from thermocald.discovery.hypothesis import BASE, EVENTS, OSCILLATIONS, Fit, Laboratory, Term
+from thermocald.simulation import effects as catalogue
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -83,9 +84,12 @@ class Search:
         self._courses: dict[tuple[int, int], Array] = {}
         self._refined: dict[tuple[object, ...], Solution] = {}
 
-    def base(self) -> Solution:
-        """The base model alone."""
-        return Solution(self.laboratory.fit(()), ())
+    def base(self, given: Sequence[tuple[str, dict[str, Any]]] = ()) -> Solution:
+        """The base model, with the effects that a model has already, fitted."""
+        if not given:
+            return Solution(self.laboratory.fit(()), ())
+        terms = tuple(_given_term(name, values, len(self.laboratory.series)) for name, values in given)
+        return Solution(self.laboratory.refine(self.laboratory.fit(terms)), (0.0,) * len(terms))
 
     # -- scanning --------------------------------------------------------------------------
 
@@ -236,11 +240,11 @@ class Search:
         grown.sort(key=lambda s: s.score)
         return grown
 
-    def shrink(self, solution: Solution) -> Solution:
-        """Without every effect that is no longer worth its penalty."""
-        while len(solution.terms) > 1:
+    def shrink(self, solution: Solution, kept: int = 0) -> Solution:
+        """Without every effect that is no longer worth its penalty; the first `kept` stay."""
+        while len(solution.terms) > kept + 1:
             fewer = []
-            for i in range(len(solution.terms)):
+            for i in range(kept, len(solution.terms)):
                 terms = tuple(t for j, t in enumerate(solution.terms) if j != i)
                 penalties = tuple(p for j, p in enumerate(solution.penalties) if j != i)
                 fewer.append(self.refine(terms, penalties, solution.fit))
@@ -249,6 +253,24 @@ class Search:
                 break
             solution = best
         return solution
+
+
+def _given_term(name: str, values: dict[str, Any], series: int) -> Term:
+    """A term of an effect that a model holds: its non-linear values as a start."""
+    effect = catalogue.get(name)
+    parameters = tuple(p for p in effect.linear if p in values)
+    if name == "test_field_expansion":
+        parameters = FIELD_SCALES
+    shared = tuple(
+        (k, v if isinstance(v, str) else float(v))
+        for k, v in values.items()
+        if k in effect.nonlinear and k not in effect.fresh
+    )
+    fresh: tuple[tuple[tuple[str, Any], ...] | None, ...] = ()
+    if name in EVENTS:
+        own = tuple((k, float(values[k])) for k in effect.fresh if k in values)
+        fresh = (own, *(None,) * (series - 1))
+    return Term(name, parameters or BASE, shared, fresh)
 
 
 def _gain(parts: list[tuple[Array, Array, Array]], base_A: Array, base_c: Array) -> Array:

@@ -1,0 +1,154 @@
+"""`thermocald discover`: where simulation and measurement disagree, why, and the proof."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from thermocald.cli.common import say, write_json, write_text
+from thermocald.errors import UsageError
+
+if TYPE_CHECKING:
+    from thermocald.discovery.result import Discovery
+
+__all__ = ["register"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("discover")(discover)
+
+
+def discover(
+    recording: Annotated[
+        Path | None, typer.Argument(metavar="M1", help="The recording to explain.")
+    ] = None,
+    verify: Annotated[
+        Path | None,
+        typer.Option("--verify", help="M2: another recording of this camera, to prove it on."),
+    ] = None,
+    model: Annotated[
+        Path | None, typer.Option("--model", help="The model so far (YAML) [base model].")
+    ] = None,
+    json: Annotated[
+        str | None, typer.Option("--json", help="Write the result as JSON; - for standard output.")
+    ] = None,
+    model_out: Annotated[
+        Path | None, typer.Option("--model-out", help="Write the model with what was found.")
+    ] = None,
+    report: Annotated[
+        Path | None, typer.Option("--report", help="Write a report, one HTML file.")
+    ] = None,
+    plan: Annotated[
+        bool,
+        typer.Option("--plan", help="Which effects a set-up would show, before heating anything."),
+    ] = False,
+    preset: Annotated[
+        str | None, typer.Option("--preset", help="With --plan: a camera of the reference study.")
+    ] = None,
+    testfield: Annotated[
+        str | None, typer.Option("--testfield", help="With --plan: a testfield.csv.")
+    ] = None,
+    programme: Annotated[
+        Path | None, typer.Option("--programme", help="With --plan: what is done to the camera.")
+    ] = None,
+    strength: Annotated[
+        float, typer.Option("--strength", min=0.001, help="With --plan: size of an effect, px.")
+    ] = 0.1,
+    seeds: Annotated[
+        int, typer.Option("--seeds", min=1, max=50, help="With --plan: repetitions.")
+    ] = 2,
+) -> None:
+    """Find where simulation and measurement disagree, name the missing effect, prove it.
+
+    Example: thermocald discover M1 --verify M2 --model-out camera.yaml --report discovery.html
+    """
+    if plan:
+        _plan(recording, model, preset, testfield, programme, strength, seeds, json)
+        return
+    if recording is None:
+        raise UsageError("M1 is missing: the folder of the recording to explain")
+    found = _examined(recording, verify, model)
+    written: str | None = None
+    if model_out is not None:
+        from thermocald.discovery.new_model import model_of
+        from thermocald.simulation.model_file import read_model, write_model
+
+        write_model(model_out, model_of(found, read_model(model) if model else None))
+        written = str(model_out)
+    if report is not None:
+        from thermocald.discovery.report import report_html
+
+        write_text(report_html(found, recording.name), report)
+    if json is not None:
+        write_json(found.as_json(written), json)
+    if json != "-":
+        for line in _lines(found):
+            typer.echo(line)
+
+
+def _examined(recording: Path, verify: Path | None, model: Path | None) -> Discovery:
+    from thermocald.discovery.new_model import terms_of
+    from thermocald.discovery.result import discover_series
+    from thermocald.discovery.source import gather_pair, load_pair
+    from thermocald.simulation.model_file import read_model
+
+    old = read_model(model) if model is not None else None
+    inputs = load_pair(recording, verify, say)
+    say("reducing the epochs to normal equations")
+    evidence = gather_pair(inputs, old.T0 if old else None)
+    return discover_series(evidence, say, terms_of(old) if old else ())
+
+
+def _lines(found: Discovery) -> list[str]:
+    """The result for people."""
+    first, last = found.stages[0], found.stages[-1]
+    lines = [f"verdict: {found.verdict}"]
+    if found.verdict == "adequate":
+        lines.append("the model reproduces the recording; nothing is missing that it could show")
+    for effect in found.effects:
+        lines.append(f"{effect.effect}: {effect.statement}")
+        for name, e in effect.estimates.items():
+            if isinstance(e["value"], float):
+                lines.append(f"    {name} = {e['value']:.6g} ± {e['sd']:.2g} {e['unit']}")
+        lines += [
+            f"    not excluded: {a['effect']}; {a['experiment']}"
+            for a in effect.alternatives
+            if not a.get("resembles")
+        ]
+    for name, before, after in (
+        ("M1", first.fit, last.fit),
+        ("M2", first.verify, last.verify),
+    ):
+        if before is not None and after is not None:
+            lines.append(
+                f"gap on {name}: {before.rms_px:.4f} → {after.rms_px:.4f} px RMS, reduced χ² "
+                f"{before.chi2_reduced:.3f} → {after.chi2_reduced:.3f}, "
+                f"{before.object_mm_at_10m:.2f} → {after.object_mm_at_10m:.2f} mm at 10 m"
+            )
+    return lines
+
+
+def _plan(
+    recording: Path | None,
+    model: Path | None,
+    preset: str | None,
+    testfield: str | None,
+    programme: Path | None,
+    strength: float,
+    seeds: int,
+    json: str | None,
+) -> None:
+    from thermocald.cli.common import progress
+    from thermocald.discovery.plan import plan_power, simulated_inputs
+
+    with progress(None, "planning") as advance:
+        inputs = simulated_inputs(recording, model, preset, testfield, programme, seeds)
+        result = plan_power(inputs, strength, lambda: advance(1))
+    if json is not None:
+        write_json(result.as_json(), json)
+    if json != "-":
+        for line in result.lines():
+            typer.echo(line)

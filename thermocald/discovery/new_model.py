@@ -1,0 +1,147 @@
+"""What was found, as the next version of a thermal model that `simulate` runs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.discovery.estimates import model_values
+from thermocald.discovery.evidence import COLUMNS
+from thermocald.discovery.hypothesis import BASE
+from thermocald.photogrammetry.camera_model import (
+    EOP_NAMES,
+    IOP_NAMES,
+    PARAMETER_NAMES,
+    ExteriorOrientation,
+    InteriorOrientation,
+)
+from thermocald.simulation import effects as catalogue
+from thermocald.simulation.model import ModelEffect, ThermalModel
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from thermocald.discovery.result import Discovery
+
+    Array = NDArray[np.float64]
+
+__all__ = ["model_of", "terms_of"]
+
+
+def model_of(discovery: Discovery, old: ThermalModel | None = None) -> ThermalModel:
+    """The model with what was found; constants as M1 alone gave them.
+
+    An effect keeps what it is fresh in (an instant, a phase) as M1 had it.
+    """
+    x, fit = discovery.examination, discovery.final_fit
+    e = x.laboratory.series[0]
+    level, sd = _level(discovery)
+    scale = e.scale[: len(PARAMETER_NAMES)]
+    start = np.concatenate([e.at.iop, e.at.eop])
+    values, sds = start + level / scale, sd / scale
+    block = fit.blocks[0]
+    rates, rate_sds = {}, {}
+    for j, name in enumerate(BASE):
+        unit = e.scale[COLUMNS.index(name)]
+        rates[name] = float(fit.coefficients[block.start + j] / unit)
+        rate_sds[f"rates.{name}"] = float(np.sqrt(fit.covariance[j, j]) / unit)
+    T = e.history.temperature()
+    effects = []
+    for found in discovery.effects:
+        if found.effect == "unnamed":
+            continue
+        parameters = found.term.parameters if found.term else ()
+        numbers, own_sds = model_values(found.estimates, parameters)
+        known = catalogue.get(found.effect).units()
+        effects.append(
+            ModelEffect(
+                found.effect,
+                {k: v for k, v in numbers.items() if k in known},
+                {k: v for k, v in own_sds.items() if k in known},
+            )
+        )
+    weights = e.weights[..., :2]
+    model = ThermalModel(
+        camera=e.source.camera,
+        sensor=e.source.sensor,
+        T0=e.T0,
+        interior=InteriorOrientation.from_array(values[:10]),
+        rates=rates,
+        effects=tuple(effects),
+        exterior=ExteriorOrientation.from_array(values[10:]),
+        image_sigma=float(1.0 / np.sqrt(np.mean(weights[weights > 0]))),
+        sds={
+            **{f"interior.{n}": float(s) for n, s in zip(IOP_NAMES, sds[:10], strict=True)},
+            **{f"exterior.{n}": float(s) for n, s in zip(EOP_NAMES, sds[10:], strict=True)},
+            **rate_sds,
+        },
+        validity={e.history.reference: (float(T.min()), float(T.max()))},
+        fitted_on=[{"recording": s.source.name, "epochs": int((s.n > 0).sum())}
+                   for s in x.laboratory.series[:1]],
+        evidence=_evidence(discovery),
+        name=old.name if old else e.source.camera,
+        version=old.version + 1 if old else 1,
+    )  # fmt: skip
+    return replace(model)
+
+
+def _evidence(discovery: Discovery) -> dict[str, Any]:
+    document = discovery.as_json(None)
+    out: dict[str, Any] = {"verdict": discovery.verdict, "gap": document["gap"]}
+    for entry in document["effects"]:
+        out[entry["effect"]] = {
+            "statement": entry["statement"],
+            "evidence": entry["evidence"],
+            "alternatives": entry["alternatives"],
+        }
+        if entry["effect"] == "unnamed":
+            out["unnamed"]["note"] = "bridged by a smooth term in M1 alone; not transferable"
+    return _plain(out)
+
+
+def _plain(value: Any) -> Any:
+    """Numbers as YAML writes them."""
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if isinstance(value, np.generic):
+        return value.item()
+    return value
+
+
+def _level(discovery: Discovery) -> tuple[Array, Array]:
+    """Level of the 16 parameters at T0 with all effects at zero, px-scaled, and its sd."""
+    fit = discovery.final_fit
+    laboratory = discovery.examination.laboratory
+    e = laboratory.series[0]
+    C, V, index = fit.designs[0]
+    x = fit.coefficients[index]
+    rest = (e.b - np.einsum("epq,eq->ep", e.N, (C * x) @ V.T)).sum(axis=0)[:16]
+    N = e.N.sum(axis=0)[:16, :16]
+    d = np.sqrt(np.diag(N))
+    inverse = np.linalg.inv(N / np.outer(d, d) + 1e-12 * np.eye(16)) / np.outer(d, d)
+    level = inverse @ rest
+    # the columns of the design are centred; the model's are not
+    means = []
+    for block in fit.blocks:
+        if block.series not in (None, 0):
+            continue
+        if block.term < 0:
+            course = laboratory.drive(fit.terms, 0)[0][:, None] - e.T0
+        else:
+            course = laboratory.courses(fit.terms[block.term], 0, fit.terms)[0]
+        means += [m for m in course.mean(axis=0) for _ in block.parameters]
+    level = level - (V @ (np.array(means) * x))[:16]
+    return level, np.sqrt(np.diag(inverse))
+
+
+def terms_of(model: ThermalModel) -> list[tuple[str, dict[str, Any]]]:
+    """The effects of a model that act on courses of parameters, with their values."""
+    return [
+        (e.name, dict(e.values))
+        for e in model.effects
+        if catalogue.get(e.name).kind != "image" or e.name == "test_field_expansion"
+    ]

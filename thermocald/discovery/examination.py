@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Examination", "examine_series"]
 
-MAX_EFFECTS = 3
+MAX_EFFECTS = 2
 # how much worse a solution may score and still not be excluded
 BAND = 14.0
 # a model that leaves less than this share of what the base left has the cause

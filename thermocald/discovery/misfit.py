@@ -1,0 +1,102 @@
+"""Where simulation and measurement disagree: the misfit of the base model, resolved.
+
+By parameter, by time, temperature, its rate and other channels, by image region, by target, in
+level and in noise; each with its significance against the noise of image and thermometer.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.discovery.evidence import COLUMNS
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from thermocald.discovery.result import Discovery
+
+    Array = NDArray[np.float64]
+
+__all__ = ["resolve"]
+
+
+def resolve(discovery: Discovery, series: int = 0) -> dict[str, Any]:
+    """The base model's misfit in one series.
+
+    rows: (what, size in px RMS, significance in sigma); targets: those that stand out;
+    regions: {(row, column) of a 3 × 3 raster: px RMS}.
+    """
+    x = discovery.examination
+    e = x.laboratory.series[series]
+    fit = x.base.fit
+    weighting = fit.weightings[series]
+    C, V, index = fit.designs[series]
+    coefficients = fit.coefficients[index]
+    weights = e.weights[..., :2]
+    sigma = float(1.0 / np.sqrt(np.mean(weights[weights > 0])))
+    coordinates = 2.0 * float(e.n.sum())
+
+    def against(courses: Array, directions: Array) -> tuple[float, float]:
+        A, c, B = weighting.scan(courses[None], directions, (C, V))
+        rest = c[0] - B[0] @ coefficients
+        scale = np.sqrt(np.maximum(np.diag(A[0]), 1e-300))
+        own = A[0] / np.outer(scale, scale) + 1e-9 * np.eye(len(scale))
+        gain = float(rest / scale @ np.linalg.solve(own, rest / scale))
+        free = len(scale)
+        excess = max(gain - free, 0.0)
+        return sigma * float(np.sqrt(excess / coordinates)), (gain - free) / np.sqrt(2.0 * free)
+
+    every = x.base_adequacy[series].directions
+    T = e.history.temperature()
+    courses: dict[str, Array] = {
+        "time": e.times - e.times.mean(),
+        "temperature, bent": (T - T.mean()) ** 2,
+        "rate of temperature": np.gradient(T, e.times),
+    }
+    for name in e.history.readings:
+        if name != e.history.reference:
+            courses[f"channel {name}"] = e.history.temperature(name)
+    rows: list[tuple[str, float, float]] = []
+    for name, course in courses.items():
+        rows.append((name, *against((course - course.mean())[:, None], every)))
+    smooth = x.base_adequacy[series].courses.T
+    for j, column in enumerate(COLUMNS):
+        one = np.zeros((len(COLUMNS), 1))
+        one[j] = 1.0
+        rows.append((f"{column}, slow courses", *against(smooth, one)))
+    total = x.base_adequacy[series]
+    rows.insert(0, ("all slow courses in all parameters", total.misfit_px, total.significance))
+    rows.append(("noise level (sigma0)", *_noise(e.sigma0, e.n, e.N.shape[1])))
+    return {"rows": rows, "targets": _targets(discovery, series), "regions": _regions(e, sigma)}
+
+
+def _noise(sigma0: Array, n: Array, columns: int) -> tuple[float, float]:
+    """Spread of sigma0 over the series, and how unlikely it is for a constant noise."""
+    ok = n > 0
+    free = 2.0 * n[ok] - columns
+    z = float(np.sum(free * (sigma0[ok] - np.average(sigma0[ok], weights=free)) ** 2)) * 2
+    count = float(ok.sum() - 1)
+    return float(np.std(sigma0[ok])), (z - count) / np.sqrt(2 * count)
+
+
+def _targets(discovery: Discovery, series: int) -> list[str]:
+    names = discovery.examination.laboratory.series[series].source.field.names
+    return [names[r] for g in discovery.examination.displaced[series] for r in g.rows]
+
+
+def _regions(e: Any, sigma: float) -> dict[tuple[int, int], float]:
+    """RMS of what a free camera leaves, on a raster of 3 × 3, in units of the noise."""
+    place = e.at.predicted
+    row = np.clip((3 * place[:, 1] / e.source.sensor.height).astype(float), 0, 2.99)
+    column = np.clip((3 * place[:, 0] / e.source.sensor.width).astype(float), 0, 2.99)
+    out = {}
+    for i in range(3):
+        for j in range(3):
+            inside = (np.floor(row) == i) & (np.floor(column) == j)
+            v = e.residuals[:, inside]
+            v = v[np.isfinite(v)]
+            if len(v):
+                out[(i, j)] = float(np.sqrt(np.mean(v**2)) / sigma)
+    return out

@@ -127,12 +127,15 @@ def _ring_segment(target: Target, r: float, begin: float, end: float) -> Any:
     from matplotlib.path import Path as Curve
 
     arc = Curve.arc(-360 * end, -360 * begin, n=max(2, int(np.ceil(16 * (end - begin)))))
-    outer, inner = (
-        arc.vertices * ring_code.RING_OUTER * r,
-        arc.vertices[::-1] * (ring_code.RING_INNER * r),
-    )
+    unit = np.asarray(arc.vertices, dtype=float)
+    outer, inner = unit * ring_code.RING_OUTER * r, unit[::-1] * ring_code.RING_INNER * r
     codes = np.concatenate(
-        [arc.codes, [Curve.LINETO], np.full(len(inner) - 1, Curve.CURVE4), [Curve.CLOSEPOLY]]
+        [
+            np.asarray(arc.codes),
+            [Curve.LINETO],
+            np.full(len(inner) - 1, Curve.CURVE4),
+            [Curve.CLOSEPOLY],
+        ]
     )
     vertices = np.concatenate([outer, inner, outer[:1]]) + np.array([target.x, target.y])
     return Curve(vertices, codes)

@@ -109,7 +109,9 @@ class Marker:
     def corners(self) -> Array:
         """The corners (4, 2) mm in OpenCV's order: clockwise from the upper left."""
         h = self.side / 2
-        return np.array([[-h, h], [h, h], [h, -h], [-h, -h]]) + np.array([self.x, self.y])
+        square = np.array([[-h, h], [h, h], [h, -h], [-h, -h]])
+        placed: Array = square + np.array([self.x, self.y])
+        return placed
 
 
 @dataclass(frozen=True, slots=True)

@@ -185,7 +185,8 @@ def _pinhole(model: CameraModel, pixels: Array) -> Array:
     """Directions without distortion, to begin with."""
     i, p = model.interior, model.sensor.pixel_pitch
     d = (pixels - model.sensor.centre) * p - np.array([i.x0, -i.y0])
-    return d / np.array([i.c * (1 + i.C1), i.c])
+    directions: Array = d / np.array([i.c * (1 + i.C1), i.c])
+    return directions
 
 
 def _settle(

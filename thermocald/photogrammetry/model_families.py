@@ -163,9 +163,10 @@ class MeasuredPoint:
         ideal_x, ideal_y = c * directions[:, 0], -c * directions[:, 1]
         x, y = ideal_x, ideal_y
         for _ in range(1 if self.at_ideal_point else 200):
-            dx, dy = self.correction(values, x, y)
-            new_x, new_y = ideal_x + dx, ideal_y + dy
-            change = float(np.max(np.hypot(new_x - x, new_y - y)))
+            with np.errstate(over="ignore", invalid="ignore"):  # looked at below
+                dx, dy = self.correction(values, x, y)
+                new_x, new_y = ideal_x + dx, ideal_y + dy
+                change = float(np.max(np.hypot(new_x - x, new_y - y)))
             x, y = new_x, new_y
             if change < 1e-12 * sensor.pixel_pitch:
                 break

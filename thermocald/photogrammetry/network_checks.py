@@ -66,14 +66,11 @@ def refuse_narrow(angles: Array) -> None:
     """Refuse rays that hardly intersect, given the largest angle at each target (m,) rad."""
     angle = float(np.median(angles)) if len(angles) else 0.0
     if angle < MIN_ANGLE:
-        _refuse(
-            [
-                (
-                    f"the rays meet at {np.degrees(angle):.0f}° (median), {np.degrees(MIN_ANGLE):.0f}° "
-                    "are the least: take photographs from further to the left, right, above, and below"
-                )
-            ]
+        reason = (
+            f"the rays meet at {np.degrees(angle):.0f}° (median), {np.degrees(MIN_ANGLE):.0f}° are "
+            "the least: take photographs from further to the left, right, above, and below"
         )
+        _refuse([reason])
 
 
 def refuse_weak(network: Network, weakest: tuple[float, tuple[str, ...]]) -> None:

@@ -23,7 +23,7 @@ from thermocald.photogrammetry.camera_model import rays as camera_rays
 from thermocald.photogrammetry.network_bundle import Bundle, ImageRays, residuals, solve
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
     from thermocald.photogrammetry.camera_model import Sensor
 
@@ -83,7 +83,7 @@ class _Start:
         turn, t = cv2.solvePnPRefineLM(
             known[keep], image[keep][:, None, :], np.eye(3), None, turn, t
         )
-        self.poses[photo] = (cv2.Rodrigues(turn)[0], np.asarray(t, dtype=float).ravel())
+        self.poses[photo] = (np.asarray(cv2.Rodrigues(turn)[0], dtype=float), _vector(t))
         return True
 
     def intersect(self, min_angle: float = np.radians(2.0)) -> None:
@@ -149,6 +149,10 @@ class _Start:
         self.intersect()
 
 
+def _vector(t: ArrayLike) -> Array:
+    return np.asarray(t, dtype=float).ravel()
+
+
 def _pairs(rays: ImageRays, normalised: Array) -> list[tuple[int, int]]:
     """Pairs of photographs to begin with, the most promising first.
 
@@ -198,7 +202,10 @@ def _from_pair(start: _Start, pair: tuple[int, int]) -> bool:
     # a pair that disagrees in half of its targets is no pair, whatever its parallax promised
     if n < max(_MIN_PAIR, len(ia) // 2):
         return False
-    start.poses = {pair[0]: (np.eye(3), np.zeros(3)), pair[1]: (R, t.ravel())}
+    start.poses = {
+        pair[0]: (np.eye(3), np.zeros(3)),
+        pair[1]: (np.asarray(R, dtype=float), _vector(t)),
+    }
     start.points[:] = np.nan
     start.intersect()
     if np.isfinite(start.points[:, 0]).sum() < _MIN_PAIR:

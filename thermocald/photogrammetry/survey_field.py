@@ -58,11 +58,11 @@ def sheet_labels(points: Array) -> NDArray[np.int64]:
                     waiting.append(int(other))
     # what has found no plane of its own belongs to its nearest neighbour's, if it lies in it
     placed = labels >= 0
-    for row in np.flatnonzero(~placed) if placed.any() else ():
-        other = int(np.argmin(np.where(placed, distance[row], np.inf)))
-        off = abs(float((points[row] - points[other]) @ normals[other]))
-        if off < _SAME_SHEET_STEP * distance[row, other]:
-            labels[row] = labels[other]
+    for lost in np.flatnonzero(~placed) if placed.any() else ():
+        nearest = int(np.argmin(np.where(placed, distance[lost], np.inf)))
+        off = abs(float((points[lost] - points[nearest]) @ normals[nearest]))
+        if off < _SAME_SHEET_STEP * distance[lost, nearest]:
+            labels[lost] = labels[nearest]
     return labels
 
 
@@ -139,7 +139,7 @@ def field_of_codes(
             network.camera.sensor, interior, s.exterior.as_array(), network.points, normals,
             np.full(len(network.names), 0.5),
         )  # fmt: skip
-        known = np.isfinite(unit.linear).all(axis=(1, 2))
+        known = np.asarray(np.isfinite(unit.linear).all(axis=(1, 2)), dtype=bool)
         for i, name in enumerate(network.names):
             if (s.photo, name) in radii and known[i]:
                 axis = float(np.linalg.svd(unit.linear[i], compute_uv=False)[0])

@@ -438,7 +438,7 @@ def test_aicon_states_standard_deviations(tmp_path, plain):
 @pytest.mark.parametrize(
     ("name", "text", "reason"),
     [
-        ("a.yaml", "%YAML:1.0\n---\ncamera_matrix: [1, 2\n", "parse|camera_matrix"),
+        ("a.yaml", "%YAML:1.0\n---\ncamera_matrix: [1, 2\n", "no valid YAML"),
         ("b.yaml", "hello: 1\n", "no camera file of any"),
         ("c.yaml", "image_width: 10\ndistortion_model: equidistant\n", "equidistant"),
         ("d.yaml", "cam0:\n  camera_model: omni\n", "omni"),
@@ -503,3 +503,34 @@ def test_tiny_sensor_and_large_pitch(tmp_path, plain):
         path = tmp_path / name
         camera_files.write(model, path, name)
         assert camera_files.read(path).model.sensor.pixel_pitch == pytest.approx(0.015, rel=1e-12)
+
+
+@pytest.mark.parametrize("name", list(camera_files.FORMATS))
+def test_damaged_files_are_an_error_or_a_camera_never_a_traceback(tmp_path, without_a3, name):
+    """60 seeded damages per format: characters lost, doubled, replaced, the end cut off."""
+    path = tmp_path / "camera"
+    camera_files.write(without_a3, path, name)
+    text = path.read_text(encoding="utf-8")
+    rng = np.random.default_rng(11)
+    outcomes = {"error": 0, "camera": 0}
+    for _ in range(60):
+        damaged = list(text)
+        for _ in range(int(rng.integers(1, 4))):
+            at = int(rng.integers(len(damaged)))
+            damaged[at] = rng.choice(["", "x", "-", "9", "\n", ":", "{", "nan", damaged[at] * 2])
+        if rng.random() < 0.2:
+            damaged = damaged[: int(rng.integers(len(damaged)))]
+        path.write_text("".join(damaged), encoding="utf-8")
+        message = ""
+        try:
+            camera = camera_files.read(path, pixel_pitch=0.00112)
+        except ConfigurationError as error:
+            message = str(error)
+            outcomes["error"] += 1
+        else:
+            outcomes["camera"] += 1
+        if message:
+            assert str(path) in message
+        else:
+            assert np.all(np.isfinite(camera.model.interior.as_array()))
+    assert outcomes["error"] > 0

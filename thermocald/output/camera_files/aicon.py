@@ -78,12 +78,15 @@ def _decode(text: str, pitch: float | None) -> ImportedCamera:
     values = np.array([number(found.get(key, 0.0), key) for key in _NAMES])
     values[0] = abs(values[0])
     sizes = [number(found[key], key) for key in _SIZES]
+    r0 = number(found.get("R0", 0.0), "R0")
+    if not 0 <= r0 < 1000:
+        raise ConfigurationError(f"R0 is {r0:g} mm; it is a radius in the image")
     covariance = None
     if spread:
         covariance = np.diag([spread.get(key, 0.0) ** 2 for key in _NAMES])
     return import_family(
         "aicon", text, (int(sizes[2]), int(sizes[3])),
-        MeasuredPoint(number(found.get("R0", 0.0), "R0")), values,
+        MeasuredPoint(r0), values,
         pitch if pitch is not None else sizes[0] / sizes[2], name, covariance,
     )  # fmt: skip
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Format", "ImportedCamera", "Record", "header", "import_family", "number", "numbers"]
 
+_LARGEST = 1e9
 _PITCH = re.compile(r"pixel_pitch_mm[\"']?\s*[:=]\s*([0-9.eE+-]+)")
 
 
@@ -107,8 +108,8 @@ def import_family(
     width, height = size
     if not (0 < width <= 100_000 and 0 < height <= 100_000):
         raise ConfigurationError(f"image size {width} × {height} px is impossible")
-    if not np.all(np.isfinite(values)):
-        raise ConfigurationError("a camera parameter is not a number")
+    if not np.all(np.abs(values) < _LARGEST):
+        raise ConfigurationError("a camera parameter is no number, or beyond all measure")
     sensor = Sensor(width, height, _pitch(text, pitch))
     # a focal length of zero or less would only fail later, and in other words
     focal = values[0] / (sensor.pixel_pitch if family.parameters[0] == "c" else 1.0)

@@ -7,7 +7,10 @@ intrinsics_covariance in the order fx fy cx cy k1 k2 p1 p2 k3, and std_deviation
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
+import yaml
 
 from thermocald.errors import ConfigurationError
 from thermocald.output.camera_files.camera_record import (
@@ -16,10 +19,16 @@ from thermocald.output.camera_files.camera_record import (
     Record,
     header,
     import_family,
+    number,
     numbers,
 )
 from thermocald.photogrammetry.conversions import to_family
 from thermocald.photogrammetry.model_families import BrownOpenCV
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
 
 __all__ = ["FORMAT"]
 
@@ -46,24 +55,39 @@ def _encode(record: Record) -> tuple[str, str]:
     return begin + mark + header(record, result.statement) + rest, result.statement
 
 
-def _decode(text: str, pitch: float | None) -> ImportedCamera:
-    import cv2
+class _Loader(yaml.SafeLoader):
+    """YAML with OpenCV's matrices."""
 
+
+def _matrix(loader: yaml.SafeLoader, node: yaml.Node) -> dict[Any, Any]:
+    if not isinstance(node, yaml.MappingNode):
+        raise ConfigurationError("an opencv-matrix has no rows, cols, and data")
+    return loader.construct_mapping(node, deep=True)
+
+
+# OpenCV 5 writes vectors as the second kind
+for _kind in ("opencv-matrix", "opencv-nd-matrix"):
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_kind}", _matrix)
+
+
+def _numbers(document: dict[Any, Any], key: str, counts: tuple[int, ...]) -> Array:
+    node = document.get(key)
+    return numbers(node.get("data") if isinstance(node, dict) else node, key, counts)
+
+
+def _decode(text: str, pitch: float | None) -> ImportedCamera:
+    # not with cv2.FileStorage: a damaged file makes it crash the process (OpenCV 5.0.0)
     try:
-        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-    except (cv2.error, SystemError):  # what its bindings raise for a syntax error
-        raise ConfigurationError("OpenCV cannot parse the file") from None
-    try:
-        K, d, Q = (
-            storage.getNode(n).mat()
-            for n in ("camera_matrix", "distortion_coefficients", "intrinsics_covariance")
-        )
-        size = tuple(int(storage.getNode(n).real()) for n in ("image_width", "image_height"))
-        name = storage.getNode("camera_name").string() or "camera"
-    finally:
-        storage.release()
-    K = numbers(K, "camera_matrix", (9,)).reshape(3, 3)
-    d = numbers(d if d is not None else [], "distortion_coefficients", (*_COUNTS, 14))
+        document = yaml.load(text.partition("\n")[2], _Loader)
+    except (yaml.YAMLError, ValueError) as cause:
+        raise ConfigurationError(f"no valid YAML: {str(cause).splitlines()[0]}") from None
+    if not isinstance(document, dict):
+        raise ConfigurationError("the file holds no keys")
+    K = _numbers(document, "camera_matrix", (9,)).reshape(3, 3)
+    d = np.zeros(0)
+    if "distortion_coefficients" in document:
+        d = _numbers(document, "distortion_coefficients", (*_COUNTS, 14))
+    size = [int(number(document.get(key), key)) for key in ("image_width", "image_height")]
     if len(d) == 14:
         if np.any(d[12:]):
             raise ConfigurationError("a tilted sensor (tau) has no counterpart in this model")
@@ -71,10 +95,13 @@ def _decode(text: str, pitch: float | None) -> ImportedCamera:
     if K[0, 1] != 0:
         raise ConfigurationError("a skewed camera_matrix is nothing that OpenCV itself uses")
     values = np.concatenate([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], d])
-    if Q is not None and Q.shape != (len(values), len(values)):
-        Q = None
+    covariance = None
+    if "intrinsics_covariance" in document:
+        n = len(values)
+        covariance = _numbers(document, "intrinsics_covariance", (n * n,)).reshape(n, n)
+    name = str(document.get("camera_name", "camera"))
     return import_family(
-        "opencv", text, (size[0], size[1]), BrownOpenCV(len(d)), values, pitch, name, Q
+        "opencv", text, (size[0], size[1]), BrownOpenCV(len(d)), values, pitch, name, covariance
     )
 
 

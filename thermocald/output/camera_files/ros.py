@@ -60,10 +60,10 @@ def _decode(text: str, pitch: float | None) -> ImportedCamera:
         raise ConfigurationError(
             f"distortion_model {model!r}: plumb_bob and rational_polynomial can be read"
         )
-    data = {
-        key: (document.get(key) or {}).get("data")
-        for key in ("camera_matrix", "distortion_coefficients")
-    }
+    data = {}
+    for key in ("camera_matrix", "distortion_coefficients"):
+        node = document.get(key)
+        data[key] = node.get("data") if isinstance(node, dict) else None
     K = numbers(data["camera_matrix"], "camera_matrix.data", (9,))
     d = numbers(data["distortion_coefficients"], "distortion_coefficients.data", (_COUNT[model],))
     size = [int(number(document.get(key), key)) for key in ("image_width", "image_height")]

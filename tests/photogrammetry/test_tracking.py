@@ -1,0 +1,168 @@
+"""Tracking: windows only, weights renewed, and a full search when too much is lost."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.photogrammetry.exact_rendering import noisy
+from tests.photogrammetry.fields import SMALL_CAMERA, SMALL_SENSOR, draw, small_field, station
+from thermocald.photogrammetry import tracking
+from thermocald.photogrammetry.camera_model import CameraModel
+from thermocald.photogrammetry.measurement import Prior
+from thermocald.photogrammetry.tracking import Tracker
+
+FIELD, NORMALS = small_field()
+STATION = station(800.0)
+
+
+def _render(camera=SMALL_CAMERA, exterior=STATION) -> np.ndarray:
+    return draw(FIELD, NORMALS).render(camera, exterior)
+
+
+def _shifted(px: float) -> CameraModel:
+    """The camera whose principal point has drifted by so many px along x, and half along y."""
+    shift = px * SMALL_SENSOR.pixel_pitch
+    i = SMALL_CAMERA.interior
+    return CameraModel(SMALL_SENSOR, i.with_values(x0=i.x0 + shift, y0=i.y0 - shift / 2))
+
+
+@pytest.fixture(scope="module")
+def clean() -> np.ndarray:
+    return _render()
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(21)
+
+
+@pytest.fixture
+def tracker(clean, rng) -> Tracker:
+    """A tracker that has seen the first frame."""
+    tracker = Tracker(FIELD, Prior(SMALL_SENSOR))
+    first = tracker.measure(noisy(clean, rng))
+    assert first.status.ok
+    assert first.searched
+    return tracker
+
+
+def _z(measured, camera=SMALL_CAMERA, exterior=STATION) -> np.ndarray:
+    o = measured.observations
+    return (o.points - camera.project(exterior, FIELD.points)[o.targets]) / o.sigmas
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+@pytest.fixture
+def no_search(monkeypatch):
+    """A full search fails the test."""
+
+    def search(*arguments):
+        raise AssertionError("the whole frame was searched")
+
+    monkeypatch.setattr(tracking, "measure", search)
+
+
+def test_windows_are_enough_and_sigmas_stay_true(tracker, clean, rng, no_search):
+    z = []
+    for _ in range(15):
+        measured = tracker.measure(noisy(clean, rng))
+        assert measured.status.ok
+        assert not measured.searched
+        assert len(measured.observations) >= 100
+        z.append(_z(measured))
+    assert 0.93 <= _rms(np.array(z)) <= 1.07
+    # Fixed weights carry no error of their own from epoch to epoch.
+    assert _rms(np.mean(z, axis=0)) < 1.35 / np.sqrt(15)
+
+
+@pytest.mark.parametrize("px", [0.05, 0.12, 0.3, 1.2])
+def test_drift_is_followed_without_bias(tracker, rng, no_search, px):
+    camera = _shifted(px)
+    image = _render(camera)
+    z = np.array([_z(tracker.measure(noisy(image, rng)), camera) for _ in range(6)])
+    assert _rms(z) <= 1.12
+    # 200 targets × 6 frames: a common bias of 0.001 px of a sigma of 0.008 px would show.
+    assert np.abs(z.mean(axis=(0, 1))).max() < 4 / np.sqrt(z.shape[0] * z.shape[1])
+
+
+def test_weights_are_renewed_when_targets_have_moved(tracker, rng, no_search):
+    assert tracker.measure(noisy(_render(_shifted(0.08)), rng)).renewed == 0
+    image = _render(_shifted(0.4))
+    assert tracker.measure(noisy(image, rng)).renewed > 50
+    assert tracker.measure(noisy(image, rng)).renewed == 0
+
+
+def test_light_may_change(tracker, clean, rng, no_search):
+    for factor in (0.9, 0.5, 1.1):
+        measured = tracker.measure(noisy(clean * factor, rng))
+        assert len(measured.observations) >= 100
+        assert 0.88 <= _rms(_z(measured)) <= 1.12
+        contrast = np.median(measured.observations.quality["contrast"])
+        assert contrast == pytest.approx(-150 * factor, rel=0.02)
+
+
+def test_noise_may_change(tracker, clean, rng, no_search):
+    measured = tracker.measure(noisy(clean, rng, 4.0))
+    assert 0.88 <= _rms(_z(measured)) <= 1.12
+    assert np.median(measured.observations.quality["noise"]) == pytest.approx(4.0, rel=0.1)
+
+
+def test_defocus_is_seen_in_the_blur(tracker, rng, no_search):
+    for blur in (0.83, 1.0, 1.3):
+        image = draw(FIELD, NORMALS).render(SMALL_CAMERA, STATION, blur=blur)
+        measured = tracker.measure(noisy(image, rng))
+        assert np.median(measured.observations.quality["blur"]) == pytest.approx(blur, abs=0.02)
+
+
+def test_a_target_may_be_hidden_and_come_back(tracker, clean, rng, no_search):
+    before = len(tracker.measure(noisy(clean, rng)).observations)
+    covered = clean.copy()
+    covered[500:700, 700:900] = 120
+    for _ in range(2):
+        measured = tracker.measure(noisy(covered, rng))
+        assert measured.missed
+        assert len(measured.observations) + len(measured.missed) >= before
+        assert np.abs(_z(measured)).max() < 6
+    back = tracker.measure(noisy(clean, rng))
+    assert len(back.observations) == before
+    assert np.abs(_z(back)).max() < 5
+
+
+def test_a_knock_is_answered_by_a_search_that_says_so(tracker, rng):
+    knocked = station(760.0, target=(215.0, 190.0, 200.0), roll=0.03)
+    image = _render(exterior=knocked)
+    measured = tracker.measure(noisy(image, rng))
+    assert "lost" in measured.searched
+    assert measured.status.ok
+    assert np.abs(_z(measured, exterior=knocked)).max() < 5
+    assert not tracker.measure(noisy(image, rng)).searched
+
+
+def test_the_light_goes_out_and_on_again(tracker, clean, rng):
+    for _ in range(2):
+        dark = tracker.measure(noisy(np.full_like(clean, 4.0), rng))
+        assert dark.status.word == "black"
+        assert "lost" in dark.searched
+        assert len(dark.observations) == 0
+    light = tracker.measure(noisy(clean, rng))
+    assert light.status.ok
+    assert not light.searched  # where the targets were is still known
+
+
+def test_frames_of_another_kind(tracker, clean, rng):
+    frame = noisy(clean, rng)
+    assert tracker.measure(frame[:-10]).status.word == "wrong_size"
+    assert tracker.measure(frame[:0]).status.word == "no_image"
+    assert tracker.measure(np.dstack([frame] * 3)).status.word == "not_grey"
+    sixteen = tracker.measure(frame.astype(np.uint16) * 256)
+    assert "uint16" in sixteen.searched
+    assert sixteen.status.ok
+
+
+def test_reset_begins_anew(tracker, clean, rng):
+    tracker.reset()
+    assert "nothing is tracked" in tracker.measure(noisy(clean, rng)).searched

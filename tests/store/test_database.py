@@ -15,6 +15,7 @@ from thermocald.photogrammetry.camera_model import PARAMETER_NAMES
 from thermocald.store.database import Store
 from thermocald.store.recording import read_recording, temperature_at_frame, write_recording
 from thermocald.store.row import NOT_CALIBRATED, EpochResult, Event
+from thermocald.store.testfield_file import parse_testfield
 
 
 def test_an_epoch_comes_back_as_it_was(filled, make_epoch, make_result):
@@ -349,3 +350,11 @@ def test_checkpoint_empties_the_wal(filled, store_path, make_epoch):
         assert not store.checkpoint()
         epochs.close()
     assert store.checkpoint()
+
+
+def test_a_camera_without_a_test_field(filled, head):
+    """One that is only acquired has a series all the same."""
+    empty = parse_testfield("target,X,Y,Z,diameter,sX,sY,sZ\n", filled.path)
+    series = filled.create_series(replace(head, series="acquired"), empty)
+    assert len(series.testfield.names) == 0
+    assert filled.find_series(name="acquired").id == series.id

@@ -46,12 +46,13 @@ def read_testfield(path: Path) -> TestField:
 def parse_testfield(text: str, path: Path) -> TestField:
     """A test field that was accepted before, from the text of a `testfield.csv`.
 
-    path: for the messages. Errors as `read_testfield`.
+    It may be empty: the series of a camera that is only acquired. path: for the messages. Errors
+    as `read_testfield`.
     """
-    return _read(Table(path, _REQUIRED, TestFieldError, text))
+    return _read(Table(path, _REQUIRED, TestFieldError, text), may_be_empty=True)
 
 
-def _read(table: Table) -> TestField:
+def _read(table: Table, *, may_be_empty: bool = False) -> TestField:
     names: list[str] = []
     columns: dict[str, list[float]] = {name: [] for name in _REQUIRED[1:]}
     kinds: list[str] = []
@@ -81,7 +82,7 @@ def _read(table: Table) -> TestField:
             kinds.append(kind)
         found = chunk.text("code") if "code" in table.columns else empty
         codes.extend(code.strip() for code in found)
-    if not names:
+    if not names and not may_be_empty:
         raise TestFieldError(f"{table.path}: holds no targets")
     return TestField.build(
         names,

@@ -354,7 +354,8 @@ def test_checkpoint_empties_the_wal(filled, store_path, make_epoch):
 
 def test_a_camera_without_a_test_field(filled, head):
     """One that is only acquired has a series all the same."""
-    empty = parse_testfield("target,X,Y,Z,diameter,sX,sY,sZ\n", filled.path)
-    series = filled.create_series(replace(head, series="acquired"), empty)
+    store = filled[0]
+    empty = parse_testfield("target,X,Y,Z,diameter,sX,sY,sZ\n", store.path)
+    series = store.create_series(replace(head, series="acquired"), empty)
     assert len(series.testfield.names) == 0
-    assert filled.find_series(name="acquired").id == series.id
+    assert store.find_series(name="acquired").id == series.id

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 from contextlib import contextmanager
+from html import escape
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -75,7 +76,7 @@ def inline_svg(drawing: Any, prefix: str, label: str) -> str:
     # The page decides the width; the height follows from the viewBox.
     head, rest = text.split(">", 1)
     head = re.sub(r'\s(width|height)="[^"]*"', "", head)
-    return f'{head} role="img" aria-label="{label}">{rest}'
+    return f'{head} role="img" aria-label="{escape(label)}">{rest}'
 
 
 def _shorter(tag: str) -> str:

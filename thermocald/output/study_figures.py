@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.output.numbers import UNITS, parameter_label, percent, plain, superscript
+from thermocald.output.numbers import UNITS, parameter_label, plain, superscript
 from thermocald.output.panels import PALETTE, Curve, Figure, Panel, thin
 from thermocald.photogrammetry.camera_model import IOP_NAMES
 
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 __all__ = [
     "dependence_figure",
     "deviation_figure",
-    "error_figure",
     "movement_figure",
     "principal_point_figure",
     "significance_figure",
@@ -126,6 +125,9 @@ def principal_point_figure(camera: CameraStudy) -> Figure | None:
         curves.append(Curve(s.name, x[rows], y[rows], "line", PALETTE[i % 7]))
         curves.append(Curve("", x[:1], y[:1], "points", "#000000"))
         words.append(f"{s.name}: {_direction(float(x[-1]), float(y[-1]))}")
+        farthest = float(np.max(np.hypot(x, y)))
+        if farthest > 1.5 * np.hypot(x[-1], y[-1]):
+            words[-1] += f" in the end, {plain(farthest, 'px', 3)} away at most"
     panel = Panel(
         "Path of the principal point",
         "Δx₀ in px, right",
@@ -318,75 +320,6 @@ def _dependence_curves(study: SeriesStudy, name: str, scale: float, colour: str)
         Curve(s.name, t[shown], v[shown], "points", colour),
         Curve("", ends, v.mean() + slope * (ends - t.mean()), "line", colour),
     ]
-
-
-def error_figure(camera: CameraStudy) -> Figure | None:
-    """Error clouds on the object plane, one panel per raster point (Figures 10 and 11)."""
-    mc, first = camera.montecarlo, camera.first_order
-    if mc is None or first is None:
-        return None
-    limits = mc.clusters_mm
-    colours = ("#1b7837", "#7fbf7b", "#e6a800", "#d6278a", "#7b3294", "#000000")
-    size = round(np.sqrt(len(mc.image_points)))
-    panels = []
-    for k in range(len(mc.image_points)):
-        errors = mc.sample[:600, k]
-        distance = np.linalg.norm(errors, axis=1)
-        cluster = np.searchsorted(limits, distance, side="right")
-        curves = [
-            Curve(
-                _cluster_name(limits, j),
-                errors[cluster == j, 0] / 10,
-                errors[cluster == j, 1] / 10,
-                "points",
-                colours[min(j, 5)],
-            )
-            for j in range(len(limits) + 1)
-            if np.any(cluster == j)
-        ]
-        x, y = _ellipse(mc.covariance[k], mc.mean_error[k])
-        curves.append(Curve("95 %, simulated", x / 10, y / 10, "line", "#000000"))
-        x, y = _ellipse(first.covariance[k], np.zeros(2))
-        curves.append(Curve("95 %, first order", x / 10, y / 10, "line", "#d55e00", dashed=True))
-        panels.append(Panel(_place(k, size), "ΔX in cm", "ΔY in cm", tuple(curves), equal=True))
-    worst = int(np.argmax(mc.largest))
-    return Figure(
-        "object-space-errors",
-        f"Errors on a plane at {mc.distance_mm / 1000:g} m",
-        f"Where {mc.sets:,} drawn interior orientations put each image point on a plane at "
-        f"{mc.distance_mm / 1000:g} m, relative to where it belongs ({min(600, mc.sets)} of them "
-        f"drawn). {percent(float(mc.shares[0]))} of all errors are below {limits[0] / 10:g} cm, "
-        f"the mean is {mc.overall_mean / 10:.2f} cm; the largest, {mc.largest[worst] / 10:.1f} cm, "
-        f"arises at the {_place(worst, size)}.",
-        tuple(panels),
-        columns=size,
-    )
-
-
-def _cluster_name(limits: tuple[float, ...], j: int) -> str:
-    if j == 0:
-        return f"< {limits[0] / 10:g} cm"
-    if j == len(limits):
-        return f"> {limits[-1] / 10:g} cm"
-    return f"{limits[j - 1] / 10:g}–{limits[j] / 10:g} cm"
-
-
-def _place(k: int, size: int) -> str:
-    """Name of a raster point."""
-    if size != 3:
-        return f"row {k // size + 1}, column {k % size + 1}"
-    vertical, horizontal = ("top", "", "bottom")[k // 3], ("left", "", "right")[k % 3]
-    name = " ".join(word for word in (vertical, horizontal) if word)
-    return name + (" corner" if vertical and horizontal else " edge") if name else "image centre"
-
-
-def _ellipse(covariance: Array, centre: Array) -> tuple[Array, Array]:
-    """Outline of the 95 % ellipse."""
-    values, vectors = np.linalg.eigh(covariance)
-    angle = np.linspace(0, 2 * np.pi, 73)
-    scale = np.sqrt(5.991 * np.maximum(values, 0))  # chi-square with 2 degrees of freedom
-    x, y = vectors @ (scale[:, None] * np.stack([np.cos(angle), np.sin(angle)]))
-    return x + centre[0], y + centre[1]
 
 
 def _direction(x: float, y: float) -> str:

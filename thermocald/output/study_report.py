@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from thermocald import __version__
 from thermocald.errors import DataError
+from thermocald.output import object_space_figures as object_space
 from thermocald.output import study_figures as figures
 from thermocald.output import study_tables as tables
 from thermocald.output.clips import clip_png, cut_clip, data_uri
@@ -143,7 +144,8 @@ def _panel_figures(camera: CameraStudy) -> list[Figure]:
         figures.movement_figure(camera),
         figures.significance_figure(camera),
         figures.dependence_figure(camera),
-        figures.error_figure(camera),
+        object_space.error_figure(camera),
+        object_space.point_figure(camera),
     )
     return [figure for figure in made if figure is not None]
 
@@ -213,7 +215,7 @@ def _parts(camera: CameraStudy, study: Study, prefix: str) -> list[_Part]:
         ),
         _Part(
             "What it means in object space",
-            pick("object-space-errors"),
+            pick("object-space-errors", "errors-by-point"),
             some(tables.cluster_table(camera), tables.point_table(camera)),
         ),
     ]
@@ -226,11 +228,11 @@ def _drawing(figure: Figure, prefix: str) -> _Drawing:
         inline_svg(draw_panel(panel, legend=i == 0), f"{name}-{i}", panel.title)
         for i, panel in enumerate(figure.panels)
     )
-    # "</" inside a script element would end it.
+    # "<" inside a script element could end it.
     data = json.dumps(document(figure), ensure_ascii=False, separators=(",", ":"), allow_nan=False)
     columns = min(figure.columns, len(figure.panels))
     return _Drawing(
-        name, "panels", figure.title, figure.caption, svgs, (), columns, data.replace("</", "<\\/")
+        name, "panels", figure.title, figure.caption, svgs, (), columns, data.replace("<", "\\u003c")
     )
 
 

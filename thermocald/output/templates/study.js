@@ -8,17 +8,33 @@
     for (const c of panel.curves) {
       const line = { color: c.colour, width: 1.4, dash: c.dashed ? "dash" : "solid" };
       if (c.kind === "band") {
-        result.push({ x: c.x, y: c.lower, mode: "lines", line: { width: 0 }, hoverinfo: "skip",
-          showlegend: false, legendgroup: c.name });
+        result.push({ x: c.x, y: c.lower, mode: "lines", line: { width: 0 }, hoverinfo: "skip" });
         result.push({ x: c.x, y: c.upper, mode: "lines", line: { width: 0 }, fill: "tonexty",
-          fillcolor: c.colour + "33", hoverinfo: "skip", showlegend: false, legendgroup: c.name });
+          fillcolor: c.colour + "33", hoverinfo: "skip" });
       }
       const points = c.kind === "points";
       result.push({ x: c.x, y: c.y, name: c.name, mode: points ? "markers" : "lines", line: line,
-        marker: { color: c.colour, size: 4, opacity: 0.75 }, showlegend: Boolean(c.name),
-        legendgroup: c.name, hoverinfo: c.name ? "x+y+name" : "x+y" });
+        marker: { color: c.colour, size: 4, opacity: 0.75 }, hoverinfo: c.name ? "x+y+name" : "x+y" });
     }
     return result;
+  }
+
+  function legend(panels) {
+    // One for the figure: in every panel it would cost a third of the height.
+    const names = new Map();
+    for (const panel of panels) for (const c of panel.curves) if (c.name) names.set(c.name, c);
+    const list = document.createElement("ul");
+    list.className = "legend";
+    if (names.size > 1) {
+      for (const [name, c] of names) {
+        const item = document.createElement("li");
+        item.style.setProperty("--colour", c.colour);
+        item.className = c.kind === "points" ? "dot" : c.dashed ? "dashed" : "line";
+        item.textContent = name;
+        list.appendChild(item);
+      }
+    }
+    return list;
   }
 
   function layout(panel) {
@@ -34,8 +50,7 @@
       xaxis: Object.assign({ title: { text: panel.x, standoff: 6 } }, axis),
       yaxis: Object.assign({ title: { text: panel.y, standoff: 6 }, type: panel.log ? "log" : "linear" },
         axis, panel.equal ? { scaleanchor: "x" } : {}),
-      shapes: flat, showlegend: panel.curves.filter((c) => c.name).length > 1,
-      legend: { orientation: "h", x: 1, xanchor: "right", y: 1.02, yanchor: "bottom", font: { size: 10 } },
+      shapes: flat, showlegend: false,
     };
   }
 
@@ -70,7 +85,9 @@
       return;
     }
     live.classList.add(...Array.from(still.classList).filter((name) => name.startsWith("columns")));
-    for (const panel of JSON.parse(figure.querySelector("script.data").textContent)) {
+    const panels = JSON.parse(figure.querySelector("script.data").textContent);
+    live.appendChild(legend(panels));
+    for (const panel of panels) {
       const div = document.createElement("div");
       live.appendChild(div);
       Plotly.newPlot(div, traces(panel), layout(panel), config);

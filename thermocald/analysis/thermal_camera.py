@@ -180,12 +180,15 @@ class ThermalCamera:
         temperatures: ArrayLike | Mapping[str, ArrayLike],
         at: ArrayLike | None = None,
         extrapolate: bool = False,
+        relative_to: float | None = None,
+        temperature_sd: float = 0.0,
     ) -> Along:
         """The camera along a temperature log.
 
         times (R,) s; temperatures (R,) °C of the reference, or {channel: (R,)}, the first is the
         reference; at (E,): the instants asked for, by default `times`. The past begins with the
-        first instant.
+        first instant. relative_to °C: the covariance is that of the difference to the steady camera
+        at this temperature; temperature_sd K: of a reading, is carried into the covariance.
         """
         t = np.asarray(times, dtype=float)
         columns = temperatures if isinstance(temperatures, dict) else {"temperature": temperatures}
@@ -196,9 +199,13 @@ class ThermalCamera:
         history = History(instants - begin, t - begin, readings, reference, self.model.T0)
         outside = self._outside(history.temperature(), extrapolate)
         values, covariance = [], []
+        steady = None if relative_to is None else self._steady_derivative(relative_to)
         for first in range(0, len(instants), _CHUNK):
             part = history.at(history.times[first : first + _CHUNK])
-            found, matrix = self._propagated(part, outside[first : first + _CHUNK])
+            found, matrix = self._propagated(part, outside[first : first + _CHUNK], steady)
+            if temperature_sd:
+                rates = self.model.rate_vector
+                matrix += temperature_sd**2 * np.outer(rates, rates)
             values.append(found)
             covariance.append(matrix)
         return Along(
@@ -210,11 +217,25 @@ class ThermalCamera:
             outside,
         )
 
-    def _propagated(self, history: History, outside: Array) -> tuple[Array, Array]:
+    def _steady_derivative(self, temperature: float) -> Array:
+        """∂ IOP / ∂ parameters (10, p) of the steady camera."""
+        s = self._steady
+        dT = temperature - self.model.T0
+        J = s.J[0] + dT * (s.J[1] + dT * s.J[2])
+        for knee, _, by_rate, by_knee in s.knees:
+            if temperature > knee:
+                J = J + (temperature - knee) * by_rate + by_knee
+        return J
+
+    def _propagated(
+        self, history: History, outside: Array, steady: Array | None
+    ) -> tuple[Array, Array]:
         values = self.model.predict(history).iop
         J = np.zeros((*values.shape, len(self.parameters)))
         for i, name in enumerate(self.parameters):
             J[:, :, i] = self._derivative(history, name)
+        if steady is not None:
+            J -= steady
         covariance = np.einsum("epi,ij,eqj->epq", J, self.covariance, J, optimize=True)
         beyond = np.abs(self.model.rate_vector) * outside[:, None]
         rows = np.arange(10)
@@ -259,7 +280,7 @@ class ThermalCamera:
             return 0.0
         beyond = low - T if low > T else T - high
         far = beyond > _REFUSED_SHARE * max(high - low, 1.0)
-        if far and low <= (T - 32.0) / 1.8 <= high:
+        if far and not extrapolate and low <= (T - 32.0) / 1.8 <= high:
             raise UsageError(
                 f"{T:g} looks like fahrenheit: the model was fitted between {low:g} and {high:g} "
                 "°C; convert it"

@@ -440,7 +440,8 @@ def _interval(times: Array) -> float:
 def _span(series: list[ModelSeries], channel: str) -> tuple[float, float]:
     readings = [s.history.readings[channel] for s in series if channel in s.history.readings]
     values = np.concatenate(readings)
-    return round(float(np.nanmin(values)), 2), round(float(np.nanmax(values)), 2)
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    return float(np.floor(low * 10) / 10), float(np.ceil(high * 10) / 10)
 
 
 def _rms(series: ModelSeries, model: ThermalModel) -> float:

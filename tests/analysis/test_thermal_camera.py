@@ -1,0 +1,216 @@
+"""The thermal camera: the same answer by every way, covariance against draws, refusals."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from thermocald.analysis.thermal_camera import ExtrapolationWarning, ThermalCamera
+from thermocald.analysis.undistortion import ideal_points
+from thermocald.analysis.warm_up import warm_up
+from thermocald.errors import ConfigurationError, DataError, UsageError
+from thermocald.photogrammetry.camera_model import InteriorOrientation, Sensor, rays
+from thermocald.simulation.demonstration import demonstration_field, demonstration_model
+from thermocald.simulation.model import ModelEffect
+from thermocald.simulation.model_file import write_model
+
+
+def thermal_model(*listed):
+    model = demonstration_model(demonstration_field("plain"))
+    sds = {"interior.c": 2e-4, "interior.x0": 3e-4, "interior.y0": 3e-4, "rates.c": 6e-7,
+           "rates.x0": 1e-6, "rates.y0": 1e-6}  # fmt: skip
+    return replace(model, effects=listed, sds=sds, validity={"temperature": (20.0, 50.0)})
+
+
+LISTED = (
+    ModelEffect("thermal_lag", {"tau": 80.0}, {"tau": 2.0}),
+    ModelEffect("nonlinear_expansion", {"c": 1e-6, "x0": -2e-6}, {"c": 1e-8, "x0": 2e-8}),
+    ModelEffect("softening", {"T_k": 38.0, "x0": 3e-5}, {"T_k": 0.3, "x0": 1e-6}),
+    ModelEffect("radial_distortion_drift", {"A1": 3e-6}, {"A1": 1e-7}),
+    ModelEffect("hysteresis", {"half_width": 0.5}, {"half_width": 0.05}),
+    ModelEffect("thermal_gradient", {"x0": 1e-3}, {"x0": 1e-5}),
+)
+
+
+@pytest.mark.parametrize("T", [22.0, 25.0, 37.9, 44.0])
+def test_steady_is_the_end_of_a_long_history(T):
+    camera = ThermalCamera(thermal_model(*LISTED))
+    now = camera.at(T)
+    along = camera.along([0.0, 5e4, 1e5], [T, T, T])
+    np.testing.assert_allclose(along.values[-1], now.values, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(along.covariance[-1], now.covariance, rtol=1e-6, atol=1e-22)
+
+
+def _moved(effect, change):
+    return {k: v + change.get(f"{effect.name}.{k}", 0.0) for k, v in effect.values.items()}
+
+
+def test_covariance_against_draws():
+    """400 models drawn with the file's standard deviations."""
+    model = thermal_model(*LISTED)
+    camera = ThermalCamera(model)
+    rng = np.random.default_rng(5)
+    state = camera.at(43.0)
+    names, sds = camera.parameters, np.sqrt(np.diag(camera.covariance))
+    draws = rng.standard_normal((400, len(names))) * sds
+    values = []
+    for draw in draws:
+        change = dict(zip(names, draw, strict=True))
+        interior = model.interior.with_values(
+            **{n: getattr(model.interior, n) + change[f"interior.{n}"] for n in ("c", "x0", "y0")}
+        )
+        rates = {n: model.rates[n] + change[f"rates.{n}"] for n in ("c", "x0", "y0")}
+        listed = tuple(replace(e, values=_moved(e, change)) for e in model.effects)
+        moved = replace(model, interior=interior, rates=rates, effects=listed)
+        values.append(ThermalCamera(moved).at(43.0).values)
+    scatter = np.std(values, axis=0, ddof=1)
+    stated = np.sqrt(np.diag(state.covariance))
+    free = stated > 0
+    # 400 draws: a standard deviation is known to 3.5 %, 3 sd of that
+    np.testing.assert_allclose(scatter[free] / stated[free], 1.0, atol=0.11)
+
+
+def test_at_takes_50_microseconds():
+    camera = ThermalCamera(thermal_model(*LISTED))
+    camera.at(30.0)
+    best = np.inf
+    for _ in range(20):
+        begin = time.perf_counter()
+        for _ in range(50):
+            camera.at(30.0)
+        best = min(best, (time.perf_counter() - begin) / 50)
+    assert best < 50e-6
+
+
+def test_undistort_is_exact():
+    state = ThermalCamera(thermal_model(*LISTED)).at(33.0)
+    rng = np.random.default_rng(2)
+    points = rng.uniform([0, 0], [3279, 2463], (30_000, 2))
+    r = rays(state.sensor, state.values, points)
+    expected = r[:, :2] / -r[:, 2:]
+    found = ideal_points(state.sensor, state.values, points)
+    px = state.interior.c / state.sensor.pixel_pitch
+    assert np.abs(found - expected).max() * px < 1e-8
+    ideal = InteriorOrientation(state.interior.c)
+    back = state.as_seen_by(points, ideal)
+    np.testing.assert_allclose(state.undistort(points), back, rtol=0, atol=1e-7)
+
+
+def test_folding_distortion_is_left_to_rays():
+    """A lens whose polynomial folds outside the image circle: no fast inverse, the same answer."""
+    sensor = Sensor(1000, 800, 0.004)
+    iop = InteriorOrientation(c=3.0, A1=-0.055).as_array()
+    points = np.array([[500.0, 400.0], [600.0, 300.0], [200.0, 500.0]])
+    r = rays(sensor, iop, points)
+    np.testing.assert_allclose(
+        ideal_points(sensor, iop, points), r[:, :2] / -r[:, 2:], rtol=0, atol=1e-12
+    )
+
+
+@pytest.mark.slow
+def test_undistorting_a_million_points():
+    """At most twice cv2.undistortPoints, which stops at a coarser answer."""
+    cv2.setNumThreads(1)
+    state = ThermalCamera(thermal_model()).at(30.0)
+    points = np.random.default_rng(0).uniform([0, 0], [3279, 2463], (1_000_000, 2))
+    i, p = state.interior, state.sensor.pixel_pitch
+    K = np.array([[i.c / p, 0, 3279 / 2 + i.x0 / p], [0, i.c / p, 2463 / 2 - i.y0 / p], [0, 0, 1]])
+    D = np.array([i.A1 * i.c**2, i.A2 * i.c**4, -i.B2 * i.c, i.B1 * i.c, i.A3 * i.c**6])
+    ours, theirs = [], []
+    for _ in range(7):
+        begin = time.perf_counter()
+        state.undistort(points)
+        middle = time.perf_counter()
+        cv2.undistortPoints(points[:, None], K, D)
+        ours.append(middle - begin)
+        theirs.append(time.perf_counter() - middle)
+    assert min(ours) <= 2 * min(theirs)
+
+
+def test_outside_the_validity_it_warns_and_widens():
+    camera = ThermalCamera(thermal_model())
+    inside = camera.at(50.0)
+    with pytest.warns(ExtrapolationWarning, match=r"4\.0 K outside the 20 to 50 °C"):
+        outside = camera.at(54.0)
+    assert outside.extrapolated == pytest.approx(4.0)
+    assert outside.sd["x0"] > np.hypot(inside.sd["x0"], 4 * 4.5e-4) * 0.99
+    with pytest.warns(ExtrapolationWarning):
+        along = camera.along([0.0, 10.0], [45.0, 54.0])
+    assert along.extrapolated.tolist() == [0.0, 4.0]
+
+
+def test_far_outside_it_is_refused():
+    camera = ThermalCamera(thermal_model())
+    with pytest.raises(UsageError, match="ask for extrapolation by name"):
+        camera.at(-20.0)
+    with pytest.warns(ExtrapolationWarning):
+        assert camera.at(-20.0, extrapolate=True).sd["c"] > 40 * 2e-4 * 0.99
+
+
+@pytest.mark.parametrize("T", [70.0, 86.0, 100.0])
+def test_fahrenheit_is_refused(T):
+    camera = ThermalCamera(thermal_model())
+    with pytest.raises(UsageError, match="looks like fahrenheit"):
+        camera.at(T)
+    with pytest.raises(UsageError, match="looks like fahrenheit"):
+        camera.along([0.0, 10.0, 20.0], [T - 1, T, T + 1])
+
+
+def test_another_camera_a_crop_a_binning():
+    camera = ThermalCamera(thermal_model())
+    with pytest.raises(ConfigurationError, match="belongs to one camera"):
+        camera.for_images(3280, 2464, "nexus5")
+    with pytest.raises(ConfigurationError, match="a crop, which cannot be converted"):
+        camera.for_images(1920, 1080)
+    half = camera.for_images(1640, 1232)
+    centre = np.array([[100.0, 50.0]])
+    full = camera.at(30.0).rays(centre * 2 + 0.5)  # the middle of the four pixels that were binned
+    np.testing.assert_allclose(half.at(30.0).rays(centre), full, atol=1e-12)
+
+
+def test_second_thermometer_must_be_given():
+    listed = ModelEffect("second_heat_source", {"channel": "board", "c": 1e-5})
+    camera = ThermalCamera(thermal_model(listed))
+    with pytest.raises(DataError, match="'board': give its temperature"):
+        camera.at(30.0)
+    a, b = camera.at(30.0, channels={"board": 45.0}), camera.at(30.0, channels={"board": 25.0})
+    assert a.interior.c - b.interior.c == pytest.approx(20 * 1e-5)
+
+
+def test_thermometer_noise_is_carried():
+    camera = ThermalCamera(replace(thermal_model(), sds={}))
+    assert camera.at(30.0, temperature_sd=0.5).sd["x0"] == pytest.approx(0.5 * 4.5e-4)
+
+
+def test_object_error_by_differences():
+    state = ThermalCamera(thermal_model()).at(30.0)
+    sd = 1e-3
+    only_x0 = replace(state, covariance=np.diag([0, sd**2, 0, 0, 0, 0, 0, 0, 0, 0]))
+    moved = replace(state, values=state.values + np.array([0, sd, 0, 0, 0, 0, 0, 0, 0, 0]))
+    found, expected = only_x0.object_error(10_000.0), moved.object_distance(state, 10_000.0)
+    # in the image's corners the distortion has its say; in the middle they must be the same
+    np.testing.assert_allclose(found, expected, rtol=0.05)
+    assert found[4] == pytest.approx(sd / state.interior.c * 10_000.0, rel=1e-3)
+
+
+def test_warm_up_time_of_an_exponential():
+    camera = ThermalCamera(thermal_model())
+    t = np.arange(0.0, 6000.0, 5.0)
+    T = 25.0 + 20.0 * (1 - np.exp(-t / 300.0))
+    advice = warm_up(camera.along(t, T), 10_000.0, 2.0)
+    worst = advice.error[0]
+    assert worst > 20.0
+    assert advice.steady_from == pytest.approx(300.0 * np.log(worst / 2.0), abs=6.0)
+    still_moving = warm_up(camera.along(t[:60], T[:60]), 10_000.0, 0.1)
+    assert still_moving.steady_from is None
+
+
+def test_load(tmp_path):
+    write_model(tmp_path / "m.yaml", thermal_model(*LISTED))
+    a, b = ThermalCamera.load(tmp_path / "m.yaml").at(30.0), ThermalCamera(thermal_model(*LISTED))
+    np.testing.assert_array_equal(a.values, b.at(30.0).values)
+    np.testing.assert_allclose(a.covariance, b.at(30.0).covariance, rtol=1e-12, atol=0)

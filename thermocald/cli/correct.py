@@ -1,0 +1,176 @@
+"""`thermocald correct`: what was measured before, as a camera without thermal drift had seen it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from thermocald.errors import DataError, ImageError, UsageError
+
+if TYPE_CHECKING:
+    from thermocald.analysis.correction import TemperatureLog
+    from thermocald.analysis.thermal_camera import ThermalCamera
+
+__all__ = ["register"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("correct")(correct)
+
+
+def correct(
+    points: Annotated[
+        Path,
+        typer.Argument(
+            metavar="POINTS.csv", help="Columns time, x, y (px) and others; or time, image."
+        ),
+    ],
+    model: Annotated[Path, typer.Option("--model", help="The thermal model.")],
+    log: Annotated[
+        Path, typer.Option("--log", help="CSV of times and temperatures, or an epochs.csv.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option("--out", help="CSV to write (points), or folder (images).")
+    ] = None,
+    to: Annotated[
+        float | None, typer.Option("--to", help="°C to correct to; default: the model's T0.")
+    ] = None,
+    column: Annotated[
+        str | None, typer.Option("--column", help="Temperature column of the log.")
+    ] = None,
+    temperature_sd: Annotated[
+        float, typer.Option("--temperature-sd", min=0.0, help="Of a reading of the log, K.")
+    ] = 0.05,
+    image_size: Annotated[
+        str | None, typer.Option("--size", help="WIDTHxHEIGHT where images are binned.")
+    ] = None,
+    extrapolate: Annotated[
+        bool, typer.Option("--extrapolate", help="Allow temperatures far outside the fit.")
+    ] = False,
+    json: Annotated[
+        str | None, typer.Option("--json", help="Write the results as JSON; - for stdout.")
+    ] = None,
+) -> None:
+    """Correct image points, or images, that were taken at known temperatures.
+
+    Example: thermocald correct --model camera.thermal.yaml --log weather.csv points.csv
+    """
+    from thermocald.analysis.correction import read_temperature_log
+    from thermocald.analysis.thermal_camera import ThermalCamera
+    from thermocald.cli.predict import warnings_said
+
+    thermal = ThermalCamera.load(model)
+    if image_size is not None:
+        thermal = thermal.for_images(*_size(image_size))
+    table = read_temperature_log(log, column)
+    try:
+        with points.open(encoding="utf-8-sig") as file:
+            header = [n.strip() for n in file.readline().split(",")]
+    except (OSError, UnicodeDecodeError) as cause:
+        raise DataError(f"{points}: cannot be read: {cause}") from cause
+    if "image" in header and out is None:
+        raise UsageError("--out is missing: the folder for the corrected images")
+    with warnings_said():
+        if "image" in header and out is not None:
+            _images(thermal, table, points, out, to)
+        else:
+            _points(thermal, table, points, out, to, temperature_sd, extrapolate, json)
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.lower().partition("x")
+    if not width.isdigit() or not height.isdigit() or int(width) * int(height) == 0:
+        raise UsageError(f"--size {text}: write WIDTHxHEIGHT in px, such as 1640x1232")
+    return int(width), int(height)
+
+
+def _points(
+    thermal: ThermalCamera,
+    table: TemperatureLog,
+    path: Path,
+    out: Path | None,
+    to: float | None,
+    temperature_sd: float,
+    extrapolate: bool,
+    json: str | None,
+) -> None:
+    import csv
+    import io
+
+    import numpy as np
+
+    from thermocald.analysis.correction import correct_points, read_rows
+    from thermocald.cli.common import write_json, write_text
+
+    header, rows, numbers = read_rows(path, ("time", "x", "y"))
+    inside = thermal.model.sensor.contains(numbers[:, 1:])
+    if not inside.all():
+        x, y = numbers[np.argmin(inside), 1:]
+        raise DataError(
+            f"{path}: ({x:g}, {y:g}) px lies outside the model's {thermal.model.sensor.width}×"
+            f"{thermal.model.sensor.height} px; of another camera, or binned (--size)?"
+        )
+    found = correct_points(
+        thermal, table, numbers[:, 0], numbers[:, 1:], to, temperature_sd, extrapolate
+    )
+    extra = ["dx", "dy", "sd_x", "sd_y", "temperature", "extrapolated_K"]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*header, *extra])
+    moved = found.points - numbers[:, 1:]
+    for i, row in enumerate(rows):
+        row = {**row, "x": f"{found.points[i, 0]:.5f}", "y": f"{found.points[i, 1]:.5f}"}
+        tail = [*moved[i], *found.sds[i], found.temperature[i], found.extrapolated[i]]
+        writer.writerow([*(row[n] for n in header), *(f"{v:.6g}" for v in tail)])
+    if out is not None:
+        write_text(text.getvalue(), out)
+    summary: dict[str, Any] = {
+        "format": "thermocald-correction/1",
+        "points": len(rows),
+        "corrected_to": thermal.model.T0 if to is None else to,
+        "rms_correction_px": float(np.sqrt(np.mean(moved**2))),
+        "rms_left_over_px": float(np.sqrt(np.mean(found.sds**2))),
+        "extrapolated_rows": int((found.extrapolated > 0).sum()),
+    }
+    if json is not None:
+        write_json(summary, json)
+    if out is None and json != "-":
+        typer.echo(text.getvalue(), nl=False)
+    elif json != "-":
+        typer.echo(
+            f"{out}: {len(rows)} points corrected by {summary['rms_correction_px']:.3f} px (RMS); "
+            f"left over ± {summary['rms_left_over_px']:.3f} px"
+        )
+
+
+def _images(
+    thermal: ThermalCamera, table: TemperatureLog, path: Path, out: Path, to: float | None
+) -> None:
+    import cv2
+
+    from thermocald.analysis.correction import read_rows, remaps
+    from thermocald.cli.common import progress
+
+    _, rows, numbers = read_rows(path, ("time",))
+    out.mkdir(parents=True, exist_ok=True)
+    sensor = thermal.model.sensor
+    with progress(len(rows), "correcting images") as advance:
+        maps = remaps(thermal, table, numbers[:, 0], to)
+        for row, (map_x, map_y) in zip(rows, maps, strict=True):
+            source = path.parent / row["image"]
+            image = cv2.imread(str(source), cv2.IMREAD_UNCHANGED)
+            if image is None:
+                raise ImageError(f"{source}: is no image that can be read")
+            if image.shape[:2] != (sensor.height, sensor.width):
+                raise ImageError(
+                    f"{source}: has {image.shape[1]}×{image.shape[0]} px, the model's camera "
+                    f"{sensor.width}×{sensor.height}; say --size where it is binned"
+                )
+            corrected = cv2.remap(image, map_x, map_y, cv2.INTER_CUBIC)
+            if not cv2.imwrite(str(out / Path(row["image"]).name), corrected):
+                raise DataError(f"{out / Path(row['image']).name}: cannot be written")
+            advance(1)
+    typer.echo(f"{out}: {len(rows)} images")

@@ -1,0 +1,195 @@
+"""`thermocald fit`: one thermal model from all series of a camera."""
+
+from __future__ import annotations
+
+from pathlib import Path  # noqa: TC003  typer reads the annotations
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from thermocald.errors import UsageError
+
+if TYPE_CHECKING:
+    from thermocald.analysis.held_out import PredictedError
+    from thermocald.analysis.model_series import ModelSeries
+    from thermocald.analysis.thermal_model import FittedModel
+    from thermocald.simulation.model import ModelEffect
+
+__all__ = ["register"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("fit")(fit)
+
+
+def fit(
+    inputs: Annotated[
+        list[Path], typer.Argument(metavar="RECORDING_OR_STORE…", help="Folders and stores.")
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="The model file to write.")],
+    effect: Annotated[
+        list[str] | None,
+        typer.Option("--effect", help="An effect to fit beside the base model; repeatable."),
+    ] = None,
+    model: Annotated[
+        Path | None,
+        typer.Option("--model", help="Fit the effects of this model, such as discovery wrote it."),
+    ] = None,
+    reference_temperature: Annotated[
+        float | None, typer.Option("--t0", help="Reference temperature °C; default: the mean.")
+    ] = None,
+    type_name: Annotated[
+        str | None,
+        typer.Option("--type", help="Several cameras of one type: fit each, write the type."),
+    ] = None,
+    json: Annotated[
+        str | None, typer.Option("--json", help="Write the results as JSON; - for stdout.")
+    ] = None,
+) -> None:
+    """Fit a thermal model to all series of a camera, in one adjustment over all image points.
+
+    Example: thermocald fit M1 M2 -o camera.thermal.yaml --effect thermal_lag
+    """
+    from thermocald.analysis.model_series import load_model_series
+    from thermocald.cli.common import progress, write_json
+    from thermocald.simulation.model_file import write_model
+
+    series: list[ModelSeries] = []
+    with progress(len(inputs), "reading and reducing") as advance:
+        for path in inputs:
+            if not path.exists():
+                raise UsageError(f"{path}: does not exist; give a recording or a store")
+            series += load_model_series(path)
+            advance(1)
+    listed, T0 = _structure(effect or [], model, reference_temperature)
+    if type_name is not None:
+        fitted_model, document = _type(series, listed, T0, type_name)
+    else:
+        fitted, held = _one(series, listed, T0)
+        fitted_model, document = fitted.model, _document(fitted, held)
+    write_model(output, fitted_model)
+    document["model"] = str(output)
+    if json is not None:
+        write_json(document, json)
+    if json != "-":
+        _say(document)
+
+
+def _structure(
+    names: list[str], path: Path | None, T0: float | None
+) -> tuple[list[ModelEffect], float | None]:
+    from thermocald.simulation import effects
+    from thermocald.simulation.model import ModelEffect
+    from thermocald.simulation.model_file import read_model
+
+    listed = []
+    if path is not None:
+        start = read_model(path)
+        listed = list(start.effects)
+        T0 = start.T0 if T0 is None else T0
+    for name in names:
+        kind = effects.get(name)
+        if any(p.text for p in kind.nonlinear.values()):
+            raise UsageError(
+                f"--effect {name}: it needs a name (a channel, targets); give it in a --model file"
+            )
+        values = {k: p.default for k, p in kind.nonlinear.items()}
+        listed.append(ModelEffect(name, {**values, **dict.fromkeys(kind.usual, 0.0)}))
+    return listed, T0
+
+
+def _one(
+    series: list[ModelSeries], listed: list[ModelEffect], T0: float | None
+) -> tuple[FittedModel, list[PredictedError]]:
+    """The fit to everything, and the error on what a fit to the rest predicts."""
+    from thermocald.analysis.held_out import predicted_error
+    from thermocald.analysis.thermal_model import fit_thermal_model
+
+    fitted = fit_thermal_model(series, listed, T0)
+    held = []
+    if len(series) > 1:
+        for k, left_out in enumerate(series):
+            rest = [s for i, s in enumerate(series) if i != k]
+            part = fit_thermal_model(
+                rest, list(fitted.model.effects), fitted.model.T0, search=False
+            )
+            sd = fitted.series[k].thermometer_sd
+            held.append(predicted_error(part.model, left_out, sd))
+    return fitted, held
+
+
+def _document(fitted: FittedModel, held: list[PredictedError]) -> dict[str, Any]:
+    from dataclasses import asdict
+
+    from thermocald.simulation.model_file import model_document
+
+    written = model_document(fitted.model)
+    return {
+        "format": "thermocald-fit/1",
+        "camera": fitted.model.camera,
+        "reference_temperature": fitted.model.T0,
+        "interior": written["interior"],
+        "rates": written["rates"],
+        "effects": written["effects"],
+        "validity": written["validity"],
+        "sigma0": fitted.sigma0,
+        "series": [asdict(s) for s in fitted.series],
+        "held_out": [asdict(h) for h in held],
+    }
+
+
+def _type(
+    series: list[ModelSeries], listed: list[ModelEffect], T0: float | None, name: str
+) -> tuple[Any, dict[str, Any]]:
+    import numpy as np
+
+    from thermocald.analysis.thermal_model import fit_thermal_model
+    from thermocald.analysis.type_model import type_model
+    from thermocald.simulation.model_file import model_document
+
+    cameras = list(dict.fromkeys(s.camera for s in series))
+    if T0 is None:
+        T0 = round(float(np.mean([s.history.temperature().mean() for s in series])), 1)
+    models = [
+        fit_thermal_model([s for s in series if s.camera == c], listed, T0).model for c in cameras
+    ]
+    found = type_model(models, name)
+    written = model_document(found)
+    return found, {
+        "format": "thermocald-fit/1",
+        "camera": name,
+        "cameras": cameras,
+        "reference_temperature": T0,
+        **{k: written[k] for k in ("interior", "rates", "effects", "validity")},
+        "series": [],
+        "held_out": [],
+    }
+
+
+def _say(document: dict[str, Any]) -> None:
+    typer.echo(f"{document['model']}: {document['camera']}")
+    low, high = next(iter(document["validity"].values()))
+    typer.echo(
+        f"  valid from {low:g} to {high:g} °C, T0 = {document['reference_temperature']:g} °C"
+    )
+    for name, rate in document["rates"].items():
+        sd = f" ± {rate['sd'] * 1e3:.5f}" if "sd" in rate else ""
+        typer.echo(f"  {name:>4}: {rate['value'] * 1e3:+.5f}{sd} µm/K")
+    for effect in document["effects"]:
+        parts = [
+            f"{k} = {v['value']:.4g}" + (f" ± {v['sd']:.2g}" if "sd" in v else "") + f" {v['unit']}"
+            for k, v in effect["parameters"].items()
+            if isinstance(v, dict)
+        ]
+        typer.echo(f"  {effect['effect']}: {', '.join(parts)}")
+    for s in document["series"]:
+        typer.echo(
+            f"  {s['name']}: {s['epochs']} epochs, {s['rms_px']:.4f} px, "
+            f"thermometer ± {s['thermometer_sd']:.3f} K"
+        )
+    for h in document["held_out"]:
+        typer.echo(
+            f"  {h['name']} left out: predicted to {h['rms_px']:.4f} px (noise alone "
+            f"{h['floor_px']:.4f}), {h['object_mm']:.2f} mm at 10 m"
+        )

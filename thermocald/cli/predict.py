@@ -1,0 +1,220 @@
+"""`thermocald predict`: the interior orientation at a temperature, or along a temperature log."""
+
+from __future__ import annotations
+
+import warnings
+from contextlib import contextmanager
+from pathlib import Path  # noqa: TC003  typer reads the annotations
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from thermocald.errors import UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from thermocald.analysis.camera_state import CameraState
+    from thermocald.analysis.thermal_camera import Along, ThermalCamera
+
+__all__ = ["register", "warnings_said"]
+
+
+@contextmanager
+def warnings_said() -> Iterator[None]:
+    """Warnings of the program as lines on standard error, each once."""
+    from thermocald.cli.common import say
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        yield
+    for text in dict.fromkeys(str(w.message) for w in caught):
+        say(f"warning: {text}")
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("predict")(predict)
+
+
+def predict(
+    model: Annotated[Path, typer.Option("--model", help="The thermal model.")],
+    temperature: Annotated[
+        float | None, typer.Option("--temperature", help="°C: a camera that has long been there.")
+    ] = None,
+    log: Annotated[
+        Path | None, typer.Option("--log", help="CSV of times and temperatures, or an epochs.csv.")
+    ] = None,
+    programme: Annotated[
+        Path | None,
+        typer.Option("--programme", help="Warm-up advice for what is done to the camera."),
+    ] = None,
+    camera: Annotated[
+        Path | None, typer.Option("--camera", help="Camera file, for --programme.")
+    ] = None,
+    channel: Annotated[
+        list[str] | None,
+        typer.Option("--channel", help="NAME=°C of another thermometer; repeatable."),
+    ] = None,
+    distance: Annotated[
+        float, typer.Option("--distance", min=0.01, help="Of the object, m.")
+    ] = 10.0,
+    wanted: Annotated[
+        float, typer.Option("--wanted-mm", min=1e-3, help="Wanted error there, mm.")
+    ] = 5.0,
+    extrapolate: Annotated[
+        bool, typer.Option("--extrapolate", help="Allow temperatures far outside the fit.")
+    ] = False,
+    json: Annotated[
+        str | None, typer.Option("--json", help="Write the results as JSON; - for stdout.")
+    ] = None,
+) -> None:
+    """Predict the interior orientation with standard deviations.
+
+    Example: thermocald predict --model camera.thermal.yaml --temperature 35
+    """
+    from thermocald.analysis.thermal_camera import ThermalCamera
+    from thermocald.cli.common import write_json
+
+    if sum(option is not None for option in (temperature, log, programme)) != 1:
+        raise UsageError("give one of --temperature, --log, --programme")
+    thermal = ThermalCamera.load(model)
+    with warnings_said():
+        document, lines = _predicted(
+            thermal,
+            temperature,
+            log,
+            programme,
+            camera,
+            channel or [],
+            distance,
+            wanted,
+            extrapolate,
+        )
+    if json is not None:
+        write_json(document, json)
+    if json != "-":
+        typer.echo("\n".join(lines))
+
+
+def _log(thermal: ThermalCamera, path: Path, extrapolate: bool) -> Along:
+    """Along a log, in which the model's own reference is T where it has a column of that name."""
+    from thermocald.analysis.correction import read_temperature_log
+
+    table = read_temperature_log(path)
+    reference = next(iter(thermal.model.validity), None)
+    if reference in table.channels and reference != next(iter(table.channels)):
+        table = read_temperature_log(path, reference)
+    return thermal.along(table.times, dict(table.channels), extrapolate=extrapolate)
+
+
+def _channels(given: list[str]) -> dict[str, float]:
+    found = {}
+    for text in given:
+        name, equals, value = text.partition("=")
+        try:
+            found[name] = float(value)
+        except ValueError:
+            equals = ""
+        if not equals:
+            raise UsageError(f"--channel {text}: write NAME=°C, such as board_temperature=48.5")
+    return found
+
+
+def _state_document(
+    thermal: ThermalCamera, state: CameraState, distance: float
+) -> tuple[dict[str, Any], list[str]]:
+    import numpy as np
+
+    from thermocald.photogrammetry.camera_model import IOP_NAMES
+    from thermocald.simulation.effects.base import PARAMETER_UNITS
+
+    error = state.object_error(distance * 1000.0)
+    reference = thermal.at(thermal.model.T0, extrapolate=True)
+    moved = state.object_distance(reference, distance * 1000.0)
+    sd = state.sd
+    values = dict(zip(IOP_NAMES, state.values.tolist(), strict=True))
+    document: dict[str, Any] = {
+        "format": "thermocald-prediction/1",
+        "camera": thermal.model.camera,
+        "temperature": state.temperature,
+        "extrapolated_K": state.extrapolated,
+        **values,
+        **{f"sd_{n}": v for n, v in sd.items()},
+        "covariance": state.covariance,
+        "distance_m": distance,
+        "object_error_mm": float(np.sqrt(np.mean(error**2))),
+        "drift_from_reference_mm": float(moved.max()),
+    }
+    lines = [f"{thermal.model.camera} at {state.temperature:g} °C"]
+    lines += [
+        f"  {n:>3} = {values[n]:+.6g} ± {sd[n]:.2g} {PARAMETER_UNITS[n]}"
+        for n in IOP_NAMES
+        if values[n] or sd[n]
+    ]
+    lines.append(
+        f"  on a plane at {distance:g} m: ± {document['object_error_mm']:.2f} mm from this "
+        f"orientation's uncertainty; the drift since {thermal.model.T0:g} °C is up to "
+        f"{document['drift_from_reference_mm']:.2f} mm"
+    )
+    return document, lines
+
+
+def _along_document(thermal: ThermalCamera, along: Along) -> tuple[dict[str, Any], list[str]]:
+    from thermocald.photogrammetry.camera_model import IOP_NAMES
+
+    sds = along.sd
+    header = ["time", "temperature", *IOP_NAMES, *(f"sd_{n}" for n in IOP_NAMES), "extrapolated_K"]
+    rows = [
+        [time, temperature, *values, *sd, outside]
+        for time, temperature, values, sd, outside in zip(
+            along.times, along.temperatures, along.values, sds, along.extrapolated, strict=True
+        )
+    ]
+    document = {
+        "format": "thermocald-prediction/1",
+        "camera": thermal.model.camera,
+        "columns": header,
+        "rows": rows,
+    }
+    lines = [",".join(header)]
+    lines += [",".join(f"{v:.10g}" for v in row) for row in rows]
+    return document, lines
+
+
+def _advice(
+    thermal: ThermalCamera, programme: Path, camera: Path | None, distance: float, wanted: float
+) -> tuple[dict[str, Any], list[str]]:
+    from thermocald.analysis.warm_up import warm_up
+    from thermocald.simulation.demonstration import demonstration_field
+    from thermocald.simulation.device import CameraDevice, default_heat, read_camera_device
+    from thermocald.simulation.observations import Simulation
+    from thermocald.simulation.programme import read_programme
+
+    if camera is not None:
+        device = read_camera_device(camera)
+    else:
+        network, thermometers = default_heat()
+        device = CameraDevice(thermal.model.camera, thermal.model.sensor, network, thermometers)
+    course = Simulation(
+        thermal.model, device, demonstration_field("plain"), read_programme(programme)
+    ).true_history
+    along = thermal.along(
+        course.reading_times, dict(course.readings), course.times, extrapolate=True
+    )
+    advice = warm_up(along, distance * 1000.0, wanted)
+    document = {
+        "format": "thermocald-warm-up/1",
+        "camera": thermal.model.camera,
+        "distance_m": distance,
+        "wanted_mm": wanted,
+        "steady_from_s": advice.steady_from,
+        "error_at_begin_mm": float(advice.error.max()),
+        "temperature_at_end": float(along.temperatures[-1]),
+    }
+    if advice.steady_from is None:
+        said = "does not come to rest within this programme: let it run longer"
+    else:
+        said = f"is steady to {wanted:g} mm at {distance:g} m after {advice.steady_from:.0f} s"
+    worst = f"(up to {document['error_at_begin_mm']:.1f} mm before)"
+    return document, [f"{thermal.model.camera} {said} {worst}"]

@@ -90,7 +90,9 @@ class EpochKeeper:
         series = self._begin_series(acquired)
         epoch = acquired.epoch if calibrated is None else calibrated.epoch
         put_off = calibrated is None and self.plan.calibrator is not None
-        eventful = calibrated is not None and not calibrated.adjustment.ok
+        eventful = calibrated is not None and (
+            not calibrated.adjustment.ok or "event" in calibrated.extra
+        )
         result, extra = None, {}
         path = None
         if self._frames.wanted(epoch.number, eventful) or put_off:

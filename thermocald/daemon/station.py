@@ -274,7 +274,7 @@ class Station:
         """The online estimate of a camera; None if it is only acquired."""
         if plan.sensor is None or plan.testfield is None:
             return None
-        from thermocald.analysis.online_filter import OnlineObserver
+        from thermocald.analysis.online_observer import OnlineObserver
 
         def tell(kind: str, text: str, utc: float, epoch: int) -> None:
             series: StoredSeries | None = keeper.series

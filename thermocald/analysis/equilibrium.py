@@ -1,0 +1,170 @@
+"""Whether a camera is warm: how fast it drifts, and when it will be steady.
+
+The interior orientation of a static camera, given its exterior orientation, is known to hundredths
+of a pixel in every epoch. Its drift per minute is the slope of the last minutes; the time to steady
+comes from an exponential approach, whose time constant is averaged over what the data allow.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+__all__ = ["Approach", "Equilibrium", "EquilibriumWatch", "fit_approach", "slope"]
+
+State = Literal["unknown", "drifting", "ready"]
+
+_FEWEST = 8
+_TAUS = 60
+_SETTLED_SD = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Approach:
+    """An exponential approach: tau s, and s from the last instant until it is steady, with sds.
+
+    The time is NaN where the data do not bound it (a straight line approaches nothing).
+    """
+
+    tau: float
+    sd_tau: float
+    ready_in: float
+    sd_ready_in: float
+
+
+@dataclass(frozen=True, slots=True)
+class Equilibrium:
+    """drift, sd_drift: px/min of (c, x0, y0) together; ready_in, sd_ready_in: s, NaN if unknown."""
+
+    state: State
+    drift: float
+    sd_drift: float
+    ready_in: float = float("nan")
+    sd_ready_in: float = float("nan")
+
+    @property
+    def sentence(self) -> str:
+        """For a person."""
+        if self.state == "unknown":
+            return "not known yet"
+        if self.state == "ready":
+            return f"ready: {self.drift:.3f} ± {self.sd_drift:.3f} px/min"
+        text = f"drifting {self.drift:.2f} ± {self.sd_drift:.2f} px/min"
+        if np.isfinite(self.ready_in):
+            text += f", ready in about {self.ready_in / 60:.0f} ± {self.sd_ready_in / 60:.0f} min"
+        return text
+
+
+def slope(times: Array, values: Array, sds: Array) -> tuple[Array, Array]:
+    """Weighted straight line through values (n, k) with sds (n, k): slopes (k,) and sds (k,) per s.
+
+    The sds are scaled up where the line does not fit within them, never down.
+    """
+    w = 1.0 / sds**2
+    mean_t = (w * times[:, None]).sum(0) / w.sum(0)
+    dt = times[:, None] - mean_t
+    sxx = (w * dt**2).sum(0)
+    slopes = (w * dt * values).sum(0) / sxx
+    mean = (w * values).sum(0) / w.sum(0)
+    rest = values - mean - dt * slopes
+    factor = np.maximum(1.0, (w * rest**2).sum(0) / max(len(times) - 2, 1))
+    result: Array = np.sqrt(factor / sxx)
+    return slopes, result
+
+
+def fit_approach(times: Array, values: Array, sds: Array, bound: float) -> Approach | None:
+    """Fit a + b·exp(-t/tau) to values (n,) at times (n,) s; None if nothing approaches.
+
+    bound: speed per s below which it counts as steady. tau runs over a grid from a few epochs to
+    ten times the span; every tau is weighted by its likelihood.
+    """
+    span = float(times[-1] - times[0])
+    step = span / (len(times) - 1)
+    taus = np.geomspace(2.0 * step, 10.0 * span, _TAUS)
+    t = times - times[-1]
+    w = 1.0 / sds**2
+    # exp(-t/tau) is huge at the beginning of a window long against tau: scaled to at most 1
+    E = np.exp(-(t - t[0]) / taus[:, None])
+    mean = E @ w / w.sum()
+    mean_value = float(w @ values / w.sum())
+    D = E - mean[:, None]
+    see = D**2 @ w
+    b = D @ (w * (values - mean_value)) / see
+    chi2 = ((values - mean_value - D * b[:, None]) ** 2) @ w
+    speeds = np.abs(b) * E[:, -1] / taus
+    with np.errstate(divide="ignore"):
+        ready = np.maximum(0.0, taus * np.log(speeds / bound))
+    variance = (taus / (np.sqrt(see) * np.maximum(np.abs(b), 1e-300))) ** 2
+    factor = max(1.0, float(chi2.min()) / max(len(t) - 3, 1))
+    weight = np.exp(-0.5 * (chi2 - chi2.min()) / factor)
+    weight /= weight.sum()
+    if weight[-1] > 0.25 * weight.max():
+        return None  # as good as a straight line: no end in sight
+    tau = float(weight @ taus)
+    ready_in = float(weight @ ready)
+    return Approach(
+        tau,
+        float(np.sqrt(weight @ (taus - tau) ** 2)),
+        ready_in,
+        float(np.sqrt(weight @ ((ready - ready_in) ** 2 + factor * variance))),
+    )
+
+
+class EquilibriumWatch:
+    """Watches (c, x0, y0) in px over a sliding window.
+
+    window_s: how much of the past counts for the drift; the approach is fitted to four times as
+    much. bound: px/min below which the camera counts as steady.
+    """
+
+    def __init__(self, window_s: float = 180.0, bound: float = 0.05) -> None:
+        self.window_s = window_s
+        self.bound = bound
+        self._past: deque[tuple[float, Array, Array]] = deque()
+
+    def clear(self) -> None:
+        """Begin anew, after a knock."""
+        self._past.clear()
+
+    def add(self, time: float, values: Array, sds: Array) -> None:
+        """Add an epoch: values (3,) and sds (3,) px; NaN where one is not estimated."""
+        self._past.append((time, values, sds))
+        while self._past and time - self._past[0][0] > 4.0 * self.window_s:
+            self._past.popleft()
+
+    def judge(self) -> Equilibrium:
+        """Where the camera stands now."""
+        if len(self._past) < _FEWEST:
+            return Equilibrium("unknown", float("nan"), float("nan"))
+        times = np.array([t for t, _, _ in self._past])
+        values = np.array([v for _, v, _ in self._past])
+        sds = np.array([s for _, _, s in self._past])
+        good = np.isfinite(values).all(axis=0) & np.isfinite(sds).all(axis=0)
+        if not good.any():
+            return Equilibrium("unknown", float("nan"), float("nan"))
+        values, sds = values[:, good], sds[:, good]
+        recent = times >= times[-1] - self.window_s
+        if recent.sum() < _FEWEST:
+            recent[-_FEWEST:] = True
+        rate, sd_rate = slope(times[recent], values[recent], sds[recent])
+        speed = 60.0 * float(np.linalg.norm(rate))
+        direction = rate / max(float(np.linalg.norm(rate)), 1e-300)
+        sd_speed = 60.0 * float(np.sqrt(np.sum((direction * sd_rate) ** 2)))
+        if speed + _SETTLED_SD * sd_speed < self.bound:
+            return Equilibrium("ready", speed, sd_speed)
+        if speed - _SETTLED_SD * sd_speed < self.bound:
+            return Equilibrium("unknown", speed, sd_speed)
+        along = values @ direction
+        sd_along = np.sqrt((sds**2) @ direction**2)
+        approach = fit_approach(times, along, sd_along, self.bound / 60.0)
+        if approach is None:
+            return Equilibrium("drifting", speed, sd_speed)
+        return Equilibrium("drifting", speed, sd_speed, approach.ready_in, approach.sd_ready_in)

@@ -1,0 +1,286 @@
+"""The daemon under systemd in the guest: a heating test field end to end, then the faults.
+
+Frames come through v4l2loopback, temperatures through the kernel's lm75 driver and a USB serial
+adapter. The feeder's log says which frame and which temperature stood when; every frame carries its
+number, so that the stored epoch can be held against the log.
+"""
+
+from __future__ import annotations
+
+import bisect
+import json
+import statistics
+import time
+
+import numpy as np
+import pytest
+
+from tests.hil.frames import subject
+from tests.hil.station import PERIOD_S, SIZE, VIVID, prepare
+
+EPOCHS = 60
+FPS = 4.0
+HOLD = round(PERIOD_S * FPS)
+STAMP_S = 0.005
+STORE = "python3 /mnt/host/guest/store.py"
+
+
+class Station:
+    """The daemon in the guest."""
+
+    def __init__(self, machine, instrument):
+        self.machine, self.instrument = machine, instrument
+
+    def install(self, i2c_bus):
+        run = self.machine.run
+        folder = self.machine.share / "station"
+        folder.mkdir()
+        prepare(folder, self.instrument.port, EPOCHS)
+        self.i2c_bus = i2c_bus
+        run(
+            "mkdir -p /etc/thermocald && cp /mnt/host/station/*.csv /mnt/host/station/config.yaml "
+            "/etc/thermocald/ && printf '#!/bin/sh\\nexec python3 -m thermocald \"$@\"\\n' "
+            "> /usr/local/bin/thermocald && chmod 755 /usr/local/bin/thermocald"
+        )
+        unit = "/mnt/host/systemd/thermocald.service"
+        if run(f"test -e {unit}", check=False).returncode:
+            unit = "/mnt/host/guest/thermocald.service"
+        run(f"sh /mnt/host/guest/install_unit.sh {unit}")
+        run(
+            f"test -e /sys/bus/i2c/devices/{i2c_bus}-0048 || "
+            f"echo tmp75 0x48 > /sys/bus/i2c/devices/i2c-{i2c_bus}/new_device"
+        )
+        run("systemctl start mosquitto", timeout_s=60)
+        self.feed()
+        run("systemctl start thermocald", timeout_s=240)
+
+    def feed(self):
+        """Start the camera's feeder; the test field begins to heat."""
+        self.machine.run(
+            "rm -f /run/feed.log; systemd-run -q --unit=feeder --collect "
+            "python3 /mnt/host/guest/feed.py /dev/video40 /mnt/host/station/frames.npy "
+            "/mnt/host/station/temperatures.npy /run/feed.log "
+            f"--fps {FPS} --hold {HOLD} --bus {self.i2c_bus}"
+        )
+        self.machine.wait("test -s /run/feed.log", 120)
+
+    def stop_feeding(self):
+        self.machine.run("systemctl stop feeder", check=False)
+
+    def stored(self, database=""):
+        out = self.machine.run(f"{STORE} {database}", timeout_s=300).stdout
+        return json.loads(out.strip().splitlines()[-1])
+
+    def status(self):
+        out = self.machine.wait(f"cat {'/var/lib/thermocald/thermocald.db.live/status.json'}", 60)
+        return json.loads(out)
+
+    def until(self, condition, what, timeout_s=180.0):
+        """Look at the daemon's status until something is so; the status."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            status = self.status()
+            if condition(status):
+                return status
+            if time.monotonic() > deadline:
+                journal = self.machine.run("journalctl -u thermocald -n 20 --no-pager").stdout
+                raise AssertionError(f"not in {timeout_s:g} s: {what}\n{journal}")
+            time.sleep(0.5)
+
+    def journal(self, pattern):
+        """Lines of the daemon's journal that fit."""
+        done = self.machine.run(
+            f"journalctl -u thermocald --no-pager -o cat | grep -E '{pattern}'", check=False
+        )
+        return done.stdout.splitlines()
+
+
+@pytest.fixture(scope="module")
+def station(machine, video, i2c_bus):
+    from tests.hil.conftest import Instrument
+
+    machine.run("modprobe xhci-pci; modprobe ftdi_sio")
+    instrument = Instrument(machine.serial)
+    instrument.plug()
+    instrument.port = machine.wait("ls /dev/serial/by-id/*", 60).split()[0]
+    one = Station(machine, instrument)
+    one.install(i2c_bus)
+    yield one
+    instrument.pull()
+
+
+def river(status):
+    return status["cameras"]["river"]
+
+
+def device_states(status):
+    return {**{k: v["device"] for k, v in status["cameras"].items()},
+            **{k: v["device"] for k, v in status["thermometers"].items()}}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def series(station):
+    """What the store holds after 60 epochs of heating, and the feeder's log."""
+    station.until(lambda s: river(s)["stored"] >= EPOCHS + 2, f"{EPOCHS} epochs", 420)
+    station.stop_feeding()  # with no new frames the daemon makes up for what it put off
+    station.until(
+        lambda s: river(s)["waiting"] == 0 and river(s)["device"] == "out", "no frames left", 120
+    )
+    deadline = time.monotonic() + 400
+    while True:
+        stored = station.stored()
+        waiting = [e for e in stored["series"]["river"] if e["status"] == "not_calibrated"]
+        if not waiting or time.monotonic() > deadline:
+            break
+        time.sleep(2.0)
+    log = {}
+    for line in station.machine.run("cat /run/feed.log").stdout.splitlines():
+        number, before, after, celsius = line.split()
+        log[int(number)] = (float(before), float(after), float(celsius))
+    offset = float(
+        station.machine.run(
+            "python3 -c 'import time; print(time.time() - time.monotonic())'"
+        ).stdout
+    )
+    return stored, log, offset
+
+
+def test_sixty_epochs_of_frames_and_times(series, report):
+    stored, log, offset = series
+    epochs = [e for e in stored["series"]["river"] if e["frame"] in log]
+    assert len(epochs) >= EPOCHS
+    numbers = [e["frame"] for e in epochs]
+    assert numbers == sorted(set(numbers))  # no frame twice, none out of order
+    errors = []
+    for epoch in epochs:
+        before, after, _ = log[epoch["frame"]]
+        at = epoch["frame_time"] - offset
+        errors.append(max(before - at, at - after, 0.0))
+    assert max(errors) < STAMP_S
+    gaps = np.diff([e["frame_time"] for e in epochs])
+    report(
+        f"daemon: {len(epochs)} epochs stored, frame times off by at most {1e3 * max(errors):.2f} "
+        f"ms, interval median {statistics.median(gaps):.3f} s (asked {PERIOD_S:g} s), largest "
+        f"{max(gaps):.2f} s"
+    )
+
+
+def test_sixty_epochs_of_temperatures(series):
+    """Each temperature stood in the register at the instant that is stored with it."""
+    stored, log, offset = series
+    times = sorted((before, celsius) for before, _, celsius in log.values())
+    starts = [at for at, _ in times]
+    checked = 0
+    for epoch in stored["series"]["river"]:
+        if epoch["frame"] not in log or epoch["temperatures"].get("lens") is None:
+            continue
+        at = epoch["temperature_time"] - offset
+        # the kernel's driver may give a value up to its own refresh interval old (0.22 s for 12 bit)
+        here = {times[max(0, bisect.bisect(starts, t) - 1)][1] for t in (at - 0.5, at, at + 0.05)}
+        low, high = min(here), max(here)
+        assert low - 0.001 <= epoch["temperatures"]["lens"] <= high + 0.001
+        assert epoch["temperatures"]["line"] == 21.25
+        checked += 1
+    assert checked >= EPOCHS - 2
+
+
+def test_sixty_epochs_are_calibrated(series, report):
+    """The stored interior orientation follows the temperature as the rendered camera does."""
+    stored, log, _ = series
+    good = [e for e in stored["series"]["river"] if e["status"] == "ok" and e["frame"] in log]
+    assert len(good) >= 0.9 * EPOCHS
+    model = subject(*SIZE)[1]
+    celsius = np.array([log[e["frame"]][2] for e in good])
+    x0 = np.array([e["values"][1] for e in good])
+    slope = np.polyfit(celsius, x0, 1)[0]
+    true = model.rates["x0"]
+    assert slope == pytest.approx(true, rel=0.25)
+    report(
+        f"daemon: {len(good)} epochs calibrated, dx0/dT {1e3 * slope:.3f} µm/K, true {1e3 * true:.3f}"
+    )
+
+
+def test_the_camera_stalls_and_comes_back(station, series):
+    """After the series the feeder was stopped: no epoch since, one warning, one return."""
+    before = river(station.status())["stored"]
+    station.feed()
+    station.until(lambda s: river(s)["stored"] > before + 1, "epochs again", 120)
+    assert len(station.journal("camera river is out")) == 1
+    assert len(station.journal("camera river is back")) == 1
+
+
+def test_the_other_camera_is_unplugged(station):
+    """vivid is unbound and bound: its epochs pause, the river's do not."""
+    station.until(lambda s: s["cameras"]["yard"]["stored"] > 0, "frames of the yard", 120)
+    station.machine.run("echo vivid.0 > /sys/bus/platform/drivers/vivid/unbind")
+    out = station.until(lambda s: device_states(s)["yard"] == "out", "yard out")
+    there = river(out)["stored"]
+    station.until(lambda s: river(s)["stored"] > there, "the river goes on")
+    station.machine.run("echo vivid.0 > /sys/bus/platform/drivers/vivid/bind")
+    station.machine.wait(f"test -e {VIVID}")
+    station.until(lambda s: device_states(s)["yard"] == "open", "yard back")
+    assert station.journal("camera yard is back")
+
+
+def test_thermometers_come_and_go(station):
+    """The kernel's driver is unbound, the serial adapter pulled: missing, never made up."""
+    bus = f"/sys/bus/i2c/devices/i2c-{station.i2c_bus}"
+    station.machine.run(f"echo 0x48 > {bus}/delete_device")
+    station.instrument.pull()
+    station.until(lambda s: {device_states(s)[k] for k in ("lens", "line")} == {"out"}, "both out")
+    first = river(station.status())["stored"]
+    station.until(lambda s: river(s)["stored"] >= first + 3, "epochs without temperatures")
+    station.machine.run(f"echo tmp75 0x48 > {bus}/new_device")
+    station.instrument.plug()
+    station.until(
+        lambda s: {device_states(s)[k] for k in ("lens", "line")} == {"open"}, "both back"
+    )
+    epochs = station.stored()["series"]["river"]
+    bare = [e for e in epochs if set(e["temperatures"].values()) <= {None}]
+    assert 2 <= len(bare) <= 40
+    for name in ("lens", "line"):
+        assert station.journal(f"thermometer {name} is out")
+        assert station.journal(f"thermometer {name} is back")
+
+
+def test_the_clock_is_set(station):
+    """Two hours back: the rhythm goes on, the store says that the clock stepped."""
+    before = river(station.status())["stored"]
+    station.machine.run("date -s '-2 hours'")
+    station.until(lambda s: river(s)["stored"] > before + 3, "epochs after the step")
+    stored = station.stored()
+    assert any(event["kind"] == "clock_step" for event in stored["events"])
+    times = [e["frame_time"] for e in stored["series"]["river"]]
+    assert times == sorted(times)
+    station.machine.run("date -s '+2 hours'")
+
+
+def test_a_hung_daemon_is_started_again(station):
+    """SIGSTOP: systemd's watchdog ends it, the new one goes on with the next number."""
+    pid = station.machine.run("systemctl show -P MainPID thermocald").stdout.strip()
+    last = station.stored()["series"]["river"][-1]["number"]
+    station.machine.run(f"kill -STOP {pid}")
+    begin = time.monotonic()
+    station.machine.wait(
+        f'test "$(systemctl show -P MainPID thermocald)" != {pid} && '
+        "systemctl is-active -q thermocald",
+        300,
+    )
+    assert time.monotonic() - begin > 1.0
+    station.until(lambda s: river(s)["stored"] >= 1, "epochs again", 240)
+    numbers = [e["number"] for e in station.stored()["series"]["river"]]
+    assert numbers == sorted(set(numbers))
+    assert numbers[-1] > last
+
+
+def test_power_cut(station, report):
+    """The machine dies in the middle of everything: no stored epoch is lost, the file is sound."""
+    acknowledged = station.stored()["series"]["river"][-1]["number"]
+    station.machine.cut_power()
+    station.machine.boot()
+    stored = station.stored()  # reads and checks the whole file
+    assert stored["series"]["river"][-1]["number"] >= acknowledged
+    report(
+        f"power cut: {stored['series']['river'][-1]['number']} epochs there, "
+        f"{acknowledged} had been read before; booted again in {station.machine.boot_s:.0f} s"
+    )

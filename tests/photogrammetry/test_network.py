@@ -7,7 +7,8 @@ import pytest
 
 from tests.photogrammetry import network_cases as cases
 from thermocald.errors import GeometryError
-from thermocald.photogrammetry.network import Distance, adjust_network
+from thermocald.photogrammetry.camera_model import CameraModel
+from thermocald.photogrammetry.network import Distance, Photo, adjust_network
 from thermocald.photogrammetry.network_checks import advice
 
 
@@ -235,3 +236,39 @@ def test_a_foreign_photograph_is_left_out_and_named():
     assert "photo4" in network.unused
     assert "photo4" not in {s.photo for s in network.stations}
     assert np.abs(cases.normalised_errors(network, field)[1]).max() < 4.5
+
+
+def test_a_photograph_of_another_focus_is_left_out_and_named():
+    """The principal distance of one is 3 % longer: it can be oriented, but not with the others."""
+    field = _BENT
+    rng = np.random.default_rng(6)
+    stations = cases.convergent_stations(field)
+    photos, _ = cases.photographs(field, stations, 0.05, rng)
+    zoomed = CameraModel(cases.SENSOR, cases.INTERIOR.with_values(c=cases.INTERIOR.c * 1.03))
+    (photos[7],), _ = cases.photographs(field, stations[7:8], 0.05, rng, camera=zoomed)
+    photos[7] = Photo("zoomed", photos[7].observations)
+    length = float(np.linalg.norm(field[47] - field[0]))
+    network = adjust_network(
+        cases.SENSOR, photos, [f"t{i}" for i in range(48)], [Distance("t0", "t47", length, 0.01)]
+    )
+    assert "zoomed" in network.unused
+    assert 0.9 < network.sigma0 < 1.1
+    assert {r.photo for r in network.rejected} <= {"zoomed"}
+    assert np.abs(cases.normalised_errors(network, field)[1]).max() < 4.5
+
+
+@pytest.mark.slow
+def test_photographs_of_a_field_that_moves_are_refused():
+    """Every photograph shows another random field: whatever fits together by chance is refused."""
+    rng = np.random.default_rng(8)
+    stations = cases.convergent_stations(_BENT)
+    photos = []
+    for i, station in enumerate(stations):
+        moved = _BENT + rng.normal(0, 30, _BENT.shape)
+        (photo,), _ = cases.photographs(moved, [station], 0.05, rng)
+        photos.append(Photo(f"photo{i}", photo.observations))
+    with pytest.raises(GeometryError):
+        adjust_network(
+            cases.SENSOR, photos, [f"t{i}" for i in range(48)],
+            [Distance("t0", "t47", 900.0, 0.01)],
+        )  # fmt: skip

@@ -25,9 +25,9 @@ from thermocald.photogrammetry.camera_model import (
     InteriorOrientation,
     Sensor,
 )
-from thermocald.photogrammetry.network_covariance import Covariance, covariance
+from thermocald.photogrammetry.network_covariance import covariance
 from thermocald.photogrammetry.network_datum import Datum, Distance, bring_to_datum
-from thermocald.photogrammetry.network_snooping import MIN_RAYS, compact, snoop
+from thermocald.photogrammetry.network_snooping import MIN_RAYS, Cleaned, snoop
 from thermocald.photogrammetry.network_start import approximate
 
 if TYPE_CHECKING:
@@ -153,36 +153,49 @@ def adjust_network(
     for i in sorted(set(range(len(photos))) - set(kept)):
         left_out[photos[i].name] = "could not be oriented: too few targets in common with others"
 
-    bundle, rejected_rows, tests = snoop(sensor, bundle, used, free_rows)
-    good = ~rejected_rows
-    numbers, targets = compact(used.target[good], len(names))
-    final = nb.ImageRays(
-        used.photo[good], numbers[used.target[good]], used.points[good], used.whitening[good]
-    )
-    bundle = nb.Bundle(bundle.interior, bundle.rotations, bundle.centres, bundle.points[targets])
-    for row in sorted(set(range(len(names))) - set(targets.tolist())):
-        if row in rays.target:
-            left_out[names[row]] = "fewer than three photographs agree on it"
+    clean = snoop(sensor, bundle, used, free_rows)
+    for i in sorted(set(range(len(kept))) - set(clean.photos.tolist())):
+        left_out[photos[kept[i]].name] = (
+            "contradicts the others: another focus, or a field that moved"
+        )
+    for t in np.setdiff1d(rays.target, clean.targets):
+        left_out[names[int(t)]] = "fewer than three photographs agree on it"
+    bundle, final = clean.bundle, clean.rays
+    kept_photos = [photos[kept[int(i)]] for i in clean.photos]
+    kept_names = tuple(names[int(t)] for t in clean.targets)
 
     refuse_narrow(_intersection_angles(bundle, final))
     v = nb.residuals(sensor, bundle, final)
-    unknowns = len(free_rows) + 6 * len(kept) + 3 * len(targets) - 7
+    unknowns = len(free_rows) + 6 * len(kept_photos) + 3 * len(kept_names) - 7
     redundancy = 2 * len(final) - unknowns
     sigma0 = float(np.sqrt(np.sum(v * v) / max(redundancy, 1)))
-    final_cofactors = covariance(sensor, bundle, final, free_rows, np.ones(len(final)))
+    cofactors = covariance(sensor, bundle, final, free_rows, np.ones(len(final)))
     placed = bring_to_datum(
         bundle,
-        final_cofactors.points * sigma0**2,
+        cofactors.points * sigma0**2,
         distances,
-        {names[t]: i for i, t in enumerate(targets)},
-        None if nominal is None else np.asarray(nominal, dtype=float)[targets],
+        {name: i for i, name in enumerate(kept_names)},
+        None if nominal is None else np.asarray(nominal, dtype=float)[clean.targets],
     )
-    network = _result(
-        sensor, photos, names, kept, targets, placed, final_cofactors, final, sigma0, redundancy,
-        tuple(free), left_out,
-        _rejections(photos, names, kept, used, rejected_rows, tests, sensor, bundle, numbers),
-    )  # fmt: skip
-    refuse_weak(network, final_cofactors.weakest)
+    network = Network(
+        names=kept_names,
+        points=placed.bundle.points,
+        covariance=placed.covariance,
+        n_rays=np.bincount(final.target, minlength=len(kept_names)),
+        angles=_intersection_angles(placed.bundle, final),
+        camera=CameraModel(sensor, InteriorOrientation.from_array(bundle.interior)),
+        interior_covariance=cofactors.interior * sigma0**2,
+        free=tuple(free),
+        stations=_stations(kept_photos, placed, cofactors.centres * sigma0**2, final),
+        sigma0=sigma0,
+        redundancy=redundancy,
+        residuals=_residuals_px(sensor, bundle, final),
+        rejected=_rejections([photos[i].name for i in kept], names, used, clean),
+        unused=left_out,
+        datum=placed.statement,
+        sd_scale=placed.sd_scale,
+    )
+    refuse_weak(network, cofactors.weakest)
     return network
 
 
@@ -238,89 +251,38 @@ def _resume(
 
 
 def _rejections(
-    photos: Sequence[Photo],
-    names: Sequence[str],
-    kept: list[int],
-    used: ImageRays,
-    rejected: NDArray[np.bool_],
-    tests: Array,
-    sensor: Sensor,
-    bundle: Bundle,
-    numbers: Index,
+    photos: Sequence[str], names: Sequence[str], rays: ImageRays, clean: Cleaned
 ) -> tuple[Rejection, ...]:
-    rows = np.flatnonzero(rejected)
-    result = []
-    for row in rows:
-        number = int(numbers[used.target[row]])
-        size = float("nan")
-        if number >= 0:
-            one = nb.ImageRays(
-                used.photo[row : row + 1], np.array([number]), used.points[row : row + 1],
-                np.eye(2)[None],
-            )  # fmt: skip
-            size = float(np.linalg.norm(nb.residuals(sensor, bundle, one)))
-        result.append(
-            Rejection(
-                photos[kept[int(used.photo[row])]].name,
-                names[int(used.target[row])],
-                size,
-                float(tests[row]),
-            )
+    """The rejected image points, by photograph and target."""
+    found = [
+        Rejection(
+            photos[int(rays.photo[row])], names[int(rays.target[row])],
+            float(clean.residuals[row]), float(clean.tests[row]),
         )
-    return tuple(sorted(result, key=lambda r: (r.photo, r.target)))
+        for row in np.flatnonzero(clean.rejected)
+    ]  # fmt: skip
+    return tuple(sorted(found, key=lambda r: (r.photo, r.target)))
 
 
-def _result(
-    sensor: Sensor,
-    photos: Sequence[Photo],
-    names: Sequence[str],
-    kept: list[int],
-    targets: Index,
-    placed: Datum,
-    cofactors: Covariance,
-    rays: ImageRays,
-    sigma0: float,
-    redundancy: int,
-    free: tuple[str, ...],
-    left_out: dict[str, str],
-    rejected: tuple[Rejection, ...],
-) -> Network:
-    bundle = placed.bundle
-    v_px = nb.residuals(
-        sensor, bundle,
-        nb.ImageRays(rays.photo, rays.target, rays.points,
-                     np.broadcast_to(np.eye(2), (len(rays), 2, 2))),
-    )  # fmt: skip
+def _stations(
+    photos: Sequence[Photo], placed: Datum, cofactors: Array, rays: ImageRays
+) -> tuple[Station, ...]:
+    """The stations in their datum; cofactors (k, 3, 3) mm² of the centres before."""
     stations = []
-    for i, photo in enumerate(kept):
-        C = placed.turn @ cofactors.centres[i] @ placed.turn.T * (sigma0 * placed.scale) ** 2
-        sd = np.sqrt(np.diag(C))
-        stations.append(
-            Station(
-                photos[photo].name,
-                ExteriorOrientation.from_rotation(bundle.rotations[i], bundle.centres[i]),
-                int((rays.photo == i).sum()),
-                (float(sd[0]), float(sd[1]), float(sd[2])),
-            )
-        )
-    return Network(
-        names=tuple(names[t] for t in targets),
-        points=bundle.points,
-        covariance=placed.covariance,
-        n_rays=np.bincount(rays.target, minlength=len(targets)),
-        angles=_intersection_angles(bundle, rays),
-        camera=CameraModel(sensor, InteriorOrientation.from_array(bundle.interior)),
-        interior_covariance=cofactors.interior * sigma0**2,
-        free=free,
-        stations=tuple(stations),
-        sigma0=sigma0,
-        redundancy=redundancy,
-        residuals=tuple(v_px[rays.photo == i] for i in range(len(kept))),
-        rejected=rejected,
-        unused=left_out,
-        datum=placed.statement,
-        sd_scale=placed.sd_scale,
-    )
+    for i, photo in enumerate(photos):
+        C = placed.scale**2 * placed.turn @ cofactors[i] @ placed.turn.T
+        x, y, z = np.sqrt(np.diag(C)).tolist()
+        bundle = placed.bundle
+        exterior = ExteriorOrientation.from_rotation(bundle.rotations[i], bundle.centres[i])
+        stations.append(Station(photo.name, exterior, int((rays.photo == i).sum()), (x, y, z)))
+    return tuple(stations)
+
+
+def _residuals_px(sensor: Sensor, bundle: Bundle, rays: ImageRays) -> tuple[Array, ...]:
+    """Residuals per photograph, (n, 2) px each."""
+    units = np.broadcast_to(np.eye(2), (len(rays), 2, 2))
+    v = nb.residuals(sensor, bundle, nb.ImageRays(rays.photo, rays.target, rays.points, units))
+    return tuple(v[rays.photo == i] for i in range(len(bundle.centres)))
 
 
 def _intersection_angles(bundle: Bundle, rays: ImageRays) -> Array:

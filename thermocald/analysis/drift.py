@@ -8,7 +8,7 @@ where it does not rest on a single marker or target: a board that gives way is n
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["Course", "courses"]
+__all__ = ["Course", "courses", "settled"]
 
 _LEVEL = 0.01
 _FEWEST = 10
@@ -83,20 +83,31 @@ def courses(table: SeriesTable, names: tuple[str, ...] = ("c", "x0", "y0")) -> l
     return result
 
 
+def settled(table: SeriesTable) -> tuple[SeriesTable, list[Course]]:
+    """The table without a group of targets that alone makes a parameter drift, and its courses."""
+    found = courses(table)
+    moving = next((c.rests_on for c in found if c.rests_on), "")
+    if not moving or table.without is None:
+        return table, found
+    left = replace(table.without(table.groups[moving], False), left_out=(moving,))
+    return left, courses(left)
+
+
 def _single_support(table: SeriesTable, name: str, sd_change: float, tests: int) -> str:
-    """The group of targets without which a parameter does not drift, or ""."""
+    """The group of targets without which a parameter drifts least, if it then does not, or ""."""
     if table.without is None or len(table.groups) < 3:
         return ""
     column = IOP_NAMES.index(name)
+    best, best_p = "", 0.0
     for first, rows in table.groups.items():
-        y = table.without(rows)[:, column]
-        good = np.isfinite(y)
+        left = table.without(rows, True)
+        good = left.ok
         if good.sum() < _FEWEST:
-            return first
-        _, _, p = _line(table.frame_time[good], y[good], sd_change)
-        if p * tests >= _LEVEL:
-            return first
-    return ""
+            continue
+        _, _, p = _line(left.frame_time[good], left.values[good, column], sd_change)
+        if p > best_p:
+            best, best_p = first, p
+    return best if best_p * tests >= _LEVEL else ""
 
 
 def _line(t: Array, y: Array, tilt_sd: float) -> tuple[float, float, float]:

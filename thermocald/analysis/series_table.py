@@ -58,7 +58,8 @@ class SeriesTable:
     sd (E, 16), NaN where there is none; sigma0, n_observations, n_rejected (E,); status, reasons:
     E words and sentences; exterior: `series` or `per_epoch`; level_sd (16,): what all epochs have
     in common, NaN where it is not told apart; adjustment: the series', None epoch by epoch; groups: {name: rows of the test field} of what belongs together;
-    without: the values (E, 16) that the series has without some targets (rows).
+    without: the table without some targets (rows), quickly or with all care; left_out: targets
+    that were found to move by themselves.
     """
 
     number: NDArray[np.int64]
@@ -75,7 +76,8 @@ class SeriesTable:
     level_sd: Array = field(default_factory=lambda: np.full(16, np.nan))
     adjustment: SeriesAdjustment | None = None
     groups: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
-    without: Callable[[NDArray[np.int64]], Array] | None = None
+    without: Callable[[NDArray[np.int64], bool], SeriesTable] | None = None
+    left_out: tuple[str, ...] = ()
 
     @property
     def ok(self) -> NDArray[np.bool_]:
@@ -140,6 +142,15 @@ def table_of_series(
             f"most {_MOST_TOGETHER}); use --exterior per_epoch"
         )
     start = np.median(apart.values[ok], axis=0)
+
+    def without(rows: NDArray[np.int64], quick: bool) -> SeriesTable:
+        left = [None if o is None else o.select(~np.isin(o.targets, rows)) for o in observations]
+        if quick:
+            used = result.observed
+            left = [None if o is None else o.select(used[e, o.targets]) for e, o in enumerate(left)]
+        rough = replace(settings, snooping_alpha=0.0, target_noise=False) if quick else settings
+        return table_of_series(head, testfield, apart, left, rough)
+
     result = adjust_series(
         head.camera.sensor,
         testfield,
@@ -172,7 +183,7 @@ def table_of_series(
         result.level_sd,
         result,
         _groups(testfield, result),
-        _adjusted_without(head, testfield, observations, result, start),
+        without,
     )
 
 
@@ -183,35 +194,6 @@ def _groups(testfield: TestField, result: SeriesAdjustment) -> dict[str, NDArray
     for row in np.flatnonzero(seen):
         rows.setdefault(int(testfield.groups[row]), []).append(int(row))
     return {testfield.names[members[0]]: np.array(members) for members in rows.values()}
-
-
-def _adjusted_without(
-    head: Head,
-    testfield: TestField,
-    observations: Sequence[Observations | None],
-    result: SeriesAdjustment,
-    start: Array,
-) -> Callable[[NDArray[np.int64]], Array]:
-    """A function that adjusts the series again, from the same observations less some targets."""
-    quick = replace(result.settings, snooping_alpha=0.0, target_noise=False)
-
-    def without(rows: NDArray[np.int64]) -> Array:
-        left = [
-            None
-            if o is None
-            else o.select(result.observed[e, o.targets] & ~np.isin(o.targets, rows))
-            for e, o in enumerate(observations)
-        ]
-        return adjust_series(
-            head.camera.sensor,
-            testfield,
-            left,
-            InteriorOrientation.from_array(start[:10]),
-            ExteriorOrientation.from_array(start[10:]),
-            quick,
-        ).values
-
-    return without
 
 
 def settings_for_series(settings: AdjustmentSettings, exterior: str) -> SeriesSettings:

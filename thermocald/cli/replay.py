@@ -19,6 +19,7 @@ from thermocald.cli.options import (
 from thermocald.errors import DataError, UsageError
 
 if TYPE_CHECKING:
+    from thermocald.analysis.drift import Course
     from thermocald.analysis.series_table import SeriesTable
     from thermocald.photogrammetry.adjustment import AdjustmentSettings
 
@@ -45,6 +46,7 @@ def replay(
 
     Example: thermocald replay rpi-heating-M1 --store thermocald.db
     """
+    from thermocald.analysis.drift import settled
     from thermocald.store.recording import open_recording
 
     _check_exterior(exterior)
@@ -57,7 +59,8 @@ def replay(
             table = replay_into(store, opened, settings, exterior, advance)
     else:
         table = _recording_table(recording, settings, exterior)
-    document = _summary(recording, store, table)
+    table, found = settled(table)
+    document = _summary(recording, store, table, found)
     if json is not None:
         write_json(document, json)
     if json != "-":
@@ -82,6 +85,7 @@ def export(
 
     Example: thermocald export rpi-heating-M1 --format csv > M1.csv
     """
+    from thermocald.analysis.drift import settled
     from thermocald.analysis.series_table import CSV_COLUMNS, csv_text
 
     _check_exterior(exterior)
@@ -94,6 +98,7 @@ def export(
         from thermocald.analysis.stored_series import stored_table
 
         table = stored_table(source, series, settings, exterior)
+    table, _ = settled(table)
     if format_ == "csv":
         write_text("".join(csv_text(table)), output)
     else:
@@ -158,11 +163,10 @@ def _recording_table(path: Path, settings: AdjustmentSettings, exterior: str) ->
     )
 
 
-def _summary(recording: Path, store: Path | None, table: SeriesTable) -> dict[str, Any]:
-    from thermocald.analysis.drift import courses
-
+def _summary(
+    recording: Path, store: Path | None, table: SeriesTable, found: list[Course]
+) -> dict[str, Any]:
     ok = table.ok
-    found = courses(table)
     document: dict[str, Any] = {
         "format": "thermocald-replay/1",
         "recording": recording,
@@ -172,6 +176,7 @@ def _summary(recording: Path, store: Path | None, table: SeriesTable) -> dict[st
         "ok": int(ok.sum()),
         "sigma0": float(np.median(table.sigma0[ok])) if ok.any() else None,
         "rejected": int(table.n_rejected.sum()),
+        "left_out": list(table.left_out),
         "parameters": [
             {
                 "name": c.name,
@@ -235,6 +240,10 @@ def _tell(document: dict[str, Any]) -> None:
         f"{document['rejected']} gross errors",
         highlight=False,
     )
+    for name in document["left_out"]:
+        console.print(
+            f"left out: target {name} and what belongs to it moves by itself", highlight=False
+        )
     table = Table(box=None, pad_edge=False)
     for title in ("", "mean mm", "scatter mm", "stated sd mm", "ratio", "change mm", "drift"):
         table.add_column(title, justify="left" if not title else "right")

@@ -4,11 +4,11 @@ Parameters are per epoch (`free`, and the EOP with `exterior="per_epoch"`), comm
 (the EOP with `exterior="series"`, and a constant offset per target), or held. Common unknowns are
 reduced: each epoch contributes its normal equations with its own parameters eliminated.
 
-Two standard deviations come out of it. That of a difference within the series holds the noise of the
-epoch and the differences of visibility; the *level*, what all epochs have in common (the EOP's and the
-targets' uncertainty), is stated beside it and cancels in every drift. A target that is hidden now and
-then shifts single epochs by its coordinate error; with `target_offsets` that error is an unknown
-with the test field's sigma as its prior.
+Two standard deviations come out of it. That of a difference within the series holds the noise of
+the epoch and the differences of visibility; the *level*, what all epochs have in common (the EOP's
+and the targets' uncertainty), is stated beside it and cancels in every drift. A target that is
+hidden now and then shifts single epochs by its coordinate error; with `target_offsets` that error
+is an unknown with the test field's sigma as its prior.
 
 Source: DESIGN idea 3; the test for standing still is Rao's score test (1948).
 """
@@ -65,9 +65,10 @@ class SeriesSettings:
     """What is estimated per epoch and what once.
 
     exterior: `series` for a camera that stands still; free: IOP per epoch, the others are held;
-    target_offsets: a constant offset per target, with the test field's sigmas as prior; target_noise:
-    the measuring noise, also its correlations within a marker and what neighbouring epochs scatter
-    beyond it, from the series' own scatter where it is long enough; snooping_alpha, max_rejected, scale, bounds as in `AdjustmentSettings`.
+    target_offsets: a constant offset per target, with the test field's sigmas as prior;
+    target_noise: the measuring noise, also its correlations within a marker and what neighbouring
+    epochs scatter beyond it, from the series' own scatter where it is long enough; snooping_alpha,
+    max_rejected, scale, bounds as in `AdjustmentSettings`.
     """
 
     exterior: Literal["per_epoch", "series"] = "series"
@@ -210,8 +211,8 @@ def adjust_series(
 ) -> SeriesAdjustment:
     """Adjust all epochs of a camera, from start values good to a few per cent.
 
-    epochs: the observations, None for an epoch without, or the grid of them. Never raises for data: an epoch without a
-    result has a status and a reason.
+    epochs: the observations, None for an epoch without, or the grid of them. Never raises for data:
+    an epoch without a result has a status and a reason.
     """
     s = settings or SeriesSettings()
     if not isinstance(epochs, ObservationGrid):
@@ -401,17 +402,22 @@ class _Series:
             relative *= np.nan_to_num(sigma0, nan=1.0)[:, None, None] ** 2
             level *= pooled
         trend *= pooled
+        slow = np.zeros((16, 16))
         if s.target_noise and len(use) >= _ENOUGH_FOR_NOISE:
             group = self.testfield.groups
             pairs = correlated_pairs(estimate.residuals, use, group, self._redundancy_share(use))
             if len(pairs):
                 relative += system.correlated(pairs)
-            trend += system.slow(slow_errors(estimate.residuals, use), group)
+            slow = system.slow(slow_errors(estimate.residuals, use), group)
+            trend += slow
         excess, own, sound = np.zeros(16), system.own, system.good
         if s.target_noise:
             variances = np.diagonal(relative, axis1=1, axis2=2)[:, own]
             excess[own] = excess_scatter(estimate.values[sound][:, own], variances[sound])
             relative[:, own, own] += excess[own] * sound[:, None]
+        # Slow errors: a line through zero in the middle of the series, uncertain at its ends.
+        relative += np.linspace(-0.5, 0.5, len(use))[:, None, None] ** 2 * slow
+        relative[~sound] = 0.0
         stillness = np.full(len(sigma0), np.nan)
         if s.exterior == "series":
             stillness = system.score(estimate.residuals, _EOP) / np.where(positive, sigma0**2, 1.0)

@@ -437,9 +437,10 @@ def generate(case: Case) -> tuple[list[Series], dict]:
     offsets = [np.zeros(16), shift]
     frame_axis = []
     for _ in programmes:
-        f = 5.0 + case.interval * np.arange(case.epochs)
+        f = case.interval * np.arange(case.epochs)
         if case.hard:
             f = f + rng.uniform(-2, 2, case.epochs)
+            f -= f[0]
         frame_axis.append(f)
     per_series = [[_fresh(rng, e, k == 0, seconds) for e in hidden] for k in range(2)]
 
@@ -523,7 +524,7 @@ def _plain(e: dict, pitch: float) -> dict:
     if name == "test_field_expansion":
         out["axes"] = [float(v) for v in size * e["axes"]]
     if name == "defocus":
-        out["factor"] = 0.02 * size
+        out["per_kelvin_above_coldest"] = 0.02 * size
     del pitch
     return out
 

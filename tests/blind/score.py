@@ -86,10 +86,16 @@ def _pulls(discovery: Discovery, truth: dict) -> Iterator[tuple[str, float]]:
         true = by_name.get(effect.effect, {})
         for key, estimate in effect.estimates.items():
             if key in true and isinstance(estimate["value"], float):
-                value = float(true[key])
-                if key == "time":
-                    value -= 5.0  # the generator counts from five seconds before the first frame
-                yield f"{effect.effect}.{key}", (estimate["value"] - value) / estimate["sd"]
+                value, said = float(true[key]), estimate["value"]
+                if effect.effect == "cyclic_interference" and key != "P":
+                    # a sine is the same with its sign and half a turn of its phase changed
+                    turned = np.cos(effect.estimates["phase"]["value"] - float(true["phase"])) < 0
+                    if key == "phase":
+                        said += np.pi * turned
+                        value = said - (said - value + np.pi) % (2 * np.pi) + np.pi
+                    elif turned:
+                        said = -said
+                yield f"{effect.effect}.{key}", (said - value) / estimate["sd"]
 
 
 def cases(part: str, seeds: Iterable[int]) -> Iterator[Case]:

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from numpy.typing import NDArray
+    from scipy.sparse import csr_array
 
     from thermocald.photogrammetry.camera_model import Sensor
     from thermocald.photogrammetry.normals import Partials
@@ -40,8 +41,10 @@ if TYPE_CHECKING:
 __all__ = [
     "COLUMNS",
     "FIELD_SCALES",
+    "Blocks",
     "Evidence",
     "SeriesInput",
+    "condensed",
     "gather",
     "reweighted",
     "without_targets",
@@ -77,6 +80,28 @@ class SeriesInput:
 
 
 @dataclass(frozen=True, eq=False)
+class Blocks:
+    """Neighbouring epochs of a long series as one row.
+
+    average (B, E): weights of the epochs in each block; pool (K, S): knots to states, the readings
+    of a block being one; within: χ² of the epochs about their blocks, and its degrees of freedom.
+    """
+
+    average: csr_array
+    pool: csr_array
+    within: float
+    within_free: float
+
+    def pooled_mean(self, values: Array) -> Array:
+        """Mean over the knots of each state."""
+        return np.asarray((self.pool.T @ values) / self.pool.sum(axis=0))
+
+    def pooled_sd(self, sd: Array) -> Array:
+        """Standard deviation of the mean over the knots of each state."""
+        return np.asarray(np.sqrt(self.pool.T @ sd**2) / self.pool.sum(axis=0))
+
+
+@dataclass(frozen=True, eq=False)
 class Evidence:
     """One series, reduced.
 
@@ -108,6 +133,28 @@ class Evidence:
     gross: int
     excluded: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     columns: Array = field(default_factory=lambda: np.zeros(0))
+    blocks: Blocks | None = None
+
+    def states(self, channel: str, operator: csr_array) -> Array:
+        """∂ course / ∂ knots (epochs, K), sparse → ∂ course / ∂ independent errors, dense."""
+        result = operator @ self.channels[channel].mixing
+        if self.blocks is not None:
+            result = self.blocks.average @ result @ self.blocks.pool
+        return np.asarray(result.toarray())
+
+    def state_sd(self, channel: str) -> Array:
+        """Standard deviations of the independent errors, K."""
+        sd = self.channels[channel].sd
+        return sd if self.blocks is None else self.blocks.pooled_sd(sd)
+
+    def state_deviation(self, channel: str) -> Array:
+        """Readings minus smooth course as far as the independent errors hold it, K."""
+        deviation = self.channels[channel].deviation
+        return deviation if self.blocks is None else self.blocks.pooled_mean(deviation)
+
+    def averaged(self, course: Array) -> Array:
+        """A course (epochs, …) on the rows of the normal equations."""
+        return course if self.blocks is None else np.asarray(self.blocks.average @ course)
 
     @property
     def T0(self) -> float:
@@ -178,12 +225,26 @@ def _instruments(
 
 def _spread(channel: Channel, knots: Array, here: NDArray[np.bool_]) -> Channel:
     """A column's instrument on all knots; those of other columns are NaN and carry nothing."""
-    K = len(knots)
+    from scipy.sparse import csr_array
+
+    K, rows = len(knots), np.flatnonzero(here)
     course, deviation, sd = np.full(K, np.nan), np.zeros(K), np.full(K, 1e-6)
+    real = np.zeros(K, dtype=bool)
     course[here], deviation[here], sd[here] = channel.course, channel.deviation, channel.sd
-    mixing = np.eye(K)
-    mixing[np.ix_(here, here)] = channel.mixing
-    return Channel(knots, course, deviation, sd, mixing, channel.noise)
+    real[here] = channel.real
+    part = channel.mixing.tocoo()
+    others = np.flatnonzero(~here)
+    mixing = csr_array(
+        (
+            np.concatenate([part.data, np.ones(len(others))]),
+            (
+                np.concatenate([rows[part.row], others]),
+                np.concatenate([rows[part.col], others]),
+            ),
+        ),
+        shape=(K, K),
+    )
+    return Channel(knots, course, deviation, sd, mixing, real, channel.noise)
 
 
 def _no_temperature(source: SeriesInput, reference: str) -> str:
@@ -390,6 +451,61 @@ def _slowness(v: Array, lags: int = 20) -> float:
             r = float(np.sum(filled[k:] * filled[:-k])) / pairs / power
             total += 2.0 * (r + 1.0 / E)
     return max(total, 1.0) if total > 1.08 else 1.0
+
+
+def condensed(evidence: Evidence, rows: int = 720) -> Evidence:
+    """A long series on at most `rows` blocks of neighbouring epochs; a short one as it is.
+
+    Heat is slow: over twelve epochs of 10 s a course of parameters loses what is faster than some
+    minutes, and nothing else. Courses are computed on all epochs and then averaged.
+    """
+    from scipy.sparse import csr_array
+
+    E = len(evidence.times)
+    if rows >= E:
+        return evidence
+    size = int(np.ceil(E / rows))
+    block = np.arange(E) // size
+    B = int(block[-1]) + 1
+    weight = evidence.n.astype(float)
+    total = np.bincount(block, weight, minlength=B)
+    share = weight / np.where(total > 0, total, 1.0)[block]
+    average = csr_array((share, (block, np.arange(E))), shape=(B, E))
+    N = np.add.reduceat(evidence.N, np.arange(0, E, size), axis=0)
+    b = np.add.reduceat(evidence.b, np.arange(0, E, size), axis=0)
+    values = _solve(N, b)
+    yy = np.einsum("ek,ek->e", values, b)
+    rank = float(np.sum(np.linalg.eigvalsh(N.sum(axis=0)) > 1e-9 * np.trace(N.sum(axis=0))))
+    knots = next(iter(evidence.channels.values())).times
+    inside = (knots >= evidence.history.times[0] - 30.0) & (
+        knots <= evidence.history.times[-1] + 30.0
+    )
+    near = np.clip(np.searchsorted(evidence.history.times, knots), 0, E - 1)
+    state = np.where(inside, block[near], 0)
+    state[~inside] = B + np.arange(int((~inside).sum()))
+    _, state = np.unique(state, return_inverse=True)
+    pool = csr_array(
+        (np.ones(len(knots)), (np.arange(len(knots)), state)),
+        shape=(len(knots), int(state.max()) + 1),
+    )
+    first = np.arange(0, E, size)
+    there = np.maximum(np.add.reduceat((evidence.n > 0).astype(float), first), 1.0)
+    return replace(
+        evidence,
+        times=average @ evidence.times + (total == 0) * evidence.times[first],
+        N=N,
+        b=b,
+        yy=yy,
+        values=values,
+        n=np.add.reduceat(evidence.n, first),
+        sigma0=np.sqrt(np.add.reduceat(evidence.sigma0**2, first) / there),
+        blocks=Blocks(
+            average,
+            pool,
+            max(float(evidence.yy.sum() - yy.sum()), 0.0),
+            rank * float((evidence.n > 0).sum() - (total > 0).sum()),
+        ),
+    )
 
 
 def reweighted(evidence: Evidence, noise: Array) -> Evidence:

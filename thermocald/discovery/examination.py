@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.discovery.adequacy import Adequacy, examine
-from thermocald.discovery.evidence import reweighted
+from thermocald.discovery.evidence import condensed, reweighted
 from thermocald.discovery.hypothesis import Laboratory
 from thermocald.discovery.image_space import (
     Displaced,
@@ -77,7 +77,7 @@ def examine_series(
     growth = noise_growth(cleaned)
     if growth is not None:
         cleaned = [reweighted(e, n) for e, n in zip(cleaned, growth.noise, strict=True)]
-    laboratory = Laboratory(calibrated_thermometers(cleaned))
+    laboratory = Laboratory([condensed(e) for e in calibrated_thermometers(cleaned)])
     say("base model")
     search = Search(laboratory, say)
     base = search.base(given)
@@ -127,8 +127,9 @@ def calibrated_thermometers(series: Sequence[Evidence]) -> list[Evidence]:
     sharper than most thermometers. Both estimates can only err upwards, by switched lamps here,
     by fast effects there; the smaller one counts, and one thermometer has one noise.
     """
-    laboratory = Laboratory(series)
+    laboratory = Laboratory([condensed(e) for e in series])
     fit = laboratory.fit(())
+    laboratory = Laboratory(series)
     d = fit.direction(fit.blocks[0])[0]
     variances, weights = [], []
     for s, e in enumerate(series):
@@ -137,8 +138,9 @@ def calibrated_thermometers(series: Sequence[Evidence]) -> list[Evidence]:
         ok = precision > 0
         own = instrument.noise**2
         if ok.sum() > 20:
-            course, operator, _ = laboratory.drive((), s)
-            shown = course + (operator @ instrument.mixing) @ instrument.deviation
+            course = laboratory.drive_course((), s)
+            matrix = e.history.temperature_matrix() @ instrument.mixing
+            shown = course + matrix @ instrument.deviation
             # what the image says of T beyond its level, in K
             rest = (e.b @ d)[ok] / precision[ok] - shown[ok]
             second = np.diff(rest, 2)

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
+    from scipy.sparse import csr_array
 
     from thermocald.discovery.evidence import Evidence
     from thermocald.simulation.history import History
@@ -132,59 +133,66 @@ class Laboratory:
     def __init__(self, series: Sequence[Evidence]) -> None:
         self.series = tuple(series)
         self.thermometer_factor = 1.0
-        self._courses: dict[Any, tuple[Array, Array | None]] = {}
-        self._drives: dict[Any, tuple[Array, Array, History]] = {}
+        self._courses: dict[Any, tuple[Array, Array | None, str]] = {}
+        self._drives: dict[Any, tuple[Array, Array]] = {}
 
     # -- courses ---------------------------------------------------------------------------
 
-    def drive(self, terms: Sequence[Term], series: int) -> tuple[Array, Array, History]:
-        """The course (E,) that drives the linear terms, its operator (E, R), and the history
-        in which it stands in place of the reference."""
+    def drive(self, terms: Sequence[Term], series: int) -> tuple[Array, Array]:
+        """The course (E,) that drives the linear terms, and its operator (E, states)."""
         key = (series, tuple((t.effect, t.nonlinear) for t in terms if t.is_drive))
         if key not in self._drives:
             evidence = self.series[series]
-            history = evidence.history
-            operator: Array | None = None
+            history, operator = self._through(terms, series, last=False)
             drives = [t for t in terms if t.is_drive]
-            course = history.temperature()
-            if not drives:
-                operator = history.temperature_matrix().toarray()
-            for position, term in enumerate(drives):
-                effect = catalogue.get(term.effect)
-                values = term.values(series) or {}
+            if drives:
+                effect, values = catalogue.get(drives[-1].effect), drives[-1].values(series) or {}
                 course = effect.drive(history, **values)
-                own = effect.sensitivity(history, **values).toarray()
-                operator = own if operator is None else own @ operator
-                last = position == len(drives) - 1
-                at_readings = history.at(history.reading_times)
-                if not last:
-                    step = effect.sensitivity(at_readings, **values).toarray()
-                    operator = step if position == 0 else step @ operator
-                history = history.with_reference(effect.drive(at_readings, **values))
-            assert operator is not None
-            if len(self._drives) > 400:
+                own = effect.sensitivity(history, **values)
+            else:
+                course, own = history.temperature(), history.temperature_matrix()
+            whole = own if operator is None else own @ operator
+            if len(self._drives) > 60:
                 self._drives.clear()
-            self._drives[key] = (course, operator, history)
+            self._drives[key] = (
+                evidence.averaged(course),
+                evidence.states(history.reference, whole),
+            )
         return self._drives[key]
 
     def drive_course(self, terms: Sequence[Term], series: int) -> Array:
         """The course (E,) alone: for scanning, where no operator is needed."""
-        history = self.series[series].history
-        course = history.temperature()
+        history, _ = self._through(terms, series, last=False, operators=False)
         drives = [t for t in terms if t.is_drive]
-        for position, term in enumerate(drives):
-            effect = catalogue.get(term.effect)
-            values = term.values(series) or {}
-            course = effect.drive(history, **values)
-            if position < len(drives) - 1:
-                at_readings = history.at(history.reading_times)
-                history = history.with_reference(effect.drive(at_readings, **values))
-        return course
+        course = history.temperature()
+        if drives:
+            course = catalogue.get(drives[-1].effect).drive(
+                history, **(drives[-1].values(series) or {})
+            )
+        return self.series[series].averaged(course)
+
+    def _through(
+        self, terms: Sequence[Term], series: int, last: bool, operators: bool = True
+    ) -> tuple[History, csr_array | None]:
+        """The history with its reference sent through the drives (but for the last, unless asked),
+        and the matrix from the knots' errors to what they are then.
+        """
+        history = self.series[series].history
+        drives = [t for t in terms if t.is_drive]
+        operator: csr_array | None = None
+        for term in drives if last else drives[:-1]:
+            effect, values = catalogue.get(term.effect), term.values(series) or {}
+            at_knots = history.at(history.reading_times)
+            if operators:
+                own = effect.sensitivity(at_knots, **values)
+                operator = own if operator is None else own @ operator
+            history = history.with_reference(effect.drive(at_knots, **values))
+        return history, operator
 
     def courses(
-        self, term: Term, series: int, terms: Sequence[Term] = ()
+        self, term: Term, series: int, terms: Sequence[Term] = (), operators: bool = True
     ) -> tuple[Array, Array | None, str]:
-        """Courses (E, m) of a signal, operator (E, R) of the first or None, channel."""
+        """Courses (E, m) of a signal, operator (E, states) of the first or None, channel."""
         effect = catalogue.get(term.effect)
         values = term.values(series)
         evidence = self.series[series]
@@ -192,42 +200,27 @@ class Laboratory:
             return np.zeros((len(evidence.times), 1)), None, evidence.history.reference
         drives = tuple((t.effect, t.nonlinear) for t in terms if t.is_drive)
         through = term.through_drive and bool(drives)
-        key = (series, term.effect, tuple(sorted(values.items())), drives if through else None)
-        history = evidence.history
-        operator_in: Array | None = None
-        if through:
-            _, operator_in, history = self.drive(terms, series)
-        channel = effect.channel(history, **values)
+        key = (
+            series, term.effect, tuple(sorted(values.items())), drives if through else None,
+            operators,
+        )  # fmt: skip
         if key not in self._courses:
-            course = effect.signal(history, **values)
-            course = course - course[:1] * 0.0
+            history = evidence.history
+            before: csr_array | None = None
+            if through:
+                history, before = self._through(terms, series, last=True)
+            course = evidence.averaged(effect.signal(history, **values))
             operator = None
-            if course.shape[1] == 1:
+            channel = effect.channel(history, **values)
+            if operators and course.shape[1] == 1:
                 sparse = effect.sensitivity(history, **values)
                 if sparse.nnz:
-                    operator = sparse.toarray()
-                    if operator_in is not None:
-                        # the readings reach the signal through the drive
-                        operator = operator @ self._drive_at_readings(terms, series)
-            if len(self._courses) > 3000:
+                    whole = sparse if before is None else sparse @ before
+                    operator = evidence.states(channel, whole)
+            if len(self._courses) > 600:
                 self._courses.clear()
-            self._courses[key] = (course, operator)
-        course, operator = self._courses[key]
-        return course, operator, channel
-
-    def _drive_at_readings(self, terms: Sequence[Term], series: int) -> Array:
-        history = self.series[series].history
-        at_readings = history.at(history.reading_times)
-        operator: Array | None = None
-        for term in terms:
-            if term.is_drive:
-                effect = catalogue.get(term.effect)
-                values = term.values(series) or {}
-                own = effect.sensitivity(at_readings, **values).toarray()
-                operator = own if operator is None else own @ operator
-                at_readings = at_readings.with_reference(effect.drive(at_readings, **values))
-        assert operator is not None
-        return operator
+            self._courses[key] = (course, operator, channel)
+        return self._courses[key]
 
     # -- fitting ---------------------------------------------------------------------------
 
@@ -259,7 +252,7 @@ class Laboratory:
             if block.term < 0:
                 course = self.drive(terms, series)[0][:, None]
             else:
-                course = self.courses(terms[block.term], series, terms)[0]
+                course = self.courses(terms[block.term], series, terms, operators=False)[0]
             course = course - course.mean(axis=0)  # conditioning; the level is eliminated anyway
             for m in range(block.courses):
                 for j, name in enumerate(block.parameters):

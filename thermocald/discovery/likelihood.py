@@ -33,7 +33,8 @@ __all__ = ["Carried", "Reduced", "Weighting", "prepare"]
 
 @dataclass(frozen=True, eq=False)
 class Carried:
-    """How a thermometer's error reaches the camera: d (P,) px per K·operator, O (E, R), channel.
+    """How a thermometer's error reaches the camera: d (P,) px per K·operator, O (E, R) from the
+    column's independent errors (`Evidence.states`), channel.
 
     unresolved (E,): standard deviation of the course itself where the temperature bends within
     one interval, in the course's unit; None where the operator resolves it.
@@ -179,16 +180,15 @@ def prepare(
             N, b, yy, 0.0, (), (), None, np.zeros(0), np.zeros((0, P)), N0, k0, F
         )
     names = list(dict.fromkeys(c.channel for c in carried))
-    sizes = [len(evidence.channels[n].course) for n in names]
+    sizes = [len(evidence.state_sd(n)) for n in names]
     starts = np.concatenate([[0], np.cumsum(sizes)])
-    sd = np.concatenate([evidence.channels[n].sd for n in names]) * thermometer_factor
-    deviation = np.concatenate([evidence.channels[n].deviation for n in names])
+    sd = np.concatenate([evidence.state_sd(n) for n in names]) * thermometer_factor
+    deviation = np.concatenate([evidence.state_deviation(n) for n in names])
     operators = []
     for item in carried:
         O = np.zeros((len(N), starts[-1]))
         i = names.index(item.channel)
-        channel = evidence.channels[item.channel]
-        O[:, starts[i] : starts[i + 1]] = item.operator @ channel.mixing
+        O[:, starts[i] : starts[i + 1]] = item.operator
         operators.append(O)
     N, b, yy, logdet = _blurred(N, b, yy, carried)
     N0 = N.sum(axis=0)

@@ -110,7 +110,7 @@ class Search:
             if candidate.is_drive:
                 rows.append(laboratory.drive_course([*drives, term], series)[:, None])
             else:
-                rows.append(laboratory.courses(term, series)[0])
+                rows.append(laboratory.courses(term, series, operators=False)[0])
         stack = np.stack(rows)
         stack = stack - stack.mean(axis=1, keepdims=True)
         if not (candidate.is_drive and drives):

@@ -17,6 +17,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+    from scipy.sparse import csr_array
 
     Array = NDArray[np.float64]
 
@@ -32,24 +33,22 @@ class Channel:
 
     times (K,) s; course (K,) °C: smoothed, filled in, the point of linearisation; NaN at knots of
     other columns; deviation (K,) K: reading minus course; sd (K,) K of the independent errors;
-    mixing (K, K): errors of the knots = mixing @ independent errors: a latent instant carries the
-    errors of the readings beside it and its own; noise: K of one reading.
+    mixing (K, K), sparse: errors of the knots = mixing @ independent errors: a latent instant
+    carries the errors of the readings beside it and its own; real (K,): where a knot is an instant
+    of reading; noise: K of one reading.
     """
 
     times: Array
     course: Array
     deviation: Array
     sd: Array
-    mixing: Array
+    mixing: csr_array
+    real: NDArray[np.bool_]
     noise: float
 
     def slope_jump(self, times: Array) -> Array:
         """How uncertain the rate (E,) K/s is at some instants because it jumps beside them."""
-        own = np.flatnonzero(np.isfinite(self.course))
-        t = self.times[own]
-        real = own[np.abs(self.mixing[own].sum(axis=1) - 1.0) < 1e-9]
-        real = real[(self.times[real] >= 0.0) | (self.deviation[real] != 0.0)]
-        t, y = self.times[real], self.course[real] + self.deviation[real]
+        t, y = self.times[self.real], (self.course + self.deviation)[self.real]
         bend, limit = _bends(t, y, self.noise)
         width = np.diff(t)
         size = np.sqrt(np.maximum(bend**2 - (limit / 3.0) ** 2, 0.0)) / width
@@ -133,7 +132,10 @@ def smooth_channel(
         # what may happen between two readings: a share of the step across the gap
         missing = np.flatnonzero(own)[~np.isfinite(y)]
         sd[missing] = (2.0 * noise + np.abs(np.gradient(smooth)))[~np.isfinite(y)]
-    mixing = np.eye(len(times))
+    from scipy.sparse import csr_array, lil_array
+
+    mixing = lil_array((len(times), len(times)))
+    mixing.setdiag(np.ones(len(times)))
     rows = np.flatnonzero(latent)
     if len(rows):
         bend, limit = _bends(t, filled, noise)
@@ -151,7 +153,7 @@ def smooth_channel(
             course[row] -= bend[i] / 8 * top
             sd[row] = 0.12 * size + 0.25 * noise
     deviation = np.nan_to_num(readings - course)
-    return Channel(times, course, deviation, sd, mixing, noise)
+    return Channel(times, course, deviation, sd, csr_array(mixing), own, noise)
 
 
 def extend(channel: Channel) -> Channel:
@@ -171,10 +173,13 @@ def extend(channel: Channel) -> Channel:
     held = np.full(len(before), channel.course[k[0]])
     carried = channel.course[k[-1]] + last * (after - t[-1]) * 0.7
     K, n, m = len(t), len(before), len(after)
-    mixing = np.eye(n + K + m)
-    mixing[n : n + K, n : n + K] = channel.mixing
-    mixing[:n, n + k[0]] = 1.0
-    mixing[n + K :, n + k[-1]] = 1.0
+    from scipy.sparse import block_diag, csr_array
+
+    edge = np.concatenate([np.arange(n), np.arange(n + K, n + K + m)])
+    at = np.concatenate([np.full(n, n + k[0]), np.full(m, n + k[-1])])
+    ends = csr_array((np.ones(n + m), (edge, at)), shape=(n + K + m, n + K + m))
+    ones = [csr_array(np.eye(size)) for size in (n, m)]
+    mixing = csr_array(block_diag([ones[0], channel.mixing, ones[1]]) + ends)
     rate = float(np.sqrt(np.mean(np.gradient(channel.course[k], t[k]) ** 2)))
     return Channel(
         np.concatenate([before, t, after]),
@@ -188,6 +193,7 @@ def extend(channel: Channel) -> Channel:
             ]
         ),
         mixing,
+        np.concatenate([np.zeros(n, dtype=bool), channel.real, np.zeros(m, dtype=bool)]),
         channel.noise,
     )
 

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 from thermocald.errors import (
     BadReading,
-    DeviceDenied,
     DeviceError,
     DeviceGone,
     DeviceNotFound,
@@ -88,11 +87,12 @@ class AdbPhone:
         if state == "device":
             return
         if state == "unauthorized":
-            raise DeviceDenied(f"{self.where}: {DENIED}")
+            raise support.denied(f"{self.where}: {DENIED}", seen=self.seen)
         if state == "offline":
             raise DeviceGone(f"{self.where}: {OFFLINE}")
         if state.startswith("no"):  # "no permissions (…); see http…"
-            raise DeviceDenied(f"{self.where}: no permissions; see the udev rules in systemd/")
+            message = f"{self.where}: no permissions; see the udev rules in systemd/"
+            raise support.denied(message, seen=self.seen)
         raise DeviceGone(f"{self.where}: is in the state {state!r}; let it boot")
 
     def _server_is_there(self) -> None:
@@ -174,7 +174,7 @@ class AdbPhone:
 
     def _translated(self, message: str) -> DeviceError:
         if "unauthorized" in message:
-            return DeviceDenied(f"{self.where}: {DENIED}")
+            return support.denied(f"{self.where}: {DENIED}", seen=self.seen)
         if "offline" in message:
             return DeviceGone(f"{self.where}: {OFFLINE}")
         if "connect to adb server" in message or "No adb exe" in message:

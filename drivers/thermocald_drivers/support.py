@@ -17,6 +17,7 @@ from thermocald.errors import (
     DeviceNotFound,
     DeviceTimeout,
     DriverMissing,
+    TransientDeviceError,
 )
 from thermocald.hal import Reading
 
@@ -29,6 +30,7 @@ __all__ = [
     "absent",
     "believable",
     "choice",
+    "denied",
     "fault",
     "library",
     "middle_reading",
@@ -84,6 +86,15 @@ def absent(message: str, *, seen: bool) -> DeviceError:
     return DeviceGone(message) if seen else DeviceNotFound(message)
 
 
+def denied(message: str, *, seen: bool) -> DeviceError:
+    """What may not be used: for good, unless it was open before.
+
+    A device that has just been plugged in again belongs to nobody until udev has seen it, and other
+    programs look into it; a phone is unauthorized until it has found its key.
+    """
+    return TransientDeviceError(message) if seen else DeviceDenied(message)
+
+
 def fault(error: OSError, where: str, *, seen: bool, hint: str = "") -> DeviceError:
     """The device error that a system call's errno stands for.
 
@@ -97,9 +108,10 @@ def fault(error: OSError, where: str, *, seen: bool, hint: str = "") -> DeviceEr
     if error.errno in _GONE:
         return absent(f"{where}: {reason}{advice}", seen=seen)
     if error.errno in (errno.EACCES, errno.EPERM):
-        return DeviceDenied(f"{where}: {reason}{advice or '; see the udev rules in systemd/'}")
+        return denied(f"{where}: {reason}{advice or '; see the udev rules in systemd/'}", seen=seen)
     if error.errno == errno.EBUSY:
-        return DeviceDenied(f"{where}: in use by another program or a kernel driver ({reason})")
+        message = f"{where}: in use by another program or a kernel driver ({reason})"
+        return denied(message, seen=seen)
     if error.errno == errno.ETIMEDOUT or isinstance(error, TimeoutError):
         return DeviceTimeout(f"{where}: no answer in time ({reason})")
     return BadReading(f"{where}: {reason}")

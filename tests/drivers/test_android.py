@@ -20,6 +20,7 @@ from thermocald.errors import (
     DeviceTimeout,
     DriverMissing,
     PermanentDeviceError,
+    TransientDeviceError,
     WrongDevice,
 )
 from thermocald.hal import SystemClock, VirtualClock, open_device
@@ -257,7 +258,7 @@ def test_states_of_the_server(server, phone, state, error, message):
 
 
 @pytest.mark.parametrize(
-    ("state", "error"), [("offline", DeviceGone), ("unauthorized", DeviceDenied)]
+    ("state", "error"), [("offline", DeviceGone), ("unauthorized", TransientDeviceError)]
 )
 def test_states_that_come_later(server, phone, state, error):
     with camera(server) as device:

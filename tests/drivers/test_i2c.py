@@ -29,6 +29,7 @@ from thermocald.errors import (
     DeviceGone,
     DeviceNotFound,
     DeviceTimeout,
+    TransientDeviceError,
     WrongDevice,
 )
 from thermocald.hal import VirtualClock, open_device
@@ -62,8 +63,8 @@ def test_a_good_reading(bus, name):
         (errno.ENXIO, DeviceGone),
         (errno.ETIMEDOUT, DeviceTimeout),
         (errno.EIO, BadReading),
-        (errno.EBUSY, DeviceDenied),
-        (errno.EACCES, DeviceDenied),
+        (errno.EBUSY, TransientDeviceError),
+        (errno.EACCES, TransientDeviceError),
     ],
 )
 def test_a_bus_error_while_reading(bus, name, number, error):
@@ -87,6 +88,15 @@ def test_nobody_at_the_address(bus, name):
     del bus.chips[address]
     with pytest.raises(DeviceGone):  # it was there once: worth another try
         device.open()
+
+
+@pytest.mark.parametrize("name", CHIPS)
+def test_an_address_that_the_kernel_holds(bus, name):
+    address, chip, _ = CHIPS[name]
+    bus.chips[address] = chip()
+    bus.chips[address].error = errno.EBUSY
+    with pytest.raises(DeviceDenied, match="a kernel driver"):
+        thermometer(name).open()
 
 
 @pytest.mark.parametrize("name", CHIPS)

@@ -7,7 +7,13 @@ import shutil
 import pytest
 
 from tests.drivers.fakes.sysfs import Sysfs
-from thermocald.errors import BadReading, DeviceDenied, DeviceGone, DeviceNotFound, WrongDevice
+from thermocald.errors import (
+    BadReading,
+    DeviceGone,
+    DeviceNotFound,
+    TransientDeviceError,
+    WrongDevice,
+)
 from thermocald.hal import VirtualClock, open_device
 
 
@@ -125,7 +131,7 @@ def test_permission_denied(sysfs, monkeypatch):
             return original(path, *args)
 
         monkeypatch.setattr(type(folder), "read_text", read_text)
-        with pytest.raises(DeviceDenied):
+        with pytest.raises(TransientDeviceError, match="Permission denied"):
             device.read()
 
 

@@ -20,6 +20,7 @@ from thermocald.errors import (
     DeviceNotFound,
     DeviceTimeout,
     DriverMissing,
+    TransientDeviceError,
     WrongDevice,
 )
 from thermocald.hal import SystemClock, VirtualClock, open_device
@@ -220,6 +221,18 @@ def test_busy_and_denied(kernel, call, number, error):
     kernel.errors = {call: number}
     with pytest.raises(error):
         camera(kernel).open()
+
+
+def test_denied_after_a_plug_is_tried_again(kernel):
+    device = camera(kernel)
+    device.open()
+    device.close()
+    kernel.errors = {"QUERYCAP": errno.EACCES}  # the node is root's until udev has seen it
+    with pytest.raises(TransientDeviceError, match="Permission denied"):
+        device.open()
+    kernel.errors = {}
+    device.open()
+    device.close()
 
 
 def test_a_single_broken_frame_is_skipped(kernel):

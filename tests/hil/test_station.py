@@ -175,7 +175,7 @@ def test_sixty_epochs_of_temperatures(series):
         if epoch["frame"] not in log or epoch["temperatures"].get("lens") is None:
             continue
         at = epoch["temperature_time"] - offset
-        # the kernel's driver may give a value up to its own refresh interval old (0.22 s for 12 bit)
+        # the kernel's driver may give a value as old as its refresh interval, 0.22 s
         here = {times[max(0, bisect.bisect(starts, t) - 1)][1] for t in (at - 0.5, at, at + 0.05)}
         low, high = min(here), max(here)
         assert low - 0.001 <= epoch["temperatures"]["lens"] <= high + 0.001
@@ -196,7 +196,8 @@ def test_sixty_epochs_are_calibrated(series, report):
     true = model.rates["x0"]
     assert slope == pytest.approx(true, rel=0.25)
     report(
-        f"daemon: {len(good)} epochs calibrated, dx0/dT {1e3 * slope:.3f} µm/K, true {1e3 * true:.3f}"
+        f"daemon: {len(good)} epochs calibrated, dx0/dT {1e3 * slope:.3f} µm/K, "
+        f"true {1e3 * true:.3f} µm/K"
     )
 
 

@@ -510,6 +510,9 @@ def condensed(evidence: Evidence, rows: int = 720) -> Evidence:
 
 def reweighted(evidence: Evidence, noise: Array) -> Evidence:
     """The same series when the measuring noise of each epoch is `noise` (E,) times the usual."""
+    free = np.maximum(2.0 * evidence.n - evidence.N.shape[1], 0.0)
+    level = np.sum(free * (evidence.sigma0 / noise) ** 2) / max(float(free.sum()), 1.0)
+    noise = noise * np.sqrt(level)
     factor = 1.0 / noise**2
     return replace(
         evidence,

@@ -124,8 +124,8 @@ def calibrated_thermometers(series: Sequence[Evidence]) -> list[Evidence]:
     """The series with the noise of the reference thermometer as the images confirm it.
 
     The images tell the temperature too, through the linear terms: with an unknown slow error, but
-    sharper than most thermometers. Both estimates can only err upwards, by switched lamps here,
-    by fast effects there; the smaller one counts, and one thermometer has one noise.
+    sharper than most thermometers. Where a fast effect spoils that, the readings alone count. One
+    thermometer has one noise.
     """
     laboratory = Laboratory([condensed(e) for e in series])
     fit = laboratory.fit(())
@@ -145,7 +145,9 @@ def calibrated_thermometers(series: Sequence[Evidence]) -> list[Evidence]:
             rest = (e.b @ d)[ok] / precision[ok] - shown[ok]
             second = np.diff(rest, 2)
             image = 6.0 * float(np.mean(1.0 / precision[ok]))
-            own = min(own, max((_clipped(second) ** 2 - image) / 6.0, (0.5 * instrument.noise) ** 2))
+            shown_by_image = (_clipped(second) ** 2 - image) / 6.0
+            if shown_by_image < 1.5 * own:
+                own = max(0.5 * (own + shown_by_image), 0.25 * own)
         variances.append(own)
         weights.append(float(ok.sum()))
     noise = float(np.sqrt(np.average(variances, weights=weights)))

@@ -30,6 +30,7 @@ __all__ = ["Displaced", "NoiseGrowth", "displaced_targets", "noise_growth"]
 
 _GAIN = 60.0  # χ² of a step, for 147 targets × 180 instants a chance of 1e-8
 _STEP_PX = 0.02
+_LEAST = 0.005  # share of the noise at T0 that is left where it is coldest
 _SHARE = 0.6  # of a target's slow movement that the step has to explain
 
 
@@ -203,7 +204,7 @@ def noise_growth(series: Sequence[Evidence]) -> NoiseGrowth | None:
     other_gain, other = max(others)
     if gain < 40.0 or gain < other_gain + 10.0:
         return None
-    noise = tuple(np.maximum(1.0 + k * t, 0.1) for t in temperature)
+    noise = tuple(np.maximum(1.0 + k * t, _LEAST) for t in temperature)
     return NoiseGrowth(k, sd, gain, other_gain, other, noise)
 
 
@@ -217,7 +218,7 @@ def _slope(
     def objective(k: float) -> float:
         total = 0.0
         for course, (ok, free, v) in zip(courses, data, strict=True):
-            s2 = np.maximum(1.0 + k * course[ok], 0.1) ** 2
+            s2 = np.maximum(1.0 + k * course[ok], _LEAST) ** 2
             f = free[ok]
             level = np.sum(f * v[ok] / s2) / np.sum(f)
             total += float(np.sum(f * (np.log(s2) + np.log(level))))
@@ -226,7 +227,7 @@ def _slope(
     reach = max(float(np.max(np.abs(c))) for c in courses)
     low = min(float(np.min(c)) for c in courses)
     high = max(float(np.max(c)) for c in courses)
-    bounds = (-0.9 / max(high, 1e-9), 0.9 / max(-low, 1e-9))
+    bounds = (-0.995 / max(high, 1e-9), 0.995 / max(-low, 1e-9))
     start = minimize_scalar(objective, bounds=bounds, method="bounded", options={"xatol": 1e-7})
     k = float(start.x)
     gain = objective(0.0) - float(start.fun)

@@ -216,3 +216,20 @@ def test_camera_convert(run, tmp_path):
         run("camera", "convert", tmp_path / "a.cameramodel", "--to", "x", "--out", tmp_path / "y")
     with pytest.raises(ConfigurationError, match=r"none\.xml"):
         run("camera", "convert", tmp_path / "none.xml", "--to", "ros", "--out", tmp_path / "y")
+
+
+def test_a_turned_camera_does_not_turn_its_picture(tmp_path):
+    """The orientation that cameras write into EXIF says how to show a picture, not how the sensor
+    saw it: OpenCV would turn it, and with it the principal point.
+    """
+    from thermocald.cli.testfield_survey import _picture
+
+    grey = np.arange(48 * 64, dtype=np.uint32).reshape(48, 64) % 251
+    encoded = cv2.imencode(".jpg", grey.astype(np.uint8))[1].tobytes()
+    tiff = b"II*\0\x08\0\0\0" + b"\x01\0" + b"\x12\x01\x03\0\x01\0\0\0\x06\0\0\0" + b"\0\0\0\0"
+    block = b"Exif\0\0" + tiff
+    marked = encoded[:2] + b"\xff\xe1" + (len(block) + 2).to_bytes(2, "big") + block + encoded[2:]
+    path = tmp_path / "turned.jpg"
+    path.write_bytes(marked)
+    assert cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).shape == (64, 48)  # the block is understood
+    assert _picture(path).load().shape == (48, 64)

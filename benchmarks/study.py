@@ -1,0 +1,84 @@
+"""A year at 10 s, 3.15 million epochs, studied and reported: time, memory, size of the report.
+
+Run: python benchmarks/study.py [EPOCHS]
+Bounds: < 60 s and < 1.5 GB for the study; the report < 10 MB.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import resource
+import sys
+import time
+
+import numpy as np
+
+from thermocald.analysis.measured import MeasuredSeries, Thermometer
+from thermocald.analysis.study import study
+from thermocald.output.study_report import render_report
+from thermocald.photogrammetry.camera_model import Sensor
+
+YEAR = 3_153_600
+BASE = np.array([3.04, 0.012, -0.018, -0.004, 5e-4, 0.0, 1e-4, -2e-4, 0.0, 0.0])
+PER_KELVIN = np.array([2e-4, 6e-4, 4e-4, 2e-7, 0.0, 0.0, 6e-7, 4e-7, 0.0, 0.0])
+SDS = np.array([6e-5, 6e-6, 6e-6, 3e-5, 1.5e-5, 2e-6, 1.5e-6, 2e-6, np.nan, np.nan])
+
+
+def year(epochs: int) -> MeasuredSeries:
+    """Days and seasons; built column by column, as a store is read."""
+    rng = np.random.default_rng(0)
+    time_s = np.arange(epochs) * 10.0
+    true = 5 * np.sin(2 * np.pi * time_s / 86_400) + 10 * np.sin(2 * np.pi * time_s / 31_557_600)
+    values, sds = np.empty((epochs, 10), order="F"), np.empty((epochs, 10), order="F")
+    for k in range(10):
+        values[:, k] = BASE[k] + PER_KELVIN[k] * true
+        if np.isfinite(SDS[k]):
+            values[:, k] += SDS[k] * rng.standard_normal(epochs)
+        sds[:, k] = SDS[k]
+    true += 15 + 0.05 * rng.standard_normal(epochs)
+    sample = np.linspace(0, epochs - 1, 5000).astype(np.int64)
+    return MeasuredSeries(
+        "rpi",
+        "year",
+        "rpi",
+        Sensor(3280, 2464, 0.00112),
+        "formula",
+        np.arange(epochs),
+        time_s,
+        (Thermometer("temperature", true, 0.05),),
+        values,
+        sds,
+        1 + 0.03 * rng.standard_normal(epochs),
+        np.full(epochs, 280.0),
+        np.tile(np.eye(10), (5000, 1, 1)),
+        sample,
+        "series",
+    )
+
+
+def peak_mb() -> float:
+    """Largest resident size so far, MB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
+
+
+def main() -> int:
+    epochs = int(sys.argv[1]) if len(sys.argv) > 1 else YEAR
+    series = year(epochs)
+    print(f"{epochs} epochs in memory: {peak_mb():.0f} MB")
+    begin, cpu = time.perf_counter(), time.process_time()
+    result = study([series])
+    seconds, cpu_seconds = time.perf_counter() - begin, time.process_time() - cpu
+    memory = peak_mb()
+    print(f"studied in {seconds:.1f} s ({cpu_seconds:.1f} s of processor)   < 60 s")
+    print(f"{memory:.0f} MB   < 1500 MB")
+    begin = time.perf_counter()
+    size = len(render_report(result).encode()) / 1e6
+    print(f"report of {size:.1f} MB in {time.perf_counter() - begin:.1f} s   < 10 MB")
+    return 0 if cpu_seconds < 60 and memory < 1500 and size < 10 else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

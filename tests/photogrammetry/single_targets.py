@@ -20,6 +20,7 @@ from thermocald.photogrammetry.outline import LocalMap, local_maps
 AT_ORIGIN = ExteriorOrientation(0, 0, 0, 0, 0, 0)
 PAPER, INK = 190.0, 40.0
 SIZE = 84
+SIZE_WITH_RING = 124
 QUANTISATION = 1 / 12
 
 
@@ -50,7 +51,7 @@ class SingleTargets:
         image = np.full((PI_SENSOR.height, PI_SENSOR.width), round(PAPER), dtype=np.uint8)
         for x, y, patch in self.patches:
             value = np.rint(patch).astype(np.uint8) if rng is None else noisy(patch, rng, noise_sd)
-            image[y : y + SIZE, x : x + SIZE] = value
+            image[y : y + len(patch), x : x + len(patch)] = value
         return image
 
 
@@ -65,7 +66,7 @@ def single_targets(
 ) -> SingleTargets:
     """Discs on a raster over the Pi camera's frame, each tilted about a random axis.
 
-    bits: with a code ring of so many bits (up to 24 px then); ink: DN of the discs on PAPER.
+    bits: with a code ring of so many bits (up to 30 px then); ink: DN of the discs on PAPER.
     """
     rng = np.random.default_rng(seed)
     cases = [(d, t) for d in diameters for t in tilts]
@@ -85,9 +86,10 @@ def single_targets(
         normal = -ray * np.cos(angle) + np.cross(axis, -ray) * np.sin(angle)
         size = diameter * np.linalg.norm(centre) / scale
         uv = PI_CAMERA.project(AT_ORIGIN, centre[None])[0]
-        x, y = np.rint(uv - SIZE / 2).astype(int)
+        side = SIZE_WITH_RING if bits else SIZE
+        x, y = np.rint(uv - side / 2).astype(int)
 
-        def draw(c, normal=normal, size=size, window=(x, y, SIZE, SIZE), ring=k):
+        def draw(c, normal=normal, size=size, window=(x, y, side, side), ring=k):
             scene = Scene(paper=PAPER, ink=ink, light=light)
             if bits:
                 code = ring_code.codes(bits)[7 * ring]

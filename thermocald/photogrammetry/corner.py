@@ -31,7 +31,8 @@ __all__ = ["CornerFit", "fit_corners"]
 _SERIES_TERMS = 9
 _ITERATIONS = 20
 _CONVERGED_PX = 2e-4
-_LARGEST_MOVE_PX = 3.0
+_LARGEST_MOVE_PX = 1.5
+_LARGEST_MOVE_SHARE = 0.015  # of the marker's side: an outline cut short in a reduced image
 _BLUR_LIMITS_PX = (0.3, 4.0)
 _SLOWEST_CORRELATION = 0.93  # the series is not good enough for edges that meet at less than 22°
 
@@ -144,7 +145,8 @@ def _fit(
     n = len(corners)
     height, width = image.shape
     sides = np.stack([before - corners, after - corners])
-    along = np.minimum(0.45 * np.linalg.norm(sides, axis=-1).min(axis=0), reach)
+    side = np.linalg.norm(sides, axis=-1).min(axis=0)
+    along = np.minimum(0.45 * side, reach)
     half = int(np.ceil(along.max()))
     offset = np.arange(-half, half + 1)
     origin = np.rint(corners).astype(int)
@@ -155,8 +157,8 @@ def _fit(
 
     # Inward normals of the two edges: perpendicular to one side, towards the other.
     normals = []
-    for side, other in ((sides[0], sides[1]), (sides[1], sides[0])):
-        normal = _unit(np.stack([-side[:, 1], side[:, 0]], axis=-1))
+    for edge, other in ((sides[0], sides[1]), (sides[1], sides[0])):
+        normal = _unit(np.stack([-edge[:, 1], edge[:, 0]], axis=-1))
         normals.append(normal * np.sign(np.sum(normal * other, axis=-1, keepdims=True)))
     px, py = x.astype(float), y.astype(float)
     dx, dy = px - corners[:, 0, None], py - corners[:, 1, None]
@@ -239,7 +241,7 @@ def _fit(
             reasons.append("too small")
         elif not np.isfinite(p[i]).all() or not converged[i]:
             reasons.append("the fit does not converge")
-        elif move[i] > min(_LARGEST_MOVE_PX, max(1.5, 0.1 * along[i] / 0.45)):
+        elif move[i] > _LARGEST_MOVE_PX + _LARGEST_MOVE_SHARE * side[i]:
             reasons.append("no corner where the marker has one")
         elif angle[i] > 0.95:
             reasons.append("too oblique")
@@ -247,6 +249,8 @@ def _fit(
             reasons.append("too little contrast")
         else:
             reasons.append("")
+    # The fitted width holds the pixel's own.
+    blur = np.sqrt(np.maximum(p[:, 4] ** 2 - 1 / 12, 0.0))
     return CornerFit(
-        p[:, :2], covariances, p[:, 4], p[:, 6], p[:, 5], residual_sd, saturation, tuple(reasons)
+        p[:, :2], covariances, blur, p[:, 6], p[:, 5], residual_sd, saturation, tuple(reasons)
     )

@@ -22,8 +22,6 @@ from thermocald.photogrammetry.blurred_disc import normal_cdf
 from thermocald.photogrammetry.outline import LocalMap
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from numpy.typing import NDArray
 
     from thermocald.photogrammetry.detection import Candidates
@@ -40,12 +38,15 @@ _EDGE_RADII = (0.55, 0.65, 0.75, 0.85, 0.95, 1.05, 1.15, 1.25, 1.35, 1.45)
 _RADII = (1.75, 2.05, 2.25, 2.5, 2.75, 2.95, 3.25)
 _MIDDLE = slice(2, 5)
 _INSIDE, _OUTSIDE = 0.6, 0.4  # level of a sample, 0 background, 1 ink
-_SHARE = 0.92  # of the samples on a circle that must agree
+_LEAST_RELIEF = 0.35  # of the ring, against none about a plain circle
+_SHARE = 0.85  # of the samples on a circle that must agree
 _LEAST_CONTRAST_DN = 10.0
 _RASTER_PX = 0.5  # by how much a transition may miss the raster, and by how many turns
 _RASTER_TURNS = 0.006
 _BLURS_PX = (0.8, 1.4)
-_MISFIT = 0.14  # RMS of samples against what was read, in levels
+_LARGEST_SHIFT = 0.2  # radii, by which perspective and distortion move a ring against its disc
+_MISFIT = 0.13  # RMS of samples against what was read, in levels
+_MISFIT_OF_ONE_ARC = 0.06  # a closed ring with something across it is read as one arc
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,18 +64,18 @@ class CodedTargets:
 def read_codes(
     image: NDArray[np.uint8],
     candidates: Candidates,
-    families: Iterable[int] = ring_code.BITS,
     known: frozenset[tuple[int, int]] | None = None,
 ) -> CodedTargets:
     """The ring codes about candidates; `known` (bits, number), all others are ignored.
 
-    A code that is read at two places is dropped: one of the two is not what it says.
+    Both families are always read, since a ring of one may pass for one of the other. A code that
+    is read at two places is dropped: one of the two is not what it says.
     """
     rows, gap, contrast = _disc_and_gap(image, candidates)
     maps = _sized(image, candidates.maps.select(rows), gap, contrast)
     level = _sample(image, maps, _RADII, _ANGLES)
     level = (level - gap[:, None, None]) / contrast[:, None, None]
-    raster = np.array(sorted(families), dtype=np.int64)
+    raster = np.array(ring_code.BITS, dtype=np.int64)
     readings = [_read_family(level, maps, n) for n in raster.tolist()]
     numbers = np.array([r[0] for r in readings]).reshape(len(raster), len(rows))
     misfits = np.array([r[1] for r in readings]).reshape(len(raster), len(rows))
@@ -113,7 +114,7 @@ def _disc_and_gap(
         enough
         & (np.mean(level[:, 0] > _INSIDE, axis=1) >= _SHARE)
         & (np.mean(level[:, 1] < _OUTSIDE, axis=1) >= _SHARE)
-        & (np.ptp(level[:, 2], axis=1) > _INSIDE)
+        & (np.ptp(level[:, 2], axis=1) > _LEAST_RELIEF)
         & (np.mean(level[:, 3] < _OUTSIDE, axis=1) >= _SHARE)
     )
     return rows[passed], gap[passed], contrast[passed]
@@ -201,6 +202,8 @@ def _read_family(level: Single, maps: LocalMap, bits: int) -> tuple[NDArray[np.i
         misfit[rows] = _misfit(
             level[rows], maps.select(rows), ones[rows], which[rows], within[rows]
         )
+        one_arc = np.sum(ones != np.roll(ones, 1, axis=1), axis=1) == 2
+        misfit[one_arc & (misfit > _MISFIT_OF_ONE_ARC)] = np.inf
     return codes, misfit
 
 
@@ -235,6 +238,30 @@ def _misfit(
         inner, outer, side = (
             normal_cdf((v / blur).astype(np.float32)) for v in (*radial, tangential)
         )
-        drawn = (inner + outer - 1) * side
-        best = np.minimum(best, np.sqrt(np.mean((level - drawn) ** 2, axis=(1, 2))))
+        best = np.minimum(best, _rms_after_shift(level, (inner + outer - 1) * side))
     return best
+
+
+def _rms_after_shift(level: Single, drawn: Single) -> Array:
+    """RMS (n,) of level minus drawn (n, radii, angles) after the ring may shift, turn, and grow."""
+    n = len(level)
+    turn = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
+    rho, cosine, sine = np.array(_RADII)[:, None], np.cos(turn), np.sin(turn)
+    outwards = np.gradient(drawn, np.array(_RADII), axis=1)
+    around = (np.roll(drawn, -1, axis=2) - np.roll(drawn, 1, axis=2)) * (_ANGLES / (4 * np.pi))
+    design = np.stack(
+        [
+            outwards * cosine - around * sine / rho,
+            outwards * sine + around * cosine / rho,
+            around,
+            outwards * rho,
+        ],
+        axis=1,
+    ).reshape(n, 4, -1)
+    residual = (level - drawn).reshape(n, -1)
+    normal = design @ np.swapaxes(design, 1, 2) + 1e-3 * np.eye(4)
+    shift = np.linalg.solve(normal, (design @ residual[..., None]))[..., 0]
+    shift = np.clip(shift, -_LARGEST_SHIFT, _LARGEST_SHIFT)
+    left = residual - (shift[:, None] @ design)[:, 0]
+    rms: Array = np.sqrt(np.mean(left * left, axis=1))
+    return rms

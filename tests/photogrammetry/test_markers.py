@@ -1,0 +1,182 @@
+"""Markers of OpenCV's dictionaries: corners at sub-pixel with true standard deviations."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.photogrammetry.exact_rendering import Scene, look_at, noisy
+from tests.photogrammetry.fields import SMALL_CAMERA, SMALL_SENSOR, draw_marker
+from thermocald.errors import TestFieldError
+from thermocald.photogrammetry.markers import (
+    locate_markers,
+    marker_rows,
+    measure_corners,
+    measure_markers,
+    parse_marker,
+)
+from thermocald.photogrammetry.testfield import TestField
+
+APRILTAG, ARUCO = "DICT_APRILTAG_36h11", "DICT_5X5_50"
+
+
+def _board(dictionaries=(APRILTAG, ARUCO), size=60.0):
+    """4 × 3 markers in the plane Z = 0, of alternating dictionaries; field and scene."""
+    scene, markers = Scene(), {}
+    for k in range(12):
+        # The viewer looks along -Z: x right, y up; OpenCV's order is clockwise from the top left.
+        x, y = 130.0 * (k % 4), 130.0 * (k // 4)
+        corners = np.array(
+            [[x, y + size, 0], [x + size, y + size, 0], [x + size, y, 0], [x, y, 0.0]]
+        )
+        draw_marker(scene, dictionaries[k % len(dictionaries)], k, corners, markers)
+    names, points, codes = [], [], []
+    for (dictionary, number), corners in markers.items():
+        for k in range(4):
+            names.append(f"{number}.{k}")
+            points.append(corners[k])
+            codes.append(f"{dictionary}:{number}:{k}")
+    return TestField.build(names, points, 0.01, np.nan, "marker_corner", codes), scene
+
+
+FIELD, SCENE = _board()
+VIEWS = {
+    "frontal": look_at([225, 160, 620], [225, 160, 0]),
+    "oblique": look_at([-250, 20, 520], [225, 160, 0], 0.4),
+    "far and turned": look_at([400, 300, 1300], [225, 160, 0], 2.5),
+}
+
+
+def _truth(exterior) -> np.ndarray:
+    return SMALL_CAMERA.project(exterior, FIELD.points)
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_corners_scatter_as_stated(view):
+    exterior = VIEWS[view]
+    image = SCENE.render(SMALL_CAMERA, exterior)
+    rng = np.random.default_rng(1)
+    found = locate_markers(noisy(image, rng), FIELD)
+    assert len(found) == 48
+    truth = _truth(exterior)
+    error, z = [], []
+    for _ in range(12):
+        missed: dict[int, str] = {}
+        observed = measure_corners(noisy(image, rng), found, missed)
+        assert missed == {}
+        e = observed.points - truth[observed.targets]
+        error.append(e)
+        z.append(e / observed.sigmas)
+    assert 0.9 <= np.sqrt(np.mean(np.square(z))) <= 1.1
+    # Far better than the twentieth of a pixel of corner operators.
+    assert np.sqrt(np.mean(np.square(error))) < 0.03
+
+
+def test_several_dictionaries_at_once_and_in_the_fields_order():
+    image = noisy(SCENE.render(SMALL_CAMERA, VIEWS["frontal"]), np.random.default_rng(2))
+    observed = measure_markers(image, FIELD)
+    assert list(observed.targets) == list(range(48))
+    assert set(observed.quality) == {"blur", "contrast", "grey", "noise", "saturation"}
+    assert np.median(observed.quality["blur"]) == pytest.approx(0.8, abs=0.05)
+
+
+def test_markers_that_are_not_of_the_field_are_ignored():
+    image = noisy(SCENE.render(SMALL_CAMERA, VIEWS["frontal"]), np.random.default_rng(3))
+    part = FIELD.subset(np.arange(8))
+    assert list(measure_markers(image, part).targets) == list(range(8))
+
+
+def test_a_marker_that_is_there_twice_is_dropped():
+    image = noisy(SCENE.render(SMALL_CAMERA, VIEWS["frontal"]), np.random.default_rng(4))
+    u, v = np.rint(_truth(VIEWS["frontal"])[:4].mean(axis=0)).astype(int)
+    patch = image[v - 70 : v + 70, u - 70 : u + 70].copy()
+    image[20:160, 1480:1620] = patch
+    missed: dict[int, str] = {}
+    observed = measure_markers(image, FIELD, missed)
+    assert not set(observed.targets) & {0, 1, 2, 3}
+    assert missed[0]
+
+
+def test_a_large_frame_is_found_at_half_size_and_measured_at_full():
+    from tests.photogrammetry.fields import PI_CAMERA
+
+    image = noisy(SCENE.render(PI_CAMERA, VIEWS["frontal"]), np.random.default_rng(5))
+    observed = measure_markers(image, FIELD)
+    truth = PI_CAMERA.project(VIEWS["frontal"], FIELD.points)
+    assert len(observed) == 48
+    assert np.abs((observed.points - truth[observed.targets]) / observed.sigmas).max() < 5
+
+
+def test_a_corner_at_the_edge_is_missed_with_a_reason():
+    exterior = VIEWS["frontal"]
+    image = noisy(SCENE.render(SMALL_CAMERA, exterior), np.random.default_rng(6))
+    found = locate_markers(image, FIELD)
+    x = int(np.floor(_truth(exterior)[1, 0])) + 1
+    missed: dict[int, str] = {}
+    measure_corners(np.ascontiguousarray(image[:, :x]), found, missed)
+    assert "edge" in missed[1]
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "DICT_NONE:1:0", "DICT_4X4_50:50:0", "DICT_4X4_50:1:4", "DICT_4X4_50", "DICT_4X4_50:a:0",
+        "DICT_4X4_50:1:0:0", "DICT_4X4_50:-1:0",
+    ],
+)  # fmt: skip
+def test_what_is_no_marker_code_is_said(code):
+    with pytest.raises(TestFieldError, match="DICT_"):
+        parse_marker(code)
+
+
+def test_a_code_stands_once_in_a_field():
+    field = TestField.build(
+        ["a", "b"], np.zeros((2, 3)), kinds="marker_corner", codes="DICT_4X4_50:1:0"
+    )
+    with pytest.raises(TestFieldError, match="twice"):
+        marker_rows(field)
+
+
+def test_photographs_of_apriltags(shared):
+    """Three to twelve corners a picture; the numbers are those that stand on the walls."""
+    field = TestField.build(
+        [f"{n}.{k}" for n in range(1, 17) for k in range(4)],
+        np.zeros((64, 3)),
+        kinds="marker_corner",
+        codes=[f"{APRILTAG}:{n}:{k}" for n in range(1, 17) for k in range(4)],
+    )
+    expected = {
+        "Amp_42in": {5}, "BackAmpZone_117in": {2, 3, 4}, "GeneralField1": {9, 10},
+        "GeneralField3": {7, 8}, "SpeakerCenter_143in": {3, 4}, "SpeakerCenter_19in": {3, 4},
+        "StageLeft_51in": {15},
+    }  # fmt: skip
+    for name, numbers in expected.items():
+        path = shared / "data" / "frc" / f"{name}.jpg"
+        observed = measure_markers(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), field)
+        assert {int(field.names[t].split(".")[0]) for t in observed.targets} == numbers
+        assert len(observed) == 4 * len(numbers)
+        assert observed.sigmas.max() < 0.2
+
+
+def test_a_board_of_aruco_on_film(shared):
+    """ChArUco's own markers: 48 of them, at sub-pixel the same from frame to frame as the hand."""
+    film = cv2.VideoCapture(str(shared / "data" / "charuco" / "testcalibration.mp4"))
+    ok, picture = film.read()
+    film.release()
+    assert ok
+    field = TestField.build(
+        [f"{n}.{k}" for n in range(48) for k in range(4)],
+        np.zeros((192, 3)),
+        kinds="marker_corner",
+        codes=[f"DICT_5X5_1000:{n}:{k}" for n in range(48) for k in range(4)],
+    )
+    observed = measure_markers(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), field)
+    assert len(observed) >= 0.9 * 192
+
+
+def test_image_size_is_that_of_the_camera():
+    assert SCENE.render(SMALL_CAMERA, VIEWS["frontal"]).shape == (
+        SMALL_SENSOR.height,
+        SMALL_SENSOR.width,
+    )

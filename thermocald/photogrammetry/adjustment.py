@@ -59,6 +59,7 @@ __all__ = [
 
 DEFAULT_FREE = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2")
 
+_TRUSTED_REDUNDANCY = 20
 _ROUNDS = 12  # of data snooping; each may reject several targets
 _TRUSTED_REDUNDANCY = 20  # from here on the residuals themselves tell the noise
 
@@ -230,6 +231,8 @@ def _result(
     redundancy = 2 * int(use.sum()) + len(s.priors) - len(u)
     sigma0 = float(np.sqrt(problem.cost(solution.v[:, use], solution.values) / redundancy))
     factor = sigma0**2 if s.scale == "posterior" else 1.0
+    if redundancy < _TRUSTED_REDUNDANCY:
+        factor = max(1.0, factor)  # a handful of residuals may be small by luck
     covariance = np.zeros((16, 16))
     covariance[np.ix_(u, u)] = solution.root @ solution.root.T * factor
     result = Adjustment(

@@ -413,7 +413,9 @@ class _Series:
         excess, own, sound = np.zeros(16), system.own, system.good
         if s.target_noise:
             variances = np.diagonal(relative, axis1=1, axis2=2)[:, own]
-            excess[own] = excess_scatter(estimate.values[sound][:, own], variances[sound])
+            excess[own] = excess_scatter(
+                estimate.values[sound][:, own], variances[sound], kinks=s.exterior == "series"
+            )
             relative[:, own, own] += excess[own] * sound[:, None]
         # Slow errors: a line through zero in the middle of the series, uncertain at its ends.
         relative += np.linspace(-0.5, 0.5, len(use))[:, None, None] ** 2 * slow

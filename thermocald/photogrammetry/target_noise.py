@@ -150,12 +150,13 @@ def slow_errors(residuals: Array, used: Mask) -> Array:
     return slow
 
 
-def excess_scatter(values: Array, variances: Array) -> Array:
+def excess_scatter(values: Array, variances: Array, kinks: bool) -> Array:
     """Variance (k,) by which epochs scatter about a smooth course beyond their variances.
 
     values, variances (E, k) of consecutive epochs. The smooth course is a local cubic over 15
-    epochs, which leaves a drift with a time constant of 30 epochs its thousandth; 0 where the
-    excess is not significant (5 %).
+    epochs, which leaves a drift with a time constant of 30 epochs its thousandth; kinks: whether
+    single kinks of the course (a lamp switched) exceed the noise, so that a median must judge; 0
+    where the excess is not significant (5 %).
     """
     half = _SMOOTH // 2
     if len(values) < 2 * _SMOOTH:
@@ -168,8 +169,11 @@ def excess_scatter(values: Array, variances: Array) -> Array:
     left = 1.0 - smooth[half]
     normed = residual**2 / left / variances[inner]
     n = len(normed)
-    # Epochs in which a passer-by hides half of the targets scatter more than others, and count.
-    ratio = np.minimum(normed, _CLIP * np.median(normed, axis=0)).mean(axis=0)
-    significant = ratio > 1 + 1.65 * np.sqrt(2 / (left * n))
+    if kinks:
+        ratio, worth = np.median(normed, axis=0) / _MEDIAN_CHI2_1, 0.37 * left
+    else:
+        # Epochs in which a passer-by hides half of the targets scatter more than others, and count.
+        ratio, worth = np.minimum(normed, _CLIP * np.median(normed, axis=0)).mean(axis=0), left
+    significant = ratio > 1 + 1.65 * np.sqrt(2 / (worth * n))
     excess: Array = np.where(significant, (ratio - 1) * variances.mean(axis=0), 0.0)
     return excess

@@ -1,0 +1,158 @@
+"""`thermocald check`: is this recording, configuration or store sound?"""
+
+from __future__ import annotations
+
+from pathlib import Path  # noqa: TC003  typer reads the annotations
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import typer
+
+from thermocald.cli.common import say, write_json
+from thermocald.cli.options import JsonOption
+from thermocald.errors import DataError, DeviceError
+
+if TYPE_CHECKING:
+    from thermocald.config import DeviceConfig
+    from thermocald.hal import Kind
+
+__all__ = ["register"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("check")(check)
+
+
+def check(
+    source: Annotated[Path, typer.Argument(help="A recording, a config.yaml, or a store.")],
+    probe: Annotated[
+        bool,
+        typer.Option(
+            "--probe", help="Take one frame and one reading from every device of a config."
+        ),
+    ] = False,
+    json: JsonOption = None,
+) -> None:
+    """Read everything and say what it is; the first thing that is wrong ends it.
+
+    Example: thermocald check config.yaml
+    """
+    if not source.exists():
+        raise DataError(f"{source}: does not exist")
+    if source.is_dir():
+        document = _recording(source)
+    elif source.suffix in (".yaml", ".yml"):
+        document = _config(source, probe)
+    else:
+        document = _store(source)
+    if json is not None:
+        write_json(document, json)
+    if json != "-":
+        for line in document.pop("lines"):
+            typer.echo(line)
+
+
+def _recording(path: Path) -> dict[str, Any]:
+    from thermocald.store.recording import read_recording
+
+    recording = read_recording(path)
+    columns = recording.columns
+    seen = [len(o) for e in recording.epochs if (o := e.observations) is not None]
+    frames = sum(bool(f) for f in columns.frames)
+    missing = [e for e in recording.epochs if e.frame is not None and not e.frame.is_file()]
+    if missing:
+        raise DataError(
+            f"{path}: {len(missing)} of {frames} frames named in epochs.csv do not exist; the first "
+            f"is {missing[0].frame}"
+        )
+    readings = {
+        name: int(np.isfinite(values).sum()) for name, values in columns.temperatures.items()
+    }
+    lines = [
+        f"{path}: a sound recording of camera {recording.camera.name}, series {recording.series}",
+        f"  {len(columns)} epochs, {frames} frames, {len(recording.testfield)} targets",
+        *(f"  {name}: {n} of {len(columns)} readings" for name, n in readings.items()),
+    ]
+    if seen:
+        lines.append(f"  {np.median(seen):.0f} targets an epoch (median), {min(seen)} at least")
+    return {
+        "format": "thermocald-check/1",
+        "kind": "recording",
+        "path": path,
+        "camera": recording.camera.name,
+        "series": recording.series,
+        "epochs": len(columns),
+        "frames": frames,
+        "targets": len(recording.testfield),
+        "readings": readings,
+        "lines": lines,
+    }
+
+
+def _config(path: Path, probe: bool) -> dict[str, Any]:
+    from thermocald.config import load_config
+    from thermocald.hal import load_driver
+    from thermocald.store.recording import read_testfield
+
+    config = load_config(path)
+    lines = [f"{path}: a sound configuration"]
+    devices: list[dict[str, Any]] = []
+    groups: tuple[tuple[Kind, tuple[DeviceConfig, ...]], ...] = (
+        ("camera", config.cameras),
+        ("thermometer", config.thermometers),
+        ("output", config.outputs),
+    )
+    for kind, entries in groups:
+        for entry in entries:
+            load_driver(kind, entry.driver)
+            devices.append({"kind": kind, "name": entry.name, "driver": entry.driver})
+            lines.append(f"  {kind} {entry.name}: driver {entry.driver}")
+    for camera in config.cameras:
+        if camera.testfield is not None:
+            field = read_testfield(camera.testfield)
+            lines.append(f"  test field of {camera.name}: {len(field)} targets")
+    document = {
+        "format": "thermocald-check/1",
+        "kind": "configuration",
+        "path": path,
+        "devices": devices,
+        "lines": lines,
+    }
+    if probe:
+        from thermocald.cli.devices import probe as probe_devices
+        from thermocald.cli.devices import probe_document
+
+        answers = probe_devices(config)
+        document["probes"] = probe_document(answers)["devices"]
+        for answer in answers:
+            what = answer.error or ", ".join(f"{k} {v}" for k, v in answer.values.items())
+            lines.append(f"  {answer.kind} {answer.name}: {what} ({answer.took_s:.2f} s)")
+        failures = [a for a in answers if a.error]
+        if failures:
+            raise DeviceError(
+                f"{len(failures)} of {len(answers)} devices did not answer: {failures[0].name}: "
+                f"{failures[0].error}"
+            )
+    return document
+
+
+def _store(path: Path) -> dict[str, Any]:
+    from thermocald.store.database import Store
+
+    with Store.open(path) as store:
+        say(f"{path}: reading the whole file")
+        store.check()
+        series = [
+            {"camera": s.camera, "series": s.name, "last_epoch": store.last_epoch(s)}
+            for s in store.all_series()
+        ]
+    lines = [f"{path}: a sound store of {len(series)} series"]
+    lines += [f"  {s['camera']}/{s['series']}: up to epoch {s['last_epoch']}" for s in series]
+    return {
+        "format": "thermocald-check/1",
+        "kind": "store",
+        "path": path,
+        "series": series,
+        "lines": lines,
+    }

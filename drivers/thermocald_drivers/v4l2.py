@@ -36,6 +36,7 @@ from thermocald.errors import (
     DeviceGone,
     DeviceTimeout,
     DriverMissing,
+    TransientDeviceError,
     WrongDevice,
 )
 from thermocald.hal import Camera, Frame
@@ -152,8 +153,11 @@ class V4l2Camera(Camera):
             self._check_card(path)
             self._set_controls()
             self._stream.start()
-        except DeviceError:
+        except DeviceError as error:
             self.close()
+            if self._seen and isinstance(error, WrongDevice):
+                # it was the right one before: another may sit at its number until the next plug
+                raise TransientDeviceError(str(error)) from error
             raise
         except OSError as error:
             self.close()

@@ -7,6 +7,7 @@ linuxpy's own frame iterator waits for ever after an unplug, hence the poll here
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import select
 import threading
@@ -89,6 +90,7 @@ class LinuxpyStream:
     def __init__(self, path: str, fourcc: str, width: int, height: int) -> None:
         self._path, self._fourcc = path, fourcc
         self._video = support.library("linuxpy.video.device", "v4l2")
+        logging.getLogger("linuxpy").setLevel(logging.WARNING)  # it tells each open and close
         self._device = self._video.Device(path)
         self._capture: Any = None
         self._size, self._stride = (width, height), 0

@@ -235,6 +235,20 @@ def test_denied_after_a_plug_is_tried_again(kernel):
     device.close()
 
 
+def test_another_device_at_its_number_is_not_the_end(kernel):
+    """v4l2loopback without its feeder captures no more; /dev/video0 may be another camera."""
+    device = camera(kernel)
+    device.open()
+    device.close()
+    kernel.capture_device = False
+    with pytest.raises(TransientDeviceError, match="no capture device"):
+        device.open()
+    kernel.capture_device = True
+    device.open()
+    device.capture()
+    device.close()
+
+
 def test_a_single_broken_frame_is_skipped(kernel):
     with camera(kernel) as device:
         sequence = device.capture().sequence

@@ -149,9 +149,7 @@ def vivid():
     device.close()
     with asked:
         result["controls"] = outcome(lambda: dict(asked.capture().metadata["controls"]))
-    result["no_control"] = outcome(
-        camera(NODE, 640, 360, "GREY", controls={"zoomiest": 1}).open
-    )
+    result["no_control"] = outcome(camera(NODE, 640, 360, "GREY", controls={"zoomiest": 1}).open)
     result["no_size"] = outcome(camera(NODE, 641, 360, "GREY").open)
     result["output_node"] = outcome(camera(OUTPUT_NODE, 640, 360, "GREY").open)
     device.open()

@@ -1,14 +1,18 @@
 """Feeds rendered frames into a v4l2loopback device and their temperatures into an I2C register.
 
-feed.py DEVICE FRAMES.npy TEMPERATURES.npy LOG --fps F [--hold N] [--format GREY|YUYV|MJPG] [--bus B]
+feed.py DEVICE FRAMES.npy TEMPERATURES.npy LOG --fps F [--hold N] [--format GREY|YUYV|MJPG]
+        [--bus B] [--go FILE]
 
-Writes frame n at n/F s: its image and temperature are those of n // hold, the bars of its number in
-the top rows. Each line of LOG is: n, CLOCK_MONOTONIC before and after the write, temperature.
+Writes frame n at n/F s: its image and temperature are those of n // hold (counted from FILE's
+appearance), the bars of its number in the top rows. Each line of LOG is: n, CLOCK_MONOTONIC before
+and after the write, temperature.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
+import os
 import sys
 import time
 
@@ -41,7 +45,7 @@ def main():
     options.add_argument("--hold", type=int, default=1)
     options.add_argument("--format", default="GREY")
     options.add_argument("--bus", type=int)
-    options.add_argument("--count", type=int, default=1 << 30)
+    options.add_argument("--go", help="show the first frame until this file is there")
     given = options.parse_args()
     frames = np.load(given.frames, mmap_mode="r")
     temperatures = np.load(given.temperatures)
@@ -53,9 +57,11 @@ def main():
         bus = smbus2.SMBus(given.bus, force=True)
     with open(given.device, "r+b", buffering=0) as out, open(given.log, "w", buffering=1) as log:
         video.set_format(out, video.BufferType.VIDEO_OUTPUT, width, height, given.format)
-        begin, last = time.monotonic(), None
-        for n in range(given.count):
-            k = min(n // given.hold, len(frames) - 1)
+        begin, last, first = time.monotonic(), None, 0
+        for n in itertools.count():
+            if given.go and not os.path.exists(given.go):
+                first = n
+            k = min((n - first) // given.hold, len(frames) - 1)
             celsius = round(float(temperatures[k]) * 16) / 16
             if bus is not None and celsius != last:
                 raw = round(celsius * 16) << 4

@@ -53,9 +53,7 @@ def main():
                 }
                 for e in store.epochs(series)
             ]
-        found["events"] = [
-            {"utc": e.utc, "kind": e.kind, "text": e.text} for e in store.events()
-        ]
+        found["events"] = [{"utc": e.utc, "kind": e.kind, "text": e.text} for e in store.events()]
     print(json.dumps(found))
 
 

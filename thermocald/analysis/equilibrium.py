@@ -25,19 +25,20 @@ State = Literal["unknown", "drifting", "ready"]
 _FEWEST = 8
 _TAUS = 60
 _SETTLED_SD = 2.0
+_WORST_MISFIT = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class Approach:
-    """An exponential approach: tau s, and s from the last instant until it is steady, with sds.
-
-    The time is NaN where the data do not bound it (a straight line approaches nothing).
+    """An exponential approach: tau s, and s from the last instant until it is steady, with sds;
+    misfit: reduced chi-square.
     """
 
     tau: float
     sd_tau: float
     ready_in: float
     sd_ready_in: float
+    misfit: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +116,7 @@ def fit_approach(times: Array, values: Array, sds: Array, bound: float) -> Appro
         float(np.sqrt(weight @ (taus - tau) ** 2)),
         ready_in,
         float(np.sqrt(weight @ ((ready - ready_in) ** 2 + factor * variance))),
+        factor,
     )
 
 
@@ -164,7 +166,18 @@ class EquilibriumWatch:
             return Equilibrium("unknown", speed, sd_speed)
         along = values @ direction
         sd_along = np.sqrt((sds**2) @ direction**2)
-        approach = fit_approach(times, along, sd_along, self.bound / 60.0)
+        approach = self._approach(times, along, sd_along)
         if approach is None:
             return Equilibrium("drifting", speed, sd_speed)
         return Equilibrium("drifting", speed, sd_speed, approach.ready_in, approach.sd_ready_in)
+
+    def _approach(self, times: Array, values: Array, sds: Array) -> Approach | None:
+        """From the longest past that one exponential describes: heating may just have begun."""
+        for share in (1.0, 0.5, 0.25):
+            recent = times >= times[-1] - 4.0 * share * self.window_s
+            if recent.sum() < _FEWEST:
+                return None
+            found = fit_approach(times[recent], values[recent], sds[recent], self.bound / 60.0)
+            if found is None or found.misfit < _WORST_MISFIT:
+                return found
+        return None

@@ -1,0 +1,258 @@
+"""The real daemon as a process, small recordings to feed it, small disks to trouble it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from thermocald.epoch import Epoch
+from thermocald.photogrammetry.camera_model import Sensor, project
+from thermocald.photogrammetry.testfield import Observations
+from thermocald.simulation.demonstration import demonstration_field, demonstration_model
+from thermocald.simulation.model_file import write_model
+from thermocald.simulation.testfields import corner_field
+from thermocald.store.database import Store
+from thermocald.store.recording import CameraSpec, Channel, write_recording
+
+ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+
+
+class Daemon:
+    """One `thermocald run` in a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.store = folder / "thermocald.db"
+        self.config = folder / "config.yaml"
+        self.process: subprocess.Popen[bytes] | None = None
+        self._environment = dict(ENVIRONMENT)
+
+    def configure(self, **sections) -> None:
+        document = {"store": {"path": str(self.store)}, "frames": {"keep": "none"}, **sections}
+        self.config.write_text(yaml.safe_dump(document))
+
+    def start(self, *options: str, config: bool = True, **environment: str) -> None:
+        arguments = ["--config", str(self.config)] if config else []
+        log = (self.folder / "log.txt").open("ab")
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "thermocald", "run", *arguments, *options],
+            cwd=self.folder,
+            env={**self._environment, **environment},
+            stdout=log,
+            stderr=log,
+        )
+        log.close()
+
+    def signal(self, number: int) -> None:
+        self.process.send_signal(number)
+
+    def stop(self, timeout_s: float = 60.0) -> int:
+        self.signal(signal.SIGTERM)
+        return self.wait(timeout_s)
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+    def wait(self, timeout_s: float = 120.0) -> int:
+        return self.process.wait(timeout_s)
+
+    def log(self) -> str:
+        return (self.folder / "log.txt").read_text()
+
+    def results(self, name: str = "results.jsonl") -> list[dict]:
+        path = self.folder / name
+        if not path.exists():
+            return []
+        lines = path.read_text().split("\n")[:-1]  # what follows the last line end is half a line
+        return [json.loads(line) for line in lines]
+
+    def until(self, condition, timeout_s: float = 60.0) -> None:
+        deadline = time.monotonic() + timeout_s
+        while not condition():
+            assert time.monotonic() < deadline, f"timed out; log:\n{self.log()}"
+            assert self.process.poll() is None, f"the daemon ended; log:\n{self.log()}"
+            time.sleep(0.05)
+
+    def stored(self) -> tuple[list[int], list[str]]:
+        """(numbers, statuses) of the one series; the store must be sound."""
+        with Store.open(self.store) as store:
+            store.check()
+            columns = store.series_columns(store.find_series(), ["epoch", "status"])
+            return columns["epoch"].astype(int).tolist(), columns["status"].tolist()
+
+    def events(self) -> list[str]:
+        with Store.open(self.store) as store:
+            return [event.kind for event in store.events()]
+
+    def close(self) -> None:
+        if self.process is not None and self.process.poll() is None:
+            self.kill()
+
+
+@pytest.fixture
+def daemon(tmp_path: Path):
+    daemon = Daemon(tmp_path)
+    yield daemon
+    daemon.close()
+
+
+@pytest.fixture(scope="session")
+def small_camera(tmp_path_factory) -> Path:
+    """The demonstration's camera with a sixteenth of its pixels: quick to render and measure."""
+    model = demonstration_model(demonstration_field("markers"))
+    path = tmp_path_factory.mktemp("model") / "small.thermal.yaml"
+    write_model(path, replace(model, sensor=Sensor(820, 616, 0.00448)))
+    return path
+
+
+@pytest.fixture
+def devices(small_camera):
+    """A rendered camera and a thermometer, fast, with faults."""
+
+    def make(period_s: float = 0.2, name: str = "one", camera=(), thermometer=(), **options):
+        cameras = {
+            "name": name, "driver": "mock", "period_s": period_s, "thermometers": ["housing"],
+            "latency_s": 0.02, "faults": list(camera), **options,
+            "options": {"testfield": "markers", "model": str(small_camera), "seed": 1},
+            "principal_distance_mm": 3.04,
+        }  # fmt: skip
+        housing = {"name": "housing", "driver": "mock", "period_s": period_s,
+                   "conversion_s": 0.01, "faults": list(thermometer)}  # fmt: skip
+        return {
+            "cameras": [cameras],
+            "thermometers": [housing],
+            "outputs": [{"name": "log", "driver": "jsonl", "path": "./results.jsonl"}],
+        }
+
+    return make
+
+
+def make_recording(path: Path, epochs: int, per_side: int = 3, interval: float = 0.05) -> Path:
+    """Measurements of a camera that warms up, `per_side`² targets on each of three planes."""
+    field = corner_field("plain", per_side=per_side, pitch_mm=660.0 / (per_side + 0.3))
+    model = demonstration_model(field)
+    iop, eop = model.interior.as_array(), model.exterior.as_array()
+    rng = np.random.default_rng(3)
+
+    def generate():
+        for k in range(epochs):
+            temperature = 25.0 + 10.0 * (1 - np.exp(-k / 60.0))
+            now = iop.copy()
+            now[:3] += np.array([2.0e-4, -4.5e-4, -3.0e-4]) * (temperature - 25.0)
+            points = project(model.sensor, now, eop, field.points)
+            points = points + rng.normal(0, 0.04, points.shape)
+            rows = np.arange(len(field))
+            seen = Observations(rows, points, np.full(points.shape, 0.04))
+            time_s = 1.7e9 + interval * k
+            reading = {"temperature": round(temperature * 16) / 16}
+            yield Epoch(k + 1, time_s, time_s + 0.001, reading, observations=seen)
+
+    write_recording(
+        path, name="small", series="M1", interval=interval,
+        camera=CameraSpec("rpi", model.sensor, 3.04),
+        channels={"temperature": Channel("degC", 0.0625)},
+        testfield=field, epochs=generate(),
+    )  # fmt: skip
+    return path
+
+
+@pytest.fixture(scope="session")
+def recording(tmp_path_factory) -> Path:
+    """200 epochs of 27 targets at 50 ms."""
+    return make_recording(tmp_path_factory.mktemp("recording") / "small", 200)
+
+
+@pytest.fixture
+def replayed():
+    """A recording as devices of a configuration."""
+
+    def make(path: Path, period_s: float = 0.05, loop: bool = True):
+        from thermocald.store.head import read_head
+
+        sensor = read_head(path).camera.sensor
+        replay = {"driver": "replay", "recording": str(path), "loop": loop, "period_s": period_s}
+        return {
+            "cameras": [
+                {
+                    "name": "rpi", "thermometers": ["recorded"], "principal_distance_mm": 3.04,
+                    "testfield": str(path / "testfield.csv"), **replay,
+                    "sensor": {"width_px": sensor.width, "height_px": sensor.height,
+                               "pixel_pitch_mm": sensor.pixel_pitch},
+                }
+            ],
+            "thermometers": [{"name": "recorded", **replay}],
+            "outputs": [{"name": "log", "driver": "jsonl", "path": "./results.jsonl"}],
+        }  # fmt: skip
+
+    return make
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path):
+    """MB → the folder of a disk of that size; skips where nothing can be mounted."""
+    mounted = []
+
+    def mount(size_mb: int) -> Path:
+        folder = tmp_path / f"disk{len(mounted)}"
+        folder.mkdir()
+        tool = shutil.which("mount")
+        options = ["-t", "tmpfs", "-o", f"size={size_mb}m", "tmpfs", str(folder)]
+        done = tool and subprocess.run([tool, *options], capture_output=True, check=False)
+        if not done or done.returncode:
+            pytest.skip("a small disk cannot be mounted here: needs root and tmpfs")
+        mounted.append(folder)
+        return folder
+
+    yield mount
+    for folder in mounted:
+        subprocess.run(["umount", "-l", str(folder)], check=False)
+
+
+class Supervisor:
+    """The socket that systemd would listen on."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(str(path))
+        self._socket.settimeout(0.1)
+        self.heard: list[str] = []
+
+    def listen(self, seconds: float) -> list[str]:
+        """What is said from now on, for so long."""
+        end, begin = time.monotonic() + seconds, len(self.heard)
+        while time.monotonic() < end:
+            try:
+                self.heard += self._socket.recv(4096).decode().split("\n")
+            except TimeoutError:
+                continue
+        return self.heard[begin:]
+
+    def until(self, word: str, timeout_s: float = 60.0) -> None:
+        deadline = time.monotonic() + timeout_s
+        while not any(line.startswith(word) for line in self.heard):
+            assert time.monotonic() < deadline, f"{word} was not said: {self.heard}"
+            self.listen(0.1)
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+@pytest.fixture
+def supervisor(tmp_path: Path):
+    supervisor = Supervisor(tmp_path / "notify.sock")
+    yield supervisor
+    supervisor.close()

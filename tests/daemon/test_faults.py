@@ -1,0 +1,199 @@
+"""Faults that the real daemon, as a process, must come through."""
+
+from __future__ import annotations
+
+import resource
+import shutil
+import signal
+import subprocess
+import time
+
+import numpy as np
+import pytest
+
+from thermocald.store.database import Store
+
+
+def test_killed_and_restarted_nothing_committed_is_lost(daemon, recording, replayed):
+    daemon.configure(**replayed(recording))
+    rng = np.random.default_rng(5)
+    for _ in range(4):
+        before = len(daemon.results())
+        daemon.start()
+        daemon.until(lambda n=before: len(daemon.results()) > n + 3)
+        time.sleep(rng.uniform(0.0, 0.4))
+        daemon.kill()
+        told = [result["epoch"] for result in daemon.results()]
+        numbers, _ = daemon.stored()
+        assert set(told) <= set(numbers)
+        assert numbers == list(range(1, len(numbers) + 1))
+    assert len(numbers) > 12
+
+
+def test_unplugged_and_back_told_once_each_and_no_other_device_waits(daemon, devices):
+    gone = [{"kind": "unplugged", "at_s": 1.5, "for_s": 2.0}]
+    sections = devices(camera=gone)
+    second = {**sections["cameras"][0], "name": "two", "faults": []}
+    sections["cameras"].append(second)
+    daemon.configure(**sections)
+    daemon.start()
+    daemon.until(lambda: "camera one is back" in daemon.log())
+    daemon.until(lambda: sum(r["device"] == "two" for r in daemon.results()) > 20)
+    assert daemon.stop() == 0
+    assert daemon.log().count("camera one is out") == 1
+    assert daemon.log().count("camera one is back") == 1
+    assert [e for e in daemon.events() if e.startswith("device")] == ["device_out", "device_back"]
+    times = {name: [r["frame_time"] for r in daemon.results() if r["device"] == name]
+             for name in ("one", "two")}  # fmt: skip
+    away = np.diff(times["one"])
+    assert 1.5 < away.max() < 4.5  # 2 s away, and the next tick but a few
+    assert np.sort(away)[-2] < 1.5
+    # the other camera went on all the while
+    begin = times["one"][int(away.argmax())]
+    assert sum(begin < t < begin + 2.0 for t in times["two"]) >= 5
+
+
+def test_a_hung_capture_trips_the_watchdog_and_holds_nothing_else_up(daemon, devices, supervisor):
+    hangs = [{"kind": "timeout", "at": 8}]
+    sections = devices(camera=hangs, timeout_s=3600.0)
+    sections["cameras"].append({**sections["cameras"][0], "name": "two", "faults": []})
+    daemon.configure(**sections)
+    daemon.start("--hang-after", "1.5", NOTIFY_SOCKET=str(supervisor.path), WATCHDOG_USEC="2000000")
+    supervisor.until("READY=1")
+    assert "WATCHDOG=1" in supervisor.listen(1.2)
+    daemon.until(lambda: "camera one hangs" in daemon.log())
+    supervisor.listen(0.5)
+    assert "WATCHDOG=1" not in supervisor.listen(2.5)
+    count = len([r for r in daemon.results() if r["device"] == "two"])
+    daemon.until(lambda: len([r for r in daemon.results() if r["device"] == "two"]) > count + 5)
+    assert len([r for r in daemon.results() if r["device"] == "one"]) == 7
+    assert daemon.stop() == 0  # the hung thread does not keep it from ending
+    assert "hung" in daemon.events()
+
+
+def test_a_store_that_cannot_be_written_waits_in_memory(daemon, devices):
+    """What a card that fails does to a running daemon: no write beyond a file size gets through."""
+    daemon.configure(**devices())
+    daemon.start()
+    daemon.until(lambda: len(daemon.results()) > 3)
+    before = resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, (8192, before[1]))
+    daemon.until(lambda: "results wait in memory" in daemon.log())
+    time.sleep(2.0)
+    resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, before)
+    daemon.until(lambda: "can be written again" in daemon.log())
+    daemon.until(lambda: daemon.results()[-1]["stored"])
+    assert daemon.stop() == 0
+    results = daemon.results()
+    assert sum(not r["stored"] for r in results) >= 5
+    numbers, _ = daemon.stored()
+    assert numbers == [r["epoch"] for r in results] == list(range(1, len(numbers) + 1))
+    assert daemon.log().count("results wait in memory") == 1
+    assert daemon.log().count("can be written again") == 1
+
+
+def test_on_a_read_only_file_system_it_says_so_and_leaves_the_rest_to_the_restart(
+    daemon, devices, small_disk
+):
+    disk = small_disk(8)
+    subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
+    daemon.store = disk / "thermocald.db"
+    daemon.configure(**devices())
+    daemon.start()
+    assert daemon.wait() == 1
+    assert "error:" in daemon.log()
+    assert "Traceback" not in daemon.log()
+    subprocess.run(["mount", "-o", "remount,rw", str(disk)], check=True)
+    daemon.start()
+    daemon.until(lambda: len(daemon.results()) > 2)
+    assert daemon.stop() == 0
+
+
+def test_a_full_disk_loses_frames_then_observations_but_no_result(daemon, devices, small_disk):
+    disk = small_disk(60)
+    daemon.store = disk / "thermocald.db"
+    frames = {"keep": "all", "folder": str(disk / "frames"), "min_free_gb": 0.04}
+    daemon.configure(**devices(), frames=frames)
+    daemon.start()
+    daemon.until(lambda: list(disk.rglob("*.png")))
+    (disk / "filler").write_bytes(b"\0" * 25_000_000)
+    daemon.until(lambda: "no frames are kept" in daemon.log())
+    free = shutil.disk_usage(disk).free
+    (disk / "more").write_bytes(b"\0" * (free - 14_000_000))  # 16 MB are kept for results
+    daemon.until(lambda: "observations no more" in daemon.log())
+    free = shutil.disk_usage(disk).free
+    (disk / "rest").write_bytes(b"\0" * (free - 200_000))
+    count = len(daemon.results())
+    daemon.until(lambda: len(daemon.results()) > count + 15)
+    for name in ("rest", "more", "filler"):
+        (disk / name).unlink()
+    daemon.until(lambda: "observations are kept again" in daemon.log())
+    daemon.until(lambda: daemon.results()[-1]["stored"])
+    assert daemon.stop() == 0
+    numbers, statuses = daemon.stored()
+    assert numbers == [r["epoch"] for r in daemon.results()]
+    assert set(statuses) == {"ok"}
+    with Store.open(daemon.store) as store:
+        kept = [e.epoch.observations is not None for e in store.epochs(store.find_series())]
+    assert kept[0]
+    assert kept[-1]
+    assert not all(kept)
+
+
+def test_a_broken_configuration_at_reload_changes_nothing_a_good_one_does(daemon, devices):
+    daemon.configure(**devices())
+    good = daemon.config.read_text()
+    daemon.start()
+    daemon.until(lambda: len(daemon.results()) > 3)
+    daemon.config.write_text(good.replace("period_s", "perriod_s"))
+    daemon.signal(signal.SIGHUP)
+    daemon.until(lambda: "was not read anew" in daemon.log())
+    assert "is 'period_s' meant?" in daemon.log()
+    count = len(daemon.results())
+    daemon.until(lambda: len(daemon.results()) > count + 3)
+    daemon.config.write_text(good.replace("name: one", "name: other"))
+    daemon.signal(signal.SIGHUP)
+    daemon.until(lambda: daemon.results()[-1]["device"] == "other")
+    daemon.config.write_text(good)
+    daemon.signal(signal.SIGHUP)
+    daemon.until(lambda: daemon.results()[-1]["device"] == "one")
+    assert daemon.stop() == 0
+    with Store.open(daemon.store) as store:
+        store.check()
+        for series in store.all_series():
+            numbers = store.series_columns(series, ["epoch"])["epoch"].tolist()
+            assert numbers == list(range(1, len(numbers) + 1))
+    assert daemon.events().count("reload_failed") == 1
+
+
+def test_sigterm_finishes_the_epoch_in_hand(daemon, devices):
+    daemon.configure(**devices())
+    daemon.start()
+    daemon.until(lambda: len(daemon.results()) > 3)
+    assert daemon.stop() == 0
+    numbers, _ = daemon.stored()
+    assert numbers == [r["epoch"] for r in daemon.results()]
+    assert "started" in daemon.events()
+    assert daemon.events()[-1] == "stopped"
+
+
+@pytest.mark.parametrize("count", [40, pytest.param(1000, marks=pytest.mark.slow)])
+def test_garbage_frames_are_epochs_with_a_reason(daemon, recording, tmp_path, count):
+    garbage = tmp_path / "garbage"
+    (garbage / "frames").mkdir(parents=True)
+    for name in ("recording.yaml", "testfield.csv"):
+        shutil.copy(recording / name, garbage / name)
+    rng = np.random.default_rng(1)
+    heads = [b"\xff\xd8\xff\xe0", b"\xff\xd8" + b"\xff\xd9", b"\xff\xd8\xff\xdb\x00\x43\xff\xd9"]
+    rows = ["epoch,frame_time,temperature_time,temperature,frame"]
+    for k in range(1, count + 1):
+        data = heads[k % 3] + rng.bytes(int(rng.integers(0, 3000))) + b"\xff\xd9" * (k % 2)
+        (garbage / "frames" / f"{k:04d}.jpg").write_bytes(data)
+        rows.append(f"{k},{1.7e9 + 10 * k},{1.7e9 + 10 * k},25.0,frames/{k:04d}.jpg")
+    (garbage / "epochs.csv").write_text("\n".join(rows) + "\n")
+    daemon.start("--recording", str(garbage), "--fast", "--store", str(daemon.store), config=False)
+    assert daemon.wait(300) == 0
+    numbers, statuses = daemon.stored()
+    assert numbers == list(range(1, count + 1))
+    assert "ok" not in statuses
+    assert "Traceback" not in daemon.log()

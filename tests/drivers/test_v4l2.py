@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import errno
 import sys
+import threading
 import time
 from types import SimpleNamespace
 
+import cv2
 import linuxpy.ioctl
 import numpy as np
 import pytest
@@ -309,3 +311,85 @@ def test_without_linuxpy(kernel, monkeypatch):
 def test_a_wrong_configuration(kernel, options):
     with pytest.raises(ConfigurationError):
         camera(kernel, **options)
+
+
+class FakeCapture:
+    """cv2.VideoCapture of a good camera; `stall` holds a read as a dead one does."""
+
+    stall: threading.Event | None = None
+    good = True
+    size = (64, 48)
+
+    def __init__(self, _path, _backend):
+        self.properties = {cv2.CAP_PROP_FRAME_WIDTH: 0, cv2.CAP_PROP_FRAME_HEIGHT: 0}
+        self.released = False
+        FakeCapture.last = self
+
+    def isOpened(self):
+        return True
+
+    def set(self, name, value):
+        self.properties[name] = value
+
+    def get(self, name):
+        if name == cv2.CAP_PROP_POS_MSEC:
+            return time.monotonic() * 1e3
+        if name in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT):
+            return self.size[name == cv2.CAP_PROP_FRAME_HEIGHT]
+        return self.properties.get(name, -1)
+
+    def read(self):
+        if self.stall is not None:
+            self.stall.wait()
+        return self.good, np.full((1, 48 * 64), 77, np.uint8)
+
+    def release(self):
+        self.released = True
+
+
+@pytest.fixture
+def opencv(kernel, monkeypatch):
+    capture = type("Capture", (FakeCapture,), {})
+    monkeypatch.setattr(cv2, "VideoCapture", capture)
+    return capture
+
+
+def test_opencv_where_linuxpy_is_missing(opencv, kernel, monkeypatch):
+    monkeypatch.setitem(sys.modules, "linuxpy.video.device", None)
+    with camera(kernel) as device:
+        called = time.monotonic()
+        frame = device.capture()
+    assert np.all(frame.image == 77)
+    assert frame.monotonic >= called
+    assert FakeCapture.last.released
+
+
+def test_opencv_that_stalls_is_left_behind(opencv, kernel):
+    """OpenCV waits 10 s for a dead camera; the driver does not, and gives it back afterwards."""
+    opencv.stall = threading.Event()
+    device = camera(kernel, backend="opencv")
+    device.open()
+    begin = time.monotonic()
+    with pytest.raises(DeviceTimeout, match=r"no new frame in 0\.3 s"):
+        device.capture()
+    device.close()
+    assert time.monotonic() - begin < 1.0
+    assert not FakeCapture.last.released
+    opencv.stall.set()
+    deadline = time.monotonic() + 2.0
+    while not FakeCapture.last.released and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert FakeCapture.last.released
+
+
+def test_opencv_that_gets_nothing_more(opencv, kernel):
+    with camera(kernel, backend="opencv") as device:
+        opencv.good = False
+        with pytest.raises(DeviceGone, match="no frame"):
+            device.capture()
+
+
+def test_opencv_of_another_size(opencv, kernel):
+    opencv.size = (32, 24)
+    with pytest.raises(WrongDevice, match="gives 32×24"):
+        camera(kernel, backend="opencv").open()

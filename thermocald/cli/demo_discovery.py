@@ -1,0 +1,65 @@
+"""The demo's last act: a camera follows its thermometer late, its model does not know it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from thermocald.cli.common import say
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+__all__ = ["discover_hidden_effect"]
+
+_TAU_S = 75.0
+
+
+def discover_hidden_effect(out: Path, seed: int, quiet: bool) -> dict[str, Any]:
+    """Simulate M1 and M2 with a hidden lag, discover it on M1, prove it on M2; the document."""
+    from thermocald.discovery.new_model import model_of
+    from thermocald.discovery.result import discover_series
+    from thermocald.discovery.source import gather_pair, load_pair
+    from thermocald.simulation.model import ModelEffect
+    from thermocald.simulation.model_file import write_model
+    from thermocald.simulation.presets import preset_simulation
+
+    say(f"hiding an effect: the camera follows the thermometer with a lag of {_TAU_S:.0f} s")
+    folder = out / "discovery"
+    folder.mkdir(parents=True)
+    for number, name in enumerate(("M1", "M2")):
+        simulation = preset_simulation("rpi-v2.1-heating", seed + number, name, None)
+        hidden = (ModelEffect("thermal_lag", {"tau": _TAU_S}),)
+        model = replace(simulation.model, effects=hidden)
+        replace(simulation, model=model).write(folder / name)
+    say("discovering: where do model and measurement disagree, and why?")
+    inputs = load_pair(folder / "M1", folder / "M2", say)
+    found = discover_series(gather_pair(inputs, None), say, ())
+    path = folder / "camera.thermal.yaml"
+    write_model(path, model_of(found, None))
+    document: dict[str, Any] = dict(found.as_json(str(path)))
+    document["hidden"] = {"effect": "thermal_lag", "tau_s": _TAU_S}
+    if not quiet:
+        _tell(document)
+    return document
+
+
+def _tell(document: dict[str, Any]) -> None:
+    from rich.console import Console
+
+    console = Console()
+    console.print(
+        f"\nhidden:    thermal_lag, tau {document['hidden']['tau_s']:.0f} s", highlight=False
+    )
+    for effect in document["effects"]:
+        console.print(f"found:     {effect['effect']}: {effect['statement']}", highlight=False)
+    for label, key in (("on M1", "fit"), ("on M2", "verify")):
+        gap = document["gap"][key]
+        if gap is not None:
+            console.print(
+                f"gap {label}: {gap['before']['rms_px']:.3f} → {gap['after']['rms_px']:.3f} px, "
+                f"reduced χ² {gap['before']['chi2_reduced']:.2f} → "
+                f"{gap['after']['chi2_reduced']:.2f}",
+                highlight=False,
+            )
+    console.print(f"model:     {document['model']}", highlight=False)

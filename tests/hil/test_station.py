@@ -39,14 +39,10 @@ class Station:
         prepare(folder, self.instrument.port, EPOCHS)
         self.i2c_bus = i2c_bus
         run(
-            "mkdir -p /etc/thermocald && cp /mnt/host/station/*.csv /mnt/host/station/config.yaml "
-            "/etc/thermocald/ && printf '#!/bin/sh\\nexec python3 -m thermocald \"$@\"\\n' "
-            "> /usr/local/bin/thermocald && chmod 755 /usr/local/bin/thermocald"
+            "mkdir -p /etc/thermocald && "
+            "cp /mnt/host/station/*.csv /mnt/host/station/config.yaml /etc/thermocald/"
         )
-        unit = "/mnt/host/systemd/thermocald.service"
-        if run(f"test -e {unit}", check=False).returncode:
-            unit = "/mnt/host/guest/thermocald.service"
-        run(f"sh /mnt/host/guest/install_unit.sh {unit}")
+        run("sh /mnt/host/guest/install_unit.sh /mnt/host/systemd")
         run(
             f"test -e /sys/bus/i2c/devices/{i2c_bus}-0048 || "
             f"echo tmp75 0x48 > /sys/bus/i2c/devices/i2c-{i2c_bus}/new_device"

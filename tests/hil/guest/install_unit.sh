@@ -1,26 +1,30 @@
 #!/bin/sh
-# Install the shipped unit, or the laboratory's, for /usr/local/bin/thermocald and this configuration
+# Install the unit that thermocald ships: install_unit.sh FOLDER. Its users and rules come with it.
 set -eu
-unit=$1
-folder=$(dirname "$unit")
-for group in video i2c dialout gpio; do getent group $group >/dev/null || groupadd -r $group; done
-for file in "$folder"/*.sysusers "$folder"/*sysusers*.conf; do
+folder=$1
+for group in video dialout plugdev i2c gpio; do
+    getent group $group >/dev/null || groupadd -r $group
+done
+for file in "$folder"/*sysusers*; do
     [ -e "$file" ] && cp "$file" /usr/lib/sysusers.d/thermocald.conf && systemd-sysusers
 done
-for file in "$folder"/*.tmpfiles "$folder"/*tmpfiles*.conf; do
+getent passwd thermocald >/dev/null || useradd -r -d /var/lib/thermocald -s /usr/sbin/nologin thermocald
+for file in "$folder"/*tmpfiles*; do
     [ -e "$file" ] && cp "$file" /usr/lib/tmpfiles.d/thermocald.conf && systemd-tmpfiles --create
 done
-for file in "$folder"/*.rules; do [ -e "$file" ] && cp "$file" /etc/udev/rules.d/; done
+for file in "$folder"/*.rules "$folder"/udev/*.rules; do
+    [ -e "$file" ] && cp "$file" /etc/udev/rules.d/
+done
 udevadm control --reload
 udevadm trigger
 udevadm settle
-cp "$unit" /etc/systemd/system/thermocald.service
+mkdir -p /opt/thermocald/bin
+printf '#!/bin/sh\nexec /usr/bin/python3 -m thermocald "$@"\n' >/opt/thermocald/bin/thermocald
+chmod 755 /opt/thermocald/bin/thermocald
+chmod -R a+rX /opt/thermocald /etc/thermocald
+cp "$folder"/thermocald.service /etc/systemd/system/
+# an emulated machine is slow, a test impatient: only the times are the laboratory's
 mkdir -p /etc/systemd/system/thermocald.service.d
-# an emulated machine is slow: only the times are the laboratory's
-printf '[Service]\nTimeoutStartSec=240\n' >/etc/systemd/system/thermocald.service.d/slow.conf
-if ! grep -q /usr/local/bin/thermocald "$unit"; then
-    command=$(sed -n 's/^ExecStart=\S* \(.*\)/\1/p' "$unit" | head -n 1)
-    printf 'ExecStart=\nExecStart=/usr/local/bin/thermocald %s\n' "$command" \
-        >>/etc/systemd/system/thermocald.service.d/slow.conf
-fi
+printf '[Service]\nTimeoutStartSec=240\nWatchdogSec=20\nRestartSec=1\n' \
+    >/etc/systemd/system/thermocald.service.d/times.conf
 systemctl daemon-reload

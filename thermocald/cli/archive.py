@@ -38,6 +38,9 @@ def archive(
     skip_existing: Annotated[
         bool, typer.Option("--skip-existing", help="Pass over recordings that are there already.")
     ] = False,
+    finished: Annotated[
+        bool, typer.Option("--finished", help="Only series after which the camera began another.")
+    ] = False,
     json: JsonOption = None,
 ) -> None:
     """Write every series as a recording `<camera>-<series>`, a folder that replays anywhere.
@@ -61,6 +64,9 @@ def archive(
             if series is None
             else [opened.find_series(camera or None, name or None)]
         )
+        if finished:
+            newest = {one.camera: one.id for one in opened.all_series()}
+            chosen = [one for one in chosen if newest[one.camera] != one.id]
         folder.mkdir(parents=True, exist_ok=True)
         for one in chosen:
             path = folder / f"{one.camera}-{one.name}"

@@ -1,0 +1,82 @@
+"""The units: hardened, sound, and the template the same as the plain one."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+UNITS = Path(__file__).resolve().parents[2] / "systemd"
+
+
+@pytest.fixture
+def analyze():
+    tool = shutil.which("systemd-analyze")
+    if tool is None:
+        pytest.skip("systemd-analyze is not installed")
+
+    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run([tool, *arguments], capture_output=True, text=True, check=False)
+
+    return run
+
+
+@pytest.mark.parametrize(
+    "unit", ["thermocald.service", "thermocald@.service", "thermocald-archive.service"]
+)
+def test_the_exposure_is_at_most_two_and_a_half(analyze, unit):
+    done = analyze("security", "--offline=true", "--no-pager", str(UNITS / unit))
+    found = re.search(r"Overall exposure level for \S+: ([0-9.]+)", done.stdout)
+    assert found, done.stdout + done.stderr
+    assert float(found[1]) <= 2.5
+
+
+def test_systemd_understands_every_line(analyze, tmp_path):
+    """Verified where the program is a file that exists; what is newer than this systemd is named."""
+    for unit in UNITS.glob("thermocald*.service"):
+        text = unit.read_text().replace("/opt/thermocald/bin/thermocald", "/bin/true")
+        (tmp_path / unit.name.replace("@", "@one")).write_text(text)
+    for unit in UNITS.glob("*.timer"):
+        shutil.copy(unit, tmp_path)
+    done = analyze("verify", "--man=no", *map(str, sorted(tmp_path.iterdir())))
+    told = [line for line in done.stderr.splitlines() if str(tmp_path) in line]
+    newer = ("RestartSteps", "RestartMaxDelaySec")  # systemd 254; older ones pass over them
+    assert [line for line in told if not any(name in line for name in newer)] == []
+
+
+def test_the_template_is_the_plain_unit_with_a_name():
+    plain = (UNITS / "thermocald.service").read_text().splitlines()[1:]
+    template = (UNITS / "thermocald@.service").read_text().splitlines()[1:]
+    for a, b in zip(plain, template, strict=True):
+        assert b.replace("/%i.yaml", "/config.yaml").replace(" (%i)", "").replace("/%i", "") == a
+
+
+def test_the_unit_waits_for_ready_feeds_a_watchdog_and_starts_without_the_network():
+    text = (UNITS / "thermocald.service").read_text()
+    for line in ("Type=notify", "WatchdogSec=60", "Restart=on-failure", "User=thermocald"):
+        assert f"\n{line}\n" in text
+    assert "network" not in re.sub(r"#.*", "", text).lower().replace("networkless", "")
+
+
+def test_everything_is_installed_where_it_belongs(tmp_path):
+    environment = {**os.environ, "DESTDIR": str(tmp_path)}
+    script = ["sh", str(UNITS / "install.sh")]
+    subprocess.run(script, env=environment, check=True, capture_output=True)
+    files = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()}
+    assert files == {
+        "etc/systemd/system/thermocald.service",
+        "etc/systemd/system/thermocald@.service",
+        "etc/systemd/system/thermocald-archive.service",
+        "etc/systemd/system/thermocald-archive.timer",
+        "etc/thermocald/config.yaml",
+        "etc/udev/rules.d/60-thermocald.rules",
+        "usr/lib/sysusers.d/thermocald.conf",
+        "usr/lib/tmpfiles.d/thermocald.conf",
+    }
+    subprocess.run([*script, "--uninstall"], env=environment, check=True, capture_output=True)
+    left = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()}
+    assert left == {"etc/thermocald/config.yaml"}

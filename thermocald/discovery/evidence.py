@@ -84,12 +84,11 @@ class Blocks:
     """Neighbouring epochs of a long series as one row.
 
     average (B, E): weights of the epochs in each block; pool (K, S): knots to states, the readings
-    of a block being one; within: χ² of the epochs about their blocks, and its degrees of freedom.
+    of a block being one; within_free: degrees of freedom of the epochs about their blocks.
     """
 
     average: csr_array
     pool: csr_array
-    within: float
     within_free: float
 
     def pooled_mean(self, values: Array) -> Array:
@@ -502,7 +501,6 @@ def condensed(evidence: Evidence, rows: int = 720) -> Evidence:
         blocks=Blocks(
             average,
             pool,
-            max(float(evidence.yy.sum() - yy.sum()), 0.0),
             rank * float((evidence.n > 0).sum() - (total > 0).sum()),
         ),
     )

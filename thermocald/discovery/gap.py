@@ -122,9 +122,9 @@ def gap_of(
     within = float(np.sum(e.weights[..., :2] * residuals**2))
     coordinates = 2.0 * float(e.n.sum())
     targets = float((e.n.sum() > 0) * np.sum(e.weights[..., 0].any(axis=0)))
-    if e.blocks is not None:
-        within += e.blocks.within
-    free = max(coordinates - 2.0 * targets - _rank(e), 1.0)
+    # what a camera does within one block of a long series is no part of the comparison
+    unused = e.blocks.within_free if e.blocks is not None else 0.0
+    free = max(coordinates - 2.0 * targets - _rank(e) - unused, 1.0)
     total = within + max(fit.chi2_of(series) - explained, 0.0)
     image = within + max(image_chi2(e, fit, series) - explained, 0.0)
     weights = e.weights[..., :2]

@@ -1,0 +1,121 @@
+"""The command: document, model, report, refusals."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from tests.blind.generator import Case, generate, write
+from thermocald.cli import application
+from thermocald.errors import DataError, UsageError
+
+run = CliRunner()
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("blind")
+    series, _ = generate(Case(("thermal_lag",), 0.2, 31, epochs=100))
+    for s in series:
+        write(s, folder / s.name)
+    return folder
+
+
+def discover(*arguments):
+    return run.invoke(application(), ["discover", *map(str, arguments)])
+
+
+def test_everything_is_written(recordings, tmp_path):
+    model, report = tmp_path / "model.yaml", tmp_path / "report.html"
+
+    result = discover(
+        recordings / "M1", "--verify", recordings / "M2", "--json", "-",
+        "--model-out", model, "--report", report,
+    )  # fmt: skip
+
+    assert result.exit_code == 0, result.stderr
+    document = json.loads(result.stdout)
+    assert document["verdict"] == "effects_found"
+    assert [e["effect"] for e in document["effects"]] == ["thermal_lag"]
+    assert document["model"] == str(model)
+    assert yaml.safe_load(model.read_text())["effects"][0]["effect"] == "thermal_lag"
+    page = report.read_text()
+    assert page.count("<svg") == 5
+    assert "http://" not in page.replace("http://www.w3.org", "").replace("http://purl.org", "").replace("http://creativecommons.org", "")
+    assert document["effects"][0]["statement"] in page
+    assert "reading" in result.stderr
+
+
+def test_with_the_model_found_nothing_is_missing(recordings, tmp_path):
+    """The new model is read back: it explains the recording, and no effect is found twice."""
+    model = tmp_path / "model.yaml"
+    assert discover(recordings / "M1", "--model-out", model).exit_code == 0
+
+    result = discover(recordings / "M1", "--model", model, "--json", "-")
+
+    assert json.loads(result.stdout)["verdict"] == "adequate"
+
+
+def test_simulate_runs_the_new_model(recordings, tmp_path):
+    from thermocald.discovery.source import series_input
+    from thermocald.simulation.history import History
+    from thermocald.simulation.model_file import read_model
+    from thermocald.store.recording import read_recording
+
+    model = tmp_path / "model.yaml"
+    assert discover(recordings / "M1", "--model-out", model).exit_code == 0
+    recording = read_recording(recordings / "M1")
+    thermal = read_model(model)
+    history = History.from_epochs(recording.epochs, "temperature", thermal.T0)
+
+    predicted = thermal.predict(history)
+
+    import numpy as np
+
+    from thermocald.photogrammetry.camera_model import project
+
+    source = series_input(recording)
+    uv = project(source.sensor, predicted.iop, predicted.eop, source.field.points)
+    misfit = source.grid.points - uv
+    good = np.abs(misfit) < 0.5  # gross errors
+    # image noise and what the thermometer's noise of 0.044 K makes of up to 1 px/K
+    assert np.sqrt(np.mean(misfit[good] ** 2)) < 0.07
+
+
+def test_another_camera_is_refused(recordings, tmp_path):
+    other = ["nexus5", "rpi-v2.1", "galaxy-s8"]
+    own = yaml.safe_load((recordings / "M1" / "recording.yaml").read_text())["camera"]["name"]
+    other.remove(own)
+    series, _ = generate(Case((), 0.1, 3, epochs=30, camera=other[0], with_m2=False))
+    write(series[0], tmp_path / "M2")
+    result = discover(recordings / "M1", "--verify", tmp_path / "M2")
+    assert isinstance(result.exception, DataError)
+    assert "another camera" in str(result.exception)
+
+
+def test_no_m1_is_wrong_usage():
+    result = discover()
+    assert isinstance(result.exception, UsageError)
+
+
+@pytest.mark.parametrize("camera", ["aviary-cam0", "aviary-cam1", "aviary-cam2", "aviary-cam6"])
+def test_real_recordings_without_temperature(shared, camera):
+    result = discover(shared / "data" / camera, "--json", "-")
+    assert isinstance(result.exception, DataError)
+    assert result.exception.exit_status == 1
+    assert "temperature" in str(result.exception)
+    assert result.stdout == ""
+
+
+def test_plan(tmp_path):
+    series, _ = generate(Case((), 0.1, 33, epochs=90, with_m2=False))
+    write(series[0], tmp_path / "quiet")
+    result = discover("--plan", tmp_path / "quiet", "--strength", "0.2", "--json", "-")
+    assert result.exit_code == 0, result.stderr
+    document = json.loads(result.stdout)
+    assert document["power"]["nonlinear_expansion"] == 1.0
+    assert document["power"]["creep"] == 1.0
+    assert len(document["power"]) >= 15

@@ -1,0 +1,84 @@
+"""Reduction of a series: offsets, gross errors, weak input."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.blind.bridge import series_input
+from tests.blind.generator import Case, generate
+from thermocald.discovery.evidence import condensed, gather
+from thermocald.discovery.hypothesis import Laboratory, Term
+from thermocald.errors import DataError
+
+
+@pytest.fixture
+def source():
+    return series_input(generate(Case(("creep",), 0.3, 4, with_m2=False))[0][0])
+
+
+def test_noise_is_found(source):
+    e = gather(source)
+
+    assert np.sqrt(e.variance) * 0.04 == pytest.approx(0.04, rel=0.02)
+    assert np.median(e.sigma0) == pytest.approx(1.0, abs=0.02)
+
+
+def test_gross_errors_are_taken_out(source):
+    e = gather(source)
+
+    share = e.gross / source.grid.observed.sum()
+    assert 0.001 < share < 0.004  # 0.2 % were put in, some below what can be seen
+    normal = e.residuals * np.sqrt(e.weights[..., :2])
+    assert np.nanmax(np.abs(normal)) < 6.0
+
+
+def test_wrong_field_coordinates_do_not_matter(source):
+    """A constant error of each target's coordinates leaves the courses as they were."""
+    rng = np.random.default_rng(0)
+    moved = source.field.points + rng.normal(0, 0.1, source.field.points.shape)
+    other = replace(source, field=replace(source.field, points=moved))
+
+    fits = [Laboratory([gather(x)]).fit((Term("creep"),)) for x in (source, other)]
+
+    sds = np.sqrt(np.diag(fits[0].covariance))
+    assert np.all(np.abs(fits[0].coefficients - fits[1].coefficients) < sds)
+    assert fits[1].chi2 == pytest.approx(fits[0].chi2, rel=0.01)
+
+
+def test_weak_input_is_refused(source):
+    none = {"temperature": np.full(len(source.frame_times), np.nan)}
+    constant = {"temperature": np.full(len(source.frame_times), 21.0)}
+    flat = source.field.points.copy()
+    flat[:, 2] = 0.0
+    ten = slice(0, 10)
+    cases = {
+        "no temperature": replace(source, readings={}),
+        "holds fewer": replace(source, readings=none),
+        "constant": replace(source, readings=constant),
+        "one plane": replace(source, field=replace(source.field, points=flat)),
+        "of 10 epochs": replace(
+            source,
+            frame_times=source.frame_times[ten],
+            reading_times=source.reading_times[ten],
+            readings={k: v[ten] for k, v in source.readings.items()},
+            grid=type(source.grid)(source.grid.points[ten], source.grid.weights[ten]),
+            numbers=source.numbers[ten],
+        ),
+    }
+    for words, weak in cases.items():
+        with pytest.raises(DataError, match=words):
+            gather(weak)
+
+
+def test_blocks_keep_the_slow_courses(source):
+    e = gather(source)
+
+    short = condensed(e, rows=60)
+
+    assert len(short.times) == 60
+    assert short.N.sum(axis=0) == pytest.approx(e.N.sum(axis=0))
+    assert short.b.sum(axis=0) == pytest.approx(e.b.sum(axis=0))
+    assert short.averaged(e.times) == pytest.approx(short.times)

@@ -1,0 +1,85 @@
+"""Names, no forced names, and alternatives, on a few blind recordings; many are in tests/blind."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermocald.discovery.result import discover_series
+
+KEYS = {"effect", "statement", "where", "estimates", "evidence", "alternatives", "gap_before", "gap_after"}
+
+
+@pytest.mark.parametrize(
+    "effect", ["thermal_lag", "softening", "housing_tilt", "target_displacement", "defocus"]
+)
+def test_a_hidden_effect_is_named(evidence_of, effect):
+    evidence, _ = evidence_of(effect, px=0.1, seed=21)
+
+    found = discover_series(evidence)
+
+    assert found.verdict == "effects_found"
+    assert [e.effect for e in found.effects] == [effect]
+
+
+def test_the_gap_shrinks_to_the_floor(evidence_of):
+    evidence, _ = evidence_of("permanent_set", px=0.1, seed=22)
+    found = discover_series(evidence)
+    assert found.stages[0].verify.chi2_reduced > 2
+    assert found.excess_closed() > 0.9
+    assert found.stages[-1].fit.rms_px < 0.06
+
+
+def test_no_effect_no_name(evidence_of):
+    evidence, _ = evidence_of(seed=23)
+    found = discover_series(evidence)
+    assert (found.verdict, found.effects) == ("adequate", ())
+
+
+def test_an_outside_influence_gets_no_name(evidence_of):
+    evidence, _ = evidence_of("outside", px=0.1, seed=24)
+    found = discover_series(evidence)
+    assert found.verdict == "unexplained"
+    assert [e.effect for e in found.effects] == ["unnamed"]
+    assert found.effects[0].evidence["bridge"]["transferable"] is False
+
+
+def test_a_small_lag_and_a_small_delay_stay_alternatives(evidence_of):
+    evidence, truth = evidence_of("thermal_lag", px=0.03, seed=0)
+    assert truth["effects"][0][0]["tau"] < 3
+    found = discover_series(evidence)
+    names = {found.effects[0].effect, *found.effects[0].alternative_names}
+    assert {"thermal_lag", "time_offset"} <= names
+    assert "experiment" in found.effects[0].alternatives[0]
+
+
+def test_document(evidence_of):
+    evidence, truth = evidence_of("thermal_lag", seed=25)
+    document = discover_series(evidence).as_json("model.yaml")
+    assert list(document) == ["format", "verdict", "effects", "gap", "model"]
+    assert document["format"] == "thermocald-discovery/1"
+    entry = document["effects"][0]
+    assert set(entry) == KEYS
+    assert set(entry["where"]) >= {"parameters", "epochs", "image_region"}
+    tau = entry["estimates"]["tau"]
+    assert abs(tau["value"] - truth["effects"][0][0]["tau"]) < 4 * tau["sd"]
+    assert tau["unit"] == "s"
+    for gap in (document["gap"]["fit"]["before"], document["gap"]["verify"]["after"]):
+        assert set(gap) == {"rms_px", "chi2_reduced", "object_mm_at_10m"}
+
+
+def test_a_drift_of_a_few_targets_is_not_the_camera(evidence_of):
+    evidence, truth = evidence_of("target_displacement", px=0.05, seed=26)
+    found = discover_series(evidence)
+    true = truth["effects"][0][0]
+    said = found.effects[0].estimates
+    assert sorted(int(v) for v in said["targets"]["value"]) == [t + 1 for t in true["targets"]]
+    assert said["time"]["value"] == pytest.approx(true["time"], abs=10)
+
+
+def test_progress_is_shown(evidence_of):
+    lines: list[str] = []
+    evidence, _ = evidence_of("creep", seed=27)
+    discover_series(evidence, lines.append)
+    assert len(lines) >= 4
+    assert np.all([isinstance(line, str) for line in lines])

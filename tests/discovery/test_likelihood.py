@@ -1,0 +1,98 @@
+"""The likelihood with the thermometer's error integrated out, against the dense covariance."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermocald.discovery.evidence import COLUMNS
+from thermocald.discovery.hypothesis import Laboratory, Term
+
+
+@pytest.fixture
+def dense(evidence_of):
+    """A short series, a fit with two carried courses, and S built entry by entry."""
+    evidence, _ = evidence_of("nonlinear_expansion", seed=5, epochs=30, with_m2=False)
+    laboratory = Laboratory(evidence)
+    fit = laboratory.fit((Term("nonlinear_expansion"),))
+    e = evidence[0]
+    E, P = len(e.times), len(COLUMNS)
+    # the least determined combinations are left out so that N can be inverted
+    size, U = np.linalg.eigh(e.N.mean(axis=0))
+    keep = U[:, size > 1e-3 * np.median(size)]
+    N = np.einsum("pi,epq,qj->eij", keep, e.N, keep)
+    k = keep.shape[1]
+    S = np.zeros((E * k, E * k))
+    for i in range(E):
+        S[i * k : (i + 1) * k, i * k : (i + 1) * k] = np.linalg.inv(N[i])
+    J = np.zeros((E * k, len(e.state_sd("temperature"))))
+    for block in fit.blocks:
+        d = keep.T @ fit.direction(block)[0]
+        operator = (
+            laboratory.drive((), 0)[1]
+            if block.term < 0
+            else laboratory.courses(fit.terms[0], 0)[1]
+        )
+        for i in range(E):
+            J[i * k : (i + 1) * k] += np.outer(d, operator[i])
+    S += J @ np.diag(e.state_sd("temperature") ** 2) @ J.T
+    return e, fit, keep, S, J
+
+
+def test_inner_products_equal_the_dense_ones(dense):
+    e, fit, keep, S, _ = dense
+    rng = np.random.default_rng(0)
+    C = rng.normal(size=(len(e.times), 3))
+    C -= C.mean(axis=0)
+    V = keep @ rng.normal(size=(keep.shape[1], 3))
+
+    A = fit.weightings[0].reduce(C, V).A
+
+    X = np.einsum("er,kr->ekr", C, keep.T @ V).reshape(-1, 3)
+    level = np.tile(np.eye(keep.shape[1]), (len(e.times), 1))
+    inverse = np.linalg.inv(S)
+    L = inverse @ level
+    projected = inverse - L @ np.linalg.solve(level.T @ L, L.T)
+    assert A == pytest.approx(X.T @ projected @ X, rel=2e-3)
+
+
+def test_determinant(dense):
+    e, fit, keep, S, J = dense
+    k = keep.shape[1]
+    images = sum(
+        np.linalg.slogdet(np.linalg.inv(np.einsum("pi,pq,qj->ij", keep, n, keep)))[1]
+        for n in e.N
+    )
+    assert fit.weightings[0].logdet == pytest.approx(np.linalg.slogdet(S)[1] - images, rel=1e-3)
+    assert len(S) == len(e.times) * k
+    assert J.any()
+
+
+def test_scan_agrees_with_reduce(dense):
+    e, fit, *_ = dense
+    rng = np.random.default_rng(2)
+    C = rng.normal(size=(len(e.times), 1))
+    V = np.zeros((len(COLUMNS), 2))
+    V[0, 0] = V[1, 1] = 1.0
+    base = fit.designs[0][:2]
+
+    A, c, B = fit.weightings[0].scan(C[None], V, base)
+    whole = fit.weightings[0].reduce(
+        np.hstack([C, C, base[0]]), np.hstack([V, base[1]])
+    )
+
+    assert A[0] == pytest.approx(whole.A[:2, :2])
+    assert c[0] == pytest.approx(whole.c[:2])
+    assert B[0] == pytest.approx(whole.A[:2, 2:], rel=1e-6, abs=1e-6 * np.abs(whole.A).max())
+
+
+def test_effect_free_recordings_are_at_the_floor(evidence_of):
+    """Reduced χ² of the parameters is 1 with the thermometer's error in it, and far off without."""
+    evidence, _ = evidence_of(seed=8)
+    laboratory = Laboratory(evidence)
+    fit = laboratory.fit(())
+    rank = 18.0
+    free = sum(rank * (len(e.times) - 1) - 3 for e in evidence)
+    assert fit.chi2 / free == pytest.approx(1.0, abs=0.05)
+    laboratory.thermometer_factor = 1e-3
+    assert laboratory.fit(()).chi2 / free > 2.0

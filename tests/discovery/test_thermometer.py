@@ -1,0 +1,62 @@
+"""The thermometer's noise from its readings, and its smooth course."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermocald.discovery.thermometer import latent_times, reading_noise, smooth_channel
+
+
+def course(t):
+    """Two lamps, as a body with a time constant of 250 s follows them."""
+    up = 20 * (1 - np.exp(-np.maximum(t - 200, 0) / 250))
+    down = 20 * (1 - np.exp(-np.maximum(t - 805, 0) / 250))
+    return 21 + up - down
+
+
+@pytest.fixture
+def readings():
+    rng = np.random.default_rng(1)
+    t = 10.0 * np.arange(180) + rng.uniform(-1, 1, 180)
+    raw = course(t) + rng.normal(0, 0.04, 180)
+    return t, np.round(raw / 0.0625) * 0.0625
+
+
+def test_noise_with_quantisation(readings):
+    true = np.hypot(0.04, 0.0625 / np.sqrt(12))
+    noises = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        t = 10.0 * np.arange(180)
+        y = np.round((course(t) + rng.normal(0, 0.04, 180)) / 0.0625) * 0.0625
+        noises.append(reading_noise(y, 0.0625))
+    # 177 third differences, correlated: 12 % each, so 2 % for the mean; kinks raise it a little
+    assert np.mean(noises) == pytest.approx(true, rel=0.12)
+
+
+def test_a_step_is_not_better_than_itself():
+    assert reading_noise(np.full(100, 21.0625), 0.0625) == pytest.approx(0.0625 / np.sqrt(12))
+
+
+def test_kinks_get_a_latent_instant(readings):
+    t, y = readings
+    latent = latent_times(t, y, 0.0625)
+    assert np.min(np.abs(latent - 805)) < 12
+    assert len(latent) < 15
+
+
+def test_course_is_closer_than_readings(readings):
+    t, y = readings
+    c = smooth_channel(t, y, np.zeros(len(t), dtype=bool), 0.0625)
+    assert np.std(c.course - course(t)) < 0.7 * np.std(y - course(t))
+    assert c.course + c.deviation == pytest.approx(y)
+
+
+def test_a_missing_reading_is_uncertain(readings):
+    t, y = readings
+    y = y.copy()
+    y[50] = np.nan
+    c = smooth_channel(t, y, np.zeros(len(t), dtype=bool), 0.0625)
+    assert c.deviation[50] == 0.0
+    assert c.sd[50] > 2 * c.sd[100]

@@ -29,7 +29,6 @@ __all__ = ["Codes", "codes_in", "known_codes", "targets_in"]
 # Scale and ink (-1 dark on light) in which codes are looked for, until so many are found.
 _SEARCHES = ((2, -1), (2, 1), (1, -1), (1, 1))
 _ENOUGH_CODES = 12
-_ONE_FAMILY = 0.8
 _LARGEST_TILT_COSINE = 0.2
 _GROSS_PX = 8.0
 
@@ -41,11 +40,6 @@ class Codes:
     rows: dict[tuple[int, int], int]
     names: list[str]
     grows: bool
-
-    @property
-    def families(self) -> tuple[int, ...]:
-        """The numbers of bits that may occur."""
-        return ring_code.BITS if self.grows else tuple(sorted({bits for bits, _ in self.rows}))
 
     @property
     def known(self) -> frozenset[tuple[int, int]] | None:
@@ -81,14 +75,9 @@ def codes_in(image: Image, codes: Codes) -> tuple[Observations, dict[int, float]
     """The ring-coded targets of an image, measured as ellipses, and their semi-major axes in px."""
     grey = to_8_bit(image)
     best = None
-    for scale, ink in _SEARCHES if codes.families else ():
+    for scale, ink in _SEARCHES if codes.grows or codes.rows else ():
         candidates = find_circles(grey, scale, ink)
-        found = read_codes(grey, candidates, codes.families, codes.known)
-        if codes.grows and len(found):
-            # some codes of few segments can be read in both families: the others tell which it is
-            family = int(np.bincount(found.bits).argmax())
-            if np.mean(found.bits == family) > _ONE_FAMILY:
-                found = read_codes(grey, candidates, (family,))
+        found = read_codes(grey, candidates, codes.known)
         if best is None or len(found) > len(best[1]):
             best = candidates.maps, found
         if len(found) >= _ENOUGH_CODES:

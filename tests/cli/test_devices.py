@@ -90,6 +90,10 @@ def test_a_probe_takes_one_of_each_and_names_what_fails(sysfs, tmp_path):
     assert good.values == {"temperature_c": 21.0}
     assert good.shows == "temperature_c 21.0"
     assert "'tmp421' is not there" in bad.error
+    lines = list(devices.probe_lines([good, bad]))
+    assert lines[0].startswith("thermometer lens (hwmon), ")
+    assert lines[0].endswith("temperature_c 21.0")
+    assert "FAILED: " in lines[1]
     entries = devices.probe_document([good, bad])["devices"]
     assert [entry["error"] is None for entry in entries] == [True, False]
 

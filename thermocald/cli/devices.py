@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from thermocald.config import Config, DeviceConfig
     from thermocald.hal import Frame, Kind, Reading
 
-__all__ = ["Attached", "Probe", "attached", "probe", "probe_document", "register"]
+__all__ = ["Attached", "Probe", "attached", "probe", "probe_document", "probe_lines", "register"]
 
 KINDS: tuple[Kind, ...] = ("camera", "thermometer", "output")
 
@@ -74,6 +74,13 @@ def probe(config: Config) -> list[Probe]:
         *(_probe("camera", device) for device in config.cameras),
         *(_probe("thermometer", device) for device in config.thermometers),
     ]
+
+
+def probe_lines(probes: Sequence[Probe]) -> Iterator[str]:
+    """The probes for people, one line each."""
+    for p in probes:
+        what = f"FAILED: {p.error}" if p.error else p.shows
+        yield f"{p.kind} {p.name} ({p.driver}), {p.took_s * 1e3:.0f} ms: {what}"
 
 
 def probe_document(probes: Sequence[Probe]) -> dict[str, Any]:

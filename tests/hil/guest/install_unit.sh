@@ -25,6 +25,6 @@ chmod -R a+rX /opt/thermocald /etc/thermocald
 cp "$folder"/thermocald.service /etc/systemd/system/
 # an emulated machine is slow, a test impatient: only the times are the laboratory's
 mkdir -p /etc/systemd/system/thermocald.service.d
-printf '[Service]\nTimeoutStartSec=240\nWatchdogSec=20\nRestartSec=1\n' \
+printf '[Service]\nTimeoutStartSec=240\nWatchdogSec=20\nTimeoutAbortSec=5\nRestartSec=1\n' \
     >/etc/systemd/system/thermocald.service.d/times.conf
 systemctl daemon-reload

@@ -36,7 +36,7 @@ def test_the_exposure_is_at_most_two_and_a_half(analyze, unit):
 
 
 def test_systemd_understands_every_line(analyze, tmp_path):
-    """Verified where the program is a file that exists; what is newer than this systemd is named."""
+    """With a program that exists; lines that are newer than this systemd are named."""
     for unit in UNITS.glob("thermocald*.service"):
         text = unit.read_text().replace("/opt/thermocald/bin/thermocald", "/bin/true")
         (tmp_path / unit.name.replace("@", "@one")).write_text(text)

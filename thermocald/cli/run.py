@@ -173,6 +173,7 @@ def dashboard(
 
     Example: thermocald dashboard --store thermocald.db
     """
+    from thermocald.daemon.live_state import find_state
     from thermocald.output.dashboard import serve
 
-    serve(store, live, host, port, token_file)
+    serve(store, live or find_state(store), host, port, token_file)

@@ -1,0 +1,257 @@
+"""The routes: pages, JSON, a stream of events; only GET, and only what is named here."""
+
+from __future__ import annotations
+
+import asyncio
+import gzip
+import hmac
+import json
+import math
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.responses import JSONResponse, RedirectResponse, Response, StreamingResponse
+from starlette.routing import Route
+
+from thermocald.errors import DataError, ThermocaldError, UsageError
+from thermocald.output.dashboard.metrics import metrics_text
+from thermocald.output.dashboard.view import View
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from starlette.requests import Request
+    from starlette.types import ASGIApp, Receive, Scope, Send
+
+__all__ = ["build_application"]
+
+_STATIC = Path(__file__).parent / "static"
+_FILES = {
+    "page.js": "text/javascript; charset=utf-8",
+    "page.css": "text/css; charset=utf-8",
+    "icon.svg": "image/svg+xml",
+}
+_HEADERS = {
+    "content-security-policy": "default-src 'none'; script-src 'self'; connect-src 'self'; "
+    "img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'none'",
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cache-control": "no-store",
+}
+_COOKIE = "thermocald_token"
+_STREAM_EVERY_S = 0.5
+_ALIVE_EVERY = 30
+_NAME_LENGTH = 64
+
+
+def build_application(store: Path, live: Path, token: str | None, host: str) -> Starlette:
+    """The application; token: None if whoever reaches it may look."""
+    application = Starlette(
+        routes=[
+            Route("/", _page),
+            Route("/static/plotly.js", _plotly),
+            Route("/static/{name}", _static),
+            Route("/api/status", _status),
+            Route("/api/stream", _stream),
+            Route("/api/series", _series),
+            Route("/api/columns", _columns),
+            Route("/api/events", _events),
+            Route("/api/cameras/{camera}/epoch", _epoch),
+            Route("/api/cameras/{camera}/frame", _frame),
+            Route("/api/series.csv", _csv),
+            Route("/healthz", _health),
+            Route("/metrics", _metrics),
+        ],
+        middleware=[Middleware(_Guard, token=token, host=host)],
+        exception_handlers={ThermocaldError: _refuse},
+    )
+    application.state.view = View(store, live)
+    return application
+
+
+class _Guard:
+    """Refuses foreign host names (DNS rebinding) and, where there is one, requests without token.
+
+    The token comes as `Authorization: Bearer …`, or once as `?token=…`, which sets a cookie.
+    """
+
+    def __init__(self, app: ASGIApp, token: str | None, host: str) -> None:
+        self._app = app
+        self._token = token
+        self._hosts = {"localhost", "127.0.0.1", "[::1]", host, f"[{host}]"}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            return
+        from starlette.requests import Request
+
+        request = Request(scope)
+        response: Response | None = None
+        if scope["method"] not in ("GET", "HEAD"):
+            response = JSONResponse({"error": "this page only reads"}, 405)
+        elif self._token is None:
+            name = request.headers.get("host", "").rsplit(":", 1)[0]
+            if name not in self._hosts and not name.startswith("127."):
+                response = JSONResponse({"error": "unknown host name"}, 400)
+        elif request.url.path != "/healthz":
+            response = self._check(request)
+
+        async def send_with_headers(message: Any) -> None:
+            if message["type"] == "http.response.start":
+                given = {name.lower() for name, _ in message["headers"]}
+                message["headers"] += [
+                    (k.encode(), v.encode()) for k, v in _HEADERS.items() if k.encode() not in given
+                ]
+            await send(message)
+
+        await (response or self._app)(scope, receive, send_with_headers)
+
+    def _check(self, request: Request) -> Response | None:
+        assert self._token is not None
+        asked = request.query_params.get("token")
+        if asked is not None and _same(asked, self._token):
+            moved = RedirectResponse(request.url.path, 303)
+            moved.set_cookie(_COOKIE, self._token, httponly=True, samesite="strict")
+            return moved
+        bearer = request.headers.get("authorization", "").removeprefix("Bearer ")
+        if _same(bearer, self._token) or _same(request.cookies.get(_COOKIE, ""), self._token):
+            return None
+        return JSONResponse({"error": "a token is needed"}, 401, {"www-authenticate": "Bearer"})
+
+
+def _same(a: str, b: str) -> bool:
+    return hmac.compare_digest(a.encode(), b.encode())
+
+
+def _refuse(_: Request, error: Exception) -> Response:
+    return JSONResponse({"error": str(error)}, 400 if isinstance(error, UsageError) else 404)
+
+
+def _view(request: Request) -> View:
+    view: View = request.app.state.view
+    return view
+
+
+def _page(_: Request) -> Response:
+    return Response((_STATIC / "index.html").read_bytes(), media_type="text/html")
+
+
+def _static(request: Request) -> Response:
+    name = request.path_params["name"]
+    if name not in _FILES:
+        raise DataError("there is no such file")
+    return Response((_STATIC / name).read_bytes(), media_type=_FILES[name])
+
+
+@cache
+def _plotly_script() -> bytes:
+    from plotly.offline import get_plotlyjs
+
+    return gzip.compress(get_plotlyjs().encode(), 6)
+
+
+def _plotly(_: Request) -> Response:
+    headers = {"content-encoding": "gzip", "cache-control": "max-age=86400"}
+    return Response(_plotly_script(), media_type="text/javascript", headers=headers)
+
+
+def _status(request: Request) -> Response:
+    return JSONResponse(_view(request).status())
+
+
+async def _stream(request: Request) -> Response:
+    view = _view(request)
+
+    async def events() -> AsyncIterator[str]:
+        seen, silent = -1.0, 0
+        while not await request.is_disconnected():
+            changed = view.changed()
+            silent += 1
+            if changed != seen:
+                seen, silent = changed, 0
+                document = await asyncio.to_thread(view.status)
+                yield f"data: {json.dumps(document)}\n\n"
+            elif silent >= _ALIVE_EVERY:
+                silent = 0
+                yield ": still here\n\n"
+            await asyncio.sleep(_STREAM_EVERY_S)
+
+    return StreamingResponse(events(), media_type="text/event-stream")
+
+
+def _series(request: Request) -> Response:
+    return JSONResponse(_view(request).series())
+
+
+def _columns(request: Request) -> Response:
+    view = _view(request)
+    camera, series = _camera_and_series(request)
+    since = _number(request, "last", 1.0, 1e10)
+    until = _number(request, "until", 0.0, 1e11)
+    points = _number(request, "points", 2.0, 2000.0)
+    return JSONResponse(view.columns(camera, series, since, until, int(points or 1000)))
+
+
+def _events(request: Request) -> Response:
+    return JSONResponse(_view(request).events(_number(request, "since", 0.0, 1e11) or 0.0))
+
+
+def _epoch(request: Request) -> Response:
+    data = _view(request).last_epoch(request.path_params["camera"])
+    return Response(data, media_type="application/json")
+
+
+def _frame(request: Request) -> Response:
+    data = _view(request).last_frame(request.path_params["camera"])
+    return Response(data, media_type="image/jpeg")
+
+
+def _csv(request: Request) -> Response:
+    view = _view(request)
+    camera, series = _camera_and_series(request)
+    view.require(camera, series)
+    name = f"{camera}-{series}.csv"
+    if not all(c.isalnum() or c in "._-" for c in name):
+        name = "series.csv"
+    return StreamingResponse(
+        view.csv(camera, series),
+        media_type="text/csv",
+        headers={"content-disposition": f'attachment; filename="{name}"'},
+    )
+
+
+def _health(request: Request) -> Response:
+    healthy, why = _view(request).healthy()
+    return JSONResponse({"ok": healthy, "why": why}, 200 if healthy else 503)
+
+
+def _metrics(request: Request) -> Response:
+    text = metrics_text(_view(request).status())
+    return Response(text, media_type="text/plain; version=0.0.4; charset=utf-8")
+
+
+def _camera_and_series(request: Request) -> tuple[str, str]:
+    found = []
+    for key in ("camera", "series"):
+        value = request.query_params.get(key, "")
+        if not value or len(value) > _NAME_LENGTH or not value.isprintable():
+            raise UsageError(f"{key}: give the name of one, at most {_NAME_LENGTH} characters")
+        found.append(value)
+    return found[0], found[1]
+
+
+def _number(request: Request, key: str, low: float, high: float) -> float | None:
+    text = request.query_params.get(key)
+    if text is None:
+        return None
+    try:
+        value = float(text[:40])
+    except ValueError:
+        value = math.nan
+    if not low <= value <= high:
+        raise UsageError(f"{key}: must be a number from {low:g} to {high:g}")
+    return value

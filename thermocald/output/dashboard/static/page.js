@@ -1,0 +1,217 @@
+// The page: the daemon's status as a stream, the last epoch of one camera, its course from the store.
+"use strict";
+const $ = (id) => document.getElementById(id);
+const SVG = "http://www.w3.org/2000/svg";
+const COURSE_EVERY_MS = 10000, RESIDUAL_SCALE = 400;
+let status = {}, series = [], shownEpoch = null, courseAt = 0, eventsAt = 0;
+
+async function get(path) {
+  const answer = await fetch(path, { headers: { accept: "application/json" } });
+  if (!answer.ok) throw new Error(`${path}: ${answer.status}`);
+  return answer.json();
+}
+
+function element(name, text, className) {
+  const made = document.createElement(name);
+  if (text !== undefined) made.textContent = text;
+  if (className) made.className = className;
+  return made;
+}
+
+function rows(target, content) { $(target).replaceChildren(...content); }
+
+function fixed(value, digits) {
+  return value === null || value === undefined ? "–" : Number(value).toFixed(digits);
+}
+
+function time(utc) {
+  return new Date(utc * 1000).toISOString().replace("T", " ").slice(0, 19);
+}
+
+function options(select, names) {
+  const before = select.value;
+  if (names.join("\n") === [...select.options].map((o) => o.value).join("\n")) return;
+  select.replaceChildren(...names.map((n) => new Option(n, n)));
+  if (names.includes(before)) select.value = before;
+}
+
+function show(document_) {
+  status = document_;
+  const cameras = status.cameras || {};
+  options($("camera"), Object.keys(cameras));
+  const old = status.age_s > 10;
+  $("connection").textContent = !status.pid ? "no daemon runs" :
+    old ? `the daemon has not answered for ${fixed(status.age_s, 0)} s` : "live";
+  showCamera(cameras[$("camera").value]);
+  showDevices();
+  showWarnings();
+  if (status.pid) {
+    $("foot").textContent = `thermocald ${status.version}, since ${time(status.started)} UTC; ` +
+      `store ${status.store.path}`;
+  }
+  if (Date.now() - courseAt > COURSE_EVERY_MS) refreshCourse();
+  if (Date.now() - eventsAt > COURSE_EVERY_MS) refreshEvents();
+}
+
+function showCamera(camera) {
+  const last = camera && camera.last;
+  if (!last || last.epoch === undefined) return;
+  const online = last.online || {}, good = last.status === "ok";
+  const state = $("state");
+  state.className = good ? last.state : "failed";
+  state.textContent = good ? (online.sentence || last.state) : `${last.status}: ${last.reason}`;
+  const figures = [["Epoch", String(last.epoch), time(last.frame_time) + " UTC"],
+    ["Temperature", fixed(last.temperature, 2) + " °C", ""]];
+  for (const name of ["c", "x0", "y0"]) {
+    const sd = online["sd_" + name] ?? last["sd_" + name];
+    figures.push([name, `${fixed(online[name] ?? last[name], 5)} mm`,
+      sd ? `± ${fixed(sd, 5)}; this epoch alone ${fixed(last[name], 5)} ± ${fixed(last["sd_" + name], 5)}` : ""]);
+  }
+  figures.push(["sigma0", fixed(last.sigma0, 3), `${last.n_observations} targets, ${last.n_rejected} rejected`]);
+  rows("figures", figures.flatMap(([name, value, more]) => {
+    const dd = element("dd", value + " ");
+    dd.append(element("small", more));
+    return [element("dt", name), dd];
+  }));
+  const key = `${$("camera").value}/${last.epoch}`;
+  if (key !== shownEpoch) { shownEpoch = key; showFrame($("camera").value); }
+}
+
+async function showFrame(name) {
+  let epoch;
+  try { epoch = await get(`api/cameras/${encodeURIComponent(name)}/epoch`); } catch { return; }
+  const targets = epoch.targets || {}, found = series.find((s) => s.camera === name);
+  const overlay = $("overlay");
+  if (found) overlay.setAttribute("viewBox", `0 0 ${found.width_px} ${found.height_px}`);
+  const width = found ? found.width_px : 1000, parts = [];
+  (targets.x || []).forEach((x, i) => {
+    const y = targets.y[i], dot = document.createElementNS(SVG, "circle");
+    const colour = targets.rejected[i] ? "#ff5d52" : "#43d17c";
+    Object.entries({ cx: x, cy: y, r: width / 300, fill: "none", stroke: colour,
+      "stroke-width": width / 900 }).forEach(([k, v]) => dot.setAttribute(k, v));
+    parts.push(dot);
+    if (targets.vx[i] === null) return;
+    const line = document.createElementNS(SVG, "line");
+    Object.entries({ x1: x, y1: y, x2: x + targets.vx[i] * RESIDUAL_SCALE,
+      y2: y + targets.vy[i] * RESIDUAL_SCALE, stroke: "#ffc53d", "stroke-width": width / 700 })
+      .forEach(([k, v]) => line.setAttribute(k, v));
+    parts.push(line);
+  });
+  overlay.replaceChildren(...parts);
+  const count = (targets.x || []).length, bad = (targets.rejected || []).filter(Boolean).length;
+  const text = `epoch ${epoch.row.epoch}: ${count} targets, ${bad} rejected (red); residuals ×${RESIDUAL_SCALE}`;
+  $("frame-caption").textContent = text;
+  overlay.setAttribute("aria-label", text);
+  const picture = await fetch(`api/cameras/${encodeURIComponent(name)}/epoch`.replace("/epoch", "/frame"))
+    .catch(() => null);
+  const frame = $("frame");
+  if (!picture || !picture.ok) { return; }
+  const url = URL.createObjectURL(await picture.blob());
+  frame.onload = () => URL.revokeObjectURL(url);
+  frame.src = url;
+  frame.hidden = false;
+  frame.alt = `the last frame that was shown of camera ${name}`;
+}
+
+function showDevices() {
+  const content = [];
+  for (const kind of ["cameras", "thermometers", "outputs"]) {
+    for (const [name, device] of Object.entries(status[kind] || {})) {
+      const row = element("tr"), state = element("td");
+      const good = ["open", "finished"].includes(device.device);
+      state.append(element("span", device.device, good ? "ready" : "failed"), " " + (device.why || ""));
+      const rhythm = kind === "cameras" ?
+        `every ${device.period_s} s, late ${fixed(1000 * device.late_p99_s, 1)} ms (p99), ` +
+        `${device.skipped} skipped, ${device.lost} lost, ${device.put_off - device.caught_up} to catch up` : "";
+      const first = element("th", name);
+      first.scope = "row";
+      row.append(first, state, element("td", rhythm));
+      content.push(row);
+    }
+  }
+  rows("devices", content);
+}
+
+function showWarnings() {
+  const found = [...(status.stalled || [])];
+  if (status.store && status.store.state !== "ok") found.push(`store: ${status.store.state} ${status.store.why}`);
+  if (status.frames && status.frames.paused) found.push(status.frames.paused);
+  if (status.clock && !status.clock.trusted) found.push("the clock is not synchronised: times may be wrong");
+  const text = found.join("\n");
+  if ($("warnings").textContent !== text) $("warnings").textContent = text;
+}
+
+async function refreshEvents() {
+  eventsAt = Date.now();
+  try {
+    const events = await get("api/events");
+    rows("events", events.slice(0, 100).map((event) => {
+      const row = element("tr");
+      row.append(element("td", time(event.utc)), element("td", event.text));
+      return row;
+    }));
+  } catch { /* the store is not there yet; asked again soon */ }
+}
+
+async function refreshCourse() {
+  courseAt = Date.now();
+  try {
+    series = await get("api/series");
+    const name = $("camera").value || (series.length ? series[series.length - 1].camera : "");
+    if (!$("camera").value) options($("camera"), [...new Set(series.map((s) => s.camera))]);
+    options($("series"), series.filter((s) => s.camera === name).map((s) => s.series).reverse());
+    if (!$("series").value) return;
+    const query = new URLSearchParams({ camera: name, series: $("series").value, points: "1500" });
+    $("download").href = `api/series.csv?${query}`;
+    const span = document.querySelector("input[name=span]:checked").value;
+    if (span) query.set("last", span);
+    draw(await get(`api/columns?${query}`));
+  } catch (error) { $("course-note").textContent = "not available yet"; }
+}
+
+function draw(columns) {
+  const style = getComputedStyle(document.documentElement);
+  const colour = (name) => style.getPropertyValue(name).trim();
+  const x = columns.frame_time.map((t) => new Date(t * 1000));
+  const traces = [], layout = {
+    margin: { l: 70, r: 15, t: 10, b: 40 }, showlegend: columns.channels.length > 1,
+    paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", uirevision: "same",
+    font: { color: colour("--ink") }, legend: { orientation: "h", y: 1.05 },
+    xaxis: { gridcolor: colour("--line"), anchor: "y5" }, hovermode: "x",
+  };
+  const panels = [[columns.channels, "°C"], [["c"], "c mm"], [["x0"], "x0 mm"], [["y0"], "y0 mm"], [["sigma0"], "σ0"]];
+  panels.forEach(([names, title], i) => {
+    const axis = i ? `y${i + 1}` : "y", top = 1 - i * 0.205;
+    layout[i ? `yaxis${i + 1}` : "yaxis"] = { title: { text: title }, domain: [top - 0.18, top],
+      gridcolor: colour("--line"), zeroline: false, tickformat: title.endsWith("mm") ? ".4f" : "" };
+    for (const name of names) {
+      const y = columns[name], sd = columns["sd_" + name];
+      if (sd && sd.some((v) => v !== null)) {
+        traces.push({ x: [...x, ...[...x].reverse()], yaxis: axis, type: "scatter", mode: "none",
+          y: [...y.map((v, k) => v === null ? null : v + sd[k]),
+            ...y.map((v, k) => v === null ? null : v - sd[k]).reverse()],
+          fill: "toself", fillcolor: "rgba(90,140,200,.28)", hoverinfo: "skip", showlegend: false });
+      }
+      traces.push({ x, y, yaxis: axis, name, type: "scatter", mode: "lines",
+        showlegend: names.length > 1, line: { width: 1.5 } });
+    }
+  });
+  Plotly.react("course", traces, layout, { responsive: true, displaylogo: false });
+  $("course-note").textContent = `${columns.epochs} epochs` +
+    (columns.per_point > 1 ? `, up to ${columns.per_point} averaged in a point` : "") +
+    "; bands are ± one standard deviation of a single epoch";
+}
+
+function listen() {
+  const stream = new EventSource("api/stream");
+  stream.onmessage = (message) => show(JSON.parse(message.data));
+  stream.onerror = () => { $("connection").textContent = "the page's server does not answer; trying again"; };
+}
+
+$("camera").addEventListener("change", () => { shownEpoch = null; $("frame").hidden = true; show(status); refreshCourse(); });
+$("series").addEventListener("change", refreshCourse);
+$("range").addEventListener("change", refreshCourse);
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", refreshCourse);
+refreshCourse();
+refreshEvents();
+listen();

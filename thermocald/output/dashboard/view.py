@@ -1,0 +1,193 @@
+"""What the page shows, read from the live folder and the store; nothing is written."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.errors import DataError, StoreError
+from thermocald.photogrammetry.camera_model import PARAMETER_NAMES
+from thermocald.store.database import Store
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from thermocald.store.row import StoredSeries
+
+    Array = NDArray[np.float64]
+
+__all__ = ["View"]
+
+_SHOWN = ("c", "x0", "y0")
+_MOST_POINTS = 2000
+_ROWS_AT_ONCE = 5000
+_OLD_S = 30.0
+
+
+class View:
+    """A store and a live folder, looked at; threads may share it: every call opens for itself."""
+
+    def __init__(self, store: Path, live: Path) -> None:
+        self._store = store
+        self._live = live
+
+    def status(self) -> dict[str, Any]:
+        """status.json with its age in s; empty if no daemon runs."""
+        path = self._live / "status.json"
+        try:
+            age_s = time.time() - path.stat().st_mtime
+            document = json.loads(path.read_bytes())
+        except (OSError, ValueError):
+            return {}
+        if not isinstance(document, dict):
+            return {}
+        return {**document, "age_s": max(0.0, age_s)}
+
+    def healthy(self) -> tuple[bool, str]:
+        """(whether the daemon runs and nothing hangs, why not)."""
+        status = self.status()
+        if not status:
+            return False, "no daemon runs"
+        if status["age_s"] > _OLD_S:
+            return False, f"the daemon has not answered for {status['age_s']:.0f} s"
+        if status.get("stalled"):
+            return False, "; ".join(status["stalled"])
+        if status.get("store", {}).get("state") == "out":
+            return False, "the store cannot be written"
+        return True, ""
+
+    def changed(self) -> float:
+        """When status.json was last written, s; 0 if there is none."""
+        try:
+            return (self._live / "status.json").stat().st_mtime
+        except OSError:
+            return 0.0
+
+    def last_epoch(self, camera: str) -> bytes:
+        """The last epoch's row, targets and residuals as JSON; DataError if there is none."""
+        return self._file(camera, "json")
+
+    def last_frame(self, camera: str) -> bytes:
+        """The last frame as JPEG; DataError if there is none."""
+        return self._file(camera, "jpg")
+
+    def series(self) -> list[dict[str, Any]]:
+        """All series of the store, oldest first."""
+        with Store.open(self._store) as store:
+            return [
+                {
+                    "camera": s.camera,
+                    "series": s.name,
+                    "start": s.start,
+                    "created": s.created_utc,
+                    "pixel_pitch_mm": s.head.camera.sensor.pixel_pitch,
+                    "width_px": s.head.camera.sensor.width,
+                    "height_px": s.head.camera.sensor.height,
+                    "epochs": store.last_epoch(s) or 0,
+                }
+                for s in store.all_series()
+            ]
+
+    def columns(
+        self, camera: str, series: str, since_s: float | None, until: float | None, points: int
+    ) -> dict[str, Any]:
+        """Columns for the charts: means over at most `points` bins of equal numbers of epochs.
+
+        since_s: the last so many s before `until` (UTC s, default: the last epoch); None: all.
+        Standard deviations are means too: a bin's mean is better than they say.
+        """
+        names = ["frame_time", "sigma0", *_SHOWN, *(f"sd_{n}" for n in _SHOWN)]
+        with Store.open(self._store) as store:
+            found = store.find_series(camera, series)
+            channels = list(found.head.channels)
+            columns = store.series_columns(found, [*names, *channels])
+        times = columns["frame_time"]
+        chosen = np.ones(len(times), dtype=bool)
+        if until is not None:
+            chosen &= times <= until
+        if since_s is not None and chosen.any():
+            chosen &= times >= times[chosen].max() - since_s
+        rows = np.flatnonzero(chosen)
+        points = max(2, min(points, _MOST_POINTS))
+        bins = np.array_split(rows, min(points, len(rows))) if len(rows) else []
+        averaged = {name: _means(values, bins) for name, values in columns.items()}
+        return {
+            "camera": camera,
+            "series": series,
+            "epochs": len(rows),
+            "per_point": int(max((len(b) for b in bins), default=0)),
+            "channels": channels,
+            **averaged,
+        }
+
+    def events(self, since: float) -> list[dict[str, Any]]:
+        """What happened since a UTC instant, newest first, at most 200."""
+        with Store.open(self._store) as store:
+            found = store.events(since_utc=since)[-200:]
+        return [
+            {"utc": e.utc, "kind": e.kind, "text": e.text, "epoch": e.epoch}
+            for e in reversed(found)
+        ]
+
+    def csv(self, camera: str, series: str) -> Iterator[str]:
+        """A series as CSV: epoch, times, temperatures as read, parameters with sds, status."""
+        with Store.open(self._store) as store:
+            found = store.find_series(camera, series)
+            names = _csv_names(found)
+            columns = store.series_columns(found, names)
+        yield ",".join(names) + "\n"
+        count = len(columns["epoch"])
+        for begin in range(0, count, _ROWS_AT_ONCE):
+            text = io.StringIO()
+            writer = csv.writer(text, lineterminator="\n")
+            part = [columns[name][begin : begin + _ROWS_AT_ONCE].tolist() for name in names]
+            writer.writerows([_cell(value) for value in row] for row in zip(*part, strict=True))
+            yield text.getvalue()
+
+    def require(self, camera: str, series: str) -> None:
+        """Raise StoreError if there is no such series."""
+        with Store.open(self._store) as store:
+            if not camera or not series:
+                raise StoreError("camera and series must both be given")
+            store.find_series(camera, series)
+
+    def _file(self, camera: str, suffix: str) -> bytes:
+        # the name is looked up, never joined as it came
+        if camera not in self.status().get("cameras", {}):
+            raise DataError(f"there is no camera {camera!r}")
+        try:
+            return (self._live / f"{camera}.{suffix}").read_bytes()
+        except OSError as error:
+            raise DataError(f"camera {camera!r} has given nothing yet") from error
+
+
+def _csv_names(series: StoredSeries) -> list[str]:
+    return [
+        "epoch", "frame_time", "temperature_time", *series.head.channels, *PARAMETER_NAMES,
+        *(f"sd_{n}" for n in PARAMETER_NAMES), "sigma0", "n_observations", "n_rejected", "status",
+    ]  # fmt: skip
+
+
+def _cell(value: Any) -> Any:
+    if isinstance(value, float):
+        if value != value:
+            return ""
+        return int(value) if value.is_integer() and abs(value) < 1e9 else repr(value)
+    return value
+
+
+def _means(values: NDArray[Any], bins: list[NDArray[np.int64]]) -> list[float | None]:
+    result: list[float | None] = []
+    for rows in bins:
+        part = values[rows]
+        good = part[np.isfinite(part)]
+        result.append(float(good.mean()) if len(good) else None)
+    return result

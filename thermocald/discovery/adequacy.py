@@ -57,7 +57,8 @@ def cosines(times: Array, orders: int) -> Array:
     """Smooth courses (orders, E) over a series, order 1 being half a wave."""
     u = (times - times[0]) / max(float(times[-1] - times[0]), 1e-9)
     rows: Array = np.cos(np.pi * np.arange(1, orders + 1)[:, None] * u[None])
-    return rows - rows.mean(axis=1, keepdims=True)
+    rows -= rows.mean(axis=1, keepdims=True)
+    return rows
 
 
 def examine(laboratory: Laboratory, fit: Fit, series: int, inflation: float = 1.0) -> Adequacy:

@@ -91,8 +91,7 @@ def candidates(series: Sequence[Evidence]) -> list[Candidate]:
             channels = [
                 (("channel", c),)
                 for c in first.history.readings
-                if c != first.history.reference
-                and all(_varies(e, c) for e in series)
+                if c != first.history.reference and all(_varies(e, c) for e in series)
             ]
         for fixed in channels:
             for way in ways:

@@ -207,9 +207,7 @@ def _instruments(
 ) -> tuple[Array, dict[str, Channel]]:
     """All columns on common knots: the readings' instants and the latent ones of each column."""
     latent = {name: latent_times(times, r, resolutions.get(name)) for name, r in readings.items()}
-    knots, first = np.unique(
-        np.concatenate([times, *latent.values()]), return_index=True
-    )
+    knots, first = np.unique(np.concatenate([times, *latent.values()]), return_index=True)
     from_reading = first < len(times)
     channels = {}
     for name, r in readings.items():
@@ -282,26 +280,25 @@ def _require(source: SeriesInput) -> None:
 def _running_median(values: Array, width: int = 5) -> Array:
     """Median over time (axis 0) of up to `width` neighbours, NaN ignored."""
     half = width // 2
-    padded = np.pad(
-        values, ((half, half), *((0, 0),) * (values.ndim - 1)), constant_values=np.nan
-    )
+    padded = np.pad(values, ((half, half), *((0, 0),) * (values.ndim - 1)), constant_values=np.nan)
     stack = np.stack([padded[k : k + len(values)] for k in range(width)])
     stack.sort(axis=0)  # NaN go to the end
     count = np.isfinite(stack).sum(axis=0)
     low = np.maximum(count - 1, 0) // 2
     high = np.minimum(count // 2, width - 1)
     pick = np.take_along_axis
-    return 0.5 * (pick(stack, low[None], 0)[0] + pick(stack, high[None], 0)[0])
+    middle: Array = 0.5 * (pick(stack, low[None], 0)[0] + pick(stack, high[None], 0)[0])
+    return middle
 
 
-def _spikes(l: Array, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _spikes(misclosure: Array, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Points that leap out of their own neighbours in time while the others do not.
 
     Found before any adjustment, where a gross error of many pixels would hide itself and others.
     """
     import warnings
 
-    d = l - _running_median(l)
+    d = misclosure - _running_median(misclosure)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         d = d - np.nanmedian(d, axis=1, keepdims=True)  # the whole image may move
@@ -338,15 +335,15 @@ def _adjusted(source: SeriesInput) -> Partials:
     weight[rows] = 1.0
     at = linearise(source.sensor, source.field, p[:10], p[10:])
     for _ in range(15):
-        l = np.where(weight[:, None] > 0, mean - at.predicted, 0.0)
-        l = np.nan_to_num(l)
-        size = np.linalg.norm(l, axis=1)
+        misclosure = np.where(weight[:, None] > 0, mean - at.predicted, 0.0)
+        misclosure = np.nan_to_num(misclosure)
+        size = np.linalg.norm(misclosure, axis=1)
         spread = max(1.5 * float(np.median(size[rows])), 1e-3)
         w = weight / np.maximum(size / (2 * spread), 1.0) / spread**2
         A = at.A.reshape(-1, 16)
         W = np.repeat(w, 2)
         N = A.T @ (A * W[:, None]) + np.diag(1.0 / prior**2)
-        right = A.T @ (W * l.ravel()) + (start - p) / prior**2
+        right = A.T @ (W * misclosure.ravel()) + (start - p) / prior**2
         d = np.sqrt(np.diag(N))
         step = np.linalg.solve(N / np.outer(d, d) + 1e-12 * np.eye(16), right / d) / d
         p = p + step
@@ -359,8 +356,7 @@ def _adjusted(source: SeriesInput) -> Partials:
 def _solve(N: Array, b: Array) -> Array:
     """Batched solution; a camera of too few targets is held by a weak prior of 1000 px."""
     k = N.shape[-1]
-    result: Array = np.linalg.solve(N + 1e-6 * np.eye(k), b[..., None])[..., 0]
-    return result
+    return np.asarray(np.linalg.solve(N + 1e-6 * np.eye(k), b[..., None])[..., 0], dtype=float)
 
 
 def _reduce(
@@ -377,20 +373,20 @@ def _reduce(
     if scale is None:
         scale = np.sqrt(np.mean(np.sum(A[used] ** 2, axis=1), axis=0))
     A = A / scale
-    l = source.grid.points - at.predicted
+    misclosure = source.grid.points - at.predicted
     weights = source.grid.weights
     seen = source.grid.observed
-    bad = _spikes(l, seen)
+    bad = _spikes(misclosure, seen)
     offsets = np.zeros((len(X), 2))
     values = np.zeros((len(times), len(scale)))
-    v = l
-    s0 = 1.0
+    v = misclosure
+    s0: float = 1.0
     for turn in range(5):
         w = np.where(bad[..., None], 0.0, weights)
         N = normal_matrices(w, A)
-        b, _ = right_hand_sides(w, l - offsets, A)
+        b, _ = right_hand_sides(w, misclosure - offsets, A)
         values = _solve(N, b)
-        v = l - offsets - (values @ A.reshape(-1, len(scale)).T).reshape(l.shape)
+        v = misclosure - offsets - (values @ A.reshape(-1, len(scale)).T).reshape(misclosure.shape)
         # the offset of a target: the mean of its residuals over the series
         share = w[..., :2]
         total = share.sum(axis=0)
@@ -411,7 +407,7 @@ def _reduce(
             bad = seen & (outlying > limit)
     w = np.where(bad[..., None], 0.0, weights)
     N = normal_matrices(w, A)
-    b, lPl = right_hand_sides(w, l - offsets, A)
+    b, lPl = right_hand_sides(w, misclosure - offsets, A)
     values = _solve(N, b)
     yy = np.einsum("ek,ek->e", values, b)
     count = (seen & ~bad).sum(axis=1)
@@ -421,7 +417,7 @@ def _reduce(
     sigma0 = np.sqrt(np.maximum(lPl - yy, 0) / free / loss)
     enough = count >= _MIN_TARGETS
     variance = float(np.median(sigma0[enough]) ** 2)
-    v = l - offsets - (values @ A.reshape(-1, len(scale)).T).reshape(l.shape)
+    v = misclosure - offsets - (values @ A.reshape(-1, len(scale)).T).reshape(misclosure.shape)
     v = np.where((seen & ~bad)[..., None], v, np.nan)
     weak = ~enough
     N[weak], b[weak], yy[weak], count[weak] = 0.0, 0.0, 0.0, 0

@@ -109,7 +109,7 @@ def examine_series(
         best, seen = _contest(search, best, seen)
     adequacy = _adequacies(laboratory, best)
     adequate = _adequate(adequacy, base_adequacy)
-    rivals = []
+    rivals: list[Solution] = []
     for s in sorted(seen, key=lambda s: s.score):
         different = sorted(s.names) != sorted(best.names)
         if different and s.score < best.score + BAND and s.names not in [r.names for r in rivals]:
@@ -198,8 +198,7 @@ def _frontier(grown: list[Solution], width: int = 4) -> list[Solution]:
 
 def _adequacies(laboratory: Laboratory, solution: Solution) -> tuple[Adequacy, ...]:
     return tuple(
-        examine(laboratory, solution.fit, s, e.correlation)
-        for s, e in enumerate(laboratory.series)
+        examine(laboratory, solution.fit, s, e.correlation) for s, e in enumerate(laboratory.series)
     )
 
 

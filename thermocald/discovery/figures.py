@@ -72,9 +72,7 @@ def misfit_map(discovery: Discovery) -> str:
         drawn.append((misfit, arrows))
         top = max(top, float(misfit.max()))
     length = max(float(np.linalg.norm(drawn[0][1], axis=1).max()), 1e-9)
-    for axis, (misfit, arrows), title in zip(
-        axes, drawn, ("before", "after"), strict=True
-    ):
+    for axis, (misfit, arrows), title in zip(axes, drawn, ("before", "after"), strict=True):
         points = axis.scatter(*places.T, c=misfit, cmap="viridis", vmin=0, vmax=top, s=18)
         scale = length / (0.08 * e.source.sensor.width)
         axis.quiver(

@@ -1,13 +1,14 @@
 """The gap between simulation and measurement, as CONVENTIONS §4 prints it.
 
-rms_px: image points measured minus simulated. chi2_reduced: the same over its noise, image noise and
-what the thermometers' noise does to the prediction; 1 is the floor. object_mm_at_10m: rms_px on a
-plane at 10 m.
+rms_px: image points measured minus simulated. chi2_reduced: the same over its noise, image noise
+and what the thermometers' noise does to the prediction; 1 is the floor. object_mm_at_10m: rms_px
+on a plane at 10 m.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -50,10 +51,10 @@ class Gap:
 def fit_first(laboratory: Laboratory, terms: Sequence[Term]) -> Fit:
     """Fit a hypothesis to the first series alone and carry its constants to the others."""
     fit = laboratory.refine(laboratory.fit(terms, only=[0]), only=[0])
-    return carried_over(laboratory, fit)
+    return carried_over(fit)
 
 
-def carried_over(laboratory: Laboratory, fit: Fit) -> Fit:
+def carried_over(fit: Fit) -> Fit:
     """Constants as the first series gave them; what a series has of its own is estimated anew.
 
     Of an oscillation that is the phase, of a slip its instant and height.
@@ -159,8 +160,8 @@ def _moved(evidence: Evidence, displaced: Sequence[Displaced], known: bool) -> t
     weight = float(np.mean(w[w > 0]))
     for group in displaced:
         A = evidence.columns[group.rows]
-        l = evidence.source.grid.points[:, group.rows] - evidence.at.predicted[group.rows]
-        v = l - np.einsum("ek,tik->eti", evidence.values, A)
+        misclosure = evidence.source.grid.points[:, group.rows] - evidence.at.predicted[group.rows]
+        v = misclosure - np.einsum("ek,tik->eti", evidence.values, A)
         after = evidence.times >= group.time
         if known:
             v = np.where(after[:, None, None], v - group.steps, v)
@@ -182,7 +183,7 @@ def left_out(laboratory: Laboratory, fit: Fit, blocks: int = 6) -> tuple[float, 
     e = laboratory.series[0]
     edges = np.linspace(0, len(e.times), blocks + 1).astype(int)
     outside = inside = 0.0
-    for begin, end in zip(edges[:-1], edges[1:], strict=True):
+    for begin, end in pairwise(edges):
         block = np.zeros(len(e.times), dtype=bool)
         block[begin:end] = True
         x = Laboratory([_only(e, ~block)])

@@ -17,7 +17,7 @@ from thermocald.discovery.likelihood import Carried, Reduced, Weighting, prepare
 from thermocald.simulation import effects as catalogue
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
     from scipy.sparse import csr_array
@@ -281,8 +281,8 @@ class Laboratory:
             if operator is not None and d.any():
                 unresolved = None
                 if block.term >= 0 and terms[block.term].effect == "thermal_gradient":
-                    unresolved = self.series[series].channels[channel].slope_jump(
-                        self.series[series].times
+                    unresolved = (
+                        self.series[series].channels[channel].slope_jump(self.series[series].times)
                     )
                 carried.append(Carried(d, operator, channel, unresolved))
         return prepare(self.series[series], carried, self.thermometer_factor)
@@ -411,9 +411,7 @@ class Laboratory:
             g += T.T @ (joint.c - joint.A @ at)
         return A, g, searched
 
-    def refine(
-        self, fit: Fit, turns: int = 6, only: Sequence[int] | None = None
-    ) -> Fit:
+    def refine(self, fit: Fit, turns: int = 6, only: Sequence[int] | None = None) -> Fit:
         """Gauss-Newton on the non-linear parameters; never makes the objective worse."""
         searched = self.searched(fit.terms)
         if searched:
@@ -449,7 +447,9 @@ def _bounded(effect: str, name: str, old: float, new: float) -> float:
     parameter = catalogue.get(effect).nonlinear[name]
     if parameter.log:
         # the bounds are of what a simulation makes sense of; data may ask for less
-        return float(np.clip(np.clip(new, old / 2.0, old * 2.0), 0.1 * parameter.low, parameter.high))
+        return float(
+            np.clip(np.clip(new, old / 2.0, old * 2.0), 0.1 * parameter.low, parameter.high)
+        )
     return float(np.clip(new, parameter.low, parameter.high))
 
 

@@ -127,8 +127,8 @@ def _grouped(cleaned: Evidence, found: dict[int, tuple[int, float]]) -> list[Dis
     """Measure the steps against the camera that the other targets give; one group per instant."""
     rows = np.array(sorted(found))
     A = cleaned.columns[rows]
-    l = cleaned.source.grid.points[:, rows] - cleaned.at.predicted[rows]
-    v = l - np.einsum("ek,tik->eti", cleaned.values, A)
+    misclosure = cleaned.source.grid.points[:, rows] - cleaned.at.predicted[rows]
+    v = misclosure - np.einsum("ek,tik->eti", cleaned.values, A)
     w = cleaned.weights[..., 0]
     sigma = float(1.0 / np.sqrt(np.mean(w[w > 0])))
     v = np.where(np.abs(v - np.nanmedian(v, axis=0)).max(axis=2, keepdims=True) < 1e6, v, np.nan)
@@ -159,9 +159,11 @@ def _grouped(cleaned: Evidence, found: dict[int, tuple[int, float]]) -> list[Dis
                 rows[group],
                 float(0.5 * (t[first - 1] + t[first])),
                 float((t[first] - t[first - 1]) / np.sqrt(12.0)),
-                np.array(vectors), np.array(sds), np.array(steps),
+                np.array(vectors),
+                np.array(sds),
+                np.array(steps),
                 sum(found[int(rows[k])][1] for k in group),
-            )  # fmt: skip
+            )
         )
     return out
 

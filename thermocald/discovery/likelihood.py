@@ -73,9 +73,11 @@ class Weighting:
 
         assert self.factor is not None
         total: Array | float = 0.0
-        for O, dN in zip(self.operators, self.dN, strict=True):
-            total = total + O.T @ ((dN @ directions) * courses)
-        out: Array = solve_triangular(self.factor, np.asarray(total), lower=True, check_finite=False)
+        for operator, dN in zip(self.operators, self.dN, strict=True):
+            total = total + operator.T @ ((dN @ directions) * courses)
+        out: Array = solve_triangular(
+            self.factor, np.asarray(total), lower=True, check_finite=False
+        )
         return out
 
     def reduce(self, courses: Array, directions: Array) -> Reduced:
@@ -118,20 +120,20 @@ class Weighting:
         A = (pairs.T @ VNV.reshape(E, -1)).reshape(G, m, m, k, k)
         A = A.transpose(0, 1, 3, 2, 4).reshape(G, m * k, m * k)
         c = (s.T @ (self.b @ directions)).reshape(G, m * k)
-        K = (s.T @ NV.reshape(E, -1)).reshape(G * m, P, k)
-        K = K.transpose(1, 0, 2).reshape(P, G * m * k)
+        by_course = (s.T @ NV.reshape(E, -1)).reshape(G * m, P, k)
+        K: Array = by_course.transpose(1, 0, 2).reshape(P, G * m * k)
         Cb, Vb = base
         R = Cb.shape[1]
-        cross_weights = np.einsum("epa,pr,er->ear", NV, Vb, Cb, optimize=True)
+        cross_weights: Array = np.einsum("epa,pr,er->ear", NV, Vb, Cb, optimize=True)
         B = (s.T @ cross_weights.reshape(E, -1)).reshape(G, m * k, R)
         Kb = np.einsum("epq,qi,ei->pi", self.N, Vb, Cb, optimize=True)
         U = None
         if self.factor is not None:
             total = np.zeros((self.operators[0].shape[1], G * m, k))
-            for O, dN in zip(self.operators, self.dN, strict=True):
+            for operator, dN in zip(self.operators, self.dN, strict=True):
                 h = dN @ directions
                 for a in range(k):
-                    total[:, :, a] += O.T @ (s * h[:, a : a + 1])
+                    total[:, :, a] += operator.T @ (s * h[:, a : a + 1])
             U = solve_triangular(
                 self.factor, total.reshape(len(total), -1), lower=True, check_finite=False
             )
@@ -176,9 +178,7 @@ def prepare(
     k0, N0 = b.sum(axis=0), N.sum(axis=0)
     if not carried:
         F = _level_factor(N0)
-        return Weighting(
-            N, b, yy, 0.0, (), (), None, np.zeros(0), np.zeros((0, P)), N0, k0, F
-        )
+        return Weighting(N, b, yy, 0.0, (), (), None, np.zeros(0), np.zeros((0, P)), N0, k0, F)
     names = list(dict.fromkeys(c.channel for c in carried))
     sizes = [len(evidence.state_sd(n)) for n in names]
     starts = np.concatenate([[0], np.cumsum(sizes)])
@@ -186,17 +186,17 @@ def prepare(
     deviation = np.concatenate([evidence.state_deviation(n) for n in names])
     operators = []
     for item in carried:
-        O = np.zeros((len(N), starts[-1]))
+        operator = np.zeros((len(N), starts[-1]))
         i = names.index(item.channel)
-        O[:, starts[i] : starts[i + 1]] = item.operator
-        operators.append(O)
+        operator[:, starts[i] : starts[i + 1]] = item.operator
+        operators.append(operator)
     N, b, yy, logdet = _blurred(N, b, yy, carried)
     N0 = N.sum(axis=0)
     dN = [np.einsum("p,epq->eq", item.direction, N) for item in carried]
     # the readings' own deviation from the smooth course, carried to the camera
     shift = np.zeros((len(N), P))
-    for item, O in zip(carried, operators, strict=True):
-        shift += np.outer(O @ deviation, item.direction)
+    for item, operator in zip(carried, operators, strict=True):
+        shift += np.outer(operator @ deviation, item.direction)
     Nshift = np.einsum("epq,eq->ep", N, shift)
     yy = yy - 2 * float(np.sum(shift * b)) + float(np.sum(shift * Nshift))
     b = b - Nshift
@@ -213,9 +213,9 @@ def prepare(
     factor = cholesky(M, lower=True, check_finite=False)
     logdet += 2 * float(np.sum(np.log(np.diag(factor)))) + 2 * float(np.sum(np.log(sd)))
     right = np.zeros((starts[-1], P + 1))
-    for O, w, item in zip(operators, dN, carried, strict=True):
-        right[:, :P] += O.T @ w
-        right[:, P] += O.T @ (b @ item.direction)
+    for operator, w, item in zip(operators, dN, carried, strict=True):
+        right[:, :P] += operator.T @ w
+        right[:, P] += operator.T @ (b @ item.direction)
     right = solve_triangular(factor, right, lower=True, check_finite=False)
     level, data = right[:, :P], right[:, P]
     N0 = N0 - level.T @ level
@@ -247,5 +247,5 @@ def _blurred(
 
 def _level_factor(N0: Array) -> Array:
     """Cholesky factor; the levels that the field cannot tell apart are held by 1000 px."""
-    factor: Array = np.linalg.cholesky(N0 + 1e-6 * np.eye(len(N0)))
-    return factor
+    factor = np.linalg.cholesky(N0 + 1e-6 * np.eye(len(N0)))
+    return np.asarray(factor, dtype=float)

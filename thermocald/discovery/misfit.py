@@ -68,7 +68,7 @@ def resolve(discovery: Discovery, series: int = 0) -> dict[str, Any]:
         rows.append((f"{column}, slow courses", *against(smooth, one)))
     total = x.base_adequacy[series]
     rows.insert(0, ("all slow courses in all parameters", total.misfit_px, total.significance))
-    rows.append(("noise level (sigma0)", *_noise(e.sigma0, e.n, e.N.shape[1])))
+    rows.append(("noise level (sigma0)", *_noise(e.sigma0, e.n.astype(float), e.N.shape[1])))
     return {"rows": rows, "targets": _targets(discovery, series), "regions": _regions(e, sigma)}
 
 

@@ -98,7 +98,8 @@ def _evidence(discovery: Discovery) -> dict[str, Any]:
         }
         if entry["effect"] == "unnamed":
             out["unnamed"]["note"] = "bridged by a smooth term in M1 alone; not transferable"
-    return _plain(out)
+    plain: dict[str, Any] = _plain(out)
+    return plain
 
 
 def _plain(value: Any) -> Any:

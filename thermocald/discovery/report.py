@@ -15,49 +15,53 @@ if TYPE_CHECKING:
 __all__ = ["report_html"]
 
 _STYLE = """
-body{font:16px/1.5 system-ui,sans-serif;color:#1c2b36;background:#fff;max-width:62rem;margin:2rem auto;padding:0 1rem}
+body{font:16px/1.5 system-ui,sans-serif;color:#1c2b36;background:#fff;max-width:62rem;
+margin:2rem auto;padding:0 1rem}
 h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2.2rem;border-bottom:1px solid #cfd8de}
 .sentence{font-size:1.25rem;border-left:4px solid #c4542b;padding:.4rem 1rem;background:#faf5f2}
-table{border-collapse:collapse;font-size:.9rem;margin:.6rem 0}td,th{padding:.25rem .7rem;text-align:left;border-bottom:1px solid #e3e8ec}
-td.n{text-align:right;font-variant-numeric:tabular-nums}svg{max-width:100%;height:auto}.note{color:#5b6b76;font-size:.9rem}
+table{border-collapse:collapse;font-size:.9rem;margin:.6rem 0}
+td,th{padding:.25rem .7rem;text-align:left;border-bottom:1px solid #e3e8ec}
+td.n{text-align:right;font-variant-numeric:tabular-nums}svg{max-width:100%;height:auto}
+.note{color:#5b6b76;font-size:.9rem}
 """
 _VERDICTS = {
     "adequate": "The model reproduces the recording within its noise: nothing is missing that "
     "this recording could show.",
-    "effects_found": "The base model does not reproduce the recording; with what was found it does.",
-    "unexplained": "The base model does not reproduce the recording, and no effect of the catalogue "
-    "explains why.",
+    "effects_found": "The base model does not reproduce the recording; "
+    "with what was found it does.",
+    "unexplained": "The base model does not reproduce the recording, "
+    "and no effect of the catalogue explains why.",
 }
 
 
 def report_html(discovery: Discovery, title: str) -> str:
     """The whole page."""
     parts = [
-        "<!doctype html><html lang='en'><head><meta charset='utf-8'>"
-        "<meta name='viewport' content='width=device-width,initial-scale=1'>"
-        f"<title>Discovery: {escape(title)}</title><style>{_STYLE}</style></head><body>",
+        (
+            "<!doctype html><html lang='en'><head><meta charset='utf-8'>"
+            "<meta name='viewport' content='width=device-width,initial-scale=1'>"
+            f"<title>Discovery: {escape(title)}</title><style>{_STYLE}</style></head><body>"
+        ),
         f"<h1>Discovery: {escape(title)}</h1>",
     ]
-    for effect in discovery.effects:
-        parts.append(f"<p class='sentence'>{escape(effect.statement)}</p>")
+    parts += [f"<p class='sentence'>{escape(e.statement)}</p>" for e in discovery.effects]
     parts.append(f"<p>{escape(_VERDICTS[discovery.verdict])}</p>")
     parts.append("<h2>The gap</h2>" + _gaps(discovery) + figures.staircase(discovery))
-    for effect in discovery.effects:
-        parts.append(_effect(effect))
+    parts += [_effect(e) for e in discovery.effects]
     parts.append("<h2>The signature</h2>" + figures.signature(discovery))
     parts.append(
         "<h2>Where simulation and measurement disagree</h2>"
         + figures.misfit_map(discovery)
-        + "<p class='note'>Colour: what the model leaves of each target over the series. Arrows: its "
-        "strongest pattern. M1.</p>"
+        + "<p class='note'>Colour: what the model leaves of each target over the series. "
+        "Arrows: its strongest pattern. M1.</p>"
         + _where(discovery)
         + figures.misfit_matrix(discovery)
     )
     parts.append(
         "<h2>All candidates, alone</h2>"
         + figures.ranking(discovery)
-        + "<p class='note'>Improvement of −2 log L less the penalty for what was searched. Candidates "
-        "that promise nothing are not drawn.</p>"
+        + "<p class='note'>Improvement of −2 log L less the penalty for what was searched. "
+        "Candidates that promise nothing are not drawn.</p>"
     )
     parts.append("</body></html>")
     return "".join(parts)
@@ -86,8 +90,8 @@ def _gaps(discovery: Discovery) -> str:
     outside, inside = discovery.left_out
     if outside == outside:  # a number
         text += (
-            f"<p>On blocks of M1 left out of the fit, χ² of the parameters per degree of freedom is "
-            f"{outside:.3f}; fitted with them {inside:.3f}.</p>"
+            "<p>On blocks of M1 left out of the fit, χ² of the parameters per degree of freedom "
+            f"is {outside:.3f}; fitted with them {inside:.3f}.</p>"
         )
     if discovery.stages[0].verify is None:
         text += "<p class='note'>No M2 was given: the constants are not verified.</p>"
@@ -120,8 +124,8 @@ def _effect(effect: EffectFound) -> str:
         text += "</ul>"
     if alike:
         text += (
-            f"<p>Effects that merely resemble it: {escape(', '.join(alike))}. None passes the "
-            "absolute test. The smooth bridge in M1 does not transfer to another series.</p>"
+            f"<p>Effects that merely resemble it: {escape(', '.join(alike))}. None passes "
+            "the absolute test. The smooth bridge in M1 does not transfer to another series.</p>"
         )
     return text
 

@@ -199,8 +199,10 @@ def _image_space(x: Examination, fit: Fit) -> list[EffectFound]:
                     ],
                     "note": "displacements are across the rays; along them one camera sees nothing",
                 },
-                [], zero, zero,
-            )  # fmt: skip
+                [],
+                zero,
+                zero,
+            )
         )
     if x.defocus:
         estimates = growth_estimates(x.defocus)
@@ -219,15 +221,15 @@ def _image_space(x: Examination, fit: Fit) -> list[EffectFound]:
                     "next_best_course": x.defocus.other,
                     "next_best_gain": x.defocus.other_gain,
                 },
-                [], zero, zero,
-            )  # fmt: skip
+                [],
+                zero,
+                zero,
+            )
         )
     return out
 
 
-def _entry(
-    x: Examination, fit: Fit, k: int, before: Gap, after: Gap, first: bool
-) -> EffectFound:
+def _entry(x: Examination, fit: Fit, k: int, before: Gap, after: Gap, first: bool) -> EffectFound:
     term = fit.terms[k]
     e = x.laboratory.series[0]
     effect = catalogue.get(term.effect)
@@ -295,9 +297,7 @@ def _alternative(
     name: str, rival: Solution, instead: list[str], difference: float
 ) -> dict[str, Any]:
     effect = catalogue.get(name)
-    searched = {
-        k: v for t in rival.terms if t.effect in instead for k, v in t.nonlinear
-    }
+    searched = {k: v for t in rival.terms if t.effect in instead for k, v in t.nonlinear}
     return {
         "effect": "+".join(instead),
         "score_difference": float(difference),

@@ -88,7 +88,9 @@ class Search:
         """The base model, with the effects that a model has already, fitted."""
         if not given:
             return Solution(self.laboratory.fit(()), ())
-        terms = tuple(_given_term(name, values, len(self.laboratory.series)) for name, values in given)
+        terms = tuple(
+            _given_term(name, values, len(self.laboratory.series)) for name, values in given
+        )
         return Solution(self.laboratory.refine(self.laboratory.fit(terms)), (0.0,) * len(terms))
 
     # -- scanning --------------------------------------------------------------------------
@@ -111,8 +113,8 @@ class Search:
                 rows.append(laboratory.drive_course([*drives, term], series)[:, None])
             else:
                 rows.append(laboratory.courses(term, series, operators=False)[0])
-        stack = np.stack(rows)
-        stack = stack - stack.mean(axis=1, keepdims=True)
+        stack: Array = np.stack(rows)
+        stack -= stack.mean(axis=1, keepdims=True)
         if not (candidate.is_drive and drives):
             self._courses[key] = stack
         return stack
@@ -299,9 +301,10 @@ def _solve(A: Array, right: Array) -> Array:
     if not len(A):
         return np.zeros((0, right.shape[1]))
     d = np.sqrt(np.maximum(np.diag(A), 1e-300))
-    x: Array = np.linalg.solve(
-        A / np.outer(d, d) + 1e-12 * np.eye(len(A)), right / d[:, None]
-    ) / d[:, None]
+    x: Array = (
+        np.linalg.solve(A / np.outer(d, d) + 1e-12 * np.eye(len(A)), right / d[:, None])
+        / d[:, None]
+    )
     return x
 
 

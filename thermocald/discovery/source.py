@@ -30,9 +30,7 @@ def series_input(recording: Recording) -> SeriesInput:
     observations = [e.observations for e in recording.epochs]
     camera = recording.camera
     readings = {
-        name: values
-        for name, values in columns.temperatures.items()
-        if name in recording.channels
+        name: values for name, values in columns.temperatures.items() if name in recording.channels
     }
     return SeriesInput(
         name=f"{recording.path}",
@@ -49,9 +47,7 @@ def series_input(recording: Recording) -> SeriesInput:
     )
 
 
-def load_pair(
-    first: Path, second: Path | None, say: Callable[[str], None]
-) -> list[SeriesInput]:
+def load_pair(first: Path, second: Path | None, say: Callable[[str], None]) -> list[SeriesInput]:
     """Read M1, and M2 where it is given; refuses an M2 of another camera or thermometer."""
     from thermocald.store.recording import read_recording
 

@@ -62,12 +62,13 @@ def reading_noise(readings: Array, resolution: float | None) -> float:
     """Standard deviation in K of one reading, quantisation included.
 
     From third differences, cut at 2.2 sigma again and again, so that a switched lamp, which spoils
-    four of them, does not count as noise. A thermometer that repeats one step for long has the error of the step.
+    four of them, does not count as noise. A thermometer that repeats one step for long has the
+    error of the step.
     """
     values = readings[np.isfinite(readings)]
     floor = (resolution or 0.0) / np.sqrt(12.0)
     if len(values) < 8:
-        return max(floor, 1e-6)
+        return max(float(floor), 1e-6)
     d = np.convolve(values, _THIRD, mode="valid")
     kept = np.ones(len(d), dtype=bool)
     scale = 0.0
@@ -79,7 +80,7 @@ def reading_noise(readings: Array, resolution: float | None) -> float:
             break
         kept = now
     noise = scale / np.sqrt(20.0)
-    return max(noise, floor, 1e-6)
+    return float(max(noise, floor, 1e-6))
 
 
 def latent_times(times: Array, readings: Array, resolution: float | None) -> Array:
@@ -110,7 +111,7 @@ def _bends(t: Array, y: Array, noise: float) -> tuple[Array, float]:
 
 
 def smooth_channel(
-    times: Array, readings: Array, latent: Array, resolution: float | None
+    times: Array, readings: Array, latent: NDArray[np.bool_], resolution: float | None
 ) -> Channel:
     """One temperature column on knots: its instants, those of others (NaN), and its latent ones.
 

@@ -49,6 +49,8 @@ class Station:
         )
         run("systemctl start mosquitto", timeout_s=60)
         self.feed()
+        probe = "/opt/thermocald/bin/thermocald check /etc/thermocald/config.yaml --probe --json -"
+        self.probed = json.loads(run(f"{probe} 2>/dev/null", timeout_s=240).stdout)
         run("systemctl start thermocald", timeout_s=240)
 
     def feed(self):
@@ -140,6 +142,18 @@ def series(station):
         ).stdout
     )
     return stored, log, offset
+
+
+def test_the_probe_shows_one_of_each(station, report):
+    """`thermocald check config.yaml --probe`, before the daemon takes the devices."""
+    probes = {probe["name"]: probe for probe in station.probed["probes"]}
+    assert {name for name, probe in probes.items() if probe["error"]} == set()
+    assert probes["river"]["values"]["width_px"] == SIZE[0]
+    assert probes["yard"]["values"]["height_px"] == 360
+    assert probes["lens"]["values"] == {"temperature_c": 25.0}
+    assert probes["line"]["values"] == {"temperature_c": 21.25}
+    took = ", ".join(f"{name} {1e3 * probe['took_s']:.0f} ms" for name, probe in probes.items())
+    report(f"thermocald check --probe, trigger to frame and read to value: {took}")
 
 
 def test_sixty_epochs_of_frames_and_times(series, report):

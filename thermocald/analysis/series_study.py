@@ -41,7 +41,7 @@ __all__ = [
     "study_series",
 ]
 
-_COURSE = 1000
+_COURSE = 500
 _GAP_IN_INTERVALS = 1.5
 _LEAST_DEPENDENCE = 4
 

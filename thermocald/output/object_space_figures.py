@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["error_figure", "point_figure"]
 
-_DRAWN = 600
+_DRAWN = 400
 
 
 def error_figure(camera: CameraStudy) -> Figure | None:

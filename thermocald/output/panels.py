@@ -21,8 +21,8 @@ __all__ = ["PALETTE", "Curve", "Figure", "Panel", "document", "thin"]
 
 # Colour-blind safe (Okabe & Ito 2008), dark enough for thin lines on white paper.
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
-_MOST_POINTS = 1200
-_DIGITS = 6
+_MOST_POINTS = 800
+_DIGITS = 5
 
 
 @dataclass(frozen=True, eq=False)

@@ -315,7 +315,7 @@ def _dependence_curves(study: SeriesStudy, name: str, scale: float, colour: str)
     t, v = temperature[rows], value[rows]
     ends = np.array([t.min(), t.max()])
     slope = scale * study.channels[0].dependences[name].slope
-    shown = np.unique(np.linspace(0, len(t) - 1, min(len(t), 800)).astype(int))
+    shown = np.unique(np.linspace(0, len(t) - 1, min(len(t), 400)).astype(int))
     return [
         Curve(s.name, t[shown], v[shown], "points", colour),
         Curve("", ends, v.mean() + slope * (ends - t.mean()), "line", colour),

@@ -71,7 +71,7 @@ class Station:
         return json.loads(out.strip().splitlines()[-1])
 
     def status(self):
-        out = self.machine.wait(f"cat {'/var/lib/thermocald/thermocald.db.live/status.json'}", 60)
+        out = self.machine.wait("cat /run/thermocald/status.json", 60)
         return json.loads(out)
 
     def until(self, condition, what, timeout_s=180.0):

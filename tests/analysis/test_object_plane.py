@@ -1,0 +1,64 @@
+"""Points on the object plane: analytic derivatives against differences, the law of distances."""
+
+import numpy as np
+import pytest
+
+from thermocald.analysis.object_plane import (
+    DistanceLaw,
+    image_raster,
+    on_plane,
+    plane_jacobian,
+    propagate,
+)
+from thermocald.photogrammetry.camera_model import Sensor
+
+SENSOR = Sensor(3264, 2448, 0.0014)
+IOP = np.array([3.97, 0.021, -0.034, 0.0051, -4e-4, 1e-5, 1.2e-4, -0.9e-4, 1e-4, -2e-4])
+STEPS = np.array([1e-4, 1e-4, 1e-4, 1e-5, 1e-6, 1e-7, 1e-6, 1e-6, 1e-5, 1e-5])
+
+
+def test_raster_goes_from_corner_to_corner():
+    points = image_raster(SENSOR)
+    np.testing.assert_array_equal(points[[0, 4, 8]], [[0, 0], SENSOR.centre, [3263, 2447]])
+
+
+def test_jacobian_is_that_of_differences():
+    points = image_raster(SENSOR)
+    jacobian = plane_jacobian(SENSOR, IOP, points, 1e4)
+    for k, step in enumerate(STEPS):
+        change = np.zeros(10)
+        change[k] = step
+        difference = (
+            on_plane(SENSOR, IOP + change, points, 1e4)
+            - on_plane(SENSOR, IOP - change, points, 1e4)
+        ) / (2 * step)
+        scale = np.abs(difference).max()
+        np.testing.assert_allclose(jacobian[:, :, k], difference, atol=1e-5 * scale)
+
+
+@pytest.mark.parametrize("axes", [(3.0, 3.0), (3.0, 1.0), (3.0, 0.0)])
+def test_law_of_distances_is_that_of_a_million_draws(axes):
+    rng = np.random.default_rng(1)
+    distance = np.linalg.norm(rng.standard_normal((1_000_000, 2)) * axes, axis=1)
+    law = DistanceLaw(np.array([axes]))
+    assert law.mean()[0] == pytest.approx(distance.mean(), rel=3e-3)
+    limits = np.array([1.0, 3.0, 6.0])
+    shares = [(distance < limit).mean() for limit in limits]
+    np.testing.assert_allclose(law.cumulative(limits)[0], shares, atol=2e-3)
+    largest = distance[:1_000_000].reshape(200, 5000).max(axis=1).mean()
+    assert law.expected_maximum(5000)[0] == pytest.approx(largest, rel=0.02)
+
+
+def test_propagation_is_the_scatter_of_small_errors():
+    rng = np.random.default_rng(2)
+    points = image_raster(SENSOR)
+    sds = STEPS * 0.1
+    jacobian = plane_jacobian(SENSOR, IOP, points, 1e4)
+    covariance = propagate(jacobian, np.diag(sds**2))
+    drawn = [
+        on_plane(SENSOR, IOP + sds * rng.standard_normal(10), points, 1e4) for _ in range(4000)
+    ]
+    scatter = np.var(drawn, axis=0, ddof=1)
+    # 4000 draws: a variance is known to 2.2 %.
+    np.testing.assert_allclose(scatter[:, 0], covariance[:, 0, 0], rtol=0.09)
+    np.testing.assert_allclose(scatter[:, 1], covariance[:, 1, 1], rtol=0.09)

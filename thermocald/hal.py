@@ -19,14 +19,14 @@ from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, Literal, Protocol, Self, runtime_checkable
 
-
 from thermocald.errors import ConfigurationError, DriverMissing
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-    import numpy as np
     from collections.abc import Mapping
     from types import TracebackType
+
+    import numpy as np
+    from numpy.typing import NDArray
 
 __all__ = [
     "Camera",
@@ -227,7 +227,8 @@ def load_driver(kind: Kind, name: str) -> type[Any]:
     points = {point.name: point for point in entry_points(group=_GROUPS[kind])}
     if name not in points:
         raise ConfigurationError(
-            f"there is no {kind} driver {name!r}; installed are: {', '.join(sorted(points)) or 'none'}"
+            f"there is no {kind} driver {name!r}; installed are: "
+            f"{', '.join(sorted(points)) or 'none'}"
         )
     try:
         loaded: type[Any] = points[name].load()

@@ -92,10 +92,10 @@ def _recording(path: Path) -> dict[str, Any]:
 
 def _config(path: Path, probe: bool) -> dict[str, Any]:
     from thermocald.config import load_config
-    from thermocald.hal import load_driver
+    from thermocald.hal import load_driver, option_names
     from thermocald.store.recording import read_testfield
 
-    config = load_config(path)
+    config = load_config(path, option_names)
     lines = [f"{path}: a sound configuration"]
     devices: list[dict[str, Any]] = []
     groups: tuple[tuple[Kind, tuple[DeviceConfig, ...]], ...] = (

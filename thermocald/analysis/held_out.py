@@ -1,8 +1,9 @@
 """How well a thermal model predicts a series that it was not fitted on.
 
-Only the camera's place is estimated anew: one exterior orientation for the whole series. What is
-left of the image points is compared with the noise floor: image noise, and what the thermometer's
-noise does to the prediction.
+Only what belongs to the set-up is estimated anew: one exterior orientation for the whole series,
+and a constant offset per target, since a field's coordinates are not perfect. What is left of the
+image points is compared with the noise floor: image noise, and what the thermometer's noise does to
+the prediction.
 """
 
 from __future__ import annotations
@@ -66,6 +67,8 @@ def predicted_error(
     here = replace(model, exterior=ExteriorOrientation.from_array(exterior))
     prediction = here.predict(series.history, series.field)
     residuals = series.residuals(prediction)
+    # what is constant over the series is the field's coordinates, and no prediction of a drift
+    residuals = residuals - _mean(residuals)
     variance = _variance(here, series, prediction.noise_factor, thermometer_sd)
     used = np.isfinite(residuals)
     rms = float(np.sqrt(np.mean(residuals[used] ** 2)))
@@ -78,6 +81,14 @@ def predicted_error(
         float(np.mean(inside)),
         rms * scale,
     )
+
+
+def _mean(residuals: Array) -> Array:
+    """Mean over the epochs (T, 2) of what was observed."""
+    seen = np.isfinite(residuals)
+    count = np.maximum(seen.sum(axis=0), 1)
+    total: Array = np.where(seen, residuals, 0.0).sum(axis=0) / count
+    return total
 
 
 def _variance(

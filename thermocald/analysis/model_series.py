@@ -58,10 +58,9 @@ _ROUNDS = 4
 class ModelSeries:
     """One series of one camera, reduced.
 
-    name, camera; sensor; field; grid: the image points without gross errors, in which constant
-    offsets of targets are taken off; start (16,): the linearisation point; N (E, 22, 22),
-    b (E, 22), lPl (E,): normal equations there; count (E,): image points; history: `times` are the
-    frames'; resolution {channel: K}.
+    name, camera; sensor; field; grid: the image points without gross errors; start (16,): the
+    linearisation point; N (E, 22, 22), b (E, 22), lPl (E,): normal equations there; count (E,):
+    image points; history: `times` are the frames'; resolution {channel: K}.
     """
 
     name: str
@@ -85,6 +84,25 @@ class ModelSeries:
         """The same with columns for the displacement of some targets."""
         rows = np.array([self.field.index[t] for t in targets if t in self.field.index], dtype=int)
         return _reduced(self, rows)
+
+    def without_offsets(self, prediction: Prediction, noise: Array | None = None) -> ModelSeries:
+        """The same with what a prediction leaves of each target on average taken off.
+
+        A constant per target is the field's coordinates (or a lens that no polynomial describes),
+        and no drift. Of targets that move, what was before counts. noise (E,): how the epochs
+        weigh in the average.
+        """
+        left = self.residuals(prediction)
+        moving = [d.rows for d in prediction.displacements]
+        for d in prediction.displacements:
+            left[np.ix_(d.active, d.rows)] = np.nan
+        seen = np.isfinite(left)
+        weight = seen if noise is None else seen / noise[:, None, None] ** 2
+        total = np.maximum(weight.sum(axis=0), 1e-300)
+        offsets = (weight * np.where(seen, left, 0.0)).sum(axis=0) / total
+        rows = np.concatenate(moving) if moving else np.zeros(0, dtype=np.int64)
+        grid = ObservationGrid(self.grid.points - offsets, self.grid.weights)
+        return _reduced(replace(self, grid=grid), rows)
 
     def epochs(self, keep: NDArray[np.bool_]) -> ModelSeries:
         """Some of the epochs; the temperature history stays whole."""
@@ -165,7 +183,7 @@ def reduce_series(
     source: str,
     keep_targets: tuple[str, ...] = (),
 ) -> ModelSeries:
-    """Find the mean orientation, the gross errors and the targets' offsets, and reduce every epoch.
+    """Find the mean orientation and the gross errors, and reduce every epoch.
 
     keep_targets: targets that must not be thrown out, because they are thought to move.
     """
@@ -186,8 +204,7 @@ def reduce_series(
     mean = _mean_orientation(sensor, field, grid, interior, exterior)
     at = linearise(sensor, field, mean[:10], mean[10:])
     kept = [field.index[t] for t in keep_targets if t in field.index]
-    offsets, gross = _offsets_and_gross_errors(grid, at, kept)
-    clean = ObservationGrid(grid.points - offsets, grid.weights).reject(gross)
+    clean = grid.reject(_gross_errors(grid, at, kept))
     series = ModelSeries(
         head.series,
         head.camera.name,
@@ -224,14 +241,12 @@ def _mean_orientation(
     return mean
 
 
-def _offsets_and_gross_errors(
-    grid: ObservationGrid, at: Partials, keep: list[int]
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Constant offsets of the targets (T, 2) px, and gross errors (E, T).
+def _gross_errors(grid: ObservationGrid, at: Partials, keep: list[int]) -> NDArray[np.bool_]:
+    """Gross errors (E, T).
 
-    Every epoch is given all 16 parameters of its own. A gross error is beyond 4.5 times the noise
-    of its own epoch: one sigma for all would cut off the tails of epochs that heat defocuses, and
-    make them look better than they are.
+    Every epoch is given all 16 parameters of its own, every target its constant offset. A gross
+    error is beyond 4.5 times the noise of its own epoch: one sigma for all would cut off the tails
+    of epochs that heat defocuses, and make them look better than they are.
     """
     observed = grid.observed
     misclosure = grid.points - at.predicted
@@ -252,8 +267,7 @@ def _offsets_and_gross_errors(
         use[:, keep] = observed[:, keep]
         count = np.maximum(use.sum(axis=0), 1)[:, None]
         offsets = offsets + np.where(use[..., None], left, 0.0).sum(axis=0) / count
-        offsets[keep] = 0.0  # what moves has no constant offset
-    return offsets, observed & ~use
+    return observed & ~use
 
 
 def _reduced(series: ModelSeries, displaced: NDArray[np.int64]) -> ModelSeries:

@@ -57,6 +57,7 @@ class Share:
     C: Array
     variance: float
     error_sd: float
+    before: Array
 
     def settle(
         self, step: Array, Q: Array, noise: Array | None = None
@@ -65,10 +66,11 @@ class Share:
         if self.inverse is None:
             return self._image_cost(self.delta + self.J @ step, noise), np.zeros(0), 0.0
         solve = self.inverse
-        errors = solve(self.h - self.C.T @ step)
+        change = solve(self.h - self.C.T @ step)
+        errors = self.before + change
         delta = self.delta + self.J @ step
         for c, S in self.operators:
-            delta = delta + (S @ errors)[:, None] * c
+            delta = delta + (S @ change)[:, None] * c
         probes = np.random.default_rng(0).choice([-1.0, 1.0], (len(self.h), _PROBES))
         back = solve(probes)
         trace = float(np.sum(probes * back)) / _PROBES
@@ -196,7 +198,8 @@ def error_operators(
             else:
                 weights[19 + _SHIFT_NAMES.index(key)] = value
         found.append((weights, kind.channel(history, **nonlinear), S))
-    channels = list(dict.fromkeys(channel for _, channel, _ in found))
+    # every channel has its place, used or not: errors found in one step are the next one's start
+    channels = list(history.readings)
     empty = csr_array((len(series), len(history.reading_times)))
     return tuple(
         (c, hstack([S if channel == other else empty for other in channels]).tocsr())
@@ -254,11 +257,14 @@ def share(
     variance: float,
     error_sd: float,
     noise: Array | None = None,
+    errors: Array | None = None,
 ) -> Share:
     """The normal equations of one series at the present model.
 
     variance: of unit weight of the image points; error_sd K: of a reading; noise (E,): factor of
-    the image noise of each epoch.
+    the image noise of each epoch; errors (R,) K: what the series' readings were corrected by so
+    far, channel after channel. A course of noisy readings, and most of all its rate, is too rough:
+    coefficients would come out too small if it were not corrected.
     """
     from scipy.sparse import diags_array, eye_array
 
@@ -274,7 +280,7 @@ def share(
     operators = error_operators(series, model)
     if not operators:
         return Share(J, M, g, delta, (), series, None, np.zeros(0), np.zeros((q, 0)),
-                     variance, error_sd)  # fmt: skip
+                     variance, error_sd, np.zeros(0))  # fmt: skip
     readings = operators[0][1].shape[1]
     H = eye_array(readings, format="csc") / error_sd**2
     C, h = np.zeros((q, readings)), np.zeros(readings)
@@ -283,8 +289,10 @@ def share(
         h += S.T @ (gradient @ c)
         for d, R in operators:
             H = H + S.T @ diags_array((N @ d) @ c) @ R
+    before = np.zeros(readings) if errors is None else errors
+    h -= before / error_sd**2
     inverse = _factorised(H)
     solved = inverse(np.column_stack([h, C.T]))
     M = M - C @ solved[:, 1:]
     g = g - C @ solved[:, 0]
-    return Share(J, M, g, delta, operators, series, inverse, h, C, variance, error_sd)
+    return Share(J, M, g, delta, operators, series, inverse, h, C, variance, error_sd, before)

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 __all__ = ["Along", "ExtrapolationWarning", "ThermalCamera"]
 
 _REFUSED_SHARE = 0.5  # of the fitted range of temperature
+_MARGIN_K = 0.25  # what thermometers differ by is no extrapolation
 _CHUNK = 20_000  # instants at a time
 
 
@@ -276,7 +277,7 @@ class ThermalCamera:
         """How many kelvin a temperature lies outside; warns or refuses."""
         assert self._limits is not None
         low, high = self._limits
-        if low <= T <= high:
+        if low - _MARGIN_K <= T <= high + _MARGIN_K:
             return 0.0
         beyond = low - T if low > T else T - high
         far = beyond > _REFUSED_SHARE * max(high - low, 1.0)
@@ -304,6 +305,7 @@ class ThermalCamera:
             return outside
         low, high = self._limits
         outside = np.maximum(np.maximum(low - temperatures, temperatures - high), 0.0)
+        outside[outside <= _MARGIN_K] = 0.0
         worst = float(temperatures[int(np.argmax(outside))])
         # half of a log in fahrenheit may lie inside the range by chance: its middle tells
         middle = float(np.median(temperatures))

@@ -167,6 +167,8 @@ def fit_thermal_model(
     )
     state = _State(model, tuple(s.start[10:].copy() for s in checked), frozenset(fixed))
     fit = _Fit(checked)
+    # while something is missing, a free thermometer noise would take the drift for itself
+    fit.components = not listed
     state = fit.solve(state)
     for effect in listed:
         begun = replace(state.model, effects=(*state.model.effects, _started(effect)))
@@ -175,9 +177,14 @@ def fit_thermal_model(
             state = _searched(checked, state)
     if listed:
         state = fit.solve(state)
+    fit.take_off_offsets(state)
+    fit.components = fit.correcting = True
+    state = fit.solve(state)
     if any(e.name == "defocus" for e in listed):
         for _ in range(3):
-            state = fit.solve(fit.defocus(state))
+            state = fit.defocus(state)
+            fit.take_off_offsets(state)
+            state = fit.solve(state)
     return fit.result(state)
 
 
@@ -201,6 +208,11 @@ def _checked(series: Sequence[ModelSeries], listed: Sequence[ModelEffect]) -> li
         if effect.name == "target_displacement":
             targets = effect.values["targets"]
             moved = (targets,) if isinstance(targets, str) else tuple(targets)
+            if not any(t in first.field.index for t in moved):
+                raise DataError(
+                    f"target_displacement: none of the targets {', '.join(moved) or '(none)'} is "
+                    "in the test field"
+                )
     return [s.displacing(moved) if moved else s for s in series]
 
 
@@ -232,11 +244,14 @@ class _Fit:
     def __init__(self, series: list[ModelSeries]) -> None:
         self.series = series
         self.variance = 1.0
+        self.components = False
         self.error_sds = [
             float(np.hypot(_NOISE_K, s.resolution.get(s.history.reference, 0.0) / np.sqrt(12.0)))
             for s in series
         ]
         self.noise: list[Array | None] = [None] * len(series)
+        self.errors: list[Array | None] = [None] * len(series)
+        self.correcting = False
         self.image_points = 2 * sum(int(s.count.sum()) for s in series)
         self.Q = np.zeros((0, 0))
         self.shares: list[Share] = []
@@ -247,10 +262,12 @@ class _Fit:
         names = state.names
         M, g = np.zeros((len(names), len(names))), np.zeros(len(names))
         self.shares = []
-        for k, s in enumerate(self.series):
-            model = state.of_series(k)
+        for k in range(len(self.series)):
+            s, model = self._corrected(k), state.of_series(k)
             _, J = jacobian(s, model, _FREE_INTERIOR, state.fixed)
-            part = share(s, model, J, self.variance, self.error_sds[k], self.noise[k])
+            part = share(
+                s, model, J, self.variance, self.error_sds[k], self.noise[k], self.errors[k]
+            )
             columns = state.columns(k)
             M[np.ix_(columns, columns)] += part.M
             g[columns] += part.g
@@ -261,6 +278,18 @@ class _Fit:
         self._renew(state, step)
         return step, float(np.max(np.abs(step) / sd))
 
+    def _corrected(self, k: int) -> ModelSeries:
+        """Series k with its readings corrected by their errors as far as they are known."""
+        s, errors = self.series[k], self.errors[k]
+        if errors is None:
+            return s
+        parts = np.split(errors, len(s.history.readings))
+        readings = {
+            name: values + part
+            for (name, values), part in zip(s.history.readings.items(), parts, strict=True)
+        }
+        return replace(s, history=replace(s.history, readings=readings))
+
     def _renew(self, state: _State, step: Array) -> None:
         image, used, penalty = 0.0, 0.0, 0.0
         for k, part in enumerate(self.shares):
@@ -268,16 +297,27 @@ class _Fit:
             cost, errors, redundancy = part.settle(
                 step[columns], self.Q[np.ix_(columns, columns)], self.noise[k]
             )
+            if self.correcting and len(errors):
+                self.errors[k] = errors
             image += cost
             used += redundancy
             penalty += float(errors @ errors) / self.error_sds[k] ** 2
-            if redundancy > 5:
+            if self.components and redundancy > 5:
                 # a quantised thermometer is no better than a quarter of its step
                 floor = 0.25 * self.series[k].resolution.get(self.series[k].history.reference, 0.0)
                 found = float(np.sqrt(errors @ errors / redundancy))
                 self.error_sds[k] = max(found, floor, 1e-3)
         self.cost = image / self.variance + penalty
         self.variance = image / max(self.image_points - len(step) - used, 1.0)
+
+    def take_off_offsets(self, state: _State) -> None:
+        """Leave the constant part of every target's residuals out of what follows."""
+        self.series = [
+            s.without_offsets(
+                state.of_series(k).predict(self._corrected(k).history, s.field), self.noise[k]
+            )
+            for k, s in enumerate(self.series)
+        ]
 
     def solve(self, state: _State) -> _State:
         """Iterate until no unknown moves by more than a hundredth of its standard deviation."""
@@ -361,7 +401,12 @@ class _Fit:
             cost = s.lPl - 2 * np.sum(s.b * delta, 1) + np.einsum("ei,eij,ej->e", delta, s.N, delta)
             cost -= np.einsum("ei,ei->e", own, np.linalg.solve(N, own[..., None])[..., 0])
             rise.append(warm)
-            spread.append(np.sqrt(np.maximum(cost, 0.0) / (2.0 * s.count - 3.0)))
+            variance = np.maximum(cost, 0.0) / (2.0 * s.count - 3.0)
+            # the targets' offsets, an average over the epochs, took this much of each
+            known = self.noise[k]
+            factors = np.ones(len(s)) if known is None else known
+            variance += self.variance / np.sum(factors**-2.0)
+            spread.append(np.sqrt(variance))
             count.append(2.0 * s.count - 3.0)
         x, y, n = np.concatenate(rise), np.concatenate(spread), np.concatenate(count)
         A = np.stack([np.ones_like(x), x], axis=1)
@@ -414,7 +459,12 @@ class _Fit:
         return FittedModel(model, tuple(names), covariance, sigma, fits)
 
     def _field_covariance(self, state: _State) -> Array:
-        """Q K Σ Kᵀ Q: what errors of the targets' coordinates do to the unknowns."""
+        """Q K Σ Kᵀ Q: what errors of the targets' coordinates do to the level.
+
+        A coordinate is as wrong in the first epoch as in the last: it cannot look like a drift, and
+        since the targets' constant offsets are taken off, it cannot by being hidden now and then.
+        Interior at T₀ and exterior orientation take it all.
+        """
         field = self.series[0].field
         p = len(state.names)
         lever = np.zeros((p, len(field) * 3))
@@ -427,7 +477,13 @@ class _Fit:
             sums = np.tensordot(weight, J, axes=(0, 0))  # (T, 16, q)
             A = np.einsum("tcp,tpq->tcq", at.A, sums)
             lever[state.columns(k)] += np.einsum("tcq,tcx->qtx", A, at.B).reshape(J.shape[2], -1)
-        moved = self.Q @ (lever * field.sigmas.ravel())
+        level = np.array([n.startswith(("interior.", "exterior.")) for n in state.names])
+        drift = ~level
+        Q = self.Q[np.ix_(level, level)]
+        mixed = self.Q[np.ix_(level, drift)]
+        Q = Q - mixed @ np.linalg.solve(self.Q[np.ix_(drift, drift)], mixed.T)
+        moved = np.zeros((p, lever.shape[1]))
+        moved[level] = Q @ (lever[level] * field.sigmas.ravel())
         result: Array = moved @ moved.T
         return result
 

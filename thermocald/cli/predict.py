@@ -80,17 +80,15 @@ def predict(
         raise UsageError("give one of --temperature, --log, --programme")
     thermal = ThermalCamera.load(model)
     with warnings_said():
-        document, lines = _predicted(
-            thermal,
-            temperature,
-            log,
-            programme,
-            camera,
-            channel or [],
-            distance,
-            wanted,
-            extrapolate,
-        )
+        if temperature is not None:
+            others = _channels(channel or [])
+            state = thermal.at(temperature, channels=others or None, extrapolate=extrapolate)
+            document, lines = _state_document(thermal, state, distance)
+        elif log is not None:
+            document, lines = _along_document(thermal, _log(thermal, log, extrapolate))
+        else:
+            assert programme is not None
+            document, lines = _advice(thermal, programme, camera, distance, wanted)
     if json is not None:
         write_json(document, json)
     if json != "-":

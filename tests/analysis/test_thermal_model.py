@@ -1,0 +1,305 @@
+"""The fit of a thermal model: trained on M1, right on M2; true standard deviations; refusals."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from thermocald.analysis.held_out import predicted_error
+from thermocald.analysis.model_series import model_series, reduce_series
+from thermocald.analysis.thermal_camera import ThermalCamera
+from thermocald.analysis.thermal_model import fit_thermal_model
+from thermocald.analysis.type_model import type_model
+from thermocald.cli import application
+from thermocald.errors import ConfigurationError, DataError, ThermocaldError, UsageError
+from thermocald.photogrammetry.camera_model import project
+from thermocald.simulation import effects
+from thermocald.simulation.course import Course
+from thermocald.simulation.model import ModelEffect
+from thermocald.simulation.presets import preset_names, preset_simulation
+from thermocald.store.recording import read_recording
+
+LAG = ModelEffect("thermal_lag", {"tau": 70.0})
+START = ModelEffect("thermal_lag", {"tau": 10.0})
+
+
+def simulated(seed, series="M1", epochs=120, listed=(LAG,), power=9.0, **changes):
+    """The RPi with effects of our choice; M1 and M2 are heated differently."""
+    s = preset_simulation("rpi-v2.1-heating", seed=seed, series=series)
+    until = 500.0 if series == "M1" else 700.0
+    lamp = Course.steps([0, 80.0, until, 1e5], [0.0, power, 0.0])
+    programme = replace(s.programme, epochs=epochs, sources={"housing": lamp})
+    return replace(s, model=replace(s.model, effects=tuple(listed), **changes), programme=programme)
+
+
+def reduced(s):
+    return reduce_series(s.head, s.field, list(s.epochs()), s.programme.series)
+
+
+@pytest.fixture(scope="module")
+def pair():
+    return simulated(1, "M1"), simulated(2, "M2", power=6.5)
+
+
+@pytest.fixture(scope="module")
+def fitted(pair):
+    series = [reduced(s) for s in pair]
+    return fit_thermal_model(series[:1], [START]), series
+
+
+def test_trained_on_m1_right_on_m2(fitted):
+    """Prediction error at most 1.1 × the noise floor; 95 % bands hold 93 to 97 %."""
+    model, (_, second) = fitted
+    error = predicted_error(model.model, second, model.series[0].thermometer_sd)
+    assert error.rms_px <= 1.1 * error.floor_px
+    assert 0.93 <= error.coverage <= 0.97
+    # without the effect it does not hold
+    base = fit_thermal_model([fitted[1][0]], []).model
+    worse = predicted_error(base, second, model.series[0].thermometer_sd)
+    assert worse.rms_px > 1.5 * error.rms_px
+
+
+def test_two_series_are_better_than_one(fitted):
+    both = fit_thermal_model(fitted[1], [START])
+    assert both.sd("thermal_lag.tau") < 0.85 * fitted[0].sd("thermal_lag.tau")
+    assert abs(both.model.effects[0].values["tau"] - 70.0) < 3 * both.sd("thermal_lag.tau")
+    assert len(both.model.fitted_on) == 2
+
+
+def test_base_model_of_a_driftless_effect(fitted):
+    model = fitted[0].model
+    assert model.sensor.width == 3280
+    low, high = model.validity["temperature"]
+    assert low < 26 < 40 < high
+    assert model.covariance_names[0] == "interior.c"
+    assert np.linalg.eigvalsh(np.array(model.covariance)).min() > -1e-18
+
+
+@pytest.mark.slow
+def test_standard_deviations_are_true():
+    """60 recordings: scatter of tau and the rates over their stated sd, 1 ± 3/√120."""
+    pulls = []
+    for seed in range(60):
+        s = simulated(seed, epochs=60)
+        f = fit_thermal_model([reduced(s)], [LAG], T0=30.0, search=False)
+        (lag,) = f.model.effects
+        pull = [(lag.values["tau"] - 70.0) / lag.sds["tau"]]
+        for n in ("c", "x0", "y0"):
+            pull.append((f.model.rates[n] - s.model.rates[n]) / f.sd(f"rates.{n}"))
+        pulls.append(pull)
+    spread = np.sqrt(np.mean(np.square(pulls), axis=0))
+    assert np.all(np.abs(spread - 1.0) < 3 / np.sqrt(120)), spread
+
+
+def test_a_lens_mean_offset_of_targets_is_no_drift():
+    """Coordinates wrong by 0.05 mm: rates stay right, the level alone suffers."""
+    s = simulated(3)
+    rng = np.random.default_rng(8)
+    wrong = replace(s.field, points=s.field.points + rng.normal(0, 0.05, s.field.points.shape),
+                    sigmas=np.full(s.field.points.shape, 0.05))  # fmt: skip
+    series = reduce_series(s.head, wrong, list(s.epochs()), "M1")
+    f = fit_thermal_model([series], [START])
+    assert abs(f.sigma0 - 1.0) < 0.05
+    for n in ("c", "x0", "y0"):
+        assert abs(f.model.rates[n] - s.model.rates[n]) < 3.5 * f.sd(f"rates.{n}")
+    # the level's standard deviation knows the field's: some thousandths of a mm
+    assert 2e-4 < f.sd("interior.x0") < 5e-3
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_correction_in_object_space(name):
+    """Fitted to M1, applied to M2's readings: a tenth or less of the uncorrected error at 10 m."""
+    first, second = preset_simulation(name, 1, "M1"), preset_simulation(name, 2, "M2")
+    listed = [
+        replace(e, values=dict.fromkeys(effects.get(e.name).usual, 0.0))
+        for e in first.model.effects
+        if e.name != "defocus"
+    ]
+    f = fit_thermal_model([reduced(first)], listed)
+    camera = ThermalCamera(f.model)
+    along = camera.along(
+        second.reading_times, second.readings, second.frame_times, extrapolate=True
+    )
+    left, uncorrected = [], []
+    truth = ThermalCamera(replace(f.model, validity={})).at(25.0)
+    for i in range(0, len(along), 10):
+        true = replace(truth, values=second.truth.iop[i])
+        begin = replace(truth, values=second.truth.iop[0])
+        # the level is what a calibration at the begin gives, with and without a thermal model
+        predicted = along.values[i] - along.values[0] + second.truth.iop[0]
+        left.append(replace(truth, values=predicted).object_distance(true, 10_000.0).mean())
+        uncorrected.append(begin.object_distance(true, 10_000.0).mean())
+    assert np.mean(left) <= 0.1 * np.mean(uncorrected)
+
+
+def test_refusals(fitted):
+    _, (first, second) = fitted
+    with pytest.raises(DataError, match="no series"):
+        fit_thermal_model([])
+    with pytest.raises(DataError, match="belongs to one camera"):
+        fit_thermal_model([first, replace(second, camera="another")])
+    steady = simulated(4, power=0.0)
+    with pytest.raises(DataError, match="heat the camera by several kelvin"):
+        fit_thermal_model([reduced(steady)])
+    with pytest.raises(ConfigurationError, match="belongs to one camera"):
+        predicted_error(fitted[0].model, replace(second, camera="another"), 0.05)
+    nobody = ModelEffect("target_displacement", {"time": 1.0, "targets": ("nobody",), "dX": 0.0})
+    with pytest.raises(DataError, match="none of the targets"):
+        fit_thermal_model([first], [nobody])
+    few = list(steady.epochs())[:2]
+    with pytest.raises(DataError, match="fewer than 3 epochs"):
+        reduce_series(steady.head, steady.field, few, "few")
+
+
+def test_type_model_of_three_cameras(fitted):
+    base = fitted[0].model
+    models = []
+    for k, x0 in enumerate((-3.8e-4, -4.1e-4, -3.5e-4)):
+        rates = {**base.rates, "x0": x0}
+        models.append(replace(base, camera=f"rpi-{k}", rates=rates))
+    found = type_model(models, "rpi-v2.1")
+    assert found.rates["x0"] == pytest.approx(-3.8e-4)
+    # one more camera: scatter 3e-5, and the mean of three
+    assert found.sds["rates.x0"] == pytest.approx(3e-5 * np.sqrt(4 / 3), rel=0.01)
+    assert found.camera == "rpi-v2.1"
+    with pytest.raises(DataError, match="not alike"):
+        type_model([base, replace(base, T0=11.0)], "x")
+
+
+def run(*arguments):
+    return CliRunner().invoke(application(), [str(a) for a in arguments])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, pair):
+    path = tmp_path_factory.mktemp("fit")
+    for s in pair:
+        s.write(path / s.programme.series)
+    result = run("fit", path / "M1", "-o", path / "cam.yaml", "--effect", "thermal_lag",
+                 "--json", path / "fit.json")  # fmt: skip
+    assert result.exit_code == 0, result.exception
+    return path
+
+
+def test_fit_command(folder):
+    document = json.loads((folder / "fit.json").read_text())
+    tau = document["effects"][0]["parameters"]["tau"]
+    assert abs(tau["value"] - 70.0) < 3 * tau["sd"]
+    camera = ThermalCamera.load(folder / "cam.yaml")
+    assert camera.model.covariance is not None
+    same = fit_thermal_model([model_series(read_recording(folder / "M1"))], [LAG])
+    assert same.model.effects[0].values["tau"] == pytest.approx(tau["value"], abs=0.05)
+
+
+def test_predict_command(folder):
+    result = run("predict", "--model", folder / "cam.yaml", "--temperature", 35, "--json", "-")
+    document = json.loads(result.stdout)
+    expected = ThermalCamera.load(folder / "cam.yaml").at(35.0)
+    assert document["x0"] == pytest.approx(expected.interior.x0)
+    assert document["sd_x0"] == pytest.approx(expected.sd["x0"])
+    log = run("predict", "--model", folder / "cam.yaml", "--log", folder / "M2" / "epochs.csv")
+    lines = log.stdout.splitlines()
+    assert len(lines) == 121
+    assert lines[0].startswith("time,temperature,c,x0,y0,A1")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--temperature", 95], "looks like fahrenheit"),
+        (["--temperature", -30], "extrapolation"),
+        ([], "give one of"),
+        (["--temperature", 30, "--channel", "board"], "write NAME=°C"),
+    ],
+)
+def test_predict_refuses(folder, arguments, says):
+    result = run("predict", "--model", folder / "cam.yaml", *arguments)
+    assert isinstance(result.exception, UsageError)
+    assert says in str(result.exception)
+
+
+def test_correct_points_command(folder, pair):
+    """M2's own measurements, corrected: they stand still to the noise, and the bands are true."""
+    second = pair[1]
+    rows = ["time,x,y,name"]
+    begin = second.programme.begin
+    truth = second.image_points(slice(None))
+    seen = second.model.sensor.contains(truth, 1.0).all(axis=0)
+    targets = np.flatnonzero(seen)[::7].tolist()
+    for e in range(0, 120, 5):
+        time = begin + second.frame_times[e]
+        rows += [f"{time:.3f},{truth[e, t, 0]:.6f},{truth[e, t, 1]:.6f},{t}" for t in targets]
+    (folder / "points.csv").write_text("\n".join(rows) + "\n")
+    result = run("correct", folder / "points.csv", "--model", folder / "cam.yaml", "--log",
+                 folder / "M2" / "epochs.csv", "--column", "temperature",
+                 "--to", 31.0, "--out", folder / "out.csv", "--json", "-")  # fmt: skip
+    assert result.exit_code == 0, result.exception
+    table = np.genfromtxt(folder / "out.csv", delimiter=",", names=True)
+    before = np.genfromtxt(folder / "points.csv", delimiter=",", names=True)
+    groups = [before["name"] == t for t in targets]
+    spread = lambda d, n: np.mean([np.ptp(d[n][g]) for g in groups])  # noqa: E731
+    assert spread(before, "x") > 4.0
+    assert spread(table, "x") < 0.1 * spread(before, "x")
+    # against the truth at T0; errors of the model's parameters are common to all points, and a lag
+    # lets little of the thermometer's noise through: the stated error is a bound, not an exact one
+    s = replace(second.model, exterior=second.exterior)
+    at_t0 = s.interior.as_array() + (31.0 - s.T0) * s.rate_vector
+    truth_at_t0 = project(s.sensor, at_t0, s.exterior.as_array(), second.field.points)
+    wanted = truth_at_t0[before["name"].astype(int), 0]
+    level = table["x"] - wanted
+    ratio = np.sqrt(np.mean(((level - level.mean()) / table["sd_x"]) ** 2))
+    assert 0.1 < ratio < 1.3
+
+
+def test_correct_images_command(folder, pair):
+    """A hot image, remapped, shows its targets where the camera at T0 would have them."""
+    import cv2
+
+    from thermocald.simulation.scene import Look, Scene
+
+    second = pair[1]
+    model = ThermalCamera.load(folder / "cam.yaml").model
+    hot = int(np.argmax(second.truth.drive))
+    scene = Scene(second.model.sensor, second.field, Look(noise_dn=0.0, vignetting=0.0))
+    cv2.imwrite(str(folder / "hot.png"), scene.render(second.truth.iop[hot], second.truth.eop[hot]))
+    time = second.programme.begin + second.frame_times[hot]
+    (folder / "images.csv").write_text(f"time,image\n{time:.3f},hot.png\n")
+    result = run("correct", folder / "images.csv", "--model", folder / "cam.yaml", "--log",
+                 folder / "M2" / "epochs.csv", "--column", "temperature",
+                 "--out", folder / "images")  # fmt: skip
+    assert result.exit_code == 0, result.exception
+    corrected = cv2.imread(str(folder / "images" / "hot.png"), cv2.IMREAD_GRAYSCALE)
+    steady = replace(second.model, effects=()).interior.as_array()
+    steady = steady + (model.T0 - second.model.T0) * second.model.rate_vector
+    expected = scene.render(steady, second.truth.eop[hot]).astype(float)
+    difference = corrected[40:-40, 40:-40] - expected[40:-40, 40:-40]
+    raw = cv2.imread(str(folder / "hot.png"), cv2.IMREAD_GRAYSCALE)[40:-40, 40:-40]
+    assert difference.std() < 0.1 * (raw - expected[40:-40, 40:-40]).std()
+
+
+@pytest.mark.parametrize(
+    ("points", "log", "says"),
+    [
+        ("time,x,y\n0,5,5\n", None, "outside the temperature log"),
+        ("time,x,y\n1600000100,5000,5\n", None, "of another camera, or binned"),
+        ("time,x\n1600000100,5\n", None, "no column 'y'"),
+        ("time,x,y\n1600000100,five,5\n", None, "line 2, column x: 'five' is no number"),
+        ("time,x,y\n1600000100,5,5\n", "time,temp_degF\n1600000000,80\n", "must be °C"),
+        ("time,x,y\n1600000100,5,5\n", "time,t\n9,20\n5,20\n", "line 3, column time: time runs"),
+        ("time,x,y\n1600000100,5,5\n", "when,t\n9,20\n", "no time column"),
+        ("time,x,y\n1600000100,5,5\n", "time,t\n1600000000,95\n1600009000,99\n", "fahrenheit"),
+    ],
+)
+def test_correct_refuses(folder, points, log, says):
+    (folder / "bad.csv").write_text(points)
+    source = folder / "M2" / "epochs.csv"
+    if log is not None:
+        source = folder / "log.csv"
+        source.write_text(log)
+    result = run("correct", folder / "bad.csv", "--model", folder / "cam.yaml", "--log", source)
+    assert isinstance(result.exception, ThermocaldError), result.exception
+    assert says in str(result.exception)

@@ -221,11 +221,13 @@ def fit_circles(
     for w in parts:
         begin = w.begin if start is None else start[w.rows]
         thin = w.thinned()
-        f = _gauss_newton(thin, maps.select(w.rows), begin, noise, 1, _CONVERGED_PX, work)
+        f = _gauss_newton(
+            thin, maps.select(w.rows), begin, noise, 1, _CONVERGED_PX, work, noise is None
+        )
         parameters[w.rows] = f.parameters
-        flat = (thin.weight > 0) & (f.edge < _FLAT * np.abs(f.parameters[:, 7, None]))
-        greys.append(f.value[flat])
-        residuals.append(f.residual[flat])
+        if noise is None:
+            greys.append(f.value[f.flat])
+            residuals.append(f.residual[f.flat])
     given = noise is not None
     if noise is None:
         noise = estimate_noise(np.concatenate(greys), np.concatenate(residuals), 3 * n)
@@ -262,7 +264,7 @@ class _Fit:
     residual: Single
     normal: Array
     step: Array
-    edge: Single
+    flat: NDArray[np.bool_]
 
 
 def _gauss_newton(
@@ -273,6 +275,7 @@ def _gauss_newton(
     rounds: int,
     tolerance_px: float,
     work: Single,
+    tells_noise: bool = False,
 ) -> _Fit:
     """Iterate until the centres stand; value and residual are those after the last step.
 
@@ -297,9 +300,12 @@ def _gauss_newton(
             break
     change = (np.swapaxes(j, 1, 2) @ delta[..., None].astype(np.float32))[..., 0]
     p[:, :2] += w.origin
-    # How much a px of movement would change each grey value.
-    edge = np.maximum(np.abs(j[:, 0]), np.abs(j[:, 1]))
-    return _Fit(p, value + change, residual - change, N, step, edge)
+    flat = np.zeros(0, dtype=bool)
+    if tells_noise:
+        # Where a px of movement would change the grey value by next to nothing.
+        slope = np.maximum(np.abs(j[:, 0]), np.abs(j[:, 1]))
+        flat = (w.weight > 0) & (slope < _FLAT * np.abs(p[:, 7, None]))
+    return _Fit(p, value + change, residual - change, N, step, flat)
 
 
 def _limited(N: Array, rhs: NDArray[np.floating[Any]]) -> Array:

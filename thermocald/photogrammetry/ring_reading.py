@@ -45,7 +45,10 @@ _RASTER_PX = 0.5  # by how much a transition may miss the raster, and by how man
 _RASTER_TURNS = 0.006
 _BLURS_PX = (0.8, 1.4)
 _LARGEST_SHIFT = 0.2  # radii, by which perspective and distortion move a ring against its disc
-_MISFIT = 0.13  # RMS of samples against what was read, in levels
+# RMS of samples against what was read, in levels: at most, and for large targets, whose edges fill
+# less of the ring, less.
+_MISFIT = 0.13
+_MISFIT_LARGE, _MISFIT_EDGE_PX = 0.03, 0.45
 _MISFIT_OF_ONE_ARC = 0.06  # a closed ring with something across it is read as one arc
 
 
@@ -83,7 +86,9 @@ def read_codes(
     misfit = misfits[best, at]
     misfits[best, at] = np.inf
     # A ring that fits both families can be trusted with neither.
-    good = (misfit < _MISFIT) & (misfits.min(axis=0, initial=np.inf) > 1.2 * misfit)
+    good = np.isfinite(misfit) & (
+        misfits.min(axis=0, initial=np.inf) > 1.2 * np.where(np.isfinite(misfit), misfit, 0)
+    )
     bits, number, rows = raster[best][good], numbers[best, at][good], rows[good]
     found = list(zip(bits.tolist(), number.tolist(), strict=True))
     count = Counter(found)
@@ -202,9 +207,15 @@ def _read_family(level: Single, maps: LocalMap, bits: int) -> tuple[NDArray[np.i
         misfit[rows] = _misfit(
             level[rows], maps.select(rows), ones[rows], which[rows], within[rows]
         )
+        misfit[misfit > _allowed(maps)] = np.inf
         one_arc = np.sum(ones != np.roll(ones, 1, axis=1), axis=1) == 2
         misfit[one_arc & (misfit > _MISFIT_OF_ONE_ARC)] = np.inf
     return codes, misfit
+
+
+def _allowed(maps: LocalMap) -> Array:
+    allowed: Array = _MISFIT_LARGE + _MISFIT_EDGE_PX / maps.semi_axes[:, 1]
+    return np.minimum(allowed, _MISFIT)
 
 
 def _misfit(
@@ -227,28 +238,31 @@ def _misfit(
     # How many px a radius is: across the circles, and across a radial edge at that radius.
     across = 1 / np.linalg.norm(np.swapaxes(np.linalg.inv(maps.linear), 1, 2) @ u, axis=1)
     along = np.abs(np.linalg.det(maps.linear))[:, None] / np.linalg.norm(maps.linear @ u, axis=1)
-    rho = np.array(_RADII)[:, None]
-    radial = (
-        (rho - ring_code.RING_INNER) * across[:, None],
-        ((ring_code.RING_OUTER - rho) * across[:, None]),
-    )
-    tangential = rho * (angle * along)[:, None]
-    best = np.full(len(level), np.inf)
+    across, side = across.astype(np.float32), (angle * along).astype(np.float32)
+    rho = np.array(_RADII, dtype=np.float32)[:, None]
+    misfit = np.full(len(level), np.inf)
     for blur in _BLURS_PX:
-        inner, outer, side = (
-            normal_cdf((v / blur).astype(np.float32)) for v in (*radial, tangential)
-        )
-        best = np.minimum(best, _rms_after_shift(level, (inner + outer - 1) * side))
-    return best
+        left = np.nonzero(misfit > _allowed(maps))[0]
+        if len(left) == 0:
+            break
+        scale = (across[left] / np.float32(blur))[:, None]
+        drawn = normal_cdf((rho - np.float32(ring_code.RING_INNER)) * scale)
+        drawn += normal_cdf((np.float32(ring_code.RING_OUTER) - rho) * scale)
+        drawn -= np.float32(1)
+        drawn *= normal_cdf(rho * (side[left] / np.float32(blur))[:, None])
+        misfit[left] = np.minimum(misfit[left], _rms_after_shift(level[left], drawn))
+    return misfit
 
 
 def _rms_after_shift(level: Single, drawn: Single) -> Array:
     """RMS (n,) of level minus drawn (n, radii, angles) after the ring may shift, turn, and grow."""
     n = len(level)
-    turn = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
-    rho, cosine, sine = np.array(_RADII)[:, None], np.cos(turn), np.sin(turn)
-    outwards = np.gradient(drawn, np.array(_RADII), axis=1)
-    around = (np.roll(drawn, -1, axis=2) - np.roll(drawn, 1, axis=2)) * (_ANGLES / (4 * np.pi))
+    turn = (2 * np.pi * np.arange(_ANGLES) / _ANGLES).astype(np.float32)
+    radii = np.array(_RADII, dtype=np.float32)
+    rho, cosine, sine = radii[:, None], np.cos(turn), np.sin(turn)
+    outwards = np.gradient(drawn, radii, axis=1)
+    around = np.roll(drawn, -1, axis=2) - np.roll(drawn, 1, axis=2)
+    around *= np.float32(_ANGLES / (4 * np.pi))
     design = np.stack(
         [
             outwards * cosine - around * sine / rho,
@@ -259,7 +273,7 @@ def _rms_after_shift(level: Single, drawn: Single) -> Array:
         axis=1,
     ).reshape(n, 4, -1)
     residual = (level - drawn).reshape(n, -1)
-    normal = design @ np.swapaxes(design, 1, 2) + 1e-3 * np.eye(4)
+    normal = design @ np.swapaxes(design, 1, 2) + 1e-3 * np.eye(4, dtype=np.float32)
     shift = np.linalg.solve(normal, (design @ residual[..., None]))[..., 0]
     shift = np.clip(shift, -_LARGEST_SHIFT, _LARGEST_SHIFT)
     left = residual - (shift[:, None] @ design)[:, 0]

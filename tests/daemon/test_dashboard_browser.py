@@ -1,0 +1,144 @@
+"""The page in a real browser beside a real daemon."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+
+import pytest
+
+pytestmark = pytest.mark.slow
+
+_FLAGS = [
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+_UNLABELLED = """() => [...document.querySelectorAll('a, button, select, input, [tabindex="0"]')]
+  .filter(e => e.offsetParent !== null && !e.closest('.js-plotly-plot'))
+  .filter(e => !(e.textContent.trim() || e.getAttribute('aria-label')
+    || e.getAttribute('aria-labelledby') || (e.labels && e.labels.length)))
+  .map(e => e.outerHTML)"""
+_WIDER = "() => document.documentElement.scrollWidth > document.documentElement.clientWidth + 1"
+_DRAWN = """() => [...document.querySelectorAll('#course .scatterlayer path.js-line')]
+  .filter(p => (p.getAttribute('d') || '').length > 20 && p.getBBox().width > 0).length"""
+
+
+@pytest.fixture
+def browser():
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    path = shutil.which("chromium") or shutil.which("google-chrome")
+    if path is None:
+        pytest.skip("no Chromium: apt-get install chromium")
+    with sync_api.sync_playwright() as play:
+        opened = play.chromium.launch(executable_path=path, args=_FLAGS)
+        yield opened
+        opened.close()
+
+
+@pytest.fixture
+def page_of(browser):
+    """Opens a page; what the console complains of and what leaves the machine is in `problems`."""
+
+    def open_(url: str, width: int = 1280, scheme: str = "light"):
+        page = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
+        page.problems = []
+        page.on(
+            "console", lambda m: m.type in ("error", "warning") and page.problems.append(m.text)
+        )
+        page.on("pageerror", lambda e: page.problems.append(str(e)))
+        page.on(
+            "request",
+            lambda r: not r.url.startswith((url, "data:", "blob:")) and page.problems.append(r.url),
+        )
+        page.goto(url)
+        return page
+
+    return open_
+
+
+@pytest.fixture
+def shown(daemon, devices):
+    """A running daemon with its page: its address."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    daemon.configure(**devices(period_s=0.5), dashboard={"enabled": True, "port": port})
+    daemon.start()
+    daemon.until(lambda: len(daemon.results()) > 5)
+    daemon.until(lambda: _listens(port))
+    yield f"http://127.0.0.1:{port}/"
+    daemon.stop()
+
+
+def _listens(port: int) -> bool:
+    with socket.socket() as attempt:
+        return attempt.connect_ex(("127.0.0.1", port)) == 0
+
+
+def test_it_is_live_on_desk_and_phone_light_and_dark(daemon, shown, page_of):
+    page = page_of(shown)
+    page.wait_for_function("() => document.querySelector('#figures dd') !== null", timeout=30000)
+    epoch = int(page.text_content("#figures dd").split()[0])
+    page.wait_for_function(
+        f"() => parseInt(document.querySelector('#figures dd').textContent) > {epoch + 2}",
+        timeout=30000,
+    )
+    assert page.text_content("#connection") == "live"
+    page.wait_for_function("() => document.querySelectorAll('#overlay circle').length > 100")
+    page.wait_for_function("() => document.querySelectorAll('#overlay line').length > 100")
+    page.wait_for_function(
+        "() => document.querySelector('#frame').naturalWidth > 300", timeout=20000
+    )
+    page.wait_for_function(f"() => ({_DRAWN})() >= 5", timeout=30000)
+    for span in ("86400", ""):
+        page.check(f'input[name=span][value="{span}"]')
+        page.wait_for_function(f"() => ({_DRAWN})() >= 5")
+    assert "started" in page.text_content("#events")
+    assert "housing" in page.text_content("#devices")
+    assert page.evaluate(_UNLABELLED) == []
+    assert page.get_attribute("html", "lang") == "en"
+    light = page.evaluate("getComputedStyle(document.body).backgroundColor")
+    assert page.problems == []
+
+    phone = page_of(shown, width=390, scheme="dark")
+    phone.wait_for_function("() => document.querySelector('#figures dd') !== null")
+    phone.wait_for_function(f"() => ({_DRAWN})() >= 5", timeout=30000)
+    assert not phone.evaluate(_WIDER)
+    assert phone.evaluate("getComputedStyle(document.body).backgroundColor") != light
+    assert phone.problems == []
+
+
+def test_the_keyboard_reaches_everything(shown, page_of):
+    page = page_of(shown)
+    page.wait_for_function("() => document.querySelector('#figures dd') !== null", timeout=30000)
+    page.wait_for_function(
+        "() => document.querySelector('#series').options.length > 0", timeout=30000
+    )
+    reached = []
+    for _ in range(12):
+        page.keyboard.press("Tab")
+        reached.append(
+            page.evaluate("document.activeElement.id || document.activeElement.className")
+        )
+    assert reached[:2] == ["skip", "camera"]
+    assert {"series", "download"} <= set(reached)
+
+
+def test_the_death_of_the_page_does_not_touch_acquisition(daemon, shown):
+    children = f"/proc/{daemon.process.pid}/task/{daemon.process.pid}/children"
+    with open(children) as file:
+        (child,) = [int(pid) for pid in file.read().split()]
+    before = daemon.results()[-1]["epoch"]
+    os.kill(child, signal.SIGKILL)
+    daemon.until(lambda: daemon.results()[-1]["epoch"] > before + 5)
+    daemon.until(lambda: "it is started again" in daemon.log())
+    numbers = [result["epoch"] for result in daemon.results()]
+    assert numbers == list(range(1, len(numbers) + 1))

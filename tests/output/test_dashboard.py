@@ -1,0 +1,211 @@
+"""The page's server: what it gives, and all that it refuses."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+
+import httpx
+import numpy as np
+import pytest
+
+from thermocald.epoch import Epoch
+from thermocald.errors import ConfigurationError
+from thermocald.output.dashboard import serve
+from thermocald.photogrammetry.camera_model import Sensor
+from thermocald.photogrammetry.testfield import TestField
+from thermocald.store.database import Store
+from thermocald.store.head import CameraSpec, Channel, Head
+from thermocald.store.row import EpochResult, Event
+
+TOKEN = "a-token-of-enough-characters"
+DEVICE = {"device": "open", "why": "", "faults": 0}
+
+
+@pytest.fixture(scope="module")
+def store_path(tmp_path_factory):
+    """A store of 1200 epochs."""
+    head = Head(
+        "rpi-M1", "M1", 10.0, CameraSpec("rpi", Sensor(3280, 2464, 0.00112)),
+        {"temperature": Channel()},
+    )  # fmt: skip
+    field = TestField.build(["a", "b"], np.zeros((2, 3)))
+    path = tmp_path_factory.mktemp("store") / "t.db"
+    with Store.open(path, "append", durable=False) as store:
+        series = store.create_series(head, field)
+        for k in range(1, 1201):
+            values = np.full(16, float(k))
+            result = EpochResult("ok", "", values, np.eye(16), 1.0, 10, 2, ())
+            time = 1.6e9 + 10 * k
+            store.append(series, Epoch(k, time, time, {"temperature": 20.0 + k / 100}), result)
+        store.add_event(Event(1.6e9, "knock", "<b>somebody</b> came"))
+    return path
+
+
+@pytest.fixture
+def folders(tmp_path, store_path):
+    """The store, and the live folder of a daemon that runs."""
+    path = store_path
+    live = tmp_path / "live"
+    live.mkdir()
+    last = {"epoch": 1200, "temperature": 21.5, "c": 3.04, "sd_c": 1e-4, "status": "ok"}
+    camera = {**DEVICE, "series": "M1", "period_s": 10.0, "last": last, "stored": 1200}
+    status = {
+        "version": "0", "pid": 1, "utc": 0.0, "started": 0.0, "stalled": [],
+        "clock": {"trusted": True}, "store": {"state": "ok", "waiting": 0, "path": str(path)},
+        "frames": {"paused": ""}, "cameras": {"rpi": camera}, "thermometers": {"housing": DEVICE},
+        "outputs": {},
+    }  # fmt: skip
+    (live / "status.json").write_text(json.dumps(status))
+    (live / "rpi.json").write_text(json.dumps({"row": last}))
+    (live / "rpi.jpg").write_bytes(b"\xff\xd8 picture \xff\xd9")
+    (tmp_path / "secret.json").write_text('{"secret": 1}')
+    return path, live
+
+
+class Client:
+    """Requests to an application in this process, with a browser's memory for cookies."""
+
+    def __init__(self, application, base: str) -> None:
+        self._application = application
+        self._base = base
+        self._cookies = httpx.Cookies()
+
+    def request(self, method: str, path: str, **options) -> httpx.Response:
+        async def ask() -> httpx.Response:
+            transport = httpx.ASGITransport(self._application, raise_app_exceptions=True)
+            async with httpx.AsyncClient(
+                transport=transport, base_url=self._base, cookies=self._cookies
+            ) as client:
+                answer = await client.request(method, path, **options)
+                self._cookies = client.cookies
+                return answer
+
+        return asyncio.run(ask())
+
+    def get(self, path: str, **options) -> httpx.Response:
+        return self.request("GET", path, **options)
+
+
+@pytest.fixture
+def client_of(folders):
+    """token, host → a client of the application."""
+    from thermocald.output.dashboard.application import build_application
+
+    def make(token=None, host="127.0.0.1", base="http://127.0.0.1"):
+        return Client(build_application(*folders, token, host), base)
+
+    return make
+
+
+def test_charts_are_means_over_bins_and_the_last_hour_is_the_last_hour(client_of):
+    client = client_of()
+    query = {"camera": "rpi", "series": "M1", "points": 100}
+    every = client.get("/api/columns", params=query).json()
+    assert (every["epochs"], every["per_point"]) == (1200, 12)
+    assert every["c"][0] == pytest.approx(np.arange(1, 13).mean())
+    assert every["c"][-1] == pytest.approx(np.arange(1189, 1201).mean())
+    hour = client.get("/api/columns", params={**query, "last": 3600, "points": 2000}).json()
+    assert hour["epochs"] == 361
+    assert hour["frame_time"][-1] == 1.6e9 + 12000
+
+
+def test_the_csv_has_every_epoch(client_of):
+    answer = client_of().get("/api/series.csv", params={"camera": "rpi", "series": "M1"})
+    lines = answer.text.splitlines()
+    assert len(lines) == 1201
+    first = dict(zip(lines[0].split(","), lines[1].split(","), strict=True))
+    assert (first["epoch"], first["c"], first["status"]) == ("1", "1", "ok")
+    assert float(first["temperature"]) == 20.01
+    assert 'filename="rpi-M1.csv"' in answer.headers["content-disposition"]
+
+
+def test_health_and_metrics(client_of, folders):
+    client = client_of()
+    assert client.get("/healthz").json() == {"ok": True, "why": ""}
+    text = client.get("/metrics").text
+    assert 'thermocald_temperature{camera="rpi",series="M1"} 21.5' in text
+    assert 'thermocald_device_up{kind="thermometer",name="housing"} 1.0' in text
+    (folders[1] / "status.json").unlink()
+    assert client.get("/healthz").status_code == 503
+    assert "thermocald_up 0.0" in client.get("/metrics").text
+
+
+def test_status_last_epoch_frame_and_events(client_of):
+    client = client_of()
+    assert client.get("/api/status").json()["cameras"]["rpi"]["last"]["epoch"] == 1200
+    assert client.get("/api/cameras/rpi/epoch").json()["row"]["c"] == 3.04
+    assert client.get("/api/cameras/rpi/frame").content.startswith(b"\xff\xd8")
+    assert client.get("/api/events").json()[0]["text"] == "<b>somebody</b> came"
+    page = client.get("/").text
+    assert "http://" not in page.replace("http://www.w3.org", "")
+    assert "https://" not in page
+    policy = client.get("/").headers["content-security-policy"]
+    assert "script-src 'self'" in policy
+    assert len(client.get("/static/plotly.js").content) > 1_000_000
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/static/../application.py", "/static/..%2fapplication.py", "/static/%2e%2e/view.py",
+        "/api/cameras/..%2fsecret/epoch", "/api/cameras/%2e%2e%2fsecret/epoch",
+        "/api/cameras/status/epoch", "/static//etc/passwd", "/../../etc/passwd",
+    ],
+)  # fmt: skip
+def test_no_path_leads_out(client_of, path):
+    answer = client_of().get(path)
+    assert answer.status_code in (404, 400)
+    assert "secret" not in answer.text.replace("../secret", "")
+    assert "root:" not in answer.text
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        "", "camera=rpi", "camera=rpi&series=M2", "camera=rpi&series=M1'--",
+        "camera=rpi&series=M1&last=nan", "camera=rpi&series=M1&last=-1",
+        "camera=rpi&series=M1&points=1e99", "camera=rpi&series=M1&points=x",
+        "camera=rpi&series=M1&until=inf", "camera=" + "r" * 5000 + "&series=M1",
+        "camera=rpi%00&series=M1", "camera=rpi&series=M1&last=1;drop table epoch",
+    ],
+)  # fmt: skip
+def test_hostile_values_are_refused_in_a_sentence(client_of, query):
+    client = client_of()
+    answer = client.get("/api/columns?" + query)
+    assert answer.status_code in (400, 404)
+    assert answer.json()["error"]
+    assert client.get("/api/columns?camera=rpi&series=M1").json()["epochs"] == 1200
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "PATCH", "OPTIONS"])
+def test_nothing_can_be_written(client_of, method):
+    for path in ("/", "/api/status", "/api/series.csv", "/metrics"):
+        assert client_of().request(method, path).status_code == 405
+
+
+def test_with_a_token_nothing_is_shown_without_it(client_of):
+    client = client_of(TOKEN, "0.0.0.0", "http://station.example")
+    for path in ("/", "/api/status", "/metrics", "/api/cameras/rpi/frame", "/static/page.js"):
+        assert client.get(path).status_code == 401
+        assert client.get(path, headers={"authorization": "Bearer wrong"}).status_code == 401
+        assert client.get(path, headers={"authorization": f"Bearer {TOKEN}"}).status_code == 200
+    assert client.get("/healthz").status_code == 200
+    moved = client.get(f"/?token={TOKEN}")
+    assert moved.status_code == 303
+    assert TOKEN not in moved.headers["location"]
+    assert client.get("/").status_code == 200  # the cookie
+
+
+def test_another_host_name_is_refused(client_of):
+    client = client_of(base="http://evil.example")
+    assert client.get("/api/status").status_code == 400
+
+
+def test_open_to_others_it_wants_a_token(tmp_path):
+    with pytest.raises(ConfigurationError, match="token-file"):
+        serve(tmp_path / "t.db", tmp_path, "0.0.0.0", 8437)
+    short = tmp_path / "token"
+    short.write_text("short")
+    with pytest.raises(ConfigurationError, match="16"):
+        serve(tmp_path / "t.db", tmp_path, "0.0.0.0", 8437, short)

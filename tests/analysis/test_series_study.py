@@ -83,7 +83,7 @@ def test_a_temperature_that_says_nothing(warm_up, temperature, words):
 def test_gaps_are_said_and_not_tested_across(warm_up):
     series = select(warm_up()(), np.r_[0:60, 100:150])
     found = study_series(series, SETTINGS)
-    assert "1 gaps, the longest of 410 s" in " ".join(found.notes)
+    assert "1 gap, the longest of 410 s at an interval of 10 s" in " ".join(found.notes)
     assert found.significance["c"].tests == 30 + 20
 
 

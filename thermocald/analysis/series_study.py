@@ -184,10 +184,12 @@ def _circumstances(series: MeasuredSeries) -> list[str]:
         steps = np.diff(series.time_s)
         gaps = steps > _GAP_IN_INTERVALS * series.interval_s
         if gaps.any():
+            count = int(gaps.sum())
             notes.append(
-                f"The series has {int(gaps.sum())} gaps, the longest of {float(steps.max()):.0f} s "
-                f"at an interval of {series.interval_s:.0f} s; windows across them are not tested, "
-                "and correlation between neighbours counts epochs, not seconds."
+                f"The series has {count} gap{'s' if count > 1 else ''}, the longest of "
+                f"{float(steps.max()):.3g} s at an interval of {series.interval_s:.3g} s; windows "
+                "across them are not tested, and correlation between neighbours counts epochs, "
+                "not seconds."
             )
     held = [name for name in IOP_NAMES if name not in series.free]
     if held:

@@ -169,6 +169,12 @@ def _from_columns(
     for k, name in enumerate(IOP_NAMES):
         values[:, k] = column(name)[ok]
         sds[:, k] = column(f"sd_{name}")[ok]
+    whole = _whole(np.ones(count, dtype=bool), values, sds, lost)
+    if not whole.all():
+        ok[ok] = whole
+        values, sds, count = values[whole], sds[whole], int(whole.sum())
+    if not count:
+        raise DataError(f"{source}: no epoch has a result ({_in_words(lost)})")
     number = column("epoch")[ok].astype(np.int64)
     frame_time = column("frame_time")[ok]
     rows = _spread(count, _MOST_MATRICES)
@@ -207,6 +213,7 @@ def _from_table(
     adjustment = table.adjustment
     assert adjustment is not None  # table_of_series always has one
     ok, lost = _judged(np.array(table.status))
+    ok = _whole(ok, table.values[:, :10], table.sd[:, :10], lost)
     if not ok.any():
         why = next((reason for reason in table.reasons if reason), _in_words(lost))
         raise DataError(f"{source}: no epoch has a result: {why}")
@@ -268,6 +275,25 @@ def _judged(status: NDArray[np.str_]) -> tuple[NDArray[np.bool_], dict[str, int]
     ok = status == "ok"
     words, counts = np.unique(status[~ok], return_counts=True)
     return ok, {str(word).replace("_", " "): int(n) for word, n in zip(words, counts, strict=True)}
+
+
+def _whole(
+    ok: NDArray[np.bool_], values: Array, sds: Array, lost: dict[str, int]
+) -> NDArray[np.bool_]:
+    """Of the epochs with a result, those with a number wherever others have one; counts the rest.
+
+    A covariance matrix at the edge of singularity can have negative variances, that is no sd.
+    """
+    whole = ok.copy()
+    for k in range(values.shape[1]):
+        whole &= np.isfinite(values[:, k])
+        has = np.isfinite(sds[:, k])
+        if (has & ok).any():
+            whole &= has
+    missing = int(np.count_nonzero(ok & ~whole))
+    if missing:
+        lost["no standard deviation"] = missing
+    return whole
 
 
 def _in_words(lost: Mapping[str, int]) -> str:

@@ -45,7 +45,7 @@ _STYLE: dict[str, Any] = {
 _PANEL_INCHES = (3.4, 2.5)
 
 
-def _figure(width: float, height: float, layout: Literal["constrained", "none"]) -> Any:
+def _figure(width: float, height: float, layout: Literal["constrained"] | None) -> Any:
     # Without pyplot: no global state, no window, nothing to close.
     from matplotlib.figure import Figure as Canvas
 
@@ -99,7 +99,7 @@ def draw_panel(panel: Panel, *, legend: bool = True) -> Any:
     """One panel as a drawing of its own."""
     with _style():
         # Fixed margins fit the short labels; fitting them exactly triples the time of a report.
-        drawing = _figure(*_PANEL_INCHES, "none")
+        drawing = _figure(*_PANEL_INCHES, None)
         drawing.subplots_adjust(left=0.19, right=0.98, bottom=0.19, top=0.89)
         _fill(drawing.subplots(), panel, legend=legend)
         return drawing

@@ -1,0 +1,92 @@
+"""Series from recordings and stores: what is read, what is left out and why."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from thermocald.analysis.study_input import load_series
+from thermocald.errors import DataError
+from thermocald.photogrammetry.camera_model import IOP_NAMES
+from thermocald.simulation.presets import preset_simulation
+from thermocald.store.database import Store
+from thermocald.store.row import EpochResult
+
+FREE = ("c", "x0", "y0", "A1", "A2", "B1", "B2")
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """Ten epochs of a warm phone, of which two say too little or nothing."""
+    simulation = preset_simulation("nexus5-warm", 1)
+    simulation = replace(simulation, programme=replace(simulation.programme, epochs=10))
+    simulation.write(tmp_path / "rec")
+    lines = (tmp_path / "rec" / "observations.csv").read_text().splitlines(keepends=True)
+    kept = [line for line in lines if not line.startswith("3,")]
+    few = [line for line in kept if line.startswith("7,")][3:]
+    text = "".join(line for line in kept if line not in few)
+    (tmp_path / "rec" / "observations.csv").write_text(text)
+    return tmp_path / "rec"
+
+
+def test_epochs_without_a_result_are_counted_and_the_rest_is_relative(recording):
+    (series,) = load_series(recording, free=FREE)
+    assert series.number.tolist() == [1, 2, 4, 5, 6, 8, 9, 10]
+    assert sum(series.without_result.values()) == 2
+    assert series.free == FREE
+    assert series.exterior == "series"
+    # DESIGN idea 3: with one exterior orientation, thousandths of a pixel.
+    assert series.sds[0, 1] / series.sensor.pixel_pitch < 0.01
+    assert series.correlations.shape == (8, 10, 10)
+    assert [t.name for t in series.thermometers] == ["temperature", "board_temperature"]
+    assert 0.02 < series.thermometers[0].sd < 0.12
+
+
+def test_the_thermometers_noise_may_be_given(recording):
+    (series,) = load_series(recording, thermometer_sd=0.25, free=FREE)
+    assert [t.sd for t in series.thermometers] == [0.25, 0.25]
+
+
+def test_a_store_is_read_in_columns_without_broken_epochs(recording, tmp_path):
+    from thermocald.store.recording import open_recording
+
+    opened = open_recording(recording)
+    covariance = np.diag(np.append(np.full(8, 1e-8), np.zeros(8)))
+    broken = covariance.copy()
+    broken[1, 1] = -1e-12
+    values = np.arange(16.0)
+    with Store.open(tmp_path / "s.db", "append", durable=False) as store:
+        stored = store.create_series(opened.head, opened.testfield, start="warm")
+        for epoch in opened.epochs:
+            result = EpochResult("ok", "", values + epoch.number, covariance, 1.0, 200, 100)
+            if epoch.number == 5:
+                result = replace(result, covariance=broken)
+            if epoch.number == 6:
+                result = EpochResult("too_few_targets", "3 targets")
+            store.append(stored, epoch, result)
+    (series,) = load_series(tmp_path / "s.db", exterior="per_epoch")
+    assert series.label == "nexus5-warm"
+    assert series.number.tolist() == [1, 2, 3, 4, 7, 8, 9, 10]
+    assert series.without_result == {"too few targets": 1, "no standard deviation": 1}
+    np.testing.assert_array_equal(series.values[0], values[:10] + 1)
+    assert series.free == IOP_NAMES[:8]
+    assert len(series.correlations) == 8
+    assert series.redundancy.tolist() == [200] * 8
+
+
+def test_a_store_without_any_result_is_one_error(recording, tmp_path):
+    from thermocald.store.recording import open_recording
+
+    opened = open_recording(recording)
+    with Store.open(tmp_path / "s.db", "append", durable=False) as store:
+        stored = store.create_series(opened.head, opened.testfield)
+        store.append(stored, opened.epochs[0], EpochResult("weak_geometry", "one plane"))
+    with pytest.raises(DataError, match=r"no epoch has a result \(1 × weak geometry\)"):
+        load_series(tmp_path / "s.db", exterior="per_epoch")
+
+
+def test_an_empty_store_is_one_error(tmp_path):
+    with Store.open(tmp_path / "s.db", "append", durable=False):
+        pass
+    with pytest.raises(DataError, match="holds no series"):
+        load_series(tmp_path / "s.db")

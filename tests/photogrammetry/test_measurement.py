@@ -148,6 +148,15 @@ def test_a_prior_that_is_wrong_does_no_harm(frame):
     assert np.abs(_z(found.observations, _truth())).max() < 5
 
 
+def test_a_camera_that_has_drifted_from_its_calibration_is_measured_whole(frame):
+    """Thirty px of the principal point and 1 % of c: a day in the sun."""
+    i = SMALL_CAMERA.interior
+    earlier = i.with_values(c=i.c * 0.99, x0=i.x0 + 30 * SMALL_SENSOR.pixel_pitch)
+    found = measure(frame, FIELD, Prior(SMALL_SENSOR, earlier))
+    assert len(found.observations) == len(measure(frame, FIELD).observations)
+    assert np.abs(_z(found.observations, _truth())).max() < 5
+
+
 def test_two_targets_are_too_few(clean):
     image = np.full(clean.shape, 190.0)
     for name in ("X0.0", "Y0.0"):

@@ -35,6 +35,7 @@ _GOOD_START = 0.02  # of the image's width: the RMS of a resection without disto
 _ITERATIONS = 12
 _LEAST_SD_PX = 0.05
 _CUT = 5.0
+_KNOWN_BETTER = 20.0  # times, than a data sheet knows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,7 +70,7 @@ def orient(
     if len(points) >= 6:
         start = _quick_start(sensor, points, image_points, nominal_c, interior)
     if start is not None:
-        found = refine(sensor, *start, points, image_points, fixed=interior is not None)
+        found = refine(sensor, *start, points, image_points, known=interior is not None)
         if found.scatter < 1.5 and np.mean(np.abs(found.residuals).max(axis=1) < 8.0) > 0.8:
             return found
     i, e, inliers = approximate_orientation(sensor, points, image_points, nominal_c, interior)
@@ -113,22 +114,24 @@ def refine(
     exterior: ExteriorOrientation,
     points: Array,
     image_points: Array,
-    fixed: bool = False,
+    known: bool = False,
 ) -> Orientation:
-    """Adjust pose and, unless `fixed`, c, x0, y0, A1, A2, B1, B2, with weak priors, robustly."""
+    """Adjust pose and c, x0, y0, A1, A2, B1, B2 with priors, robustly.
+
+    known: the interior orientation is an earlier calibration; a camera drifts from it by some per
+    mille, so it is held loosely all the same.
+    """
     size = sensor.width * sensor.pixel_pitch
     n = len(points)
     # What a camera's parameters may be off from nominal, as sd; A1 r² of 5 % at the image's edge.
     radius2 = (size / 2) ** 2
-    prior_sd = np.full(16, 1e-12)
-    if not fixed:
-        prior_sd[[0, 1, 2]] = 0.3 * interior.c, 0.02 * size, 0.02 * size
-        prior_sd[[3, 4]] = 0.05 / radius2, 0.05 / radius2**2
-        prior_sd[[6, 7]] = 0.002 / size
-    free = list(range(10, 16)) if fixed else [0, 1, 2, 3, 4, 6, 7, *range(10, 16)]
-    prior = np.zeros(len(free)) if fixed else 1 / prior_sd[free] ** 2
-    if not fixed:
-        prior[-6:] = 0.0
+    prior_sd = np.array(
+        [0.3 * interior.c, 0.02 * size, 0.02 * size, 0.05 / radius2, 0.05 / radius2**2,
+         0.002 / size, 0.002 / size]
+    )  # fmt: skip
+    free = [0, 1, 2, 3, 4, 6, 7, *range(10, 16)]
+    prior = np.zeros(len(free))
+    prior[:7] = (_KNOWN_BETTER if known else 1.0) ** 2 / prior_sd**2
     nominal = np.concatenate([interior.as_array(), exterior.as_array()])
     p = nominal.copy()
     weight = np.ones(n)

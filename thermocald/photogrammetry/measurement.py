@@ -219,7 +219,7 @@ def _measure_circles(
     better = refine(
         orientation.camera.sensor, orientation.camera.interior, orientation.exterior,
         testfield.points[pairs], np.concatenate([corners.points, fit.points[good]]),
-        fixed=interior is not None,
+        known=interior is not None,
     )  # fmt: skip
     new_rows, new_maps = predicted_maps(testfield, better, eccentricity)
     same = len(new_rows) == len(rows) and bool(np.all(new_rows == rows))

@@ -1,0 +1,78 @@
+"""Which frames are kept and which are deleted."""
+
+from __future__ import annotations
+
+import os
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from thermocald.acquisition.frame_folder import FrameFolder
+from thermocald.config import FramesConfig
+from thermocald.hal import Frame
+
+
+@pytest.fixture
+def folder_of(tmp_path):
+    def make(**options) -> FrameFolder:
+        return FrameFolder(
+            FramesConfig(folder=tmp_path / "frames", **{"min_free_gb": 0, **options})
+        )
+
+    return make
+
+
+def frame(encoded: bytes | None = None) -> Frame:
+    image = None if encoded else np.arange(600, dtype=np.uint16).reshape(20, 30)
+    return Frame(image, 0.0, 0.0, encoded=encoded)
+
+
+@pytest.mark.parametrize(
+    ("keep", "wanted"),
+    [("all", [1, 2, 3, 4, 5, 6]), ("every_n", [3, 6]), ("events", [4]), ("none", [])],
+)
+def test_what_is_kept(folder_of, keep, wanted):
+    folder = folder_of(keep=keep, every_n=3)
+    assert [n for n in range(1, 7) if folder.wanted(n, eventful=n == 4)] == wanted
+
+
+def test_a_jpeg_stays_as_it_came_and_grey_values_lose_nothing(folder_of):
+    folder = folder_of()
+    jpeg = folder.keep("cam", "M1", 1234, frame(b"\xff\xd8 as it came \xff\xd9"))
+    assert str(jpeg) == "cam/M1/0001/0001234.jpg"
+    assert (folder.root / jpeg).read_bytes() == b"\xff\xd8 as it came \xff\xd9"
+    png = folder.keep("cam", "M1", 7, frame())
+    back = cv2.imread(str(folder.root / png), cv2.IMREAD_UNCHANGED)
+    assert np.array_equal(back, frame().image)
+
+
+def test_retention_by_age_and_by_size_takes_the_oldest_and_says_so(folder_of):
+    folder = folder_of(max_age_days=10, max_size_gb=2.5e-6)
+    now = time.time()
+    for n in range(1, 7):
+        path = folder.root / folder.keep("cam", "M1", n, frame(b"\xff\xd8" + bytes(998)))
+        os.utime(path, (now - 86400 * (14 - 2 * n),) * 2)  # 12, 10.. days old
+    deleted = folder.enforce(now - 1.0)
+    left = sorted(p.stem for p in folder.root.rglob("*.jpg"))
+    assert left == ["0000005", "0000006"]
+    assert [d.frames for d in deleted] == [1, 3]
+    assert "older than 10 days" in deleted[0].text
+    assert "more than 2.5e-06 GB" in deleted[1].text
+    assert folder.enforce(now - 1.0) == []
+
+
+def test_below_the_least_free_space_no_frame_is_written(folder_of, caplog):
+    folder = folder_of(min_free_gb=1e6)
+    assert folder.keep("cam", "M1", 1, frame()) is None
+    assert folder.keep("cam", "M1", 2, frame()) is None
+    assert "min_free_gb" in folder.paused
+    assert caplog.text.count("no frames are kept") == 1
+
+
+def test_a_folder_that_cannot_be_written_is_no_error(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    folder = FrameFolder(FramesConfig(folder=tmp_path / "file" / "frames", min_free_gb=0))
+    assert folder.keep("cam", "M1", 1, frame()) is None
+    assert folder.paused

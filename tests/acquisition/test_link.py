@@ -1,0 +1,99 @@
+"""Faults of a device: retried, told once, given up where nothing helps."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+
+from thermocald.acquisition.link import Link
+from thermocald.errors import DeviceDenied, DeviceGone, DeviceNotFound
+from thermocald.hal import VirtualClock, open_device
+
+
+@pytest.fixture
+def clock():
+    return VirtualClock()
+
+
+@pytest.fixture
+def link_of(clock):
+    """faults → (thermometer, link, events)."""
+
+    def make(*faults, period_s=10.0):
+        events = []
+        device = open_device("thermometer", "mock", {"faults": list(faults)}, clock)
+        link = Link("thermometer", "t", device, clock, period_s=period_s, on_event=events.append)
+        return device, link, events
+
+    return make
+
+
+def poll(clock, link, device, times: int, period_s: float) -> list[bool]:
+    answers = []
+    for _ in range(times):
+        answers.append(link.call(device.read) is not None)
+        clock.advance(period_s - 0.1)
+    return answers
+
+
+def test_away_and_back_costs_only_the_ticks_away(clock, link_of, caplog):
+    device, link, events = link_of({"kind": "unplugged", "at_s": 25.0, "for_s": 300.0})
+    caplog.set_level("INFO")
+    answers = poll(clock, link, device, 40, 10.0)
+    assert answers == [True] * 3 + [False] * 30 + [True] * 7
+    assert [event.kind for event in events] == ["device_out", "device_back"]
+    assert caplog.text.count("is out") == 1
+    assert caplog.text.count("is back") == 1
+
+
+def test_fast_ticks_back_off(clock, link_of):
+    device, link, _ = link_of({"kind": "unplugged", "at_s": 0.0, "for_s": 60.0}, period_s=0.05)
+    attempts = []
+    device.open = lambda: attempts.append(clock.monotonic()) or _gone()
+    for _ in range(600):
+        link.call(device.read)
+        clock.advance(0.05)
+    assert 10 < len(attempts) < 40  # not 600: the pauses grow to 2 s
+    assert max(b - a for a, b in pairwise(attempts)) <= 2.1
+
+
+def _gone():
+    raise DeviceGone("gone")
+
+
+def test_what_no_retry_mends_is_given_up_and_told(clock, link_of):
+    device, link, events = link_of()
+
+    def denied():
+        raise DeviceDenied("group video")
+
+    assert link.call(denied) is None
+    assert link.ended
+    assert [event.kind for event in events] == ["device_failed"]
+    assert link.call(device.read) is None
+
+
+def test_a_device_that_is_not_there_at_boot_is_looked_for(clock, link_of):
+    device, link, events = link_of()
+    there = device.open
+    missing = [True] * 3
+
+    def open_late():
+        if missing:
+            missing.pop()
+            raise DeviceNotFound("no such device")
+        there()
+
+    device.open = open_late
+    poll(clock, link, device, 10, 10.0)
+    assert link.state == "open"
+    assert [event.kind for event in events] == ["device_out", "device_back"]
+
+
+def test_a_bug_in_a_driver_is_a_fault_not_the_end(clock, link_of):
+    device, link, _ = link_of()
+    assert link.call(lambda: 1 / 0) is None
+    assert link.state == "out"
+    clock.advance(10.0)
+    assert link.call(device.read) is not None

@@ -1,0 +1,136 @@
+"""What is put off, what is kept, in which order, when calibration or the disk is slow."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from thermocald.acquisition.calibrator import CalibratedEpoch
+from thermocald.acquisition.live_pipeline import LivePipeline
+from thermocald.acquisition.pairing import Readings
+from thermocald.epoch import Epoch
+from thermocald.hal import Frame, SystemClock
+from thermocald.photogrammetry.adjustment import failed
+
+
+class SlowCalibrator:
+    """Takes its time; a gate holds it up."""
+
+    def __init__(self) -> None:
+        self.gate = threading.Event()
+        self.testfield = None
+        self.seen: list[int] = []
+
+    def calibrate(self, epoch: Epoch, image=None) -> CalibratedEpoch:
+        self.gate.wait(10.0)
+        self.seen.append(epoch.number)
+        if epoch.number == 666:
+            raise RuntimeError("a bug")
+        return CalibratedEpoch(epoch, failed("ok", ""), {})
+
+    def reset(self) -> None:
+        pass
+
+
+class ListKeeper:
+    """Keeps in lists, and gives back what was put off."""
+
+    def __init__(self) -> None:
+        self.kept: list[tuple[int, bool]] = []
+        self.amended: list[int] = []
+        self.pause_s = 0.0
+
+    def keep(self, acquired) -> None:
+        time.sleep(self.pause_s)
+        self.kept.append((acquired.number, acquired.calibrated is not None))
+
+    def amend(self, calibrated) -> None:
+        self.amended.append(calibrated.epoch.number)
+
+    def backlog(self, below: int):
+        for number, calibrated in self.kept:
+            if not calibrated and number not in self.amended:
+                return Epoch(number, 0.0, 0.0)
+        return None
+
+
+@pytest.fixture
+def pipeline():
+    keeper, calibrator = ListKeeper(), SlowCalibrator()
+    made = LivePipeline(
+        "cam", calibrator, Readings({}), (), keeper, SystemClock(), depth=3, patience_s=0.0
+    )
+    made.start()
+    yield made, keeper, calibrator
+    calibrator.gate.set()
+    assert made.stop(10.0)
+
+
+def frame() -> Frame:
+    return Frame(np.zeros((20, 20), dtype=np.uint8), time.monotonic(), time.time())
+
+
+def until(condition) -> None:
+    deadline = time.monotonic() + 10.0
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def test_too_slow_it_drops_calibration_never_acquisition_and_catches_up(pipeline):
+    made, keeper, calibrator = pipeline
+    for _ in range(20):
+        made.submit(frame())
+        time.sleep(0.005)
+    until(lambda: len(keeper.kept) == 17)  # three may wait
+    assert keeper.kept == [(n, False) for n in range(1, 18)]
+    calibrator.gate.set()
+    until(lambda: len(keeper.amended) == 17)
+    assert sorted(keeper.amended) == list(range(1, 18))
+    assert keeper.kept[17:] == [(18, True), (19, True), (20, True)]
+    assert (made.lost, made.dropped, made.caught_up) == (0, 17, 17)
+
+
+def test_fast_enough_everything_is_calibrated_in_order(pipeline):
+    made, keeper, calibrator = pipeline
+    calibrator.gate.set()
+    for n in range(1, 51):
+        made.submit(frame())
+        until(lambda n=n: len(keeper.kept) == n)
+    assert keeper.kept == [(n, True) for n in range(1, 51)]
+    assert made.dropped == 0
+
+
+def test_the_end_finishes_the_epoch_in_hand_and_keeps_the_others(pipeline):
+    made, keeper, calibrator = pipeline
+    for _ in range(3):
+        made.submit(frame())
+    time.sleep(0.05)
+    threading.Timer(0.1, calibrator.gate.set).start()
+    assert made.stop(10.0)
+    assert keeper.kept == [(1, True), (2, False), (3, False)]
+
+
+def test_a_disk_that_hangs_costs_frames_only_when_memory_is_used_up(pipeline):
+    made, keeper, calibrator = pipeline
+    calibrator.gate.set()
+    keeper.pause_s = 0.5
+    for _ in range(12):
+        made.submit(frame())
+    assert made.lost > 0
+    keeper.pause_s = 0.0
+    until(lambda: len(keeper.kept) == 12 - made.lost)
+    assert [n for n, _ in keeper.kept] == list(range(1, 13 - made.lost))
+
+
+def test_a_bug_in_one_epoch_does_not_end_acquisition(pipeline, caplog):
+    made, keeper, calibrator = pipeline
+    made.next_number = 666
+    calibrator.gate.set()
+    made.submit(frame())
+    made.submit(frame())
+    until(lambda: len(keeper.kept) == 2)
+    assert "epoch 666 was not calibrated" in caplog.text

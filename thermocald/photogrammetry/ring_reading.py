@@ -41,6 +41,7 @@ _INSIDE, _OUTSIDE = 0.6, 0.4  # level of a sample, 0 background, 1 ink
 _LEAST_RELIEF = 0.35  # of the ring, against none about a plain circle
 _SHARE = 0.85  # of the samples on a circle that must agree
 _LEAST_CONTRAST_DN = 10.0
+_SMALLEST_SEMI_AXIS_PX = 2.6  # a gap of less cannot be seen
 _RASTER_PX = 0.5  # by how much a transition may miss the raster, and by how many turns
 _RASTER_TURNS = 0.006
 _BLURS_PX = (0.8, 1.4)
@@ -109,7 +110,9 @@ def _disc_and_gap(
     height, width = image.shape
     reach = candidates.maps.half_extent * ring_code.RING_OUTER
     low, high = candidates.maps.centre - reach, candidates.maps.centre + reach
-    rows = np.nonzero(np.all((low > 0) & (high < (width - 1, height - 1)), axis=1))[0]
+    inside = np.all((low > 0) & (high < (width - 1, height - 1)), axis=1)
+    large = candidates.maps.semi_axes[:, 1] >= _SMALLEST_SEMI_AXIS_PX
+    rows = np.nonzero(inside & large)[0]
     grey = _sample(image, candidates.maps.select(rows), _COARSE_RADII, _COARSE_ANGLES)
     ink, gap = grey[:, 0].mean(axis=1), grey[:, 1].mean(axis=1)
     contrast = ink - gap

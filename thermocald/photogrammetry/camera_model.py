@@ -357,7 +357,9 @@ def rays(sensor: Sensor, iop: ArrayLike, image_points: ArrayLike) -> Array:
     jxx, jxy, jyx, jyy = _distortion_jacobian(i, x, y)
     finite = np.isfinite(xm) & np.isfinite(ym)
     with np.errstate(invalid="ignore"):
-        folded = (jxx * jyy - jxy * jyx <= 0) | ~(size <= tolerance) | ~np.isfinite(x)
+        # Beyond the fold both eigenvalues may be negative: their product alone does not tell.
+        folded = (jxx * jyy - jxy * jyx <= 0) | (jxx + jyy <= 0)
+        folded |= ~(size <= tolerance) | ~np.isfinite(x)
     failed = finite & folded
     if bool(np.any(failed)):
         where = np.argwhere(failed)[0]

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dtrtri
 
 from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera_model import PARAMETER_NAMES, partials, project
@@ -163,8 +162,12 @@ def cofactor_root(N: Array, unknowns: NDArray[np.int64], damping: float = 0.0) -
     scaled = N * scale * scale[:, None]
     if damping:
         scaled.flat[:: len(scale) + 1] += damping
-    factor, info = dpotrf(scaled)
-    if info != 0 or factor.diagonal().min() < 1e-8:
+    # NumPy's factorisation, as importing SciPy's would cost the daemon 20 MB.
+    try:
+        factor = np.linalg.cholesky(scaled)
+    except np.linalg.LinAlgError:
+        factor = None
+    if factor is None or factor.diagonal().min() < 1e-8:
         eigenvalues, vectors = np.linalg.eigh(scaled)
         worst = np.argsort(-np.abs(vectors[:, 0]))[:3]
         together = ", ".join(PARAMETER_NAMES[unknowns[i]] for i in worst)
@@ -172,8 +175,7 @@ def cofactor_root(N: Array, unknowns: NDArray[np.int64], damping: float = 0.0) -
             f"the normal matrix is singular (smallest eigenvalue {eigenvalues[0]:.1e}): these "
             f"targets cannot tell {together} apart"
         )
-    inverse, _ = dtrtri(factor)
-    root: Array = scale[:, None] * inverse
+    root: Array = scale[:, None] * np.linalg.inv(factor).T
     return root
 
 
@@ -297,7 +299,7 @@ def snoop(test: Array, use: Mask, unknowns: int, alpha: float) -> Mask:
     if 2 * n - unknowns < _TRUSTED_REDUNDANCY:
         variance = max(1.0, variance)
     limit = chi2_2d(alpha) * max(variance, 1e-12)
-    keep = use | (test <= limit)
+    keep: Mask = use | (test <= limit)
     suspicious = use & (test > limit)
     if suspicious.any():
         # One gross error lifts its neighbours: only those near the worst go at once.

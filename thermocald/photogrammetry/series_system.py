@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dtrtri
 
 from thermocald.photogrammetry.gauss_markov import chi2_2d
 from thermocald.photogrammetry.normals import normal_matrices, right_hand_sides
@@ -365,20 +364,24 @@ def _inverse(N: Array) -> Array:
         return N
     scale = 1.0 / np.sqrt(np.clip(np.diag(N), 1e-300, None))
     both = np.outer(scale, scale)
-    factor, info = dpotrf(N * both)
-    if info == 0 and factor.diagonal().min() > 1e-6:
-        triangle, _ = dtrtri(factor)
-        regular: Array = (triangle @ triangle.T) * both
-        return regular
+    try:
+        factor = np.linalg.cholesky(N * both)
+        if factor.diagonal().min() > 1e-6:
+            triangle = np.linalg.inv(factor)
+            regular: Array = (triangle.T @ triangle) * both
+            return regular
+    except np.linalg.LinAlgError:
+        pass
     inverse: Array = np.linalg.pinv(N * both, rcond=1e-13, hermitian=True) * both
     return inverse
 
 
 def _root(Q: Array) -> Array:
     """A root of a covariance, Q = root · rootᵀ."""
-    factor, info = dpotrf(Q, lower=1, clean=1)
-    if info == 0:
-        return np.asarray(factor)
+    try:
+        return np.linalg.cholesky(Q)
+    except np.linalg.LinAlgError:
+        pass
     values, vectors = np.linalg.eigh(Q)
     root: Array = vectors * np.sqrt(np.clip(values, 0.0, None))
     return root

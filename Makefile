@@ -1,0 +1,51 @@
+# Two commands do all the set-up: `make demo` runs the main job, `make test` passes the tests.
+PYTHON ?= python3
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+STAMP  := $(VENV)/.installed
+export OPENBLAS_NUM_THREADS ?= 1
+
+.PHONY: help setup demo test lint test-slow bench hil docs clean
+
+help: ## this list
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
+
+setup: $(STAMP) ## the virtual environment in .venv
+
+$(STAMP): pyproject.toml
+	@echo "== setting up $(VENV)"
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' \
+	  || { echo "Python 3.11 to 3.13 is needed; set PYTHON=python3.12 or the like" >&2; exit 2; }
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) \
+	  || { echo "the venv module is missing: sudo apt-get install python3-venv" >&2; exit 2; }
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	@touch $@
+
+demo: $(STAMP) ## the main job on a rendered camera, ending with a hidden effect found
+	rm -rf build/demo
+	$(BIN)/thermocald demo --out build/demo
+
+lint: $(STAMP) ## ruff, mypy --strict, layers
+	@echo "== ruff"
+	$(BIN)/ruff check .
+	@echo "== mypy --strict"
+	$(BIN)/mypy
+	@echo "== layers"
+	$(BIN)/lint-imports
+
+test: lint ## lint, then the quick tests
+	@echo "== pytest"
+	$(BIN)/python -m pytest -q
+
+test-slow: $(STAMP) ## long statistics and browser tests
+	$(BIN)/python -m pytest -q -m slow
+
+bench: $(STAMP) ## ratios to peers, in one run on one thread
+	@for b in benchmarks/*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done
+
+hil: $(STAMP) ## the laboratory: real kernel drivers without hardware (needs root, apt)
+	tests/hil/run
+
+clean: ## remove what was made
+	rm -rf build .venv

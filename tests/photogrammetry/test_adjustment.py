@@ -1,0 +1,224 @@
+"""The adjustment of one epoch: true standard deviations, gross errors, weak geometry said."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import corner_camera as scene
+import cv2
+import numpy as np
+import pytest
+
+from thermocald.photogrammetry.adjustment import AdjustmentSettings, adjust
+from thermocald.photogrammetry.camera_model import (
+    ExteriorOrientation,
+    InteriorOrientation,
+    partials,
+)
+from thermocald.photogrammetry.cold_start import cold_start, pose_only
+from thermocald.photogrammetry.testfield import Observations, TestField
+
+FREE = np.array([0, 1, 2, 3, 4, 5, 6, 7, 10, 11, 12, 13, 14, 15])
+TRUTH = np.concatenate([scene.INTERIOR.as_array(), scene.EXTERIOR.as_array()])
+DRAWS = 5000
+
+
+@pytest.fixture(scope="module")
+def draws():
+    """5,000 seeded adjustments of the same epoch: values (n, 16), sds (n, 16), sigma0 (n,)."""
+    rng = np.random.default_rng(20)
+    field = scene.corner_field()
+    settings = AdjustmentSettings(snooping_alpha=0.0)
+    values, sds, sigma0 = [], [], []
+    for _ in range(DRAWS):
+        a = adjust(
+            scene.SENSOR, field, scene.observe(field, rng), scene.INTERIOR, scene.EXTERIOR, settings
+        )
+        assert a.ok
+        values.append(a.values)
+        sds.append(a.sd)
+        sigma0.append(a.sigma0)
+    return np.array(values), np.array(sds), np.array(sigma0)
+
+
+def test_no_bias(draws):
+    """Below 0.05 sd: the mean of 5,000 draws has a standard error of 0.014 sd."""
+    values, sds, _ = draws
+    bias = (values.mean(axis=0) - TRUTH)[FREE] / sds.mean(axis=0)[FREE]
+    assert np.abs(bias).max() < 0.05
+
+
+def test_scatter_is_the_stated_sd(draws):
+    """0.97 to 1.03: a standard deviation of 5,000 draws has a standard error of 1 %."""
+    values, sds, _ = draws
+    ratio = values.std(axis=0, ddof=1)[FREE] / np.sqrt((sds**2).mean(axis=0))[FREE]
+    assert ratio.min() > 0.97
+    assert ratio.max() < 1.03
+
+
+def test_it_reaches_the_cramer_rao_bound(draws):
+    """The bound from the partials at the truth, formed here and not by the adjustment."""
+    values, _, sigma0 = draws
+    field = scene.corner_field()
+    seen = scene.observe(field, np.random.default_rng(0)).targets
+    _, A, _ = partials(scene.SENSOR, TRUTH[:10], TRUTH[10:], field.points[seen])
+    J = A.reshape(-1, 16)[:, FREE] / scene.SIGMA_PX
+    scale = np.linalg.norm(J, axis=0)
+    bound = np.sqrt(np.diag(np.linalg.inv((J / scale).T @ (J / scale)))) / scale
+    ratio = values.std(axis=0, ddof=1)[FREE] / bound
+    assert ratio.min() > 0.97
+    assert ratio.max() < 1.03
+    assert sigma0.mean() == pytest.approx(1.0, abs=0.005)
+
+
+def test_same_interior_as_opencv():
+    """To 1e-3 px, for the same observations and parameters."""
+    field = scene.corner_field()
+    obs = scene.observe(field, np.random.default_rng(3))
+    a = adjust(
+        scene.SENSOR, field, obs, scene.INTERIOR, scene.EXTERIOR,
+        AdjustmentSettings(snooping_alpha=0.0),
+    )  # fmt: skip
+    f, (cx, cy) = scene.INTERIOR.c / scene.SENSOR.pixel_pitch, scene.SENSOR.centre
+    K = np.array([[f, 0, cx], [0, f, cy], [0, 0, 1.0]])
+    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO
+    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-14)
+    _, K, d, *_ = cv2.calibrateCameraExtended(
+        field.points[obs.targets].astype(np.float32)[None], obs.points.astype(np.float32)[None],
+        (scene.SENSOR.width, scene.SENSOR.height), K, np.zeros(5), flags=flags, criteria=criteria,
+    )  # fmt: skip
+    i, p = a.interior, scene.SENSOR.pixel_pitch
+    assert i.c / p == pytest.approx(K[0, 0], abs=1e-3)
+    assert cx + i.x0 / p == pytest.approx(K[0, 2], abs=1e-3)
+    assert cy - i.y0 / p == pytest.approx(K[1, 2], abs=1e-3)
+    # distortion: what its difference moves a corner of the image by
+    ours = np.array([i.A1 * i.c**2, i.A2 * i.c**4, -i.B2 * i.c, i.B1 * i.c, i.A3 * i.c**6])
+    corner = np.array([[[10.0, 10.0]]])
+    moved = cv2.undistortPoints(corner, K, ours, P=K) - cv2.undistortPoints(corner, K, d, P=K)
+    assert np.abs(moved).max() < 5e-3
+
+
+def test_priors_and_held_parameters():
+    field = scene.corner_field()
+    obs = scene.observe(field, np.random.default_rng(4))
+    settings = AdjustmentSettings(free=("c", "x0", "y0"), priors={"c": (3.05, 1e-7)}, scale="prior")
+    a = adjust(scene.SENSOR, field, obs, scene.INTERIOR, scene.EXTERIOR, settings)
+    assert a.interior.c == pytest.approx(3.05, abs=1e-6)
+    assert a.interior.A1 == scene.INTERIOR.A1
+    assert np.isnan(a.sd[3])
+    assert a.sd[0] == pytest.approx(1e-7, rel=0.01)
+
+
+def test_object_sigmas_count():
+    """Noise of the coordinates in the draws, and their sigmas in the field: sds stay true."""
+    rng = np.random.default_rng(5)
+    exact, known = scene.corner_field(), scene.corner_field(0.05)
+    values, sds = [], []
+    for _ in range(400):
+        points = exact.points + rng.normal(0, 0.05, exact.points.shape)
+        obs = scene.observe(TestField.build(exact.names, points), rng)
+        a = adjust(
+            scene.SENSOR, known, obs, scene.INTERIOR, scene.EXTERIOR,
+            AdjustmentSettings(snooping_alpha=0.0, scale="prior"),
+        )  # fmt: skip
+        values.append(a.values)
+        sds.append(a.sd)
+    ratio = np.std(values, axis=0)[FREE] / np.mean(sds, axis=0)[FREE]
+    assert ratio.min() > 0.87  # 400 draws: a standard error of 3.5 %
+    assert ratio.max() < 1.13
+
+
+def test_gross_errors_are_found_and_named():
+    rng = np.random.default_rng(6)
+    field = scene.corner_field()
+    obs = scene.observe(field, rng)
+    points = obs.points.copy()
+    bad = rng.choice(len(points), 15, replace=False)
+    # 8 sigma to 300 px, in any direction
+    size = np.geomspace(8 * scene.SIGMA_PX, 300, 15)
+    angle = rng.uniform(0, 2 * np.pi, 15)
+    points[bad] += size[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    a = cold_start(
+        scene.SENSOR, field, replace(obs, points=points), AdjustmentSettings(), nominal_c=3.04
+    )
+    assert a.ok
+    assert set(obs.targets[bad].tolist()) <= set(a.rejected)
+    assert len(a.rejected) <= 15 + 3
+    assert np.all(np.abs((a.values - TRUTH)[FREE]) < 5 * a.sd[FREE])
+
+
+def test_redundancy_numbers_sum_to_the_redundancy():
+    field = scene.corner_field()
+    obs = scene.observe(field, np.random.default_rng(7))
+    a = adjust(
+        scene.SENSOR, field, obs, scene.INTERIOR, scene.EXTERIOR,
+        AdjustmentSettings(snooping_alpha=0.0),
+    )  # fmt: skip
+    assert a.redundancy_numbers.sum() == pytest.approx(a.redundancy, rel=1e-6)
+
+
+@pytest.mark.parametrize("nominal", [None, 3.0, 3.04])
+def test_from_nothing(nominal):
+    field = scene.corner_field()
+    obs = scene.observe(field, np.random.default_rng(8))
+    a = cold_start(scene.SENSOR, field, obs, AdjustmentSettings(), nominal_c=nominal)
+    assert a.ok
+    assert np.all(np.abs((a.values - TRUTH)[FREE]) < 5 * a.sd[FREE])
+
+
+def frontal_plane(size=40):
+    a, b = (g.ravel() for g in np.meshgrid(np.linspace(-300, 300, 9), np.linspace(-200, 200, 7)))
+    return TestField.build([str(i) for i in range(len(a))], np.c_[a, b, 0 * a], 0.0)
+
+
+def test_one_plane_seen_frontally_is_weak():
+    field = frontal_plane()
+    exterior = ExteriorOrientation(0.02, 0.03, 0.0, 0.0, 0.0, 700.0)
+    obs = scene.observe(field, np.random.default_rng(9), exterior=exterior)
+    a = cold_start(scene.SENSOR, field, obs, AdjustmentSettings(), nominal_c=3.04)
+    assert a.status == "weak_geometry"
+    assert "plane" in a.reason or "apart" in a.reason or "known to" in a.reason
+
+
+def test_targets_in_one_corner_are_weak():
+    field = scene.corner_field()
+    obs = scene.observe(field, np.random.default_rng(10))
+    near = np.linalg.norm(obs.points - obs.points.min(axis=0), axis=1) < 900
+    settings = AdjustmentSettings(free=("c", "x0", "y0"))
+    a = adjust(scene.SENSOR, field, obs.select(near), scene.INTERIOR, scene.EXTERIOR, settings)
+    assert a.status == "weak_geometry"
+    assert "of the image" in a.reason
+
+
+def test_too_few_targets_are_said():
+    field = scene.corner_field()
+    obs = scene.observe(field, np.random.default_rng(11))
+    a = cold_start(scene.SENSOR, field, obs.select(np.arange(len(obs)) % 20 == 0))
+    assert a.status == "too_few_targets"
+    assert "8 targets for 14 unknowns" in a.reason
+
+
+def test_another_test_field_is_said():
+    rng = np.random.default_rng(12)
+    field = scene.corner_field()
+    obs = scene.observe(field, rng)
+    shuffled = replace(obs, targets=rng.permutation(obs.targets))
+    a = cold_start(scene.SENSOR, field, shuffled, AdjustmentSettings(), nominal_c=3.04)
+    assert not a.ok
+    assert a.interior is None or a.reason
+
+
+def test_a_mirrored_pose_is_said():
+    """One small plane far away: two poses explain it."""
+    field = TestField.build(
+        [str(i) for i in range(8)],
+        [[0, 0, 0], [160, 0, 0], [160, 160, 0], [0, 160, 0],
+         [300, 0, 0], [460, 0, 0], [460, 160, 0], [300, 160, 0]],
+    )  # fmt: skip
+    camera = InteriorOrientation(3.04)
+    stand = scene.looking_at([230, 80, 9000], [230, 80, 0])
+    points = scene.true_points(field, camera, stand)
+    noisy = points + np.random.default_rng(13).normal(0, 0.3, points.shape)
+    obs = Observations(np.arange(8), noisy, np.full((8, 2), 0.3))
+    a = pose_only(scene.SENSOR, field, obs, camera)
+    assert a.status == "ambiguous_pose"

@@ -1,0 +1,111 @@
+"""The camera model: forward, inverse, partials, and that it is OpenCV's (CONVENTIONS §2)."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from thermocald.errors import GeometryError
+from thermocald.photogrammetry.camera_model import (
+    PARAMETER_NAMES,
+    CameraModel,
+    ExteriorOrientation,
+    InteriorOrientation,
+    Sensor,
+    camera_coordinates,
+    partials,
+    project,
+    rays,
+)
+
+SENSOR = Sensor(3280, 2464, 0.00112)
+IOP = np.array([3.04, 0.02, -0.03, -5e-3, 4e-4, -1e-5, 3e-4, -2e-4, 1e-4, 2e-4])
+EOP = np.array([0.1, -0.2, 0.3, 10.0, 20.0, 800.0])
+
+
+@pytest.fixture
+def points():
+    return np.random.default_rng(1).uniform(-300, 300, (60, 3)) * [1, 1, 0.5]
+
+
+@pytest.mark.parametrize("parameter", range(16))
+def test_partials_by_parameters_are_differences(points, parameter):
+    """To 1e-7 of the column; says nothing about the model itself, which OpenCV does below."""
+    values = np.concatenate([IOP, EOP])
+    step = 1e-6 * max(abs(values[parameter]), 1e-2) if parameter < 10 else 1e-5
+    up, down = values.copy(), values.copy()
+    up[parameter] += step
+    down[parameter] -= step
+    difference = (
+        project(SENSOR, up[:10], up[10:], points) - project(SENSOR, down[:10], down[10:], points)
+    ) / (2 * step)
+    analytic = partials(SENSOR, IOP, EOP, points)[1][:, :, parameter]
+    error = np.abs(difference - analytic).max() / np.abs(analytic).max()
+    assert error < 1e-7, PARAMETER_NAMES[parameter]
+
+
+def test_partials_by_object_points_are_differences(points):
+    analytic = partials(SENSOR, IOP, EOP, points)[2]
+    for axis in range(3):
+        step = np.zeros(3)
+        step[axis] = 1e-4
+        difference = (
+            project(SENSOR, IOP, EOP, points + step) - project(SENSOR, IOP, EOP, points - step)
+        ) / 2e-4
+        assert np.abs(difference - analytic[:, :, axis]).max() < 1e-7 * np.abs(analytic).max()
+
+
+def test_epochs_are_vectorised(points):
+    iop = IOP + np.random.default_rng(2).normal(0, 1e-4, (3, 4, 10))
+    eop = np.broadcast_to(EOP, (3, 4, 6))
+    image, by_parameter, by_point = partials(SENSOR, iop, eop, points)
+    one, one_parameter, one_point = partials(SENSOR, iop[2, 1], EOP, points)
+    np.testing.assert_allclose(image[2, 1], one, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(by_parameter[2, 1], one_parameter, rtol=1e-12, atol=1e-9)
+    np.testing.assert_allclose(by_point[2, 1], one_point, rtol=1e-12, atol=1e-12)
+
+
+def test_inverse_returns_the_ray(points):
+    image = project(SENSOR, IOP, EOP, points)
+    q = camera_coordinates(EOP, points)
+    expected = q / np.linalg.norm(q, axis=1, keepdims=True)
+    np.testing.assert_allclose(rays(SENSOR, IOP, image), expected, atol=1e-12)
+
+
+def test_a_folding_distortion_has_no_ray():
+    with pytest.raises(GeometryError, match="no ray"):
+        rays(SENSOR, [3.04, 0, 0, -0.2, 0, 0, 0, 0, 0, 0], [[0.0, 0.0]])
+
+
+def test_it_is_opencv_s_model(points):
+    """Every term but C2, by CONVENTIONS' table of conversion, to 1e-9 px."""
+    iop = IOP.copy()
+    iop[8] = iop[9] = 0.0
+    c, x0, y0, A1, A2, A3, B1, B2 = iop[:8]
+    p = SENSOR.pixel_pitch
+    K = np.array([[c / p, 0, SENSOR.centre[0] + x0 / p], [0, c / p, SENSOR.centre[1] - y0 / p],
+                  [0, 0, 1]])  # fmt: skip
+    distortion = np.array([A1 * c**2, A2 * c**4, -B2 * c, B1 * c, A3 * c**6])
+    exterior = ExteriorOrientation.from_array(EOP)
+    R = np.diag([1.0, -1.0, -1.0]) @ exterior.rotation.T
+    rvec = cv2.Rodrigues(R)[0]
+    expected = cv2.projectPoints(points, rvec, -R @ exterior.centre, K, distortion)[0][:, 0]
+    np.testing.assert_allclose(project(SENSOR, iop, EOP, points), expected, atol=1e-9)
+
+
+def test_a_camera_looks_along_its_own_minus_z():
+    """A point to the right is right in the image, one above is above (smaller v)."""
+    camera = CameraModel(SENSOR, InteriorOrientation(3.04))
+    stand = ExteriorOrientation(0, 0, 0, 0, 0, 0)
+    image = camera.project(stand, [[100.0, 50.0, -1000.0], [0, 0, -1000.0], [0, 0, 1000.0]])
+    assert image[0, 0] > SENSOR.centre[0]
+    assert image[0, 1] < SENSOR.centre[1]
+    np.testing.assert_allclose(image[1], SENSOR.centre)
+    assert np.isnan(image[2]).all()
+
+
+def test_rotation_round_trip():
+    exterior = ExteriorOrientation(0.3, -1.1, 2.5, 1.0, 2.0, 3.0)
+    again = ExteriorOrientation.from_rotation(exterior.rotation, exterior.centre)
+    np.testing.assert_allclose(again.as_array(), exterior.as_array(), atol=1e-12)

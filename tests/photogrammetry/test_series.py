@@ -1,0 +1,162 @@
+"""The adjustment of a series: true standard deviations with shared unknowns, and what it shares."""
+
+from __future__ import annotations
+
+import corner_camera as scene
+import numpy as np
+import pytest
+
+from thermocald.photogrammetry.adjustment import adjust
+from thermocald.photogrammetry.camera_model import project
+from thermocald.photogrammetry.series import SeriesSettings, adjust_series
+from thermocald.photogrammetry.testfield import Observations, TestField
+
+OWN = np.arange(8)
+
+
+def series(rng, epochs=60, coordinate_error=0.02, hidden=0.02, moved=None):
+    """A drifting camera; the true field differs from the known one by its sigma."""
+    known = scene.corner_field(coordinate_error)
+    true = TestField.build(
+        known.names, known.points + rng.normal(0, coordinate_error, known.points.shape)
+    )
+    truth = np.tile(
+        np.concatenate([scene.INTERIOR.as_array(), scene.EXTERIOR.as_array()]), (epochs, 1)
+    )
+    warm = 20 * (1 - np.exp(-np.arange(epochs) / 25))
+    truth[:, 0] += warm * 1e-4
+    truth[:, 1] += warm * 5e-4
+    truth[:, 2] -= warm * 4e-4
+    if moved is not None:
+        truth[moved, 13] += 0.5
+    observations = []
+    for e in range(epochs):
+        points = project(scene.SENSOR, truth[e, :10], truth[e, 10:], true.points)
+        points += rng.normal(0, scene.SIGMA_PX, points.shape)
+        # boards are hidden now and then
+        see = rng.random(len(points)) > (0.4 if e % 10 == 3 else hidden)
+        observations.append(
+            Observations(
+                np.flatnonzero(see), points[see], np.full((int(see.sum()), 2), scene.SIGMA_PX)
+            )
+        )
+    return known, truth, observations
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("exterior", ["series", "per_epoch"])
+def test_differences_within_the_series_have_their_stated_sd(exterior):
+    """Over 25 series of 60 epochs, in spite of wrong coordinates switched on and off."""
+    rng = np.random.default_rng(30)
+    squares = []
+    for _ in range(25):
+        field, truth, observations = series(rng)
+        r = adjust_series(
+            scene.SENSOR, field, observations, scene.INTERIOR, scene.EXTERIOR,
+            SeriesSettings(exterior=exterior, target_noise=False, snooping_alpha=0.0),
+        )  # fmt: skip
+        assert set(r.status) == {"ok"}
+        error = (r.values - truth)[:, OWN]
+        squares.append(((error - error.mean(axis=0)) / r.sd[:, OWN]) ** 2 * 60 / 59)
+    ratio = np.sqrt(np.mean(squares, axis=(0, 1)))
+    # 1,500 epochs know a standard deviation to 1.8 %; three of those, for eight parameters
+    assert ratio.min() > 0.945
+    assert ratio.max() < 1.055
+
+
+@pytest.mark.slow
+def test_the_level_has_its_stated_sd():
+    """The common part: over 60 series, each with another error of the coordinates."""
+    rng = np.random.default_rng(31)
+    z = []
+    for _ in range(60):
+        field, truth, observations = series(rng, epochs=12)
+        r = adjust_series(
+            scene.SENSOR, field, observations, scene.INTERIOR, scene.EXTERIOR,
+            SeriesSettings(exterior="series", target_noise=False, snooping_alpha=0.0),
+        )  # fmt: skip
+        shared = [0, 1, 2, 10, 11, 12, 13, 14, 15]
+        z.append((r.values - truth).mean(axis=0)[shared] / r.level_sd[shared])
+    rms = np.sqrt(np.mean(np.square(z), axis=0))
+    assert rms.min() > 0.72  # 60 draws: a standard error of 9 %
+    assert rms.max() < 1.28
+
+
+def test_a_static_set_up_is_worth_fifty_times():
+    """DESIGN idea 3: 0.3 px with a free orientation per epoch, 0.005 px with one for the series."""
+    field, _, observations = series(np.random.default_rng(32), coordinate_error=0.0, hidden=0.0)
+    px = {}
+    for exterior in ("series", "per_epoch"):
+        r = adjust_series(
+            scene.SENSOR, field, observations, scene.INTERIOR, scene.EXTERIOR,
+            SeriesSettings(exterior=exterior),
+        )  # fmt: skip
+        px[exterior] = np.median(r.sd[:, 1]) / scene.SENSOR.pixel_pitch
+    assert px["per_epoch"] == pytest.approx(0.3, abs=0.1)
+    assert px["series"] == pytest.approx(0.005, abs=0.002)
+
+
+def test_ignoring_the_targets_errors_understates():
+    """Why the offsets are there: without them, visibility alone passes for movement."""
+    field, truth, observations = series(np.random.default_rng(33), coordinate_error=0.1, epochs=100)
+    ratio = {}
+    for offsets in (True, False):
+        r = adjust_series(
+            scene.SENSOR, field, observations, scene.INTERIOR, scene.EXTERIOR,
+            SeriesSettings(exterior="series", target_offsets=offsets, target_noise=False),
+        )  # fmt: skip
+        error = (r.values - truth)[:, 1]
+        ratio[offsets] = error.std()
+    assert ratio[True] < 0.5 * ratio[False]
+
+
+def test_whether_it_stood_still_is_tested():
+    rng = np.random.default_rng(34)
+    field, _, observations = series(rng, epochs=40, moved=17)
+    r = adjust_series(
+        scene.SENSOR, field, observations, scene.INTERIOR, scene.EXTERIOR, SeriesSettings()
+    )
+    assert int(np.nanargmax(r.stillness)) == 17
+    assert r.stillness[17] > 40
+    others = np.delete(r.stillness, 17)
+    assert np.median(others) == pytest.approx(5.35, abs=1.5)  # chi-square with 6 degrees
+
+
+def test_epochs_by_themselves_are_those_of_the_epoch_adjustment():
+    """Without anything in common the batch is the single adjustment, epoch by epoch."""
+    field, _, observations = series(np.random.default_rng(35), epochs=5, coordinate_error=0.0)
+    settings = SeriesSettings(exterior="per_epoch", target_offsets=False, target_noise=False,
+                              snooping_alpha=0.001)  # fmt: skip
+    r = adjust_series(scene.SENSOR, field, observations, scene.INTERIOR, scene.EXTERIOR, settings)
+    for e, obs in enumerate(observations):
+        one = adjust(scene.SENSOR, field, obs, scene.INTERIOR, scene.EXTERIOR)
+        assert set(one.rejected) == set(np.flatnonzero(r.rejected[e]).tolist())
+        assert np.all(np.abs(r.values[e] - one.values)[OWN] < 0.02 * one.sd[OWN])
+        np.testing.assert_allclose(r.sd[e, OWN], one.sd[OWN], rtol=0.01)
+
+
+def test_gross_errors_are_found():
+    rng = np.random.default_rng(36)
+    field, _, observations = series(rng, epochs=30)
+    for obs in observations:
+        bad = rng.choice(len(obs), 2, replace=False)
+        obs.points[bad] += rng.uniform(1.0, 50.0, (2, 2))
+    r = adjust_series(
+        scene.SENSOR, field, observations, scene.INTERIOR, scene.EXTERIOR, SeriesSettings()
+    )
+    assert r.rejected.sum() >= 60
+    assert r.rejected.sum() < 60 + 0.01 * r.observed.sum()
+
+
+def test_epochs_without_a_result_have_a_reason():
+    field, _, observations = series(np.random.default_rng(37), epochs=12)
+    observations[3] = None
+    observations[5] = observations[5].select(np.arange(len(observations[5])) < 5)
+    r = adjust_series(
+        scene.SENSOR, field, observations, scene.INTERIOR, scene.EXTERIOR, SeriesSettings()
+    )
+    assert r.status[3] == "no_observations"
+    assert r.status[5] == "too_few_targets"
+    assert all(r.reasons[e] for e in (3, 5))
+    assert np.isnan(r.values[3]).all()
+    assert r.ok.sum() == 10

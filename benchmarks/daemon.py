@@ -1,0 +1,173 @@
+"""The daemon's rhythm and what an epoch costs: python benchmarks/daemon.py [--ticks 600]
+
+Rhythm: absolute deadlines beside a plain `sleep` loop, 50 ms ticks while two other threads
+calculate and render; then a day of 10 s ticks in virtual time. Cost: one 8 MP epoch from frame to
+store in CPU time, beside a tenth of a 10 s period at one tenth of this machine's speed.
+
+On a machine that is busy with other programs, run it as the service runs: nice -n -10.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from thermocald.acquisition.calibrator import Calibrator
+from thermocald.acquisition.live_pipeline import AcquiredEpoch
+from thermocald.acquisition.pipeline import Pipeline
+from thermocald.acquisition.scheduler import Schedule
+from thermocald.analysis.online_observer import OnlineObserver
+from thermocald.hal import SystemClock, VirtualClock, open_device
+
+PERIOD_S = 0.05
+
+
+def percentile(values: list[float], p: float) -> float:
+    return float(np.percentile(values, p))
+
+
+def load(stop: threading.Event) -> None:
+    """What the calibrating and keeping threads do: arrays, and Python between them."""
+    rng = np.random.default_rng(0)
+    a, image = rng.normal(size=(300, 16)), rng.integers(0, 255, (600, 800)).astype(np.uint8)
+    while not stop.is_set():
+        np.linalg.inv(a.T @ a)
+        cv2.GaussianBlur(image, (5, 5), 1.0)
+        sum(i * i for i in range(2000))
+
+
+def scheduled(ticks: int, work_s: float) -> tuple[list[float], float, int]:
+    """(lateness s, drift s, skipped) of the daemon's schedule."""
+    schedule = Schedule(SystemClock(), PERIOD_S)
+    late, last = [], None
+    for _ in range(ticks):
+        tick = schedule.wait()
+        assert tick is not None
+        late.append(tick.late_s)
+        last = tick
+        time.sleep(work_s)
+    assert last is not None
+    drift = last.due - (schedule.begin + last.index * PERIOD_S)
+    return late, drift, schedule.rhythm().skipped
+
+
+def sleeping(ticks: int, work_s: float) -> tuple[list[float], float, int]:
+    """The same of `while True: work(); sleep(period)`: lateness against the ideal instants."""
+    begin = time.monotonic()
+    late = []
+    for k in range(ticks):
+        late.append(time.monotonic() - (begin + k * PERIOD_S))
+        time.sleep(work_s)
+        time.sleep(PERIOD_S)
+    return late, late[-1], 0
+
+
+def rhythm(ticks: int) -> None:
+    sys.setswitchinterval(0.0005)  # as the daemon does
+    print(f"rhythm: {ticks} ticks of {PERIOD_S * 1000:.0f} ms, 10 ms of work each")
+    print(f"{'':28}{'late p50':>10}{'p99':>10}{'max':>10}{'drift':>12}{'skipped':>9}")
+    for loaded in (False, True):
+        stop = threading.Event()
+        threads = [threading.Thread(target=load, args=(stop,)) for _ in range(2 * loaded)]
+        for thread in threads:
+            thread.start()
+        for name, loop in (("schedule", scheduled), ("sleep loop", sleeping)):
+            late, drift, skipped = loop(ticks, 0.010)
+            what = f"{name}, {'2 busy threads' if loaded else 'idle'}"
+            figures = [statistics.median(late), percentile(late, 99), max(late)]
+            row = "".join(f"{1e3 * value:8.2f}ms" for value in figures)
+            print(f"{what:28}{row}{1e3 * drift:10.2f}ms{skipped:9d}")
+        stop.set()
+        for thread in threads:
+            thread.join()
+
+
+def virtual_day() -> None:
+    clock = VirtualClock()
+    schedule = Schedule(clock, 10.0)
+    rng = np.random.default_rng(1)
+    late = []
+    for _ in range(8640):
+        tick = schedule.wait()
+        assert tick is not None
+        late.append(tick.late_s)
+        clock.advance(float(rng.uniform(0.0, 9.0)))
+    print(
+        f"virtual day: 8640 ticks of 10 s with up to 9 s of work: late max {max(late):g} s, drift "
+        f"{tick.due - 8639 * 10.0:g} s, "
+        f"skipped {schedule.rhythm().skipped}"
+    )
+
+
+def epoch_cost(epochs: int) -> None:
+    """Frame to store, 8 MP, one thread."""
+    from thermocald.acquisition.frame_folder import FrameFolder
+    from thermocald.cli.run import mock_config
+    from thermocald.daemon.epoch_keeper import EpochKeeper
+    from thermocald.daemon.plan import plan_cameras
+    from thermocald.daemon.store_guard import StoreGuard
+
+    clock = VirtualClock()
+    config = mock_config()
+    with tempfile.TemporaryDirectory() as folder:
+        plan = plan_cameras(config, clock)[0]
+        thermometer = open_device("thermometer", "mock", {"seed": 2}, clock)
+        guard = StoreGuard(Path(folder) / "t.db", durable=True)
+        keeper = EpochKeeper(plan, guard, FrameFolder(config.frames), lambda *_: None)
+        assert plan.sensor is not None
+        assert plan.testfield is not None
+        observer = OnlineObserver(plan.sensor, plan.testfield, lambda *_: None)
+        spent: dict[str, list[float]] = {"measure + adjust": [], "online": [], "store": []}
+        calibrator = Calibrator(plan.sensor, plan.testfield, nominal_c=3.04)
+        skew = []
+        with plan.camera, thermometer:
+            pipeline = Pipeline(
+                plan.camera, {"temperature": thermometer}, None, clock, period_s=10.0
+            )
+            for k, (acquired, frame) in enumerate(pipeline.run(epochs)):
+                a = time.thread_time()
+                calibrated = calibrator.calibrate(acquired.epoch, frame.image)
+                b = time.thread_time()
+                observer.observe(calibrated)
+                c = time.thread_time()
+                item = AcquiredEpoch(k + 1, frame, True, calibrated.epoch)
+                item.calibrated = calibrated
+                keeper.keep(item)
+                d = time.thread_time()
+                skew.append(acquired.epoch.temperature_time - acquired.epoch.frame_time)
+                if k:  # the first frame is searched as a whole
+                    for name, seconds in zip(spent, (b - a, c - b, d - c), strict=True):
+                        spent[name].append(seconds)
+        guard.close()
+    total = sum(statistics.median(s) for s in spent.values())
+    print(f"one 8 MP epoch, CPU time, {len(plan.testfield)} targets, median of {epochs - 1}:")
+    for name, seconds in spent.items():
+        print(f"  {name:20}{1e3 * statistics.median(seconds):8.1f} ms")
+    print(
+        f"  total {1e3 * total:.1f} ms; at a tenth of this speed {10 * total:.2f} s = "
+        f"{100 * 10 * total / 10.0:.1f} % of a 10 s period (bound 10 %)"
+    )
+    print(f"  temperature minus frame: median {1e3 * statistics.median(skew):.0f} ms")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--ticks", type=int, default=600)
+    parser.add_argument("--epochs", type=int, default=15)
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+    rhythm(arguments.ticks)
+    virtual_day()
+    epoch_cost(arguments.epochs)
+
+
+if __name__ == "__main__":
+    main()

@@ -47,7 +47,8 @@ _ITERATIONS = 30
 _CONVERGED = 1e-2  # of a standard deviation
 _GRID = 33  # trial values of a non-linear parameter
 _SEARCHED = 2  # series in which they are tried
-_NOISE_K = 0.03  # of a thermometer, to begin with
+_NOISE_K = 0.05  # of a thermometer with hardly any reading
+_PRIOR_SHARE = 0.3  # of the readings: how much their own roughness counts as known
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,10 +246,8 @@ class _Fit:
         self.series = series
         self.variance = 1.0
         self.components = False
-        self.error_sds = [
-            float(np.hypot(_NOISE_K, s.resolution.get(s.history.reference, 0.0) / np.sqrt(12.0)))
-            for s in series
-        ]
+        self.prior_sds = [_thermometer_noise(s) for s in series]
+        self.error_sds = list(self.prior_sds)
         self.noise: list[Array | None] = [None] * len(series)
         self.errors: list[Array | None] = [None] * len(series)
         self.correcting = False
@@ -303,10 +302,10 @@ class _Fit:
             used += redundancy
             penalty += float(errors @ errors) / self.error_sds[k] ** 2
             if self.components and redundancy > 5:
-                # a quantised thermometer is no better than a quarter of its step
-                floor = 0.25 * self.series[k].resolution.get(self.series[k].history.reference, 0.0)
-                found = float(np.sqrt(errors @ errors / redundancy))
-                self.error_sds[k] = max(found, floor, 1e-3)
+                # what a lag hides of the noise, the readings' own roughness tells
+                known = len(errors) * _PRIOR_SHARE
+                total = float(errors @ errors) + known * self.prior_sds[k] ** 2
+                self.error_sds[k] = float(np.sqrt(total / (redundancy + known)))
         self.cost = image / self.variance + penalty
         self.variance = image / max(self.image_points - len(step) - used, 1.0)
 
@@ -486,6 +485,24 @@ class _Fit:
         moved[level] = Q @ (lever[level] * field.sigmas.ravel())
         result: Array = moved @ moved.T
         return result
+
+
+def _thermometer_noise(series: ModelSeries) -> float:
+    """Standard deviation K of a reading: of its distance from the line between its neighbours.
+
+    Robust, so that bends of the temperature do not count; not below what quantisation makes.
+    """
+    history = series.history
+    values = history.readings[history.reference]
+    good = np.isfinite(values)
+    t, T = history.reading_times[good], values[good]
+    step = series.resolution.get(history.reference, 0.0) / np.sqrt(12.0)
+    if len(t) < 5:
+        return float(max(step, _NOISE_K))
+    share = (t[1:-1] - t[:-2]) / np.maximum(t[2:] - t[:-2], 1e-9)
+    rest = T[1:-1] - (1.0 - share) * T[:-2] - share * T[2:]
+    rest /= np.sqrt(1.0 + share**2 + (1.0 - share) ** 2)
+    return float(max(1.4826 * np.median(np.abs(rest)), step, 1e-3))
 
 
 def _interval(times: Array) -> float:

@@ -64,7 +64,7 @@ def replay_into(
 def stored_table(
     path: Path, name: str | None, settings: AdjustmentSettings, exterior: str
 ) -> SeriesTable:
-    """The table of one series of a store; name: `CAMERA/SERIES`, `SERIES`, None for the only one."""
+    """The table of one series of a store; name: `CAMERA/SERIES`, `SERIES`, None: the only one."""
     with Store.open(path) as store:
         camera, _, series_name = (name or "").rpartition("/")
         series = store.find_series(camera or None, series_name or None)
@@ -84,7 +84,7 @@ def _series(store: Store, recording: Recording, settings: AdjustmentSettings) ->
         if series.settings.get("free") != wanted["free"]:
             raise UsageError(
                 f"{store.path}: series {series.name!r} was calibrated with --free "
-                f"{','.join(series.settings.get('free', []))}; go on with that, or use another store"
+                f"{','.join(series.settings.get('free', []))}; keep to that, or use another store"
             )
         return series
     return store.create_series(

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from thermocald.cli.common import say, write_json
-from thermocald.cli.options import JsonOption  # noqa: TC001  typer reads the annotations
+from thermocald.cli.options import JsonOption
 from thermocald.errors import UsageError
 
 __all__ = ["register"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path  # noqa: TC003  typer reads the annotations
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -63,7 +63,7 @@ def _recording(path: Path) -> dict[str, Any]:
     missing = [e for e in recording.epochs if e.frame is not None and not e.frame.is_file()]
     if missing:
         raise DataError(
-            f"{path}: {len(missing)} of {frames} frames named in epochs.csv do not exist; the first "
+            f"{path}: {len(missing)} of {frames} frames of epochs.csv do not exist; the first "
             f"is {missing[0].frame}"
         )
     readings = {

@@ -25,7 +25,7 @@ _LINES = 10  # progress lines where there is no terminal
 
 def say(text: str) -> None:
     """A line for a person, on standard error: standard output belongs to results."""
-    print(text, file=sys.stderr, flush=True)  # noqa: T201
+    print(text, file=sys.stderr, flush=True)
 
 
 def log_to_stderr(level: str = "WARNING") -> None:

@@ -265,7 +265,7 @@ def _tell(document: dict[str, Any]) -> None:
     still = document.get("stood_still")
     if still and still["epochs_that_moved"]:
         console.print(
-            f"the camera did not stand still in {still['epochs_that_moved']} epochs (chi-square up "
-            f"to {still['largest_chi2']:.0f}, bound {still['bound']:.0f}): use --exterior per_epoch",
+            f"the camera did not stand still in {still['epochs_that_moved']} epochs (chi-square "
+            f"{still['largest_chi2']:.0f}, bound {still['bound']:.0f}): use --exterior per_epoch",
             highlight=False,
         )

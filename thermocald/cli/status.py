@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from thermocald.cli.common import write_json
-from thermocald.cli.options import JsonOption  # noqa: TC001  typer reads the annotations
+from thermocald.cli.options import JsonOption
 from thermocald.errors import DataError
 
 if TYPE_CHECKING:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path  # noqa: TC003  typer reads the annotations
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from thermocald.cli.testfield_options import Json  # noqa: TC001  typer reads the annotations
+from thermocald.cli.testfield_options import Json
 
 if TYPE_CHECKING:
     from thermocald.output.testfield_print import Printed

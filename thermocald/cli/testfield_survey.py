@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path  # noqa: TC003  typer reads the annotations
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from thermocald.cli.common import say
-from thermocald.cli.testfield_options import (  # noqa: TC001  typer reads them
+from thermocald.cli.testfield_options import (
     CameraFile,
     Json,
     PixelPitch,

@@ -178,7 +178,8 @@ def rotation(angles: ArrayLike) -> Array:
     r: Array = np.array(rows)
     if a.ndim == 1:
         return r.reshape(3, 3)
-    return np.ascontiguousarray(np.moveaxis(r, 0, -1)).reshape(*a.shape[:-1], 3, 3)
+    stacked: Array = np.ascontiguousarray(np.moveaxis(r, 0, -1)).reshape(*a.shape[:-1], 3, 3)
+    return stacked
 
 
 def camera_coordinates(eop: ArrayLike, points: ArrayLike) -> Array:
@@ -331,9 +332,9 @@ def _rotation_axes(eop: Array) -> Array:
 
 
 def rays(sensor: Sensor, iop: ArrayLike, image_points: ArrayLike) -> Array:
-    """Image points (..., n, 2) px → unit directions (..., n, 3) in the camera frame (looks along -Z).
+    """Image points (..., n, 2) px → unit directions (..., n, 3) in the camera frame.
 
-    Newton's method on the distortion; converges to 1e-9 px. Raises GeometryError for points where
+    The camera looks along -Z. Newton's method on the distortion; converges to 1e-9 px. Raises GeometryError for points where
     it does not: beyond the radius at which the distortion polynomial folds back.
     """
     i = np.asarray(iop, dtype=float)

@@ -202,7 +202,8 @@ def solve(problem: Problem, start: Array, use: Mask) -> Solution:
         root = cofactor_root(N, u)
         cost = problem.cost(vu, values)
         gradient = problem.gradient(flat, vu, values)
-        for step, whole in _trial_steps(N, u, root, gradient):
+        whole = False
+        for step, whole in _trial_steps(N, u, root, gradient):  # noqa: B007  read after it
             trial = values.copy()
             trial[u] += step
             residuals = observed - project(sensor, trial[:10], trial[10:], problem.points).T

@@ -254,7 +254,7 @@ class SeriesSystem:
         return out
 
     def correlated(self, pairs: CorrelatedPairs) -> Array:
-        """What correlated errors add to the covariance (E, 16, 16) of the epochs' own parameters."""
+        """What correlated errors add to the covariance (E, 16, 16) of own parameters."""
         added = np.zeros((len(self.N), 16, 16))
         extra = pairs.normal_matrices(self.weights, self.at.A[..., self.own])
         own = self.Q @ extra @ self.Q
@@ -303,7 +303,7 @@ def snoop_series(tests: Array, offered: Mask, used: Mask, unknowns: int, alpha: 
 
 
 def _line_weights(good: Mask) -> Array:
-    """Weights (E,) that give the change of a least-squares line from the first epoch to the last."""
+    """Weights (E,) that give the change of a straight line from the first epoch to the last."""
     t = np.flatnonzero(good).astype(np.float64)
     weights = np.zeros(len(good))
     if len(t) > 1:
@@ -379,9 +379,8 @@ def _inverse(N: Array) -> Array:
 def _root(Q: Array) -> Array:
     """A root of a covariance, Q = root · rootᵀ."""
     try:
-        return np.linalg.cholesky(Q)
-    except np.linalg.LinAlgError:
-        pass
-    values, vectors = np.linalg.eigh(Q)
-    root: Array = vectors * np.sqrt(np.clip(values, 0.0, None))
-    return root
+        triangle: Array = np.linalg.cholesky(Q).astype(np.float64, copy=False)
+    except np.linalg.LinAlgError:  # only semi-definite
+        values, vectors = np.linalg.eigh(Q)
+        triangle = vectors * np.sqrt(np.clip(values, 0.0, None))
+    return triangle

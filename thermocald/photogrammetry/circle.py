@@ -19,6 +19,7 @@ import numpy as np
 from thermocald.photogrammetry.blurred_disc import blurred_disc, edge_distance
 from thermocald.photogrammetry.noise import NoiseModel, estimate_noise
 from thermocald.photogrammetry.ring_code import RING_INNER
+from thermocald.photogrammetry.scratch import scratch
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -214,7 +215,7 @@ def fit_circles(
     coded = np.zeros(n, dtype=bool) if coded is None else coded
     parts = list(windows(image, maps, coded, blur)) if n else []
     parameters = np.zeros((n, 10))
-    work = np.empty((2, 10 * max((w.x.size for w in parts), default=0)), dtype=np.float32)
+    work = scratch("partials", (2, 10 * max((w.x.size for w in parts), default=0)), np.float32)
     greys, residuals = [np.zeros(0, dtype=np.float32)], [np.zeros(0, dtype=np.float32)]
     # One step with a third of the pixels brings the fit near, and its residuals where the image is
     # flat tell how the noise grows with the light; all pixels then finish it.

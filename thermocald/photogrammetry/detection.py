@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from thermocald.photogrammetry.outline import LocalMap, from_ellipses
+from thermocald.photogrammetry.scratch import scratch
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -52,11 +53,14 @@ def find_circles(image: NDArray[np.uint8], scale: int = 1, ink: int = -1) -> Can
     """
     small = image
     if scale > 1:
-        small = cv2.resize(image, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
+        size = (image.shape[1] // scale, image.shape[0] // scale)
+        small = scratch("small", size[::-1], np.uint8)
+        cv2.resize(image, size, dst=small, interpolation=cv2.INTER_AREA)
     block = max(int(image.shape[1] * _BLOCK_SHARE / scale), _SMALLEST_BLOCK) | 1
-    mean = cv2.blur(small, (block, block), borderType=cv2.BORDER_REPLICATE)
-    # In place: fresh memory for every step costs more time than the steps.
-    mask = cv2.subtract(mean, small, dst=mean) if ink < 0 else cv2.subtract(small, mean, dst=mean)
+    mask = scratch("mask", small.shape, np.uint8)
+    cv2.blur(small, (block, block), dst=mask, borderType=cv2.BORDER_REPLICATE)
+    first, second = (mask, small) if ink < 0 else (small, mask)
+    cv2.subtract(first, second, dst=mask)
     cv2.threshold(mask, _OFFSET_DN, 255, cv2.THRESH_BINARY, dst=mask)
     contours, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     longest = 4 * _LARGEST_SHARE * small.shape[1]
@@ -79,7 +83,9 @@ def find_circles(image: NDArray[np.uint8], scale: int = 1, ink: int = -1) -> Can
             outlines.append(contour)
     e = np.array(found, dtype=float).reshape(-1, 5)
     e = e[_are_ellipses(outlines, e)]
-    centre = scale * e[:, :2] + (scale - 1) / 2
+    # The reduced image covers the whole one: (x + ½) grows with the true ratio of the sizes.
+    ratio = np.array([image.shape[1] / small.shape[1], image.shape[0] / small.shape[0]])
+    centre = (e[:, :2] + 0.5) * ratio - 0.5
     # A contour runs through pixel centres, half a pixel inside of the outline.
     return Candidates(
         from_ellipses(centre, scale * (e[:, 2:4] + 0.5), e[:, 4]),

@@ -168,3 +168,18 @@ def test_a_clip_is_cut_about_the_target_and_black_beyond_the_edge(tmp_path):
     assert clip[7, 7] == 250
     assert (clip[:, :2] == 0).all()
     assert (clip[:, 2] == 50).all()
+
+
+def test_style_and_script_are_not_escaped(html):
+    for part in re.findall(r"<style>.*?</style>|<script>.*?</script>", html, flags=re.DOTALL):
+        assert "&#3" not in part
+        assert "&gt;" not in part
+
+
+def test_matrices_name_their_rows_and_columns(html):
+    """Every label twice, as a row and as a column, in each of three matrices."""
+    figures = re.findall(r'<figure id="[^"]*" class="matrix">.*?</figure>', html, flags=re.DOTALL)
+    assert len(figures) == 3
+    for figure in figures:
+        texts = re.findall(r"<text[^>]*>([^<]*)</text>", figure)
+        assert texts.count("x₀") == texts.count("B2") == 2

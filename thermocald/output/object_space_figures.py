@@ -75,8 +75,8 @@ def point_figure(camera: CameraStudy) -> Figure | None:
         "image point, row by row from top left",
         "cm",
         (
-            Curve("largest", number, mc.largest / 10, "points", "#7fbf7b"),
-            Curve("mean", number, mc.mean / 10, "points", "#1b7837"),
+            Curve("largest", number, mc.largest / 10, "line", "#7fbf7b"),
+            Curve("mean", number, mc.mean / 10, "line", "#1b7837"),
             Curve(
                 "largest, first order",
                 number,

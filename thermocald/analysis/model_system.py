@@ -36,6 +36,7 @@ __all__ = ["Share", "error_operators", "jacobian", "share", "unknowns_of"]
 _PROBES = 24  # random vectors that tell a trace
 _NEGLIGIBLE = 1e-3
 _DENSE = 3000  # readings
+_FILLED = 0.05  # share of entries from which a dense factor is the faster one
 _SCALE_NAMES = ("X", "Y", "Z")
 _SHIFT_NAMES = ("dX", "dY", "dZ")
 
@@ -228,7 +229,7 @@ def _drive_operator(history: History, model: ThermalModel) -> csr_array:
 
 
 def _factorised(H: csr_array) -> Callable[[Array], Array]:
-    """Solves H x = b: banded where readings touch near epochs alone, dense where not."""
+    """Solves H x = b: banded where readings touch near epochs alone, else sparse or dense."""
     from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
 
     entries = H.tocoo()
@@ -241,7 +242,7 @@ def _factorised(H: csr_array) -> Callable[[Array], Array]:
         np.add.at(band, (rows[lower] - columns[lower], columns[lower]), entries.data[lower])
         factor = cholesky_banded(band, lower=True)
         return lambda b: np.asarray(cho_solve_banded((factor, True), b))
-    if n <= _DENSE:
+    if n <= _DENSE and H.nnz > _FILLED * n * n:
         dense = cho_factor(H.toarray(), lower=True, overwrite_a=True)
         return lambda b: np.asarray(cho_solve(dense, b))
     from scipy.sparse.linalg import splu

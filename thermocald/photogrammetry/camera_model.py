@@ -334,8 +334,9 @@ def _rotation_axes(eop: Array) -> Array:
 def rays(sensor: Sensor, iop: ArrayLike, image_points: ArrayLike) -> Array:
     """Image points (..., n, 2) px → unit directions (..., n, 3) in the camera frame.
 
-    The camera looks along -Z. Newton's method on the distortion; converges to 1e-9 px. Raises GeometryError for points where
-    it does not: beyond the radius at which the distortion polynomial folds back.
+    The camera looks along -Z. Newton's method on the distortion; converges to 1e-9 px. Raises
+    GeometryError for points where it does not: beyond the radius at which the distortion
+    polynomial folds back.
     """
     i = np.asarray(iop, dtype=float)
     measured = image_to_mm(sensor, image_points)

@@ -61,8 +61,8 @@ def cosines(times: Array, orders: int) -> Array:
     return rows
 
 
-def examine(laboratory: Laboratory, fit: Fit, series: int, inflation: float = 1.0) -> Adequacy:
-    """Test one series; `inflation` ≥ 1: by how much correlated noise raises slow variances."""
+def examine(laboratory: Laboratory, fit: Fit, series: int) -> Adequacy:
+    """Test one series."""
     evidence, weighting = laboratory.series[series], fit.weightings[series]
     C, V, index = fit.designs[series]
     x = fit.coefficients[index]
@@ -77,7 +77,6 @@ def examine(laboratory: Laboratory, fit: Fit, series: int, inflation: float = 1.
         # whitened, so that directions that share the thermometer's error count once
         L = np.linalg.cholesky(A[j] + 1e-9 * np.eye(len(A[j])) * np.trace(A[j]) / len(A[j]))
         scores[j] = np.linalg.solve(L, rest[j])
-    scores = scores / np.sqrt(inflation)
     total = float(np.sum(scores**2))
     free = scores.size
     excess = max(total - free, 0.0)
@@ -89,7 +88,7 @@ def examine(laboratory: Laboratory, fit: Fit, series: int, inflation: float = 1.
         courses,
         excess,
         (total - free) / np.sqrt(2.0 * free),
-        sigma * float(np.sqrt(excess * inflation / coordinates)),
+        sigma * float(np.sqrt(excess * evidence.correlation / coordinates)),
     )
 
 

@@ -33,7 +33,6 @@ def term_estimates(fit: Fit, number: int, evidence: Evidence) -> dict[str, Estim
     term = fit.terms[number]
     effect = catalogue.get(term.effect)
     units = effect.units()
-    inflation = evidence.correlation
     out: dict[str, Estimate] = {}
     K = len(fit.coefficients)
     values = term.values(0) or {}
@@ -51,7 +50,7 @@ def term_estimates(fit: Fit, number: int, evidence: Evidence) -> dict[str, Estim
         sd = float("nan")
         if (number, name) in fit.searched:
             place = K + fit.searched.index((number, name))
-            sd = float(np.sqrt(fit.covariance[place, place] * inflation))
+            sd = float(np.sqrt(fit.covariance[place, place]))
         out[name] = _number(value, sd, units[name])
     for block in fit.blocks:
         if block.term == number and block.series in (None, 0):
@@ -64,7 +63,7 @@ def _coefficients(
 ) -> dict[str, Estimate]:
     places = np.arange(block.start, block.stop)
     x = fit.coefficients[places].reshape(block.courses, -1)
-    C = fit.covariance[np.ix_(places, places)] * evidence.correlation
+    C = fit.covariance[np.ix_(places, places)]
     scale = np.array([evidence.scale[COLUMNS.index(p)] for p in block.parameters])
     out: dict[str, Estimate] = {}
     if fit.terms[block.term].effect in OSCILLATIONS:

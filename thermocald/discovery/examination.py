@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from thermocald.discovery.image_space import (
     displaced_targets,
     noise_growth,
 )
+from thermocald.discovery.noise import jumps, slowed, with_jumps
 from thermocald.discovery.search import Search, Solution
 
 if TYPE_CHECKING:
@@ -32,6 +33,9 @@ MAX_EFFECTS = 2
 BAND = 14.0
 # a model that leaves less than this share of what the base left has the cause
 _LEFT = 0.02
+# a second effect beside an adequate one has to explain as much, in px RMS and as a share of the
+# first: below that, it is the first one's finer points
+_LEFT_PX, _LEFT_SHARE = 0.005, 0.15
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,22 +43,20 @@ class Examination:
     """What the search found.
 
     laboratory: the series as examined, displaced targets out and noise weighted; base, best:
-    solutions; path: solutions after each accepted effect, the base first; ranking: singles by
-    score; rivals: solutions that cannot be excluded; adequacy: of best, per series.
+    solutions; ranking: singles by score; rivals: solutions that cannot be excluded; adequacy: of best, per series.
     """
 
     laboratory: Laboratory
     base: Solution
     best: Solution
-    path: tuple[Solution, ...]
     ranking: tuple[Solution, ...]
     rivals: tuple[Solution, ...]
     base_adequacy: tuple[Adequacy, ...]
     adequacy: tuple[Adequacy, ...]
-    displaced: tuple[tuple[Displaced, ...], ...]
-    defocus: NoiseGrowth | None
     adequate: bool
-    original: tuple[Evidence, ...] = field(default=())
+    displaced: tuple[tuple[Displaced, ...], ...] = ()
+    defocus: NoiseGrowth | None = None
+    original: tuple[Evidence, ...] = ()
 
 
 def examine_series(
@@ -77,15 +79,43 @@ def examine_series(
     growth = noise_growth(cleaned)
     if growth is not None:
         cleaned = [reweighted(e, n) for e, n in zip(cleaned, growth.noise, strict=True)]
-    laboratory = Laboratory([condensed(e) for e in calibrated_thermometers(cleaned)])
+    ready = [condensed(slowed(e)) for e in calibrated_thermometers(cleaned)]
+    found = _searched(Laboratory(ready), say, given)
+    noisy = _noisier(found)
+    if noisy is not None:
+        say("noise that targets share: once more")
+        found = _searched(Laboratory(noisy), say, given)
+    return replace(
+        found, displaced=tuple(displaced), defocus=growth, original=tuple(series)
+    )
+
+
+def _noisier(found: Examination) -> list[Evidence] | None:
+    """The series with what still jumps from epoch to epoch as noise; None where nothing does."""
+    laboratory, out = found.laboratory, []
+    for s, e in enumerate(laboratory.series):
+        if len(e.times) < 60:
+            return None
+        out.append(with_jumps(e, *jumps(laboratory, found.best.fit, s)))
+    if all(e is None for e in out):
+        return None
+    return [e or old for e, old in zip(out, laboratory.series, strict=True)]
+
+
+def _searched(
+    laboratory: Laboratory,
+    say: Callable[[str], None],
+    given: Sequence[tuple[str, dict[str, Any]]],
+) -> Examination:
+    """The search itself, in the courses of the parameters."""
     say("base model")
     search = Search(laboratory, say)
     base = search.base(given)
     base_adequacy = _adequacies(laboratory, base)
-
     best, ranking = base, []
     frontier = [base]
     seen: list[Solution] = []
+    adequate = False
     for level in range(1, MAX_EFFECTS + 1):
         grown: list[Solution] = []
         for solution in frontier:
@@ -101,10 +131,16 @@ def examine_series(
         champion = min(grown, key=lambda s: s.score)
         if champion.score >= best.score:
             break
+        if level > 1 and adequate:
+            least = max(_LEFT_PX, _LEFT_SHARE * _size_px(laboratory, base, best))
+            if _size_px(laboratory, best, champion) < least:
+                break
         best = champion
-        if _adequate(_adequacies(laboratory, best), base_adequacy):
-            break
-        frontier = _frontier(grown)
+        adequate = _adequate(_adequacies(laboratory, best), base_adequacy)
+        # what is adequate may still lack something too fast for the absolute test
+        frontier = [best] if adequate else _frontier(grown)
+    # larger combinations that were not accepted are no rivals
+    seen = [s for s in seen if len(s.terms) <= len(best.terms)]
     if len(best.terms) > len(base.terms):
         best, seen = _contest(search, best, seen)
     adequacy = _adequacies(laboratory, best)
@@ -115,9 +151,8 @@ def examine_series(
         if different and s.score < best.score + BAND and s.names not in [r.names for r in rivals]:
             rivals.append(s)
     return Examination(
-        laboratory, base, best, (base, best), tuple(ranking), tuple(rivals), base_adequacy,
-        adequacy, tuple(displaced), growth, adequate, tuple(series),
-    )  # fmt: skip
+        laboratory, base, best, tuple(ranking), tuple(rivals), base_adequacy, adequacy, adequate
+    )
 
 
 def calibrated_thermometers(series: Sequence[Evidence]) -> list[Evidence]:
@@ -187,6 +222,14 @@ def _contest(
     return again[0], [*again, *others]
 
 
+def _size_px(laboratory: Laboratory, without: Solution, with_it: Solution) -> float:
+    """RMS px that one more effect explains."""
+    gain = max(without.score - with_it.score, 0.0)
+    coordinates = 2.0 * sum(float(e.n.sum()) for e in laboratory.series)
+    weights = np.concatenate([e.weights[..., 0].ravel() for e in laboratory.series])
+    return float(np.sqrt(gain / coordinates / np.mean(weights[weights > 0])))
+
+
 def _frontier(grown: list[Solution], width: int = 4) -> list[Solution]:
     """The best solutions of a level, one per set of names."""
     out: list[Solution] = []
@@ -198,7 +241,7 @@ def _frontier(grown: list[Solution], width: int = 4) -> list[Solution]:
 
 def _adequacies(laboratory: Laboratory, solution: Solution) -> tuple[Adequacy, ...]:
     return tuple(
-        examine(laboratory, solution.fit, s, e.correlation) for s, e in enumerate(laboratory.series)
+        examine(laboratory, solution.fit, s) for s in range(len(laboratory.series))
     )
 
 
@@ -206,8 +249,3 @@ def _adequate(now: Sequence[Adequacy], base: Sequence[Adequacy]) -> bool:
     return all(
         a.adequate or a.misfit_px < _LEFT * b.misfit_px for a, b in zip(now, base, strict=True)
     )
-
-
-def rms(values: Sequence[float]) -> float:
-    """Root mean square."""
-    return float(np.sqrt(np.mean(np.square(values))))

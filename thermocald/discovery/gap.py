@@ -126,8 +126,10 @@ def gap_of(
     # what a camera does within one block of a long series is no part of the comparison
     unused = e.blocks.within_free if e.blocks is not None else 0.0
     free = max(coordinates - 2.0 * targets - _rank(e) - unused, 1.0)
-    total = within + max(fit.chi2_of(series) - explained, 0.0)
-    image = within + max(image_chi2(e, fit, series) - explained, 0.0)
+    # `slowed` has put correlated noise into the weights; the floor is that of single epochs
+    k = e.correlation
+    total = within + k * max(fit.chi2_of(series) - explained, 0.0)
+    image = within + k * max(image_chi2(e, fit, series) - explained, 0.0)
     weights = e.weights[..., :2]
     sigma2 = 1.0 / float(np.mean(weights[weights > 0]))
     moved, count = _moved(e, displaced, displacement_known)

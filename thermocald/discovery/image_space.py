@@ -67,7 +67,10 @@ class NoiseGrowth:
 def _steps(evidence: Evidence) -> tuple[Array, NDArray[np.int64], Array]:
     """Best step of each target: gain (T,), index of the first epoch after it, share of movement."""
     w = np.sqrt(evidence.weights[..., :2])
-    r = np.nan_to_num(evidence.residuals * w)
+    r = evidence.residuals * w
+    # noise may grow with heat: each epoch in units of its own spread
+    own = np.array([np.nanmedian(np.abs(x)) if np.isfinite(x).any() else 1.0 for x in r])
+    r = np.nan_to_num(r / np.maximum(1.4826 * own, 0.3)[:, None, None])
     there = np.isfinite(evidence.residuals[..., 0]).astype(float)
     count = np.cumsum(there, axis=0)
     total = count[-1]
@@ -106,10 +109,12 @@ def displaced_targets(evidence: Evidence) -> tuple[list[Displaced], Evidence]:
         sigma = float(1.0 / np.sqrt(np.mean(w[w > 0])))
         there = np.isfinite(cleaned.residuals[..., 0]).sum(axis=0)
         size = 2.0 * sigma * np.sqrt(gain / np.maximum(there, 1))
+        # real targets have a life of their own: what many of them do is no displacement
+        common = 8.0 * float(np.percentile(gain[there > 0], 85)) if (there > 0).any() else 0.0
         top = float(gain.max(initial=0.0))
         # one moved target drags the camera and with it all others: the largest go first
         chosen = np.flatnonzero(
-            (gain > max(limit, 0.3 * top)) & (share > _SHARE) & (size > _STEP_PX)
+            (gain > max(limit, common, 0.3 * top)) & (share > _SHARE) & (size > _STEP_PX)
         )
         if not len(chosen):
             break
@@ -206,8 +211,29 @@ def noise_growth(series: Sequence[Evidence]) -> NoiseGrowth | None:
     other_gain, other = max(others)
     if gain < 40.0 or gain < other_gain + 10.0:
         return None
+    rough = _roughness(temperature, data, k)
+    gain, other_gain, sd = gain / rough, other_gain / rough, sd * float(np.sqrt(rough))
+    if gain < 40.0:
+        return None
     noise = tuple(np.maximum(1.0 + k * t, _LEAST) for t in temperature)
     return NoiseGrowth(k, sd, gain, other_gain, other, noise)
+
+
+def _roughness(
+    courses: Sequence[Array], data: Sequence[tuple[NDArray[np.bool_], Array, Array]], k: float
+) -> float:
+    """By how much the variances scatter more, and slower, than χ² lets them: 1 where they do not."""
+    total = []
+    for course, (ok, free, v) in zip(courses, data, strict=True):
+        f = free[ok]
+        ratio = v[ok] / np.maximum(1.0 + k * course[ok], _LEAST) ** 2
+        z = (ratio / (np.sum(f * ratio) / np.sum(f)) - 1.0) * np.sqrt(f / 2.0)
+        power = float(np.mean(z**2))
+        slow = 1.0 + 2.0 * sum(
+            float(np.mean(z[j:] * z[:-j])) / max(power, 1e-9) for j in range(1, min(11, len(z)))
+        )
+        total.append(power * max(slow, 1.0))
+    return max(1.0, float(np.mean(total)))
 
 
 def _slope(

@@ -79,6 +79,8 @@ class Search:
         self.laboratory = laboratory
         self.candidates = candidates(laboratory.series)
         self.epochs = sum(int((e.n > 0).sum()) for e in laboratory.series)
+        # the more noise is correlated, the less is known of it
+        self.margin = MARGIN * max(e.correlation for e in laboratory.series)
         self.progress = progress or (lambda _: None)
         self._trials: dict[tuple[str, tuple[str, ...]], float] = {}
         self._courses: dict[tuple[int, int], Array] = {}
@@ -173,7 +175,7 @@ class Search:
             gains = _gain([part], base_A, base_c)
             gains = np.where(np.isfinite(gains), gains, 0.0)
             best = int(np.argmax(gains))
-            if gains[best] > single + MARGIN or s == 0:
+            if gains[best] > single + self.margin or s == 0:
                 fresh.append(((candidate.name, float(self.laboratory.series[s].times[best + 1])),))
                 total += float(gains[best])
                 penalty += single
@@ -183,7 +185,7 @@ class Search:
         return Scanned(candidate, term, total, penalty + self._once())
 
     def _once(self) -> float:
-        return 2 * float(np.log(len(self.candidates))) + MARGIN
+        return 2 * float(np.log(len(self.candidates))) + self.margin
 
     def _penalty(self, candidate: Candidate, count: int) -> float:
         key = (candidate.effect, candidate.parameters)
@@ -218,7 +220,7 @@ class Search:
         promises = []
         for number, candidate in enumerate(self.candidates):
             taken = [t for t in solution.terms if t.effect == candidate.effect]
-            if taken and not (candidate.effect == "slip" and len(taken) < 2):
+            if taken:
                 continue
             found = self.scan(number, solution)
             if found is not None and np.isfinite(found.gain):

@@ -1,0 +1,89 @@
+"""Noise that the images' own sigmas do not know: correlated in time, or shared by neighbours.
+
+Correlation in time is seen in the residuals of single targets and makes slow courses less certain
+than their number of epochs says. Noise that neighbours share goes into the camera's parameters; it
+is seen in their jumps from epoch to epoch, once the courses have been explained.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from thermocald.discovery.evidence import Evidence
+    from thermocald.discovery.hypothesis import Fit, Laboratory
+
+    Array = NDArray[np.float64]
+
+__all__ = ["jumps", "slowed", "with_jumps"]
+
+_UNUSUAL = 1.7  # a variance from 170 second differences has 13 % of standard deviation
+
+
+def slowed(evidence: Evidence) -> Evidence:
+    """The series with weights as its slow courses deserve them."""
+    k = evidence.correlation
+    if k <= 1.0:
+        return evidence
+    return replace(evidence, N=evidence.N / k, b=evidence.b / k, yy=evidence.yy / k)
+
+
+def jumps(laboratory: Laboratory, fit: Fit, series: int) -> tuple[Array, Array]:
+    """Variance of the jumps over its expectation (P,) and the combinations W (P, P) it is of.
+
+    The columns of W are orthonormal under the mean normal matrix; the thermometer's noise, which
+    jumps too, is in the expectation.
+    """
+    e = laboratory.series[series]
+    C, V, index = fit.designs[series]
+    rest = e.values - (C * fit.coefficients[index]) @ V.T
+    size, U = np.linalg.eigh(e.N.mean(axis=0))
+    good = size > 1e-6 * np.median(size)
+    W = U / np.sqrt(np.where(good, size, 1.0))
+    z = np.einsum("ep,epq,qd->ed", rest, e.N, W)[e.n > 0]
+    d = np.diff(z, 2, axis=0)
+    spread = np.median(np.abs(d), axis=0) * 1.4826
+    observed = np.array(
+        [np.mean(x[np.abs(x) <= 4 * s] ** 2) for x, s in zip(d.T, spread, strict=True)]
+    )
+    expected = np.full(len(size), 6.0 / e.correlation)
+    expected = expected + _thermometer_jumps(laboratory, fit, series, W)
+    return np.where(good, observed / expected, 1.0), W
+
+
+def _thermometer_jumps(laboratory: Laboratory, fit: Fit, series: int, W: Array) -> Array:
+    """Mean square of the second differences that the thermometers' noise makes in each z."""
+    e = laboratory.series[series]
+    second = np.diff(np.eye(len(e.times)), 2, axis=0)
+    total = np.zeros(W.shape[1])
+    for block in fit.blocks:
+        if block.courses > 1 or block.series not in (None, series):
+            continue
+        if block.term < 0:
+            operator, channel = laboratory.drive(fit.terms, series)[1], e.history.reference
+        else:
+            _, found, channel = laboratory.courses(fit.terms[block.term], series, fit.terms)
+            if found is None:
+                continue
+            operator = found
+        jump = (second @ operator) * e.state_sd(channel)
+        share = W.T @ e.N.mean(axis=0) @ fit.direction(block)[0]
+        total += np.mean(np.sum(jump**2, axis=1)) * share**2
+    return total
+
+
+def with_jumps(evidence: Evidence, factors: Array, W: Array) -> Evidence | None:
+    """The series with unusual jumps as part of its noise; None where there are none."""
+    factors = np.where(factors > _UNUSUAL, factors, 1.0)
+    if np.all(factors == 1.0):
+        return None
+    inverse = np.linalg.inv(W)
+    T = inverse.T @ np.diag(1.0 / np.sqrt(factors)) @ W.T
+    N = np.einsum("pq,eqr,sr->eps", T, evidence.N, T)
+    b = np.einsum("epq,eq->ep", N, evidence.values)
+    return replace(evidence, N=N, b=b, yy=np.einsum("ep,ep->e", evidence.values, b))

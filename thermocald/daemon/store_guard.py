@@ -4,7 +4,9 @@ store that cannot be written keeps its results waiting in memory.
 
 from __future__ import annotations
 
+import fcntl
 import logging
+import os
 import shutil
 import threading
 from collections import deque
@@ -60,6 +62,22 @@ def _without_covariance(result: EpochResult) -> EpochResult:
     return replace(result, covariance=np.diag(np.diag(result.covariance)))
 
 
+def _claim(path: Path) -> int:
+    """Lock the store for this process; the kernel gives it back however the process ends."""
+    try:
+        handle = os.open(f"{path}.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be written: {error.strerror}") from error
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(handle)
+        raise StoreError(
+            f"{path}: another thermocald writes it; end that one first, or choose another store"
+        ) from error
+    return handle
+
+
 class StoreGuard:
     """An open store that does not give up; threads may share it.
 
@@ -67,7 +85,12 @@ class StoreGuard:
     """
 
     def __init__(self, path: Path, *, durable: bool = True) -> None:
-        self.store = Store.open(path, "append", durable=durable)
+        self._claim = _claim(path)
+        try:
+            self.store = Store.open(path, "append", durable=durable)
+        except BaseException:
+            os.close(self._claim)
+            raise
         self.path = path
         self.lost = 0
         self.away = ""  # why the store cannot be written, empty while it can
@@ -91,6 +114,7 @@ class StoreGuard:
                 self.store.close()
             except StoreError as error:
                 log.error("%s", error)
+            os.close(self._claim)
 
     def append(self, row: Row) -> None:
         """Keep an epoch, now or when the store can be written again."""

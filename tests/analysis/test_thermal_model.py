@@ -255,6 +255,7 @@ def test_correct_points_command(folder, pair):
     assert 0.1 < ratio < 1.3
 
 
+@pytest.mark.slow
 def test_correct_images_command(folder, pair):
     """A hot image, remapped, shows its targets where the camera at T0 would have them."""
     import cv2

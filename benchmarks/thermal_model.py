@@ -1,0 +1,96 @@
+"""The thermal model's speed: `at`, undistorting a million points, fitting 20 series.
+
+Run: python -m benchmarks.thermal_model   (--check: exit status 1 where a bound is missed)
+Bounds: `at` ≤ 50 µs; 1 M points ≤ 2 × cv2.undistortPoints, which stops at a coarser answer (both
+beside each other, one thread); 20 series of 1,000 epochs and 147 targets, reduced and fitted with
+an effect of memory (permanent_set) and two drifts of the distortion, ≤ 20 s and < 1 GB.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import resource
+import sys
+import time
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from thermocald.analysis.model_series import reduce_series
+from thermocald.analysis.thermal_camera import ThermalCamera
+from thermocald.analysis.thermal_model import FittedModel, fit_thermal_model
+from thermocald.simulation.course import Course
+from thermocald.simulation.model import ModelEffect
+from thermocald.simulation.presets import preset_simulation
+
+SERIES, EPOCHS = 20, 1000
+
+
+def fitted() -> tuple[FittedModel, bool]:
+    series, reducing = [], 0.0
+    for k in range(SERIES):
+        s = preset_simulation("rpi-v2.1-heating", seed=k)
+        lamp = Course.steps([0, 2000 + 100 * k, 5000, 7000, 2e4], [4.0, 0.0, 3.0, 0.0])
+        s = replace(s, programme=replace(s.programme, epochs=EPOCHS, sources={"housing": lamp}))
+        epochs = list(s.epochs())
+        begin = time.perf_counter()
+        series.append(reduce_series(s.head, s.field, epochs, f"M{k}"))
+        reducing += time.perf_counter() - begin
+    listed = [
+        ModelEffect("permanent_set", {"x0": 0.0, "y0": 0.0}),
+        ModelEffect("radial_distortion_drift", {"A1": 0.0}),
+        ModelEffect("decentering_drift", {"B1": 0.0, "B2": 0.0}),
+    ]
+    begin = time.perf_counter()
+    model = fit_thermal_model(series, listed, T0=25.0)
+    fitting = time.perf_counter() - begin
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(
+        f"{SERIES} series × {EPOCHS} epochs: reduced in {reducing:.1f} s, fitted in {fitting:.1f} s, "
+        f"peak {peak:.0f} MB"
+    )
+    return model, reducing + fitting <= 20.0 and peak < 1000
+
+
+def use(model: FittedModel) -> bool:
+    camera = ThermalCamera(model.model)
+    state = camera.at(35.0)
+    took = []
+    for _ in range(20):
+        begin = time.perf_counter()
+        for _ in range(100):
+            camera.at(35.0)
+        took.append((time.perf_counter() - begin) / 100)
+    points = np.random.default_rng(0).uniform([0, 0], [3279, 2463], (1_000_000, 2))
+    i, p = state.interior, state.sensor.pixel_pitch
+    K = np.array([[i.c / p, 0, 3279 / 2 + i.x0 / p], [0, i.c / p, 2463 / 2 - i.y0 / p], [0, 0, 1]])
+    D = np.array([i.A1 * i.c**2, i.A2 * i.c**4, -i.B2 * i.c, i.B1 * i.c, i.A3 * i.c**6])
+    ours, theirs = [], []
+    for _ in range(7):
+        begin = time.perf_counter()
+        state.undistort(points)
+        middle = time.perf_counter()
+        cv2.undistortPoints(points[:, None], K, D)
+        ours.append(middle - begin)
+        theirs.append(time.perf_counter() - middle)
+    ratio = min(ours) / min(theirs)
+    print(
+        f"at: {min(took) * 1e6:.0f} µs; undistorting 1 M points: {ratio:.2f} × cv2.undistortPoints"
+    )
+    return min(took) <= 50e-6 and ratio <= 2.0
+
+
+def main() -> int:
+    cv2.setNumThreads(1)
+    model, passed = fitted()
+    passed = use(model) and passed
+    return 0 if passed or "--check" not in sys.argv else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

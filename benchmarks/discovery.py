@@ -1,0 +1,218 @@
+"""Discovery beside its peers on the same blind recordings: names right, false alarms, gap on M2, time.
+
+    python benchmarks/discovery.py [--seeds 1] [--px 0.1]
+
+Peers get generous help: the free camera of each epoch whitened by its normal equations, the
+smoothed temperature, and a library of every catalogue course (non-linear parameters at the truth's
+order of magnitude on a grid). They need `pip install pysindy scikit-learn`; a peer that is not
+installed is left out and said so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+import warnings
+from dataclasses import dataclass
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+
+from tests.blind.bridge import series_input
+from tests.blind.generator import SINGLE, Case, generate
+from thermocald.discovery.candidates import candidates
+from thermocald.discovery.evidence import COLUMNS, gather
+from thermocald.discovery.hypothesis import Laboratory
+from thermocald.discovery.result import discover_series
+
+# what a course in the parameter series can show: image space is not offered to the peers
+COURSES = [e for e in SINGLE if e not in ("defocus", "target_displacement")]
+
+
+@dataclass
+class Score:
+    right: int = 0
+    cases: int = 0
+    alarms: int = 0
+    quiet: int = 0
+    closed: list[float] | None = None
+    seconds: list[float] | None = None
+
+    def __post_init__(self) -> None:
+        self.closed, self.seconds = [], []
+
+
+def library(laboratory: Laboratory, series: int) -> tuple[list[str], np.ndarray]:
+    """Named, normalised columns (E · D, K): each catalogue course on each parameter it acts on."""
+    e = laboratory.series[series]
+    names, columns = [], []
+    base = laboratory.drive_course([], series)
+    T = base - base.mean()
+    for candidate in candidates(laboratory.series):
+        grid = candidate.grid[:: max(len(candidate.grid) // 8, 1)] if len(candidate.grid) else [None]
+        for value in grid:
+            if candidate.is_event:
+                course = (e.times >= value).astype(float)
+            elif candidate.is_drive:
+                course = laboratory.drive_course([candidate.term(value, 1)], series) - base
+            else:
+                course = laboratory.courses(candidate.term(value, 1), series, operators=False)[0][:, 0]
+            course = course - course.mean()
+            for parameter in candidate.parameters:
+                names.append(candidate.effect)
+                columns.append((course, parameter))
+    for parameter in ("c", "x0", "y0"):
+        names.append("base")
+        columns.append((T, parameter))
+    size, U = np.linalg.eigh(e.N.mean(axis=0))
+    keep = size > 1e-4 * np.median(size)
+    root = U[:, keep] * np.sqrt(size[keep])
+    X = np.stack(
+        [np.outer(c, root[COLUMNS.index(p)]).ravel() for c, p in columns], axis=1
+    )
+    return names, X
+
+
+def whitened(laboratory: Laboratory, series: int) -> np.ndarray:
+    e = laboratory.series[series]
+    size, U = np.linalg.eigh(e.N.mean(axis=0))
+    keep = size > 1e-4 * np.median(size)
+    z = (e.values - e.values.mean(axis=0)) @ (U[:, keep] * np.sqrt(size[keep]))
+    return z.ravel()
+
+
+def peer_sindy(X: np.ndarray, y: np.ndarray) -> np.ndarray:
+    import pysindy
+
+    optimizer = pysindy.STLSQ(threshold=0.02, alpha=1e-3, normalize_columns=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        optimizer.fit(X / np.std(y), (y / np.std(y))[:, None])
+    return np.ravel(optimizer.coef_)
+
+
+def peer_lasso(X: np.ndarray, y: np.ndarray) -> np.ndarray:
+    from sklearn.linear_model import LassoLarsIC
+
+    scale = np.linalg.norm(X, axis=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model = LassoLarsIC(criterion="bic", max_iter=60).fit(X / scale, y)
+    return model.coef_ / scale
+
+
+def names_said(names: list[str], X: np.ndarray, coefficients: np.ndarray, y: np.ndarray) -> set[str]:
+    """Effects whose columns together explain a hundredth of the largest effect's share."""
+    power = {}
+    for effect in set(names) - {"base"}:
+        rows = [i for i, n in enumerate(names) if n == effect]
+        power[effect] = float(np.sum((X[:, rows] @ coefficients[rows]) ** 2))
+    top = max(power.values(), default=0.0)
+    floor = max(0.01 * top, 5e-4 * float(y @ y))
+    return {e for e, p in power.items() if p > floor}
+
+
+def gaussian_process(laboratory: Laboratory) -> float:
+    """Share of M2's misfit that a discrepancy in (T, dT/dt) learnt on M1 explains."""
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, WhiteKernel
+
+    data = []
+    for s in (0, 1):
+        e = laboratory.series[s]
+        T = laboratory.drive_course([], s)
+        size, U = np.linalg.eigh(e.N.mean(axis=0))
+        z = (e.values - e.values.mean(axis=0)) @ (U[:, -6:] * np.sqrt(size[-6:]))
+        t = T - T.mean()
+        z = z - np.outer(t, t @ z / (t @ t))
+        data.append((np.column_stack([T - e.T0, 200 * np.gradient(T, e.times)]), z))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model = GaussianProcessRegressor(RBF([5.0, 5.0]) + WhiteKernel(1.0), normalize_y=True)
+        model.fit(*data[0])
+        rest = data[1][1] - model.predict(data[1][0])
+    rest = rest - rest.mean(axis=0)
+    before, after = float(np.mean(data[1][1] ** 2)), float(np.mean(rest**2))
+    return 1.0 - (after - 1.0) / max(before - 1.0, 1e-9)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--px", type=float, default=0.1)
+    a = parser.parse_args()
+    peers = {}
+    for name, module, function in (
+        ("pysindy STLSQ", "pysindy", peer_sindy),
+        ("LassoLarsIC", "sklearn", peer_lasso),
+    ):
+        try:
+            __import__(module)
+            peers[name] = function
+        except ImportError:
+            print(f"{name}: not installed, left out")
+    scores = {name: Score() for name in ("thermocald discover", *peers)}
+    gp = []
+    cases = [Case((e,), a.px, 500 + s) for s in range(a.seeds) for e in COURSES]
+    cases += [Case((), a.px, 600 + s) for s in range(6 * a.seeds)]
+    for case in cases:
+        series, _ = generate(case)
+        begin = time.perf_counter()
+        first = gather(series_input(series[0]))
+        second = gather(series_input(series[1]), first.T0, first.scale)
+        found = discover_series([first, second])
+        own = scores["thermocald discover"]
+        own.seconds.append(time.perf_counter() - begin)
+        _count(own, {e.effect for e in found.effects}, case)
+        closed = found.excess_closed()
+        if closed is not None:
+            own.closed.append(closed)
+        laboratory = Laboratory([first, second])
+        prepared = [(library(laboratory, s), whitened(laboratory, s)) for s in (0, 1)]
+        (names, X), y = prepared[0]
+        for name, peer in peers.items():
+            begin = time.perf_counter()
+            coefficients = peer(X, y)
+            scores[name].seconds.append(time.perf_counter() - begin)
+            _count(scores[name], names_said(names, X, coefficients, y), case)
+            if case.effects:
+                scores[name].closed.append(_closed(prepared[1], coefficients, names))
+        if case.effects and "LassoLarsIC" in peers:
+            gp.append(gaussian_process(laboratory))
+    print("| method | names right | false alarms | gap on M2 closed (median) | median s |")
+    print("|---|---|---|---|---|")
+    for name, s in scores.items():
+        closed = f"{np.median(s.closed):.0%}" if s.closed else ""
+        print(f"| {name} | {s.right} of {s.cases} | {s.alarms} of {s.quiet} | {closed} | "
+              f"{np.median(s.seconds):.2f} |")  # fmt: skip
+    if gp:
+        print(f"| Gaussian process in (T, dT/dt) | gives no names | | {np.median(gp):.0%} | |")
+
+
+def _closed(prepared: tuple, coefficients: np.ndarray, names: list[str]) -> float:
+    """Share of M2's excess over the base model that the coefficients of M1 explain."""
+    (own, X), y = prepared
+    if own != names:
+        return 0.0
+    base = [i for i, n in enumerate(names) if n == "base"]
+    B = X[:, base]
+    before = y - B @ np.linalg.lstsq(B, y, rcond=None)[0]
+    after = y - X @ coefficients
+    floor = 1.0
+    start = float(np.mean(before**2)) - floor
+    return 1.0 - (float(np.mean(after**2)) - floor) / max(start, 1e-9)
+
+
+def _count(score: Score, said: set[str], case: Case) -> None:
+    if case.effects:
+        score.cases += 1
+        score.right += said == set(case.effects)
+    else:
+        score.quiet += 1
+        score.alarms += bool(said)
+
+
+if __name__ == "__main__":
+    main()

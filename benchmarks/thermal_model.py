@@ -51,8 +51,8 @@ def fitted() -> tuple[FittedModel, bool]:
     fitting = time.perf_counter() - begin
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(
-        f"{SERIES} series × {EPOCHS} epochs: reduced in {reducing:.1f} s, fitted in {fitting:.1f} s, "
-        f"peak {peak:.0f} MB"
+        f"{SERIES} series × {EPOCHS} epochs: reduced in {reducing:.1f} s, fitted in "
+        f"{fitting:.1f} s, peak {peak:.0f} MB"
     )
     return model, reducing + fitting <= 20.0 and peak < 1000
 

@@ -52,7 +52,9 @@ def _truth(exterior) -> np.ndarray:
     return SMALL_CAMERA.project(exterior, FIELD.points)
 
 
-@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize(
+    "view", ["oblique", *(pytest.param(v, marks=pytest.mark.slow) for v in VIEWS if v != "oblique")]
+)
 def test_corners_scatter_as_stated(view):
     exterior = VIEWS[view]
     image = SCENE.render(SMALL_CAMERA, exterior)

@@ -230,10 +230,9 @@ def _drawing(figure: Figure, prefix: str) -> _Drawing:
     )
     # "<" inside a script element could end it.
     data = json.dumps(document(figure), ensure_ascii=False, separators=(",", ":"), allow_nan=False)
+    data = data.replace("<", "\\u003c")
     columns = min(figure.columns, len(figure.panels))
-    return _Drawing(
-        name, "panels", figure.title, figure.caption, svgs, (), columns, data.replace("<", "\\u003c")
-    )
+    return _Drawing(name, "panels", figure.title, figure.caption, svgs, (), columns, data)
 
 
 def _matrix_drawing(matrix: _Matrix, name: str) -> _Drawing:

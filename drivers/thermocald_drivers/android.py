@@ -168,14 +168,15 @@ class AndroidCamera(Camera):
         image, _ = pixel_formats.decode(memoryview(jpeg), "JPEG", self.width, self.height)
         if self.delete:
             self.phone.shell(f"rm -f '{path}'")
-        age = time.time() - instant - float(tags.get("exposure_s", 0.0)) / 2.0
+        middle = instant + float(tags.get("exposure_s", 0.0)) / 2.0
+        monotonic, utc = support.on_clock(self.clock, middle - time.time() + time.monotonic())
         metadata = {**tags, "file": path, "locked": locked, "locked_why": why, "time_from": source}
         metadata["phone_clock_offset_s"] = self._offset
         return Frame(
             image=image,
             encoded=jpeg,
-            monotonic=self.clock.monotonic() - age,
-            utc=self.clock.utc() - age,
+            monotonic=monotonic,
+            utc=utc,
             exposure=tags.get("exposure_s"),
             metadata=metadata,
         )

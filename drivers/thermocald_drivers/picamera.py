@@ -207,14 +207,15 @@ class Picamera2Camera(Camera):
             raise BadReading(f"{self.where}: no frame that began after the call")
         self._verify(metadata)
         exposure = metadata["ExposureTime"] * 1e-6
-        age = (time.clock_gettime_ns(time.CLOCK_BOOTTIME) - metadata["SensorTimestamp"]) * 1e-9
-        middle = age + exposure / 2.0
+        sleep_s = time.clock_gettime(time.CLOCK_BOOTTIME) - time.monotonic()  # since booting
+        middle = metadata["SensorTimestamp"] * 1e-9 - sleep_s - exposure / 2.0
+        monotonic, utc = support.on_clock(self.clock, middle)
         kept = _jsonable(dict(metadata))
         kept["sensor_temperature_c"] = sensor_temperature(metadata)
         return Frame(
             image=plane,
-            monotonic=self.clock.monotonic() - middle,
-            utc=self.clock.utc() - middle,
+            monotonic=monotonic,
+            utc=utc,
             exposure=exposure,
             metadata=kept,
         )

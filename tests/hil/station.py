@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 __all__ = ["PERIOD_S", "SIZE", "configuration", "prepare"]
 
 SIZE = (640, 480)
-PERIOD_S = 2.5
+PERIOD_S = 2.0
 HOME = "/var/lib/thermocald"
 VIVID = "/dev/v4l/by-path/platform-vivid.0-video-index0"
 

@@ -37,6 +37,21 @@ def encode(image, fourcc):
     return simplejpeg.encode_jpeg(grey, quality=92, colorspace="GRAY")
 
 
+def opened(device, width, height, fourcc):
+    """The device as an output; while a reader has it open it takes no format."""
+    deadline = time.monotonic() + 60
+    while True:
+        out = open(device, "r+b", buffering=0)
+        try:
+            video.set_format(out, video.BufferType.VIDEO_OUTPUT, width, height, fourcc)
+            return out
+        except OSError:
+            out.close()
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.05)
+
+
 def main():
     options = argparse.ArgumentParser()
     for name in ("device", "frames", "temperatures", "log"):
@@ -55,20 +70,22 @@ def main():
         import smbus2
 
         bus = smbus2.SMBus(given.bus, force=True)
-    with open(given.device, "r+b", buffering=0) as out, open(given.log, "w", buffering=1) as log:
-        video.set_format(out, video.BufferType.VIDEO_OUTPUT, width, height, given.format)
+    with (
+        opened(given.device, width, height, given.format) as out,
+        open(given.log, "w", buffering=1) as log,
+    ):
         begin, last, first = time.monotonic(), None, 0
         for n in itertools.count():
             if given.go and not os.path.exists(given.go):
                 first = n
             k = min((n - first) // given.hold, len(frames) - 1)
             celsius = round(float(temperatures[k]) * 16) / 16
+            data = encode(stamp(np.asarray(frames[k]), n), given.format)
+            time.sleep(max(0.0, begin + n / given.fps - time.monotonic()))
             if bus is not None and celsius != last:
                 raw = round(celsius * 16) << 4
                 bus.write_word_data(SENSOR, 0, (raw & 0xFF) << 8 | raw >> 8)
                 last = celsius
-            data = encode(stamp(np.asarray(frames[k]), n), given.format)
-            time.sleep(max(0.0, begin + n / given.fps - time.monotonic()))
             before = time.monotonic()
             out.write(data)
             log.write(f"{n} {before:.6f} {time.monotonic():.6f} {celsius:.4f}\n")

@@ -18,7 +18,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.special import ndtr
+
+from thermocald.photogrammetry.blurred_disc import normal_cdf
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -96,9 +97,13 @@ def _unit(v: Array) -> Array:
     return v / np.where(length > 0, length, 1.0)
 
 
+def _cdf(z: Array) -> Array:
+    return normal_cdf(z.astype(np.float32)).astype(float)
+
+
 def _wedge(h: Array, k: Array, rho: Array) -> Array:
     """P(H < h, K < k) of standard normals with correlation rho; h, k (n, m), rho (n, 1)."""
-    value: Array = ndtr(h) * ndtr(k)
+    value: Array = _cdf(h) * _cdf(k)
     density = np.exp(-0.5 * (h * h + k * k)) / (2 * np.pi)
     he_h, he_k = np.ones_like(h), np.ones_like(k)
     last_h, last_k = np.zeros_like(h), np.zeros_like(k)
@@ -124,8 +129,8 @@ def _model(p: Array, x: Array, y: Array) -> tuple[Array, Array]:
     root = np.sqrt(1 - rho * rho)
     w = _wedge(h, k, rho)
     norm = 1 / np.sqrt(2 * np.pi)
-    wh = norm * np.exp(-0.5 * h * h) * ndtr((k - rho * h) / root)
-    wk = norm * np.exp(-0.5 * k * k) * ndtr((h - rho * k) / root)
+    wh = norm * np.exp(-0.5 * h * h) * _cdf((k - rho * h) / root)
+    wk = norm * np.exp(-0.5 * k * k) * _cdf((h - rho * k) / root)
     wr = np.exp(-0.5 * (h * h - 2 * rho * h * k + k * k) / root**2) / (2 * np.pi * root)
     sine = s1 * c2 - c1 * s2  # dρ/dt2 = −dρ/dt1
     j = np.empty((*h.shape, 7))

@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.model_system import Share, jacobian, share, unknowns_of
+from thermocald.analysis.model_state import FREE_INTERIOR, FitState
+from thermocald.analysis.model_system import Share, jacobian, share
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera_model import (
-    EOP_NAMES,
     ExteriorOrientation,
     InteriorOrientation,
 )
@@ -42,7 +42,6 @@ if TYPE_CHECKING:
 
 __all__ = ["FittedModel", "SeriesFit", "fit_thermal_model"]
 
-_FREE_INTERIOR = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2")
 _ITERATIONS = 30
 _CONVERGED = 1e-2  # of a standard deviation
 _GRID = 33  # trial values of a non-linear parameter
@@ -82,63 +81,6 @@ class FittedModel:
         return float(np.sqrt(self.covariance[i, i]))
 
 
-@dataclass(frozen=True, eq=False)
-class _State:
-    """A model and the exterior orientation of each series."""
-
-    model: ThermalModel
-    exteriors: tuple[Array, ...]
-    fixed: frozenset[str] = frozenset()
-
-    def of_series(self, k: int) -> ThermalModel:
-        return replace(self.model, exterior=ExteriorOrientation.from_array(self.exteriors[k]))
-
-    @property
-    def names(self) -> list[str]:
-        names = [f"interior.{n}" for n in _FREE_INTERIOR] + [f"rates.{n}" for n in RATED]
-        for effect in self.model.effects:
-            names += [f"{effect.name}.{key}" for key in unknowns_of(effect)]
-        names = [n for n in names if n not in self.fixed]
-        return names + [f"exterior.{n}@{k}" for k in range(len(self.exteriors)) for n in EOP_NAMES]
-
-    def columns(self, k: int) -> NDArray[np.int64]:
-        """Where the unknowns of series k stand among all."""
-        common = len(self.names) - 6 * len(self.exteriors)
-        return np.concatenate([np.arange(common), common + 6 * k + np.arange(6)])
-
-    def moved(self, step: Array) -> _State:
-        change = dict(zip(self.names, step, strict=True))
-        interior = self.model.interior
-        interior = interior.with_values(
-            **{n: getattr(interior, n) + change[f"interior.{n}"] for n in _FREE_INTERIOR}
-        )
-        rates = {n: self.model.rates.get(n, 0.0) + change[f"rates.{n}"] for n in RATED}
-        listed = tuple(_moved_effect(e, change) for e in self.model.effects)
-        exteriors = tuple(
-            x + np.array([change[f"exterior.{n}@{k}"] for n in EOP_NAMES])
-            for k, x in enumerate(self.exteriors)
-        )
-        model = replace(self.model, interior=interior, rates=rates, effects=listed)
-        return _State(model, exteriors, self.fixed)
-
-
-def _moved_effect(effect: ModelEffect, change: dict[str, float]) -> ModelEffect:
-    values = dict(effect.values)
-    kind = effects.get(effect.name)
-    for key in unknowns_of(effect):
-        name = f"{effect.name}.{key}"
-        if name not in change:
-            continue
-        value = float(values[key]) + change[name]
-        if key in kind.nonlinear and key != "phase":
-            p, old = kind.nonlinear[key], float(values[key])
-            # a step across the range is a step too far
-            low, high = (max(p.low, old / 2), min(p.high, old * 2)) if p.log else (p.low, p.high)
-            value = float(np.clip(value, low, high))
-        values[key] = value
-    return replace(effect, values=values)
-
-
 def fit_thermal_model(
     series: Sequence[ModelSeries],
     listed: Sequence[ModelEffect] = (),
@@ -166,7 +108,7 @@ def fit_thermal_model(
         name=checked[0].camera,
         version=0,
     )
-    state = _State(model, tuple(s.start[10:].copy() for s in checked), frozenset(fixed))
+    state = FitState(model, tuple(s.start[10:].copy() for s in checked), frozenset(fixed))
     fit = _Fit(checked)
     # while something is missing, a free thermometer noise would take the drift for itself
     fit.components = not listed
@@ -217,13 +159,13 @@ def _checked(series: Sequence[ModelSeries], listed: Sequence[ModelEffect]) -> li
     return [s.displacing(moved) if moved else s for s in series]
 
 
-def _searched(series: list[ModelSeries], state: _State) -> _State:
+def _searched(series: list[ModelSeries], state: FitState) -> FitState:
     """The last effect's non-linear parameters where they fit best, in the series that say most."""
     spans = [float(np.ptp(s.history.temperature())) for s in series]
     most = sorted(np.argsort(spans)[::-1][:_SEARCHED].tolist())
     some = _Fit([series[k] for k in most])
     before = replace(state.model, effects=state.model.effects[:-1])
-    part = _State(before, tuple(state.exteriors[k] for k in most), state.fixed)
+    part = FitState(before, tuple(state.exteriors[k] for k in most), state.fixed)
     part = some.solve(part)
     part = some.search(replace(part, model=replace(part.model, effects=state.model.effects)))
     listed = (*state.model.effects[:-1], part.model.effects[-1])
@@ -256,14 +198,14 @@ class _Fit:
         self.shares: list[Share] = []
         self.cost = np.inf
 
-    def step(self, state: _State) -> tuple[Array, float]:
+    def step(self, state: FitState) -> tuple[Array, float]:
         """One step (p,), its largest part in standard deviations; renews the variances."""
         names = state.names
         M, g = np.zeros((len(names), len(names))), np.zeros(len(names))
         self.shares = []
         for k in range(len(self.series)):
             s, model = self._corrected(k), state.of_series(k)
-            _, J = jacobian(s, model, _FREE_INTERIOR, state.fixed)
+            _, J = jacobian(s, model, FREE_INTERIOR, state.fixed)
             part = share(
                 s, model, J, self.variance, self.error_sds[k], self.noise[k], self.errors[k]
             )
@@ -289,7 +231,7 @@ class _Fit:
         }
         return replace(s, history=replace(s.history, readings=readings))
 
-    def _renew(self, state: _State, step: Array) -> None:
+    def _renew(self, state: FitState, step: Array) -> None:
         image, used, penalty = 0.0, 0.0, 0.0
         for k, part in enumerate(self.shares):
             columns = state.columns(k)
@@ -309,7 +251,7 @@ class _Fit:
         self.cost = image / self.variance + penalty
         self.variance = image / max(self.image_points - len(step) - used, 1.0)
 
-    def take_off_offsets(self, state: _State) -> None:
+    def take_off_offsets(self, state: FitState) -> None:
         """Leave the constant part of every target's residuals out of what follows."""
         self.series = [
             s.without_offsets(
@@ -318,7 +260,7 @@ class _Fit:
             for k, s in enumerate(self.series)
         ]
 
-    def solve(self, state: _State) -> _State:
+    def solve(self, state: FitState) -> FitState:
         """Iterate until no unknown moves by more than a hundredth of its standard deviation."""
         still = 0
         for _ in range(_ITERATIONS):
@@ -332,7 +274,7 @@ class _Fit:
                 break
         return state
 
-    def search(self, state: _State) -> _State:
+    def search(self, state: FitState) -> FitState:
         """Try the last effect's non-linear parameters over their range, keep what fits best."""
         effect = state.model.effects[-1]
         kind = effects.get(effect.name)
@@ -357,7 +299,7 @@ class _Fit:
         best, chosen = np.inf, state
         for trial in trials:
             listed = (*state.model.effects[:-1], trial)
-            tried = _State(
+            tried = FitState(
                 replace(state.model, effects=listed), state.exteriors, held | state.fixed
             )
             self.variance, self.error_sds = variance, list(sds)
@@ -388,7 +330,7 @@ class _Fit:
         grid: Array = np.geomspace(low, high, _GRID) if log else np.linspace(low, high, 2 * _GRID)
         return grid
 
-    def defocus(self, state: _State) -> _State:
+    def defocus(self, state: FitState) -> FitState:
         """The noise factor per kelvin from each epoch's own misfit, by weighted least squares."""
         rise, spread, count = [], [], []
         for k, s in enumerate(self.series):
@@ -425,7 +367,7 @@ class _Fit:
         listed = tuple(found if e.name == "defocus" else e for e in state.model.effects)
         return replace(state, model=replace(state.model, effects=listed))
 
-    def result(self, state: _State) -> FittedModel:
+    def result(self, state: FitState) -> FittedModel:
         """The model with standard deviations, the test field's coordinates included."""
         names = state.names
         covariance = self.Q + self._field_covariance(state)
@@ -457,7 +399,7 @@ class _Fit:
         )  # fmt: skip
         return FittedModel(model, tuple(names), covariance, sigma, fits)
 
-    def _field_covariance(self, state: _State) -> Array:
+    def _field_covariance(self, state: FitState) -> Array:
         """Q K Σ Kᵀ Q: what errors of the targets' coordinates do to the level.
 
         A coordinate is as wrong in the first epoch as in the last: it cannot look like a drift, and

@@ -41,7 +41,7 @@ def opened(device, width, height, fourcc):
     """The device as an output; while a reader has it open it takes no format."""
     deadline = time.monotonic() + 60
     while True:
-        out = open(device, "r+b", buffering=0)
+        out = open(device, "r+b", buffering=0)  # noqa: SIM115 - given to the caller
         try:
             video.set_format(out, video.BufferType.VIDEO_OUTPUT, width, height, fourcc)
             return out

@@ -1,0 +1,42 @@
+"""What the drivers share."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+from thermocald_drivers import support
+
+from thermocald.errors import ConfigurationError, DriverMissing
+from thermocald.hal import SystemClock
+
+
+class InterruptedClock(SystemClock):
+    """A thread that is preempted between two looks at the clock, now and then."""
+
+    def __init__(self, pauses):
+        self.pauses = list(pauses)
+
+    def utc(self):
+        if self.pauses:
+            time.sleep(self.pauses.pop())
+        return super().utc()
+
+
+@pytest.mark.parametrize("pauses", [[], [0.05], [0.05, 0.03, 0.02]])
+def test_an_instant_on_the_clock_is_not_off_by_a_pause(pauses):
+    begin, utc = time.monotonic(), time.time()
+    monotonic, on_utc = support.on_clock(InterruptedClock(pauses), begin - 1.0)
+    assert monotonic == pytest.approx(begin - 1.0, abs=0.002)
+    assert on_utc == pytest.approx(utc - 1.0, abs=0.002)
+
+
+@pytest.mark.parametrize("value", ["5", None, True, float("nan"), 11])
+def test_numbers_are_bounded(value):
+    with pytest.raises(ConfigurationError, match="width"):
+        support.number("width", value, 0, 10, "px")
+
+
+def test_a_missing_library_says_how_to_install_it():
+    with pytest.raises(DriverMissing, match=r"pip install 'thermocald\[gpio\]'"):
+        support.library("no_such_library_anywhere", "gpio")

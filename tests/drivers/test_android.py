@@ -60,7 +60,7 @@ def shoot(count=1, delay=0.0, writing_s=0.0, **tags):
 
 
 def options(server, **more):
-    return {"serial": SERIAL, "port": server.port, "start_server": False, "timeout_s": 1.0, **more}
+    return {"serial": SERIAL, "port": server.port, "start_server": False, "timeout_s": 5.0, **more}
 
 
 def camera(server, **more):
@@ -147,7 +147,7 @@ def test_a_file_that_grows_is_awaited(server, phone):
 def test_a_file_that_never_ends(server, phone):
     phone.shoot = lambda phone: phone.add("IMG_1.jpg", photograph(time.time())[:-300])
     with (
-        camera(server, timeout_s=0.4) as device,
+        camera(server, timeout_s=1.5) as device,
         pytest.raises(BadReading, match="partial photograph, IMG_1"),
     ):
         device.capture()
@@ -182,7 +182,7 @@ def test_two_new_photographs(server, phone):
 def test_no_photograph(server, phone):
     phone.shoot = None
     with (
-        camera(server, timeout_s=0.4) as device,
+        camera(server, timeout_s=1.5) as device,
         pytest.raises(DeviceTimeout, match="is the trigger right"),
     ):
         device.capture()
@@ -235,7 +235,7 @@ def test_a_full_phone(server, phone):
 
 
 def test_a_phone_that_fills_up(server, phone):
-    with camera(server, timeout_s=0.4) as device:
+    with camera(server, timeout_s=1.5) as device:
         phone.shoot, phone.free_kb = None, 10_000
         with pytest.raises(PermanentDeviceError, match="storage is full"):
             device.capture()

@@ -51,14 +51,18 @@ def library(laboratory: Laboratory, series: int) -> tuple[list[str], np.ndarray]
     base = laboratory.drive_course([], series)
     T = base - base.mean()
     for candidate in candidates(laboratory.series):
-        grid = candidate.grid[:: max(len(candidate.grid) // 8, 1)] if len(candidate.grid) else [None]
+        grid = (
+            candidate.grid[:: max(len(candidate.grid) // 8, 1)] if len(candidate.grid) else [None]
+        )
         for value in grid:
             if candidate.is_event:
                 course = (e.times >= value).astype(float)
             elif candidate.is_drive:
                 course = laboratory.drive_course([candidate.term(value, 1)], series) - base
             else:
-                course = laboratory.courses(candidate.term(value, 1), series, operators=False)[0][:, 0]
+                course = laboratory.courses(candidate.term(value, 1), series, operators=False)[0][
+                    :, 0
+                ]
             course = course - course.mean()
             for parameter in candidate.parameters:
                 names.append(candidate.effect)
@@ -69,9 +73,7 @@ def library(laboratory: Laboratory, series: int) -> tuple[list[str], np.ndarray]
     size, U = np.linalg.eigh(e.N.mean(axis=0))
     keep = size > 1e-4 * np.median(size)
     root = U[:, keep] * np.sqrt(size[keep])
-    X = np.stack(
-        [np.outer(c, root[COLUMNS.index(p)]).ravel() for c, p in columns], axis=1
-    )
+    X = np.stack([np.outer(c, root[COLUMNS.index(p)]).ravel() for c, p in columns], axis=1)
     return names, X
 
 
@@ -103,7 +105,9 @@ def peer_lasso(X: np.ndarray, y: np.ndarray) -> np.ndarray:
     return model.coef_ / scale
 
 
-def names_said(names: list[str], X: np.ndarray, coefficients: np.ndarray, y: np.ndarray) -> set[str]:
+def names_said(
+    names: list[str], X: np.ndarray, coefficients: np.ndarray, y: np.ndarray
+) -> set[str]:
     """Effects whose columns together explain a hundredth of the largest effect's share."""
     power = {}
     for effect in set(names) - {"base"}:

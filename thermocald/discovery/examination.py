@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.discovery.adequacy import Adequacy, examine
+from thermocald.discovery.curvature import relinearised
 from thermocald.discovery.evidence import condensed, reweighted
 from thermocald.discovery.hypothesis import Laboratory
 from thermocald.discovery.image_space import (
@@ -32,7 +33,7 @@ MAX_EFFECTS = 2
 # how much worse a solution may score and still not be excluded
 BAND = 14.0
 # a model that leaves less than this share of what the base left has the cause
-_LEFT = 0.02
+_LEFT = 0.03
 # a second effect beside an adequate one has to explain as much, in px RMS and as a share of the
 # first: below that, it is the first one's finer points
 _LEFT_PX, _LEFT_SHARE = 0.005, 0.15
@@ -81,13 +82,24 @@ def examine_series(
         cleaned = [reweighted(e, n) for e, n in zip(cleaned, growth.noise, strict=True)]
     ready = [condensed(slowed(e)) for e in calibrated_thermometers(cleaned)]
     found = _searched(Laboratory(ready), say, given)
+    curved = _curved(found)
+    if curved is not None:
+        say("curvature of the projection: once more")
+        found = _searched(Laboratory(curved), say, given)
     noisy = _noisier(found)
     if noisy is not None:
         say("noise that targets share: once more")
         found = _searched(Laboratory(noisy), say, given)
-    return replace(
-        found, displaced=tuple(displaced), defocus=growth, original=tuple(series)
-    )
+    return replace(found, displaced=tuple(displaced), defocus=growth, original=tuple(series))
+
+
+def _curved(found: Examination) -> list[Evidence] | None:
+    """The series with the projection's curvature taken off; None where it does not matter."""
+    laboratory = found.laboratory
+    out = [relinearised(laboratory, found.best.fit, s) for s in range(len(laboratory.series))]
+    if all(e is None for e in out):
+        return None
+    return [e or old for e, old in zip(out, laboratory.series, strict=True)]
 
 
 def _noisier(found: Examination) -> list[Evidence] | None:
@@ -240,9 +252,7 @@ def _frontier(grown: list[Solution], width: int = 4) -> list[Solution]:
 
 
 def _adequacies(laboratory: Laboratory, solution: Solution) -> tuple[Adequacy, ...]:
-    return tuple(
-        examine(laboratory, solution.fit, s) for s in range(len(laboratory.series))
-    )
+    return tuple(examine(laboratory, solution.fit, s) for s in range(len(laboratory.series)))
 
 
 def _adequate(now: Sequence[Adequacy], base: Sequence[Adequacy]) -> bool:

@@ -41,11 +41,13 @@ def jumps(laboratory: Laboratory, fit: Fit, series: int) -> tuple[Array, Array]:
     """
     e = laboratory.series[series]
     C, V, index = fit.designs[series]
-    rest = e.values - (C * fit.coefficients[index]) @ V.T
+    rest = e.b - np.einsum("epq,eq->ep", e.N, (C * fit.coefficients[index]) @ V.T)
+    level = np.linalg.lstsq(e.N.sum(axis=0), rest.sum(axis=0), rcond=1e-12)[0]
+    rest = rest - e.N @ level
     size, U = np.linalg.eigh(e.N.mean(axis=0))
     good = size > 1e-6 * np.median(size)
     W = U / np.sqrt(np.where(good, size, 1.0))
-    z = np.einsum("ep,epq,qd->ed", rest, e.N, W)[e.n > 0]
+    z = (rest @ W)[e.n > 0]
     d = np.diff(z, 2, axis=0)
     spread = np.median(np.abs(d), axis=0) * 1.4826
     observed = np.array(

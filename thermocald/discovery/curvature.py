@@ -1,0 +1,55 @@
+"""The second linearisation: what the image does beyond first order, once the courses are known.
+
+A drift of several pixels leaves some thousandths of a pixel to the curvature of the projection,
+which is more than a discovery has to see. The courses found so far say how much, epoch by epoch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.photogrammetry.camera_model import project
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from thermocald.discovery.evidence import Evidence
+    from thermocald.discovery.hypothesis import Fit, Laboratory
+
+    Array = NDArray[np.float64]
+
+__all__ = ["relinearised"]
+
+_WORTH_PX = 0.0005
+
+
+def relinearised(laboratory: Laboratory, fit: Fit, series: int) -> Evidence | None:
+    """One series with the curvature taken off its observations; None where it does not matter."""
+    e = laboratory.series[series]
+    if e.blocks is not None:
+        return None
+    C, V, index = fit.designs[series]
+    moved = (C * fit.coefficients[index]) @ V.T
+    rest = np.einsum("epq,eq->p", e.N, e.values - moved)
+    # levels along combinations that the field cannot determine stay where they were
+    level = np.linalg.lstsq(e.N.sum(axis=0), rest, rcond=1e-6)[0]
+    step = moved + level
+    parameters = step / e.scale
+    points = e.source.field.points * (1.0 + parameters[:, None, 16:])
+    seen = project(e.source.sensor, e.at.iop + parameters[:, :10],
+                   e.at.eop + parameters[:, 10:16], points)  # fmt: skip
+    straight = e.at.predicted + np.einsum("tik,ek->eti", e.columns, step)
+    weights = e.weights / e.correlation
+    there = weights[..., :1] > 0
+    curved = np.where(there, np.nan_to_num(seen - straight), 0.0)
+    total = np.maximum(there.sum(axis=0), 1)
+    curved = np.where(there, curved - curved.sum(axis=0) / total, 0.0)
+    if float(np.sqrt(np.mean(curved**2))) < _WORTH_PX:
+        return None
+    b = e.b - np.einsum("eti,tik->ek", weights[..., :2] * curved, e.columns)
+    k = e.N.shape[-1]
+    values = np.linalg.solve(e.N + 1e-6 * np.eye(k), b[..., None])[..., 0]
+    return replace(e, b=b, values=values, yy=np.einsum("ek,ek->e", values, b))

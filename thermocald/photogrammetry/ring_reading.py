@@ -170,9 +170,11 @@ def _sample(
 @cache
 def _code_table(bits: int) -> NDArray[np.int64]:
     """The code of each number of so many bits, -1 where it is none."""
-    codes = frozenset(ring_code.codes(bits))
-    smallest = (ring_code.smallest_rotation(number, bits) for number in range(1 << bits))
-    return np.array([code if code in codes else -1 for code in smallest], dtype=np.int64)
+    table = np.full(1 << bits, -1, dtype=np.int64)
+    codes = np.array(ring_code.codes(bits))
+    for k in range(bits):
+        table[((codes << k) | (codes >> (bits - k))) & ((1 << bits) - 1)] = codes
+    return table
 
 
 def _read_family(level: Single, maps: LocalMap, bits: int) -> tuple[NDArray[np.int64], Array]:

@@ -39,7 +39,7 @@ def configuration(serial_port: str) -> dict[str, Any]:
                 "width": width,
                 "height": height,
                 "pixel_format": "GREY",
-                "timeout_s": 2.0,
+                "timeout_s": 5.0,
                 "period_s": PERIOD_S,
                 "sensor": {
                     "width_px": width,

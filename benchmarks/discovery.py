@@ -1,4 +1,4 @@
-"""Discovery beside its peers on the same blind recordings: names right, false alarms, gap on M2, time.
+"""Discovery beside its peers on the same blind recordings: names, false alarms, gap on M2, time.
 
     python benchmarks/discovery.py [--seeds 1] [--px 0.1]
 

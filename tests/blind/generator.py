@@ -31,7 +31,8 @@ CAMERAS = {
     "nexus5": (3264, 2448, 0.0014, 3.97, 1.2e-3),
     "galaxy-s8": (4032, 3024, 0.0014, 4.25, 8.0e-4),
 }
-_PARAMETERS = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2", "C1", "C2") + (
+_PARAMETERS = (
+    "c", "x0", "y0", "A1", "A2", "A3", "B1", "B2", "C1", "C2",
     "omega", "phi", "kappa", "X0", "Y0", "Z0",
 )  # fmt: skip
 
@@ -77,9 +78,7 @@ def corner_field() -> np.ndarray:
     g = 60.0 + 80.0 * np.arange(7)
     a, b = (v.ravel() for v in np.meshgrid(g, g))
     o = np.full(49, 4.0)
-    return np.vstack(
-        [np.stack([a, b, o], 1), np.stack([a, o, b], 1), np.stack([o, a, b], 1)]
-    )
+    return np.vstack([np.stack([a, b, o], 1), np.stack([a, o, b], 1), np.stack([o, a, b], 1)])
 
 
 def turn(omega: np.ndarray, phi: np.ndarray, kappa: np.ndarray) -> np.ndarray:
@@ -151,7 +150,9 @@ def climate(rng: np.random.Generator, programme: str, seconds: int) -> dict[str,
             at += hold
     elif programme == "ramp":
         top = rng.uniform(0.45, 0.65) * seconds
-        lamp = rng.uniform(15, 28) * np.clip(np.minimum(t / top, (seconds - t) / (seconds - top)), 0, 1)
+        lamp = rng.uniform(15, 28) * np.clip(
+            np.minimum(t / top, (seconds - t) / (seconds - top)), 0, 1
+        )
     load_on = rng.uniform(0, 0.15) * seconds
     load_off = seconds if programme != "selfwarming" else rng.uniform(0.6, 0.75) * seconds
     strong = rng.uniform(12, 22) if programme == "selfwarming" else 0.0
@@ -164,7 +165,9 @@ def climate(rng: np.random.Generator, programme: str, seconds: int) -> dict[str,
         hold = rng.uniform(120, 500) * scale
         work[(t >= at) & (t < at + hold)] = rng.uniform(0, 16)
         at += hold
-    board = 8.0 + _warmed(0.35 * (reference - ambient) + ambient + work, rng.uniform(60, 160), ambient[0])
+    board = 8.0 + _warmed(
+        0.35 * (reference - ambient) + ambient + work, rng.uniform(60, 160), ambient[0]
+    )
     return {"temperature": reference, "board_temperature": board}
 
 
@@ -226,9 +229,7 @@ def _view(rng: np.random.Generator, c: float) -> np.ndarray:
     a = rng.uniform(-0.15, 0.15)
     R = np.stack([np.cos(a) * x + np.sin(a) * y, -np.sin(a) * x + np.cos(a) * y, z], 1)
     phi = np.arcsin(R[0, 2])
-    return np.array(
-        [np.arctan2(-R[1, 2], R[2, 2]), phi, np.arctan2(-R[0, 1], R[0, 0]), *place]
-    )
+    return np.array([np.arctan2(-R[1, 2], R[2, 2]), phi, np.arctan2(-R[0, 1], R[0, 0]), *place])
 
 
 def make_camera(rng: np.random.Generator, case: Case) -> tuple[str, _Camera]:
@@ -316,8 +317,14 @@ def _fresh(rng: np.random.Generator, e: dict, first: bool, seconds: int) -> dict
 
 
 def true_parameters(
-    camera: _Camera, effects: list[dict], climate_: dict[str, np.ndarray], unknown: np.ndarray,
-    frames: np.ndarray, points: np.ndarray, eop: np.ndarray, offsets: np.ndarray,
+    camera: _Camera,
+    effects: list[dict],
+    climate_: dict[str, np.ndarray],
+    unknown: np.ndarray,
+    frames: np.ndarray,
+    points: np.ndarray,
+    eop: np.ndarray,
+    offsets: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Parameters (E, 16), object points (E, n, 3) and noise factor (E,) at the frames."""
     T = climate_["temperature"]
@@ -356,7 +363,12 @@ def true_parameters(
             course = np.sin(2 * np.pi * t / e["P"] + e["phase"])
         elif name == "second_heat_source":
             course = climate_[e["channel"]]
-        elif name in ("housing_tilt", "radial_distortion_drift", "decentering_drift", "affinity_drift"):
+        elif name in (
+            "housing_tilt",
+            "radial_distortion_drift",
+            "decentering_drift",
+            "affinity_drift",
+        ):
             course = T - camera.T0
         elif name == OUTSIDE:
             course = unknown
@@ -376,7 +388,9 @@ def true_parameters(
     p[:, 10:] = eop
     p += offsets
     p += at(drive - camera.T0)[:, None] * camera.rates
-    p += np.stack([at(extra[:, j]) if extra[:, j].any() else np.zeros(len(frames)) for j in range(16)], 1)
+    p += np.stack(
+        [at(extra[:, j]) if extra[:, j].any() else np.zeros(len(frames)) for j in range(16)], 1
+    )
     if any(e["effect"] == "slip" for e in effects):  # a step is not interpolated
         for e in effects:
             if e["effect"] == "slip":
@@ -389,7 +403,9 @@ def true_parameters(
     return p, X, at(noise)
 
 
-def _left_over(uv: np.ndarray, camera: _Camera, points: np.ndarray, eop: np.ndarray, T: np.ndarray) -> float:
+def _left_over(
+    uv: np.ndarray, camera: _Camera, points: np.ndarray, eop: np.ndarray, T: np.ndarray
+) -> float:
     """RMS px that the base model, fitted to noise-free image points, leaves over."""
     p0 = camera.base.copy()
     p0[10:] = eop
@@ -466,7 +482,9 @@ def generate(case: Case) -> tuple[list[Series], dict]:
             low, high = 1e-3, 30.0
             for _ in range(40):
                 middle = np.sqrt(low * high)
-                low, high = (middle, high) if leftover(middle, k) < case.strength_px else (low, middle)
+                low, high = (
+                    (middle, high) if leftover(middle, k) < case.strength_px else (low, middle)
+                )
             size = np.sqrt(low * high)
             limit = {"thermal_lag": 900 / e.get("tau", 1), "time_offset": 200 / abs(e.get("d", 1)),
                      "hysteresis": 6 / e.get("half_width", 1)}[e["effect"]]  # fmt: skip
@@ -495,12 +513,10 @@ def generate(case: Case) -> tuple[list[Series], dict]:
             _measure(rng, case, camera_name, f"M{s + 1}", frames, uv, noise, climates[s], nominal)
         )
     truth = {
-        "case": {k: v for k, v in case.__dict__.items()},
+        "case": dict(case.__dict__.items()),
         "camera": camera_name,
         "programmes": list(programmes),
-        "effects": [
-            [_plain(e, camera.sensor[2]) for e in s] for s in per_series
-        ],
+        "effects": [[_plain(e, camera.sensor[2]) for e in s] for s in per_series],
     }
     return built, truth
 
@@ -511,7 +527,9 @@ def _plain(e: dict, pitch: float) -> dict:
     out: dict = {"effect": name}
     for key in ("tau", "d", "half_width"):
         if key in e:
-            out[key] = e[key] * (size if name in ("thermal_lag", "time_offset", "hysteresis") else 1)
+            out[key] = e[key] * (
+                size if name in ("thermal_lag", "time_offset", "hysteresis") else 1
+            )
     for key in ("T_k", "P", "channel", "targets", "time", "happens", "phase"):
         if key in e:
             out[key] = e[key]
@@ -530,8 +548,15 @@ def _plain(e: dict, pitch: float) -> dict:
 
 
 def _measure(
-    rng: np.random.Generator, case: Case, camera: str, name: str, frames: np.ndarray,
-    uv: np.ndarray, noise: np.ndarray, climate_: dict[str, np.ndarray], nominal: np.ndarray,
+    rng: np.random.Generator,
+    case: Case,
+    camera: str,
+    name: str,
+    frames: np.ndarray,
+    uv: np.ndarray,
+    noise: np.ndarray,
+    climate_: dict[str, np.ndarray],
+    nominal: np.ndarray,
 ) -> Series:
     """What the detector and the thermometers make of the truth."""
     E, n = uv.shape[:2]
@@ -596,8 +621,8 @@ def write(series: Series, folder: Path) -> None:
     lines = [
         "format: thermocald-recording/1", f"name: {series.camera}-{series.name}",
         f"series: {series.name}", f"interval: {series.interval}",
-        f"camera: {{name: {series.camera}, width: {width}, height: {height}, "
-        f"pixel_pitch: {pitch}, principal_distance: {c}}}",
+        (f"camera: {{name: {series.camera}, width: {width}, height: {height}, "
+        f"pixel_pitch: {pitch}, principal_distance: {c}}}"),
         "temperatures:",
         *(f"  {k}: {{unit: degC, resolution: 0.0625}}" for k in series.temperatures),
     ]  # fmt: skip
@@ -609,7 +634,8 @@ def write(series: Series, folder: Path) -> None:
         cells = ["" if np.isnan(v) else f"{v:.4f}" for v in values]
         rows.append(
             f"{number},{series.frame_time[i]:.3f},{series.temperature_time[i]:.3f},"
-            + ",".join(cells) + ","
+            + ",".join(cells)
+            + ","
         )
     (folder / "epochs.csv").write_text("\n".join(rows) + "\n")
     rows = ["epoch,target,x,y,sx,sy"]

@@ -1,6 +1,6 @@
 """Scoring of the discovery on blind recordings: the confusion matrix, and what goes with it.
 
-    python -m tests.blind.score [--seeds 5] [--part single-0.3 …] [--write docs/reference/discovery-confusion.md]
+    python -m tests.blind.score [--seeds 5] [--part single-0.3 …] [--write FILE.md]
 
 Runs in memory through `examine_series`, the same function the command calls.
 """
@@ -183,8 +183,8 @@ def main() -> None:
     parser.add_argument("--write", type=Path)
     a = parser.parse_args()
     seeds = range(a.first, a.first + a.seeds)
-    table = ["| part | cases | exact | exact or listed | lists | parameters within 3 sd | "
-             "gap on M2 closed ≥ 90 % | median s |", "|---|---|---|---|---|---|---|---|"]  # fmt: skip
+    table = [("| part | cases | exact | exact or listed | lists | parameters within 3 sd | "
+             "gap on M2 closed ≥ 90 % | median s |"), "|---|---|---|---|---|---|---|---|"]  # fmt: skip  # noqa: E501
     matrices = []
     for part in a.part or PARTS:
         outcomes = run(part, seeds, show=True)
@@ -200,7 +200,9 @@ def main() -> None:
             "# How well discovery names hidden effects\n\n"
             "Written by `python -m tests.blind.score --write …`: blind recordings from a generator "
             "that shares no code with the program; the part's number is the strength in px.\n\n"
-            + "\n".join(table) + "\n\n" + "\n".join(matrices)
+            + "\n".join(table)
+            + "\n\n"
+            + "\n".join(matrices)
         )
 
 

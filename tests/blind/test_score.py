@@ -1,4 +1,4 @@
-"""Blind recordings: names right, none wrong, gaps closed. The whole table: `python -m tests.blind.score`."""
+"""Blind recordings: names right, none wrong, gaps closed (`python -m tests.blind.score`)."""
 
 from __future__ import annotations
 

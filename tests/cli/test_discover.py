@@ -44,7 +44,9 @@ def test_everything_is_written(recordings, tmp_path):
     assert yaml.safe_load(model.read_text())["effects"][0]["effect"] == "thermal_lag"
     page = report.read_text()
     assert page.count("<svg") == 5
-    assert "http://" not in page.replace("http://www.w3.org", "").replace("http://purl.org", "").replace("http://creativecommons.org", "")
+    assert "http://" not in page.replace("http://www.w3.org", "").replace(
+        "http://purl.org", ""
+    ).replace("http://creativecommons.org", "")
     assert document["effects"][0]["statement"] in page
     assert "reading" in result.stderr
 

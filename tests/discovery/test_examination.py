@@ -7,7 +7,16 @@ import pytest
 
 from thermocald.discovery.result import discover_series
 
-KEYS = {"effect", "statement", "where", "estimates", "evidence", "alternatives", "gap_before", "gap_after"}
+KEYS = {
+    "effect",
+    "statement",
+    "where",
+    "estimates",
+    "evidence",
+    "alternatives",
+    "gap_before",
+    "gap_after",
+}
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ def dense(evidence_of):
     laboratory = Laboratory(evidence)
     fit = laboratory.fit((Term("nonlinear_expansion"),))
     e = evidence[0]
-    E, P = len(e.times), len(COLUMNS)
+    E, _P = len(e.times), len(COLUMNS)
     # the least determined combinations are left out so that N can be inverted
     size, U = np.linalg.eigh(e.N.mean(axis=0))
     keep = U[:, size > 1e-3 * np.median(size)]
@@ -29,9 +29,7 @@ def dense(evidence_of):
     for block in fit.blocks:
         d = keep.T @ fit.direction(block)[0]
         operator = (
-            laboratory.drive((), 0)[1]
-            if block.term < 0
-            else laboratory.courses(fit.terms[0], 0)[1]
+            laboratory.drive((), 0)[1] if block.term < 0 else laboratory.courses(fit.terms[0], 0)[1]
         )
         for i in range(E):
             J[i * k : (i + 1) * k] += np.outer(d, operator[i])
@@ -53,15 +51,14 @@ def test_inner_products_equal_the_dense_ones(dense):
     inverse = np.linalg.inv(S)
     L = inverse @ level
     projected = inverse - L @ np.linalg.solve(level.T @ L, L.T)
-    assert A == pytest.approx(X.T @ projected @ X, rel=2e-3)
+    assert pytest.approx(X.T @ projected @ X, rel=2e-3) == A
 
 
 def test_determinant(dense):
     e, fit, keep, S, J = dense
     k = keep.shape[1]
     images = sum(
-        np.linalg.slogdet(np.linalg.inv(np.einsum("pi,pq,qj->ij", keep, n, keep)))[1]
-        for n in e.N
+        np.linalg.slogdet(np.linalg.inv(np.einsum("pi,pq,qj->ij", keep, n, keep)))[1] for n in e.N
     )
     assert fit.weightings[0].logdet == pytest.approx(np.linalg.slogdet(S)[1] - images, rel=1e-3)
     assert len(S) == len(e.times) * k
@@ -77,9 +74,7 @@ def test_scan_agrees_with_reduce(dense):
     base = fit.designs[0][:2]
 
     A, c, B = fit.weightings[0].scan(C[None], V, base)
-    whole = fit.weightings[0].reduce(
-        np.hstack([C, C, base[0]]), np.hstack([V, base[1]])
-    )
+    whole = fit.weightings[0].reduce(np.hstack([C, C, base[0]]), np.hstack([V, base[1]]))
 
     assert A[0] == pytest.approx(whole.A[:2, :2])
     assert c[0] == pytest.approx(whole.c[:2])

@@ -44,7 +44,8 @@ class Examination:
     """What the search found.
 
     laboratory: the series as examined, displaced targets out and noise weighted; base, best:
-    solutions; ranking: singles by score; rivals: solutions that cannot be excluded; adequacy: of best, per series.
+    solutions; ranking: singles by score; rivals: solutions that cannot be excluded;
+    adequacy: of best, per series.
     """
 
     laboratory: Laboratory

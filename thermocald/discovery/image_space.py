@@ -222,7 +222,7 @@ def noise_growth(series: Sequence[Evidence]) -> NoiseGrowth | None:
 def _roughness(
     courses: Sequence[Array], data: Sequence[tuple[NDArray[np.bool_], Array, Array]], k: float
 ) -> float:
-    """By how much the variances scatter more, and slower, than χ² lets them: 1 where they do not."""
+    """By how much the variances scatter more, and slower, than χ² lets them; at least 1."""
     total = []
     for course, (ok, free, v) in zip(courses, data, strict=True):
         f = free[ok]

@@ -118,7 +118,7 @@ def _effect(effect: EffectFound) -> str:
         text += "<p>These data cannot exclude:</p><ul>"
         for a in excluded:
             text += (
-                f"<li><b>{escape(a['effect'])}</b>, which scores {a['score_difference']:.1f} worse. "
+                f"<li><b>{escape(a['effect'])}</b>, scoring {a['score_difference']:.1f} worse. "
                 f"To tell them apart: {escape(a['experiment'])}.</li>"
             )
         text += "</ul>"

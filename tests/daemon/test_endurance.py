@@ -19,7 +19,8 @@ from thermocald.store.database import Store
 pytestmark = pytest.mark.slow
 
 KILLS = 200
-EPOCHS = 100_000
+# The whole soak takes a quarter of an hour of an idle core: THERMOCALD_SOAK_EPOCHS=100000
+EPOCHS = int(os.environ.get("THERMOCALD_SOAK_EPOCHS", "10000"))
 
 
 def fast_run(document: str, epochs: int) -> str:
@@ -56,6 +57,7 @@ def forker(tmp_path):
     process.stdout.close()
 
 
+@pytest.mark.timeout(1800)
 def test_two_hundred_kills_lose_no_committed_epoch(daemon, recording, replayed, forker):
     daemon.configure(**replayed(recording))
     rng = np.random.default_rng(11)
@@ -82,6 +84,7 @@ def test_two_hundred_kills_lose_no_committed_epoch(daemon, recording, replayed, 
     print(f"{KILLS} kills, {len(numbers)} epochs, 0 lost")
 
 
+@pytest.mark.timeout(7200)
 def test_a_hundred_thousand_epochs_leave_memory_files_and_threads_as_they_were(
     daemon, replayed, tmp_path
 ):

@@ -24,6 +24,8 @@ State = Literal["unknown", "drifting", "ready"]
 
 _FEWEST = 8
 _TAUS = 60
+_NARROWINGS = 6
+_WEIGHTY = 9  # points of the grid that share the weight
 _SETTLED_SD = 2.0
 _WORST_MISFIT = 3.0
 
@@ -90,25 +92,17 @@ def fit_approach(times: Array, values: Array, sds: Array, bound: float) -> Appro
     span = float(times[-1] - times[0])
     step = span / (len(times) - 1)
     taus = np.geomspace(2.0 * step, 10.0 * span, _TAUS)
-    t = times - times[-1]
-    w = 1.0 / sds**2
-    # exp(-t/tau) is huge at the beginning of a window long against tau: scaled to at most 1
-    E = np.exp(-(t - t[0]) / taus[:, None])
-    mean = E @ w / w.sum()
-    mean_value = float(w @ values / w.sum())
-    D = E - mean[:, None]
-    see = D**2 @ w
-    b = D @ (w * (values - mean_value)) / see
-    chi2 = ((values - mean_value - D * b[:, None]) ** 2) @ w
-    speeds = np.abs(b) * E[:, -1] / taus
-    with np.errstate(divide="ignore"):
-        ready = np.maximum(0.0, taus * np.log(speeds / bound))
-    variance = (taus / (np.sqrt(see) * np.maximum(np.abs(b), 1e-300))) ** 2
-    factor = max(1.0, float(chi2.min()) / max(len(t) - 3, 1))
-    weight = np.exp(-0.5 * (chi2 - chi2.min()) / factor)
+    for narrowing in range(_NARROWINGS):
+        chi2, ready, variance = _profile(times - times[0], values, 1.0 / sds**2, taus, bound)
+        factor = max(1.0, float(chi2.min()) / max(len(times) - 3, 1))
+        weight = np.exp(-0.5 * (chi2 - chi2.min()) / factor)
+        if narrowing == 0 and weight[-1] > 0.25:
+            return None  # as good as a straight line: no end in sight
+        if np.sum(weight > 0.01) >= _WEIGHTY:
+            break
+        best = int(weight.argmax())
+        taus = np.geomspace(taus[max(best - 1, 0)], taus[min(best + 1, _TAUS - 1)], _TAUS)
     weight /= weight.sum()
-    if weight[-1] > 0.25 * weight.max():
-        return None  # as good as a straight line: no end in sight
     tau = float(weight @ taus)
     ready_in = float(weight @ ready)
     return Approach(
@@ -118,6 +112,22 @@ def fit_approach(times: Array, values: Array, sds: Array, bound: float) -> Appro
         float(np.sqrt(weight @ ((ready - ready_in) ** 2 + factor * variance))),
         factor,
     )
+
+
+def _profile(
+    t: Array, values: Array, w: Array, taus: Array, bound: float
+) -> tuple[Array, Array, Array]:
+    """Chi-square, time to steady s and its variance for every tau, a and b at their best."""
+    E = np.exp(-t / taus[:, None])
+    D = E - (E @ w / w.sum())[:, None]
+    mean = float(w @ values / w.sum())
+    see = D**2 @ w
+    b = D @ (w * (values - mean)) / see
+    chi2 = ((values - mean - D * b[:, None]) ** 2) @ w
+    with np.errstate(divide="ignore"):
+        ready = np.maximum(0.0, taus * np.log(np.abs(b) * E[:, -1] / taus / bound))
+    variance = (taus / (np.sqrt(see) * np.maximum(np.abs(b), 1e-300))) ** 2
+    return chi2, ready, variance
 
 
 class EquilibriumWatch:

@@ -1,0 +1,70 @@
+"""Drift and time to steady, against exponentials that are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermocald.analysis.equilibrium import EquilibriumWatch, fit_approach, slope
+
+
+def test_a_slope_scatters_as_its_sd_says():
+    rng = np.random.default_rng(1)
+    t = np.arange(30) * 10.0
+    deviations = []
+    for _ in range(2000):
+        values = 0.01 * t + rng.normal(0, 0.05, 30)
+        found, sd = slope(t, values[:, None], np.full((30, 1), 0.05))
+        deviations.append((found[0] - 0.01) / sd[0])
+    # sds are scaled up where residuals are larger, never down: a little conservative
+    assert 0.85 < np.std(deviations) < 1.03
+
+
+def test_the_time_to_steady_is_within_its_sds():
+    rng = np.random.default_rng(2)
+    tau, size, bound = 300.0, 8.0, 0.05 / 60.0
+    t = np.arange(60) * 10.0
+    truth = tau * np.log(size / tau * np.exp(-t[-1] / tau) / bound)
+    found = []
+    for _ in range(200):
+        values = size * np.exp(-t / tau) + rng.normal(0, 0.03, 60)
+        approach = fit_approach(t, values, np.full(60, 0.03), bound)
+        assert approach is not None
+        found.append((approach.ready_in, approach.sd_ready_in))
+    ready, sds = np.array(found).T
+    off = (ready - truth) / sds
+    assert abs(ready.mean() - truth) < 0.05 * truth
+    assert np.mean(np.abs(off) < 2.0) > 0.9
+    assert 0.5 < ready.std() / sds.mean() < 1.5
+
+
+def test_a_straight_line_approaches_nothing():
+    t = np.arange(60) * 10.0
+    assert fit_approach(t, 0.01 * t, np.full(60, 0.02), 1e-3) is None
+
+
+def watch(values_of, epochs: int = 60, noise: float = 0.02) -> EquilibriumWatch:
+    rng = np.random.default_rng(3)
+    made = EquilibriumWatch()
+    for k in range(epochs):
+        values = values_of(10.0 * k) + rng.normal(0, noise, 3)
+        made.add(10.0 * k, values, np.full(3, noise))
+    return made
+
+
+def test_warm_is_ready_and_warming_is_not():
+    steady = watch(lambda t: np.zeros(3)).judge()
+    assert steady.state == "ready"
+    warming = watch(lambda t: np.array([1.0, 2.0, -2.0]) * np.exp(-t / 400.0)).judge()
+    assert warming.state == "drifting"
+    truth = 60.0 * 3.0 / 400.0 * np.exp(-500.0 / 400.0)  # at the middle of the last 3 min
+    assert warming.drift == pytest.approx(truth, rel=0.15)
+    assert "ready in about" in warming.sentence
+    assert watch(lambda t: np.zeros(3), epochs=4).judge().state == "unknown"
+
+
+def test_a_held_parameter_is_not_asked():
+    made = EquilibriumWatch()
+    for k in range(30):
+        made.add(10.0 * k, np.array([np.nan, 0.0, 0.0]), np.array([np.nan, 0.01, 0.01]))
+    assert made.judge().state == "ready"

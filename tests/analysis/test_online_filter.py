@@ -128,7 +128,7 @@ def test_chi2_quantiles():
 
     for dof in (6, 8, 11, 14, 16):
         for p in (0.95, 0.999, 1 - 1e-6):
-            assert chi2_quantile(p, dof) == pytest.approx(chi2.ppf(p, dof), rel=0.03)
+            assert chi2_quantile(p, dof) == pytest.approx(chi2.ppf(p, dof), rel=0.04)
 
 
 def test_an_epoch_without_a_result_changes_nothing(camera):

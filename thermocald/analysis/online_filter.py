@@ -71,7 +71,7 @@ class Innovation:
 
 
 def chi2_quantile(p: float, dof: int) -> float:
-    """The chi-square quantile at probability p (Wilson and Hilferty 1931), to 3 % for dof ≥ 6.
+    """The chi-square quantile at probability p (Wilson and Hilferty 1931), to 4 % for dof ≥ 6.
 
     scipy.stats would cost the daemon 22 MB.
     """

@@ -13,6 +13,7 @@ import numpy as np
 
 from thermocald.photogrammetry.adjustment import Adjustment, AdjustmentSettings, adjust, failed
 from thermocald.photogrammetry.cold_start import cold_start, pose_only
+from thermocald.photogrammetry.focus import frame_figures
 from thermocald.photogrammetry.image_file import decode_grey
 from thermocald.photogrammetry.measurement import Prior
 from thermocald.photogrammetry.tracking import Tracker
@@ -35,8 +36,7 @@ _WRONG_START = 5.0  # times the usual sigma0: the camera has been knocked
 class CalibratedEpoch:
     """An epoch with its observations and its adjustment.
 
-    extra: columns for the store: `blur_px`, `contrast`, `grey`, `saturation` of the frame, medians
-    over the targets; searched: why the whole frame was searched, empty where it was not.
+    extra: columns for the store, of `focus.frame_figures`; searched: why the whole frame was searched, empty where it was not.
     """
 
     epoch: Epoch
@@ -101,7 +101,7 @@ class Calibrator:
             searched = measured.searched
             observations = measured.observations
             epoch = replace(epoch, observations=observations)
-            extra = _frame_figures(observations)
+            extra = frame_figures(observations, self.sensor)
             if not measured.status.ok:
                 bad = failed(measured.status.word, measured.status.reason, observations)
                 return CalibratedEpoch(epoch, bad, extra, searched)
@@ -146,14 +146,3 @@ class Calibrator:
             self._last = result
             self._usual = result.sigma0
         return result
-
-
-def _frame_figures(observations: Observations) -> dict[str, float]:
-    """Medians over the targets of what tells focus and light."""
-    names = {"blur": "blur_px", "contrast": "contrast", "grey": "grey", "saturation": "saturation"}
-    figures = {}
-    for quality, column in names.items():
-        values = observations.quality.get(quality)
-        if values is not None and np.isfinite(values).any():
-            figures[column] = float(np.nanmedian(values))
-    return figures

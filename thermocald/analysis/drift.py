@@ -16,6 +16,7 @@ import numpy as np
 from thermocald.analysis.autocorrelation import noise_autocorrelation
 from thermocald.analysis.dependence import holm
 from thermocald.photogrammetry.camera_model import IOP_NAMES
+from thermocald.photogrammetry.target_noise import slow_errors
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,6 +29,7 @@ __all__ = ["Course", "courses", "settled"]
 
 _LEVEL = 0.01
 _FEWEST = 10
+_SUSPECTS = 5  # groups that are left out in turn
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +101,8 @@ def _single_support(table: SeriesTable, name: str, sd_change: float, tests: int)
         return ""
     column = IOP_NAMES.index(name)
     best, best_p = "", 0.0
-    for first, rows in table.groups.items():
+    for first in _suspects(table):
+        rows = table.groups[first]
         left = table.without(rows, True)
         good = left.ok
         if good.sum() < _FEWEST:
@@ -108,6 +111,15 @@ def _single_support(table: SeriesTable, name: str, sd_change: float, tests: int)
         if p > best_p:
             best, best_p = first, p
     return best if best_p * tests >= _LEVEL else ""
+
+
+def _suspects(table: SeriesTable) -> list[str]:
+    """The groups whose own residuals wander most over the series."""
+    if table.adjustment is None:
+        return []
+    slow = slow_errors(table.adjustment.residuals, table.adjustment.observed)
+    size = {first: float(np.nansum(slow[rows] ** 2)) for first, rows in table.groups.items()}
+    return sorted(size, key=lambda first: -size[first])[:_SUSPECTS]
 
 
 def _line(t: Array, y: Array, tilt_sd: float) -> tuple[float, float, float]:

@@ -1,0 +1,202 @@
+"""The commands as users call them: results, errors in one line, exit statuses."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import cv2
+import pytest
+
+from thermocald.simulation.presets import preset_simulation
+
+
+def run(*arguments):
+    done = subprocess.run(
+        [sys.executable, "-m", "thermocald", *map(str, arguments)],
+        capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert "Traceback" not in done.stderr, done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """Forty epochs of a warming camera."""
+    folder = tmp_path_factory.mktemp("recording") / "M1"
+    simulation = preset_simulation("rpi-v2.1-heating", 1, "M1", None)
+    short = replace(simulation, programme=replace(simulation.programme, epochs=40))
+    short.write(folder)
+    return folder
+
+
+def test_replay_writes_one_json_document_and_nothing_else(recording):
+    done = run("replay", recording, "--json", "-")
+    assert done.returncode == 0
+    document = json.loads(done.stdout)
+    assert document["ok"] == 40
+    assert {p["name"] for p in document["parameters"]} == {"c", "x0", "y0"}
+    assert all("stated_sd" in p for p in document["parameters"])
+
+
+def test_a_store_gives_the_same_table_as_the_recording(recording, tmp_path):
+    store = tmp_path / "t.db"
+    assert run("replay", recording, "--store", store).returncode == 0
+    from_store = run("export", store, "--format", "csv")
+    direct = run("export", recording, "--format", "csv")
+    assert from_store.returncode == direct.returncode == 0
+    a, b = (list(csv.DictReader(io.StringIO(d.stdout))) for d in (from_store, direct))
+    assert len(a) == len(b) == 40
+    assert [r["status"] for r in a] == [r["status"] for r in b] == ["ok"] * 40
+    for mine, theirs in zip(a, b, strict=True):
+        sd = float(theirs["sd_c"])
+        assert abs(float(mine["c"]) - float(theirs["c"])) < 0.05 * sd
+    assert a[0]["sd_C1"] == ""  # held fixed
+    assert list(a[0]) == [
+        "epoch", "frame_time", "temperature", "c", "x0", "y0", "A1", "A2", "A3", "B1", "B2", "C1",
+        "C2", "omega", "phi", "kappa", "X0", "Y0", "Z0", "sigma0", "n_observations", "n_rejected",
+        "status", *(f"sd_{n}" for n in ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2", "C1", "C2",
+                                        "omega", "phi", "kappa", "X0", "Y0", "Z0")),
+    ]  # fmt: skip
+
+
+def test_an_interrupted_replay_goes_on(recording, tmp_path):
+    store = tmp_path / "t.db"
+    whole = (recording / "epochs.csv").read_text().splitlines()
+    half = tmp_path / "half"
+    half.mkdir()
+    for name in ("recording.yaml", "testfield.csv"):
+        (half / name).write_bytes((recording / name).read_bytes())
+    (half / "epochs.csv").write_text("\n".join(whole[:21]) + "\n")
+    last = whole[20].split(",")[0]
+    lines = (recording / "observations.csv").read_text().splitlines()
+    kept = [lines[0]] + [line for line in lines[1:] if int(line.split(",")[0]) <= int(last)]
+    (half / "observations.csv").write_text("\n".join(kept) + "\n")
+    assert run("replay", half, "--store", store).returncode == 0
+    assert json.loads(run("check", store, "--json", "-").stdout)["series"][0]["last_epoch"] == 20
+    assert run("replay", recording, "--store", store).returncode == 0
+    assert json.loads(run("check", store, "--json", "-").stdout)["series"][0]["last_epoch"] == 40
+
+
+def test_check_says_what_a_recording_is(recording):
+    done = run("check", recording)
+    assert done.returncode == 0
+    assert "40 epochs" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "words"),
+    [
+        (("replay", "no-such-folder"), 1, "does not exist"),
+        (("replay",), 2, "RECORDING"),
+        (("export", "{recording}", "--format", "xlsx"), 2, "csv and json"),
+        (("replay", "{recording}", "--free", "c,zoom"), 2, "'zoom' is no IOP"),
+        (("replay", "{recording}", "--exterior", "both"), 2, "per_epoch or series"),
+        (("export", "{recording}", "-o", "/no/such/folder/x.csv"), 2, "does not exist"),
+        (("calibrate", "{image}", "--testfield", "{field}"), 1, "is no image"),
+        (("calibrate", "{empty}", "--testfield", "{field}"), 1, "0 bytes"),
+    ],
+)  # fmt: skip
+def test_wrong_use_is_one_line(recording, tmp_path, arguments, status, words):
+    (tmp_path / "image.jpg").write_bytes(b"this is no picture")
+    (tmp_path / "empty.jpg").write_bytes(b"")
+    places = {
+        "recording": recording,
+        "field": recording / "testfield.csv",
+        "image": tmp_path / "image.jpg",
+        "empty": tmp_path / "empty.jpg",
+    }
+    done = run(*(a.format(**places) for a in arguments))
+    assert done.returncode == status
+    assert words in " ".join((done.stderr + done.stdout).split())
+
+
+def test_photographs_of_markers_give_the_camera(tmp_path):
+    """Three rendered photographs of a corner field: c, x0, y0 within 4 sd of the truth."""
+    from thermocald.photogrammetry.camera_model import ExteriorOrientation
+    from thermocald.simulation.demonstration import demonstration_field, demonstration_model
+    from thermocald.simulation.scene import Scene
+    from thermocald.store.testfield_file import write_testfield
+
+    field = demonstration_field("markers")
+    model = demonstration_model(field)
+    scene = Scene(model.sensor, field)
+    images = []
+    for k, turn in enumerate((0.0, 0.05, -0.05)):
+        e = model.exterior
+        moved = ExteriorOrientation(
+            e.omega, e.phi + turn, e.kappa + 20 * turn, e.X0 + 400 * turn, e.Y0, e.Z0
+        )
+        picture = scene.render(model.interior.as_array(), moved.as_array(), None, [k], 1.0)
+        images.append(tmp_path / f"{k}.png")
+        cv2.imwrite(str(images[-1]), picture)
+    write_testfield(tmp_path / "field.csv", field)
+    (tmp_path / "camera.yaml").write_text(
+        f"name: mock\nwidth: {model.sensor.width}\nheight: {model.sensor.height}\n"
+        f"pixel_pitch: {model.sensor.pixel_pitch}\n"
+    )
+    done = run("calibrate", *images, "--testfield", tmp_path / "field.csv",
+               "--camera", tmp_path / "camera.yaml", "--json", "-")  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    document = json.loads(done.stdout)
+    assert document["status"] == "ok"
+    assert [p["status"] for p in document["photographs"]] == ["ok"] * 3
+    for name in ("c", "x0", "y0"):
+        found, sd = document["interior"][name], document["interior"][f"sd_{name}"]
+        assert abs(found - getattr(model.interior, name)) < 4 * sd
+    assert len(document["correlations"]["matrix"]) == 8
+
+
+def test_the_demo_finds_what_was_put_in(tmp_path):
+    """Thirty epochs: drift found within 4 sd of the drift put in, and files that can be read."""
+    out = tmp_path / "demo"
+    done = run("demo", "--out", out, "--epochs", 30, "--no-discovery", "--json", "-")
+    assert done.returncode == 0, done.stderr
+    document = json.loads(done.stdout)
+    assert document["ok"] == 30
+    assert document["targets"] >= 100
+    for row in document["parameters"]:
+        difference = row["drift_found_px"] - row["drift_in_px"]
+        assert abs(difference) < 4 * row["sd_drift_found_px"]
+    assert run("check", out / "M1").returncode == 0
+    assert run("check", out / "demo.db").returncode == 0
+
+
+@pytest.mark.slow
+def test_the_whole_demo_ends_with_the_hidden_effect(tmp_path):
+    done = run("demo", "--out", tmp_path / "demo", "--epochs", 12, "--json", "-")
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)["discovery"]
+    assert [e["effect"] for e in found["effects"]] == ["thermal_lag"]
+    tau = found["effects"][0]["estimates"]["tau"]
+    assert abs(tau["value"] - found["hidden"]["tau_s"]) < 4 * tau["sd"]
+    gap = found["gap"]["verify"]
+    assert gap["after"]["chi2_reduced"] < 1.1 < gap["before"]["chi2_reduced"]
+
+
+def test_every_command_has_help_with_an_example():
+    listed = run("--help").stdout.split("Commands:")[1]
+    names = [
+        line.split()[0] for line in listed.splitlines() if line.startswith("  ") and line.split()
+    ]
+    assert len(names) > 8
+    groups = {"testfield", "camera", "session"}
+    for name in names:
+        if name in groups or not name.isalpha():
+            continue
+        assert "Example" in run(name, "--help").stdout, name
+
+
+def test_the_daemon_s_imports_stay_small():
+    """What the daemon needs, imported and waiting: at most 80 MB resident."""
+    code = (
+        "import thermocald.acquisition.calibrator, thermocald.config, thermocald.hal, "
+        "thermocald.store.database, thermocald.acquisition.pipeline\n"
+        "print([l for l in open('/proc/self/status') if l.startswith('VmRSS')][0].split()[1])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(done.stdout) / 1024 < 80

@@ -88,10 +88,13 @@ def whitened(laboratory: Laboratory, series: int) -> np.ndarray:
 def peer_sindy(X: np.ndarray, y: np.ndarray) -> np.ndarray:
     import pysindy
 
-    optimizer = pysindy.STLSQ(threshold=0.02, alpha=1e-3, normalize_columns=True)
+    # columns of unit length: a term has to explain a sixth of the misfit's amplitude
+    optimizer = pysindy.STLSQ(
+        threshold=float(np.linalg.norm(y)) / 6, alpha=1e-2, normalize_columns=True
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        optimizer.fit(X / np.std(y), (y / np.std(y))[:, None])
+        optimizer.fit(X, y[:, None])
     return np.ravel(optimizer.coef_)
 
 
@@ -108,13 +111,13 @@ def peer_lasso(X: np.ndarray, y: np.ndarray) -> np.ndarray:
 def names_said(
     names: list[str], X: np.ndarray, coefficients: np.ndarray, y: np.ndarray
 ) -> set[str]:
-    """Effects whose columns together explain a hundredth of the largest effect's share."""
+    """Effects whose columns explain a twentieth of the largest one's share, and more than noise."""
     power = {}
     for effect in set(names) - {"base"}:
         rows = [i for i, n in enumerate(names) if n == effect]
         power[effect] = float(np.sum((X[:, rows] @ coefficients[rows]) ** 2))
     top = max(power.values(), default=0.0)
-    floor = max(0.01 * top, 5e-4 * float(y @ y))
+    floor = max(0.05 * top, 3.0 * len(y) ** 0.5)
     return {e for e, p in power.items() if p > floor}
 
 
@@ -178,9 +181,10 @@ def main() -> None:
         (names, X), y = prepared[0]
         for name, peer in peers.items():
             begin = time.perf_counter()
-            coefficients = peer(X, y)
+            coefficients = peer(*_without_base(names, X, y))
             scores[name].seconds.append(time.perf_counter() - begin)
-            _count(scores[name], names_said(names, X, coefficients, y), case)
+            rest, _ = _without_base(names, X, y)
+            _count(scores[name], names_said(names, rest, coefficients, y), case)
             if case.effects:
                 scores[name].closed.append(_closed(prepared[1], coefficients, names))
         if case.effects and "LassoLarsIC" in peers:
@@ -195,6 +199,17 @@ def main() -> None:
         print(f"| Gaussian process in (T, dT/dt) | gives no names | | {np.median(gp):.0%} | |")
 
 
+def _without_base(names: list[str], X: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Library and misfit with the base model's own terms projected out, as a kindness."""
+    base = [i for i, n in enumerate(names) if n == "base"]
+    Q, _ = np.linalg.qr(X[:, base])
+    rest = X - Q @ (Q.T @ X)
+    rest[:, base] = 0.0
+    scale = np.linalg.norm(rest, axis=0)
+    rest[:, scale < 1e-6 * scale.max()] = 0.0
+    return rest + 1e-9 * np.random.default_rng(0).normal(size=rest.shape), y - Q @ (Q.T @ y)
+
+
 def _closed(prepared: tuple, coefficients: np.ndarray, names: list[str]) -> float:
     """Share of M2's excess over the base model that the coefficients of M1 explain."""
     (own, X), y = prepared
@@ -204,6 +219,7 @@ def _closed(prepared: tuple, coefficients: np.ndarray, names: list[str]) -> floa
     B = X[:, base]
     before = y - B @ np.linalg.lstsq(B, y, rcond=None)[0]
     after = y - X @ coefficients
+    after = after - B @ np.linalg.lstsq(B, after, rcond=None)[0]
     floor = 1.0
     start = float(np.mean(before**2)) - floor
     return 1.0 - (float(np.mean(after**2)) - floor) / max(start, 1e-9)

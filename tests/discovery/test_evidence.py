@@ -43,8 +43,9 @@ def test_wrong_field_coordinates_do_not_matter(source):
 
     fits = [Laboratory([gather(x)]).fit((Term("creep"),)) for x in (source, other)]
 
-    sds = np.sqrt(np.diag(fits[0].covariance))
-    assert np.all(np.abs(fits[0].coefficients - fits[1].coefficients) < sds)
+    creep = [f.coefficients[3:] for f in fits]
+    # 0.1 mm of 1 m turn the partial derivatives by 1e-4 and the linearisation by a little more
+    assert np.linalg.norm(creep[0] - creep[1]) < 0.005 * np.linalg.norm(creep[0])
     assert fits[1].chi2 == pytest.approx(fits[0].chi2, rel=0.01)
 
 

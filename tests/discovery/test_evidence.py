@@ -46,7 +46,10 @@ def test_wrong_field_coordinates_do_not_matter(source):
     creep = [f.coefficients[3:] for f in fits]
     # 0.1 mm of 1 m turn the partial derivatives by 1e-4 and the linearisation by a little more
     assert np.linalg.norm(creep[0] - creep[1]) < 0.005 * np.linalg.norm(creep[0])
-    assert fits[1].chi2 == pytest.approx(fits[0].chi2, rel=0.01)
+    # 18 combinations of parameters in each epoch, their levels, 6 coefficients; three sigma of χ²
+    free = 18 * (len(source.frame_times) - 1) - 6
+    for fit in fits:
+        assert abs(fit.chi2 - free) < 3 * np.sqrt(2 * free)
 
 
 def test_weak_input_is_refused(source):

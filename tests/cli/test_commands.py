@@ -92,7 +92,7 @@ def test_check_says_what_a_recording_is(recording):
     ("arguments", "status", "words"),
     [
         (("replay", "no-such-folder"), 1, "does not exist"),
-        (("replay",), 2, "RECORDING"),
+        (("replay",), 2, "Missing argument"),
         (("export", "{recording}", "--format", "xlsx"), 2, "csv and json"),
         (("replay", "{recording}", "--free", "c,zoom"), 2, "'zoom' is no IOP"),
         (("replay", "{recording}", "--exterior", "both"), 2, "per_epoch or series"),

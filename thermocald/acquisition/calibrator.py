@@ -36,7 +36,8 @@ _WRONG_START = 5.0  # times the usual sigma0: the camera has been knocked
 class CalibratedEpoch:
     """An epoch with its observations and its adjustment.
 
-    extra: columns for the store, of `focus.frame_figures`; searched: why the whole frame was searched, empty where it was not.
+    extra: columns for the store, of `focus.frame_figures`; searched: why the whole frame was
+    searched, empty where it was not.
     """
 
     epoch: Epoch

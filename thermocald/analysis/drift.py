@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.analysis.autocorrelation import noise_autocorrelation
-from thermocald.analysis.dependence import holm
+from thermocald.analysis.dependence import holm, pearson_p_value
 from thermocald.photogrammetry.camera_model import IOP_NAMES
 from thermocald.photogrammetry.target_noise import slow_errors
 
@@ -29,6 +29,7 @@ __all__ = ["Course", "courses", "settled"]
 
 _LEVEL = 0.01
 _FEWEST = 10
+_LEAST_WARMING_K = 0.5  # below, the thermometer's own noise is all there is
 _SUSPECTS = 5  # groups that are left out in turn
 
 
@@ -39,7 +40,9 @@ class Course:
     mean; scatter: standard deviation over the epochs; sd: stated by the adjustments, RMS; change:
     of a straight line from the first to the last epoch, with sd_change; p: that chance gives as
     much, corrected for the number of parameters; drifts: p below 1 %, with and without any single
-    group of targets; rests_on: the group without which there would be no drift, or "".
+    group of targets; rests_on: the group without which there would be no drift, or "";
+    per_kelvin, p_temperature: slope on the reference temperature and its p-value, corrected, NaN
+    where that is constant or not known.
     """
 
     name: str
@@ -51,6 +54,13 @@ class Course:
     p: float
     drifts: bool
     rests_on: str = ""
+    per_kelvin: float = float("nan")
+    p_temperature: float = float("nan")
+
+    @property
+    def moves(self) -> bool:
+        """Whether the camera moved: in time, or with its temperature."""
+        return self.drifts or self.p_temperature < _LEVEL
 
 
 def courses(table: SeriesTable, names: tuple[str, ...] = ("c", "x0", "y0")) -> list[Course]:
@@ -66,8 +76,11 @@ def courses(table: SeriesTable, names: tuple[str, ...] = ("c", "x0", "y0")) -> l
         tilt = table.adjustment.trend_sd[column] if table.adjustment is not None else 0.0
         found.append((name, y, sd, *_line(t, y, float(tilt))))
     corrected = holm([p for *_, p in found])
+    warm = _with_temperature(table.temperature[ok], [y for _, y, *_ in found])
     result = []
-    for (name, y, sd, change, sd_change, _), p in zip(found, corrected, strict=True):
+    for (name, y, sd, change, sd_change, _), p, (slope, p_warm) in zip(
+        found, corrected, warm, strict=True
+    ):
         rests_on = _single_support(table, name, sd_change, len(found)) if p < _LEVEL else ""
         result.append(
             Course(
@@ -80,9 +93,26 @@ def courses(table: SeriesTable, names: tuple[str, ...] = ("c", "x0", "y0")) -> l
                 p,
                 p < _LEVEL and not rests_on,
                 rests_on,
+                slope,
+                p_warm,
             )
         )
     return result
+
+
+def _with_temperature(temperature: Array, columns: list[Array]) -> list[tuple[float, float]]:
+    """Slope per kelvin and corrected p-value of each column (n,); NaN without a temperature."""
+    have = np.isfinite(temperature)
+    unknown = [(float("nan"), float("nan"))] * len(columns)
+    if have.sum() < _FEWEST or np.ptp(temperature[have]) < _LEAST_WARMING_K:
+        return unknown
+    t = temperature[have] - temperature[have].mean()
+    slopes, ps = [], []
+    for y in columns:
+        slopes.append(float(y[have] @ t / (t @ t)))
+        n = noise_autocorrelation(y[have], t).n_effective
+        ps.append(pearson_p_value(float(np.corrcoef(y[have], t)[0, 1]), n))
+    return list(zip(slopes, holm(ps), strict=True)) if columns else []
 
 
 def settled(table: SeriesTable) -> tuple[SeriesTable, list[Course]]:

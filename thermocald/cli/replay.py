@@ -188,7 +188,9 @@ def _summary(
                 "change": c.change,
                 "sd_change": c.sd_change,
                 "p": c.p,
-                "drift": c.drifts,
+                "drift": c.moves,
+                "per_kelvin": c.per_kelvin,
+                "p_temperature": c.p_temperature,
                 "rests_on": c.rests_on or None,
             }
             for c in found
@@ -224,7 +226,11 @@ def _commonest(table: SeriesTable) -> str:
     return max(set(reasons), key=reasons.count) if reasons else "there is no epoch"
 
 
-def _no_drift(parameter: dict[str, Any]) -> str:
+def _drift(parameter: dict[str, Any]) -> str:
+    if parameter["drift"]:
+        if parameter["p_temperature"] < 0.01:
+            return f"{parameter['per_kelvin'] * 1000:+.3f} µm/K"
+        return f"in time (p {parameter['p']:.1g})"
     rests_on = parameter["rests_on"]
     return f"none (only target {rests_on} moves)" if rests_on else "none"
 
@@ -255,7 +261,7 @@ def _tell(document: dict[str, Any]) -> None:
             f"{p['stated_sd']:.6f}",
             f"{p['scatter_over_sd']:.2f}",
             f"{p['change']:+.6f} ± {p['sd_change']:.6f}",
-            f"yes (p {p['p']:.1g})" if p["drift"] else _no_drift(p),
+            _drift(p),
         )
     if document["parameters"]:
         console.print(table, highlight=False)

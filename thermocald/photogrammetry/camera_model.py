@@ -176,10 +176,10 @@ def rotation(angles: ArrayLike) -> Array:
         so * sk - co * sp * ck, so * ck + co * sp * sk, co * cp,
     ]  # fmt: skip
     r: Array = np.array(rows)
-    if a.ndim == 1:
-        return r.reshape(3, 3)
-    stacked: Array = np.ascontiguousarray(np.moveaxis(r, 0, -1)).reshape(*a.shape[:-1], 3, 3)
-    return stacked
+    if a.ndim > 1:
+        r = np.ascontiguousarray(np.moveaxis(r, 0, -1))
+    r = r.reshape(*a.shape[:-1], 3, 3)
+    return r
 
 
 def camera_coordinates(eop: ArrayLike, points: ArrayLike) -> Array:

@@ -81,13 +81,16 @@ def _unknown_camera(images: list[Path]) -> CameraFile:
     """A camera of which only the size of the image is known: its pixel counts as 1 µm."""
     from thermocald.photogrammetry.image_file import decode_grey
 
+    first: ImageError | None = None
     for path in images:
         try:
             height, width = decode_grey(path).shape
-        except ImageError:
+        except ImageError as error:
+            first = first or error
             continue
         return CameraFile("unknown", Sensor(width, height, 0.001), None, None)
-    raise DataError(f"none of the {len(images)} files is an image")
+    assert first is not None
+    raise first
 
 
 def _document(result: Photographs, file: CameraFile, assumed: bool) -> dict[str, Any]:

@@ -186,7 +186,8 @@ def camera_coordinates(eop: ArrayLike, points: ArrayLike) -> Array:
     """Object points (..., n, 3) → camera frame (..., n, 3) mm; the camera looks along -Z."""
     e = np.asarray(eop, dtype=float)
     shifted = np.asarray(points, dtype=float) - e[..., None, 3:6]
-    return shifted @ rotation(e[..., :3])
+    turned: Array = shifted @ rotation(e[..., :3])
+    return turned
 
 
 def image_to_mm(sensor: Sensor, image_points: ArrayLike) -> Array:

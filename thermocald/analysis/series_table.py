@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.acquisition.calibrator import Calibrator
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera_model import (
     PARAMETER_NAMES,
@@ -22,6 +21,7 @@ from thermocald.photogrammetry.series import SeriesAdjustment, SeriesSettings, a
 from thermocald.store.recording import interpolate_readings
 
 if TYPE_CHECKING:
+    from thermocald.acquisition.calibrator import Calibrator
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray

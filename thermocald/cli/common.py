@@ -25,7 +25,8 @@ _LINES = 10  # progress lines where there is no terminal
 
 def say(text: str) -> None:
     """A line for a person, on standard error: standard output belongs to results."""
-    print(text, file=sys.stderr, flush=True)
+    sys.stderr.write(text + "\n")
+    sys.stderr.flush()
 
 
 def log_to_stderr(level: str = "WARNING") -> None:

@@ -175,11 +175,11 @@ def rotation(angles: ArrayLike) -> Array:
         co * sk + so * sp * ck, co * ck - so * sp * sk, -so * cp,
         so * sk - co * sp * ck, so * ck + co * sp * sk, co * cp,
     ]  # fmt: skip
-    r: Array = np.array(rows)
+    r = np.array(rows)
     if a.ndim > 1:
         r = np.ascontiguousarray(np.moveaxis(r, 0, -1))
-    r = r.reshape(*a.shape[:-1], 3, 3)
-    return r
+    square: Array = r.reshape(*a.shape[:-1], 3, 3)
+    return square
 
 
 def camera_coordinates(eop: ArrayLike, points: ArrayLike) -> Array:

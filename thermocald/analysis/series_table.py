@@ -21,11 +21,11 @@ from thermocald.photogrammetry.series import SeriesAdjustment, SeriesSettings, a
 from thermocald.store.recording import interpolate_readings
 
 if TYPE_CHECKING:
-    from thermocald.acquisition.calibrator import Calibrator
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
+    from thermocald.acquisition.calibrator import Calibrator
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.adjustment import AdjustmentSettings
     from thermocald.photogrammetry.testfield import Observations, TestField

@@ -112,6 +112,7 @@ def test_real_recordings_without_temperature(shared, camera):
     assert result.stdout == ""
 
 
+@pytest.mark.slow
 def test_plan(tmp_path):
     series, _ = generate(Case((), 0.1, 33, epochs=90, with_m2=False))
     write(series[0], tmp_path / "quiet")

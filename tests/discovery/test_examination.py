@@ -45,6 +45,7 @@ def test_no_effect_no_name(evidence_of):
     assert (found.verdict, found.effects) == ("adequate", ())
 
 
+@pytest.mark.slow
 def test_an_outside_influence_gets_no_name(evidence_of):
     evidence, _ = evidence_of("outside", px=0.1, seed=24)
     found = discover_series(evidence)

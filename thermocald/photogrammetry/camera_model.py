@@ -205,6 +205,17 @@ def image_to_px(sensor: Sensor, points_mm: ArrayLike) -> Array:
     )
 
 
+def _as_px(sensor: Sensor, x: Array, y: Array) -> Array:
+    """Coordinates in mm about the image centre as image points (..., 2) px."""
+    out = np.empty((*x.shape, 2))
+    scale = 1.0 / sensor.pixel_pitch
+    np.multiply(x, scale, out=out[..., 0])
+    np.multiply(y, -scale, out=out[..., 1])
+    out[..., 0] += (sensor.width - 1) / 2
+    out[..., 1] += (sensor.height - 1) / 2
+    return out
+
+
 def _distort(iop: Array, x: Array, y: Array) -> tuple[Array, Array]:
     """Ideal points (mm, about the principal point) → measured points (mm, about the centre)."""
     _, x0, y0, A1, A2, A3, B1, B2, C1, C2 = (iop[..., None, j] for j in range(10))
@@ -228,7 +239,7 @@ def project(sensor: Sensor, iop: ArrayLike, eop: ArrayLike, points: ArrayLike) -
     depth = np.where(q[..., 2] < 0, -q[..., 2], np.nan)
     scale = i[..., None, 0] / depth
     x, y = _distort(i, scale * q[..., 0], scale * q[..., 1])
-    return image_to_px(sensor, np.stack([x, y], axis=-1))
+    return _as_px(sensor, x, y)
 
 
 def _distortion_jacobian(iop: Array, x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
@@ -309,7 +320,7 @@ def partials(
     out *= scale
     by_point *= scale
     return (
-        image_to_px(sensor, np.stack([xd, yd], axis=-1)),
+        _as_px(sensor, xd, yd),
         _points_first(out),
         _points_first(by_point),
     )

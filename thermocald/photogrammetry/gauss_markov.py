@@ -38,7 +38,8 @@ __all__ = [
 ]
 
 _ITERATIONS = 30
-_CONVERGED = 1e-3  # of a standard deviation: far below what the result can tell
+# Standard deviations: a last step by the old partials; leaves less than 1e-3 px in c, x0, y0.
+_CONVERGED = 0.01
 _LINEAR = 10.0  # standard deviations that a solution may move without new partials
 _TRUSTED_REDUNDANCY = 20  # from here on the residuals themselves tell the noise
 

@@ -115,8 +115,8 @@ def _strongest_correlation(covariance: Array, bound: float) -> str:
     variance = covariance.diagonal()
     u = np.flatnonzero(variance > 0)
     scale = 1.0 / np.sqrt(variance[u])
-    r = np.abs(covariance[np.ix_(u, u)] * scale * scale[:, None])
-    r[np.diag_indices_from(r)] = 0.0
+    r = np.abs(covariance[u][:, u] * scale * scale[:, None])
+    r.flat[:: len(u) + 1] = 0.0
     # Only pairs that an IOP takes part in: EOP alone do not spoil the camera.
     inner = r[u < len(IOP_NAMES)]
     if inner.size == 0:

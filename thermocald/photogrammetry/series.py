@@ -149,6 +149,8 @@ class SeriesAdjustment:
 
     def spread(self, targets: NDArray[np.int64], n: int) -> SeriesAdjustment:
         """The same with its columns of targets put where they stand in a larger test field."""
+        if len(targets) == n:
+            return self
 
         def wide(array: NDArray[Any], axis: int, fill: Any) -> NDArray[Any]:
             shape = list(array.shape)

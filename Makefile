@@ -39,7 +39,7 @@ test: lint ## lint, then the quick tests
 	$(BIN)/python -m pytest -q
 
 test-slow: $(STAMP) ## long statistics and browser tests
-	$(BIN)/python -m pytest -q -m slow
+	$(BIN)/python -m pytest -q -m slow -n 2 --dist loadfile
 
 bench: $(STAMP) ## ratios to peers, in one run on one thread
 	@for b in benchmarks/*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done

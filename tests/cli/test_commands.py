@@ -191,12 +191,24 @@ def test_every_command_has_help_with_an_example():
         assert "Example" in run(name, "--help").stdout, name
 
 
-def test_the_daemon_s_imports_stay_small():
-    """What the daemon needs, imported and waiting: at most 80 MB resident."""
+def resident_mb(imports):
+    """Resident memory of a process that imports something and waits."""
     code = (
-        "import thermocald.acquisition.calibrator, thermocald.config, thermocald.hal, "
-        "thermocald.store.database, thermocald.acquisition.pipeline\n"
+        f"import {imports}\n"
         "print([l for l in open('/proc/self/status') if l.startswith('VmRSS')][0].split()[1])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert int(done.stdout) / 1024 < 80
+    return int(done.stdout) / 1024
+
+
+def test_the_daemon_s_imports_stay_small():
+    """What the daemon needs, imported and waiting: 80 MB where numpy and cv2 alone are 41.
+
+    The kernel maps more or less of the libraries' files, 41 to 65 MB for the same two: what is ours
+    is the difference.
+    """
+    ours = resident_mb(
+        "thermocald.acquisition.calibrator, thermocald.config, thermocald.hal, "
+        "thermocald.store.database, thermocald.acquisition.pipeline"
+    )
+    assert ours - resident_mb("numpy, cv2") < 80 - 41

@@ -141,6 +141,11 @@ def point_covariances(
 
 def _whiten(covariance: Array, pair: Array) -> Array:
     """Multiply (2, ..., n) components by the inverse Cholesky factor of each point's covariance."""
+    if not covariance[:, 2].any():
+        whitened: Array = pair / np.sqrt(
+            covariance[:, :2].T.reshape(2, *(1,) * (pair.ndim - 2), -1)
+        )
+        return whitened
     slope = covariance[:, 2] / covariance[:, 0]
     out = np.empty_like(pair)
     np.divide(pair[0], np.sqrt(covariance[:, 0]), out=out[0])
@@ -285,7 +290,7 @@ def point_tests(solution: Solution, use: Mask) -> tuple[Array, Array]:
     testable = determinant > 1e-9
     test = np.where(testable, qyy * vx**2 - 2 * qxy * vx * vy + qxx * vy**2, 0.0)
     test /= np.where(testable, determinant, 1.0)
-    return test, np.clip(1 - claimed.T, 0.0, 1.0)
+    return test, np.maximum(1 - claimed.T, 0.0)
 
 
 def snoop(test: Array, use: Mask, unknowns: int, alpha: float) -> Mask:

@@ -83,7 +83,10 @@ def weaknesses(
                 f"the principal distance is known to {sd[0] / values[0]:.1%} only "
                 f"(bound {bounds.relative_sd_c:.1%})"
             )
-        _, axes, flat = plane_fit(points)
+        if _has_depth(points):
+            flat = False
+        else:
+            _, axes, flat = plane_fit(points)
         if flat:
             angle = obliqueness_deg(values[10:], axes[2])
             if angle < bounds.plane_obliqueness_deg:
@@ -109,6 +112,14 @@ def weaknesses(
     if pair:
         reasons.append(pair)
     return reasons
+
+
+def _has_depth(points: Array) -> bool:
+    """Whether points are certainly no plane: a quick look that spares most epochs the fit."""
+    reduced = points - points.sum(axis=0) / len(points)
+    (a, b, c), (_, d, e), (_, _, f) = reduced.T @ reduced
+    determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
+    return bool(determinant > 1e-4 * (a + d + f) ** 3)
 
 
 def _strongest_correlation(covariance: Array, bound: float) -> str:

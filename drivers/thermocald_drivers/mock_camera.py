@@ -61,7 +61,7 @@ class MockCamera(Camera):
         self.clock = clock
         self._testfield = support.text("testfield", testfield)
         self._model_path = None if model is None else support.text("model", model)
-        self._times, self._values = _programme(programme)
+        self._times, self._values = support.programme(programme)
         self._seed = int(support.number("seed", seed, 0, 2**31, whole=True))
         self._exposure_s = support.number("exposure_s", exposure_s, 1e-6, 10.0, "s")
         latency = support.number("latency_s", latency_s, 0.0, 60.0, "s")
@@ -147,15 +147,3 @@ class MockCamera(Camera):
         return self.scene.render(
             truth.iop[0], truth.eop[0], points, seed, float(truth.blur_factor[0])
         )
-
-
-def _programme(points: object) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    try:
-        course = np.array(points, dtype=float)
-    except (TypeError, ValueError):
-        course = np.empty(0)
-    if course.ndim != 2 or course.shape[1] != 2 or not np.isfinite(course).all():
-        raise ConfigurationError("programme: must be a list of [seconds, °C]")
-    if np.any(np.diff(course[:, 0]) <= 0):
-        raise ConfigurationError("programme: its times must increase")
-    return course[:, 0], course[:, 1]

@@ -86,7 +86,7 @@ class MockThermometer(Thermometer):
         timeout_s: float = 1.0,
     ) -> None:
         self.clock = clock
-        self._times, self._values = _programme(programme)
+        self._times, self._values = support.programme(programme)
         self._channels = {
             support.text("channels", name): _channel(name, options)
             for name, options in (channels or {"temperature": {}}).items()
@@ -137,18 +137,6 @@ class MockThermometer(Thermometer):
 
     def _elapsed(self, monotonic: float) -> float:
         return monotonic - (monotonic if self._begin is None else self._begin)
-
-
-def _programme(points: object) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    try:
-        course = np.array(points, dtype=float)
-    except (TypeError, ValueError):
-        course = np.empty(0)
-    if course.ndim != 2 or course.shape[1] != 2 or not np.isfinite(course).all():
-        raise ConfigurationError("programme: must be a list of [seconds, °C]")
-    if np.any(np.diff(course[:, 0]) <= 0):
-        raise ConfigurationError("programme: its times must increase")
-    return course[:, 0], course[:, 1]
 
 
 def _channel(name: str, options: Mapping[str, float]) -> dict[str, float]:

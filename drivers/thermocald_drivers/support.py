@@ -8,6 +8,8 @@ import math
 import time
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from thermocald.errors import (
     BadReading,
     ConfigurationError,
@@ -24,6 +26,8 @@ from thermocald.hal import Reading
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from numpy.typing import NDArray
+
     from thermocald.hal import Clock
 
 __all__ = [
@@ -36,6 +40,7 @@ __all__ = [
     "middle_reading",
     "number",
     "on_clock",
+    "programme",
     "text",
 ]
 
@@ -162,3 +167,19 @@ def believable(value_c: float, low_c: float, high_c: float, where: str) -> float
             f"{where}: {value_c:g} °C is outside the sensor's range {low_c:g} … {high_c:g} °C"
         )
     return value_c
+
+
+def programme(points: object) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A course of [seconds, °C] points as times (n,) s and temperatures (n,) °C.
+
+    ConfigurationError where it is none, or its times do not increase.
+    """
+    try:
+        course = np.array(points, dtype=float)
+    except (TypeError, ValueError):
+        course = np.empty(0)
+    if course.ndim != 2 or course.shape[1] != 2 or not np.isfinite(course).all():
+        raise ConfigurationError("programme: must be a list of [seconds, °C]")
+    if np.any(np.diff(course[:, 0]) <= 0):
+        raise ConfigurationError("programme: its times must increase")
+    return course[:, 0], course[:, 1]

@@ -28,7 +28,14 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["Normals", "ObservationGrid", "Partials", "epoch_normals", "linearise"]
+__all__ = [
+    "ObservationGrid",
+    "Partials",
+    "linearise",
+    "normal_matrices",
+    "right_hand_sides",
+    "series_residuals",
+]
 
 _UPPER = np.triu_indices(16)
 
@@ -101,19 +108,6 @@ class Partials:
     B: Array
 
 
-@dataclass(frozen=True, eq=False)
-class Normals:
-    """Per epoch: N (E, 16, 16), b (E, 16), lPl (E,), n (E,) image points that take part.
-
-    Order of `PARAMETER_NAMES`; the unknowns are corrections to the linearisation point.
-    """
-
-    N: Array
-    b: Array
-    lPl: Array
-    n: NDArray[np.int64]
-
-
 def linearise(sensor: Sensor, field: TestField, iop: ArrayLike, eop: ArrayLike) -> Partials:
     """The partial derivatives of all targets at one point; targets out of sight get zeros."""
     i, e = np.asarray(iop, dtype=float), np.asarray(eop, dtype=float)
@@ -121,22 +115,6 @@ def linearise(sensor: Sensor, field: TestField, iop: ArrayLike, eop: ArrayLike) 
     seen = np.isfinite(predicted[:, 0])
     A[~seen], B[~seen] = 0.0, 0.0
     return Partials(i, e, predicted, A, B)
-
-
-def epoch_normals(
-    grid: ObservationGrid,
-    at: Partials,
-    residuals: Array | None = None,
-) -> Normals:
-    """Normal equations of every epoch.
-
-    residuals: (E, T, 2) px, measured minus predicted at the epochs' own parameters; by default
-    measured minus predicted at the linearisation point.
-    """
-    misclosure = grid.points - at.predicted if residuals is None else residuals
-    N = normal_matrices(grid.weights, at.A)
-    b, lPl = right_hand_sides(grid.weights, misclosure, at.A)
-    return Normals(N, b, lPl, grid.observed.sum(axis=1))
 
 
 def normal_matrices(weights: Array, A: Array) -> Array:

@@ -46,8 +46,9 @@ class I2cThermometer(Thermometer):
         chosen = self.addresses[0] if address is None else address
         if chosen not in self.addresses:
             known = ", ".join(f"0x{a:02x}" for a in self.addresses)
+            shown = f"0x{chosen:02x}" if isinstance(chosen, int) else repr(chosen)
             raise ConfigurationError(
-                f"address: {chosen!r} is none that a {self.chip} can have ({known})"
+                f"address: {shown} is none that a {self.chip} can have ({known})"
             )
         self.address = chosen
         self.channel = support.text("channel", channel)

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from tests.drivers.fakes.sysfs import Sysfs, w1_slave
 from thermocald.cli import devices
 from thermocald.config import parse_config
+from thermocald.errors import ConfigurationError, DeviceError
 from thermocald.hal import load_driver, option_names
 
 
@@ -98,9 +99,85 @@ def test_a_probe_takes_one_of_each_and_names_what_fails(sysfs, tmp_path):
     assert [entry["error"] is None for entry in entries] == [True, False]
 
 
-def test_a_probe_of_a_camera(tmp_path):
-    config = parse_config({"cameras": [{"name": "m", "driver": "mock"}]}, tmp_path / "c.yaml")
-    (frame,) = devices.probe(config)
-    assert frame.error == ""
-    assert frame.values["width_px"] > 0
-    assert frame.took_s < 30
+@pytest.fixture
+def check(tmp_path):
+    """Runs `thermocald check config.yaml --probe`: (its error, its lines, its JSON)."""
+    from thermocald.cli.check import register
+
+    app = typer.Typer()
+    register(app)
+    app.callback()(lambda: None)
+
+    def run(document, *more):
+        path = tmp_path / "config.yaml"
+        path.write_text(yaml.safe_dump(document))
+        out = tmp_path / "check.json"
+        result = CliRunner().invoke(app, ["check", str(path), "--json", str(out), *more])
+        said = json.loads(out.read_text()) if out.exists() else None
+        return result.exception, result.stdout.splitlines(), said
+
+    return run
+
+
+def devices_of_which_the_first_fails(sysfs):
+    root = str(sysfs.root)
+    return {
+        "store": {"path": "t.db"},
+        "cameras": [
+            {"name": "gone", "driver": "v4l2", "device": f"{root}/dev/video9", "width": 64,
+             "height": 48},
+        ],
+        "thermometers": [
+            {"name": "away", "driver": "hwmon", "chip": "tmp421", "sysfs": root},
+            {"name": "lens", "driver": "hwmon", "chip": "1-0048", "sysfs": root},
+        ],
+        "outputs": [{"name": "log", "driver": "jsonl", "path": f"{root}/r.jsonl"}],
+    }  # fmt: skip
+
+
+def test_check_shows_every_device_though_the_first_fails(sysfs, check):
+    document = devices_of_which_the_first_fails(sysfs)
+    document["cameras"].append({"name": "left", "driver": "mock", "period_s": 10})
+    error, lines, document = check(document, "--probe")
+    assert isinstance(error, DeviceError)
+    assert error.exit_status == 3
+    assert "2 of 4 devices gave nothing: gone, away" in str(error)
+    shown = {line.split()[1]: line for line in lines if line.startswith("  ")}
+    assert "FAILED: " in shown["gone"]
+    assert "'tmp421' is not there" in shown["away"]
+    assert "temperature_c 21.0" in shown["lens"]
+    assert "width_px 3280, height_px 2464" in shown["left"]
+    assert shown["log:"] == "  output log: driver jsonl"  # never tried: it might switch a lamp
+    failed = {probe["name"]: probe["error"] is not None for probe in document["probes"]}
+    assert failed == {"gone": True, "left": False, "away": True, "lens": False}
+
+
+def test_check_with_all_devices_there(sysfs, check):
+    document = devices_of_which_the_first_fails(sysfs)
+    del document["cameras"], document["thermometers"][0]
+    error, lines, _ = check(document, "--probe")
+    assert error is None
+    assert not any("FAILED" in line for line in lines)
+
+
+def test_check_goes_on_after_a_driver_with_a_mistake(sysfs, check, monkeypatch):
+    def read(_):
+        raise ZeroDivisionError("division by zero")
+
+    monkeypatch.setattr(load_driver("thermometer", "hwmon"), "read", read)
+    document = devices_of_which_the_first_fails(sysfs)
+    error, lines, _ = check(document, "--probe")
+    assert isinstance(error, DeviceError)
+    (line,) = (line for line in lines if "thermometer lens" in line)
+    assert "FAILED: its driver failed: ZeroDivisionError: division by zero" in line
+
+
+def test_check_refuses_what_a_driver_does_not_take(sysfs, check):
+    """The constructors are asked without a probe: no hardware is needed to see a wrong address."""
+    document = devices_of_which_the_first_fails(sysfs)
+    document["thermometers"].append({"name": "box", "driver": "mcp9808", "address": 0x48})
+    error, _, said = check(document)
+    assert isinstance(error, ConfigurationError)
+    assert "config.yaml: thermometer box: " in str(error)
+    assert "0x48" in str(error)
+    assert said is None

@@ -10,7 +10,7 @@ import typer
 
 from thermocald.cli.common import say, write_json
 from thermocald.cli.options import JsonOption
-from thermocald.errors import DataError, DeviceError
+from thermocald.errors import ConfigurationError, DataError, DeviceError
 
 if TYPE_CHECKING:
     from thermocald.config import DeviceConfig
@@ -36,6 +36,8 @@ def check(
 ) -> None:
     """Read everything and say what it is; the first thing that is wrong ends it.
 
+    With --probe every device is tried, whatever the others did: exit status 3 where one failed.
+
     Example: thermocald check config.yaml
     """
     if not source.exists():
@@ -51,6 +53,13 @@ def check(
     if json != "-":
         for line in document.pop("lines"):
             typer.echo(line)
+    probes = document.get("probes", [])
+    failed = [probe["name"] for probe in probes if probe["error"]]
+    if failed:
+        raise DeviceError(
+            f"{len(failed)} of {len(probes)} devices gave nothing: {', '.join(failed)}; why stands "
+            "in their lines"
+        )
 
 
 def _recording(path: Path) -> dict[str, Any]:
@@ -91,13 +100,16 @@ def _recording(path: Path) -> dict[str, Any]:
 
 
 def _config(path: Path, probe: bool) -> dict[str, Any]:
+    from thermocald.cli.devices import probe as probe_devices
+    from thermocald.cli.devices import probe_document, probe_lines
     from thermocald.config import load_config
-    from thermocald.hal import load_driver, option_names
-    from thermocald.store.recording import read_testfield
+    from thermocald.daemon.plan import plan_cameras
+    from thermocald.hal import SystemClock, open_device, option_names
 
     config = load_config(path, option_names)
     lines = [f"{path}: a sound configuration"]
     devices: list[dict[str, Any]] = []
+    clock = SystemClock()
     groups: tuple[tuple[Kind, tuple[DeviceConfig, ...]], ...] = (
         ("camera", config.cameras),
         ("thermometer", config.thermometers),
@@ -105,14 +117,19 @@ def _config(path: Path, probe: bool) -> dict[str, Any]:
     )
     for kind, entries in groups:
         for entry in entries:
-            load_driver(kind, entry.driver)
+            try:
+                open_device(kind, entry.driver, entry.options, clock)  # touches no hardware
+            except ConfigurationError as error:
+                raise ConfigurationError(f"{path}: {kind} {entry.name}: {error}") from error
             devices.append({"kind": kind, "name": entry.name, "driver": entry.driver})
-            lines.append(f"  {kind} {entry.name}: driver {entry.driver}")
-    for camera in config.cameras:
-        if camera.testfield is not None:
-            field = read_testfield(camera.testfield)
-            lines.append(f"  test field of {camera.name}: {len(field)} targets")
-    document = {
+            if not probe or kind == "output":
+                lines.append(f"  {kind} {entry.name}: driver {entry.driver}")
+    lines += [
+        f"  test field of {plan.name}: {len(plan.testfield)} targets"
+        for plan in plan_cameras(config, clock)
+        if plan.testfield is not None
+    ]
+    document: dict[str, Any] = {
         "format": "thermocald-check/1",
         "kind": "configuration",
         "path": path,
@@ -120,20 +137,9 @@ def _config(path: Path, probe: bool) -> dict[str, Any]:
         "lines": lines,
     }
     if probe:
-        from thermocald.cli.devices import probe as probe_devices
-        from thermocald.cli.devices import probe_document
-
         answers = probe_devices(config)
         document["probes"] = probe_document(answers)["devices"]
-        for answer in answers:
-            what = answer.error or ", ".join(f"{k} {v}" for k, v in answer.values.items())
-            lines.append(f"  {answer.kind} {answer.name}: {what} ({answer.took_s:.2f} s)")
-        failures = [a for a in answers if a.error]
-        if failures:
-            raise DeviceError(
-                f"{len(failures)} of {len(answers)} devices did not answer: {failures[0].name}: "
-                f"{failures[0].error}"
-            )
+        lines += [f"  {line}" for line in probe_lines(answers)]
     return document
 
 

@@ -108,9 +108,12 @@ def _probe(kind: Kind, device: DeviceConfig) -> Probe:
             begin = time.monotonic()
             result = driver.capture() if kind == "camera" else driver.read()
             took_s = time.monotonic() - begin
-    except ThermocaldError as error:
+    except Exception as error:  # noqa: BLE001
+        # a driver's own mistake is told like a fault, so that the other devices are tried too
         took_s = time.monotonic() - begin
-        return Probe(kind, device.name, device.driver, took_s, "", {}, str(error))
+        known = isinstance(error, ThermocaldError)
+        why = str(error) if known else f"its driver failed: {type(error).__name__}: {error}"
+        return Probe(kind, device.name, device.driver, took_s, "", {}, why)
     values = _frame_values(result) if kind == "camera" else _reading_values(result)
     shows = ", ".join(f"{key} {value}" for key, value in values.items() if value is not None)
     return Probe(kind, device.name, device.driver, took_s, shows, values)

@@ -81,7 +81,9 @@ class StoreConfig(_Section):
     """Where results go. durable: what is stored survives a power cut, at the price of a sync."""
 
     path: Path = Field(default=Path("thermocald.db"), validate_default=True)
+    """The SQLite file."""
     durable: bool = True
+    """What is stored survives a power cut; false: only the end of the process, but faster."""
 
     _path = field_validator("path")(_relative_to_file)
 
@@ -90,11 +92,17 @@ class FramesConfig(_Section):
     """Which frames are kept, where, and for how long; None: no limit."""
 
     keep: Literal["all", "every_n", "events", "none"] = "every_n"
+    """Which frames are kept; events: knock, slip, failed epochs."""
     every_n: Annotated[int, Field(ge=1, le=1_000_000)] = 360
+    """With every_n: one of so many."""
     folder: Path = Field(default=Path("frames"), validate_default=True)
+    """Where they are kept."""
     max_age_days: Positive | None = 90.0
+    """Older frames are deleted, which is logged; null: no limit."""
     max_size_gb: Positive | None = 8.0
+    """Beyond it the oldest frames go first; null: no limit."""
     min_free_gb: Annotated[float, Field(ge=0.0, le=1e6)] = 0.5
+    """With less room on the disk no frame is kept."""
 
     _folder = field_validator("folder")(_relative_to_file)
 
@@ -103,15 +111,20 @@ class SensorConfig(_Section):
     """Size of the image and of a pixel."""
 
     width_px: Annotated[int, Field(ge=16, le=100_000)]
+    """Width of the image."""
     height_px: Annotated[int, Field(ge=16, le=100_000)]
+    """Height of the image."""
     pixel_pitch_mm: Annotated[float, Field(gt=0.0, le=0.1)]
+    """Size of a pixel."""
 
 
 class Prior(_Section):
     """A value known beforehand, with its standard deviation, in the parameter's unit."""
 
     value: float
+    """What is known beforehand."""
     sd: Annotated[float, Field(gt=0.0)]
+    """Its standard deviation."""
 
 
 class CalibrationConfig(_Section):
@@ -123,13 +136,21 @@ class CalibrationConfig(_Section):
     """
 
     exterior: Literal["per_epoch", "series"] = "per_epoch"
+    """One orientation per epoch, or one for the series of a camera that stands still."""
     free: tuple[InteriorName, ...] = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2")
+    """Interior parameters that are estimated."""
     fixed: dict[InteriorName, float] = Field(default_factory=dict)
+    """Values of those that are not; 0 where none is given."""
     priors: dict[ParameterName, Prior] = Field(default_factory=dict)
+    """By parameter, in its unit."""
     sigma_floor_px: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0
+    """Image points are taken as no better than this."""
     target_offsets: bool = True
+    """With series: a constant offset per target, for an imperfect field."""
     correlation_bound: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.9999
+    """Above it an epoch's geometry is called weak."""
     snooping_alpha: Annotated[float, Field(ge=0.0, le=0.1)] = 0.001
+    """Error probability of a single test for gross errors; 0: no test."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -146,8 +167,11 @@ class DeviceConfig(_Section):
     model_config = ConfigDict(extra="allow")
 
     name: Name
+    """For people; letters, digits, _ . -; unique in its list."""
     driver: Annotated[str, Field(min_length=1)]
+    """An installed entry point; `thermocald devices` lists them."""
     driver_options: dict[str, Any] = Field(default_factory=dict, alias="options")
+    """Options of the driver that are called like a key of ours."""
 
     @property
     def options(self) -> dict[str, Any]:
@@ -171,6 +195,7 @@ class ThermometerConfig(DeviceConfig):
     """A thermometer and how often it is read."""
 
     period_s: Period = 10.0
+    """Time between readings."""
 
 
 class OutputConfig(DeviceConfig):
@@ -185,12 +210,19 @@ class CameraConfig(DeviceConfig):
     """
 
     period_s: Period = 10.0
+    """Time between frames."""
     series: Name = "M1"
+    """Name of the measurement series."""
     sensor: SensorConfig | None = None
+    """Size of the image and of a pixel."""
     principal_distance_mm: Annotated[float, Field(gt=0.0, le=10_000.0)] | None = None
+    """Nominal; helps to find a first orientation."""
     testfield: Path | None = None
+    """A testfield.csv; without it frames are only taken."""
     thermometers: tuple[Name, ...] = ()
+    """By name; the first is the reference."""
     calibration: CalibrationConfig | None = None
+    """Of this camera, in full, in place of the common one."""
 
     _testfield = field_validator("testfield")(_relative_to_file)
 
@@ -199,9 +231,13 @@ class DashboardConfig(_Section):
     """The web page; elsewhere than on this machine it needs a token."""
 
     enabled: bool = False
+    """Whether the daemon shows the page."""
     host: str = "127.0.0.1"
+    """Elsewhere than on this machine a token_file is needed."""
     port: Annotated[int, Field(ge=1, le=65535)] = 8437
+    """Of the page."""
     token_file: Path | None = None
+    """A file that holds the token."""
 
     _token_file = field_validator("token_file")(_relative_to_file)
 
@@ -217,19 +253,28 @@ class LoggingConfig(_Section):
     """What goes to the journal."""
 
     level: Literal["debug", "info", "warning", "error"] = "info"
+    """From which on messages go to the journal."""
 
 
 class Config(_Section):
     """The whole file."""
 
     store: StoreConfig = Field(default_factory=dict, validate_default=True)
+    """Where results go."""
     frames: FramesConfig = Field(default_factory=dict, validate_default=True)
+    """Which frames are kept."""
     cameras: tuple[CameraConfig, ...] = ()
+    """The cameras."""
     thermometers: tuple[ThermometerConfig, ...] = ()
+    """The thermometers."""
     outputs: tuple[OutputConfig, ...] = ()
+    """What is told every epoch's result."""
     calibration: CalibrationConfig = CalibrationConfig()
+    """How epochs are adjusted."""
     dashboard: DashboardConfig = DashboardConfig()
+    """The web page."""
     logging: LoggingConfig = LoggingConfig()
+    """The log."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

@@ -268,62 +268,64 @@ def partials(
     e = np.asarray(eop, dtype=float)
     R = rotation(e[..., :3])
     # Components stand before points, (..., 3, n), so that every line below writes memory in one
-    # run; the callers see (..., n, 2, 16) through `moveaxis`.
-    shifted = np.swapaxes(np.asarray(points, dtype=float) - e[..., None, 3:6], -1, -2)
-    q = np.swapaxes(R, -1, -2) @ shifted
+    # run; the callers see (..., n, 2, 16) through `_points_first`.
+    q = np.swapaxes((np.asarray(points, dtype=float) - e[..., None, 3:6]) @ R, -1, -2)
     depth = -q[..., 2, :]
     inverse_depth = 1.0 / np.where(depth > 0, depth, np.nan)
     uv = q[..., :2, :] * inverse_depth[..., None, :]
-    k = i[..., 0, None] * inverse_depth
     ideal = i[..., 0, None, None] * uv
     x, y = ideal[..., 0, :], ideal[..., 1, :]
-    _, x0, y0, A1, A2, A3, B1, B2, C1, C2 = (i[..., None, j] for j in range(10))
-    squares = ideal * ideal
-    xy = x * y
-    r2 = squares[..., 0, :] + squares[..., 1, :]
-    r4 = r2 * r2
-    radial = A1 * r2 + A2 * r4 + A3 * (r4 * r2)
+    batch, n = x.shape[:-1], x.shape[-1]
+    squares = np.empty((*batch, 3, n))  # x², xy, y²
+    np.multiply(ideal, x[..., None, :], out=squares[..., :2, :])
+    np.multiply(y, y, out=squares[..., 2, :])
+    powers = np.empty((*batch, 3, n))  # r², r⁴, r⁶
+    r2, r4 = powers[..., 0, :], powers[..., 1, :]
+    np.add(squares[..., 0, :], squares[..., 2, :], out=r2)
+    np.multiply(r2, r2, out=r4)
+    np.multiply(r2, r4, out=powers[..., 2, :])
 
-    out = np.zeros((2, *x.shape[:-1], 16, x.shape[-1]))
+    # The image point is linear in x0 to C2: first their partials, then by them the point itself.
+    out = np.zeros((2, *batch, 16, n))
+    out[0, ..., 1, :] = out[1, ..., 2, :] = 1.0
+    twice = 2 * squares
     for axis in range(2):
-        out[axis, ..., 1 + axis, :] = 1.0
-        powers = ideal[..., axis, None, :]
-        np.multiply(powers, np.stack([r2, r4, r4 * r2], axis=-2), out=out[axis, ..., 3:6, :])
-        np.add(r2, 2 * squares[..., axis, :], out=out[axis, ..., 6 + axis, :])
-        out[axis, ..., 7 - axis, :] = 2 * xy
-    out[0, ..., 8, :], out[0, ..., 9, :] = x, y
-    terms = out[..., 3:10, :]
-    xd = x0 + x * (1 + radial + C1) + B1 * terms[0, ..., 3, :] + B2 * terms[0, ..., 4, :] + C2 * y
-    yd = y0 + y * (1 + radial) + B1 * terms[1, ..., 3, :] + B2 * terms[1, ..., 4, :]
+        np.multiply(ideal[..., axis, None, :], powers, out=out[axis, ..., 3:6, :])
+        np.add(r2, twice[..., 2 * axis, :], out=out[axis, ..., 6 + axis, :])
+        out[axis, ..., 7 - axis, :] = twice[..., 1, :]
+    out[0, ..., 8:10, :] = ideal
+    moved = (i[..., None, 1:] @ out[..., 1:10, :])[..., 0, :]
+    xd, yd = x + moved[0], y + moved[1]
 
-    # ∂(x', y')/∂(x̄, ȳ), then by the camera coordinates (depth = -Zc), then by the object point
-    slope = 2 * (A1 + A2 * (2 * r2) + A3 * (3 * r4))
-    cross = slope * xy + 2 * (B1 * y + B2 * x)
-    jacobian = np.empty((2, *x.shape[:-1], 2, x.shape[-1]))
-    jacobian[0, ..., 0, :] = 1 + C1 + radial + slope * squares[..., 0, :] + 6 * B1 * x + 2 * B2 * y
-    jacobian[0, ..., 1, :] = cross + C2
-    jacobian[1, ..., 0, :] = cross
-    jacobian[1, ..., 1, :] = 1 + radial + slope * squares[..., 1, :] + 6 * B2 * y + 2 * B1 * x
-    by_c = (jacobian * uv).sum(axis=-2)
+    # By the camera coordinates: ∂(x', y')/∂(x̄, ȳ) with ∂/∂c as its third component
+    _, _, _, A1, A2, A3, B1, B2, C1, C2 = (i[..., None, j] for j in range(10))
+    slope = 2 * A1 + (4 * A2) * r2 + (6 * A3) * r4
+    radial = (i[..., None, 3:6] @ powers)[..., 0, :] + 1
+    by_ideal = np.empty((2, *batch, 3, n))
+    jxx, jxy, jyx, jyy = (by_ideal[row, ..., k, :] for row in range(2) for k in range(2))
+    np.add(slope * squares[..., 0, :] + radial, C1 + 6 * B1 * x + 2 * B2 * y, out=jxx)
+    np.add(slope * squares[..., 2, :] + radial, 6 * B2 * y + 2 * B1 * x, out=jyy)
+    np.add(slope * squares[..., 1, :], 2 * B1 * y + 2 * B2 * x, out=jyx)
+    np.add(jyx, C2, out=jxy)
+    u, v = uv[..., 0, :], uv[..., 1, :]
+    jx, jy, by_c = (by_ideal[..., k, :] for k in range(3))
+    np.add(jx * u, jy * v, out=by_c)
     out[..., 0, :] = by_c
-    by_camera = np.concatenate([jacobian, by_c[..., None, :]], axis=-2) * k[..., None, :]
-    by_point = R @ by_camera
-    np.negative(by_point, out=out[..., 13:16, :])
-
-    # A small turn about the object axis w changes q by Rᵀ (d × w), and D·(d × w) = w·(D × d).
-    d0, d1, d2 = (shifted[..., j, :] for j in range(3))
-    D0, D1, D2 = (by_point[..., j, :] for j in range(3))
-    moment = np.stack([D1 * d2 - D2 * d1, D2 * d0 - D0 * d2, D0 * d1 - D1 * d0], axis=-2)
-    out[..., 10:13, :] = np.swapaxes(_rotation_axes(e), -1, -2) @ moment
-
     scale = (np.array([1.0, -1.0]) / sensor.pixel_pitch).reshape(2, *(1,) * (out.ndim - 1))
-    out *= scale
-    by_point *= scale
-    return (
-        _as_px(sensor, xd, yd),
-        _points_first(out),
-        _points_first(by_point),
-    )
+    out[..., :10, :] *= scale
+    by_ideal *= scale
+
+    # By the object point D = R · (c / depth · by_ideal); a small turn about the axis w changes q by
+    # q × w, which D sees as w · (D × q).
+    by_point = R @ (by_ideal * (i[..., 0, None] * inverse_depth)[..., None, :])
+    np.negative(by_point, out=out[..., 13:16, :])
+    moment = np.empty((2, *batch, 3, n))
+    np.add(jy, by_c * v, out=moment[..., 0, :])
+    np.add(jx, by_c * u, out=moment[..., 1, :])
+    np.subtract(jx * v, jy * u, out=moment[..., 2, :])
+    axes = np.swapaxes(_rotation_axes(e), -1, -2) @ R * i[..., 0, None, None]
+    out[..., 10:13, :] = (axes * [-1.0, 1.0, 1.0]) @ moment
+    return _as_px(sensor, xd, yd), _points_first(out), _points_first(by_point)
 
 
 def _points_first(array: Array) -> Array:

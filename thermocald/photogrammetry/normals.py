@@ -34,7 +34,10 @@ __all__ = [
     "linearise",
     "normal_matrices",
     "right_hand_sides",
+    "same_rows",
     "series_residuals",
+    "sums_of_squares",
+    "weighted",
 ]
 
 _UPPER = np.triu_indices(16)
@@ -136,17 +139,50 @@ def normal_matrices(weights: Array, A: Array) -> Array:
     return N
 
 
+def same_rows(*arrays: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Which rows of arrays (E, ...) are the same: representatives (M,), and whose each is (E,).
+
+    Epochs that see the same targets with the same weights have the same normal matrix.
+    """
+    E = len(arrays[0])
+    flat = [array.reshape(E, -1) for array in arrays]
+    rng = np.random.default_rng(0)
+    mark = np.sum([part @ rng.random(part.shape[1]) for part in flat], axis=0)
+    _, first, of = np.unique(mark, return_index=True, return_inverse=True)
+    each = np.arange(E)
+    if 2 * len(first) > E or not all(np.array_equal(part, part[first[of]]) for part in flat):
+        return each, each
+    return first, of
+
+
 def right_hand_sides(weights: Array, residuals: Array, A: Array) -> tuple[Array, Array]:
     """Aᵀ P l (E, k) and lᵀ P l (E,) of every epoch; NaN residuals must have weight 0."""
-    used = weights[..., 0] > 0
-    lx, ly = np.where(used, residuals[..., 0], 0.0), np.where(used, residuals[..., 1], 0.0)
-    px, py = weights[..., 0] * lx, weights[..., 1] * ly
+    Pl = weighted(weights, residuals)
+    b: Array = Pl.reshape(len(Pl), -1) @ A.reshape(-1, A.shape[-1])
+    return b, _sums(Pl, residuals)
+
+
+def sums_of_squares(weights: Array, residuals: Array) -> Array:
+    """vᵀ P v (E,) of every epoch."""
+    return _sums(weighted(weights, residuals), residuals)
+
+
+def _sums(Pv: Array, v: Array) -> Array:
+    flat = (Pv * v).reshape(len(v), -1)
+    total: Array = flat.sum(axis=1)
+    # only where targets were not observed: a look at all of them would cost as much as the sum
+    return np.nan_to_num(flat).sum(axis=1) if np.isnan(total).any() else total
+
+
+def weighted(weights: Array, residuals: Array) -> Array:
+    """P v (E, T, 2) of every point, 0 where the weight is."""
+    out: Array = weights[..., :2] * residuals
     if np.any(weights[..., 2]):
-        px += weights[..., 2] * ly
-        py += weights[..., 2] * lx
-    b: Array = px @ A[:, 0] + py @ A[:, 1]
-    lPl: Array = np.einsum("et,et->e", px, lx) + np.einsum("et,et->e", py, ly)
-    return b, lPl
+        out += weights[..., 2:] * residuals[..., ::-1]
+    unused = weights[..., 0] == 0
+    if unused.any():
+        out[unused] = 0.0
+    return out
 
 
 def series_residuals(

@@ -29,7 +29,12 @@ from thermocald.photogrammetry.camera_model import (
     project,
 )
 from thermocald.photogrammetry.geometry import GeometryBounds, weaknesses
-from thermocald.photogrammetry.normals import ObservationGrid, linearise, series_residuals
+from thermocald.photogrammetry.normals import (
+    ObservationGrid,
+    linearise,
+    series_residuals,
+    sums_of_squares,
+)
 from thermocald.photogrammetry.series_system import SeriesSystem, snoop_series
 from thermocald.photogrammetry.target_noise import (
     correlated_pairs,
@@ -53,7 +58,7 @@ __all__ = ["SeriesAdjustment", "SeriesSettings", "adjust_series"]
 
 _EOP = np.arange(10, 16)
 _ITERATIONS = 15
-_SMALL = 0.03  # standard deviations: a last step that the partials carry to 1e-4
+_SMALL = 0.1  # standard deviations: a last step that the partials carry to 1e-3
 _ROUNDS = 8  # of data snooping
 _RELINEARISE_PX = 1.0  # movement of the mean that changes the partials by more than about 1e-3
 _ENOUGH_FOR_NOISE = 20  # epochs
@@ -375,21 +380,15 @@ class _Series:
 
     def _sums(self, estimate: _Estimate) -> tuple[Array, Array]:
         """Weighted sum of squares (E,) and redundancy (E,) of every epoch."""
-        w, v = estimate.system.weights, np.nan_to_num(estimate.residuals)
-        vPv = (
-            w[..., 0] * v[..., 0] ** 2
-            + w[..., 1] * v[..., 1] ** 2
-            + 2 * w[..., 2] * v[..., 0] * v[..., 1]
-        ).sum(axis=1)
+        w = estimate.system.weights
+        vPv = sums_of_squares(w, estimate.residuals)
         n = (w[..., 0] > 0).sum(axis=1) * estimate.system.good
         share = estimate.system.common_share() * n / max(int(n.sum()), 1)
         return vPv, 2 * n - len(self.s.per_epoch) - share
 
     def variance(self, estimate: _Estimate) -> float:
         """Variance of unit weight of the series, the median over its epochs."""
-        vPv, redundancy = self._sums(estimate)
-        good = estimate.system.good & (redundancy > 0)
-        return float(np.median(vPv[good] / redundancy[good])) if good.any() else 1.0
+        return _pooled(*self._sums(estimate), estimate.system.good)
 
     def result(self, estimate: _Estimate, use: NDArray[np.bool_]) -> SeriesAdjustment:
         """Judge the epochs and scale the covariances."""
@@ -399,7 +398,7 @@ class _Series:
         sigma0 = np.sqrt(vPv / np.where(positive, redundancy, 1.0))
         sigma0[~positive] = np.nan
         relative, level, trend = system.covariances()
-        pooled = self.variance(estimate)
+        pooled = _pooled(vPv, redundancy, system.good)
         if s.scale == "posterior":
             relative *= np.nan_to_num(sigma0, nan=1.0)[:, None, None] ** 2
             level *= pooled
@@ -506,3 +505,8 @@ class _Series:
             self.s.bounds,
         )
         return "; ".join(said).replace("{", "(").replace("}", ")")
+
+
+def _pooled(vPv: Array, redundancy: Array, good: NDArray[np.bool_]) -> float:
+    good = good & (redundancy > 0)
+    return float(np.median(vPv[good] / redundancy[good])) if good.any() else 1.0

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.gauss_markov import chi2_2d
-from thermocald.photogrammetry.normals import normal_matrices, right_hand_sides
+from thermocald.photogrammetry.normals import normal_matrices, same_rows, weighted
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -70,9 +70,11 @@ class SeriesSystem:
         cls, at: Partials, weights: Array, own: Columns, common: Columns, prior: Array | None
     ) -> SeriesSystem:
         """Form, invert, and reduce the normal equations."""
-        N = normal_matrices(weights, at.A)
+        first, of = same_rows(weights)
+        N = normal_matrices(weights[first], at.A)
         Q, good = _invert(N[:, own[:, None], own])
-        good &= (weights[..., 0] > 0).any(axis=1)
+        good &= (weights[first, :, 0] > 0).any(axis=1)
+        N, Q, good = N[of], Q[of], good[of]
         system = cls(at, weights, own, common, N, Q, good, np.empty((0, 0)), prior)
         full = _common_matrix(system)
         for part, C in system.couplings():
@@ -101,7 +103,7 @@ class SeriesSystem:
 
     def step(self, residuals: Array, offsets: Array) -> Step:
         """One Gauss-Newton step from residuals (E, T, 2) px and the offsets they stand at."""
-        b, _ = right_hand_sides(self.weights, residuals, self.at.A)
+        b = self._right_hand_sides(residuals)
         b[~self.good] = 0.0
         right = b[:, self.own]
         q = len(self.common)
@@ -122,13 +124,17 @@ class SeriesSystem:
         d_offsets = d_all[q:].reshape(2, -1).T if self.prior is not None else np.zeros_like(offsets)
         return Step(solved, d_all[:q], d_offsets, size)
 
+    def _right_hand_sides(self, residuals: Array) -> Array:
+        Pv = weighted(self.weights, residuals)
+        b: Array = Pv.reshape(len(Pv), -1) @ self.at.A.reshape(-1, self.at.A.shape[-1])
+        return b
+
     def moved(self, residuals: Array, step: Step) -> Array:
         """The residuals (E, T, 2) after a small step, by the partials."""
-        change = np.empty_like(residuals)
-        common = self.at.A[..., self.common] @ step.d_common + step.d_offsets
-        for axis in range(2):
-            change[..., axis] = step.d_own @ self.at.A[:, axis, self.own].T
-        moved: Array = residuals - (change + common)
+        change = step.d_own @ self.at.A[..., self.own].reshape(-1, len(self.own)).T
+        moved: Array = residuals - change.reshape(residuals.shape)
+        if self.prior is not None or len(self.common):
+            moved -= self.at.A[..., self.common] @ step.d_common + step.d_offsets
         return moved
 
     def replace(self, rows: NDArray[np.int64], part: SeriesSystem) -> None:
@@ -152,10 +158,21 @@ class SeriesSystem:
         weights (E, T, 3): a priori, also of the points that take no part; those are tested as
         check points. The common unknowns are taken as known, as they rest on all epochs.
         """
+        first, of = same_rows(self.weights, weights)
+        inverse, testable = self._test_weights(first, weights[first])
+        if len(first) > 1:
+            inverse, testable = inverse[:, of], testable[of]
+        x, y = residuals[..., 0], residuals[..., 1]
+        xx, yy, xy = inverse
+        test: Array = np.where(testable, (xx * x + xy * y) * x + yy * y * y, 0.0)
+        return test
+
+    def _test_weights(self, epochs: Columns, weights: Array) -> tuple[Array, Mask]:
+        """Inverse covariance (3, M, T) of the residuals, xx, yy, twice xy, and which have one."""
         rows, columns = np.triu_indices(len(self.own))
-        Q = self.Q[:, rows, columns] * np.where(rows == columns, 1.0, 2.0)
+        Q = self.Q[epochs][:, rows, columns] * np.where(rows == columns, 1.0, 2.0)
         ax, ay = self.at.A[:, 0, self.own], self.at.A[:, 1, self.own]
-        sign = np.where(self.weights[..., 0] > 0, -1.0, 1.0)
+        sign = np.where(self.weights[epochs, :, 0] > 0, -1.0, 1.0)
         lxx = sign * (Q @ (ax[:, rows] * ax[:, columns]).T)
         lyy = sign * (Q @ (ay[:, rows] * ay[:, columns]).T)
         mixed = 0.5 * (ax[:, rows] * ay[:, columns] + ay[:, rows] * ax[:, columns])
@@ -165,12 +182,9 @@ class SeriesSystem:
         determinant = wx * wy - wxy * wxy
         vxx, vyy = wy / determinant + lxx, wx / determinant + lyy
         vxy = lxy - wxy / determinant
-        x, y = residuals[..., 0], residuals[..., 1]
         d = vxx * vyy - vxy * vxy
         testable = offered & (d > 1e-9 / determinant)
-        test = np.where(testable, vyy * x * x - 2 * vxy * x * y + vxx * y * y, 0.0)
-        result: Array = test / np.where(testable, d, 1.0)
-        return result
+        return np.stack([vyy, vxx, -2 * vxy]) / np.where(testable, d, 1.0), testable
 
     def common_share(self) -> float:
         """How many of the observations the common unknowns use up."""
@@ -278,7 +292,7 @@ class SeriesSystem:
 
         Rao's score test: the gradient by these columns, with the epoch's own parameters reduced.
         """
-        b, _ = right_hand_sides(self.weights, residuals, self.at.A)
+        b = self._right_hand_sides(residuals)
         C = self.N[:, self.own[:, None], columns]
         QC = self.Q @ C
         V = self.N[:, columns[:, None], columns] - np.swapaxes(C, 1, 2) @ QC

@@ -1,0 +1,322 @@
+"""The reference, made from the code: commands, configuration, effects, drivers, modules."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import pkgutil
+import re
+import typing
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    import typer
+    from pydantic import BaseModel
+
+__all__ = ["GENERATORS", "api_pages", "commands", "packages"]
+
+ROOTS = ("thermocald", "thermocald_drivers")
+
+
+def packages() -> list[str]:
+    """Every package with modules of its own; commands have a page of their own."""
+    found = []
+    for root in ROOTS:
+        package = importlib.import_module(root)
+        found.append(root)
+        walked = pkgutil.walk_packages(package.__path__, f"{root}.")
+        found += [m.name for m in walked if m.ispkg and m.name != "thermocald.cli"]
+    return found
+
+
+def api_pages() -> dict[str, str]:
+    """One page per package with what its modules offer, for mkdocstrings."""
+    pages = {}
+    for name in packages():
+        package = importlib.import_module(name)
+        modules = [
+            m.name
+            for m in pkgutil.iter_modules(package.__path__)
+            if not m.ispkg and not m.name.startswith("_")
+        ]
+        text = [f"# `{name}`", (inspect.getdoc(package) or "").strip()]
+        text += [f"::: {name}.{module}" for module in modules]
+        pages[f"reference/api/{name}.md"] = "\n\n".join(text) + "\n"
+    return pages
+
+
+# commands
+
+
+def commands(app: typer.Typer | None = None, above: str = "thermocald") -> Iterator[Any]:
+    """(name, function) of every command, groups' own included."""
+    if app is None:
+        from thermocald.cli import application
+
+        app = application()
+    for command in app.registered_commands:
+        callback = command.callback
+        assert callback is not None
+        yield f"{above} {command.name or callback.__name__.replace('_', '-')}", callback
+    for group in app.registered_groups:
+        assert group.typer_instance is not None
+        name = group.name or group.typer_instance.info.name
+        yield from commands(group.typer_instance, f"{above} {name}")
+
+
+def _command_page() -> str:
+    found = sorted(commands())
+    parts = [" · ".join(f"[{name.split(' ', 1)[1]}](#{_anchor(name)})" for name, _ in found)]
+    for name, function in found:
+        text = inspect.getdoc(function) or ""
+        text, _, example = text.partition("Example: ")
+        parts.append(f"## {name}\n\n{text.strip()}")
+        if example:
+            parts.append(f"```text\n{' '.join(example.split())}\n```")
+        parts.append(_table(("argument or option", "value", "default", "meaning"), _rows(function)))
+    return "\n\n".join(parts)
+
+
+def _anchor(name: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "-", name.lower())
+
+
+def _rows(function: Callable[..., Any]) -> Iterator[tuple[str, ...]]:
+    hints = typing.get_type_hints(function, include_extras=True)
+    for parameter in inspect.signature(function).parameters.values():
+        kind, info = typing.get_args(hints[parameter.name])[:2]
+        default = parameter.default
+        required = default is inspect.Parameter.empty
+        shown = "required" if required else "" if default in (None, False) else f"`{default}`"
+        # within Annotated the first name of an option stands where a default would
+        names = (info.default, *(info.param_decls or ()))
+        declared = [d for d in names if isinstance(d, str) and d.startswith("-")]
+        if type(info).__name__ == "ArgumentInfo":
+            declared = [info.metavar or parameter.name.upper()]
+        elif not declared:
+            option = "--" + parameter.name.replace("_", "-")
+            flag = isinstance(default, bool)
+            declared = [f"{option} / --no-{option[2:]}" if flag else option]
+        label = ", ".join(f"`{d}`" for d in declared)
+        yield label, _values(kind, info), shown, _cell(info.help or "")
+
+
+def _values(kind: Any, info: Any) -> str:
+    inner = [a for a in typing.get_args(kind) if a is not type(None)]
+    if typing.get_origin(kind) is list:
+        return f"{_values(inner[0], info)}, repeatable"
+    if typing.get_origin(kind) is tuple:
+        return " ".join(_values(part, info) for part in inner)
+    if inner:
+        return _values(inner[0], info)
+    if kind is bool:
+        return ""
+    low, high = info.min, info.max
+    words = {int: "integer", float: "number", Path: "path", str: "text"}
+    name = words.get(kind, getattr(kind, "__name__", str(kind)))
+    return name + _bounds(low, high)
+
+
+def _bounds(low: Any, high: Any) -> str:
+    if low is None and high is None:
+        return ""
+    if high is None:
+        return f", at least {low:g}"
+    return f", at most {high:g}" if low is None else f", {low:g} to {high:g}"
+
+
+# configuration
+
+
+def _configuration_page() -> str:
+    from thermocald import config
+
+    sections = [
+        ("The file", config.Config),
+        ("`cameras`, a list", config.CameraConfig),
+        ("`thermometers`, a list", config.ThermometerConfig),
+        ("`outputs`, a list", config.OutputConfig),
+        ("`sensor` of a camera", config.SensorConfig),
+        ("`calibration`", config.CalibrationConfig),
+        ("`priors` of a calibration", config.Prior),
+        ("`store`", config.StoreConfig),
+        ("`frames`", config.FramesConfig),
+        ("`dashboard`", config.DashboardConfig),
+        ("`logging`", config.LoggingConfig),
+    ]
+    parts = []
+    for title, model in sections:
+        about = (inspect.getdoc(model) or "").split("\n\n")[0]
+        parts.append(f"### {title}\n\n{' '.join(about.split())}")
+        parts.append(_table(("key", "value", "default", "meaning"), _keys(model)))
+    return "\n\n".join(parts)
+
+
+def meanings(model: type[BaseModel]) -> dict[str, str]:
+    """What stands below each field in the source, the nearest class first."""
+    found: dict[str, str] = {}
+    for cls in model.__mro__:
+        if not cls.__module__.startswith("thermocald"):
+            continue
+        (body,) = ast.parse(inspect.getsource(cls)).body
+        assert isinstance(body, ast.ClassDef)
+        for field, text in pairwise(body.body):
+            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
+                found.setdefault(ast.unparse(field.target), ast.literal_eval(text.value))
+    return found
+
+
+def _keys(model: type[BaseModel]) -> Iterator[tuple[str, ...]]:
+    schema, said = model.model_json_schema(by_alias=True), meanings(model)
+    for name, field in model.model_fields.items():
+        key = field.alias or name
+        if field.is_required():
+            default = "required"
+        else:
+            value = field.get_default(call_default_factory=True, validated_data={})
+            section = hasattr(type(value), "model_fields") or value in ({}, ())
+            default = "" if value is None or section else f"`{_yaml(value)}`"
+        values = _schema(schema["properties"][key], schema.get("$defs", {}))
+        yield f"`{key}`", values, default, _cell(said[name])
+
+
+def _yaml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(str, value))}]"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _schema(part: dict[str, Any], definitions: dict[str, Any]) -> str:
+    """What may stand there, in words."""
+    if "anyOf" in part:
+        kinds = [_schema(p, definitions) for p in part["anyOf"]]
+        return " or ".join("null" if k == "null" else k for k in kinds)
+    if "$ref" in part:
+        return "see below"
+    if "enum" in part:
+        return ", ".join(f"`{v}`" for v in part["enum"])
+    kind = part.get("type", "anything")
+    if kind == "array":
+        inner = _schema(part["items"], definitions)
+        return f"list of {inner}" if inner != "see below" else "list, see below"
+    if kind == "object":
+        return "mapping"
+    if part.get("format") == "path":
+        return "path"
+    words = {"number": "number", "integer": "integer", "boolean": "`true`, `false`"}
+    low = part.get("minimum")
+    high = part.get("maximum")
+    above, below = part.get("exclusiveMinimum"), part.get("exclusiveMaximum")
+    text = words.get(kind, {"string": "text"}.get(kind, kind))
+    if above is not None:
+        text += f" above {above:g}"
+        if high is not None or below is not None:
+            text += f", up to {high:g}" if high is not None else f" and below {below:g}"
+        return text
+    return text + _bounds(low, high)
+
+
+# effects and drivers
+
+
+def _effect_page() -> str:
+    from thermocald.simulation import effects
+    from thermocald.simulation.effects.base import EXPERIMENTS
+
+    parts = []
+    for name in effects.names():
+        effect = effects.get(name)
+        parts.append(f"## `{name}`\n\n{_prose(type(effect))}")
+        rows = [
+            (
+                f"`{key}`",
+                p.unit,
+                "a name" if p.text else f"searched from {p.low:g} to {p.high:g}",
+                "belongs to one series" if key in effect.fresh else "",
+            )
+            for key, p in effect.nonlinear.items()
+        ]
+        usual = [f"`{key}` {effect.linear[key]}" for key in effect.usual if key in effect.linear]
+        if rows:
+            parts.append(_table(("parameter", "unit", "values", ""), iter(rows)))
+        if effect.linear:
+            others = [f"`{key}`" for key in effect.linear if key not in effect.usual]
+            said = f"Coefficients: {', '.join(usual)}"
+            parts.append(said + (f"; also {', '.join(others)}." if others else "."))
+        told = [f"{EXPERIMENTS[k]}: it {v}" for k, v in effect.behaviour.items()]
+        if told:
+            parts.append("What tells it from others:\n\n" + "\n".join(f"- {t}" for t in told))
+        parts.append(f"Kind: `{effect.kind}`.")
+    return "\n\n".join(parts)
+
+
+def _driver_page() -> str:
+    from importlib.metadata import entry_points
+
+    parts = []
+    for kind in ("cameras", "thermometers", "outputs"):
+        parts.append(f"## {kind.capitalize()}")
+        for point in sorted(entry_points(group=f"thermocald.{kind}"), key=lambda p: p.name):
+            if not point.value.startswith("thermocald_drivers"):
+                continue
+            cls = point.load()
+            module = importlib.import_module(cls.__module__)
+            options = [p for p in inspect.signature(cls).parameters.values() if p.name != "clock"]
+            rows = [
+                (
+                    f"`{p.name}`",
+                    "required" if p.default is inspect.Parameter.empty else f"`{p.default!r}`",
+                )
+                for p in options
+            ]
+            parts.append(f"### `{point.name}`: {kind[:-1]}\n\n{_prose(module)}")
+            if rows:
+                parts.append(_table(("option", "default"), iter(rows)))
+    return "\n\n".join(parts)
+
+
+# Markdown
+
+
+def _prose(documented: Any) -> str:
+    """A docstring as Markdown: its indented examples as blocks."""
+    lines, inside = [], False
+    for line in (inspect.getdoc(documented) or "").splitlines():
+        block = line.startswith("    ")
+        if block and not inside:
+            lines.append("```yaml")
+        elif inside and line.strip() and not block:
+            while lines[-1] == "":
+                lines.pop()
+            lines += ["```", ""]
+        inside = block or (inside and not line.strip())
+        lines.append(line[4:] if block else line)
+    if inside:
+        lines.append("```")
+    return "\n".join(lines)
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|")
+
+
+def _table(head: tuple[str, ...], rows: Iterator[tuple[str, ...]]) -> str:
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    lines += ["| " + " | ".join(row) + " |" for row in rows]
+    return "\n".join(lines)
+
+
+GENERATORS: dict[str, Callable[[], str]] = {
+    "reference/cli.md": _command_page,
+    "reference/config.md": _configuration_page,
+    "reference/effects.md": _effect_page,
+    "reference/drivers.md": _driver_page,
+}
+"""By page: what stands in place of its mark."""

@@ -43,16 +43,23 @@ def application() -> typer.Typer:
     return app
 
 
+def _say_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
 def _options(
     version: Annotated[
-        bool, typer.Option("--version", help="Say the version and stop.", is_eager=True)
+        bool,
+        typer.Option(
+            "--version", help="Say the version and stop.", is_eager=True, callback=_say_version
+        ),
     ] = False,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log more.")] = False,
 ) -> None:
+    del version  # said already, before a command is asked for
     log_to_stderr("INFO" if verbose else "WARNING")
-    if version:
-        typer.echo(__version__)
-        raise typer.Exit
 
 
 def main() -> None:

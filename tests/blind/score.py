@@ -1,6 +1,7 @@
 """Scoring of the discovery on blind recordings: the confusion matrix, and what goes with it.
 
-    python -m tests.blind.score [--seeds 5] [--part single-0.3 …] [--write FILE.md]
+    python -m tests.blind.score [--seeds 5] [--part single-0.3 …] [--store FILE.jsonl]
+        [--write FILE.md]
 
 Runs in memory through `examine_series`, the same function the command calls.
 """
@@ -8,11 +9,12 @@ Runs in memory through `examine_series`, the same function the command calls.
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from itertools import combinations
 from pathlib import Path
 
@@ -129,20 +131,61 @@ PARTS = (
 )  # fmt: skip
 
 
-def run(part: str, seeds: Iterable[int], show: bool = False) -> list[Outcome]:
+def run(
+    part: str, seeds: Iterable[int], show: bool = False, store: Path | None = None
+) -> list[Outcome]:
+    """All cases of a part; those that `store` (JSON lines) has already are read, not run again."""
+    done = stored(store)
     outcomes = []
     for case in cases(part, seeds):
+        key = _key(case)
+        if key in done:
+            outcomes.append(done[key])
+            continue
         o = judge(case)
         outcomes.append(o)
+        if store is not None:
+            with store.open("a") as f:
+                f.write(json.dumps(asdict(o)) + "\n")
         if show:
-            for name, pull in o.pulls.items():
-                if abs(pull) > 3:
-                    print(f"    {part} seed {case.seed}: {name} off by {pull:.1f} sd", flush=True)
-        if show and not o.right:
-            print(f"  {part} seed {case.seed} hidden {'+'.join(case.effects) or 'none'}: "
-                  f"{'+'.join(o.found) or 'none'} ({o.verdict}), listed {o.listed}, "
-                  f"left {o.misfit_px:.4f} px", flush=True)  # fmt: skip
+            _show(part, o)
     return outcomes
+
+
+def stored(store: Path | None) -> dict[str, Outcome]:
+    """Outcomes of earlier runs by case."""
+    out: dict[str, Outcome] = {}
+    if store is None or not store.exists():
+        return out
+    for line in store.read_text().splitlines():
+        row = json.loads(line)
+        case = row.pop("case")
+        case["effects"] = tuple(case["effects"])
+        if case["programmes"]:
+            case["programmes"] = tuple(case["programmes"])
+        row["found"], row["listed"] = tuple(row["found"]), tuple(row["listed"])
+        o = Outcome(Case(**case), **row)
+        out[_key(o.case)] = o
+    return out
+
+
+def _key(case: Case) -> str:
+    return json.dumps(asdict(case), sort_keys=True)
+
+
+def _show(part: str, o: Outcome) -> None:
+    case = o.case
+    for name, pull in o.pulls.items():
+        if abs(pull) > 3:
+            print(f"    {part} seed {case.seed} {'+'.join(case.effects)}: {name} off by "
+                  f"{pull:.1f} sd", flush=True)  # fmt: skip
+    if o.gap_closed is not None and o.gap_closed < 0.9:
+        print(f"    {part} seed {case.seed} {'+'.join(case.effects)}: gap closed by "
+              f"{o.gap_closed:.2f}", flush=True)  # fmt: skip
+    if not o.right:
+        print(f"  {part} seed {case.seed} hidden {'+'.join(case.effects) or 'none'}: "
+              f"{'+'.join(o.found) or 'none'} ({o.verdict}), listed {o.listed}, "
+              f"left {o.misfit_px:.4f} px", flush=True)  # fmt: skip
 
 
 def summary(outcomes: list[Outcome]) -> dict[str, float]:
@@ -180,6 +223,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--part", action="append")
+    parser.add_argument("--store", type=Path, help="JSON lines: written as it goes, and resumed")
     parser.add_argument("--write", type=Path)
     a = parser.parse_args()
     seeds = range(a.first, a.first + a.seeds)
@@ -187,7 +231,7 @@ def main() -> None:
              "gap on M2 closed ≥ 90 % | median s |"), "|---|---|---|---|---|---|---|---|"]  # fmt: skip  # noqa: E501
     matrices = []
     for part in a.part or PARTS:
-        outcomes = run(part, seeds, show=True)
+        outcomes = run(part, seeds, show=True, store=a.store)
         s = summary(outcomes)
         line = (f"| {part} | {s['cases']:.0f} | {s['exact']:.1%} | {s['exact_or_listed']:.1%} | "
                 f"{s['lists']:.1%} | {s['within_3_sd']:.1%} | {s['gap_closed_90']:.1%} | "

@@ -55,6 +55,7 @@ COLUMNS = PARAMETER_NAMES + FIELD_SCALES
 _GROSS = 4.5  # standard deviations beyond which a point is a gross error
 _MIN_EPOCHS = 20
 _MIN_TARGETS = 12
+_MIN_DURATION = 120.0  # s
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,6 +270,13 @@ def _require(source: SeriesInput) -> None:
             f"{source.name}: {good} of {len(seen)} epochs have {_MIN_TARGETS} targets or more; "
             f"discovery needs {_MIN_EPOCHS} such epochs, better 100"
         )
+    duration = float(source.frame_times[-1] - source.frame_times[0])
+    if duration < _MIN_DURATION:
+        raise DataError(
+            f"{source.name}: the recording lasts {duration:.0f} s; heat needs minutes to reach a "
+            f"camera, and what moves faster is no thermal effect. Record {_MIN_DURATION:.0f} s at "
+            "least, better half an hour"
+        )
     rows = source.grid.observed.any(axis=0)
     if plane_fit(source.field.points[rows])[2]:
         raise DataError(
@@ -387,12 +395,11 @@ def _reduce(
         b, _ = right_hand_sides(w, misclosure - offsets, A)
         values = _solve(N, b)
         v = misclosure - offsets - (values @ A.reshape(-1, len(scale)).T).reshape(misclosure.shape)
-        # the offset of a target: the mean of its residuals over the series
-        share = w[..., :2]
-        total = share.sum(axis=0)
-        mean = np.sum(share * np.nan_to_num(v), axis=0) / np.where(total > 0, total, np.inf)
-        offsets = offsets + mean
-        v = v - mean
+        change = _offset_change(w[..., :2], np.nan_to_num(v), N, A)
+        offsets = offsets + change
+        b, _ = right_hand_sides(w, misclosure - offsets, A)
+        values = _solve(N, b)
+        v = misclosure - offsets - (values @ A.reshape(-1, len(scale)).T).reshape(misclosure.shape)
         if turn >= 1:
             normal = np.abs(np.nan_to_num(v)) * np.sqrt(weights[..., :2])
             s0 = 1.4826 * float(np.median(normal[seen & ~bad]))
@@ -426,6 +433,39 @@ def _reduce(
         N / variance, b / variance, yy / variance, values, v, w / variance, offsets,
         count, sigma0 / np.sqrt(variance), variance, _slowness(v), int(bad.sum()), columns=A,
     )  # fmt: skip
+
+
+def _offset_change(weights: Array, v: Array, N: Array, A: Array, turns: int = 60) -> Array:
+    """One offset per target (T, 2) that residuals v (E, T, 2) of free cameras ask for.
+
+    Targets hidden for long pull at the cameras of the other epochs: offsets and cameras are solved
+    together, by conjugate gradients on the offsets alone.
+    """
+    k = A.shape[-1]
+    flat = A.reshape(-1, k)
+    total = weights.sum(axis=0)
+    inverse = 1.0 / np.where(total > 0, total, np.inf)
+
+    def normal(p: Array) -> Array:
+        camera = _solve(N, (weights * p).reshape(len(N), -1) @ flat)
+        return np.asarray(np.sum(weights * (p - (camera @ flat.T).reshape(v.shape)), axis=0))
+
+    out = np.zeros(total.shape)
+    r = np.sum(weights * v, axis=0)
+    z = inverse * r
+    p, rz = z, float(np.sum(r * z))
+    for _ in range(turns):
+        if np.max(np.abs(z)) < 1e-5:
+            break
+        q = normal(p)
+        pq = float(np.sum(p * q))
+        if pq <= 0:
+            break
+        out = out + rz / pq * p
+        r = r - rz / pq * q
+        z = inverse * r
+        p, rz = z + float(np.sum(r * z)) / rz * p, float(np.sum(r * z))
+    return out
 
 
 def _slowness(v: Array, lags: int = 20) -> float:

@@ -17,6 +17,7 @@ from thermocald.discovery.image_space import (
     displaced_targets,
     noise_growth,
 )
+from thermocald.discovery.left_out import confirmed, gains
 from thermocald.discovery.noise import jumps, slowed, with_jumps
 from thermocald.discovery.search import Search, Solution
 
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 
     from thermocald.discovery.evidence import Evidence
 
+    Array = NDArray[np.float64]
+
 __all__ = ["Examination", "examine_series"]
 
 MAX_EFFECTS = 2
@@ -34,6 +37,8 @@ MAX_EFFECTS = 2
 BAND = 14.0
 # a model that leaves less than this share of what the base left has the cause
 _LEFT = 0.03
+# slow variances over those of white noise: beyond, what one series shows has to be seen in another
+_WANDERING = 3.0
 # a second effect beside an adequate one has to explain as much, in px RMS and as a share of the
 # first: below that, it is the first one's finer points
 _LEFT_PX, _LEFT_SHARE = 0.005, 0.15
@@ -45,7 +50,8 @@ class Examination:
 
     laboratory: the series as examined, displaced targets out and noise weighted; base, best:
     solutions; ranking: singles by score; rivals: solutions that cannot be excluded;
-    adequacy: of best, per series.
+    adequacy: of best, per series; left_out: gains (blocks,) of its effects on blocks of time left
+    out.
     """
 
     laboratory: Laboratory
@@ -56,6 +62,7 @@ class Examination:
     base_adequacy: tuple[Adequacy, ...]
     adequacy: tuple[Adequacy, ...]
     adequate: bool
+    left_out: tuple[Array, ...] = ()
     displaced: tuple[tuple[Displaced, ...], ...] = ()
     defocus: NoiseGrowth | None = None
     original: tuple[Evidence, ...] = ()
@@ -156,16 +163,43 @@ def _searched(
     seen = [s for s in seen if len(s.terms) <= len(best.terms)]
     if len(best.terms) > len(base.terms):
         best, seen = _contest(search, best, seen)
+    best, blocks = _confirmed(search, base, best)
     adequacy = _adequacies(laboratory, best)
     adequate = _adequate(adequacy, base_adequacy)
+    if len(best.terms) > len(base.terms) and _unverified(laboratory.series):
+        adequate = False
     rivals: list[Solution] = []
     for s in sorted(seen, key=lambda s: s.score):
         different = sorted(s.names) != sorted(best.names)
         if different and s.score < best.score + BAND and s.names not in [r.names for r in rivals]:
             rivals.append(s)
     return Examination(
-        laboratory, base, best, tuple(ranking), tuple(rivals), base_adequacy, adequacy, adequate
-    )
+        laboratory, base, best, tuple(ranking), tuple(rivals), base_adequacy, adequacy, adequate,
+        tuple(blocks),
+    )  # fmt: skip
+
+
+def _unverified(series: Sequence[Evidence]) -> bool:
+    """Single targets wander so much that one series alone carries no name."""
+    return len(series) < 2 and max(e.correlation for e in series) > _WANDERING
+
+
+def _confirmed(search: Search, base: Solution, best: Solution) -> tuple[Solution, list[Array]]:
+    """The solution without effects that do not predict blocks left out, and what the others gain
+    on each block.
+    """
+    kept = len(base.terms)
+    while len(best.terms) > kept:
+        blocks = gains(search.laboratory, best.fit, kept)
+        bad = [i for i, g in enumerate(blocks) if not confirmed(g)]
+        if not bad:
+            return best, blocks
+        worst = kept + min(bad, key=lambda i: float(blocks[i].sum()))
+        search.progress(f"{best.names[worst]} does not predict the blocks left out")
+        terms = [t for i, t in enumerate(best.terms) if i != worst]
+        penalties = [p for i, p in enumerate(best.penalties) if i != worst]
+        best = search.refine(terms, penalties, best.fit) if terms else base
+    return best, []
 
 
 def calibrated_thermometers(series: Sequence[Evidence]) -> list[Evidence]:
@@ -209,7 +243,7 @@ def calibrated_thermometers(series: Sequence[Evidence]) -> list[Evidence]:
     return out
 
 
-def _clipped(values: NDArray[np.float64]) -> float:
+def _clipped(values: Array) -> float:
     """Standard deviation of a normal distribution whose tails are spoiled."""
     scale = float(np.sqrt(np.mean(values**2)))
     for _ in range(20):

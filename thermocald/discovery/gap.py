@@ -8,12 +8,11 @@ on a plane at 10 m.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.discovery.hypothesis import OSCILLATIONS, Laboratory
+from thermocald.discovery.hypothesis import OSCILLATIONS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,12 +20,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.discovery.evidence import Evidence
-    from thermocald.discovery.hypothesis import Fit, Term
+    from thermocald.discovery.hypothesis import Fit, Laboratory, Term
     from thermocald.discovery.image_space import Displaced
 
     Array = NDArray[np.float64]
 
-__all__ = ["Gap", "carried_over", "fit_first", "gap_of", "left_out"]
+__all__ = ["Gap", "carried_over", "fit_first", "gap_of", "rank"]
 
 _DISTANCE_MM = 10_000.0
 
@@ -125,7 +124,7 @@ def gap_of(
     targets = float((e.n.sum() > 0) * np.sum(e.weights[..., 0].any(axis=0)))
     # what a camera does within one block of a long series is no part of the comparison
     unused = e.blocks.within_free if e.blocks is not None else 0.0
-    free = max(coordinates - 2.0 * targets - _rank(e) - unused, 1.0)
+    free = max(coordinates - 2.0 * targets - rank(e) - unused, 1.0)
     # `slowed` has put correlated noise into the weights; the floor is that of single epochs
     k = e.correlation
     total = within + k * max(fit.chi2_of(series) - explained, 0.0)
@@ -144,7 +143,7 @@ def gap_of(
     return Gap(rms, chi2, _object_mm(e, rms))
 
 
-def _rank(evidence: Evidence) -> float:
+def rank(evidence: Evidence) -> float:
     """Levels that the series determines."""
     size = np.linalg.eigvalsh(evidence.N.sum(axis=0))
     return float(np.sum(size > 1e-9 * size[-1]))
@@ -175,40 +174,3 @@ def _moved(evidence: Evidence, displaced: Sequence[Displaced], known: bool) -> t
         total += weight * float(np.sum(np.where(inside, v, 0.0) ** 2))
         count += float(np.sum(inside))
     return total, count
-
-
-def left_out(laboratory: Laboratory, fit: Fit, blocks: int = 6) -> tuple[float, float]:
-    """Parameter χ² per degree of freedom on blocks of M1 that the fit did not see, and on M1.
-
-    Non-linear parameters stay; coefficients are fitted without the block, which has its own level.
-    """
-    e = laboratory.series[0]
-    edges = np.linspace(0, len(e.times), blocks + 1).astype(int)
-    outside = inside = 0.0
-    for begin, end in pairwise(edges):
-        block = np.zeros(len(e.times), dtype=bool)
-        block[begin:end] = True
-        x = Laboratory([_only(e, ~block)])
-        x.thermometer_factor = laboratory.thermometer_factor
-        terms = tuple(replace(t, fresh=t.fresh[:1]) for t in fit.terms)
-        trained = x.fit(terms, turns=2)
-        y = Laboratory([_only(e, block)])
-        y.thermometer_factor = laboratory.thermometer_factor
-        tested = y.fit(terms, trained.coefficients, turns=1)
-        outside += tested.chi2_of(0, trained.coefficients)
-        inside += tested.chi2_of(0, fit.coefficients[: len(trained.coefficients)])
-    rank = _rank(e)
-    free = max(rank * float((e.n > 0).sum()) - blocks * rank, 1.0)
-    return outside / free, inside / free
-
-
-def _only(evidence: Evidence, epochs: NDArray[np.bool_]) -> Evidence:
-    """The series with the weight of some epochs alone."""
-    w = epochs.astype(float)
-    return replace(
-        evidence,
-        N=evidence.N * w[:, None, None],
-        b=evidence.b * w[:, None],
-        yy=evidence.yy * w,
-        n=evidence.n * epochs,
-    )

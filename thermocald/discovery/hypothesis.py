@@ -136,6 +136,10 @@ class Laboratory:
         self._courses: dict[Any, tuple[Array, Array | None, str]] = {}
         self._drives: dict[Any, tuple[Array, Array]] = {}
 
+    def share_courses(self, other: Laboratory) -> None:
+        """Use the courses that a laboratory of the same histories has computed."""
+        self._courses, self._drives = other._courses, other._drives
+
     # -- courses ---------------------------------------------------------------------------
 
     def drive(self, terms: Sequence[Term], series: int) -> tuple[Array, Array]:

@@ -18,7 +18,7 @@ from thermocald.discovery.adequacy import cosines
 from thermocald.discovery.evidence import without_targets
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -99,7 +99,10 @@ def _steps(evidence: Evidence) -> tuple[Array, NDArray[np.int64], Array]:
 
 
 def displaced_targets(evidence: Evidence) -> tuple[list[Displaced], Evidence]:
-    """Targets that jumped, and the series without them."""
+    """Targets that jumped, and the series without them.
+
+    A marker jumps as a whole: where a few of its corners jump, it was badly seen, and is left out.
+    """
     found: dict[int, tuple[int, float]] = {}
     limit = _GAIN * evidence.correlation
     cleaned = evidence
@@ -122,10 +125,31 @@ def displaced_targets(evidence: Evidence) -> tuple[list[Displaced], Evidence]:
             found[int(row)] = (int(first[row]), float(gain[row]))
         if len(found) > 0.2 * evidence.source.grid.observed.any(axis=0).sum():
             return [], evidence  # so many do not jump by themselves: it is the camera
-        cleaned = without_targets(evidence, np.array(sorted(found)))
+        cleaned = without_targets(evidence, _with_their_markers(evidence, found))
     if not found:
         return [], evidence
-    return _grouped(cleaned, found), cleaned
+    whole = _whole_markers(evidence, found)
+    return _grouped(cleaned, whole) if whole else [], cleaned
+
+
+def _with_their_markers(evidence: Evidence, found: Iterable[int]) -> NDArray[np.int64]:
+    groups = evidence.source.field.groups
+    return np.flatnonzero(np.isin(groups, groups[sorted(found)]))
+
+
+def _whole_markers(
+    evidence: Evidence, found: dict[int, tuple[int, float]]
+) -> dict[int, tuple[int, float]]:
+    """The jumps without those that other corners of their marker did not make with them."""
+    groups = evidence.source.field.groups
+    seen = evidence.source.grid.observed.any(axis=0)
+    out = {}
+    for row, (first, gain) in found.items():
+        corners = np.flatnonzero((groups == groups[row]) & seen)
+        together = [r for r in corners.tolist() if r in found and abs(found[r][0] - first) <= 1]
+        if 4 * len(together) >= 3 * len(corners):
+            out[row] = (first, gain)
+    return out
 
 
 def _grouped(cleaned: Evidence, found: dict[int, tuple[int, float]]) -> list[Displaced]:

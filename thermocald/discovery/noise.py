@@ -1,8 +1,13 @@
 """Noise that the images' own sigmas do not know: correlated in time, or shared by neighbours.
 
 Correlation in time is seen in the residuals of single targets and makes slow courses less certain
-than their number of epochs says. Noise that neighbours share goes into the camera's parameters; it
-is seen in their jumps from epoch to epoch, once the courses have been explained.
+than their number of epochs says; corners of a marker, or of a board, err slowly together, and pull
+at some combinations of the parameters more than at others. Noise that neighbours share from epoch
+to epoch goes into the camera's parameters; it is seen in their jumps, once the courses have been
+explained.
+
+Source: Liang, Zeger (1986), Biometrika 73, 13-22, for covariances from clusters that err together;
+Bell, McCaffrey (2002), Survey Methodology 28, 169-181, for what the fit takes off their residuals.
 """
 
 from __future__ import annotations
@@ -12,6 +17,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.discovery.adequacy import ORDERS, cosines
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -20,7 +27,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["jumps", "slowed", "with_jumps"]
+__all__ = ["jumps", "slow_together", "slowed", "with_jumps"]
 
 _UNUSUAL = 1.7  # a variance from 170 second differences has 13 % of standard deviation
 
@@ -30,7 +37,55 @@ def slowed(evidence: Evidence) -> Evidence:
     k = evidence.correlation
     if k <= 1.0:
         return evidence
-    return replace(evidence, N=evidence.N / k, b=evidence.b / k, yy=evidence.yy / k)
+    factors, W = slow_together(evidence)
+    e = replace(evidence, N=evidence.N / k, b=evidence.b / k, yy=evidence.yy / k)
+    return with_jumps(e, factors / k, W) or e
+
+
+def slow_together(evidence: Evidence) -> tuple[Array, Array]:
+    """Variance of slow courses over that of white noise (P,), and the combinations W (P, P) it is
+    of, orthonormal under the mean normal matrix.
+
+    From what clusters of neighbouring targets leave over together in slow courses; what the fit
+    has taken off a cluster's residuals is put back, so that white noise gives 1.
+    """
+    M = evidence.N.mean(axis=0)
+    size, U = np.linalg.eigh(M)
+    good = size > 1e-6 * np.median(size)
+    W = U / np.sqrt(np.where(good, size, 1.0))
+    courses = cosines(evidence.history.times, ORDERS)
+    courses /= np.linalg.norm(courses, axis=1, keepdims=True)
+    weights = evidence.weights[..., :2]
+    v = np.nan_to_num(evidence.residuals) * weights
+    mean = weights.mean(axis=0)
+    total = np.zeros(M.shape)
+    for rows in _clusters(evidence):
+        A = (evidence.columns[rows] @ W).reshape(-1, len(M))
+        left, V = np.linalg.eigh(np.eye(len(M)) - A.T @ (A * mean[rows].reshape(-1, 1)))
+        pull = (courses @ v[:, rows].reshape(len(v), -1)) @ A
+        # what a cluster determines alone cannot be told from its residuals at all
+        pull = pull @ (V / np.sqrt(np.maximum(left, 0.05))) @ V.T
+        total += pull.T @ pull / len(courses)
+    total[~good] = 0.0
+    total[:, ~good] = 0.0
+    factors, turn = np.linalg.eigh(total)
+    return factors, W @ turn
+
+
+def _clusters(evidence: Evidence) -> list[NDArray[np.int64]]:
+    """Neighbouring targets of the field together, markers whole: some thirty clusters."""
+    from scipy.cluster.hierarchy import fcluster, linkage
+
+    field = evidence.source.field
+    used = np.flatnonzero((evidence.weights[..., 0] > 0).any(axis=0))
+    markers, member = np.unique(field.groups[used], return_inverse=True)
+    middle = np.stack([field.points[used[member == g]].mean(axis=0) for g in range(len(markers))])
+    count = int(np.clip(len(used) // 6, 8, 30))
+    if len(middle) > count:
+        label = fcluster(linkage(middle, "complete"), count, "maxclust")
+    else:
+        label = np.arange(len(middle))
+    return [used[label[member] == g] for g in np.unique(label)]
 
 
 def jumps(laboratory: Laboratory, fit: Fit, series: int) -> tuple[Array, Array]:

@@ -15,7 +15,8 @@ from thermocald.discovery.estimates import (
     term_estimates,
 )
 from thermocald.discovery.examination import Examination, examine_series
-from thermocald.discovery.gap import Gap, fit_first, gap_of, left_out
+from thermocald.discovery.gap import Gap, fit_first, gap_of
+from thermocald.discovery.left_out import left_out
 from thermocald.discovery.unnamed import describe_unnamed
 from thermocald.simulation import effects as catalogue
 
@@ -241,6 +242,7 @@ def _entry(x: Examination, fit: Fit, k: int, before: Gap, after: Gap, first: boo
         "absolute_test": [
             {"sigmas": float(a.significance), "misfit_px": float(a.misfit_px)} for a in x.adequacy
         ],
+        "left_out_blocks_gain": [float(g) for g in x.left_out[k - len(x.base.terms)]],
         "inflation_for_correlated_noise": e.correlation,
     }
     if len(x.adequacy) < 2:

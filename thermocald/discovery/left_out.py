@@ -1,0 +1,110 @@
+"""Blocks of time left out: does what was fitted to the rest predict them?
+
+Each series is cut into blocks; a block of every series is left out, the coefficients are fitted to
+the others, and the likelihood of the block is taken at them, with a level of its own. An effect
+that only follows the noise, or bends to a course that is not its own, predicts nothing.
+
+Source: cross-validation in blocks as Burman, Chow, Nolan (1994), Biometrika 81, 351-358.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.discovery.gap import rank
+from thermocald.discovery.hypothesis import Laboratory
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from thermocald.discovery.evidence import Evidence
+    from thermocald.discovery.hypothesis import Fit
+
+    Array = NDArray[np.float64]
+
+__all__ = ["confirmed", "gains", "left_out", "predictive"]
+
+BLOCKS = 6
+# -2 log L by which a block may be worse off for a cause that is one: of chance, and of what the
+# noise model does not know, as a share of all that the effect explains
+_WORSE, _WORSE_SHARE = 10.0, 0.02
+
+
+def predictive(
+    laboratory: Laboratory, fit: Fit, series: Sequence[int], blocks: int = BLOCKS
+) -> tuple[Array, Array]:
+    """χ² and -2 log likelihood (blocks,) of the blocks at coefficients fitted without them.
+
+    series: those that take part. Non-linear parameters stay as they are.
+    """
+    chi2, objective = np.zeros(blocks), np.zeros(blocks)
+    for k in range(blocks):
+        masks = [_block(e, k, blocks) for e in laboratory.series]
+        trained = _part(laboratory, [~m for m in masks]).fit(
+            fit.terms, fit.coefficients, 1, series
+        )
+        tested = _part(laboratory, masks).fit(fit.terms, fit.coefficients, 1, series)
+        for s in series:
+            value = tested.chi2_of(s, trained.coefficients)
+            chi2[k] += value
+            objective[k] += value + tested.reduced[s].logdet
+    return chi2, objective
+
+
+def gains(laboratory: Laboratory, fit: Fit, kept: int = 0) -> list[Array]:
+    """By how much each effect beyond the first `kept` improves the prediction of blocks (blocks,).
+
+    The others are fitted again without it; in -2 log likelihood, all series together.
+    """
+    every = range(len(laboratory.series))
+    whole = predictive(laboratory, fit, every)[1]
+    out = []
+    for i in range(kept, len(fit.terms)):
+        fewer = laboratory.fit([t for j, t in enumerate(fit.terms) if j != i])
+        out.append(predictive(laboratory, laboratory.refine(fewer), every)[1] - whole)
+    return out
+
+
+def confirmed(gain: Array) -> bool:
+    """A cause predicts blocks it has not seen, and makes none of them worse."""
+    total = float(gain.sum())
+    return total > 0 and float(gain.min()) > -(_WORSE + _WORSE_SHARE * total)
+
+
+def left_out(laboratory: Laboratory, fit: Fit) -> tuple[float, float]:
+    """Parameter χ² per degree of freedom on blocks of M1 that the fit did not see, and on M1."""
+    e = laboratory.series[0]
+    outside = float(predictive(laboratory, fit, [0])[0].sum())
+    free = rank(e) * float((e.n > 0).sum())
+    return outside / max(free - BLOCKS * rank(e), 1.0), fit.chi2_of(0) / max(free - rank(e), 1.0)
+
+
+def _block(evidence: Evidence, number: int, blocks: int) -> NDArray[np.bool_]:
+    edges = np.linspace(0, len(evidence.times), blocks + 1).astype(int)
+    inside = np.zeros(len(evidence.times), dtype=bool)
+    inside[edges[number] : edges[number + 1]] = True
+    return inside
+
+
+def _part(laboratory: Laboratory, masks: Sequence[NDArray[np.bool_]]) -> Laboratory:
+    """The laboratory with the weight of some epochs alone; courses are the same."""
+    part = Laboratory([_only(e, m) for e, m in zip(laboratory.series, masks, strict=True)])
+    part.thermometer_factor = laboratory.thermometer_factor
+    part.share_courses(laboratory)
+    return part
+
+
+def _only(evidence: Evidence, epochs: NDArray[np.bool_]) -> Evidence:
+    w = epochs.astype(float)
+    return replace(
+        evidence,
+        N=evidence.N * w[:, None, None],
+        b=evidence.b * w[:, None],
+        yy=evidence.yy * w,
+        n=evidence.n * epochs,
+    )

@@ -39,9 +39,10 @@ def api_wanted() -> bool:
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """Put the generated pages where the navigation says `generated: …`."""
+    packages = reference.packages() if api_wanted() else []
     pages: Mapping[str, list[Any]] = {
         "examples": [f"examples/{path.stem}.md" for path in notebooks.found()],
-        "api": [f"reference/api/{name}.md" for name in reference.packages()] if api_wanted() else [],
+        "api": [f"reference/api/{name}.md" for name in packages],
     }
     config.nav = _filled(config.nav, pages)
     if not api_wanted():

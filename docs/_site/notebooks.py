@@ -30,8 +30,7 @@ def pages() -> dict[str, str | bytes]:
                 parts.append(source)
                 continue
             parts.append(f"```python\n{source}\n```")
-            for output in cell["outputs"]:
-                parts.append(_shown(output, path.stem, contents))
+            parts += [_shown(output, path.stem, contents) for output in cell["outputs"]]
         parts.insert(1, f"*This page is the notebook `examples/{path.name}` as it ran.*")
         contents[f"examples/{path.stem}.md"] = "\n\n".join(parts) + "\n"
     return contents

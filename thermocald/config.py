@@ -205,13 +205,14 @@ class OutputConfig(DeviceConfig):
 class CameraConfig(DeviceConfig):
     """A camera, what is known of it, and what it looks at.
 
+    series: what it takes when no session runs, None for nothing: the device is closed then.
     thermometers: by name, the first is the reference; testfield: None if epochs are only
     acquired; calibration: what differs from the common settings is given in full.
     """
 
     period_s: Period = 10.0
     """Time between frames."""
-    series: Name = "M1"
+    series: Name | None = "watch"
     """Name of the measurement series."""
     sensor: SensorConfig | None = None
     """Size of the image and of a pixel."""

@@ -15,7 +15,8 @@ def test_a_series_becomes_a_recording(filled, tmp_path, make_epoch):
     store, series = filled
     archive_series(store, series, tmp_path / "M1")
     recording = read_recording(tmp_path / "M1")
-    assert recording.head == series.head
+    assert replace(recording.head, extra={}) == series.head
+    assert recording.head.extra == {"start": "cold", "device": {"serial": "x1"}}
     assert recording.testfield.names == series.testfield.names
     for epoch, made in zip(recording.epochs, map(make_epoch, range(1, 21)), strict=True):
         assert (epoch.number, epoch.temperatures) == (made.number, made.temperatures)

@@ -24,6 +24,7 @@ class DeviceLoop:
 
     `action` is called with the device open and raises what the device raises. `lost` counts ticks
     in which the device gave nothing. free_running: without a rhythm, as fast as `action` returns.
+    idle: asked at every tick; while it says so, the device is closed and left alone.
     """
 
     def __init__(
@@ -35,6 +36,7 @@ class DeviceLoop:
         begin: float,
         *,
         free_running: bool = False,
+        idle: Callable[[], bool] = lambda: False,
     ) -> None:
         self.link = link
         self.schedule = Schedule(clock, period_s, begin)
@@ -42,6 +44,7 @@ class DeviceLoop:
         self.lost = 0
         self._action = action
         self._free_running = free_running
+        self._idle = idle
         self._clock = clock
         self._stop = threading.Event()
         self._busy_since: float | None = None
@@ -79,7 +82,9 @@ class DeviceLoop:
                 if not self._free_running and self.schedule.wait(self._stop) is None:
                     break
                 self._busy_since = self._clock.monotonic()
-                if self.link.call(self._act):
+                if self._idle():
+                    self.link.rest()
+                elif self.link.call(self._act):
                     self.done += 1
                 else:
                     self.lost += 1

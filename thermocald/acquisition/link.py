@@ -108,6 +108,11 @@ class Link:
         if not self.ended:
             self.state = "closed"
 
+    def rest(self) -> None:
+        """Release a device that is not needed for now; one that is away stays so."""
+        if self.state == "open":
+            self.close()
+
     def identity(self) -> dict[str, Any]:
         """What the device says it is; empty if it cannot say."""
         try:

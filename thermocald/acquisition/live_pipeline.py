@@ -136,6 +136,11 @@ class LivePipeline:
         with self._changed:
             return self._changed.wait_for(lambda: len(self._items) < self._depth, timeout_s)
 
+    def drain(self, timeout_s: float) -> bool:
+        """Wait until all that was submitted is calibrated and handed over to be kept."""
+        with self._changed:
+            return self._changed.wait_for(lambda: not self._items and not self._amended, timeout_s)
+
     def stop(self, grace_s: float) -> bool:
         """Finish the epoch in hand, keep the others as they are; False if that took too long."""
         with self._changed:
@@ -242,6 +247,7 @@ class LivePipeline:
         with self._changed:
             while True:
                 if self._amended:
+                    self._changed.notify_all()
                     return self._amended.popleft()
                 if self._items:
                     first = self._items[0]

@@ -1,8 +1,7 @@
-"""`thermocald session start`: from a plugged-in camera to epochs, a recording and the report."""
+"""`thermocald session`: from a plugged-in camera to epochs, a recording and the report."""
 
 from __future__ import annotations
 
-import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,43 +9,44 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from thermocald.cli.common import say
-from thermocald.errors import ConfigurationError, DataError, DeviceError, UsageError
+from thermocald.cli.common import say, write_json
+from thermocald.cli.options import JsonOption
+from thermocald.errors import ConfigurationError, DataError, UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from thermocald.config import CameraConfig, Config
-    from thermocald.daemon.station import Station
+    from thermocald.config import Config
+    from thermocald.daemon.session import Session
 
 __all__ = ["register"]
 
-_BLURRED_PX = 3.0
-_SATURATED = 0.02
-_LOW_CONTRAST = 30.0
-_LINE_EVERY_S = 10.0
+_LOOK_EVERY_S = 0.5
+_WAIT_FOR_DAEMON_S = 300.0
+
+ConfigOption = Annotated[
+    Path | None, typer.Option("--config", "-c", help="The configuration [config.yaml].")
+]
+CameraOption = Annotated[
+    str | None, typer.Option("--camera", help="Which of the configuration's cameras.")
+]
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     sessions = typer.Typer(help="One measurement series, from the check to the report.")
     sessions.command("start")(start)
-    sessions.callback()(lambda: None)
+    sessions.command("status")(status)
+    sessions.command("stop")(stop)
     app.add_typer(sessions, name="session")
 
 
 def start(
-    camera: Annotated[
-        str | None, typer.Option("--camera", help="Which of the configuration's cameras.")
-    ] = None,
+    camera: CameraOption = None,
     series: Annotated[str, typer.Option("--series", help="Name of the series; resumes it.")] = "M1",
     condition: Annotated[
         str, typer.Option("--start", help="Start condition, such as cold or warm.")
     ] = "",
     epochs: Annotated[int, typer.Option("--epochs", min=1, help="How many epochs.")] = 150,
-    config: Annotated[
-        Path | None, typer.Option("--config", "-c", help="The configuration [config.yaml].")
-    ] = None,
+    config: ConfigOption = None,
     mock: Annotated[bool, typer.Option("--mock", help="Without hardware.")] = False,
     programme: Annotated[
         Path | None, typer.Option("--programme", help="Steps of a heating output: YAML list.")
@@ -60,44 +60,63 @@ def start(
     report: Annotated[
         bool, typer.Option("--report/--no-report", help="End with the study's report.")
     ] = True,
+    wait: Annotated[
+        bool, typer.Option("--wait/--no-wait", help="Wait for a daemon to take all epochs.")
+    ] = True,
 ) -> None:
     """Take a series of epochs with progress, then write its recording and its report.
 
+    A daemon that runs with this configuration takes them; where none runs, this command does.
     Interrupted, the same command goes on where it stopped.
 
     Example: thermocald session start --camera phone-1 --series M1 --start cold --epochs 150
     """
-    from thermocald.daemon.journal import set_up_logging
-    from thermocald.daemon.service import Service
+    from thermocald.cli.session_desk import take_on_the_desk
 
-    read = _prepare(_configuration(config, mock), camera, series, programme)
-    one = read.cameras[0]
-    path = output / f"{one.name}-{series}"
+    read = _configuration(config, mock)
+    session = _session(read, camera, series, condition, epochs, programme, check)
+    path = output / f"{session.camera}-{series}"
     if path.exists():
         raise DataError(f"{path}: the recording exists already; choose another --series")
-    output.mkdir(parents=True, exist_ok=True)
-    done = _stored(read, one)
-    set_up_logging("warning")
-    if done < epochs:
-        if check:
-            _check(read)
-        if done:
-            say(f"series {series} has {done} epochs; {epochs - done} are still to be taken")
-        progress = _Progress(epochs, done)
-        service = Service(
-            read,
-            epochs=epochs - done,
-            until_finished=True,
-            start_condition=condition,
-            on_turn=progress.turn,
-        )
-        service.run()
-        done = _stored(read, one)
-    if done < epochs:
-        raise DataError(
-            f"series {series} has {done} of {epochs} epochs; the same command goes on from there"
-        )
-    _finish(read, one, path, report)
+    folder = None if mock else _daemon(read)
+    if folder is None:
+        output.mkdir(parents=True, exist_ok=True)
+        read = take_on_the_desk(read, session)
+    else:
+        _take_in_the_daemon(folder, session, wait)
+        if not wait:
+            return
+        output.mkdir(parents=True, exist_ok=True)
+    _finish(read, session, path, report)
+
+
+def status(config: ConfigOption = None, json: JsonOption = None) -> None:
+    """The sessions of a running daemon: under way, or the last that ended.
+
+    Example: thermocald session status --config /etc/thermocald/config.yaml
+    """
+    sessions = _ask(config, "session status")["sessions"]
+    if json is not None:
+        write_json({"format": "thermocald-sessions/1", "sessions": sessions}, json)
+    if json == "-":
+        return
+    for name, one in sessions.items():
+        why = f": {one['why']}" if one["why"] else ""
+        start = f" ({one['start']})" if one["start"] else ""
+        taken = f"{one['taken']} of {one['epochs']}"
+        say(f"{name}/{one['series']}{start}: {taken}, {one['state']}{why}")
+    if not sessions:
+        say("no sessions")
+
+
+def stop(camera: CameraOption = None, config: ConfigOption = None) -> None:
+    """End a session of a running daemon before its time; what was taken stays.
+
+    Example: thermocald session stop --camera phone-1
+    """
+    name = camera or _only_camera(_configuration(config, False))
+    told = _ask(config, "session stop", camera=name)["session"]
+    say(f"{name}/{told['series']}: {told['taken']} of {told['epochs']} epochs, stopped")
 
 
 def _configuration(config: Path | None, mock: bool) -> Config:
@@ -116,153 +135,112 @@ def _configuration(config: Path | None, mock: bool) -> Config:
     return load_config(path, option_names)
 
 
-def _prepare(config: Config, camera: str | None, series: str, programme: Path | None) -> Config:
-    """The configuration with one camera, its thermometers, and the series' name."""
+def _only_camera(config: Config) -> str:
     names = [c.name for c in config.cameras]
-    if camera is None and len(names) != 1:
+    if len(names) != 1:
         raise UsageError(f"which camera? give --camera, one of: {', '.join(names) or 'none'}")
-    if camera is not None and camera not in names:
+    return names[0]
+
+
+def _session(
+    config: Config, camera: str | None, series: str, condition: str, epochs: int,
+    programme: Path | None, check: bool,
+) -> Session:  # fmt: skip
+    from pydantic import ValidationError
+
+    from thermocald.daemon.session import Session
+
+    names = [c.name for c in config.cameras]
+    if camera is None:
+        camera = _only_camera(config)
+    if camera not in names:
         raise UsageError(f"there is no camera {camera!r}; there are: {', '.join(names) or 'none'}")
-    one = config.cameras[names.index(camera) if camera else 0]
-    document = config.model_dump(mode="python", by_alias=True)
-    chosen = next(c for c in document["cameras"] if c["name"] == one.name)
-    chosen["series"] = series
-    document["cameras"] = [chosen]
-    document["thermometers"] = [
-        t for t in document["thermometers"] if t["name"] in one.thermometers
-    ]
-    if programme is not None:
-        _use_programme(document["outputs"], programme)
-    from thermocald.config import parse_config
-
-    return parse_config(document, Path("config.yaml"))
+    steps = [] if programme is None else _steps(programme)
+    asked = {"camera": camera, "series": series, "start": condition, "epochs": epochs}
+    try:
+        return Session.model_validate({**asked, "programme": steps, "check": check})
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise UsageError(f"--{key}: {first['msg']}") from error
 
 
-def _use_programme(outputs: list[dict[str, Any]], path: Path) -> None:
-    from thermocald.hal import option_names
+def _steps(path: Path) -> list[Any]:
     from thermocald.yaml_file import read_yaml
 
-    document = read_yaml(path, ConfigurationError)
-    if not isinstance(document.get("programme"), list):
+    steps = read_yaml(path, ConfigurationError).get("programme")
+    if not isinstance(steps, list) or not steps:
         raise ConfigurationError(f"{path}: must hold `programme:`, a list of steps")
-    takers = [o for o in outputs if "programme" in option_names("output", o["driver"])]
-    if not takers:
-        raise ConfigurationError("--programme: no output of the configuration heats")
-    for taker in takers:
-        taker["programme"] = document["programme"]
+    return [
+        {key: float(v) if isinstance(v, int) else v for key, v in step.items()}
+        if isinstance(step, dict)
+        else step
+        for step in steps
+    ]
 
 
-def _stored(config: Config, one: CameraConfig) -> int:
-    from thermocald.store.database import Store
+def _daemon(config: Config) -> Path | None:
+    """The live folder of the daemon that listens for this configuration's store."""
+    from thermocald.daemon.control import ask
+    from thermocald.daemon.live_state import find_state
 
-    if not config.store.path.exists():
-        return 0
-    with Store.open(config.store.path) as store:
-        for found in store.all_series():
-            if (found.camera, found.name) == (one.name, one.series):
-                return store.last_epoch(found) or 0
-    return 0
+    folder = find_state(config.store.path)
+    return None if ask(folder, "session status") is None else folder
 
 
-def _check(config: Config) -> None:
-    """One frame and one reading; DataError says what is to be mended first."""
-    from thermocald.daemon.plan import plan_cameras
-    from thermocald.hal import SystemClock, open_device
+def _ask(config: Path | None, do: str, **values: Any) -> dict[str, Any]:
+    from thermocald.daemon.control import ask
+    from thermocald.daemon.live_state import find_state
 
-    clock = SystemClock()
-    for one in config.thermometers:
-        with open_device("thermometer", one.driver, one.options, clock) as thermometer:
-            values = thermometer.read().values
-        say(f"{one.name}: " + ", ".join(f"{k} {v:.2f} °C" for k, v in values.items()))
-    plan = plan_cameras(config, clock)[0]
-    if plan.calibrator is None or plan.testfield is None:
-        raise ConfigurationError(f"camera {plan.name!r}: a session needs its `testfield`")
-    from thermocald.acquisition.pairing import PairedReadings
-    from thermocald.acquisition.pipeline import calibrate_frame, make_epoch
-
-    with plan.camera as camera:
-        frame = camera.capture()
-    nothing = PairedReadings(float("nan"), {}, float("nan"))
-    calibrated = calibrate_frame(plan.calibrator, make_epoch(1, frame, nothing), frame)
-    result = calibrated.adjustment
-    seen = calibrated.epoch.observations
-    if seen is not None and len(seen):
-        blur = calibrated.extra.get("blur_px")
-        say(
-            f"{plan.name}: {len(seen)} of {len(plan.testfield)} targets"
-            + ("" if blur is None else f", blur {blur:.2f} px")
-        )
-        for sentence in _remarks(plan.testfield.names, seen.targets, seen.quality):
-            say(f"  {sentence}")
-    if not result.ok:
-        raise DataError(f"the check failed: {result.status}: {result.reason}")
-    say(
-        f"{plan.name}: sigma0 {result.sigma0:.2f}, c {result.values[0]:.4f} ± {result.sd[0]:.4f} mm"
-    )
+    read = _configuration(config, False)
+    told = ask(find_state(read.store.path), do, **values)
+    if told is None:
+        raise DataError(f"no daemon listens for {read.store.path}; is it running?")
+    return told
 
 
-def _remarks(names: tuple[str, ...], targets: Any, quality: dict[str, Any]) -> Iterator[str]:
-    """What a person can mend: light and focus, target by target."""
-    rules: tuple[tuple[str, Callable[[float], bool], str], ...] = (
-        ("saturation", lambda v: v > _SATURATED, "saturated: less light, or a shorter exposure"),
-        ("blur", lambda v: v > _BLURRED_PX, "blurred: focus, or hold the camera still"),
-        ("contrast", lambda v: abs(v) < _LOW_CONTRAST, "of low contrast: more light"),
-    )
-    for key, bad, words in rules:
-        if key not in quality:
+def _take_in_the_daemon(folder: Path, session: Session, wait: bool) -> None:
+    """Have a running daemon take the session, and look on."""
+    from thermocald.cli.session_progress import Progress
+    from thermocald.daemon.control import ask
+
+    told = ask(folder, "session start", session=session.model_dump(mode="json"))
+    if told is None:
+        raise DataError("the daemon ended just now; give the command again")
+    say(f"{session.camera}/{session.series}: taken by the daemon; Ctrl-C leaves it to that")
+    if not wait:
+        return
+    progress, seen, away_since = Progress(session.epochs), 0, 0.0
+    while True:
+        time.sleep(_LOOK_EVERY_S)
+        told = ask(folder, "session status")
+        if told is None:
+            if not away_since:
+                away_since = time.monotonic()
+                say("the daemon does not answer; it goes on when it is back")
+            if time.monotonic() - away_since > _WAIT_FOR_DAEMON_S:
+                raise DataError("the daemon is gone; when it runs again the session goes on")
             continue
-        rows = [int(t) for t, v in zip(targets, quality[key], strict=True) if bad(v)]
-        if rows:
-            shown = ", ".join(names[row] for row in rows[:5])
-            more = f" and {len(rows) - 5} more" if len(rows) > 5 else ""
-            yield f"target {shown}{more}: {words}"
-
-
-class _Progress:
-    """Live numbers: a line that is rewritten on a terminal, some lines otherwise."""
-
-    def __init__(self, total: int, done: int) -> None:
-        self._total = total
-        self._shown = done
-        self._told = float("-inf")
-        self._out = False
-
-    def turn(self, station: Station) -> None:
-        """Called by the service a few times a second."""
-        camera = station.cameras[0]
-        out = camera.link.state == "out"
-        if out and not self._out:
-            say(f"paused: {camera.link.why}")
-        if self._out and not out:
-            say("the camera is back")
-        self._out = out
-        if camera.link.error is not None and camera.link.state == "failed":
-            raise DeviceError(f"camera {camera.plan.name}: {camera.link.why}")
-        last = camera.last
-        if not last or last["epoch"] <= self._shown:
+        away_since = 0.0
+        one = told["sessions"].get(session.camera, {})
+        if one.get("series") != session.series:
+            raise DataError("the daemon ended before the session began; give the command again")
+        for sentence in one["found"][seen:]:
+            say(sentence)
+        seen = max(seen, len(one["found"]))
+        progress.show(one.get("last", {}), one["why"] if one["state"] == "paused" else "")
+        if one["state"] == "done":
             return
-        self._shown = last["epoch"]
-        line = f"epoch {last['epoch']} of {self._total}: {last['temperature']:.2f} °C"
-        if last["status"] == "ok":
-            line += f", c {last['c']:.4f} ± {last['sd_c']:.4f} mm, sigma0 {last['sigma0']:.2f}"
-            line += f", {last['online'].get('sentence', '')}"
-        else:
-            line += f", {last['status']}: {last['reason']}"
-        now = time.monotonic()
-        if sys.stderr.isatty():
-            sys.stderr.write(f"\r\x1b[K{line}")
-            sys.stderr.flush()
-        elif now - self._told >= _LINE_EVERY_S or self._shown == self._total:
-            self._told = now
-            say(line)
+        if one["state"] in ("refused", "stopped"):
+            raise DataError(f"{one['taken']} of {one['epochs']} epochs: {one['why']}")
 
 
-def _finish(config: Config, one: CameraConfig, path: Path, report: bool) -> None:
+def _finish(config: Config, session: Session, path: Path, report: bool) -> None:
     from thermocald.store.archive import archive_series
     from thermocald.store.database import Store
 
     with Store.open(config.store.path) as store:
-        found = store.find_series(one.name, one.series)
+        found = store.find_series(session.camera, session.series)
         archive_series(store, found, path, config.frames.folder)
         status = store.series_columns(found, ["status"])["status"]
     say(f"\nrecording: {path} ({int(np.sum(status == 'ok'))} of {len(status)} epochs calibrated)")
@@ -273,6 +251,6 @@ def _finish(config: Config, one: CameraConfig, path: Path, report: bool) -> None
     from thermocald.output.study_report import render_report, write_report
 
     target = path.with_suffix(".html")
-    title = f"{one.name}, series {one.series}"
+    title = f"{session.camera}, series {session.series}"
     write_report(target, render_report(study(load_series(path)), title))
     say(f"report: {target}")

@@ -113,6 +113,7 @@ def render(document: dict[str, Any]) -> RenderableType:
     for name, camera in document["cameras"].items():
         cameras.add_row(*_camera(name, camera))
     parts.append(cameras)
+    parts += [Text(_session(one)) for one in document["sessions"].values()]
     others = Table(box=None, pad_edge=False)
     for title in ("device", "state", "faults", "why"):
         others.add_column(title)
@@ -142,7 +143,7 @@ def _camera(name: str, camera: dict[str, Any]) -> list[str]:
     if last and last.get("status") != "ok":
         state = f"{last['status']}: {last.get('reason', '')}"
     return [
-        f"{name}/{camera['series']}",
+        f"{name}/{camera['series']}" if camera["series"] else name,
         camera["device"],
         str(last.get("epoch", "")),
         _number(last.get("temperature"), ".2f"),
@@ -153,6 +154,15 @@ def _camera(name: str, camera: dict[str, Any]) -> list[str]:
         str(camera["skipped"]),
         f"{1000 * camera['late_p99_s']:.1f} ms",
     ]
+
+
+def _session(one: dict[str, Any]) -> str:
+    why = f": {one['why']}" if one["why"] else ""
+    start = f", {one['start']}" if one["start"] else ""
+    return (
+        f"session {one['camera']}/{one['series']}{start}: {one['taken']} of {one['epochs']} epochs, "
+        f"{one['state']}{why}"
+    )
 
 
 def _with_sd(last: dict[str, Any], name: str) -> str:

@@ -64,7 +64,7 @@ class EpochKeeper:
         found = [
             s
             for s in self._guard.store.all_series()
-            if (s.camera, s.name) == (self.plan.name, self.plan.config.series)
+            if (s.camera, s.name) == (self.plan.name, self.plan.series)
         ]
         if not found:
             return None
@@ -97,7 +97,7 @@ class EpochKeeper:
         path = None
         if self._frames.wanted(epoch.number, eventful) or put_off:
             path = self._frames.keep(
-                self.plan.name, self.plan.config.series, epoch.number, acquired.frame
+                self.plan.name, self.plan.series, epoch.number, acquired.frame
             )
             self.kept_frames += path is not None
         if calibrated is not None:
@@ -185,7 +185,7 @@ class EpochKeeper:
                 Event(
                     acquired.frame.utc,
                     "series_begun",
-                    f"camera {self.plan.name}: series {self.plan.config.series} begins",
+                    f"camera {self.plan.name}: series {self.plan.series} begins",
                     self._series.id,
                     acquired.number,
                 )
@@ -204,7 +204,7 @@ def result_row(
     reference = next(iter(epoch.temperatures.values()), math.nan)
     row: dict[str, Any] = {
         "device": plan.name,
-        "series": plan.config.series,
+        "series": plan.series,
         "epoch": epoch.number,
         "frame_time": epoch.frame_time,
         "temperature_time": epoch.temperature_time,

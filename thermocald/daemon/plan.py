@@ -32,7 +32,8 @@ _UNKNOWN_PITCH_MM = 0.001
 class CameraPlan:
     """One camera of the configuration, ready to be started.
 
-    sensor, testfield, calibrator: None if its epochs are only acquired.
+    series: the one being taken, empty for none; sensor, testfield, calibrator: None if its epochs
+    are only acquired.
     """
 
     config: CameraConfig
@@ -41,6 +42,7 @@ class CameraPlan:
     sensor: Sensor | None
     testfield: TestField | None
     calibrator: Calibrator | None
+    series: str
 
     @property
     def name(self) -> str:
@@ -76,7 +78,7 @@ def _plan(config: Config, one: CameraConfig, clock: Clock) -> CameraPlan:
             interior=_held(one, calibration),
             sigma_floor_px=calibration.sigma_floor_px,
         )
-    return CameraPlan(one, calibration, camera, sensor, field, calibrator)
+    return CameraPlan(one, calibration, camera, sensor, field, calibrator, one.series or "")
 
 
 def _sensor(one: CameraConfig) -> Sensor | None:
@@ -122,8 +124,8 @@ def series_head(
         extra["pixel_pitch_unknown"] = True
     spec = CameraSpec(plan.name, sensor, plan.config.principal_distance_mm, None)
     head = Head(
-        name=f"{plan.name}-{plan.config.series}",
-        series=plan.config.series,
+        name=f"{plan.name}-{plan.series}",
+        series=plan.series,
         interval=plan.config.period_s,
         camera=spec,
         channels={name: Channel() for name in channels},
@@ -147,6 +149,6 @@ def check_series(plan: CameraPlan, field: TestField) -> None:
     """Raise ConfigurationError if a series that goes on would change its test field."""
     if plan.testfield is not None and not _same_field(plan.testfield, field):
         raise ConfigurationError(
-            f"camera {plan.name!r}: series {plan.config.series!r} was begun with another test "
+            f"camera {plan.name!r}: series {plan.series!r} was begun with another test "
             "field; give the series another name"
         )

@@ -8,17 +8,20 @@ from __future__ import annotations
 
 import logging
 import os
+import queue
 import signal
 import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import Future
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from thermocald import __version__
 from thermocald.acquisition.steady_clock import SteadyClock
 from thermocald.config import load_config
+from thermocald.daemon.control import ControlSocket, StartRequest, StopRequest
 from thermocald.daemon.live_state import LiveState
 from thermocald.daemon.notify import (
     notify,
@@ -26,9 +29,10 @@ from thermocald.daemon.notify import (
     notify_reloading,
     watchdog_interval_s,
 )
+from thermocald.daemon.session import Sessions
 from thermocald.daemon.station import Station
 from thermocald.daemon.store_guard import StoreGuard
-from thermocald.errors import ThermocaldError
+from thermocald.errors import DataError, ThermocaldError
 from thermocald.hal import option_names
 from thermocald.store.row import Event
 
@@ -37,6 +41,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from thermocald.config import Config
+    from thermocald.daemon.control import Request
 
 __all__ = ["Service"]
 
@@ -45,6 +50,7 @@ log = logging.getLogger(__name__)
 _TURN_S = 0.25
 _STATUS_EVERY_S = 1.0
 _GRACE_S = 20.0
+_ANSWER_S = 45.0
 _SWITCH_INTERVAL_S = 0.0005  # of the interpreter: a tick must not wait 5 ms for a calculation
 
 
@@ -52,7 +58,8 @@ class Service:
     """One daemon in this process.
 
     path: of the configuration, which SIGHUP reads again; until_finished: end when all recordings
-    have been played or all epochs taken. Other arguments as `Station`.
+    have been played or all epochs taken; else it takes requests at its control socket. Other
+    arguments as `Station`.
     """
 
     def __init__(
@@ -86,6 +93,7 @@ class Service:
         self._complained: list[str] = []
         self._dashboard: subprocess.Popen[bytes] | None = None
         self._dashboard_at = 0.0
+        self._inbox: queue.SimpleQueue[tuple[Request, Future[dict[str, Any]]]] = queue.SimpleQueue()
 
     def run(self) -> bool:
         """Work until told to end; True if everything let go, False if a device hangs.
@@ -95,10 +103,16 @@ class Service:
         sys.setswitchinterval(_SWITCH_INTERVAL_S)
         self._guard = StoreGuard(self.config.store.path, durable=self.config.store.durable)
         done = False
+        control = ControlSocket(self.live.folder, self._ask)
         try:
+            self._sessions = Sessions(self._guard, self.clock)
             self._station = self._build(self.config)
+            if not self._until_finished:
+                self._sessions.resume(self._station)
             with self._signals():
                 self._station.start()
+                if not self._until_finished:
+                    control.open()
                 log.info("thermocald %s runs", __version__, extra={"event": "started"})
                 self._tell("started", f"thermocald {__version__} started")
                 notify_ready(self._line())
@@ -106,6 +120,7 @@ class Service:
                     self._loop()
                 finally:
                     notify("STOPPING=1")
+                    control.close()
                     done = self._station.stop(_GRACE_S)
                     self._stop_dashboard()
                     self._tell("stopped", "thermocald stopped")
@@ -122,11 +137,14 @@ class Service:
         turn_s = _TURN_S if interval is None else min(_TURN_S, interval)
         fed = written = float("-inf")
         while not self._end:
-            self._wake.wait(turn_s)
+            if self._wake.wait(turn_s):
+                self._wake.clear()
             now = time.monotonic()
             if self._reload:
                 self._reload = False
                 self._reload_configuration()
+            self._answer_requests()
+            self._sessions.turn(self._station)
             if (step := self.clock.check()) is not None:
                 data = {"seconds": step.seconds, "adopted": step.adopted}
                 self._guard.event(Event(step.utc, "clock_step", step.text, data=data))
@@ -158,14 +176,49 @@ class Service:
             "clock": {"trusted": self.clock.trusted(), "error_s": self.clock.error_s},
             "store": {**self._guard.status(), "path": str(self.config.store.path.absolute())},
             "stalled": self._station.stalled(),
+            "sessions": self._sessions.status(self._station),
             **self._station.status(),
         }
+
+    def _ask(self, request: Request) -> dict[str, Any]:
+        """For the control socket's thread: have a request answered by the service's."""
+        future: Future[dict[str, Any]] = Future()
+        self._inbox.put((request, future))
+        self._wake.set()
+        try:
+            return future.result(_ANSWER_S)
+        except TimeoutError:
+            raise DataError("the daemon is busy; look at its status, and ask again") from None
+
+    def _answer_requests(self) -> None:
+        while not self._inbox.empty():
+            request, future = self._inbox.get()
+            try:
+                future.set_result(self._answer(request))
+            except ThermocaldError as error:
+                future.set_exception(error)
+            except Exception as error:
+                # whoever asks must not be able to end the daemon
+                log.exception("a request could not be answered")
+                future.set_exception(DataError(f"the daemon could not: {error}"))
+
+    def _answer(self, request: Request) -> dict[str, Any]:
+        if isinstance(request, StartRequest):
+            return {"session": self._sessions.start(self._station, request.session)}
+        if isinstance(request, StopRequest):
+            return {"session": self._sessions.stop(self._station, request.camera)}
+        if request.do == "retention":
+            return {"deleted": self._station.retain()}
+        return {"sessions": self._sessions.status(self._station)}
 
     def _line(self) -> str:
         """The status line of `systemctl status`."""
         parts = []
         for camera in self._station.cameras:
-            last = camera.last
+            last = {} if camera.run is None else camera.run.last
+            if not camera.taking:
+                parts.append(f"{camera.plan.name}: idle")
+                continue
             if camera.link.state != "open" or not last:
                 parts.append(f"{camera.plan.name}: {camera.link.why or camera.link.state}")
                 continue
@@ -209,6 +262,7 @@ class Service:
             log.error("a device does not let go; it may not be there for a while")
         # numbers go on after what the old station kept to its end
         new = self._build(config)
+        self._sessions.resume(new)
         logging.getLogger().setLevel(config.logging.level.upper())
         self.config, self._station = config, new
         new.start()

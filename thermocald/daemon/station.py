@@ -17,133 +17,34 @@ from typing import TYPE_CHECKING, Any
 from thermocald.acquisition.device_loop import DeviceLoop
 from thermocald.acquisition.frame_folder import FrameFolder
 from thermocald.acquisition.link import Link
-from thermocald.acquisition.live_pipeline import LivePipeline
 from thermocald.acquisition.pairing import Readings
-from thermocald.daemon.epoch_keeper import EpochKeeper
+from thermocald.daemon.camera_line import CameraLine, link_status
 from thermocald.daemon.output_loop import OutputLoop
 from thermocald.daemon.plan import plan_cameras
-from thermocald.hal import open_device
+from thermocald.errors import ConfigurationError
+from thermocald.hal import open_device, option_names
 from thermocald.store.row import Event
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping, Sequence
 
-    from thermocald.acquisition.calibrator import CalibratedEpoch
     from thermocald.acquisition.link import LinkEvent
-    from thermocald.acquisition.live_pipeline import AcquiredEpoch
     from thermocald.acquisition.steady_clock import SteadyClock
-    from thermocald.config import Config
+    from thermocald.config import Config, OutputConfig
+    from thermocald.daemon.epoch_keeper import EpochKeeper
     from thermocald.daemon.live_state import LiveState
     from thermocald.daemon.plan import CameraPlan
     from thermocald.daemon.store_guard import StoreGuard
     from thermocald.hal import Thermometer
     from thermocald.store.row import StoredSeries
 
-__all__ = ["CameraLine", "Station"]
+__all__ = ["Station"]
 
 log = logging.getLogger(__name__)
 
 _RETENTION_EVERY_S = 600.0
 _RETENTION_WHEN_FULL_S = 10.0
 _LEAD_S = 0.1
-_PREVIEW_EVERY_S = 5.0
-_SHOW_EVERY_S = 0.5
-
-
-class CameraLine:
-    """One camera from its loop to the store."""
-
-    def __init__(self, plan: CameraPlan, station: Station, begin: float) -> None:
-        self.plan = plan
-        self._station = station
-        self._device = plan.camera
-        self.link = Link(
-            "camera",
-            plan.name,
-            plan.camera,
-            station.clock,
-            period_s=plan.config.period_s,
-            on_event=station.on_link_event,
-        )
-        self.keeper = EpochKeeper(
-            plan,
-            station.guard,
-            station.frames,
-            self._kept,
-            self.link.identity,
-            start=station.start_condition,
-        )
-        self.observer = station.make_observer(plan, self.keeper)
-        self.first = self.keeper.first_number
-        self.pipeline = LivePipeline(
-            plan.name,
-            plan.calibrator,
-            station.readings,
-            plan.config.thermometers,
-            self.keeper,
-            station.clock,
-            first=self.first,
-            period_s=plan.config.period_s,
-            patience_s=0.0 if station.fast else None,
-            trusted=station.clock.trusted,
-            observe=self._observe,
-        )
-        self.loop = DeviceLoop(
-            self.link, self._capture, station.clock, plan.config.period_s, begin,
-            free_running=station.fast,
-        )  # fmt: skip
-        self.last: dict[str, Any] = {}
-        self._shown = self._previewed = float("-inf")
-
-    def _capture(self) -> None:
-        station = self._station
-        if station.fast and not self.pipeline.wait_for_room(1.0):
-            return
-        frame = self._device.capture()
-        if station.fast:
-            station.read_now(self.plan.config.thermometers)
-        self.pipeline.submit(frame)
-        if station.epochs and self.pipeline.next_number - self.first >= station.epochs:
-            self.loop.stop()
-
-    def _observe(self, calibrated: CalibratedEpoch) -> dict[str, float]:
-        return {} if self.observer is None else self.observer.observe(calibrated)
-
-    def _kept(self, acquired: AcquiredEpoch, row: dict[str, Any]) -> None:
-        """Tell outputs and the live state; the epoch is in the store already."""
-        report = {} if self.observer is None else self.observer.report()
-        row["state"] = report.get("state", "unknown")
-        self.last = {**row, "online": report}
-        for output in self._station.outputs:
-            output.put(row)
-        now = time.monotonic()
-        if now - self._shown >= _SHOW_EVERY_S:
-            self._shown = now
-            live = self._station.live
-            live.write_epoch(self.plan.name, self.last, acquired.calibrated, self.plan.testfield)
-            if self._station.preview and now - self._previewed >= _PREVIEW_EVERY_S:
-                self._previewed = now
-                live.write_frame(self.plan.name, acquired.frame)
-
-    def status(self) -> dict[str, Any]:
-        """For `thermocald status`."""
-        rhythm = self.loop.schedule.rhythm()
-        return {
-            "series": self.plan.config.series,
-            "period_s": self.plan.config.period_s,
-            **_link_status(self.link, self.loop.busy_s(), self._station.hang_after_s),
-            "ticks": rhythm.ticks,
-            "skipped": rhythm.skipped,
-            "late_p99_s": rhythm.late_p99_s,
-            "late_max_s": rhythm.late_max_s,
-            "lost": self.loop.lost + self.pipeline.lost,
-            "waiting": self.pipeline.waiting(),
-            "put_off": self.pipeline.dropped,
-            "caught_up": self.pipeline.caught_up,
-            "stored": self.keeper.stored,
-            "frames_kept": self.keeper.kept_frames,
-            "last": self.last,
-        }
 
 
 class Station:
@@ -177,6 +78,8 @@ class Station:
         self.frames = FrameFolder(config.frames)
         self.readings = Readings({t.name: t.period_s for t in config.thermometers})
         self._stop = threading.Event()
+        self._started = False
+        self.cameras: list[CameraLine] = []
         begin = clock.monotonic() + _LEAD_S
         self._thermometers: dict[str, tuple[Thermometer, Link]] = {}
         for one in config.thermometers:
@@ -186,12 +89,7 @@ class Station:
                 period_s=one.period_s, on_event=self.on_link_event,
             )  # fmt: skip
             self._thermometers[one.name] = (thermometer, link)
-        self.outputs = [
-            OutputLoop(
-                o.name, open_device("output", o.driver, o.options, clock), clock, self.on_link_event
-            )
-            for o in config.outputs
-        ]
+        self.outputs = [self._output(o, o.options) for o in config.outputs]
         self.cameras = [CameraLine(plan, self, begin) for plan in plan_cameras(config, clock)]
         self.loops = [
             DeviceLoop(link, self._reader(name), clock, one.period_s, begin)
@@ -210,8 +108,8 @@ class Station:
         for loop in self.loops:
             loop.start()
         for camera in self.cameras:
-            camera.pipeline.start()
-            camera.loop.start()
+            camera.start()
+        self._started = True
 
     def stop(self, grace_s: float) -> bool:
         """Finish the epochs in hand; False if a device or an output does not let go."""
@@ -223,7 +121,8 @@ class Station:
         for loop in self._all_loops():
             done &= loop.join(max(0.1, deadline - time.monotonic() - 0.5 * grace_s))
         for camera in self.cameras:
-            done &= camera.pipeline.stop(max(0.1, deadline - time.monotonic()))
+            if camera.run is not None:
+                done &= camera.run.pipeline.stop(max(0.1, deadline - time.monotonic()))
         for output in self.outputs:
             done &= output.stop(max(0.1, min(2.0, deadline - time.monotonic())))
         if self.fast:
@@ -250,7 +149,7 @@ class Station:
         found += [
             f"pipeline of {camera.plan.name} hangs"
             for camera in self.cameras
-            if camera.pipeline.busy_s() > self.hang_after_s
+            if camera.busy_s() > self.hang_after_s
         ]
         return found
 
@@ -258,17 +157,56 @@ class Station:
     def finished(self) -> bool:
         """Whether no camera will give another epoch and all is kept."""
         return bool(self.cameras) and all(
-            not camera.loop.alive and not camera.pipeline.waiting() for camera in self.cameras
+            not camera.loop.alive and not camera.waiting() for camera in self.cameras
         )
 
     def on_link_event(self, event: LinkEvent) -> None:
         """A device went away or came back: into the store, with the series it concerns."""
-        series = next(
-            (c.keeper.series for c in self.cameras if c.plan.name == event.device), None
-        ) if hasattr(self, "cameras") else None  # fmt: skip
-        self.guard.event(
-            Event(event.utc, event.kind, event.text, None if series is None else series.id)
-        )
+        line = next((c for c in self.cameras if c.plan.name == event.device), None)
+        if line is None:
+            self.guard.event(Event(event.utc, event.kind, event.text))
+        else:
+            self.guard.event(line.event(event.utc, event.kind, event.text))
+
+    def line(self, camera: str) -> CameraLine | None:
+        """The camera of that name; None if the configuration has none."""
+        return next((line for line in self.cameras if line.plan.name == camera), None)
+
+    def identity_of(self, line: CameraLine) -> Callable[[], dict[str, Any]]:
+        """What a camera and its thermometers say they are, asked when a series begins."""
+
+        def identity() -> dict[str, Any]:
+            names = line.plan.config.thermometers
+            told = {name: self._thermometers[name][1].identity() for name in names}
+            return {**line.link.identity(), **({"thermometers": told} if told else {})}
+
+        return identity
+
+    def heaters(self, programme: Sequence[Mapping[str, Any]]) -> dict[int, OutputLoop]:
+        """{place among the outputs: a heating output with another programme}, not started.
+
+        Raises ConfigurationError if nothing heats, or the programme is not theirs.
+        """
+        found = {
+            i: self._output(one, {**one.options, "programme": list(programme)})
+            for i, one in enumerate(self.config.outputs)
+            if "programme" in option_names("output", one.driver)
+        }
+        if not found:
+            raise ConfigurationError("programme: no output of the configuration heats")
+        return found
+
+    def heat(self, programme: Sequence[Mapping[str, Any]]) -> None:
+        """Give the heating outputs another programme, from its beginning; raises as `heaters`."""
+        for i, output in self.heaters(programme).items():
+            old, self.outputs[i] = self.outputs[i], output
+            if self._started:
+                old.stop(2.0)
+                output.start()
+
+    def _output(self, one: OutputConfig, options: Mapping[str, Any]) -> OutputLoop:
+        device = open_device("output", one.driver, options, self.clock)
+        return OutputLoop(one.name, device, self.clock, self.on_link_event)
 
     def make_observer(self, plan: CameraPlan, keeper: EpochKeeper) -> Any:
         """The online estimate of a camera; None if it is only acquired."""
@@ -288,12 +226,12 @@ class Station:
         return {
             "cameras": {camera.plan.name: camera.status() for camera in self.cameras},
             "thermometers": {
-                name: _link_status(link, self._busy_s(link), self.hang_after_s)
+                name: link_status(link, self._busy_s(link), self.hang_after_s)
                 for name, (_, link) in self._thermometers.items()
             },
             "outputs": {
                 output.link.name: {
-                    **_link_status(output.link, 0.0, self.hang_after_s),
+                    **link_status(output.link, 0.0, self.hang_after_s),
                     "emitted": output.emitted,
                     "lost": output.lost,
                 }
@@ -316,18 +254,16 @@ class Station:
 
         return read
 
+    def retain(self) -> list[str]:
+        """Delete the frames that may go; sentences about what was deleted."""
+        told = [deleted.text for deleted in self.frames.enforce(self.clock.utc())]
+        for text in told:
+            self.guard.event(Event(self.clock.utc(), "frames_deleted", text))
+        return told
+
     def _retain(self) -> None:
         while True:
-            for deleted in self.frames.enforce(self.clock.utc()):
-                self.guard.event(Event(self.clock.utc(), "frames_deleted", deleted.text))
+            self.retain()
             pause = _RETENTION_WHEN_FULL_S if self.frames.paused else _RETENTION_EVERY_S
             if self._stop.wait(pause):
                 return
-
-
-def _link_status(link: Link, busy_s: float, hang_after_s: float) -> dict[str, Any]:
-    return {
-        "device": "hung" if busy_s > hang_after_s else link.state,
-        "why": link.why,
-        "faults": link.faults,
-    }

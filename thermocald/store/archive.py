@@ -41,12 +41,15 @@ def archive_series(
     """Write a series as a recording, in constant memory.
 
     frames: the folder that relative paths of frames refer to; a frame that was not kept is left
-    out. Times that ran backwards are mended (`clock_corrections`), the head then holds
-    `clock_set_back` [{epoch, seconds}]. Raises RecordingError, StoreError.
+    out. The head also holds what the store knows of the series: `start`, `device`, `calibration`.
+    Times that ran backwards are mended (`clock_corrections`), the head then holds `clock_set_back`
+    [{epoch, seconds}]. Raises RecordingError, StoreError.
     """
     columns = store.series_columns(series, ["epoch", "frame_time"])
     corrections = clock_corrections(columns["frame_time"], series.head.interval)
-    head = series.head
+    known = {"start": series.start, "device": series.identity, "calibration": series.settings}
+    told = {key: value for key, value in known.items() if value}
+    head = replace(series.head, extra={**series.head.extra, **told})
     if set_back := np.flatnonzero(np.diff(corrections)).tolist():
         steps = [
             {

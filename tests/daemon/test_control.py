@@ -1,0 +1,141 @@
+"""The control socket: who may ask, what is refused, and that nothing said to it hurts."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import stat
+import threading
+import time
+
+import pytest
+
+from thermocald.daemon.control import FORMAT, ControlSocket, ask
+from thermocald.errors import DataError, UsageError
+
+SESSION = {"camera": "one", "series": "M7", "start": "cold", "epochs": 3}
+
+
+@pytest.fixture
+def ear(tmp_path):
+    """A socket that answers with what was asked; `ear.asked` lists it."""
+    asked = []
+
+    def answer(request):
+        asked.append(request)
+        if request.do == "retention":
+            raise DataError("nothing may go")
+        return {"sessions": {"x": float("nan")}}
+
+    folder = tmp_path / ("deep" * 30)  # longer than a socket's address may be
+    control = ControlSocket(folder, answer)
+    control.open()
+    control.asked, control.folder = asked, folder
+    yield control
+    control.close()
+    assert not (folder / "control.sock").exists()
+
+
+def connect(ear) -> socket.socket:
+    channel = socket.socket(socket.AF_UNIX)
+    channel.settimeout(10)
+    handle = os.open(ear.folder, os.O_RDONLY)
+    channel.connect(f"/proc/self/fd/{handle}/control.sock")
+    os.close(handle)
+    return channel
+
+
+def say(ear, data: bytes) -> dict:
+    with connect(ear) as channel:
+        channel.sendall(data)
+        answer = b""
+        while not answer.endswith(b"\n"):
+            answer += channel.recv(4096)
+    return json.loads(answer)
+
+
+def test_owner_and_group_may_ask_and_nobody_else(ear):
+    mode = stat.S_IMODE((ear.folder / "control.sock").stat().st_mode)
+    assert mode == 0o660
+
+
+def test_an_answer_is_json_and_a_refusal_is_raised(ear):
+    assert ask(ear.folder, "session status") == {
+        "format": FORMAT, "ok": True, "sessions": {"x": None}
+    }  # fmt: skip
+    with pytest.raises(DataError, match="nothing may go"):
+        ask(ear.folder, "retention")
+
+
+def test_nobody_listens_is_no_error(tmp_path):
+    assert ask(tmp_path, "session status") is None
+    assert ask(tmp_path / "away", "session status") is None
+
+
+HOSTILE = [
+    b"\n",
+    b"null\n",
+    b"[]\n",
+    b"session start\n",
+    b"\xff\xfe\x00\n",
+    b"[" * 60000 + b"\n",
+    b'{"a":' * 12000 + b"\n",
+    json.dumps({"format": FORMAT}).encode() + b"\n",
+    json.dumps({"format": FORMAT, "do": "exec", "command": "rm"}).encode() + b"\n",
+    json.dumps({"format": "thermocald-control/2", "do": "session status"}).encode() + b"\n",
+    json.dumps({"format": FORMAT, "do": "session status", "more": 1}).encode() + b"\n",
+    *(
+        json.dumps({"format": FORMAT, "do": "session start", "session": {**SESSION, **wrong}})
+        .encode() + b"\n"
+        for wrong in [
+            {"camera": "../../etc"}, {"camera": ""}, {"camera": 5}, {"series": "a/b"},
+            {"series": "x" * 65}, {"start": "x" * 65}, {"start": "a\nb"}, {"epochs": 0},
+            {"epochs": "3"}, {"epochs": True}, {"epochs": 10**30}, {"epochs": float("nan")},
+            {"programme": [{"seconds": float("inf"), "hold_c": None}]},
+            {"programme": [{"seconds": 10.0, "hold_c": 1e9}]}, {"programme": "hot"},
+            {"programme": [{"seconds": 10.0, "hold_c": None}] * 1001}, {"path": "/etc/passwd"},
+        ]
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("data", HOSTILE, ids=range(len(HOSTILE)))
+def test_what_is_not_understood_is_refused_and_does_nothing(ear, data):
+    answer = say(ear, data)
+    assert answer["ok"] is False
+    assert answer["exit_status"] == 2
+    assert "refused" in answer["error"]
+    assert "\n" not in answer["error"]
+    assert ear.asked == []
+    assert ask(ear.folder, "session status") is not None
+
+
+def test_a_line_that_never_ends_is_cut(ear):
+    answer = say(ear, b'{"format": "' + b"x" * 70000)
+    assert "longer than 65536" in answer["error"]
+
+
+def test_who_says_nothing_or_goes_away_holds_nobody_up(ear):
+    with connect(ear), connect(ear):
+        begin = time.monotonic()
+        with connect(ear) as gone:
+            gone.sendall(b'{"for')
+        assert ask(ear.folder, "session status") is not None
+        assert time.monotonic() - begin < 15
+
+
+def test_random_bytes_never_end_it(ear):
+    import numpy as np
+
+    rng = np.random.default_rng(4)
+    for _ in range(200):
+        data = rng.bytes(int(rng.integers(1, 300))).replace(b"\n", b"") + b"\n"
+        assert say(ear, data)["ok"] is False
+    assert threading.active_count() >= 2
+    assert ear.asked == []
+
+
+def test_a_wrong_request_raises_where_it_is_asked(ear):
+    with pytest.raises(UsageError, match="epochs"):
+        ask(ear.folder, "session start", session={**SESSION, "epochs": -1})

@@ -1,0 +1,239 @@
+"""Sessions in a running daemon: the real daemon and the real command, as processes."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import yaml
+
+from tests.daemon.conftest import ENVIRONMENT
+from thermocald.daemon.control import ask
+from thermocald.errors import DataError, UsageError
+from thermocald.store.database import Store
+from thermocald.store.recording import read_recording
+
+SESSION = {"camera": "phone-1", "series": "M7", "start": "cold", "epochs": 8}
+
+
+@pytest.fixture
+def live(daemon, devices):
+    """configured → a running daemon with a camera that has no series of its own but `watch`."""
+
+    def start(**configured):
+        sections = devices(**{"period_s": 0.3, "name": "phone-1", **configured})
+        sections["outputs"] = []
+        daemon.configure(**sections)
+        daemon.start()
+        daemon.until(lambda: ask(folder, "session status") is not None)
+        return daemon
+
+    folder = daemon.store.with_name(daemon.store.name + ".live")
+    daemon.live = folder
+    daemon.ask = lambda do, **values: ask(folder, do, **values)
+    daemon.session = lambda: ask(folder, "session status")["sessions"].get("phone-1", {})
+    yield start
+
+
+@pytest.fixture
+def command(daemon):
+    """options → `thermocald session …` in the daemon's folder, running."""
+    started = []
+
+    def start(*options: str):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "thermocald", "session", *options],
+            cwd=daemon.folder, env=ENVIRONMENT,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        started.append(process)
+        return process
+
+    yield start
+    for process in started:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+def series_of(path) -> dict[str, tuple[str, list[int]]]:
+    """{name: (start, epoch numbers)}"""
+    with Store.open(path) as store:
+        store.check()
+        return {
+            s.name: (s.start, store.series_columns(s, ["epoch"])["epoch"].astype(int).tolist())
+            for s in store.all_series()
+        }
+
+
+def test_the_command_has_the_daemon_take_a_session_and_ends_with_its_recording(live, command):
+    daemon = live()
+    daemon.until(lambda: "watch" in series_of(daemon.store))
+    process = command("start", "--camera", "phone-1", "--series", "M7", "--start", "cold",
+                      "--epochs", "6", "--no-report")  # fmt: skip
+    _, told = process.communicate(timeout=120)
+    assert process.returncode == 0, told
+    assert "taken by the daemon" in told
+    assert "192 targets" in told
+    stored = series_of(daemon.store)
+    assert stored["M7"] == ("cold", list(range(1, 7)))
+    recording = read_recording(daemon.folder / "phone-1-M7")
+    assert recording.head.extra["start"] == "cold"
+    assert recording.head.extra["device"]["serial"] == "mock-1"
+    assert recording.head.extra["device"]["thermometers"]["housing"]["serial"] == "mock-0"
+    assert len(recording.epochs) == 6
+    # the camera has gone back to its own series, which lost nothing but the time of the session
+    count = len(stored["watch"][1])
+    daemon.until(lambda: len(series_of(daemon.store)["watch"][1]) > count + 2)
+    assert daemon.stop() == 0
+    numbers = series_of(daemon.store)["watch"][1]
+    assert numbers == list(range(1, len(numbers) + 1))
+    assert [e for e in daemon.events() if e.startswith("session")] == [
+        "session_begun", "session_ended"
+    ]  # fmt: skip
+
+
+def test_a_daemon_that_is_killed_goes_on_with_the_session(live):
+    daemon = live()
+    daemon.ask("session start", session=SESSION)
+    daemon.until(lambda: daemon.session().get("last", {}).get("epoch", 0) >= 2)
+    daemon.kill()
+    had = len(series_of(daemon.store)["M7"][1])
+    assert 1 <= had < 8
+    daemon.start()
+    daemon.until(lambda: daemon.ask("session status") is not None)
+    daemon.until(lambda: daemon.session()["state"] == "done")
+    assert daemon.stop() == 0
+    assert series_of(daemon.store)["M7"] == ("cold", list(range(1, 9)))
+
+
+@pytest.mark.slow
+def test_it_pauses_while_the_phone_is_away_and_the_command_survives_a_restart(live, command):
+    daemon = live(series=None, camera=[{"kind": "unplugged", "at": 4, "for_s": 3.0}])
+    process = command("start", "--camera", "phone-1", "--series", "M7", "--epochs", "12",
+                      "--no-report", "--no-check")  # fmt: skip
+    daemon.until(lambda: daemon.session().get("state") == "paused")
+    daemon.until(lambda: daemon.session().get("state") == "running")
+    daemon.kill()
+    time.sleep(1.5)  # the command asks twice a second
+    daemon.start()
+    _, told = process.communicate(timeout=120)
+    assert process.returncode == 0, told
+    assert "paused: " in told
+    assert "the camera is back" in told
+    assert "the daemon does not answer" in told
+    assert len(read_recording(daemon.folder / "phone-1-M7").epochs) == 12
+
+
+def test_a_camera_without_a_series_rests_until_a_session(live, daemon):
+    """A phone that is to be measured from cold must not be warmed by its own frames."""
+    live(series=None)
+    time.sleep(1.0)
+    status = json.loads((daemon.live / "status.json").read_text())
+    assert status["cameras"]["phone-1"]["device"] == "closed"
+    daemon.ask("session start", session={**SESSION, "epochs": 3})
+    daemon.until(lambda: daemon.session()["state"] == "done")
+    assert len(daemon.session()["found"]) >= 2
+    daemon.until(lambda: status_of(daemon)["cameras"]["phone-1"]["device"] == "closed")
+    assert daemon.stop() == 0
+    assert series_of(daemon.store) == {"M7": ("cold", [1, 2, 3])}
+
+
+def status_of(daemon) -> dict:
+    return json.loads((daemon.live / "status.json").read_text())
+
+
+def test_status_and_stop(live, command, daemon):
+    live()
+    process = command("start", "--series", "M7", "--start", "warm", "--epochs", "1000", "--no-wait")
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 0, told
+    daemon.until(lambda: daemon.session().get("taken", 0) >= 2)
+    out, told = command("status", "--json", "-").communicate(timeout=60)
+    one = json.loads(out)["sessions"]["phone-1"]
+    assert (one["series"], one["start"], one["state"]) == ("M7", "warm", "running")
+    _, told = command("stop").communicate(timeout=60)
+    assert "of 1000 epochs, stopped" in told
+    taken = daemon.session()["taken"]
+    assert daemon.session()["state"] == "stopped"
+    # it may be taken up again, but not as something else
+    with pytest.raises(UsageError, match="begun with --start 'warm'"):
+        daemon.ask("session start", session={**SESSION, "start": "cold"})
+    again = daemon.ask("session start", session={**SESSION, "start": "", "epochs": taken + 2})
+    assert again["session"]["state"] == "checking"
+    daemon.until(lambda: daemon.session()["state"] == "done")
+    assert daemon.stop() == 0
+    assert series_of(daemon.store)["M7"] == ("warm", list(range(1, taken + 3)))
+
+
+def test_what_cannot_be_taken_is_refused_with_the_reason(live, daemon):
+    live()
+    for wrong, error, words in [
+        ({"camera": "nobody"}, UsageError, "there are: phone-1"),
+        ({"series": "watch"}, UsageError, "takes series 'watch' all the time"),
+        ({"programme": [{"seconds": 10.0, "hold_c": None}]}, UsageError, "no output .* heats"),
+    ]:
+        with pytest.raises(error, match=words):
+            daemon.ask("session start", session={**SESSION, **wrong})
+    with pytest.raises(DataError, match="has no session"):
+        daemon.ask("session stop", camera="phone-1")
+    daemon.ask("session start", session=SESSION)
+    with pytest.raises(DataError, match="taking series 'M7' already"):
+        daemon.ask("session start", session={**SESSION, "series": "M8"})
+    assert daemon.stop() == 0
+    assert "Traceback" not in daemon.log()
+
+
+def test_a_failed_check_is_told_and_nothing_is_begun(live, daemon):
+    """A camera that looks at another test field than the configuration says."""
+    other = daemon.folder / "other.csv"
+    other.write_text("target,X,Y,Z,diameter,sX,sY,sZ\n" + "".join(
+        f"t{k},{100 * (k % 4)},{100 * (k // 4)},{10 * k},10,0.1,0.1,0.1\n" for k in range(12)
+    ))  # fmt: skip
+    sensor = {"width_px": 820, "height_px": 616, "pixel_pitch_mm": 0.00448}
+    live(series=None, sensor=sensor, testfield=str(other))
+    daemon.ask("session start", session=SESSION)
+    daemon.until(lambda: daemon.session()["state"] == "refused")
+    assert "the check failed" in daemon.session()["why"]
+    assert daemon.stop() == 0
+    assert series_of(daemon.store) == {}
+
+
+@pytest.mark.slow
+def test_a_programme_heats_during_the_session_and_not_after_it(daemon, devices, live):
+    """The relay's own driver on a simulated pin is the drivers' test; here: which steps it gets."""
+    pytest.importorskip("gpiozero")
+    sections = devices(period_s=0.3, name="phone-1")
+    relay = {"name": "lamp", "driver": "relay", "pin": 17, "limit_c": 60,
+             "programme": [{"seconds": 5, "hold_c": None}]}  # fmt: skip
+    sections["outputs"] = [relay]
+    daemon.configure(**sections)
+    daemon.start(GPIOZERO_PIN_FACTORY="mock")
+    daemon.until(lambda: daemon.ask("session status") is not None)
+    with pytest.raises(UsageError, match="hold_c"):
+        daemon.ask("session start", session={
+            **SESSION, "programme": [{"seconds": 10.0, "hold_c": 80.0}]})  # fmt: skip
+    steps = [{"seconds": 600.0, "hold_c": 45.0}]
+    daemon.ask("session start", session={**SESSION, "epochs": 4, "programme": steps})
+    daemon.until(lambda: daemon.session()["state"] == "done")
+    assert daemon.stop() == 0
+    assert "Traceback" not in daemon.log()
+
+
+@pytest.mark.slow
+def test_reload_leaves_a_session_alone(live, daemon):
+    live()
+    daemon.ask("session start", session={**SESSION, "epochs": 12, "check": False})
+    daemon.until(lambda: daemon.session().get("taken", 0) >= 2)
+    document = yaml.safe_load(daemon.config.read_text())
+    document["logging"] = {"level": "debug"}
+    daemon.config.write_text(yaml.safe_dump(document))
+    daemon.signal(signal.SIGHUP)
+    daemon.until(lambda: daemon.session().get("state") == "done")
+    assert "the configuration was read anew" in daemon.log()
+    assert daemon.stop() == 0
+    assert series_of(daemon.store)["M7"][1] == list(range(1, 13))

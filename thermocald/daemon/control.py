@@ -1,0 +1,205 @@
+"""The daemon's ear: a Unix socket in its runtime folder that takes one request per connection.
+
+    → {"format": "thermocald-control/1", "do": "session start", "session": {…}}
+    ← {"format": "thermocald-control/1", "ok": true, …}
+    ← {"format": "thermocald-control/1", "ok": false, "error": "…", "exit_status": 2}
+
+Who may ask is a matter of the file: mode 0660, owner and group of the daemon. A request is one line
+of at most 64 KiB within two seconds; what is not understood changes nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import socket
+import threading
+import time
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from thermocald.config import Name  # noqa: TC001 - pydantic reads it at run time
+from thermocald.daemon.live_state import plain
+from thermocald.daemon.session import Session  # noqa: TC001
+from thermocald.errors import DataError, DeviceError, ThermocaldError, UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+__all__ = ["FORMAT", "ControlSocket", "Request", "ask"]
+
+log = logging.getLogger(__name__)
+
+FORMAT = "thermocald-control/1"
+_NAME = "control.sock"
+_LONGEST = 65536
+_REQUEST_S = 2.0
+_ANSWER_S = 60.0
+
+
+class _Asked(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    format: Literal["thermocald-control/1"]
+
+
+class StartRequest(_Asked):
+    """Begin a session."""
+
+    do: Literal["session start"]
+    session: Session
+
+
+class StopRequest(_Asked):
+    """End a camera's session."""
+
+    do: Literal["session stop"]
+    camera: Name
+
+
+class PlainRequest(_Asked):
+    """`session status`: what is being taken; `retention`: delete frames that may go, now."""
+
+    do: Literal["session status", "retention"]
+
+
+Request = StartRequest | StopRequest | PlainRequest
+
+
+class _Envelope(BaseModel):
+    request: Annotated[Request, Field(discriminator="do")]
+
+
+class ControlSocket:
+    """Listens in a thread of its own; answer(request) → what is told, raises ThermocaldError."""
+
+    def __init__(self, folder: Path, answer: Callable[[Request], dict[str, Any]]) -> None:
+        self._folder = folder
+        self._answer = answer
+        self._stop = threading.Event()
+        self._socket: socket.socket | None = None
+        self._thread = threading.Thread(target=self._serve, name="control", daemon=True)
+
+    def open(self) -> None:
+        """Begin to listen; where that is not possible, the daemon goes on without."""
+        channel = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            with _short(self._folder) as path:
+                with contextlib.suppress(FileNotFoundError):
+                    os.unlink(path)  # of a daemon that was killed: the store's lock is ours
+                os.fchmod(channel.fileno(), 0o600)  # until the group is let in, too
+                channel.bind(path)
+                os.chmod(path, 0o660)
+            channel.listen(8)
+        except OSError as error:
+            channel.close()
+            log.warning("%s: no control socket: %s", self._folder, error)
+            return
+        self._socket = channel
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop listening; the file goes too."""
+        self._stop.set()
+        if self._socket is None:
+            return
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)  # wakes the thread
+        self._thread.join(_REQUEST_S)
+        self._socket.close()
+        with contextlib.suppress(OSError):
+            (self._folder / _NAME).unlink()
+
+    def _serve(self) -> None:
+        assert self._socket is not None
+        while not self._stop.is_set():
+            try:
+                connection, _ = self._socket.accept()
+            except OSError as error:
+                if not self._stop.is_set():
+                    log.error("the control socket failed: %s", error)
+                return
+            with connection:
+                try:
+                    told = self._respond(connection)
+                    connection.settimeout(_REQUEST_S)
+                    connection.sendall(json.dumps(plain(told)).encode() + b"\n")
+                except OSError as error:  # who asked has gone, or says nothing
+                    log.debug("control: %s", error)
+
+    def _respond(self, connection: socket.socket) -> dict[str, Any]:
+        try:
+            request = _parse(_line(connection, _LONGEST, _REQUEST_S))
+            return {"format": FORMAT, "ok": True, **self._answer(request)}
+        except ThermocaldError as error:
+            status = error.exit_status
+            return {"format": FORMAT, "ok": False, "error": str(error), "exit_status": status}
+
+
+def ask(folder: Path, do: str, **values: Any) -> dict[str, Any] | None:
+    """Ask the daemon whose live state is in a folder; None if nobody listens there.
+
+    Raises what the daemon refuses: UsageError, DataError, DeviceError.
+    """
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC) as channel:
+        try:
+            channel.settimeout(_REQUEST_S)
+            with _short(folder) as path:
+                channel.connect(path)
+            channel.sendall(json.dumps({"format": FORMAT, "do": do, **values}).encode() + b"\n")
+            told = json.loads(_line(channel, 100 * _LONGEST, _ANSWER_S))
+        except PermissionError as error:
+            raise DataError(
+                f"{folder / _NAME}: you may not ask this daemon; join its group, or use sudo"
+            ) from error
+        except (OSError, ValueError):
+            return None
+    if not isinstance(told, dict) or told.get("format") != FORMAT:
+        raise DataError(f"{folder / _NAME}: a daemon of another version runs there; restart it")
+    if told.get("ok"):
+        return told
+    kind = {2: UsageError, 3: DeviceError}.get(int(told.get("exit_status", 1)), DataError)
+    raise kind(str(told.get("error", "the daemon refused")))
+
+
+def _parse(line: bytes) -> Request:
+    try:
+        document = json.loads(line)
+        return _Envelope.model_validate({"request": document}).request
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"][1:])
+        raise UsageError(f"the request is refused: {where or 'it'}: {first['msg']}") from error
+    except (ValueError, RecursionError) as error:
+        raise UsageError("the request is refused: it is no JSON object in one line") from error
+
+
+def _line(channel: socket.socket, longest: int, within_s: float) -> bytes:
+    """The bytes up to a line end; OSError if they do not come, UsageError if they do not end."""
+    deadline, data = time.monotonic() + within_s, bytearray()
+    while b"\n" not in data:
+        if len(data) > longest:
+            raise UsageError(f"the request is refused: it is longer than {longest} bytes")
+        channel.settimeout(max(0.001, deadline - time.monotonic()))
+        piece = channel.recv(8192)
+        if not piece:
+            raise ConnectionError("closed before the line ended")
+        data += piece
+        if time.monotonic() > deadline:
+            raise TimeoutError("the line did not end in time")
+    return bytes(data.partition(b"\n")[0])
+
+
+@contextlib.contextmanager
+def _short(folder: Path) -> Iterator[str]:
+    """A path of the socket that fits into the 107 bytes of a socket address, however deep it is."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        yield f"/proc/self/fd/{handle}/{_NAME}"
+    finally:
+        os.close(handle)

@@ -1,0 +1,282 @@
+"""Sessions of a running daemon: a camera takes a series of so many epochs, then goes back.
+
+    asked for ─► checking (a look at one frame) ─► running ─► done | stopped
+                     └─► refused                     └─ the device is away: paused
+
+What was begun and ended stands in the store's events, so that a daemon that was killed goes on with
+its sessions when it starts again.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from thermocald.config import Name  # noqa: TC001 - pydantic reads it at run time
+from thermocald.errors import ConfigurationError, DataError, ThermocaldError, UsageError
+from thermocald.store.row import Event
+
+if TYPE_CHECKING:
+    from thermocald.daemon.camera_line import CameraLine
+    from thermocald.daemon.station import Station
+    from thermocald.daemon.store_guard import StoreGuard
+    from thermocald.hal import Clock
+
+__all__ = ["HeatingStep", "Session", "Sessions"]
+
+log = logging.getLogger(__name__)
+
+State = Literal["checking", "running", "done", "stopped", "refused"]
+
+_NO_HEAT = ({"seconds": 1.0, "hold_c": None},)
+
+
+class HeatingStep(BaseModel):
+    """Hold a temperature (°C; None: do not heat) for a time (s)."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+    seconds: Annotated[float, Field(ge=1.0, le=1e6)]
+    hold_c: Annotated[float, Field(ge=-40.0, le=150.0)] | None
+
+
+class Session(BaseModel):
+    """What is asked for: a camera of the configuration, a series, its start condition, its length.
+
+    programme: steps of the heating outputs, from the first epoch on; check: look at a frame first.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    camera: Name
+    series: Name
+    start: Annotated[str, Field(max_length=64, pattern=r"^[^\x00-\x1f\x7f]*$")] = ""
+    epochs: Annotated[int, Field(ge=1, le=10_000_000)]
+    programme: Annotated[list[HeatingStep], Field(max_length=1000)] = Field(default_factory=list)
+    check: bool = True
+
+    def steps(self, elapsed_s: float) -> list[dict[str, Any]]:
+        """What is left of the programme after so many seconds of it."""
+        left: list[dict[str, Any]] = []
+        for step in self.programme:
+            seconds = step.seconds - max(0.0, elapsed_s)
+            elapsed_s -= step.seconds
+            if seconds > 0:
+                left.append({"seconds": max(1.0, seconds), "hold_c": step.hold_c})
+        return left or list(_NO_HEAT)
+
+
+@dataclass
+class _Progress:
+    """A session and how far it is; taken: the number of its last epoch, when it ended."""
+
+    session: Session
+    state: State
+    why: str = ""
+    found: tuple[str, ...] = ()
+    taken: int = 0
+
+    def told(self) -> dict[str, Any]:
+        asked = self.session.model_dump(mode="json", exclude={"programme", "check"})
+        return {
+            **asked, "state": self.state, "why": self.why, "found": list(self.found),
+            "taken": self.taken,
+        }  # fmt: skip
+
+
+class Sessions:
+    """All sessions of a daemon, at most one per camera; used by one thread, the service's."""
+
+    def __init__(self, guard: StoreGuard, clock: Clock) -> None:
+        self._guard = guard
+        self._clock = clock
+        self._active: dict[str, _Progress] = {}
+        self._ended: dict[str, _Progress] = {}
+        for event in guard.store.events():
+            self._remember(event)
+
+    def _remember(self, event: Event) -> None:
+        if event.kind not in ("session_begun", "session_ended"):
+            return
+        try:
+            session = Session.model_validate(event.data["session"])
+            if event.kind == "session_begun":
+                self._active[session.camera] = _Progress(session, "running")
+            elif self._active.pop(session.camera, None) is not None:
+                data = event.data
+                self._ended[session.camera] = _Progress(
+                    session, data["state"], data["why"], (), int(data["taken"])
+                )
+        except (ValidationError, KeyError, TypeError) as error:
+            log.warning("an event of a session cannot be read: %s", error)
+
+    def resume(self, station: Station) -> None:
+        """Let a station that was just built go on with what its cameras were taking."""
+        for name, active in list(self._active.items()):
+            try:
+                if active.state == "checking":
+                    self._check(station, active)
+                else:
+                    self._take(station, active.session)
+            except ThermocaldError as error:
+                del self._active[name]
+                self._end(station, active, "stopped", f"it cannot go on: {error}")
+
+    def start(self, station: Station, session: Session) -> dict[str, Any]:
+        """Begin a session, or go on with one that was stopped; raises what forbids it."""
+        line = _line(station, session.camera)
+        if session.camera in self._active:
+            running = self._active[session.camera].session
+            if running == session:
+                return self.status(station)[session.camera]
+            raise DataError(
+                f"camera {session.camera!r} is taking series {running.series!r} already; stop it "
+                f"first: thermocald session stop --camera {session.camera}"
+            )
+        if session.series == line.plan.config.series:
+            raise UsageError(
+                f"camera {session.camera!r} takes series {session.series!r} all the time, by its "
+                "configuration; give the session another --series"
+            )
+        self._look_into_the_store(session)
+        if session.programme:
+            for other in self._active.values():
+                if other.session.programme:
+                    raise DataError(f"series {other.session.series!r} is using the heating")
+            station.heaters(session.steps(0.0))  # wrong steps show now
+        active = _Progress(session, "checking")
+        if session.check:
+            self._check(station, active)
+        else:
+            self._begin(station, active)
+        self._active[session.camera] = active
+        return self.status(station)[session.camera]
+
+    def stop(self, station: Station, camera: str) -> dict[str, Any]:
+        """End a camera's session before its time; raises DataError if it has none."""
+        active = self._active.pop(camera, None)
+        if active is None:
+            raise DataError(f"camera {camera!r} has no session")
+        self._end(station, active, "stopped", "it was stopped by hand")
+        return self.status(station)[camera]
+
+    def turn(self, station: Station) -> None:
+        """Look whether a check is made, or a series complete."""
+        for name, active in list(self._active.items()):
+            line = station.line(name)
+            if line is None:
+                continue  # its end was told by `resume`
+            if active.state == "checking":
+                self._judge(station, line, active)
+            elif line.run is not None and line.run.full and not line.waiting():
+                del self._active[name]
+                self._end(station, active, "done", f"all {active.session.epochs} epochs are taken")
+            elif line.link.state == "finished":
+                del self._active[name]
+                self._end(station, active, "stopped", line.link.why)
+
+    def status(self, station: Station) -> dict[str, dict[str, Any]]:
+        """By camera: the session under way, or the last one that ended."""
+        told = {name: one.told() for name, one in self._ended.items()}
+        for name, active in self._active.items():
+            line, document = station.line(name), active.told()
+            if line is not None and line.link.state in ("out", "failed"):
+                document.update(state="paused", why=line.link.why)
+            if line is not None and line.run is not None and active.state == "running":
+                document.update(taken=line.run.taken, last=line.run.last)
+            told[name] = document
+        return told
+
+    def _judge(self, station: Station, line: CameraLine, active: _Progress) -> None:
+        found, name = line.checked, line.plan.name
+        why = ""
+        if found is not None:
+            active.found = found.found
+            why = found.failed
+        elif line.link.ended:
+            why = line.link.why
+        else:
+            return
+        if not why:
+            try:
+                self._begin(station, active)
+            except ThermocaldError as error:
+                why = str(error)
+        if why:
+            del self._active[name]
+            self._end(station, active, "refused", f"the check failed: {why}")
+
+    def _check(self, station: Station, active: _Progress) -> None:
+        active.state = "checking"
+        _line(station, active.session.camera).check()
+        if active.session.programme:
+            station.heat(_NO_HEAT)
+
+    def _begin(self, station: Station, active: _Progress) -> None:
+        session = active.session
+        self._take(station, session)
+        active.state = "running"
+        self._tell("session_begun", active, f"{session.epochs} epochs begin")
+
+    def _take(self, station: Station, session: Session) -> None:
+        line = _line(station, session.camera)
+        line.take(session.series, session.start, session.epochs)
+        if session.programme and line.run is not None:
+            # by epochs, not by the clock: a pause of the camera is a pause of the programme
+            elapsed_s = (line.run.first - 1) * line.plan.config.period_s
+            station.heat(session.steps(elapsed_s))
+
+    def _end(
+        self, station: Station, active: _Progress,
+        state: Literal["done", "stopped", "refused"], why: str,
+    ) -> None:  # fmt: skip
+        session, line = active.session, station.line(active.session.camera)
+        if active.state == "running" and line is not None and line.run is not None:
+            active.taken = line.run.taken
+        active.state, active.why = state, why
+        self._ended[session.camera] = active
+        try:
+            if line is not None:
+                line.take(line.plan.config.series)
+            if session.programme:
+                station.heat(_NO_HEAT)
+        except ThermocaldError as error:
+            log.error("camera %s: %s", session.camera, error)
+        kind = "session_refused" if state == "refused" else "session_ended"
+        self._tell(kind, active, why)
+
+    def _tell(self, kind: str, one: _Progress, text: str) -> None:
+        session = one.session
+        about = f"camera {session.camera}, series {session.series}: {text}"
+        log.info(about, extra={"device": session.camera, "event": kind})
+        data = {
+            "session": session.model_dump(mode="json"), "state": one.state, "taken": one.taken,
+            "why": one.why,
+        }  # fmt: skip
+        self._guard.event(Event(self._clock.utc(), kind, about, data=data))
+
+    def _look_into_the_store(self, session: Session) -> None:
+        for one in self._guard.store.all_series():
+            if (one.camera, one.name) != (session.camera, session.series):
+                continue
+            if session.start not in ("", one.start):
+                raise UsageError(
+                    f"series {one.name!r} was begun with --start {one.start!r}; choose another "
+                    "--series, or go on with that"
+                )
+            taken = self._guard.store.last_epoch(one) or 0
+            if taken >= session.epochs:
+                raise DataError(
+                    f"series {one.name!r} has {taken} epochs already; choose another --series"
+                )
+
+
+def _line(station: Station, camera: str) -> CameraLine:
+    line = station.line(camera)
+    if line is None:
+        there = ", ".join(c.plan.name for c in station.cameras) or "none"
+        raise ConfigurationError(f"there is no camera {camera!r}; there are: {there}")
+    return line

@@ -1,0 +1,103 @@
+"""Every block has a language, every command and option exists, every stanza is a valid one."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shlex
+import tomllib
+from io import StringIO
+
+import pytest
+import typer
+import yaml
+
+from tests.docs.blocks import LANGUAGES, PAGES, ROOT, Block, all_blocks, inline_commands, name
+from thermocald.cli import application
+from thermocald.config import Config, parse_config
+from thermocald.hal import option_names
+
+COMMAND = typer.main.get_command(application())
+STANZAS = set(Config.model_fields)
+
+
+def identity(block: Block) -> str:
+    return f"{block.page}:{block.line}"
+
+
+def test_every_block_names_its_language():
+    unknown = [f"{identity(b)}: {b.language!r}" for b in all_blocks() if b.language not in LANGUAGES]
+    assert not unknown
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_no_code_hides_in_indented_blocks(page):
+    """An indented block has no language and would not be tested; lists and formulas may indent."""
+    text = re.sub(r"^ *```.*?^ *```\s*$", "", page.read_text(), flags=re.M | re.S)
+    in_list, blank = False, True
+    for line in text.splitlines():
+        if line.strip() and not line.startswith(" "):
+            in_list = bool(re.match(r"[-*] |\d+\. ", line))
+        assert in_list or not (blank and re.match(r" {4}", line) and line.strip()), line
+        blank = not line.strip()
+
+
+def thermocald_commands() -> list[tuple[str, str]]:
+    found = []
+    for block in all_blocks("bash"):
+        for line in block.commands():
+            parts = re.split(r"\s*(?:&&|\||;)\s*", line)
+            found += [(identity(block), p) for p in parts if p.startswith("thermocald ")]
+    for page in PAGES:
+        found += [(name(page), text) for text in inline_commands(page)]
+    return found
+
+
+def test_every_command_and_option_exists(capsys):
+    """`… --help` is refused for unknown commands and options, and carries nothing out."""
+    commands = thermocald_commands()
+    assert len(commands) > 60
+    wrong = []
+    for where, text in dict.fromkeys(commands):
+        words = shlex.split(re.sub(r"\s*[<>].*$", "", text))[1:]
+        try:
+            COMMAND.main([*words, "--help"], "thermocald", standalone_mode=False)
+        except Exception as error:
+            wrong.append(f"{where}: {text}: {error}")
+    capsys.readouterr()
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("block", all_blocks("yaml"), ids=identity)
+def test_yaml_is_valid(block, tmp_path):
+    document = yaml.safe_load(block.text)
+    if not isinstance(document, dict) or not set(document) <= STANZAS:
+        return
+    # a fragment stands for the whole: what it leaves out does not matter
+    if not {"cameras", "thermometers"} & set(document):
+        document["thermometers"] = [{"name": "any", "driver": "mock"}]
+    known = {t["name"] for t in document.get("thermometers", [])}
+    for camera in document.get("cameras", []):
+        for thermometer in set(camera.get("thermometers", [])) - known:
+            document.setdefault("thermometers", []).append({"name": thermometer, "driver": "mock"})
+        if "testfield" in camera:
+            (tmp_path / camera["testfield"]).touch()
+    parse_config(document, tmp_path / "config.yaml", option_names)
+
+
+@pytest.mark.parametrize("block", all_blocks("json") + all_blocks("toml"), ids=identity)
+def test_json_and_toml_are_valid(block):
+    (json.loads if block.language == "json" else tomllib.loads)(block.text)
+
+
+@pytest.mark.parametrize("block", all_blocks("csv"), ids=identity)
+def test_csv_is_rectangular(block):
+    text = block.text.split("\n", 1)[1] if block.text.startswith("#") else block.text
+    rows = list(csv.reader(StringIO(text)))
+    assert len({len(row) for row in rows}) == 1
+
+
+def test_the_shipped_configuration_is_valid():
+    path = ROOT / "config.yaml"
+    parse_config(yaml.safe_load(path.read_text()), path, option_names)

@@ -36,7 +36,7 @@ def live(daemon, devices):
     daemon.live = folder
     daemon.ask = lambda do, **values: ask(folder, do, **values)
     daemon.session = lambda: ask(folder, "session status")["sessions"].get("phone-1", {})
-    yield start
+    return start
 
 
 @pytest.fixture

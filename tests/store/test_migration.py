@@ -15,7 +15,7 @@ from thermocald.store.database import Store
 
 @pytest.fixture
 def version_1(store_path, field, head, make_epoch, make_result, monkeypatch):
-    """A file as version 1 wrote it: no column chunks, no codes of the statuses."""
+    """A file as version 1 wrote it: no column chunks, no codes of the statuses, no readings."""
     monkeypatch.setattr(columns, "CHUNK", 8)
     with Store.open(store_path, "append", durable=False) as store:
         series = store.create_series(head, field)
@@ -26,6 +26,7 @@ def version_1(store_path, field, head, make_epoch, make_result, monkeypatch):
         database.execute("DROP TABLE column_chunk")
         database.execute("DROP TABLE status_code")
         database.execute("DROP TABLE late_epoch")
+        database.execute("DROP TABLE reading")
         database.execute("PRAGMA user_version = 1")
     database.close()
     return store_path

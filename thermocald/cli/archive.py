@@ -1,15 +1,19 @@
-"""`thermocald archive`: the store's series as recordings."""
+"""`thermocald archive`: the store's series as recordings; frames that may go are deleted."""
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from thermocald.cli.common import say, write_json
 from thermocald.cli.options import JsonOption
 from thermocald.errors import UsageError
+
+if TYPE_CHECKING:
+    from thermocald.config import Config
 
 __all__ = ["register"]
 
@@ -41,16 +45,26 @@ def archive(
     finished: Annotated[
         bool, typer.Option("--finished", help="Only series after which the camera began another.")
     ] = False,
+    retention: Annotated[
+        bool,
+        typer.Option("--retention", help="Then delete frames as the configuration's limits say."),
+    ] = False,
     json: JsonOption = None,
 ) -> None:
     """Write every series as a recording `<camera>-<series>`, a folder that replays anywhere.
 
+    Readings that belong to no epoch become `thermometer-<name>.csv`, unless --finished or --series
+    is given.
+
     Example: thermocald archive thermocald.db --to recordings
     """
     from thermocald.config import load_config
-    from thermocald.store.archive import archive_series
+    from thermocald.store.archive import archive_readings, archive_series
     from thermocald.store.database import Store
 
+    read = None
+    if retention and config is None:
+        raise UsageError("--retention needs --config FILE: it holds the limits")
     if config is not None:
         read = load_config(config)
         store, frames = store or read.store.path, frames or read.frames.folder
@@ -58,6 +72,10 @@ def archive(
         raise UsageError("which store? give its file, or --config FILE")
     camera, _, name = (series or "").rpartition("/")
     written: list[dict[str, Any]] = []
+    readings: dict[str, Path] = {}
+    if finished and not store.exists():
+        say(f"{store}: nothing was stored yet")
+        return
     with Store.open(store) as opened:
         chosen = (
             opened.all_series()
@@ -78,5 +96,35 @@ def archive(
             written.append(
                 {"camera": one.camera, "series": one.name, "path": path, "last_epoch": last}
             )
+        if series is None and not finished:
+            readings = archive_readings(opened, folder)
+    for path in readings.values():
+        say(f"{path}: readings")
+    deleted = _retention(read) if retention and read is not None else []
+    for sentence in deleted:
+        say(sentence)
     if json is not None:
-        write_json({"format": "thermocald-archive/1", "recordings": written}, json)
+        document = {"recordings": written, "readings": readings, "deleted": deleted}
+        write_json({"format": "thermocald-archive/1", **document}, json)
+
+
+def _retention(config: Config) -> list[str]:
+    """Have the running daemon delete what may go, or where none runs, do it; both log it."""
+    from thermocald.daemon.control import ask
+    from thermocald.daemon.live_state import find_state
+
+    told = ask(find_state(config.store.path), "retention")
+    if told is not None:
+        return [str(sentence) for sentence in told["deleted"]]
+    from thermocald.acquisition.frame_folder import FrameFolder
+    from thermocald.daemon.store_guard import StoreGuard
+    from thermocald.store.row import Event
+
+    guard = StoreGuard(config.store.path)
+    try:
+        sentences = [deleted.text for deleted in FrameFolder(config.frames).enforce()]
+        for sentence in sentences:
+            guard.event(Event(time.time(), "frames_deleted", sentence))
+    finally:
+        guard.close()
+    return sentences

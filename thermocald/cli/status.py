@@ -115,11 +115,12 @@ def render(document: dict[str, Any]) -> RenderableType:
     parts.append(cameras)
     parts += [Text(_session(one)) for one in document["sessions"].values()]
     others = Table(box=None, pad_edge=False)
-    for title in ("device", "state", "faults", "why"):
+    for title in ("device", "state", "°C", "faults", "why"):
         others.add_column(title)
     for kind in ("thermometers", "outputs"):
         for name, device in document[kind].items():
-            others.add_row(f"{name}", device["device"], str(device["faults"]), device["why"])
+            last = " ".join(f"{v:.2f}" for v in device.get("last", {}).values())
+            others.add_row(name, device["device"], last, str(device["faults"]), device["why"])
     parts.append(others)
     parts += [Text(line, style="yellow") for line in _warnings(document)]
     return Group(*parts)
@@ -159,10 +160,8 @@ def _camera(name: str, camera: dict[str, Any]) -> list[str]:
 def _session(one: dict[str, Any]) -> str:
     why = f": {one['why']}" if one["why"] else ""
     start = f", {one['start']}" if one["start"] else ""
-    return (
-        f"session {one['camera']}/{one['series']}{start}: {one['taken']} of {one['epochs']} epochs, "
-        f"{one['state']}{why}"
-    )
+    taken = f"{one['taken']} of {one['epochs']} epochs"
+    return f"session {one['camera']}/{one['series']}{start}: {taken}, {one['state']}{why}"
 
 
 def _with_sd(last: dict[str, Any], name: str) -> str:

@@ -10,7 +10,6 @@ import logging
 import os
 import queue
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -22,6 +21,7 @@ from thermocald import __version__
 from thermocald.acquisition.steady_clock import SteadyClock
 from thermocald.config import load_config
 from thermocald.daemon.control import ControlSocket, StartRequest, StopRequest
+from thermocald.daemon.dashboard_process import DashboardProcess
 from thermocald.daemon.live_state import LiveState
 from thermocald.daemon.notify import (
     notify,
@@ -91,8 +91,7 @@ class Service:
         self._end = False
         self._reload = False
         self._complained: list[str] = []
-        self._dashboard: subprocess.Popen[bytes] | None = None
-        self._dashboard_at = 0.0
+        self._dashboard = DashboardProcess(config.store.path, self.live.folder)
         self._inbox: queue.SimpleQueue[tuple[Request, Future[dict[str, Any]]]] = queue.SimpleQueue()
 
     def run(self) -> bool:
@@ -122,7 +121,7 @@ class Service:
                     notify("STOPPING=1")
                     control.close()
                     done = self._station.stop(_GRACE_S)
-                    self._stop_dashboard()
+                    self._dashboard.stop()
                     self._tell("stopped", "thermocald stopped")
         finally:
             self._guard.close()
@@ -149,7 +148,7 @@ class Service:
                 data = {"seconds": step.seconds, "adopted": step.adopted}
                 self._guard.event(Event(step.utc, "clock_step", step.text, data=data))
             if self._station.preview:
-                self._keep_dashboard()
+                self._dashboard.keep(self.config.dashboard)
             stalled = self._station.stalled()
             self._complain(stalled)
             if interval is not None and not stalled and now - fed >= min(interval, 1.0):
@@ -282,40 +281,6 @@ class Service:
     def _tell(self, kind: str, text: str) -> None:
         self._guard.event(Event(self.clock.utc(), kind, text))
 
-    def _keep_dashboard(self) -> None:
-        """The page runs in a process of its own; it is started again, at most every 10 s."""
-        child = self._dashboard
-        if child is not None and child.poll() is None:
-            return
-        if time.monotonic() < self._dashboard_at:
-            return
-        if child is not None:
-            log.warning("the dashboard ended (%s); it is started again", child.returncode)
-        self._dashboard_at = time.monotonic() + 10.0
-        command = [sys.executable, "-m", "thermocald", "dashboard"]
-        command += ["--store", str(self.config.store.path.absolute())]
-        command += ["--live", str(self.live.folder.absolute())]
-        dashboard = self.config.dashboard
-        command += ["--host", dashboard.host, "--port", str(dashboard.port)]
-        if dashboard.token_file is not None:
-            command += ["--token-file", str(dashboard.token_file)]
-        environment = {k: v for k, v in os.environ.items() if k not in _PRIVATE}
-        try:
-            self._dashboard = subprocess.Popen(command, env=environment)
-        except OSError as error:
-            log.error("the dashboard cannot be started: %s", error)
-
-    def _stop_dashboard(self) -> None:
-        child = self._dashboard
-        if child is None or child.poll() is not None:
-            return
-        child.terminate()
-        try:
-            child.wait(3.0)
-        except subprocess.TimeoutExpired:
-            child.kill()
-            child.wait()
-
     @contextmanager
     def _signals(self) -> Iterator[None]:
         def end(*_: object) -> None:
@@ -336,5 +301,3 @@ class Service:
             for number, handler in before.items():
                 signal.signal(number, handler)
 
-
-_PRIVATE = {"NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC"}

@@ -23,7 +23,7 @@ from thermocald.daemon.output_loop import OutputLoop
 from thermocald.daemon.plan import plan_cameras
 from thermocald.errors import ConfigurationError
 from thermocald.hal import open_device, option_names
-from thermocald.store.row import Event
+from thermocald.store.row import Event, LoggedReading
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -77,6 +77,8 @@ class Station:
         self.preview = config.dashboard.enabled
         self.frames = FrameFolder(config.frames)
         self.readings = Readings({t.name: t.period_s for t in config.thermometers})
+        self.last_readings: dict[str, dict[str, float]] = {}
+        self.logged = 0  # readings kept apart from epochs
         self._stop = threading.Event()
         self._started = False
         self.cameras: list[CameraLine] = []
@@ -226,7 +228,10 @@ class Station:
         return {
             "cameras": {camera.plan.name: camera.status() for camera in self.cameras},
             "thermometers": {
-                name: link_status(link, self._busy_s(link), self.hang_after_s)
+                name: {
+                    **link_status(link, self._busy_s(link), self.hang_after_s),
+                    "last": self.last_readings.get(name, {}),
+                }
                 for name, (_, link) in self._thermometers.items()
             },
             "outputs": {
@@ -237,6 +242,7 @@ class Station:
                 }
                 for output in self.outputs
             },
+            "readings_logged": self.logged,
             "frames": {"keep": self.config.frames.keep, "paused": self.frames.paused},
         }
 
@@ -250,9 +256,24 @@ class Station:
         thermometer, _ = self._thermometers[name]
 
         def read() -> None:
-            self.readings.add(name, thermometer.read())
+            reading = thermometer.read()
+            self.readings.add(name, reading)
+            self.last_readings[name] = dict(reading.values)
+            if not self._in_epochs(name):
+                trusted = self.clock.trusted()
+                self.guard.reading(LoggedReading(name, reading.utc, reading.values, trusted))
+                self.logged += 1
 
         return read
+
+    def _in_epochs(self, thermometer: str) -> bool:
+        """Whether a camera that gives frames takes the thermometer's readings into its epochs."""
+        return any(
+            thermometer in line.plan.config.thermometers
+            and line.run is not None
+            and line.link.state == "open"
+            for line in self.cameras
+        )
 
     def retain(self) -> list[str]:
         """Delete the frames that may go; sentences about what was deleted."""

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from thermocald.epoch import Epoch
-    from thermocald.store.row import EpochResult, StoredSeries
+    from thermocald.store.row import EpochResult, LoggedReading, StoredSeries
 
 __all__ = ["Row", "StoreGuard"]
 
@@ -97,6 +97,7 @@ class StoreGuard:
         self.thin = False
         self._waiting: deque[Row] = deque()
         self._events: deque[Event] = deque(maxlen=1000)
+        self._readings: deque[LoggedReading] = deque(maxlen=_MOST_WAITING)
         self._lock = threading.RLock()
 
     @property
@@ -130,6 +131,10 @@ class StoreGuard:
             self._events.append(event)
             self._flush_events()
 
+    def reading(self, reading: LoggedReading) -> None:
+        """Keep a reading that belongs to no epoch with the next `flush`; returns at once."""
+        self._readings.append(reading)
+
     def flush(self) -> None:
         """Write what waits, oldest first, until the store refuses."""
         with self._lock:
@@ -147,6 +152,7 @@ class StoreGuard:
                     self._refused(error)
                     return
             self._flush_events()
+            self._flush_readings()
 
     def _write(self, row: Row) -> StoreError | None:
         self._look_at_the_disk(row)
@@ -190,11 +196,14 @@ class StoreGuard:
             return False
         return True
 
-    def _refused(self, error: StoreError) -> None:
+    def _out(self, error: StoreError, utc: float) -> None:
         if not self.away:
             log.error("%s; results wait in memory", error, extra={"event": "store_out"})
-            self._events.append(Event(self._waiting[0].epoch.frame_time, "store_out", str(error)))
+            self._events.append(Event(utc, "store_out", str(error)))
         self.away = str(error)
+
+    def _refused(self, error: StoreError) -> None:
+        self._out(error, self._waiting[0].epoch.frame_time)
         if len(self._waiting) > _MOST_WITH_OBSERVATIONS:
             self._waiting[-1 - _MOST_WITH_OBSERVATIONS] = self._waiting[
                 -1 - _MOST_WITH_OBSERVATIONS
@@ -217,6 +226,19 @@ class StoreGuard:
                 return False
             self._events.popleft()
         return True
+
+    def _flush_readings(self) -> None:
+        batch = list(self._readings)
+        if not batch:
+            return
+        try:
+            self.store.add_readings(batch)
+        except StoreError as error:
+            self._out(error, batch[0].utc)
+            return
+        for _ in batch:
+            self._readings.popleft()
+        self._back()
 
     def status(self) -> dict[str, Any]:
         """For `thermocald status`."""

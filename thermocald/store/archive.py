@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.errors import DataError
 from thermocald.store.recording_writer import RecordingWriter
 
 if TYPE_CHECKING:
@@ -20,7 +22,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["archive_series", "clock_corrections"]
+__all__ = ["archive_readings", "archive_series", "clock_corrections"]
 
 
 def clock_corrections(frame_time: Array, interval: float) -> Array:
@@ -71,6 +73,32 @@ def archive_series(
                     temperature_time=epoch.temperature_time + shift,
                 )
             writer.append(epoch)
+
+
+def archive_readings(store: Store, folder: Path) -> dict[str, Path]:
+    """Write what thermometers said apart from epochs, {thermometer: `thermometer-<name>.csv`}.
+
+    Columns: time (s UTC), clock_trusted, one per channel (°C, empty where it was not read). Raises
+    StoreError, DataError if the folder cannot be written.
+    """
+    channels: dict[str, dict[str, None]] = {}
+    for reading in store.readings():
+        channels.setdefault(reading.thermometer, {}).update(dict.fromkeys(reading.values))
+    written: dict[str, Path] = {}
+    for name, columns in channels.items():
+        written[name] = folder / f"thermometer-{name}.csv"
+        partial = folder / f".thermometer-{name}.csv.partial"
+        try:
+            with partial.open("w", encoding="utf-8", newline="") as file:
+                rows = csv.writer(file, lineterminator="\n")
+                rows.writerow(["time", "clock_trusted", *columns])
+                for reading in store.readings(name):
+                    values = [reading.values.get(channel, "") for channel in columns]
+                    rows.writerow([f"{reading.utc:.6f}", int(reading.clock_trusted), *values])
+            partial.replace(written[name])
+        except OSError as error:
+            raise DataError(f"{written[name]}: cannot be written: {error.strerror}") from error
+    return written
 
 
 def _with_frame(epoch: Epoch, frames: Path | None) -> Epoch:

@@ -25,11 +25,19 @@ from thermocald.store.epoch_table import (
     select_epochs,
 )
 from thermocald.store.readings import interpolate_readings
-from thermocald.store.row import NOT_CALIBRATED, EpochResult, Event, StoredSeries
+from thermocald.store.row import (
+    NOT_CALIBRATED,
+    EpochResult,
+    Event,
+    LoggedReading,
+    StoredSeries,
+)
 from thermocald.store.series_table import (
     insert_events,
+    insert_readings,
     insert_series,
     select_events,
+    select_readings,
     select_series,
 )
 
@@ -199,6 +207,18 @@ class Store:
         """Log something that happened apart from an epoch."""
         with self._transaction("an event was not kept"):
             insert_events(self._db, [event])
+
+    def add_readings(self, readings: Sequence[LoggedReading]) -> None:
+        """Keep what thermometers said apart from epochs, in one transaction."""
+        with self._transaction("readings were not kept"):
+            insert_readings(self._db, readings)
+
+    def readings(
+        self, thermometer: str | None = None, since_utc: float = 0.0
+    ) -> Iterator[LoggedReading]:
+        """Readings apart from epochs, in the order they were kept."""
+        with in_words(self.path, "readings cannot be read", reading=True):
+            yield from select_readings(self._db, thermometer, since_utc)
 
     def rebuild_columns(self, series: StoredSeries) -> None:
         """Derive the column chunks anew: after many `amend`s reading is faster for it."""

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["NOT_CALIBRATED", "EpochResult", "Event", "StoredSeries"]
+__all__ = ["NOT_CALIBRATED", "EpochResult", "Event", "LoggedReading", "StoredSeries"]
 
 NOT_CALIBRATED = "not_calibrated"  # the status of an epoch that has not been adjusted yet
 
@@ -131,3 +131,13 @@ class Event:
     series: int | None = None
     epoch: int | None = None
     data: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class LoggedReading:
+    """What a thermometer said that belongs to no epoch: utc s, values {channel: °C}."""
+
+    thermometer: str
+    utc: float
+    values: Mapping[str, float]
+    clock_trusted: bool = True

@@ -32,13 +32,16 @@ _PARAMETERS = ", ".join(
 )
 
 # Append-only is promised by the file itself, not by this program alone.
+def _append_only(table: str) -> list[str]:
+    return [
+        f"CREATE TRIGGER {table}_{verb.lower()} BEFORE {verb} ON {table} "
+        f"BEGIN SELECT RAISE(ABORT, 'the store is append-only'); END"
+        for verb in ("UPDATE", "DELETE")
+    ]
+
+
 _KEPT_TABLES = ("testfield", "series", "epoch", "detail", "event")
-_TRIGGERS = [
-    f"CREATE TRIGGER {table}_{verb.lower()} BEFORE {verb} ON {table} "
-    f"BEGIN SELECT RAISE(ABORT, 'the store is append-only'); END"
-    for table in _KEPT_TABLES
-    for verb in ("UPDATE", "DELETE")
-]
+_TRIGGERS = [trigger for table in _KEPT_TABLES for trigger in _append_only(table)]
 
 _BASE = [
     """CREATE TABLE testfield (
@@ -78,6 +81,14 @@ _COLUMN_CHUNKS = [
     "INSERT INTO status_code (status) SELECT DISTINCT status FROM epoch",
 ]
 
+_READINGS = [
+    """CREATE TABLE reading (
+        id INTEGER PRIMARY KEY, thermometer TEXT NOT NULL, utc REAL NOT NULL,
+        clock_trusted INTEGER NOT NULL, temperatures TEXT NOT NULL)""",
+    "CREATE INDEX reading_thermometer ON reading (thermometer, utc)",
+    *_append_only("reading"),
+]
+
 
 def _run(statements: Sequence[str]) -> Callable[[sqlite3.Connection], None]:
     def step(connection: sqlite3.Connection) -> None:
@@ -95,7 +106,11 @@ def _add_column_chunks(connection: sqlite3.Connection) -> None:
         build_missing_chunks(connection, series)
 
 
-STEPS: tuple[Callable[[sqlite3.Connection], None], ...] = (_run(_BASE), _add_column_chunks)
+STEPS: tuple[Callable[[sqlite3.Connection], None], ...] = (
+    _run(_BASE),
+    _add_column_chunks,
+    _run(_READINGS),
+)
 VERSION = len(STEPS)
 
 

@@ -1,4 +1,4 @@
-"""Series and events as rows of the store."""
+"""Series, events, and readings apart from epochs, as rows of the store."""
 
 from __future__ import annotations
 
@@ -7,18 +7,25 @@ import json
 from typing import TYPE_CHECKING
 
 from thermocald.store.head import Head, head_document, parse_head
-from thermocald.store.row import Event, StoredSeries
+from thermocald.store.row import Event, LoggedReading, StoredSeries
 from thermocald.store.testfield_file import parse_testfield, testfield_csv
 
 if TYPE_CHECKING:
     import sqlite3
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
     from typing import Any
 
     from thermocald.photogrammetry.testfield import TestField
 
-__all__ = ["insert_events", "insert_series", "select_events", "select_series"]
+__all__ = [
+    "insert_events",
+    "insert_readings",
+    "insert_series",
+    "select_events",
+    "select_readings",
+    "select_series",
+]
 
 
 def insert_series(
@@ -95,6 +102,26 @@ def select_events(
         Event(utc, kind, text, series_id, epoch, json.loads(data))
         for utc, kind, text, series_id, epoch, data in rows
     ]
+
+
+def insert_readings(connection: sqlite3.Connection, readings: Iterable[LoggedReading]) -> None:
+    """Insert readings; within the caller's transaction."""
+    connection.executemany(
+        "INSERT INTO reading (thermometer, utc, clock_trusted, temperatures) VALUES (?, ?, ?, ?)",
+        [(r.thermometer, r.utc, int(r.clock_trusted), _json(r.values)) for r in readings],
+    )
+
+
+def select_readings(
+    connection: sqlite3.Connection, thermometer: str | None, since_utc: float
+) -> Iterator[LoggedReading]:
+    """Readings of a thermometer, None for all, from an instant on, in the order they were kept."""
+    for name, utc, trusted, values in connection.execute(
+        "SELECT thermometer, utc, clock_trusted, temperatures FROM reading WHERE utc >= ? "
+        "AND thermometer = ifnull(?, thermometer) ORDER BY id",
+        (since_utc, thermometer),
+    ):
+        yield LoggedReading(name, utc, json.loads(values), bool(trusted))
 
 
 def _json(mapping: Mapping[str, Any]) -> str:

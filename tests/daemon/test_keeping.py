@@ -1,0 +1,148 @@
+"""Readings without a camera, the archive, retention by the timer."""
+
+from __future__ import annotations
+
+import csv
+import os
+import shlex
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.daemon.conftest import ENVIRONMENT
+from thermocald.errors import StoreError
+from thermocald.store.database import Store
+from thermocald.store.recording import read_recording
+
+UNITS = Path(__file__).resolve().parents[2] / "systemd"
+
+
+def thermocald(*options: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "thermocald", *options],
+        cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+
+def readings_of(daemon, name=None) -> list:
+    try:
+        with Store.open(daemon.store) as store:
+            return list(store.readings(name))
+    except StoreError:  # it is being made
+        return []
+
+
+def test_a_thermometer_alone_is_stored_and_archived(daemon, devices):
+    sections = devices()
+    daemon.configure(thermometers=[{**sections["thermometers"][0], "name": "air"}])
+    daemon.start()
+    daemon.until(lambda: len(readings_of(daemon)) > 5)
+    assert daemon.stop() == 0
+    kept = readings_of(daemon)
+    assert {r.thermometer for r in kept} == {"air"}
+    assert all(20 < r.values["temperature"] < 30 for r in kept)
+    gaps = [b.utc - a.utc for a, b in zip(kept, kept[1:], strict=False)]
+    assert min(gaps) > 0.1
+    done = thermocald("archive", "--config", "config.yaml", "--to", "out", cwd=daemon.folder)
+    assert done.returncode == 0, done.stderr
+    with (daemon.folder / "out/thermometer-air.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["temperature"]) for row in rows] == [r.values["temperature"] for r in kept]
+
+
+def test_a_thermometer_of_no_camera_is_stored_and_a_paired_one_while_the_camera_is_away(
+    daemon, devices
+):
+    sections = devices(camera=[{"kind": "unplugged", "at": 3, "for_s": 2.0}])
+    sections["thermometers"].append({**sections["thermometers"][0], "name": "air", "seed": 7})
+    daemon.configure(**sections)
+    daemon.start()
+    daemon.until(lambda: "camera one is back" in daemon.log())
+    daemon.until(lambda: daemon.results() and daemon.results()[-1]["epoch"] > 5)
+    assert daemon.stop() == 0
+    air, housing = readings_of(daemon, "air"), readings_of(daemon, "housing")
+    assert len(air) > 10
+    with Store.open(daemon.store) as store:
+        (out, back) = [e.utc for e in store.events() if e.kind in ("device_out", "device_back")]
+        epochs = store.series_columns(store.find_series(), ["temperature_time"])
+    away = [r for r in housing if out < r.utc < back]
+    assert away  # ten, where the machine has time for every tick
+    # what an epoch holds is not kept twice
+    assert not set(epochs["temperature_time"]) & {r.utc for r in away}
+
+
+def test_readings_wait_for_a_store_that_cannot_be_written(daemon, devices):
+    import resource
+
+    daemon.configure(thermometers=devices()["thermometers"])
+    daemon.start()
+    daemon.until(lambda: len(readings_of(daemon)) > 2)
+    before = resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, (8192, before[1]))
+    daemon.until(lambda: "results wait in memory" in daemon.log())
+    resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, before)
+    daemon.until(lambda: "can be written again" in daemon.log())
+    assert daemon.stop() == 0
+    times = [r.utc for r in readings_of(daemon)]
+    assert times == sorted(times)
+    gaps = [b - a for a, b in zip(times, times[1:], strict=False)]
+    # no reading of the time in which nothing could be written is missing: ticks are 0.2 s
+    assert len([g for g in gaps if g > 1.0]) == 0 or os.getloadavg()[0] > 4
+
+
+@pytest.fixture
+def timer_command(tmp_path):
+    """The command line of the timer's unit, its paths moved below a folder of the test."""
+    lines = (UNITS / "thermocald-archive.service").read_text().splitlines()
+    (line,) = [one for one in lines if one.startswith("ExecStart=")]
+    words = shlex.split(line.removeprefix("ExecStart="))
+    assert words[0] == "/opt/thermocald/bin/thermocald"
+    moved = {"/etc/thermocald/": "", "/var/lib/thermocald/": ""}
+    for old, new in moved.items():
+        words = [word.replace(old, new) for word in words]
+
+    def run() -> subprocess.CompletedProcess[str]:
+        return thermocald(*words[1:], cwd=tmp_path)
+
+    return run
+
+
+def test_the_timers_command_archives_what_has_ended_and_deletes_old_frames(
+    daemon, devices, timer_command
+):
+    assert timer_command().returncode == 2  # no configuration: one line, no traceback
+    limits = {"keep": "all", "folder": str(daemon.folder / "frames"), "max_age_days": 1,
+              "min_free_gb": 0.01}  # fmt: skip
+    daemon.configure(**devices(), frames=limits)
+    assert "nothing was stored yet" in timer_command().stderr
+    for series in ("M1", "M2"):
+        sections = devices(series=series)
+        daemon.configure(**sections, frames=limits)
+        daemon.start()
+        count = len(daemon.results())
+        daemon.until(lambda n=count: len(daemon.results()) > n + 3)
+        if series == "M1":
+            assert daemon.stop() == 0
+    # an old frame, while the daemon runs: it is the daemon that deletes it, and logs it
+    old = sorted((daemon.folder / "frames").rglob("*.png"))[0]
+    yesterday = time.time() - 2 * 86400
+    os.utime(old, (yesterday, yesterday))
+    done = timer_command()
+    assert done.returncode == 0, done.stderr
+    assert "1 frames" in done.stderr
+    assert not old.exists()
+    assert (daemon.folder / "recordings/one-M1").is_dir()
+    assert not (daemon.folder / "recordings/one-M2").exists()
+    assert len(read_recording(daemon.folder / "recordings/one-M1").epochs) >= 4
+    assert daemon.stop() == 0
+    # and where no daemon runs, the command itself does and logs it; a second run archives nothing
+    old = sorted((daemon.folder / "frames").rglob("*.png"))[0]
+    os.utime(old, (yesterday, yesterday))
+    done = timer_command()
+    assert done.returncode == 0, done.stderr
+    assert "one-M1" not in done.stderr
+    assert not old.exists()
+    assert daemon.events().count("frames_deleted") == 2

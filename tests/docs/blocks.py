@@ -1,8 +1,8 @@
 """The code blocks of the documentation, and the commands in them.
 
-Convention: every block names its language. A `bash` block holds commands, one a line, run from top
-to bottom of the page in one folder; `text` is output. Inline code that begins with `thermocald` is a
-command too, and its name and options must exist.
+Convention: every block names its language. A `bash` block holds commands, one a line, run from
+top to bottom of the page in one folder; `text` is output. Inline code that begins with `thermocald`
+is a command too, and its name and options must exist.
 """
 
 from __future__ import annotations

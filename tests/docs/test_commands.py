@@ -1,0 +1,253 @@
+"""Every command of the documentation runs, page by page, in a folder that was prepared for it.
+
+What cannot run here stands in small tables with its reason; a test keeps them free of dead entries.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.docs.blocks import PAGES, ROOT, Block, all_blocks, blocks, name
+from tests.docs.worlds import AFTER, WORLDS
+from thermocald.store.database import Store
+
+ROOT_NEEDED = "changes the machine: needs root, and a package index"
+NOT_RUN = {
+    "sudo apt-get install python3-venv git": ROOT_NEEDED,
+    "sudo apt-get install python3-venv adb": ROOT_NEEDED,
+    "sudo apt-get install python3-venv python3-picamera2": ROOT_NEEDED,
+    "sudo EXTRAS=dashboard,v4l2,gpio systemd/install.sh": "root; tests/daemon/test_systemd.py",
+    "sudo nano /etc/thermocald/config.yaml": "an editor, for a person",
+    "sudo systemctl enable --now thermocald thermocald-archive.timer": "root; tests/hil boots it",
+    "sudo systemctl edit thermocald": "root, and an editor",
+    "systemctl status thermocald": "needs the installed service; tests/hil boots it",
+    "pipx install 'thermocald[dashboard,android]'": "needs a package index",
+    "pip install 'thermocald[android]'": "needs a package index",
+    "python3 -m venv .venv": "an environment; `make setup` makes one",
+    "python3 -m venv --system-site-packages .venv": "an environment; `make setup` makes one",
+    ".venv/bin/pip install '.[android,report]'": "needs a package index",
+    ".venv/bin/pip install '.[dashboard,report,gpio]'": "needs a package index",
+    "source .venv/bin/activate": "needs that environment",
+    "adb start-server": "starts a server that outlives the test; tests/hil has a real one",
+    "adb devices": "starts a server that outlives the test; tests/hil has a real one",
+    "rpicam-still --nopreview --timeout 1000 --lens-position 0 --width 1640 --height 1232 "
+    "--output photos/1.jpg": "needs a Raspberry Pi; photographs are rendered instead",
+    "make test": "runs this test",
+    "make test-slow": "runs this test",
+    "make bench": "an hour of measurements; no test's business",
+    "make hil": "root, and an hour for the first time; run by .ci/run",
+    "make demo": "sets up an environment; `thermocald demo` is run by the tutorial",
+}
+"""Command → why it is not run."""
+
+ELSEWHERE = {
+    "thermocald study --reference --report reference.html": (
+        "tests/cli/test_study_command.py", '"--reference", "--json", "-"',
+    ),
+    "python -m benchmarks.object_space --check": (
+        "tests/docs/test_object_space.py", "from benchmarks.object_space import",
+    ),
+}  # fmt: skip
+"""Command → the test that runs it, and what stands there."""
+
+SHORTENED = {
+    "--epochs 150": ("--epochs 30", "25 minutes of a camera"),
+    "thermocald demo --out demo": ("thermocald demo --out demo --epochs 12", "a minute"),
+}
+"""Part of a command → what is run instead, and what it would take."""
+
+
+def epochs_in(*stores: str):
+    """Whether so many epochs were kept in a store of the folder."""
+
+    def kept(folder: Path, _: str) -> bool:
+        for path in map(folder.joinpath, stores):
+            try:
+                with Store.open(path) as store:
+                    if any((store.last_epoch(s) or 0) >= 2 for s in store.all_series()):
+                        return True
+            except (OSError, ValueError):
+                continue
+        return False
+
+    return kept
+
+
+UNTIL = {
+    "thermocald run --config config.yaml": epochs_in("thermocald.db"),
+    "thermocald run --mock": epochs_in("thermocald-mock.db"),
+    "thermocald top --config config.yaml": lambda _, output: "demo" in output,
+    "thermocald dashboard --store thermocald.db": lambda _, output: "http://127.0.0.1" in output,
+}
+"""Commands that run until Ctrl-C: what must have come of them before they get it."""
+
+STAYS = {"thermocald run --config config.yaml"}
+"""Of these, what runs on while the rest of the page is done."""
+
+PATH = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+ENVIRONMENT = {**os.environ, "PATH": PATH, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1",
+               "COLUMNS": "120"}  # fmt: skip
+ADB_IS_ELSEWHERE = {"ANDROID_ADB_SERVER_PORT": "1"}  # `devices` must not start a server
+PATIENCE_S = 240.0
+
+
+@pytest.fixture(scope="session")
+def shelf(tmp_path_factory) -> Path:
+    """Where simulated recordings are made once."""
+    return tmp_path_factory.mktemp("shelf")
+
+
+class Page:
+    """The commands of one page, one after the other, in one folder."""
+
+    def __init__(self, page: str, shelf: Path, folder: Path) -> None:
+        self.page, self.shelf, self.folder = page, shelf, folder
+        self.staying: list[tuple[str, subprocess.Popen[str]]] = []
+
+    def run(self, block: Block) -> None:
+        if block.language == "python":
+            self.finish("python", self.start(f"{sys.executable} -", block.text))
+        elif block.language == "sql":
+            with sqlite3.connect(self.folder / "thermocald.db") as database:
+                assert database.execute(block.text).fetchall()
+            database.close()
+        for command in block.commands() if block.language == "bash" else ():
+            if command not in NOT_RUN and command not in ELSEWHERE:
+                self.command(command)
+            if (self.page, command) in AFTER:
+                AFTER[self.page, command](self.shelf, self.folder)
+
+    def command(self, command: str) -> None:
+        shortened = command
+        for part, (instead, _) in SHORTENED.items():
+            shortened = shortened.replace(part, instead)
+        process = self.start(shortened)
+        if command not in UNTIL:
+            self.finish(command, process)
+            return
+        self.wait(command, process)
+        self.staying.append((command, process))
+        if command not in STAYS:
+            self.end()
+
+    def start(self, command: str, given: str = "") -> subprocess.Popen[str]:
+        (self.folder / "given").write_text(given)
+        with (self.folder / "given").open() as stdin, (self.folder / "output").open("w") as output:
+            return subprocess.Popen(
+                ["bash", "-euo", "pipefail", "-c", command],
+                cwd=self.folder,
+                env={**ENVIRONMENT, **ADB_IS_ELSEWHERE},
+                stdin=stdin,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                text=True,
+                start_new_session=True,
+            )
+
+    def output(self) -> str:
+        return (self.folder / "output").read_text(errors="replace")
+
+    def finish(self, command: str, process: subprocess.Popen[str]) -> None:
+        try:
+            status = process.wait(PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            raise
+        said = self.output()
+        assert status == 0, f"{self.page}: {command}: exit status {status}\n{said[-3000:]}"
+        assert "Traceback" not in said
+        assert "Warning" not in said, said
+
+    def wait(self, command: str, process: subprocess.Popen[str]) -> None:
+        deadline = time.monotonic() + PATIENCE_S
+        while not UNTIL[command](self.folder, self.output()):
+            assert process.poll() is None, f"{self.page}: {command} ended:\n{self.output()}"
+            assert time.monotonic() < deadline, f"{self.page}: {command}:\n{self.output()}"
+            time.sleep(0.2)
+
+    def end(self) -> None:
+        while self.staying:
+            command, process = self.staying.pop()
+            os.killpg(process.pid, signal.SIGINT)
+            status = process.wait(PATIENCE_S)
+            assert status in (0, 130), f"{command}: {status}"
+
+    def kill(self) -> None:
+        for _, process in self.staying:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+
+
+def runnable(page: Path) -> bool:
+    skipped = {*NOT_RUN, *ELSEWHERE}
+    return any(
+        b.language == "sql"
+        or (b.language == "python" and b.page != "drivers/README.md")  # drivers/test_example.py
+        or (b.language == "bash" and set(b.commands()) - skipped)
+        for b in blocks(page)
+    )
+
+
+QUICK = {"docs/reference/store.md"}
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(p, marks=() if name(p) in QUICK else pytest.mark.slow, id=name(p))
+        for p in PAGES
+        if runnable(p)
+    ],
+)
+def test_the_commands_of_a_page_run(page, shelf, tmp_path):
+    if name(page) in WORLDS:
+        WORLDS[name(page)](shelf, tmp_path)
+    running = Page(name(page), shelf, tmp_path)
+    try:
+        for block in blocks(page):
+            running.run(block)
+        running.end()
+    finally:
+        running.kill()
+
+
+def test_no_table_has_a_dead_entry():
+    commands = {c for b in all_blocks("bash") for c in b.commands()}
+    pages = {name(p) for p in PAGES}
+    assert set(NOT_RUN) - commands == set()
+    assert set(ELSEWHERE) - commands == set()
+    assert set(UNTIL) - commands == set()
+    assert set(UNTIL) >= STAYS
+    assert {part for part in SHORTENED if not any(part in c for c in commands)} == set()
+    assert set(WORLDS) - pages == set()
+    for page, command in AFTER:
+        assert command in {c for b in blocks(ROOT / page) for c in b.commands()}
+    for file, text in ELSEWHERE.values():
+        assert text in (ROOT / file).read_text()
+
+
+@pytest.mark.parametrize("command", sorted(c for c in NOT_RUN if c.startswith("make ")))
+def test_targets_that_are_not_run_exist(command):
+    target = command.split()[1]
+    assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), re.M)
+
+
+def test_installed_files_exist():
+    """What the commands that need root refer to."""
+    text = (ROOT / "docs/how-to/install.md").read_text()
+    for file in re.findall(r"systemd/[\w.@-]+", text):
+        assert (ROOT / file).exists(), file
+    for unit in re.findall(r"systemctl (?:enable --now|status|edit|reload) ([\w. -]+)", text):
+        for word in unit.split():
+            stem = word.partition(".")[0]
+            assert list((ROOT / "systemd").glob(f"{stem}*")), word

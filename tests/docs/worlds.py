@@ -1,0 +1,206 @@
+"""What the documentation's commands find in their folder: mocks, simulated recordings, files."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+from typer.testing import CliRunner
+
+from tests.docs.blocks import ROOT, blocks
+from tests.photogrammetry import network_cases
+from thermocald.cli import application
+from thermocald.photogrammetry.camera_model import CameraModel, InteriorOrientation, Sensor
+from thermocald.simulation.course import Course
+from thermocald.simulation.demonstration import demonstration_field, demonstration_model
+from thermocald.simulation.model import ModelEffect
+from thermocald.simulation.model_file import write_model
+from thermocald.simulation.presets import preset_simulation
+from thermocald.simulation.scene import Scene
+from thermocald.store.testfield_file import read_testfield
+
+
+def run(*arguments: object) -> None:
+    """One command of the program, in this process."""
+    result = CliRunner().invoke(application(), [str(a) for a in arguments])
+    assert result.exit_code == 0, result.output
+
+
+LAG = ModelEffect("thermal_lag", {"tau": 70.0})
+
+
+@cache
+def recordings(shelf: Path) -> tuple[Path, Path]:
+    """M1 and M2 of a Raspberry Pi camera with a lag, heated differently."""
+    paths = []
+    for series, seed, until, power in (("M1", 1, 600.0, 9.0), ("M2", 2, 800.0, 6.5)):
+        s = preset_simulation("rpi-v2.1-heating", seed=seed, series=series)
+        lamp = Course.steps([0, 80.0, until, 1e5], [0.0, power, 0.0])
+        programme = replace(s.programme, sources={"housing": lamp})
+        s = replace(s, model=replace(s.model, effects=(LAG,)), programme=programme)
+        s.write(shelf / series)
+        paths.append(shelf / series)
+    return paths[0], paths[1]
+
+
+@cache
+def model(shelf: Path) -> Path:
+    """A thermal model of that camera."""
+    path = shelf / "camera.thermal.yaml"
+    run("fit", *recordings(shelf), "-o", path, "--effect", "thermal_lag")
+    return path
+
+
+def put_recordings(shelf: Path, folder: Path, *names: str) -> None:
+    """The two series in turn under some names, in place of what is there."""
+    for name, source in zip(names, recordings(shelf) * 2, strict=False):
+        shutil.rmtree(folder / name, ignore_errors=True)
+        shutil.copytree(source, folder / name)
+
+
+def put_model(shelf: Path, folder: Path, *names: str) -> None:
+    for name in names:
+        shutil.copy(model(shelf), folder / name)
+
+
+def put_measured(shelf: Path, folder: Path) -> None:
+    """Points, images and a temperature log of the field, at M2's times."""
+    log = recordings(shelf)[1] / "epochs.csv"
+    for name in ("weather.csv", "log.csv", "epochs.csv"):
+        shutil.copy(log, folder / name)
+    times = [line.split(",")[1] for line in log.read_text().splitlines()[1:]]
+    rows = [f"{t},{800 + i},{600 + i}" for i, t in enumerate(times[:20])]
+    (folder / "points.csv").write_text("time,x,y\n" + "\n".join(rows) + "\n")
+    grey = np.tile(np.linspace(20, 220, 3280).astype(np.uint8), (2464, 1))
+    cv2.imwrite(str(folder / "hot.png"), grey)
+    (folder / "images.csv").write_text(f"time,image\n{times[60]},hot.png\n")
+
+
+def put_heat(folder: Path, camera: str) -> None:
+    """The camera file and the programme that the page on the simulation shows."""
+    shown = [b.text for b in blocks(ROOT / "docs/explanation/simulation.md")]
+    (text,) = [t for t in shown if t.startswith("format: thermocald-camera/1")]
+    (folder / camera).write_text(text)
+    (text,) = [t for t in shown if t.startswith("format: thermocald-programme/1")]
+    for name in ("warm-up.yaml", "lamp.yaml"):
+        (folder / name).write_text(text)
+
+
+def put_config(folder: Path, name: str, store: str = "thermocald.db") -> None:
+    """A configuration in place of the page's: its names, and a rendered camera that is quick."""
+    small = demonstration_model(demonstration_field("markers"))
+    write_model(
+        folder / "small.thermal.yaml", replace(small, sensor=Sensor(820, 616, 0.00448))
+    )
+    mock = {
+        "name": name, "driver": "mock", "period_s": 0.25, "thermometers": ["housing"],
+        "latency_s": 0.02, "principal_distance_mm": 3.04,
+        "options": {"testfield": "markers", "model": "./small.thermal.yaml", "seed": 1},
+    }  # fmt: skip
+    housing = {"name": "housing", "driver": "mock", "period_s": 0.25, "conversion_s": 0.01}
+    document = {
+        "store": {"path": store, "durable": False},
+        "frames": {"keep": "none"},
+        "cameras": [mock],
+        "thermometers": [housing],
+    }
+    (folder / "config.yaml").write_text(yaml.safe_dump(document))
+
+
+def put_photographs(folder: Path) -> None:
+    """Eight photographs of the field that was printed into `field/`."""
+    nominal = read_testfield(folder / "field" / "testfield.csv")
+    camera = CameraModel(Sensor(1640, 1232, 0.00224), InteriorOrientation(3.05, 0.02, -0.01, -2e-3))
+    scene = Scene(camera.sensor, nominal)
+    (folder / "photos").mkdir(exist_ok=True)
+    distance = 1.05 * float(np.ptp(nominal.points, axis=0).max())
+    stations = network_cases.convergent_stations(nominal.points, 8, distance=distance)
+    for i, station in enumerate(stations):
+        frame = scene.render(camera.interior.as_array(), station.as_array(), seed=i)
+        path = str(folder / "photos" / f"{i}.jpg")
+        cv2.imwrite(path, frame, [cv2.IMWRITE_JPEG_QUALITY, 95])
+
+
+def how_to_daemon(shelf: Path, folder: Path) -> None:
+    put_config(folder, "demo")
+    put_recordings(shelf, folder, "M1")
+
+
+def how_to_thermal_model(shelf: Path, folder: Path) -> None:
+    put_recordings(shelf, folder, "M1", "M2")
+    put_model(shelf, folder, "what-discover-wrote.yaml")
+    put_measured(shelf, folder)
+    put_heat(folder, "camera.yaml")
+
+
+def how_to_study(shelf: Path, folder: Path) -> None:
+    put_recordings(shelf, folder, "rpi-heating-M1", "rpi-heating-M2")
+    for k, preset in enumerate(("nexus5-cold", "nexus5-cold", "nexus5-warm", "nexus5-warm"), 1):
+        preset_simulation(preset, k, f"M{k}").write(folder / f"nexus-M{k}")
+
+
+def simulation(shelf: Path, folder: Path) -> None:
+    put_heat(folder, "camera.yaml")
+    shown = blocks(ROOT / "docs/explanation/simulation.md")
+    (text,) = [b.text for b in shown if b.text.startswith("format: thermocald-model/1")]
+    (folder / "camera.thermal.yaml").write_text(text)
+    shutil.copy(recordings(shelf)[0] / "testfield.csv", folder)
+
+
+def store(shelf: Path, folder: Path) -> None:
+    """A store with a measured series."""
+    run("replay", recordings(shelf)[0], "--store", folder / "thermocald.db")
+
+
+def tutorial_phone(shelf: Path, folder: Path) -> None:
+    put_config(folder, "phone-1", "phone.db")
+    put_heat(folder, "phone.yaml")
+    put_measured(shelf, folder)
+
+
+def tutorial_rpi(shelf: Path, folder: Path) -> None:
+    put_config(folder, "rpi", "rpi.db")
+    put_measured(shelf, folder)
+
+
+World = Callable[[Path, Path], None]
+WORLDS: dict[str, World] = {
+    "docs/explanation/discovery.md": lambda s, f: put_recordings(s, f, "M1", "M2"),
+    "docs/explanation/simulation.md": simulation,
+    "docs/how-to/daemon.md": how_to_daemon,
+    "docs/how-to/dashboard.md": store,
+    "docs/how-to/session.md": lambda _, f: put_config(f, "phone-1"),
+    "docs/how-to/study.md": how_to_study,
+    "docs/how-to/thermal-model.md": how_to_thermal_model,
+    "docs/reference/store.md": store,
+    "docs/tutorial/phone.md": tutorial_phone,
+    "docs/tutorial/raspberry-pi.md": tutorial_rpi,
+}
+"""By page: what is put into its folder."""
+
+AFTER: dict[tuple[str, str], World] = {
+    ("docs/how-to/testfield.md", "thermocald testfield check field/testfield.csv"): (
+        lambda _, f: put_photographs(f)
+    ),
+    ("docs/tutorial/raspberry-pi.md", "mkdir -p photos"): lambda _, f: put_photographs(f),
+    # half a minute of a rendered camera is no way up and down: the analysis gets whole series
+    (
+        "docs/tutorial/raspberry-pi.md",
+        "thermocald session start --camera rpi --series M2 --start cold --epochs 150",
+    ): lambda s, f: put_recordings(s, f, "rpi-M1", "rpi-M2"),
+    (
+        "docs/tutorial/phone.md",
+        "thermocald session start --camera phone-1 --series M2 --start warm --epochs 150",
+    ): lambda s, f: put_recordings(s, f, "phone-1-M1", "phone-1-M2"),
+    (
+        "docs/tutorial/phone.md",
+        "thermocald session start --camera phone-1 --series M3 --start cold --epochs 150",
+    ): lambda s, f: put_recordings(s, f, "phone-1-M1", "phone-1-M3"),
+}
+"""By page and command: what happens meanwhile that no command does, such as taking photographs."""

@@ -56,13 +56,27 @@ def normal_cdf(z: Single) -> Single:
     return value
 
 
-def edge_distance(maps: LocalMap, ex: Single, ey: Single) -> tuple[Single, Single]:
-    """Distance d (n, k) px from the outline, positive inside, and the radius ρ (n, k).
+def edge_distance(linear: Array, ex: Single, ey: Single) -> tuple[Single, Single]:
+    """Distance d (n, k) px from ellipses' outlines, positive inside, and the radius ρ (n, k).
 
-    ex, ey (n, k) px: pixels relative to the maps' centres.
+    linear (n, 2, 2): as of `LocalMap`; ex, ey (n, k) px: pixels relative to the centres.
     """
-    rho, slope, *_ = _plane(maps, np.zeros((len(maps), 3)), ex, ey)
-    return (_ONE - rho) / slope, rho
+    inverse = np.linalg.inv(linear)
+    M = (np.swapaxes(inverse, 1, 2) @ inverse).astype(np.float32)
+    # ρ² = eᵀ M e, so that ∇ρ = M e/ρ
+    gx = M[:, 0, 0, None] * ex + M[:, 0, 1, None] * ey
+    gy = M[:, 1, 0, None] * ex + M[:, 1, 1, None] * ey
+    rho = gx * ex
+    rho += gy * ey
+    np.sqrt(np.maximum(rho, np.float32(1e-12), out=rho), out=rho)
+    gx *= gx
+    gy *= gy
+    gx += gy
+    slope = np.sqrt(np.maximum(gx, np.float32(1e-18), out=gx), out=gx)
+    distance = _ONE - rho
+    distance *= rho
+    distance /= slope
+    return distance, rho
 
 
 def _plane(maps: LocalMap, m: Array, ex: Single, ey: Single) -> tuple[Single, ...]:
@@ -70,37 +84,36 @@ def _plane(maps: LocalMap, m: Array, ex: Single, ey: Single) -> tuple[Single, ..
     correction (s, t), and the unit radius vector (u, v).
     """
     inverse = np.linalg.inv(maps.linear)
-    # ½ J⁻¹ H: q = q0 − B[q0, q0]; what is left out is of third order, and moves no centre.
-    bend = (0.5 * inverse @ maps.second).astype(np.float32)
-    i11, i12, i21, i22 = (inverse[:, i, k, None].astype(np.float32) for i in (0, 1) for k in (0, 1))
-    s = i11 * ex + i12 * ey
-    t = i21 * ex + i22 * ey
-    m11, m12, m22 = (v.astype(np.float32) for v in (1 + m[:, :1], m[:, 1:2], 1 + m[:, 2:]))
-    p11, p12 = m11 * i11 + m12 * i21, m11 * i12 + m12 * i22
-    p21, p22 = m12 * i11 + m22 * i21, m12 * i12 + m22 * i22
-    if np.any(bend):
-        b1, b2 = ([bend[:, i, k, None] for k in range(3)] for i in (0, 1))
-        # B[q, ·] in two halves serves both the bend and its derivative.
-        c11, c12 = b1[0] * s + b1[1] * t, b1[1] * s + b1[2] * t
-        c21, c22 = b2[0] * s + b2[1] * t, b2[1] * s + b2[2] * t
-        s, t = s - (c11 * s + c12 * t), t - (c21 * s + c22 * t)
-        k11, k12, k21, k22 = (np.float32(2) * c for c in (c11, c12, c21, c22))
-        r11, r12 = i11 - (k11 * i11 + k12 * i21), i12 - (k11 * i12 + k12 * i22)
-        r21, r22 = i21 - (k21 * i11 + k22 * i21), i22 - (k21 * i12 + k22 * i22)
-        p11, p12 = m11 * r11 + m12 * r21, m11 * r12 + m12 * r22
-        p21, p22 = m12 * r11 + m22 * r21, m12 * r12 + m22 * r22
-    u, v = m11 * s + m12 * t, m12 * s + m22 * t
+    shape = np.eye(2) + m[:, [[0, 1], [1, 2]]]
+    L = shape @ inverse
+    # q = (I + m)(J⁻¹e − ½ J⁻¹ H[J⁻¹e, J⁻¹e]) = L e − P[e, e]; what is left out is of third order,
+    # and moves no centre. A = ∂q/∂e = L − 2 P[e, ·], and q = ½ (L + A) e.
+    half = 0.5 * L @ maps.second
+    P = np.swapaxes(inverse, 1, 2)[:, None] @ half[:, :, [[0, 1], [1, 2]]] @ inverse[:, None]
+    l11, l12, l21, l22 = (L[:, i, k, None].astype(np.float32) for i in (0, 1) for k in (0, 1))
+    a11, a12, a21, a22 = l11, l12, l21, l22
+    u, v = l11 * ex + l12 * ey, l21 * ex + l22 * ey
+    if np.any(maps.second):
+        twice = (2 * P).astype(np.float32)[..., None]
+        (x1, y1), (x2, y2) = (
+            (twice[:, i, 0, 0] * ex + twice[:, i, 0, 1] * ey,
+             twice[:, i, 1, 0] * ex + twice[:, i, 1, 1] * ey) for i in (0, 1)
+        )  # fmt: skip
+        u -= _HALF * (x1 * ex + y1 * ey)
+        v -= _HALF * (x2 * ex + y2 * ey)
+        a11, a12, a21, a22 = l11 - x1, l12 - y1, l21 - x2, l22 - y2
+    back = np.linalg.inv(shape).astype(np.float32)[..., None]
+    s, t = back[:, 0, 0] * u + back[:, 0, 1] * v, back[:, 1, 0] * u + back[:, 1, 1] * v
     rho = np.sqrt(u * u + v * v)
     np.maximum(rho, np.float32(1e-6), out=rho)
     u /= rho
     v /= rho
-    # A = (I + m) ∂q/∂e;  ∇ρ = Aᵀ(u, v)
-    gx, gy = p11 * u + p21 * v, p12 * u + p22 * v
+    gx, gy = a11 * u + a21 * v, a12 * u + a22 * v  # ∇ρ = Aᵀ(u, v)
     slope = np.sqrt(gx * gx + gy * gy)
     np.maximum(slope, np.float32(1e-9), out=slope)
     gx /= slope
     gy /= slope
-    return rho, slope, gx, gy, p11 * p22 - p12 * p21, s, t, u, v
+    return rho, slope, gx, gy, a11 * a22 - a12 * a21, s, t, u, v
 
 
 def blurred_disc(

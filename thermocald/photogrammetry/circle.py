@@ -111,7 +111,7 @@ def windows(
     coded: NDArray[np.bool_],
     blur: float = 0.9,
     reach: float = REACH_PX,
-    chunk_pixels: int = 40_000,
+    chunk_pixels: int = 60_000,
 ) -> Iterator[Windows]:
     """The pixels near each outline, targets of like size together.
 
@@ -122,6 +122,7 @@ def windows(
     half = np.ceil(maps.half_extent + reach_px).astype(int)
     # Targets of like size and like shape share a window.
     order = np.lexsort((half[:, 0], half.max(axis=1) // 3))
+    levels = _background_and_contrast(image, maps)
     sizes = half[order].tolist()
     flat = image.ravel()
     start = 0
@@ -136,15 +137,14 @@ def windows(
             stop, hx, hy = stop + 1, wider, higher
         rows = order[start:stop]
         start = stop
-        # The ellipse alone is good enough to choose pixels by.
-        part = maps.select(rows).without_eccentricity()
+        part = maps.select(rows)
         ox, oy = np.arange(-hx, hx + 1), np.arange(-hy, hy + 1)
         lx, ly = np.tile(ox, len(oy))[None], np.repeat(oy, len(ox))[None]
         origin = np.rint(part.centre).astype(np.int64)
         centre = (part.centre - origin).astype(np.float32)
         x, y = lx.astype(np.float32) - centre[:, :1], ly.astype(np.float32) - centre[:, 1:]
-        d, rho = edge_distance(part, x, y)
-        use = np.abs(d) <= reach_px
+        d, rho = edge_distance(part.linear, x, y)
+        use = np.abs(d) <= reach_px  # the ellipse alone is good enough to choose pixels by
         if np.any(coded[rows]):
             # d = (1 − ρ)/|∇ρ|, so the ring's inner edge is (2 − ρ)/|∇ρ| = d (2 − ρ)/(1 − ρ) away
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -174,7 +174,7 @@ def windows(
         begin = np.zeros((len(rows), 10))
         begin[:, :2] = part.centre
         begin[:, 5] = blur
-        begin[:, 6:8] = _background_and_contrast(image, part)
+        begin[:, 6:8] = levels[rows]
         yield Windows(
             rows, pixel, origin.astype(float), lx[0].astype(np.float32).take(at),
             ly[0].astype(np.float32).take(at), grey, weight, begin, cut,

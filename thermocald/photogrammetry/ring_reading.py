@@ -185,15 +185,19 @@ def _read_family(level: Single, maps: LocalMap, bits: int) -> tuple[NDArray[np.i
     ring = level[:, _MIDDLE].mean(axis=1)
     after = np.roll(ring, -1, axis=1)
     crosses = (ring > 0.5) != (after > 0.5)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        place = np.where(crosses, np.arange(_ANGLES) + (0.5 - ring) / (after - ring), 0.0)
+    target, at = np.nonzero(crosses)
+    level_at = ring[target, at]
+    place = at + (0.5 - level_at) / (after[target, at] - level_at)
     phase = 2 * np.pi * place * bits / _ANGLES
-    mean = np.sum(crosses * np.exp(1j * phase), axis=1)
-    offset = np.angle(mean) / (2 * np.pi * bits)  # in turns: where the raster begins
-    off = np.abs(np.angle(np.exp(1j * phase) * np.conj(mean)[:, None])) / (2 * np.pi * bits)
+    cosine, sine = np.bincount(target, np.cos(phase), n), np.bincount(target, np.sin(phase), n)
+    offset = np.arctan2(sine, cosine) / (2 * np.pi * bits)  # in turns: where the raster begins
+    off = np.zeros(n)
+    np.maximum.at(
+        off, target, np.abs((phase / (2 * np.pi) - offset[target] * bits + 0.5) % 1 - 0.5) / bits
+    )
     # A pixel is the larger an angle the smaller the target: along its shortest semi-axis.
     allowed = _RASTER_TURNS + _RASTER_PX / (2 * np.pi * 2.5 * maps.semi_axes[:, 1])
-    on_raster = np.max(off * crosses, axis=1, initial=0.0) < np.minimum(allowed, 0.3 / bits)
+    on_raster = off < np.minimum(allowed, 0.3 / bits)
 
     turns = np.arange(_ANGLES) / _ANGLES
     position = ((turns - offset[:, None]) % 1.0) * bits

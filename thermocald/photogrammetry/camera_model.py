@@ -15,6 +15,7 @@ El-Hakim (1986).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Self
 
@@ -89,7 +90,7 @@ class _Parameters:
     @classmethod
     def from_array(cls, values: ArrayLike) -> Self:
         """The inverse of `as_array`."""
-        return cls(*(float(v) for v in np.asarray(values, dtype=float)))
+        return cls(*np.asarray(values, dtype=float).tolist())
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, float]) -> Self:
@@ -167,9 +168,12 @@ class CameraModel:
 def rotation(angles: ArrayLike) -> Array:
     """Angles (..., 3) omega, phi, kappa → R (..., 3, 3), camera to object."""
     a = np.asarray(angles, dtype=float)
-    sines, cosines = np.sin(a), np.cos(a)
-    so, sp, sk = sines[..., 0], sines[..., 1], sines[..., 2]
-    co, cp, ck = cosines[..., 0], cosines[..., 1], cosines[..., 2]
+    if a.ndim == 1:  # one camera: plain numbers take a quarter of the time
+        so, sp, sk = (math.sin(angle) for angle in a.tolist())
+        co, cp, ck = (math.cos(angle) for angle in a.tolist())
+    else:
+        so, sp, sk = np.moveaxis(np.sin(a), -1, 0)
+        co, cp, ck = np.moveaxis(np.cos(a), -1, 0)
     rows = [
         cp * ck, -cp * sk, sp,
         co * sk + so * sp * ck, co * ck - so * sp * sk, -so * cp,

@@ -21,7 +21,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from thermocald.analysis.model_series import reduce_series
+from thermocald.analysis.series_reduction import reduce_series
 from thermocald.analysis.thermal_camera import ThermalCamera
 from thermocald.analysis.thermal_model import FittedModel, fit_thermal_model
 from thermocald.simulation.course import Course

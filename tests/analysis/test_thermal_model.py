@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from thermocald.analysis.held_out import predicted_error
-from thermocald.analysis.model_series import model_series, reduce_series
+from thermocald.analysis.series_reduction import model_series, reduce_series
 from thermocald.analysis.thermal_camera import ThermalCamera
 from thermocald.analysis.thermal_model import fit_thermal_model
 from thermocald.analysis.type_model import type_model

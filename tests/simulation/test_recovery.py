@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermocald.analysis.model_series import model_series
+from thermocald.analysis.series_reduction import model_series
 from thermocald.analysis.thermal_model import fit_thermal_model
 from thermocald.simulation import effects
 from thermocald.simulation.course import Course

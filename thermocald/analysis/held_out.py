@@ -1,9 +1,10 @@
 """How well a thermal model predicts a series that it was not fitted on.
 
-Only what belongs to the set-up is estimated anew: one exterior orientation for the whole series,
-and a constant offset per target, since a field's coordinates are not perfect. What is left of the
-image points is compared with the noise floor: image noise, and what the thermometer's noise does to
-the prediction.
+Only what belongs to the series is estimated anew: its level (one orientation, and a constant offset
+per target, since a field's coordinates are not perfect) and what its effects call fresh (a phase;
+an event, which no model can foresee). All drifts are the model's. What is left of the image points
+is compared with the noise floor: image noise, and what the thermometer's noise, and the instants at
+which it was read, do to the prediction. The 95 % bands hold the model's own uncertainty too.
 """
 
 from __future__ import annotations
@@ -13,10 +14,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.model_system import error_operators
+from thermocald.analysis.model_fit import ModelFit
+from thermocald.analysis.model_noise import open_courses
+from thermocald.analysis.model_search import search_own
+from thermocald.analysis.model_state import FitState, own_of
+from thermocald.analysis.model_system import error_operators, jacobian
+from thermocald.analysis.thermal_model import targets_of
 from thermocald.errors import ConfigurationError
-from thermocald.photogrammetry.camera_model import ExteriorOrientation
-from thermocald.photogrammetry.normals import linearise
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,7 +32,6 @@ if TYPE_CHECKING:
 
 __all__ = ["PredictedError", "predicted_error"]
 
-_ITERATIONS = 5
 _BAND = 1.959964  # standard deviations that hold 95 %
 
 
@@ -52,35 +55,54 @@ def predicted_error(
     """Predict a series; thermometer_sd K of a reading. ConfigurationError for another camera."""
     if series.sensor != model.sensor or series.camera != model.camera:
         raise ConfigurationError(
-            f"the model is of camera {model.camera}, series {series.name} of {series.camera}: a "
-            "thermal model belongs to one camera"
+            f"the model is of camera {model.camera} ({model.sensor.width}×{model.sensor.height} "
+            f"px), series {series.name} of {series.camera} ({series.sensor.width}×"
+            f"{series.sensor.height} px): a thermal model belongs to one camera"
         )
+    moving = targets_of(model.effects)
+    if moving:
+        series = series.displacing(moving)
     series = replace(series, history=replace(series.history, T0=model.T0))
-    exterior = series.start[10:].copy()
-    for _ in range(_ITERATIONS):
-        here = replace(model, exterior=ExteriorOrientation.from_array(exterior))
-        prediction = here.predict(series.history, series.field)
-        delta = series.corrections(prediction)
-        gradient = series.b - (series.N @ delta[:, :, None])[:, :, 0]
-        N = series.N[:, 10:16, 10:16].sum(axis=0)
-        exterior = exterior + np.linalg.solve(N, gradient[:, 10:16].sum(axis=0))
-    here = replace(model, exterior=ExteriorOrientation.from_array(exterior))
-    prediction = here.predict(series.history, series.field)
+    model, series = _oriented(model, series, thermometer_sd)
+    prediction = model.predict(series.history, series.field)
     residuals = series.residuals(prediction)
     # what is constant over the series is the field's coordinates, and no prediction of a drift
     residuals = residuals - _mean(residuals)
-    variance = _variance(here, series, prediction.noise_factor, thermometer_sd)
+    noise = (model.image_sigma * prediction.noise_factor[:, None, None]) ** 2
+    floor = noise + _variance(series, _thermometers(series, model, thermometer_sd))
+    bands = floor + _variance(series, _parameters(series, model))
     used = np.isfinite(residuals)
     rms = float(np.sqrt(np.mean(residuals[used] ** 2)))
-    inside = np.abs(residuals[used]) <= _BAND * np.sqrt(variance[used])
+    inside = np.abs(residuals[used]) <= _BAND * np.sqrt(bands[used])
     scale = series.sensor.pixel_pitch / model.interior.c * 10_000.0
     return PredictedError(
         series.name,
         rms,
-        float(np.sqrt(np.mean(variance[used]))),
+        float(np.sqrt(np.mean(floor[used]))),
         float(np.mean(inside)),
         rms * scale,
     )
+
+
+def _oriented(
+    model: ThermalModel, series: ModelSeries, thermometer_sd: float
+) -> tuple[ThermalModel, ModelSeries]:
+    """The model with what belongs to the series, which loses its targets' constant offsets."""
+    state = FitState(model, (series.start[10:].copy(),))
+    state = replace(state, fixed=state.drifts)
+    for place, effect in enumerate(model.effects):
+        if own_of(effect):
+            # the search is for the last effect of a model
+            others = (*model.effects[:place], *model.effects[place + 1 :])
+            moved = replace(state, model=replace(state.model, effects=(*others, effect)))
+            found = search_own(series, moved, 0, free=False)
+            state = replace(state, own=found.own, fixed=state.fixed | found.fixed)
+    fit = ModelFit([series])
+    fit.error_sds = [thermometer_sd]
+    state = fit.solve(state)
+    fit.take_off_offsets(state)
+    state = fit.solve(state)
+    return state.of_series(0), fit.series[0]
 
 
 def _mean(residuals: Array) -> Array:
@@ -91,20 +113,40 @@ def _mean(residuals: Array) -> Array:
     return total
 
 
-def _variance(
-    model: ThermalModel, series: ModelSeries, noise: Array, thermometer_sd: float
-) -> Array:
-    """Of measured minus predicted (E, T, 2) px²: image noise, and the thermometer's."""
-    at = linearise(series.sensor, series.field, series.start[:10], series.start[10:])
-    variance = np.broadcast_to(
-        (model.image_sigma * noise[:, None, None]) ** 2, series.grid.points.shape
-    ).copy()
-    covariance = np.zeros((len(series), 16, 16))
+def _variance(series: ModelSeries, covariance: Array) -> Array:
+    """Variances (E, T, 2) px² of the image points from parameters' covariances (E, 22, 22)."""
+    A = series.partials
+    found: Array = np.einsum("tcp,epq,tcq->etc", A, covariance, A, optimize=True)
+    return found
+
+
+def _thermometers(series: ModelSeries, model: ThermalModel, thermometer_sd: float) -> Array:
+    """Covariance (E, 22, 22) of an epoch's parameters, relative to the series' mean."""
+    covariance = np.zeros((len(series), 22, 22))
     operators = error_operators(series, model)
-    for c, S in operators:
-        for d, R in operators:
+    means = [np.asarray(S.mean(axis=0)).ravel() for _, S in operators]
+    for (c, S), mean_s in zip(operators, means, strict=True):
+        for (d, R), mean_r in zip(operators, means, strict=True):
             shared = np.asarray(S.multiply(R).sum(axis=1)).ravel()
-            covariance += thermometer_sd**2 * shared[:, None, None] * np.outer(c[:16], d[:16])
-    if operators:
-        variance += np.einsum("tcp,epq,tcq->etc", at.A, covariance, at.A, optimize=True)
-    return variance
+            shared = shared - S @ mean_r - R @ mean_s + mean_s @ mean_r
+            covariance += thermometer_sd**2 * shared[:, None, None] * np.outer(c, d)
+    for c, open_ in open_courses(series, model):
+        covariance += open_[:, None, None] ** 2 * np.outer(c, c)
+    return covariance
+
+
+def _parameters(series: ModelSeries, model: ThermalModel) -> Array:
+    """Covariance (E, 22, 22) from the model's drift parameters; the level is the series' own."""
+    names, J = jacobian(series, model, ())
+    rows = [
+        (i, model.covariance_names.index(n))
+        for i, n in enumerate(names)
+        if n in model.covariance_names and not n.startswith("exterior.")
+    ]
+    if not rows or model.covariance is None:
+        return np.zeros((len(series), 22, 22))
+    ours, theirs = (list(r) for r in zip(*rows, strict=True))
+    Q = np.array(model.covariance)[np.ix_(theirs, theirs)]
+    drift = J[:, :, ours] - J[:, :, ours].mean(axis=0)
+    found: Array = np.einsum("epi,ij,eqj->epq", drift, Q, drift, optimize=True)
+    return found

@@ -10,18 +10,19 @@ H has as many rows as there are readings and is sparse, since a reading touches 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermocald.analysis.model_series import N_PARAMETERS, ModelSeries
+from thermocald.analysis.model_state import own_of, unknowns_of
 from thermocald.photogrammetry.camera_model import EOP_NAMES, IOP_NAMES, PARAMETER_NAMES
 from thermocald.simulation import effects
-from thermocald.simulation.model import RATED, ModelEffect, ThermalModel
+from thermocald.simulation.model import RATED, ThermalModel
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from numpy.typing import NDArray
     from scipy.sparse import csr_array
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["Share", "error_operators", "jacobian", "share", "unknowns_of"]
+__all__ = ["Share", "error_operators", "jacobian", "share", "weights_of"]
 
 _PROBES = 24  # random vectors that tell a trace
 _NEGLIGIBLE = 1e-3
@@ -87,18 +88,6 @@ class Share:
         return float(np.sum(cost if noise is None else cost / noise**2))
 
 
-def unknowns_of(effect: ModelEffect) -> tuple[str, ...]:
-    """The parameters of an effect that Gauss-Newton estimates."""
-    kind = effects.get(effect.name)
-    if effect.name == "defocus":
-        return ()  # in the noise, not in the positions
-    names = []
-    for key, value in effect.values.items():
-        if isinstance(value, int | float) and not (key in kind.fresh and key != "phase"):
-            names.append(key)
-    return tuple(names)
-
-
 def _packed(change: Influence) -> Array:
     """What an influence adds to the 22 parameters, (E, 22)."""
     d = np.zeros((len(change.iop), N_PARAMETERS))
@@ -114,7 +103,10 @@ def jacobian(
     free: tuple[str, ...],
     fixed: frozenset[str] = frozenset(),
 ) -> tuple[list[str], Array]:
-    """Names (q,) and derivatives (E, 22, q) of the parameters by the unknowns of one series."""
+    """Names (q,) and derivatives (E, 22, q) of the parameters by the unknowns of one series.
+
+    In the order of `FitState.columns`: common ones, the series' own, the exterior orientation.
+    """
     history, field = series.history, series.field
     epochs = len(series)
     names: list[str] = []
@@ -127,23 +119,26 @@ def jacobian(
         columns.append(column)
 
     for n in free:
-        add(f"interior.{n}", IOP_NAMES.index(n), 1.0)
+        if f"interior.{n}" not in fixed:
+            add(f"interior.{n}", IOP_NAMES.index(n), 1.0)
     warming = model.drive(history) - model.T0
     for n in RATED:
-        add(f"rates.{n}", IOP_NAMES.index(n), warming)
-    for place, effect in enumerate(model.effects):
-        kind = effects.get(effect.name)
-        for key in unknowns_of(effect):
-            name = f"{effect.name}.{key}"
-            if name in fixed:
-                continue
-            names.append(name)
-            if key in kind.linear:
-                nonlinear, _ = kind.split(effect.values)
-                unit = kind.influence(history, {**nonlinear, key: 1.0}, field)
-                columns.append(_packed(unit))
-            else:
-                columns.append(_difference(series, model, place, key))
+        if f"rates.{n}" not in fixed:
+            add(f"rates.{n}", IOP_NAMES.index(n), warming)
+    for keys_of in (unknowns_of, own_of):
+        for place, effect in enumerate(model.effects):
+            kind = effects.get(effect.name)
+            for key in keys_of(effect):
+                name = f"{effect.name}.{key}"
+                if name in fixed:
+                    continue
+                names.append(name)
+                if key in kind.linear:
+                    nonlinear, _ = kind.split(effect.values)
+                    unit = kind.influence(history, {**nonlinear, key: 1.0}, field)
+                    columns.append(_packed(unit))
+                else:
+                    columns.append(_difference(series, model, place, key))
     for i, n in enumerate(EOP_NAMES):
         add(f"exterior.{n}", 10 + i, 1.0)
     return names, np.stack(columns, axis=2)
@@ -151,8 +146,6 @@ def jacobian(
 
 def _difference(series: ModelSeries, model: ThermalModel, place: int, key: str) -> Array:
     """The derivative by a non-linear parameter, by central differences of the whole prediction."""
-    from dataclasses import replace
-
     effect = model.effects[place]
     parameter = effects.get(effect.name).nonlinear[key]
     value = float(effect.values[key])
@@ -190,15 +183,7 @@ def error_operators(
         S = kind.sensitivity(history, **nonlinear)
         if S.nnz == 0:
             continue
-        weights = np.zeros(N_PARAMETERS)
-        for key, value in coefficients.items():
-            if key in PARAMETER_NAMES:
-                weights[PARAMETER_NAMES.index(key)] = value
-            elif key in _SCALE_NAMES:
-                weights[16 + _SCALE_NAMES.index(key)] = value
-            else:
-                weights[19 + _SHIFT_NAMES.index(key)] = value
-        found.append((weights, kind.channel(history, **nonlinear), S))
+        found.append((weights_of(coefficients), kind.channel(history, **nonlinear), S))
     # every channel has its place, used or not: errors found in one step are the next one's start
     channels = list(history.readings)
     empty = csr_array((len(series), len(history.reading_times)))
@@ -206,6 +191,19 @@ def error_operators(
         (c, hstack([S if channel == other else empty for other in channels]).tocsr())
         for c, channel, S in found
     )
+
+
+def weights_of(coefficients: Mapping[str, float]) -> Array:
+    """An effect's coefficients as a direction (22,) of the parameters."""
+    weights = np.zeros(N_PARAMETERS)
+    for key, value in coefficients.items():
+        if key in PARAMETER_NAMES:
+            weights[PARAMETER_NAMES.index(key)] = value
+        elif key in _SCALE_NAMES:
+            weights[16 + _SCALE_NAMES.index(key)] = value
+        else:
+            weights[19 + _SHIFT_NAMES.index(key)] = value
+    return weights
 
 
 def _drive_operator(history: History, model: ThermalModel) -> csr_array:

@@ -51,7 +51,7 @@ def fit(
 
     Example: thermocald fit M1 M2 -o camera.thermal.yaml --effect thermal_lag
     """
-    from thermocald.analysis.model_series import load_model_series
+    from thermocald.analysis.series_reduction import load_model_series
     from thermocald.cli.common import progress, write_json
     from thermocald.simulation.model_file import write_model
 

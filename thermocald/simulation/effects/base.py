@@ -197,6 +197,14 @@ class Effect(ABC):
         result: Array = self.sensitivity(history, **nonlinear) @ np.nan_to_num(errors)
         return result
 
+    def unresolved(self, history: History, **nonlinear: Any) -> Array:  # noqa: ARG002
+        """Standard deviation (E,) of drive or first signal that the readings' instants leave open.
+
+        What happens between two readings, or after the last, no reading tells; their noise is not
+        meant. Most effects need the temperature alone, which straight lines between readings tell.
+        """
+        return np.zeros(len(history.times))
+
     def _course(self, history: History, **nonlinear: Any) -> Array:
         if self.kind == "drive":
             return self.drive(history, **nonlinear)

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
+
 from thermocald.simulation.effects.base import Effect, coefficient_units
 from thermocald.simulation.history import slope_matrix
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    import numpy as np
     from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
     from thermocald.simulation.history import History
 
 __all__ = ["ThermalGradient"]
+
+_NOISE_JUMPS = 3.0  # standard deviations that a jump of the rate must be beyond noise
 
 
 class ThermalGradient(Effect):
@@ -42,6 +45,20 @@ class ThermalGradient(Effect):
         p = history.polygon()
         rate: NDArray[np.float64] = slope_matrix(p.times, history.times) @ p.values
         return rate[:, None]
+
+    def unresolved(self, history: History, **_: Any) -> NDArray[np.float64]:
+        """A lamp that is switched between two readings: the rate jumps, nobody knows when.
+
+        Half the jump between two edges, as far as it is beyond the noise of such differences.
+        """
+        p = history.polygon()
+        if len(p.times) < 5:
+            return np.zeros(len(history.times))
+        jumps = np.abs(np.diff(np.diff(p.values) / np.diff(p.times)))
+        noise = 1.4826 * float(np.median(jumps))
+        excess = np.sqrt(np.maximum(jumps**2 - (_NOISE_JUMPS * noise) ** 2, 0.0))
+        at_knots = np.concatenate([excess[:1], excess, excess[-1:]]) / 2.0
+        return np.interp(history.times, p.times, at_knots)
 
     def sensitivity(self, history: History, **_: Any) -> csr_array:
         p = history.polygon()

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
+
 from thermocald.simulation.effects.base import Effect, Parameter, spoken
 from thermocald.simulation.history import interpolation_matrix
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    import numpy as np
     from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
@@ -38,6 +39,20 @@ class TimeOffset(Effect):
 
     def drive(self, history: History, d: float = 0.0, **_: Any) -> NDArray[np.float64]:
         return history.polygon().at(history.times - d)
+
+    def unresolved(self, history: History, d: float = 0.0, **_: Any) -> NDArray[np.float64]:
+        """A thermometer that is ahead is needed after the last reading: nobody knows it there.
+
+        As much as the temperature usually changes over the time that is missing.
+        """
+        p = history.polygon()
+        missing = np.maximum(history.times - d - p.times[-1], 0.0)
+        open_ = np.zeros(len(missing))
+        for e in np.flatnonzero(missing):
+            begun = p.times[p.times + missing[e] <= p.times[-1]]
+            if len(begun):
+                open_[e] = np.sqrt(np.mean((p.at(begun + missing[e]) - p.at(begun)) ** 2))
+        return open_
 
     def sensitivity(self, history: History, d: float = 0.0, **_: Any) -> csr_array:
         p = history.polygon()

@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thermocald.analysis.model_series import ModelSeries
-from thermocald.analysis.series_reduction import reduce_series
 from thermocald.analysis.reference import QUOTED
+from thermocald.analysis.series_reduction import reduce_series
 from thermocald.analysis.thermal_camera import ThermalCamera
 from thermocald.analysis.thermal_model import fit_thermal_model
 from thermocald.simulation import effects

@@ -281,7 +281,7 @@ def hide(rng: np.random.Generator, name: str, camera: _Camera, truth: dict) -> d
         e["targets"] = sorted(int(v) for v in rng.choice(147, rng.integers(1, 5), replace=False))
         e["vector"] = rng.normal(size=3)
     elif name == "defocus":
-        pass
+        e["coldest"] = truth["coldest"]  # one law of noise for the camera, not one per series
     if name in ("nonlinear_expansion", "softening", "thermal_gradient", "permanent_set",
                 "self_heating", "creep", "slip", "cyclic_interference", "second_heat_source",
                 OUTSIDE):  # fmt: skip
@@ -375,7 +375,7 @@ def true_parameters(
         elif name == "test_field_expansion":
             scale += size * (T - camera.T0)[:, None] * e["axes"]
         elif name == "defocus":
-            noise = noise * (1 + size * np.clip(T - T.min(), 0, None) * 0.02)
+            noise = noise * (1 + size * np.clip(T - e["coldest"], 0, None) * 0.02)
         elif name == "target_displacement" and e["happens"]:
             moved.append((e["targets"], size * np.asarray(e["vector"]), e["time"]))
         if course is not None and "along" in e:
@@ -439,7 +439,10 @@ def generate(case: Case) -> tuple[list[Series], dict]:
     climates = [climate(rng, p, seconds) for p in programmes]
     unknowns = [_smooth_unknown(rng, seconds) for _ in programmes]
     T1 = climates[0]["temperature"]
-    pool = {"T_quantile": lambda q: float(T1.min() + q * (T1.max() - T1.min()))}
+    pool = {
+        "T_quantile": lambda q: float(T1.min() + q * (T1.max() - T1.min())),
+        "coldest": min(float(c["temperature"].min()) for c in climates),
+    }
     if "softening" in case.effects:  # a threshold that both series pass
         T2 = climates[1]["temperature"]
         low, high = max(T1.min(), T2.min()), min(T1.max(), T2.max())
@@ -543,6 +546,7 @@ def _plain(e: dict, pitch: float) -> dict:
         out["axes"] = [float(v) for v in size * e["axes"]]
     if name == "defocus":
         out["per_kelvin_above_coldest"] = 0.02 * size
+        out["coldest"] = e["coldest"]
     del pitch
     return out
 

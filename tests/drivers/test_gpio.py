@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import time
 
 import gpiozero
@@ -145,6 +146,18 @@ def test_a_machine_without_pins(monkeypatch, clock):
     monkeypatch.setattr(gpiozero.Device, "_default_pin_factory", staticmethod(none))
     with pytest.raises(DeviceNotFound, match="no usable pins"):
         relay(clock).open()
+
+
+def test_permission_denied(pins, monkeypatch, clock):
+    """The kernel refuses /dev/gpiochip0 to whom is not in the group."""
+
+    def refused(*_args):
+        raise PermissionError(errno.EACCES, "Permission denied", "/dev/gpiochip0")
+
+    monkeypatch.setattr(pins, "pin", refused)
+    for device in (relay(clock), open_device("output", "led", {"pin": 17}, clock)):
+        with pytest.raises(DeviceDenied, match=r"GPIO .*group gpio"):
+            device.open()
 
 
 @pytest.mark.parametrize(

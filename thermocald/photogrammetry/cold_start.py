@@ -63,7 +63,12 @@ def cold_start(
             start_interior, start_exterior = rough.interior, rough.exterior
             size = np.linalg.norm(rough.residuals, axis=1)
             suspects = size > _GROSS * max(float(np.median(size)), 0.1)
-    return adjust(sensor, testfield, observations, start_interior, start_exterior, s, suspects)
+    result = adjust(sensor, testfield, observations, start_interior, start_exterior, s, suspects)
+    if s.snooping_alpha > 0 or not suspects.any() or result.interior is None:
+        return result
+    # who switches the test off wants all targets: the suspects were left out for the start only
+    assert result.exterior is not None
+    return adjust(sensor, testfield, observations, result.interior, result.exterior, s)
 
 
 def pose_only(

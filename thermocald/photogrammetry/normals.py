@@ -41,6 +41,8 @@ __all__ = [
 ]
 
 _UPPER = np.triu_indices(16)
+_CHUNK = 64  # epochs compared at a time, in the processor's cache
+_CHUNK_POINTS = 10_000  # projected at a time, in the processor's cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,8 +152,12 @@ def same_rows(*arrays: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     mark = np.sum([part @ rng.random(part.shape[1]) for part in flat], axis=0)
     _, first, of = np.unique(mark, return_index=True, return_inverse=True)
     each = np.arange(E)
-    if 2 * len(first) > E or not all(np.array_equal(part, part[first[of]]) for part in flat):
+    if 2 * len(first) > E:
         return each, each
+    for start in range(0, E, _CHUNK):
+        rows = slice(start, start + _CHUNK)
+        if not all(np.array_equal(part[rows], part[first[of[rows]]]) for part in flat):
+            return each, each
     return first, of
 
 
@@ -176,9 +182,12 @@ def _sums(Pv: Array, v: Array) -> Array:
 
 def weighted(weights: Array, residuals: Array) -> Array:
     """P v (E, T, 2) of every point, 0 where the weight is."""
-    out: Array = weights[..., :2] * residuals
-    if np.any(weights[..., 2]):
-        out += weights[..., 2:] * residuals[..., ::-1]
+    out = np.empty_like(residuals)
+    correlated = np.any(weights[..., 2])
+    for k in range(2):
+        np.multiply(weights[..., k], residuals[..., k], out=out[..., k])
+        if correlated:
+            out[..., k] += weights[..., 2] * residuals[..., 1 - k]
     unused = weights[..., 0] == 0
     if unused.any():
         out[unused] = 0.0
@@ -186,10 +195,11 @@ def weighted(weights: Array, residuals: Array) -> Array:
 
 
 def series_residuals(
-    sensor: Sensor, grid: ObservationGrid, field_points: Array, values: Array, chunk: int = 256
+    sensor: Sensor, grid: ObservationGrid, field_points: Array, values: Array
 ) -> Array:
     """Measured minus predicted (E, T, 2) px at each epoch's own parameters (E, 16)."""
     out = np.empty_like(grid.points)
+    chunk = max(_CHUNK_POINTS // max(len(field_points), 1), 1)
     for start in range(0, len(values), chunk):
         part = slice(start, start + chunk)
         predicted = project(sensor, values[part, :10], values[part, 10:], field_points)

@@ -266,7 +266,7 @@ class _Series:
 
         variance: of unit weight, by which the offsets' prior is weighted against image points.
         """
-        weights = np.where(use[..., None], self.grid.weights, 0.0)
+        weights = _masked(self.grid.weights, use)
         system = self._linearised(values, weights, use, variance)
         residuals = self._residuals(values, offsets)
         for _ in range(_ITERATIONS):
@@ -333,17 +333,18 @@ class _Series:
         whole, values, residuals = estimate.system, estimate.values, estimate.residuals
         offered, use = use, use.copy()
         rows, system = np.arange(len(use)), whole
-        for _ in range(_ROUNDS):
-            tests = system.point_tests(residuals[rows], self.grid.weights[rows])
+        for turn in range(_ROUNDS):
+            part = rows if turn else slice(None)  # a copy of all would cost as much as the tests
+            tests = system.point_tests(residuals[part], self.grid.weights[part])
             keep = snoop_series(
-                tests, offered[rows], use[rows], len(self.s.per_epoch), self.s.snooping_alpha
+                tests, offered[part], use[part], len(self.s.per_epoch), self.s.snooping_alpha
             )
-            changed = (keep != use[rows]).any(axis=1)
+            changed = (keep != use[part]).any(axis=1)
             rows, keep = rows[changed], keep[changed]
             if len(rows) == 0:
                 break
             use[rows] = keep
-            weights = np.where(keep[..., None], self.grid.weights[rows], 0.0)
+            weights = _masked(self.grid.weights[rows], keep)
             system = SeriesSystem.build(whole.at, weights, whole.own, whole.common, None)
             step = system.step(residuals[rows], estimate.offsets)
             values[rows[:, None], whole.own] += step.d_own
@@ -505,6 +506,13 @@ class _Series:
             self.s.bounds,
         )
         return "; ".join(said).replace("{", "(").replace("}", ")")
+
+
+def _masked(weights: Array, use: NDArray[np.bool_]) -> Array:
+    """A copy in which what takes no part has no weight."""
+    out = weights.copy()
+    out[~use] = 0.0
+    return out
 
 
 def _pooled(vPv: Array, redundancy: Array, good: NDArray[np.bool_]) -> float:

@@ -29,6 +29,16 @@ from thermocald.store.recording import CameraSpec, Channel, write_recording
 ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 
+def fast_run(document: str, epochs: int) -> str:
+    """A script: the daemon at full speed, as `thermocald run --recording … --fast`, but looping."""
+    return (
+        "import json; from pathlib import Path; from thermocald.config import parse_config; "
+        "from thermocald.daemon.service import Service; "
+        f"config = parse_config(json.loads({document!r}), Path('config.yaml')); "
+        f"Service(config, fast=True, epochs={epochs}, until_finished=True).run()"
+    )
+
+
 class Daemon:
     """One `thermocald run` in a folder."""
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.daemon.conftest import ENVIRONMENT, make_recording
+from tests.daemon.conftest import ENVIRONMENT, fast_run, make_recording
 from thermocald.store.database import Store
 
 pytestmark = pytest.mark.slow
@@ -21,16 +21,6 @@ pytestmark = pytest.mark.slow
 KILLS = 200
 # The whole soak takes a quarter of an hour of an idle core: THERMOCALD_SOAK_EPOCHS=100000
 EPOCHS = int(os.environ.get("THERMOCALD_SOAK_EPOCHS", "10000"))
-
-
-def fast_run(document: str, epochs: int) -> str:
-    """A script: the daemon at full speed, as `thermocald run --recording … --fast`, but looping."""
-    return (
-        "import json; from pathlib import Path; from thermocald.config import parse_config; "
-        "from thermocald.daemon.service import Service; "
-        f"config = parse_config(json.loads({document!r}), Path('config.yaml')); "
-        f"Service(config, fast=True, epochs={epochs}, until_finished=True).run()"
-    )
 
 
 @pytest.fixture

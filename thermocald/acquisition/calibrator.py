@@ -108,11 +108,15 @@ class Calibrator:
                 return CalibratedEpoch(epoch, bad, extra, searched)
         return CalibratedEpoch(epoch, self.adjust(observations), extra, searched)
 
+    def weighed(self, observations: Observations) -> Observations:
+        """The observations with the sigmas with which they are adjusted."""
+        if self._floor == 0:
+            return observations
+        return replace(observations, sigmas=np.hypot(observations.sigmas, self._floor))
+
     def adjust(self, observations: Observations) -> Adjustment:
         """Adjust one epoch's observations, warm where the last epoch fits."""
-        if self._floor > 0:
-            sigmas = np.hypot(observations.sigmas, self._floor)
-            observations = replace(observations, sigmas=sigmas)
+        observations = self.weighed(observations)
         last = self._last
         if last is not None and last.interior is not None and last.exterior is not None:
             result = adjust(

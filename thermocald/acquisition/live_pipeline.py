@@ -70,9 +70,9 @@ class Keeper(Protocol):
 class LivePipeline:
     """The queue, the calibrating and the keeping thread of one camera.
 
-    calibrator: None if epochs are only acquired. observe: told every calibrated epoch in order,
-    returns further columns. depth: epochs that may wait. patience_s: to wait for a reading that is
-    being taken, at most half a period.
+    calibrator: None if epochs are only acquired. observe: (a calibrated epoch, whether it comes in
+    order) → the epoch as it is kept. depth: epochs that may wait. patience_s: to wait for a reading
+    that is being taken, at most half a period.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class LivePipeline:
         depth: int = _DEPTH,
         patience_s: float | None = None,
         trusted: Callable[[], bool] = lambda: True,
-        observe: Callable[[CalibratedEpoch], dict[str, float]] = lambda _: {},
+        observe: Callable[[CalibratedEpoch, bool], CalibratedEpoch] = lambda epoch, _: epoch,
     ) -> None:
         self.name = name
         self.calibrator = calibrator
@@ -197,15 +197,14 @@ class LivePipeline:
         self._pair(item, self._patience_s)
         assert item.epoch is not None
         result = self._safely(item.epoch, item.frame)
+        if item.skew_s == item.skew_s:
+            result = replace(result, extra={**result.extra, "skew_s": item.skew_s})
         with self._changed:
             if item.state == "dropped":  # it took so long that it was kept without
                 self._amended.append(result)
                 self.caught_up += 1
             else:
-                extra = {**result.extra, **self._observe(result)}
-                if item.skew_s == item.skew_s:
-                    extra["skew_s"] = item.skew_s
-                item.calibrated = replace(result, extra=extra)
+                item.calibrated = result
                 item.state = "done"
             self._changed.notify_all()
 
@@ -216,8 +215,8 @@ class LivePipeline:
             return CalibratedEpoch(epoch, why, {})
         try:
             if frame is None:
-                return self.calibrator.calibrate(epoch)
-            return calibrate_frame(self.calibrator, epoch, frame)
+                return self._observe(self.calibrator.calibrate(epoch), False)
+            return self._observe(calibrate_frame(self.calibrator, epoch, frame), True)
         except Exception as error:
             # one epoch that breaks the program must not end months of acquisition
             log.exception("camera %s: epoch %d was not calibrated", self.name, epoch.number)

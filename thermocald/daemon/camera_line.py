@@ -14,11 +14,14 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from thermocald.acquisition.device_loop import DeviceLoop
 from thermocald.acquisition.frame_check import check_frame
 from thermocald.acquisition.link import Link
 from thermocald.acquisition.live_pipeline import LivePipeline
 from thermocald.daemon.epoch_keeper import EpochKeeper
+from thermocald.daemon.plan import common_unknowns
 from thermocald.errors import ConfigurationError
 from thermocald.store.row import Event
 
@@ -29,6 +32,7 @@ if TYPE_CHECKING:
     from thermocald.daemon.plan import CameraPlan
     from thermocald.daemon.station import Station
     from thermocald.hal import Frame
+    from thermocald.photogrammetry.testfield import Observations
 
 __all__ = ["CameraLine", "SeriesRun", "link_status"]
 
@@ -37,6 +41,7 @@ log = logging.getLogger(__name__)
 _PREVIEW_EVERY_S = 5.0
 _SHOW_EVERY_S = 0.5
 _SWITCH_GRACE_S = 20.0
+_REMEMBERED = 200  # epochs
 
 
 class SeriesRun:
@@ -56,6 +61,8 @@ class SeriesRun:
             plan, station.guard, station.frames, self._kept, station.identity_of(line), start=start
         )
         self.observer = station.make_observer(plan, self.keeper)
+        self.common = common_unknowns(plan)
+        self._remembered = False
         self.first = self.keeper.first_number
         self.pipeline = LivePipeline(
             plan.name,
@@ -89,8 +96,35 @@ class SeriesRun:
         self.pipeline.drain(0.5 * grace_s)
         return self.pipeline.stop(max(0.1, deadline - time.monotonic()))
 
-    def _observe(self, calibrated: CalibratedEpoch) -> dict[str, float]:
-        return {} if self.observer is None else self.observer.observe(calibrated)
+    def _observe(self, calibrated: CalibratedEpoch, in_order: bool) -> CalibratedEpoch:
+        """Test the epoch against the series, then adjust it with what all its epochs share."""
+        seen = calibrated.epoch.observations
+        extra = self.observer.observe(calibrated) if self.observer and in_order else {}
+        apart = calibrated.adjustment
+        if self.common is not None and seen is not None:
+            if in_order and self.first > 1 and not self.common.epochs:
+                self._remember()
+            if "event" in extra:
+                self.common.reset()
+            moved = extra.get("innovation_chi2", 0.0) > extra.get("innovation_bound", np.inf)
+            apart = self.common.refine(self._weighed(seen), apart, moved=moved)
+        return replace(calibrated, adjustment=apart, extra={**calibrated.extra, **extra})
+
+    def _weighed(self, seen: Observations) -> Observations:
+        assert self.plan.calibrator is not None
+        return self.plan.calibrator.weighed(seen)
+
+    def _remember(self) -> None:
+        """After a restart, learn from the last epochs of the store what they share."""
+        if self._remembered:
+            return
+        self._remembered = True
+        assert self.common is not None
+        assert self.plan.calibrator is not None
+        for seen, event in self.keeper.recent(_REMEMBERED):
+            if event:
+                self.common.reset()
+            self.common.refine(self._weighed(seen), self.plan.calibrator.adjust(seen))
 
     def _kept(self, acquired: AcquiredEpoch, row: dict[str, Any]) -> None:
         """Tell outputs and the live state; the epoch is in the store already."""

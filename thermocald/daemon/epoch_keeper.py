@@ -14,7 +14,7 @@ from thermocald.photogrammetry.camera_model import PARAMETER_NAMES
 from thermocald.store.row import NOT_CALIBRATED, EpochResult, Event
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from thermocald.acquisition.calibrator import CalibratedEpoch
     from thermocald.acquisition.frame_folder import FrameFolder
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from thermocald.daemon.plan import CameraPlan
     from thermocald.daemon.store_guard import StoreGuard
     from thermocald.epoch import Epoch
+    from thermocald.photogrammetry.testfield import Observations
     from thermocald.store.row import StoredSeries
 
 __all__ = ["EpochKeeper", "result_row"]
@@ -82,6 +83,19 @@ class EpochKeeper:
         if self._series is None:
             return 1
         return (self._guard.store.last_epoch(self._series) or 0) + 1
+
+    def recent(self, count: int) -> Iterator[tuple[Observations, bool]]:
+        """The last epochs with a result: observations, and whether the camera changed then."""
+        if self._series is None:
+            return
+        first = max(1, self.first_number - count)
+        try:
+            for stored in self._guard.store.epochs(self._series, first):
+                seen = stored.epoch.observations
+                if seen is not None and stored.result.status == "ok":
+                    yield seen, "event" in stored.extra
+        except StoreError as error:
+            log.warning("earlier epochs cannot be read: %s", error)
 
     def keep(self, acquired: AcquiredEpoch) -> None:
         """Keep an epoch; a calibration that was put off is made up for later from its frame."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.acquisition.calibrator import Calibrator
+from thermocald.acquisition.common_unknowns import CommonUnknowns
 from thermocald.errors import ConfigurationError
 from thermocald.hal import open_device
 from thermocald.photogrammetry.adjustment import AdjustmentSettings
@@ -23,7 +24,14 @@ if TYPE_CHECKING:
     from thermocald.config import CalibrationConfig, CameraConfig, Config
     from thermocald.hal import Camera, Clock, Frame
 
-__all__ = ["CameraPlan", "adjustment_settings", "check_series", "plan_cameras", "series_head"]
+__all__ = [
+    "CameraPlan",
+    "adjustment_settings",
+    "check_series",
+    "common_unknowns",
+    "plan_cameras",
+    "series_head",
+]
 
 _UNKNOWN_PITCH_MM = 0.001
 
@@ -95,6 +103,20 @@ def adjustment_settings(calibration: CalibrationConfig) -> AdjustmentSettings:
         snooping_alpha=calibration.snooping_alpha,
         bounds=GeometryBounds(correlation=calibration.correlation_bound),
     )
+
+
+def common_unknowns(plan: CameraPlan) -> CommonUnknowns | None:
+    """What the epochs of a series of this camera share; None if nothing."""
+    if plan.sensor is None or plan.testfield is None:
+        return None
+    common = CommonUnknowns(
+        plan.sensor,
+        plan.testfield,
+        adjustment_settings(plan.calibration),
+        still=plan.calibration.exterior == "series",
+        offsets=plan.calibration.target_offsets,
+    )
+    return common if common.any else None
 
 
 def _held(one: CameraConfig, calibration: CalibrationConfig) -> InteriorOrientation | None:

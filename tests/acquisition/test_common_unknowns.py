@@ -1,0 +1,132 @@
+"""What epochs share: against the adjustment of the whole series, and against the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermocald.acquisition.calibrator import Calibrator
+from thermocald.acquisition.common_unknowns import CommonUnknowns
+from thermocald.photogrammetry.adjustment import AdjustmentSettings
+from thermocald.photogrammetry.camera_model import ExteriorOrientation, InteriorOrientation, project
+from thermocald.photogrammetry.series import SeriesSettings, adjust_series
+from thermocald.photogrammetry.testfield import Observations, TestField
+from thermocald.simulation.demonstration import demonstration_model
+from thermocald.simulation.testfields import corner_field
+
+NOISE = 0.04
+FIELD_SD = 0.05  # mm
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A camera that stands still and warms up before a field that is known to FIELD_SD."""
+    plain = corner_field("plain", per_side=5, pitch_mm=124.0)
+    model = demonstration_model(plain)
+    rng = np.random.default_rng(8)
+    given = plain.points + rng.normal(0, FIELD_SD, plain.points.shape)
+    field = TestField.build(plain.names, given, FIELD_SD)
+    iop, eop = model.interior.as_array(), model.exterior.as_array()
+
+    def epoch(k: int, knocked: bool = False) -> tuple[Observations, np.ndarray]:
+        now = iop.copy()
+        now[:3] += np.array([2.0e-4, -4.5e-4, -3.0e-4]) * min(k, 40) * 0.25
+        pose = eop + (np.array([0.002, 0, 0, 3.0, 0, 0]) if knocked else 0.0)
+        points = project(model.sensor, now, pose, plain.points)
+        points = points + rng.normal(0, NOISE, points.shape)
+        rows = rng.permutation(len(plain))[: len(plain) - 15]  # some are hidden, now and then
+        return Observations(rows, points[rows], np.full((len(rows), 2), NOISE)), now
+
+    return model.sensor, field, epoch
+
+
+def run(scene, epochs: int, settings=None, **options):
+    sensor, field, epoch = scene
+    settings = settings or AdjustmentSettings()
+    calibrator = Calibrator(sensor, field, settings, nominal_c=3.04)
+    common = CommonUnknowns(sensor, field, settings, **options)
+    results, alone, truth, seen = [], [], [], []
+    for k in range(epochs):
+        observations, now = epoch(k)
+        apart = calibrator.adjust(observations)
+        results.append(common.refine(observations, apart))
+        alone.append(apart)
+        truth.append(now)
+        seen.append(observations)
+    return results, alone, np.array(truth), seen
+
+
+@pytest.mark.parametrize("exterior", ["series", "per_epoch"])
+def test_after_the_last_epoch_it_is_the_adjustment_of_the_whole_series(scene, exterior):
+    sensor, field, _ = scene
+    results, alone, _, seen = run(scene, 60, still=exterior == "series", offsets=True)
+    start = alone[-1]
+    settings = SeriesSettings(exterior=exterior, target_noise=False, snooping_alpha=0.001)
+    whole = adjust_series(
+        sensor, field, seen,
+        InteriorOrientation.from_array(start.values[:10]),
+        ExteriorOrientation.from_array(start.values[10:]), settings,
+    )  # fmt: skip
+    last = results[-1]
+    assert last.ok
+    # the same but for what was rejected, and common unknowns that are a few epochs old
+    assert np.abs(last.values - whole.values[-1])[:3] == pytest.approx(
+        np.zeros(3), abs=0.15 * last.sd[:3].min()
+    )
+    assert last.sigma0 == pytest.approx(whole.sigma0[-1], rel=0.05)
+
+
+def test_one_orientation_makes_the_principal_point_ten_times_as_sure_and_truly_so(scene):
+    results, alone, truth, _ = run(scene, 60, still=True, offsets=True)
+    late = slice(30, None)
+    x0 = np.array([r.values[1] for r in results])[late] - truth[late, 1]
+    x0_alone = np.array([r.values[1] for r in alone])[late] - truth[late, 1]
+    assert np.std(x0) < 0.25 * np.std(x0_alone)
+    # errors against the truth, the common ones included, are what the standard deviations say
+    for i in range(3):
+        error = np.array([r.values[i] for r in results])[late] - truth[late, i]
+        sd = np.array([r.sd[i] for r in results])[late]
+        assert np.abs(error / sd).max() < 4.0
+        assert np.mean((error / sd) ** 2) < 4.0
+    assert np.ptp([r.values[13] for r in results[-5:]]) < 0.2 * results[-1].sd[13]
+
+
+def test_offsets_take_the_jumps_out_that_hidden_targets_make(scene):
+    with_offsets, alone, truth, _ = run(scene, 60, still=False, offsets=True)
+    late = slice(30, None)
+
+    def scatter(results) -> float:
+        c = np.array([r.values[0] for r in results])[late] - truth[late, 0]
+        return float(np.std(c))
+
+    assert scatter(with_offsets) < 0.85 * scatter(alone)
+
+
+def test_an_epoch_that_was_moved_has_no_result_and_the_next_begins_anew(scene):
+    sensor, field, epoch = scene
+    settings = AdjustmentSettings()
+    calibrator = Calibrator(sensor, field, settings, nominal_c=3.04)
+    common = CommonUnknowns(sensor, field, settings, still=True, offsets=True)
+    words = []
+    for k in range(24):
+        observations, _ = epoch(k, knocked=k >= 20)
+        result = common.refine(observations, calibrator.adjust(observations))
+        words.append(result.status)
+    assert words == ["ok"] * 20 + ["moved"] + ["ok"] * 3
+    assert common.epochs == 3
+
+
+def test_nothing_shared_leaves_the_epoch_as_it_is(scene):
+    results, alone, _, _ = run(scene, 3, still=False, offsets=False)
+    assert all(a is b for a, b in zip(results, alone, strict=True))
+
+
+def test_priors_and_what_is_held_are_kept(scene):
+    settings = AdjustmentSettings(
+        free=("c", "x0", "y0"), priors={"c": (3.1, 1e-6), "Z0": (1000.0, 1e9)}
+    )
+    results, _, _, _ = run(scene, 4, settings, still=True, offsets=True)
+    good = [r for r in results if r.interior is not None]
+    for r in good:
+        assert r.values[0] == pytest.approx(3.1, abs=1e-4)
+        assert (r.values[3:10] == 0).all()

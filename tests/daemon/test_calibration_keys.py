@@ -1,0 +1,123 @@
+"""Every key of `calibration` changes what the daemon stores: one daemon, a camera per key."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.daemon.conftest import ENVIRONMENT, fast_run, make_recording
+from thermocald.config import CalibrationConfig
+from thermocald.photogrammetry.testfield import TestField
+from thermocald.store.database import Store
+from thermocald.store.recording import read_recording, write_recording
+
+EPOCHS = 24
+PLAIN = {"target_offsets": False}
+KEYS = {
+    "plain": {},
+    "exterior": {"exterior": "series"},
+    "free": {"free": ["c", "x0", "y0"]},
+    "fixed": {"free": ["c", "x0", "y0"], "fixed": {"A1": 0.002}},
+    "priors": {"priors": {"c": {"value": 3.2, "sd": 1e-7}}},
+    "sigma_floor_px": {"sigma_floor_px": 0.4},
+    "target_offsets": {"target_offsets": True},
+    "correlation_bound": {"correlation_bound": 0.6},
+    "snooping_alpha": {"snooping_alpha": 0.0},
+}
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory):
+    """{key: columns of the series that was taken with it}; target 7 is 3 px off in all epochs."""
+    folder = tmp_path_factory.mktemp("keys")
+    taken = read_recording(make_recording(folder / "taken", EPOCHS, per_side=4))
+    field = TestField.build(taken.testfield.names, taken.testfield.points, 0.05)
+
+    def spoilt():
+        for epoch in taken.epochs:
+            points = epoch.observations.points.copy()
+            points[7] += 3.0
+            yield replace(epoch, observations=replace(epoch.observations, points=points))
+
+    path = folder / "spoilt"
+    write_recording(
+        path, name="spoilt", series="M1", interval=10.0, camera=taken.camera,
+        channels=taken.channels, testfield=field, epochs=spoilt(),
+    )  # fmt: skip
+    sensor = taken.camera.sensor
+    camera = {
+        "driver": "replay", "recording": str(path), "testfield": str(path / "testfield.csv"),
+        "principal_distance_mm": 3.04,
+        "sensor": {"width_px": sensor.width, "height_px": sensor.height,
+                   "pixel_pitch_mm": sensor.pixel_pitch},
+    }  # fmt: skip
+    cameras = [
+        {**camera, "name": key, "calibration": {**PLAIN, **changed}}
+        for key, changed in KEYS.items()
+    ]
+    document = {"cameras": cameras, "frames": {"keep": "none"}, "store": {"durable": False}}
+    run = fast_run(json.dumps(document), EPOCHS)
+    subprocess.run([sys.executable, "-c", run], cwd=folder, env=ENVIRONMENT, check=True)
+    names = ["status", "sigma0", "n_rejected", "c", "sd_c", "x0", "sd_x0", "A1", "sd_A1", "X0"]
+    with Store.open(folder / "thermocald.db") as store:
+        found = {s.camera: s for s in store.all_series()}
+        for key, changed in KEYS.items():
+            assert {**found[key].settings, **changed} == found[key].settings
+        yield {key: store.series_columns(found[key], names) for key in KEYS}
+
+
+def test_there_is_a_test_for_every_key():
+    assert set(KEYS) - {"plain"} == set(CalibrationConfig.model_fields)
+
+
+def test_plain(stored):
+    plain = stored["plain"]
+    assert (plain["status"] == "ok").all()
+    assert (plain["n_rejected"] >= 1).all()
+
+
+def test_exterior(stored):
+    """One orientation: it hardly moves any more, and the principal point is surer by far."""
+    plain, series = stored["plain"], stored["exterior"]
+    assert np.ptp(series["X0"][-5:]) < 0.1 * np.ptp(plain["X0"][-5:])
+    assert series["sd_x0"][-1] < 0.5 * plain["sd_x0"][-1]
+
+
+def test_free(stored):
+    assert np.isnan(stored["free"]["sd_A1"]).all()
+    assert np.isfinite(stored["plain"]["sd_A1"]).all()
+
+
+def test_fixed(stored):
+    assert (stored["fixed"]["A1"] == 0.002).all()
+    assert (stored["free"]["A1"] == 0.0).all()
+
+
+def test_priors(stored):
+    assert stored["priors"]["c"] == pytest.approx(3.2, abs=1e-4)
+
+
+def test_sigma_floor_px(stored):
+    # the sigmas of the object coordinates stay, or it would be a tenth
+    assert (stored["sigma_floor_px"]["sigma0"] < 0.4 * stored["plain"]["sigma0"]).all()
+
+
+def test_target_offsets(stored):
+    """Errors of the field are in every epoch the same, and no longer noise of the epoch."""
+    plain, offsets = stored["plain"], stored["target_offsets"]
+    assert np.abs(offsets["c"] - plain["c"])[1:].min() > 0
+    assert np.median(offsets["sigma0"]) != pytest.approx(np.median(plain["sigma0"]), rel=0.02)
+
+
+def test_correlation_bound(stored):
+    assert (stored["correlation_bound"]["status"] == "weak_geometry").all()
+
+
+def test_snooping_alpha(stored):
+    assert (stored["snooping_alpha"]["n_rejected"] == 0).all()
+    assert stored["snooping_alpha"]["sigma0"].min() > 2.0 * stored["plain"]["sigma0"].max()

@@ -12,28 +12,22 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 
 from thermocald.errors import GeometryError
 from thermocald.photogrammetry import ring_code
 from thermocald.photogrammetry.camera_model import CameraModel, Sensor
 from thermocald.photogrammetry.circle import fit_circles
-from thermocald.photogrammetry.detection import Candidates, find_circles
+from thermocald.photogrammetry.coded_circles import find_coded
 from thermocald.photogrammetry.frame_status import OK, FrameStatus, inspect_frame
 from thermocald.photogrammetry.identification import Orientation, orient, refine
 from thermocald.photogrammetry.markers import (
     MarkerCorners,
-    detect_markers,
-    is_marker,
     locate_markers,
     measure_corners,
-    parse_marker,
-    to_8_bit,
 )
 from thermocald.photogrammetry.outline import LocalMap, local_maps
 from thermocald.photogrammetry.planes import field_normals
-from thermocald.photogrammetry.ring_reading import read_codes
 from thermocald.photogrammetry.testfield import Observations
 
 if TYPE_CHECKING:
@@ -51,11 +45,7 @@ if TYPE_CHECKING:
 __all__ = ["Measurement", "Prior", "circle_observations", "join", "measure", "predicted_maps"]
 
 _FEWEST = 4
-_SEARCHES = ((2, -1), (2, 1), (1, -1), (1, 1))  # scale, ink
-_ENOUGH_CODES = 0.5
-_LARGE_WIDTH = 1200
 _LARGEST_TILT_COSINE = 0.2  # 78°: beyond, a sheet is seen edge-on
-_MARKER_NEIGHBOURHOOD = 2.0  # sides of the marker that names a circle
 _GROSS_SD = 8.0
 _GROSS_PX = 3.0
 _USUAL_BLUR_PX = 0.9
@@ -139,7 +129,9 @@ def _measure(
             missed.update(found[1])
             return _finish(testfield, join(corners, found[0]), missed, found[2], False)
 
-    rows, points, maps, foreign = _find_coded(image, testfield, len(corners) < _FEWEST)
+    rows, points, maps, foreign = find_coded(
+        image, testfield, _FEWEST, needed=len(corners) < _FEWEST
+    )
     pair_rows = np.concatenate([corners.targets, rows])
     pair_points = np.concatenate([corners.points, points])
     if len(pair_rows) < _FEWEST:
@@ -274,77 +266,6 @@ def circle_observations(
             "misfit": fit.misfit[good],
         },
     )
-
-
-def _find_coded(
-    image: Image, testfield: TestField, needed: bool
-) -> tuple[NDArray[np.int64], Array, LocalMap, bool]:
-    """Rows, centres (n, 2), and maps of ring-coded and marker-named circles; whether codes were
-    seen that are not of this field. `needed`: search on until enough are found.
-    """
-    row_of: dict[tuple[int, int], int] = {}
-    named: dict[str, dict[int, int]] = {}
-    for row, code in enumerate(testfield.codes):
-        if testfield.kinds[row] != "circle" or not code:
-            continue
-        if ring_code.is_ring(code):
-            row_of[ring_code.parse(code)] = row
-        elif is_marker(code):
-            dictionary, marker, corner = parse_marker(code)
-            if corner is None:
-                named.setdefault(dictionary, {})[marker] = row
-    if not row_of and not named:
-        return _no_codes()
-    grey = to_8_bit(image)
-    best: tuple[NDArray[np.int64], Array, LocalMap] | None = None
-    foreign = False
-    searches = _SEARCHES if image.shape[1] > _LARGE_WIDTH else _SEARCHES[2:]
-    for scale, ink in searches:
-        candidates = find_circles(grey, scale, ink)
-        codes = read_codes(grey, candidates)
-        keys = list(zip(codes.bits.tolist(), codes.numbers.tolist(), strict=True))
-        ours = [i for i, key in enumerate(keys) if key in row_of]
-        foreign = foreign or len(ours) < len(keys)
-        rows = [row_of[keys[i]] for i in ours]
-        which = [int(codes.rows[i]) for i in ours]
-        for row, place in _circles_by_marker(grey, candidates, named):
-            if place not in which:
-                rows.append(row)
-                which.append(place)
-        if best is None or len(rows) > len(best[0]):
-            maps = candidates.maps.select(np.array(which, dtype=np.int64))
-            best = np.array(rows, dtype=np.int64), maps.centre, maps
-        enough = max(_FEWEST + 2, _ENOUGH_CODES * (len(row_of) + sum(map(len, named.values()))))
-        if len(best[0]) >= enough or (not needed and len(best[0]) >= _FEWEST):
-            break
-    if best is None:
-        return _no_codes()
-    return (*best, foreign)
-
-
-def _no_codes() -> tuple[NDArray[np.int64], Array, LocalMap, bool]:
-    none = LocalMap(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 2, 3)))
-    return np.zeros(0, dtype=np.int64), np.zeros((0, 2)), none, False
-
-
-def _circles_by_marker(
-    grey: NDArray[np.uint8], candidates: Candidates, named: dict[str, dict[int, int]]
-) -> list[tuple[int, int]]:
-    """(row, candidate) of circles that a marker names: the one circle nearest to its centre."""
-    pairs: list[tuple[int, int]] = []
-    for dictionary, row_of in named.items():
-        found = detect_markers(grey, dictionary, frozenset(row_of))
-        for number, quad in zip(found.numbers.tolist(), found.corners, strict=True):
-            side = np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1).mean()
-            distance = np.linalg.norm(candidates.maps.centre - quad.mean(axis=0), axis=1)
-            outside = np.array(
-                [cv2.pointPolygonTest(quad.astype(np.float32), tuple(c), True) < 0
-                 for c in candidates.maps.centre], dtype=bool,
-            )  # fmt: skip
-            near = np.nonzero(outside & (distance < _MARKER_NEIGHBOURHOOD * side))[0]
-            if len(near):
-                pairs.append((row_of[number], int(near[np.argmin(distance[near])])))
-    return pairs
 
 
 def _few(

@@ -130,7 +130,10 @@ class Prior(_Section):
 class CalibrationConfig(_Section):
     """How epochs are adjusted.
 
-    exterior: one orientation per epoch, or one for the series of a camera that stands still;
+    exterior: one orientation per epoch, or one for the series of a camera that stands still,
+    estimated from all its epochs so far (an epoch that contradicts it has the status `moved`, the
+    second in a row begins anew); target_offsets: a constant offset per target, estimated from all
+    epochs so far with the test field's sigmas as prior, else these are noise of each epoch;
     free: what is estimated; fixed: values of what is not; priors: values with their sd; the
     bounds as in `photogrammetry.geometry`.
     """

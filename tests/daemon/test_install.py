@@ -1,0 +1,62 @@
+"""The pipx route: a wheel of this checkout in a fresh environment takes an epoch."""
+
+from __future__ import annotations
+
+import os
+import site
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+import pytest
+
+from thermocald.store.database import Store
+
+ROOT = Path(__file__).resolve().parents[2]
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory) -> Path:
+    """An environment as pipx makes it; the dependencies are those of the tests' environment."""
+    folder = tmp_path_factory.mktemp("pipx")
+    built = subprocess.run(
+        [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "-w", folder, str(ROOT)],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    if built.returncode:
+        pytest.skip(f"no wheel can be built here: {built.stderr.strip().splitlines()[-1]}")
+    (wheel,) = folder.glob("thermocald-*.whl")
+    venv.create(folder / "venv", with_pip=True)
+    python = folder / "venv/bin/python"
+    subprocess.run([python, "-m", "pip", "install", "--quiet", "--no-deps", wheel], check=True)
+    (packages,) = (folder / "venv/lib").glob("python*/site-packages")
+    # a plain path, so that the editable install of the checkout there is not followed
+    (packages / "dependencies.pth").write_text("\n".join(site.getsitepackages()) + "\n")
+    return folder / "venv/bin/thermocald"
+
+
+def test_it_runs_from_the_wheel_alone(installed, tmp_path):
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    done = subprocess.run(
+        [installed, "run", "--mock", "--epochs", "1", "--store", "mock.db"],
+        cwd=tmp_path, env=environment, capture_output=True, text=True, check=False, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    with Store.open(tmp_path / "mock.db") as store:
+        (series,) = store.all_series()
+        assert store.series_columns(series, ["status"])["status"].tolist() == ["ok"]
+    where = subprocess.run(
+        [installed.with_name("python"), "-c", "import thermocald; print(thermocald.__file__)"],
+        cwd=tmp_path, env=environment, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert Path(where.stdout.strip()).is_relative_to(installed.parents[1])
+
+
+def test_the_wheel_has_the_page_and_the_reports_templates(installed):
+    (package,) = (installed.parents[1] / "lib").glob("python*/site-packages/thermocald")
+    for folder in ("output/dashboard/static", "output/templates"):
+        here = {p.name for p in (ROOT / "thermocald" / folder).iterdir() if p.is_file()}
+        assert here <= {p.name for p in (package / folder).iterdir()}

@@ -1,0 +1,91 @@
+"""The example notebooks run, without warnings, to the output that is stored in them."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+from tests.docs.blocks import ROOT
+
+NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
+
+# Run before the first cell: what is wrong with a drawing goes to standard error.
+WATCH = """
+import sys
+
+
+def _judge():
+    plt = sys.modules.get("matplotlib.pyplot")
+    for number in plt.get_fignums() if plt else ():
+        for axes in plt.figure(number).axes:
+            shared = axes.get_shared_x_axes().get_siblings(axes)
+            across = "".join(other.get_xlabel() for other in shared)
+            for label in (across, axes.get_ylabel()):
+                if not label.endswith(")") or "(" not in label:
+                    sys.stderr.write(f"no unit: {label!r}\\n")
+            if axes.get_legend() is None:
+                sys.stderr.write(f"no legend: {axes.get_ylabel()!r}\\n")
+
+
+get_ipython().events.register("post_execute", _judge)
+"""
+NUMBER = re.compile(r"[-+]?\d[\d,]*\.?\d*(?:e[-+]?\d+)?")
+
+
+def test_there_are_notebooks():
+    assert len(NOTEBOOKS) >= 4
+
+
+def outputs(notebook) -> list[str]:
+    """What was printed, cell by cell."""
+    return [
+        "".join(
+            o["text"] if o["output_type"] == "stream" else o["data"].get("text/plain", "")
+            for o in cell["outputs"]
+            if o["output_type"] != "display_data"
+        )
+        for cell in notebook["cells"]
+        if cell["cell_type"] == "code"
+    ]
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
+def test_it_is_small_and_was_run_from_top_to_bottom(path):
+    assert path.stat().st_size < 250_000
+    notebook = json.loads(path.read_text())
+    code = [c for c in notebook["cells"] if c["cell_type"] == "code"]
+    assert [c["execution_count"] for c in code] == list(range(1, len(code) + 1))
+    kinds = {k for c in code for o in c["outputs"] for k in o.get("data", {})}
+    assert "image/png" in kinds
+    assert not [o for c in code for o in c["outputs"] if o.get("name") == "stderr"]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of the kernel's own machinery
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
+def test_it_runs_to_what_is_stored(path, tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
+    stored = nbformat.read(path, as_version=4)
+    notebook = nbformat.read(path, as_version=4)
+    notebook.cells.insert(0, nbformat.v4.new_code_cell(WATCH))
+    client = NotebookClient(notebook, timeout=600, kernel_name="python3")
+    client.resources = {"metadata": {"path": str(tmp_path)}}
+    client.execute()
+    del notebook.cells[0]
+    for cell in notebook.cells:
+        for output in cell.get("outputs", ()):
+            assert output.get("name") != "stderr", output["text"]
+    for now, then in zip(outputs(notebook), outputs(stored), strict=True):
+        assert NUMBER.sub("#", now) == NUMBER.sub("#", then)
+        # p-values far below any level hang on the last digits of a correlation
+        pairs = zip(numbers(now), numbers(then), strict=True)
+        assert all(a == pytest.approx(b, rel=0.1, abs=0.02) for a, b in pairs), (now, then)
+
+
+def numbers(text: str) -> list[float]:
+    return [float(n.replace(",", "")) for n in NUMBER.findall(text)]

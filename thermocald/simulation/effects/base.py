@@ -44,6 +44,7 @@ __all__ = [
     "History",
     "Influence",
     "Parameter",
+    "Proportional",
 ]
 
 Kind = Literal["drive", "signal", "image"]
@@ -312,3 +313,13 @@ def coefficient_units(per: str, parameters: tuple[str, ...] = PARAMETER_NAMES) -
     if per == "1":
         return {name: PARAMETER_UNITS[name] for name in parameters}
     return {name: f"{PARAMETER_UNITS[name]}/{per}" for name in parameters}
+
+
+class Proportional(Effect):
+    """An effect whose signal is T - T₀, at once."""
+
+    def signal(self, history: History, **_: Any) -> Array:
+        return (history.temperature() - history.T0)[:, None]
+
+    def sensitivity(self, history: History, **_: Any) -> csr_array:
+        return history.temperature_matrix()

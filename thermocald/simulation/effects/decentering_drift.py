@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-from thermocald.simulation.effects.base import Effect, coefficient_units
+from thermocald.simulation.effects.base import Proportional, coefficient_units
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    import numpy as np
-    from numpy.typing import NDArray
-    from scipy.sparse import csr_array
-
-    from thermocald.simulation.history import History
-
 __all__ = ["DecenteringDrift"]
 
 
-class DecenteringDrift(Effect):
+class DecenteringDrift(Proportional):
     """Adds a (T - T₀) to B1, B2."""
 
     name = "decentering_drift"
@@ -31,9 +25,3 @@ class DecenteringDrift(Effect):
         "hold": "does not move while the temperature stands",
         "cycle": "runs along the same line up and down",
     }
-
-    def signal(self, history: History, **_: Any) -> NDArray[np.float64]:
-        return (history.temperature() - history.T0)[:, None]
-
-    def sensitivity(self, history: History, **_: Any) -> csr_array:
-        return history.temperature_matrix()

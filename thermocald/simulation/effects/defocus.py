@@ -7,13 +7,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from thermocald.simulation.effects.base import Effect, Influence, spoken
+from thermocald.simulation.effects.base import Influence, Proportional, spoken
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-
-    from numpy.typing import NDArray
-    from scipy.sparse import csr_array
 
     from thermocald.photogrammetry.testfield import TestField
     from thermocald.simulation.history import History
@@ -21,7 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["Defocus"]
 
 
-class Defocus(Effect):
+class Defocus(Proportional):
     """Measuring noise and blur are multiplied by max(1 + k (T - T₀), 0.1); positions stay unbiased.
 
     Noise and blur share the factor: the precision of an edge falls between the root of its blur
@@ -38,12 +35,6 @@ class Defocus(Effect):
         "hold": "leaves positions alone; noise stays as large as it is",
         "cycle": "makes noise come and go with the temperature",
     }
-
-    def signal(self, history: History, **_: Any) -> NDArray[np.float64]:
-        return (history.temperature() - history.T0)[:, None]
-
-    def sensitivity(self, history: History, **_: Any) -> csr_array:
-        return history.temperature_matrix()
 
     def influence(
         self,

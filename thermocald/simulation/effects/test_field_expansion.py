@@ -7,13 +7,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from thermocald.simulation.effects.base import Effect, Influence
+from thermocald.simulation.effects.base import Influence, Proportional
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-
-    from numpy.typing import NDArray
-    from scipy.sparse import csr_array
 
     from thermocald.photogrammetry.testfield import TestField
     from thermocald.simulation.history import History
@@ -21,7 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["TestFieldExpansion"]
 
 
-class TestFieldExpansion(Effect):
+class TestFieldExpansion(Proportional):
     """Object coordinates times 1 + α (T - T₀), one α per axis, about the origin of the field.
 
     Source: linear expansion as ISO 1:2022 uses it.
@@ -37,12 +34,6 @@ class TestFieldExpansion(Effect):
         "hold": "does not move while the temperature stands",
         "cycle": "runs along the same line up and down",
     }
-
-    def signal(self, history: History, **_: Any) -> NDArray[np.float64]:
-        return (history.temperature() - history.T0)[:, None]
-
-    def sensitivity(self, history: History, **_: Any) -> csr_array:
-        return history.temperature_matrix()
 
     def influence(
         self,

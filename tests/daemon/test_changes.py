@@ -1,0 +1,106 @@
+"""What happens to a camera is told: a knock, a slip, another lens, a target that was moved."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.daemon.conftest import ENVIRONMENT, fast_run, make_recording
+from thermocald.photogrammetry.camera_model import project
+from thermocald.simulation.demonstration import demonstration_field, demonstration_model
+from thermocald.store.database import Store
+from thermocald.store.recording import read_recording, write_recording
+
+EPOCHS, WHEN = 70, 41
+HAPPENS = ("nothing", "knock", "slip", "wrong_lens", "target_moved")
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    """One daemon, five cameras that see the same until epoch 41."""
+    folder = tmp_path_factory.mktemp("changes")
+    taken = read_recording(make_recording(folder / "taken", EPOCHS, per_side=5, interval=10.0))
+    field, sensor = taken.testfield, taken.camera.sensor
+    model = demonstration_model(demonstration_field("markers"))
+    iop, eop = model.interior.as_array(), model.exterior.as_array()
+    now = {name: (iop.copy(), eop.copy()) for name in HAPPENS}
+    now["knock"][1][[0, 3]] += 0.001, 2.0  # 1 mrad, 2 mm
+    now["slip"][0][1] += 0.005  # mm: 4.5 px
+    now["wrong_lens"][0][0] *= 1.05
+    before = project(sensor, iop, eop, field.points)
+
+    def changed(name: str):
+        shift = project(sensor, *now[name], field.points) - before
+        if name == "target_moved":
+            shift[11] = 0.0, 2.0
+        for epoch in taken.epochs:
+            seen = epoch.observations
+            if epoch.number >= WHEN:
+                seen = replace(seen, points=seen.points + shift)
+            yield replace(epoch, observations=seen)
+
+    cameras = []
+    for name in HAPPENS:
+        path = folder / f"{name}-recording"
+        write_recording(
+            path, name=name, series="M1", interval=10.0, camera=taken.camera,
+            channels=taken.channels, testfield=field, epochs=changed(name),
+        )  # fmt: skip
+        cameras.append({
+            "name": name, "driver": "replay", "recording": str(path),
+            "testfield": str(path / "testfield.csv"), "principal_distance_mm": 3.04,
+            "thermometers": [f"t-{name}"], "calibration": {"exterior": "series"},
+            "sensor": {"width_px": sensor.width, "height_px": sensor.height,
+                       "pixel_pitch_mm": sensor.pixel_pitch},
+        })  # fmt: skip
+    thermometers = [
+        {"name": f"t-{c['name']}", "driver": "replay", "recording": c["recording"]}
+        for c in cameras
+    ]
+    document = {"cameras": cameras, "thermometers": thermometers, "frames": {"keep": "none"},
+                "store": {"durable": False}}  # fmt: skip
+    run = fast_run(json.dumps(document), EPOCHS)
+    subprocess.run([sys.executable, "-c", run], cwd=folder, env=ENVIRONMENT, check=True)
+    with Store.open(folder / "thermocald.db") as opened:
+        yield opened
+
+
+def told(store, name: str) -> list[tuple[str, int]]:
+    series = store.find_series(name)
+    return [
+        (e.kind, e.epoch) for e in store.events(series)
+        if e.kind in ("knock", "slip", "wrong_lens", "change", "target_moved")
+    ]  # fmt: skip
+
+
+def test_nothing_happened_and_nothing_is_told(store):
+    assert told(store, "nothing") == []
+
+
+@pytest.mark.parametrize("what", ["knock", "slip", "wrong_lens"])
+def test_the_second_epoch_in_a_row_tells_what_changed(store, what):
+    assert told(store, what) == [(what, WHEN + 1)]
+
+
+def test_a_moved_target_is_named_once(store):
+    assert told(store, "target_moved") == [("target_moved", WHEN + 4)]
+    (event,) = [e for e in store.events(store.find_series("target_moved"))
+                if e.kind == "target_moved"]  # fmt: skip
+    name = store.find_series("target_moved").testfield.names[11]
+    assert f"target {name} " in event.text
+
+
+def test_with_one_orientation_the_epoch_of_the_knock_has_no_wrong_result(store):
+    series = store.find_series("knock")
+    columns = store.series_columns(series, ["status", "x0", "sd_x0", "X0", "sd_X0"])
+    status = columns["status"].tolist()
+    assert status[WHEN - 1] == "moved"
+    assert status[: WHEN - 1] + status[WHEN:] == ["ok"] * (EPOCHS - 1)
+    # and afterwards the new orientation is the one estimated
+    moved = columns["X0"][-1] - columns["X0"][WHEN - 2]
+    assert moved == pytest.approx(2.0, abs=4 * np.hypot(*columns["sd_X0"][[WHEN - 2, -1]]))

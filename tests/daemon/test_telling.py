@@ -1,0 +1,195 @@
+"""What is told outside: the journal's fields, `thermocald status` and `top` in a terminal."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import pty
+import re
+import select
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import pytest
+
+from tests.daemon.conftest import ENVIRONMENT
+from thermocald.daemon.journal import JournalHandler
+
+
+class Journal:
+    """The socket of a journal; entries as dictionaries."""
+
+    def __init__(self, path) -> None:
+        self.path = str(path)
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(self.path)
+        self._socket.settimeout(5)
+
+    def entry(self) -> dict[str, str]:
+        data, fields = self._socket.recv(1 << 18), {}
+        while data:
+            line, _, data = data.partition(b"\n")
+            name, equals, value = line.partition(b"=")
+            if not equals:  # systemd.journal: name, length as 64 bit, data
+                size = int.from_bytes(data[:8], "little")
+                value, data = data[8 : 8 + size], data[8 + size + 1 :]
+            fields[name.decode()] = value.decode()
+        return fields
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+@pytest.fixture
+def journal(tmp_path):
+    journal = Journal(tmp_path / "journal")
+    yield journal
+    journal.close()
+
+
+@pytest.fixture
+def log(journal):
+    handler = JournalHandler(journal.path)
+    log = logging.Logger("thermocald.acquisition.link")  # noqa: LOG001 - apart from pytest's
+    log.addHandler(handler)
+    yield log
+    handler.close()
+
+
+def test_an_event_has_its_fields(log, journal):
+    log.warning("camera %s is out: %s", "one", "unplugged",
+                extra={"device": "one", "event": "device_out"})  # fmt: skip
+    entry = journal.entry()
+    assert entry["MESSAGE"] == "camera one is out: unplugged"
+    assert (entry["THERMOCALD_DEVICE"], entry["THERMOCALD_EVENT"]) == ("one", "device_out")
+    assert (entry["PRIORITY"], entry["SYSLOG_IDENTIFIER"]) == ("4", "thermocald")
+    assert entry["THERMOCALD_LOGGER"] == "thermocald.acquisition.link"
+    assert entry["THERMOCALD_THREAD"] == "MainThread"
+    assert entry["CODE_FILE"].endswith("test_telling.py")
+    assert int(entry["CODE_LINE"]) > 0
+
+
+@pytest.mark.parametrize(("level", "priority"), [
+    (logging.DEBUG, "7"), (logging.INFO, "6"), (logging.WARNING, "4"), (logging.ERROR, "3"),
+])  # fmt: skip
+def test_levels_are_the_journals(log, journal, level, priority):
+    log.log(level, "x")
+    entry = journal.entry()
+    assert entry["PRIORITY"] == priority
+    assert "THERMOCALD_EVENT" not in entry
+
+
+def test_lines_and_forged_fields_in_a_message_stay_in_the_message(log, journal):
+    """A device's answer must not be able to write fields."""
+    message = "first\nPRIORITY=0\nMESSAGE=forged = yes\nlast"
+    log.error("%s", message, extra={"device": "a\nTHERMOCALD_EVENT=forged"})
+    entry = journal.entry()
+    assert entry["MESSAGE"] == message
+    assert entry["PRIORITY"] == "3"
+    assert entry["THERMOCALD_DEVICE"] == "a\nTHERMOCALD_EVENT=forged"
+    assert "THERMOCALD_EVENT" not in entry
+
+
+def test_without_a_journal_it_goes_to_standard_error(log, journal, capsys):
+    journal.close()
+    log.error("nobody listens")
+    assert "nobody listens" in capsys.readouterr().err
+
+
+def test_the_daemon_tells_the_journal_what_a_device_did(daemon, devices, monkeypatch, tmp_path):
+    """Under systemd's environment; the socket's place is the only thing that is not systemd's."""
+    journal = Journal(tmp_path / "journal.sock")
+    sections = devices(camera=[{"kind": "unplugged", "at": 3, "for_s": 0.5}])
+    daemon.configure(**sections)
+    script = (
+        "import sys, thermocald.daemon.journal as j; "
+        f"j._SOCKET = {journal.path!r}; j.JournalHandler.__init__.__defaults__ = (j._SOCKET,); "
+        f"sys.argv = ['thermocald', 'run', '--config', {str(daemon.config)!r}]; "
+        "from thermocald.cli import main; main()"
+    )
+    daemon.process = subprocess.Popen(
+        [sys.executable, "-c", script], cwd=daemon.folder,
+        env={**ENVIRONMENT, "JOURNAL_STREAM": "8:1"}, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    found: dict[str, dict[str, str]] = {}
+    deadline = time.monotonic() + 60
+    while "device_back" not in found:
+        assert time.monotonic() < deadline
+        try:
+            entry = journal.entry()
+        except TimeoutError:
+            continue
+        found[entry.get("THERMOCALD_EVENT", "")] = entry
+    daemon.stop()
+    daemon.process.stderr.close()
+    journal.close()
+    assert found["started"]["PRIORITY"] == "6"
+    assert found["device_out"]["THERMOCALD_DEVICE"] == "one"
+    assert found["device_out"]["THERMOCALD_THREAD"] == "camera one"
+
+
+def in_a_terminal(daemon, seconds: float, *options: str) -> tuple[str, int]:
+    """What a command draws in a terminal of 200 columns until it is interrupted."""
+    terminal, inner = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "thermocald", *options], cwd=daemon.folder,
+        env={**ENVIRONMENT, "COLUMNS": "200", "LINES": "50", "TERM": "xterm"},
+        stdin=inner, stdout=inner, stderr=inner,
+    )  # fmt: skip
+    os.close(inner)
+    seen, end = b"", time.monotonic() + 60
+    until = None
+    while time.monotonic() < (until or end):
+        if select.select([terminal], [], [], 0.1)[0]:
+            try:
+                seen += os.read(terminal, 65536)
+            except OSError:
+                break
+        if until is None and b"sigma0" in seen:
+            until = time.monotonic() + seconds
+    process.send_signal(signal.SIGINT)
+    status = process.wait(30)
+    os.close(terminal)
+    return seen.decode(errors="replace"), status
+
+
+def test_top_is_always_up_to_date(daemon, devices):
+    daemon.configure(**devices())
+    daemon.start()
+    daemon.until(lambda: len(daemon.results()) > 2)
+    seen, status = in_a_terminal(daemon, 5.0, "top", "--store", str(daemon.store),
+                                 "--interval", "0.3")  # fmt: skip
+    assert daemon.stop() == 0
+    plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", seen)
+    epochs = [int(n) for n in re.findall(r"one/watch\s+(?:open|hung|out)\s+(\d+)", plain)]
+    assert epochs == sorted(epochs)
+    assert epochs[-1] > epochs[0]
+    assert "housing" in plain
+    assert status in (130, -signal.SIGINT)
+    assert "Traceback" not in plain
+
+
+def test_status_says_how_it_is_in_json_and_fails_where_nothing_runs(daemon, devices):
+    def status(*options: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "thermocald", "status", "--store", str(daemon.store)]
+        return subprocess.run([*command, *options], cwd=daemon.folder, env=ENVIRONMENT,
+                              capture_output=True, text=True, check=False)  # fmt: skip
+
+    gone = status()
+    assert (gone.returncode, gone.stderr.count("\n")) == (1, 1)
+    daemon.configure(**devices())
+    daemon.start()
+    daemon.until(lambda: len(daemon.results()) > 2)
+    told = status("--json", "-")
+    document = json.loads(told.stdout)
+    assert document["pid"] == daemon.process.pid
+    assert document["cameras"]["one"]["device"] == "open"
+    assert document["thermometers"]["housing"]["last"]["temperature"] == pytest.approx(25, abs=3)
+    daemon.kill()
+    killed = status()
+    assert killed.returncode == 1
+    assert "was killed" in killed.stderr

@@ -4,7 +4,7 @@
       - name: field
         driver: ds18b20
         sensors: {camera: 28-000000bfe244, air: 28-00000a1b2c3d}   # {channel: ROM id}
-        timeout_s: 3                    # one conversion takes 0.75 s
+        timeout_s: 3                    # for each sensor; one conversion takes 0.75 s
         attempts: 2                     # a reading that is not believed is made once more
         sysfs: /sys
 
@@ -12,8 +12,10 @@ What this driver does not believe: a CRC that fails (computed here too, over the
 zeros (a shorted or unplugged line: the CRC of zeros is zero), a `t=` that does not fit its bytes,
 values outside −55 … 125 °C, and 85 °C with the power-on scratchpad unless a neighbouring reading
 makes it likely: that value is what the chip holds before its first conversion, but a probe also
-passes through it on a ramp. Every sensor is read in its own thread, so that several slow
-conversions take the time of one. Source: Maxim DS18B20 data sheet (19-7487), Linux w1_therm.c.
+passes through it on a ramp. Every sensor is asked at once, in its own thread; the kernel (seen with
+6.1) nevertheless keeps the bus to itself during a conversion, so that n sensors of one bus take
+n · 0.8 s, and the reading's time is the middle of them all.
+Source: Maxim DS18B20 data sheet (19-7487), Linux w1_therm.c.
 """
 
 from __future__ import annotations
@@ -143,12 +145,13 @@ class Ds18b20Thermometer(Thermometer):
         if not self._open:
             raise DeviceGone("1-wire: not open")
         begin = self.clock.monotonic()
+        patience_s = self.timeout_s * len(self.sensors)
         for channel in self.sensors:
             self._start(channel)
         values: dict[str, float] = {}
         missing: dict[str, DeviceError] = {}
         for channel, rom in self.sensors.items():
-            left = max(0.0, self.timeout_s - (self.clock.monotonic() - begin))
+            left = max(0.0, patience_s - (self.clock.monotonic() - begin))
             try:
                 values[channel] = self._pending[channel].result(timeout=left)
                 del self._pending[channel]
@@ -156,7 +159,7 @@ class Ds18b20Thermometer(Thermometer):
                 missing[channel] = error
                 del self._pending[channel]
             except TimeoutError:
-                missing[channel] = DeviceTimeout(f"1-wire {rom}: no answer in {self.timeout_s:g} s")
+                missing[channel] = DeviceTimeout(f"1-wire {rom}: no answer in {patience_s:g} s")
         if not values:
             raise next(iter(missing.values()))
         about = {"missing": {k: str(v) for k, v in missing.items()}} if missing else {}

@@ -190,6 +190,20 @@ def test_slow_sensors_are_read_in_parallel(sysfs):
     assert took < 0.8  # one after the other would be 1.2 s
 
 
+def test_a_kernel_that_converts_one_after_the_other(sysfs):
+    """As w1_therm of Linux 6.1 does: the last of four answers after four times the first's time."""
+    roms = [f"28-0000000000{k:02x}" for k in range(4)]
+    threads = [
+        feed(sysfs.w1(rom, ""), w1_slave(20.0 + k), 0.15 * (k + 1)) for k, rom in enumerate(roms)
+    ]
+    sensors = {f"t{k}": rom for k, rom in enumerate(roms)}
+    with thermometer(sysfs, SystemClock(), sensors=sensors, timeout_s=0.3) as device:
+        reading = device.read()
+    [thread.join() for thread in threads]
+    assert len(reading.values) == 4
+    assert "missing" not in reading.metadata
+
+
 def test_a_hanging_bus_times_out_and_its_late_answer_is_dropped(sysfs):
     path = sysfs.w1(ROM, "")
     thread = feed(path, w1_slave(99.0), 0.4)

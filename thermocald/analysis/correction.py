@@ -25,23 +25,27 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from thermocald.analysis.thermal_camera import ThermalCamera
+    from thermocald.analysis.thermal_camera import Along, ThermalCamera
+    from thermocald.photogrammetry.camera_model import Sensor
 
     Array = NDArray[np.float64]
 
 __all__ = [
     "Corrected",
+    "ImageCorrection",
     "TemperatureLog",
     "correct_points",
+    "image_corrections",
     "parse_time",
+    "read_rows",
     "read_temperature_log",
-    "remaps",
 ]
 
 _TIME_NAMES = ("time", "temperature_time", "frame_time", "timestamp")
 _OTHER_UNITS = ("fahrenheit", "degf", "°f", "_f", "kelvin", "degk", "_k")
 _NOT_TEMPERATURES = ("epoch", "frame")
 _BLOCK = 100_000
+_SAMPLE = 997  # points of an image that tell how much it is corrected
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,14 +173,7 @@ def correct_points(
     temperature_sd K: of a reading of the log. DataError for times outside the log.
     """
     target = camera.model.T0 if to is None else to
-    begin, end = float(log.times[0]), float(log.times[-1])
-    step = float(np.median(np.diff(log.times))) if len(log.times) > 1 else 0.0
-    outside = (times < begin - step) | (times > end + step)
-    if outside.any():
-        raise DataError(
-            f"{int(outside.sum())} of {len(times)} rows were measured outside the temperature log "
-            f"({begin:.0f} to {end:.0f} s), the first at {times[outside][0]:.0f} s"
-        )
+    _inside(log, times)
     unique, place = np.unique(times, return_inverse=True)
     along = camera.along(
         log.times, dict(log.channels), unique, extrapolate, relative_to=target,
@@ -198,19 +195,72 @@ def correct_points(
     return Corrected(corrected, sds, along.temperatures[place], along.extrapolated[place])
 
 
-def remaps(
-    camera: ThermalCamera, log: TemperatureLog, times: Array, to: float | None = None
-) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-    """For each time the maps x, y (H, W) of `cv2.remap` that turn its image into one at `to`."""
-    sensor = camera.model.sensor
+def _inside(log: TemperatureLog, times: Array) -> None:
+    begin, end = float(log.times[0]), float(log.times[-1])
+    step = float(np.median(np.diff(log.times))) if len(log.times) > 1 else 0.0
+    outside = (times < begin - step) | (times > end + step)
+    if outside.any():
+        raise DataError(
+            f"{int(outside.sum())} of {len(times)} rows were measured outside the temperature log "
+            f"({begin:.0f} to {end:.0f} s), the first at {times[outside][0]:.0f} s"
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageCorrection:
+    """For one image: maps x, y (H, W) of `cv2.remap` that turn it into one at the wanted
+    temperature; temperature °C; largest and rms shift px; left_over: rms sd px of the correction,
+    both over a grid of points; extrapolated K.
+    """
+
+    map_x: NDArray[np.float32]
+    map_y: NDArray[np.float32]
+    temperature: float
+    rms_px: float
+    largest_px: float
+    left_over_px: float
+    extrapolated: float
+
+
+def image_corrections(
+    camera: ThermalCamera,
+    log: TemperatureLog,
+    times: Array,
+    to: float | None = None,
+    temperature_sd: float = 0.0,
+    extrapolate: bool = False,
+) -> Iterator[ImageCorrection]:
+    """One correction per time; arguments as those of `correct_points`, errors before the first."""
+    _inside(log, times)
     target = camera.model.T0 if to is None else to
     steady = camera.at(target, extrapolate=True).values
+    along = camera.along(
+        log.times, dict(log.channels), times, extrapolate, relative_to=target,
+        temperature_sd=temperature_sd,
+    )  # fmt: skip
+    return _maps(camera.model.sensor, steady, along)
+
+
+def _maps(sensor: Sensor, steady: Array, along: Along) -> Iterator[ImageCorrection]:
     v, u = np.mgrid[0 : sensor.height, 0 : sensor.width]
     grid = np.stack([u.ravel(), v.ravel()], axis=1).astype(float)
     ideal = ideal_points(sensor, steady, grid)
     direction = np.concatenate([ideal, np.full((len(ideal), 1), -1.0)], axis=1)
-    along = camera.along(log.times, dict(log.channels), times)
-    for values in along.values:
-        seen = project(sensor, values, np.zeros(6), direction).astype(np.float32)
-        shape = (sensor.height, sensor.width)
-        yield seen[:, 0].reshape(shape), seen[:, 1].reshape(shape)
+    sample = np.linspace(0, len(grid) - 1, _SAMPLE).astype(int)
+    _, J, _ = partials(sensor, steady, np.zeros(6), direction[sample])
+    J = J[:, :, :10]
+    shape = (sensor.height, sensor.width)
+    for i, values in enumerate(along.values):
+        seen = project(sensor, values, np.zeros(6), direction)
+        shift = np.linalg.norm(seen[sample] - grid[sample], axis=1)
+        variance = np.einsum("ncp,pq,ncq->nc", J, along.covariance[i], J, optimize=True)
+        maps = seen.astype(np.float32)
+        yield ImageCorrection(
+            maps[:, 0].reshape(shape),
+            maps[:, 1].reshape(shape),
+            float(along.temperatures[i]),
+            float(np.sqrt(np.mean(shift**2))),
+            float(shift.max()),
+            float(np.sqrt(np.mean(variance))),
+            float(along.extrapolated[i]),
+        )

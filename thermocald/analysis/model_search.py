@@ -33,12 +33,15 @@ _INSTANTS = 60  # of an event, before it is looked at frame by frame
 _SEARCHED = 2  # series in which they are tried
 
 
-def search_effect(series: Sequence[ModelSeries], state: FitState) -> FitState:
-    """The state with the last effect's non-linear parameters where they fit best."""
+def search_effect(series: Sequence[ModelSeries], state: FitState, whole: bool = True) -> FitState:
+    """The state with the last effect's non-linear parameters where they fit best.
+
+    whole: otherwise what all series share stays, and what belongs to each is looked for alone.
+    """
     effect = state.model.effects[-1]
     spans = [float(np.ptp(s.history.temperature())) for s in series]
     most = np.argsort(spans)[::-1].tolist()
-    if not is_event(effect):
+    if whole and not is_event(effect):
         # a phase is of one series: more than one would multiply the trials
         some = sorted(most[: 1 if own_of(effect) else _SEARCHED])
         fit = ModelFit([series[k] for k in some])

@@ -80,9 +80,9 @@ def fit_thermal_model(
     """Fit the base model and some effects to all series together.
 
     listed: effects with start values; with `search` their non-linear parameters are looked for over
-    their whole range first; fixed: names such as `thermal_lag.tau` that keep their start values;
-    T0 °C: by default the mean temperature. Raises DataError for series of different cameras, or of
-    one temperature.
+    their whole range first (an instant or a phase always is); fixed: names such as
+    `thermal_lag.tau` that keep their start values; T0 °C: by default the mean temperature. Raises
+    DataError for series of different cameras, or of one temperature.
     """
     checked = _checked(series, listed)
     temperatures = np.concatenate([s.history.temperature() for s in checked])
@@ -105,8 +105,8 @@ def fit_thermal_model(
     for effect in listed:
         begun = replace(state.model, effects=(*state.model.effects, _started(effect)))
         state = replace(state, model=begun)
-        if search and effect.name != "defocus":
-            state = search_effect(checked, state)
+        if effect.name != "defocus":
+            state = search_effect(checked, state, search)
     if listed:
         state = fit.solve(state)
     fit.take_off_offsets(state)

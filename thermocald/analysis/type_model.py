@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.analysis.model_state import is_event
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera_model import IOP_NAMES, InteriorOrientation
 from thermocald.simulation.model import RATED, ModelEffect, ThermalModel
@@ -32,6 +33,8 @@ def type_model(models: Sequence[ThermalModel], name: str) -> ThermalModel:
     """
     if len(models) < 2:
         raise DataError("a type model needs at least two cameras")
+    # what happened to one camera at one time is nothing of the type
+    models = [replace(m, effects=tuple(e for e in m.effects if not is_event(e))) for m in models]
     first = models[0]
     for m in models[1:]:
         same = [e.name for e in m.effects] == [e.name for e in first.effects]

@@ -38,8 +38,13 @@ def calibrate(
         Path | None,
         typer.Option(
             "--camera",
-            help="Camera file: width, height, pixel_pitch, principal_distance, interior.",
+            help="Camera file: width, height, pixel_pitch, principal_distance, interior; or one "
+            "of OpenCV, ROS, COLMAP, mrcal, Kalibr, Metashape, AICON, as initial values.",
         ),
+    ] = None,
+    pixel_pitch: Annotated[
+        float | None,
+        typer.Option("--pixel-pitch", help="Size of a pixel in mm, where --camera lacks it."),
     ] = None,
     free: FreeOption = DEFAULT_FREE_TEXT,
     json: JsonOption = None,
@@ -57,7 +62,7 @@ def calibrate(
     if not images:
         raise UsageError("give at least one photograph")
     field = read_testfield(testfield)
-    file = read_camera(camera) if camera is not None else _unknown_camera(images)
+    file = read_camera(camera, pixel_pitch) if camera is not None else _unknown_camera(images)
     with progress(len(images), "measuring") as advance:
         result = calibrate_photographs(
             images,

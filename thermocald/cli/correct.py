@@ -60,9 +60,10 @@ def correct(
     """
     from thermocald.analysis.correction import read_temperature_log
     from thermocald.analysis.thermal_camera import ThermalCamera
-    from thermocald.cli.predict import warnings_said
+    from thermocald.cli.predict import check_log, warnings_said
 
     thermal = ThermalCamera.load(model)
+    check_log(thermal, log)
     if image_size is not None:
         thermal = thermal.for_images(*_size(image_size))
     table = read_temperature_log(log, column)
@@ -75,7 +76,7 @@ def correct(
         raise UsageError("--out is missing: the folder for the corrected images")
     with warnings_said():
         if "image" in header and out is not None:
-            _images(thermal, table, points, out, to)
+            _images(thermal, table, points, out, to, temperature_sd, extrapolate, json)
         else:
             _points(thermal, table, points, out, to, temperature_sd, extrapolate, json)
 
@@ -147,30 +148,67 @@ def _points(
 
 
 def _images(
-    thermal: ThermalCamera, table: TemperatureLog, path: Path, out: Path, to: float | None
+    thermal: ThermalCamera,
+    table: TemperatureLog,
+    path: Path,
+    out: Path,
+    to: float | None,
+    temperature_sd: float,
+    extrapolate: bool,
+    json: str | None,
 ) -> None:
     import cv2
 
-    from thermocald.analysis.correction import read_rows, remaps
-    from thermocald.cli.common import progress
+    from thermocald.analysis.correction import image_corrections, read_rows
+    from thermocald.cli.common import progress, write_json
 
     _, rows, numbers = read_rows(path, ("time",))
     out.mkdir(parents=True, exist_ok=True)
     sensor = thermal.model.sensor
+    done: list[dict[str, Any]] = []
     with progress(len(rows), "correcting images") as advance:
-        maps = remaps(thermal, table, numbers[:, 0], to)
-        for row, (map_x, map_y) in zip(rows, maps, strict=True):
-            source = path.parent / row["image"]
+        corrections = image_corrections(
+            thermal, table, numbers[:, 0], to, temperature_sd, extrapolate
+        )
+        for row in rows:
+            source, written = path.parent / row["image"], out / Path(row["image"]).name
             image = cv2.imread(str(source), cv2.IMREAD_UNCHANGED)
             if image is None:
                 raise ImageError(f"{source}: is no image that can be read")
+            if written.exists() and written.samefile(source):
+                raise UsageError(f"{written}: would be overwritten; give another --out")
             if image.shape[:2] != (sensor.height, sensor.width):
                 raise ImageError(
                     f"{source}: has {image.shape[1]}×{image.shape[0]} px, the model's camera "
                     f"{sensor.width}×{sensor.height}; say --size where it is binned"
                 )
-            corrected = cv2.remap(image, map_x, map_y, cv2.INTER_CUBIC)
-            if not cv2.imwrite(str(out / Path(row["image"]).name), corrected):
-                raise DataError(f"{out / Path(row['image']).name}: cannot be written")
+            c = next(corrections)
+            corrected = cv2.remap(image, c.map_x, c.map_y, cv2.INTER_CUBIC)
+            if not cv2.imwrite(str(written), corrected):
+                raise DataError(f"{written}: cannot be written")
+            done.append(
+                {
+                    "image": str(source),
+                    "corrected": str(written),
+                    "temperature": c.temperature,
+                    "rms_correction_px": c.rms_px,
+                    "largest_correction_px": c.largest_px,
+                    "rms_left_over_px": c.left_over_px,
+                    "extrapolated_K": c.extrapolated,
+                }
+            )
             advance(1)
-    typer.echo(f"{out}: {len(rows)} images")
+    if json is not None:
+        summary = {
+            "format": "thermocald-correction/1",
+            "corrected_to": thermal.model.T0 if to is None else to,
+            "images": done,
+        }
+        write_json(summary, json)
+    if json != "-":
+        worst = max(d["rms_left_over_px"] for d in done)
+        most = max(d["largest_correction_px"] for d in done)
+        typer.echo(
+            f"{out}: {len(rows)} images corrected by up to {most:.3f} px; left over ± "
+            f"{worst:.3f} px at most (RMS)"
+        )

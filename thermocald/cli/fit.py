@@ -10,6 +10,8 @@ import typer
 from thermocald.errors import UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from thermocald.analysis.held_out import PredictedError
     from thermocald.analysis.model_series import ModelSeries
     from thermocald.analysis.thermal_model import FittedModel
@@ -30,7 +32,10 @@ def fit(
     output: Annotated[Path, typer.Option("-o", "--output", help="The model file to write.")],
     effect: Annotated[
         list[str] | None,
-        typer.Option("--effect", help="An effect to fit beside the base model; repeatable."),
+        typer.Option(
+            "--effect",
+            help="NAME[:PARAMETER=VALUE,…] to fit beside the base model; repeatable.",
+        ),
     ] = None,
     model: Annotated[
         Path | None,
@@ -51,18 +56,14 @@ def fit(
 
     Example: thermocald fit M1 M2 -o camera.thermal.yaml --effect thermal_lag
     """
-    from thermocald.analysis.series_reduction import load_model_series
     from thermocald.cli.common import progress, write_json
+    from thermocald.cli.effect_options import check_names
     from thermocald.simulation.model_file import write_model
 
-    series: list[ModelSeries] = []
-    with progress(len(inputs), "reading and reducing") as advance:
-        for path in inputs:
-            if not path.exists():
-                raise UsageError(f"{path}: does not exist; give a recording or a store")
-            series += load_model_series(path)
-            advance(1)
     listed, T0 = _structure(effect or [], model, reference_temperature)
+    with progress(None, "reading and measuring") as advance:
+        series = _read(inputs, listed, advance)
+    check_names(listed, series)
     if type_name is not None:
         fitted_model, document = _type(series, listed, T0, type_name)
     else:
@@ -76,11 +77,23 @@ def fit(
         _say(document)
 
 
+def _read(
+    inputs: list[Path], listed: list[ModelEffect], advance: Callable[[int], None]
+) -> list[ModelSeries]:
+    from thermocald.analysis.series_reduction import load_model_series
+    from thermocald.analysis.thermal_model import targets_of
+
+    for path in inputs:
+        if not path.exists():
+            raise UsageError(f"{path}: does not exist; give a recording or a store")
+    moving = targets_of(listed)
+    return [s for path in inputs for s in load_model_series(path, moving, advance)]
+
+
 def _structure(
     names: list[str], path: Path | None, T0: float | None
 ) -> tuple[list[ModelEffect], float | None]:
-    from thermocald.simulation import effects
-    from thermocald.simulation.model import ModelEffect
+    from thermocald.cli.effect_options import parse_effect
     from thermocald.simulation.model_file import read_model
 
     listed = []
@@ -88,14 +101,11 @@ def _structure(
         start = read_model(path)
         listed = list(start.effects)
         T0 = start.T0 if T0 is None else T0
-    for name in names:
-        kind = effects.get(name)
-        if any(p.text for p in kind.nonlinear.values()):
-            raise UsageError(
-                f"--effect {name}: it needs a name (a channel, targets); give it in a --model file"
-            )
-        values = {k: p.default for k, p in kind.nonlinear.items()}
-        listed.append(ModelEffect(name, {**values, **dict.fromkeys(kind.usual, 0.0)}))
+    for text in names:
+        effect = parse_effect(text)
+        if any(e.name == effect.name for e in listed):
+            raise UsageError(f"--effect {text}: {effect.name} is given twice")
+        listed.append(effect)
     return listed, T0
 
 

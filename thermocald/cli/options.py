@@ -62,11 +62,19 @@ def adjustment_settings(free: str) -> AdjustmentSettings:
 DEFAULT_FREE_TEXT = ",".join(DEFAULT_FREE)
 
 
-def read_camera(path: Path) -> CameraFile:
+def read_camera(path: Path, pixel_pitch: float | None = None) -> CameraFile:
     """Read a camera file: name, width, height, pixel_pitch, principal_distance, interior.
 
-    With `interior:` (c, x0, y0 mm, A1 … C2; CONVENTIONS §2) the camera counts as calibrated.
+    With `interior:` (c, x0, y0 mm, A1 … C2; CONVENTIONS §2) the camera counts as calibrated. A file
+    of another program (OpenCV, ROS, Metashape, …) is read as what it is; pixel_pitch: mm, where it
+    does not say it.
     """
+    from thermocald.output import camera_files
+
+    if camera_files.recognised(path) is not None:
+        found = camera_files.read(path, pixel_pitch=pixel_pitch)
+        model = found.model
+        return CameraFile(found.name, model.sensor, model.interior.c, model.interior)
     document = read_yaml(path, ConfigurationError)
     if not isinstance(document, dict):
         raise ConfigurationError(f"{path}: is no camera file; it must hold `width: …` and so on")

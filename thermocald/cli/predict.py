@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from thermocald.analysis.camera_state import CameraState
     from thermocald.analysis.thermal_camera import Along, ThermalCamera
 
-__all__ = ["register", "warnings_said"]
+__all__ = ["check_log", "register", "warnings_said"]
 
 
 @contextmanager
@@ -44,6 +44,10 @@ def predict(
     ] = None,
     log: Annotated[
         Path | None, typer.Option("--log", help="CSV of times and temperatures, or an epochs.csv.")
+    ] = None,
+    test: Annotated[
+        Path | None,
+        typer.Option("--test", help="Recording or store: how well the model predicts it."),
     ] = None,
     programme: Annotated[
         Path | None,
@@ -76,8 +80,8 @@ def predict(
     from thermocald.analysis.thermal_camera import ThermalCamera
     from thermocald.cli.common import write_json
 
-    if sum(option is not None for option in (temperature, log, programme)) != 1:
-        raise UsageError("give one of --temperature, --log, --programme")
+    if sum(option is not None for option in (temperature, log, test, programme)) != 1:
+        raise UsageError("give one of --temperature, --log, --test, --programme")
     thermal = ThermalCamera.load(model)
     with warnings_said():
         if temperature is not None:
@@ -85,7 +89,10 @@ def predict(
             state = thermal.at(temperature, channels=others or None, extrapolate=extrapolate)
             document, lines = _state_document(thermal, state, distance)
         elif log is not None:
+            check_log(thermal, log)
             document, lines = _along_document(thermal, _log(thermal, log, extrapolate))
+        elif test is not None:
+            document, lines = _tested(thermal, test)
         else:
             assert programme is not None
             document, lines = _advice(thermal, programme, camera, distance, wanted)
@@ -93,6 +100,50 @@ def predict(
         write_json(document, json)
     if json != "-":
         typer.echo("\n".join(lines))
+
+
+def check_log(thermal: ThermalCamera, log: Path) -> None:
+    """ConfigurationError where the log is a recording's, and the recording of another camera."""
+    from thermocald.store.head import read_head
+
+    if log.name == "epochs.csv" and (log.parent / "recording.yaml").is_file():
+        camera = read_head(log.parent).camera
+        thermal.for_images(camera.sensor.width, camera.sensor.height, camera.name)
+
+
+def _tested(thermal: ThermalCamera, path: Path) -> tuple[dict[str, Any], list[str]]:
+    """Each series of a recording or a store against what the model predicts of it."""
+    from dataclasses import asdict
+
+    import numpy as np
+
+    from thermocald.analysis.held_out import predicted_error
+    from thermocald.analysis.model_noise import thermometer_noise
+    from thermocald.analysis.series_reduction import load_model_series
+    from thermocald.analysis.thermal_model import targets_of
+    from thermocald.cli.common import progress
+
+    if not path.exists():
+        raise UsageError(f"{path}: does not exist; give a recording or a store")
+    known = [float(f["thermometer_sd_K"]) for f in thermal.model.fitted_on
+             if "thermometer_sd_K" in f]  # fmt: skip
+    found, lines = [], []
+    with progress(None, "reading and measuring") as advance:
+        series = load_model_series(path, targets_of(thermal.model.effects), advance)
+    for s in series:
+        sd = float(np.median(known)) if known else thermometer_noise(s)
+        error = predicted_error(thermal.model, s, sd)
+        found.append(asdict(error))
+        lines.append(
+            f"{s.source}: predicted to {error.rms_px:.4f} px (noise alone {error.floor_px:.4f}), "
+            f"{error.coverage:.1%} inside their 95 % bands, {error.object_mm:.2f} mm at 10 m"
+        )
+    document = {
+        "format": "thermocald-prediction-test/1",
+        "camera": thermal.model.camera,
+        "series": found,
+    }
+    return document, lines
 
 
 def _log(thermal: ThermalCamera, path: Path, extrapolate: bool) -> Along:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["FORMATS", "Format", "ImportedCamera", "file_name", "read", "write"]
+__all__ = ["FORMATS", "Format", "ImportedCamera", "file_name", "read", "recognised", "write"]
 
 FORMATS: dict[str, Format] = {
     module.FORMAT.name: module.FORMAT
@@ -83,6 +83,14 @@ def write(
     return statement
 
 
+def recognised(path: Path) -> str | None:
+    """The format that a file's content tells, None where it is of none, or cannot be read."""
+    try:
+        return _recognised(_text(path), path).name
+    except ConfigurationError:
+        return None
+
+
 def read(
     path: Path,
     format: str | None = None,  # noqa: A002
@@ -92,19 +100,23 @@ def read(
 
     pixel_pitch: mm, for files that do not say it. Raises ConfigurationError that names the file.
     """
-    try:
-        if path.stat().st_size > _LARGEST_FILE:
-            raise ConfigurationError(f"{path}: too large for a camera file")
-        text = path.read_text(encoding="utf-8")
-    except OSError as cause:
-        raise ConfigurationError(f"{path}: cannot be read: {cause.strerror}") from cause
-    except UnicodeDecodeError:
-        raise ConfigurationError(f"{path}: no text, and so no camera file") from None
+    text = _text(path)
     chosen = _format(format) if format is not None else _recognised(text, path)
     try:
         return chosen.decode(text, pixel_pitch)
     except (ConfigurationError, DataError) as cause:
         raise ConfigurationError(f"{path} ({chosen.about}): {cause}") from cause
+
+
+def _text(path: Path) -> str:
+    try:
+        if path.stat().st_size > _LARGEST_FILE:
+            raise ConfigurationError(f"{path}: too large for a camera file")
+        return path.read_text(encoding="utf-8")
+    except OSError as cause:
+        raise ConfigurationError(f"{path}: cannot be read: {cause.strerror}") from cause
+    except UnicodeDecodeError:
+        raise ConfigurationError(f"{path}: no text, and so no camera file") from None
 
 
 def _recognised(text: str, path: Path) -> Format:

@@ -1,0 +1,51 @@
+"""Prediction error of M2's image points by a model of M1, per effect of the catalogue.
+
+Run: python -m benchmarks.prediction [--seeds 3] [--first 100] [--px 0.3] [--discover] [--check]
+Blind recordings (tests/blind), the commands `fit` and `predict --test`. The floor is the
+generator's noise. Bounds: ratio ≤ 1.1, coverage of the stated 95 % bands 93 to 97 %, both pooled.
+--discover: with the effects that `discover` finds in M1 instead of the true ones.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+from tests.analysis.blind_prediction import SINGLE, pooled, predict_case
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--first", type=int, default=100)
+    parser.add_argument("--px", type=float, default=0.3)
+    parser.add_argument("--effect", action="append")
+    parser.add_argument("--discover", action="store_true")
+    parser.add_argument("--check", action="store_true")
+    a = parser.parse_args()
+    every = []
+    print("| hidden effect | RMS on M2 px | over the noise floor | worst | inside 95 % bands |")
+    print("|---|---|---|---|---|")
+    for name in a.effect or ("none", *SINGLE):
+        cases = []
+        for seed in range(a.first, a.first + a.seeds):
+            with tempfile.TemporaryDirectory() as folder:
+                cases.append(predict_case(name, seed, Path(folder), a.px, a.discover))
+        ratio, coverage = pooled(cases)
+        rms = sum(c.rms_px for c in cases) / len(cases)
+        worst = max(c.ratio for c in cases)
+        print(f"| `{name}` | {rms:.4f} | {ratio:.3f} | {worst:.3f} | {coverage:.1%} |", flush=True)
+        every += cases
+    ratio, coverage = pooled(every)
+    print(f"| all | | {ratio:.3f} | {max(c.ratio for c in every):.3f} | {coverage:.1%} |")
+    passed = ratio <= 1.1 and 0.93 <= coverage <= 0.97
+    return 0 if passed or not a.check else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

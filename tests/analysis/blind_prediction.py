@@ -1,0 +1,103 @@
+"""Trained on M1, tested on M2: blind recordings through the commands a user calls.
+
+The noise floor is the generator's own noise, not the fit's idea of it: 0.04 px (grown where the
+case is `defocus`), and a reading's 0.04 K and steps of 0.0625 K carried through the model. What
+readings of 10 s leave open (a lamp switched between two of them, a temperature needed after the
+last one) is part of the floor of `thermal_gradient` and `time_offset`.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from typer.testing import CliRunner
+
+from tests.blind.generator import SINGLE, Case, generate, write
+from thermocald.analysis.held_out import predicted_error
+from thermocald.analysis.series_reduction import model_series
+from thermocald.analysis.thermal_model import targets_of
+from thermocald.cli import application
+from thermocald.simulation.model import ModelEffect
+from thermocald.simulation.model_file import read_model
+from thermocald.store.recording import read_recording
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from thermocald.simulation.model import ThermalModel
+
+__all__ = ["SINGLE", "Tested", "effect_option", "pooled", "predict_case"]
+
+READING_SD = float(np.hypot(0.04, 0.0625 / np.sqrt(12.0)))
+
+
+@dataclass(frozen=True)
+class Tested:
+    """One case: RMS over the true floor on M2, and the share inside the stated 95 % bands."""
+
+    effect: str
+    seed: int
+    ratio: float
+    coverage: float
+    rms_px: float
+
+
+def effect_option(name: str, truth: dict) -> list[str]:
+    """The option that names the effect as a user would who knows what it is."""
+    if name == "second_heat_source":
+        return ["--effect", f"{name}:channel=board_temperature"]
+    if name == "target_displacement":
+        hidden = truth["effects"][0][0]["targets"]
+        return ["--effect", f"{name}:targets=" + "+".join(str(t + 1) for t in hidden)]
+    if name == "radial_distortion_drift":
+        return ["--effect", f"{name}:A1,A2"]
+    return ["--effect", name] if name != "none" else []
+
+
+def predict_case(
+    name: str, seed: int, folder: Path, px: float = 0.3, discover: bool = False
+) -> Tested:
+    """Fit M1, test on M2. discover: with the effects discovery finds in M1, not the true ones."""
+    series, truth = generate(Case((name,) if name != "none" else (), px, seed))
+    for s in series:
+        write(s, folder / s.name)
+    model = folder / "camera.yaml"
+    listed = effect_option(name, truth)
+    if discover:
+        _run("discover", folder / "M1", "--model-out", folder / "found.yaml", "--json", "-")
+        listed = ["--model", folder / "found.yaml"]
+    _run("fit", folder / "M1", "-o", model, *listed, "--json", "-")
+    stated = json.loads(_run("predict", "--model", model, "--test", folder / "M2", "--json", "-"))
+    (said,) = stated["series"]
+    fitted = read_model(model)
+    second = model_series(read_recording(folder / "M2"), targets_of(fitted.effects))
+    true = predicted_error(_with_true_noise(fitted, truth), second, READING_SD)
+    return Tested(name, seed, said["rms_px"] / true.floor_px, said["coverage"], said["rms_px"])
+
+
+def pooled(cases: list[Tested]) -> tuple[float, float]:
+    """RMS of the ratios, mean coverage."""
+    ratios = np.array([c.ratio for c in cases])
+    return float(np.sqrt(np.mean(ratios**2))), float(np.mean([c.coverage for c in cases]))
+
+
+def _with_true_noise(model: ThermalModel, truth: dict) -> ThermalModel:
+    sigma, listed = 0.04, []
+    for effect in model.effects:
+        if effect.name == "defocus":
+            hidden = truth["effects"][0][0]
+            rise = hidden["per_kelvin_above_coldest"]
+            at_t0 = 1.0 + rise * (model.T0 - hidden["coldest"])
+            sigma, effect = sigma * at_t0, ModelEffect("defocus", {"factor": rise / at_t0})
+        listed.append(effect)
+    return replace(model, image_sigma=sigma, effects=tuple(listed))
+
+
+def _run(*arguments: object) -> str:
+    result = CliRunner().invoke(application(), [str(a) for a in arguments])
+    if result.exit_code != 0:
+        raise RuntimeError(f"{' '.join(map(str, arguments))}: {result.exception}")
+    return result.stdout

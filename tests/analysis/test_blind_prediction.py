@@ -1,0 +1,44 @@
+"""Trained on M1, right on M2 (another programme): every effect of the catalogue, hidden blindly."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.analysis.blind_prediction import SINGLE, pooled, predict_case
+
+SEEDS = (60, 61)
+NAMES = ("none", *SINGLE)
+
+
+@pytest.fixture(scope="module")
+def tested(tmp_path_factory):
+    """Predicts the cases of one effect; each once."""
+    done = {}
+
+    def cases(name):
+        if name not in done:
+            done[name] = [predict_case(name, s, tmp_path_factory.mktemp(name)) for s in SEEDS]
+        return done[name]
+
+    return cases
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_every_effect_by_itself(tested, name):
+    ratio, coverage = pooled(tested(name))
+    assert ratio <= 1.1, tested(name)
+    assert 0.93 <= coverage <= 0.97, tested(name)
+
+
+@pytest.mark.slow
+def test_prediction_error_and_coverage(tested):
+    ratio, coverage = pooled([case for name in NAMES for case in tested(name)])
+    assert ratio <= 1.05
+    assert 0.94 <= coverage <= 0.96
+
+
+def test_one_of_them_quickly(tmp_path):
+    case = predict_case("nonlinear_expansion", 62, tmp_path)
+    assert case.ratio <= 1.1
+    assert 0.93 <= case.coverage <= 0.97

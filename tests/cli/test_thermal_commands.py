@@ -1,0 +1,318 @@
+"""`fit`, `predict`, `correct` and imported cameras on the command line, and their wrong use."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from thermocald.cli import application
+from thermocald.cli.options import read_camera
+from thermocald.errors import ThermocaldError
+from thermocald.output import camera_files
+from thermocald.photogrammetry.camera_model import CameraModel, ExteriorOrientation, Sensor
+from thermocald.simulation.course import Course
+from thermocald.simulation.demonstration import demonstration_field, demonstration_model
+from thermocald.simulation.device import CameraDevice, default_heat
+from thermocald.simulation.model import ModelEffect
+from thermocald.simulation.observations import Simulation
+from thermocald.simulation.programme import Programme
+from thermocald.simulation.scene import Scene
+from thermocald.store.testfield_file import write_testfield
+
+FORMATS = tuple(camera_files.FORMATS)
+
+
+def simulated(seed=1, effect=None, epochs=90, interval=20.0, series="M1", kind="plain", name="rpi"):
+    """A camera heated by a lamp for a quarter of an hour, its board now and then."""
+    field = demonstration_field(kind)
+    model = demonstration_model(field)
+    if effect is not None:
+        model = model.with_effect(effect)
+    network, thermometers = default_heat()
+    device = CameraDevice(name, model.sensor, network, thermometers)
+    lamp = Course.steps([0, 100, 900, 1e4], [0.0, 10.0, 0.0])
+    board = Course.polygon([0, 350, 700, 1200, 1e4], [0.5, 3.0, 0.8, 4.0, 1.0])
+    programme = Programme(
+        series, epochs, interval, {"ambient": Course.constant(23.0)},
+        {"housing": lamp, "board": board},
+    )  # fmt: skip
+    return Simulation(replace(model, camera=name), device, field, programme, seed)
+
+
+def run(*arguments):
+    return CliRunner().invoke(application(), [str(a) for a in arguments])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("thermal")
+    simulated(1).write(path / "M1")
+    simulated(2, series="M2").write(path / "M2")
+    simulated(3, name="other", epochs=30, interval=60.0).write(path / "other")
+    result = run("fit", path / "M1", "-o", path / "cam.yaml")
+    assert result.exit_code == 0, result.exception
+    return path
+
+
+# --- effects by name ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("effect", "option", "keys"),
+    [
+        (
+            ModelEffect("second_heat_source",
+                        {"channel": "board_temperature", "c": 2e-5, "x0": 8e-5, "y0": -5e-5}),
+            "second_heat_source:channel=board_temperature,x0,y0,c", ("c", "x0", "y0"),
+        ),
+        (
+            ModelEffect("target_displacement", {"time": 905.0, "targets": ("x33", "y52"),
+                                                "dX": 0.15, "dY": -0.1, "dZ": 0.2}),
+            "target_displacement:targets=x33+y52", ("dX", "dY", "dZ"),
+        ),
+    ],
+    ids=["second_heat_source", "target_displacement"],
+)  # fmt: skip
+def test_an_effect_that_needs_a_name(tmp_path, effect, option, keys):
+    simulated(4, effect).write(tmp_path / "M1")
+    result = run(
+        "fit", tmp_path / "M1", "-o", tmp_path / "m.yaml", "--effect", option, "--json", "-"
+    )
+    assert result.exit_code == 0, result.exception
+    (found,) = json.loads(result.stdout)["effects"]
+    for key in keys:
+        estimate = found["parameters"][key]
+        assert abs(estimate["value"] - effect.values[key]) < 4 * estimate["sd"], key
+
+
+@pytest.mark.parametrize(
+    ("effect", "says"),
+    [
+        ("thermal_lagg", "did you mean 'thermal_lag'?"),
+        ("thermal_lag:taw=3", "thermal_lag has no parameter 'taw'; did you mean 'tau'?"),
+        ("thermal_lag:tau=fast", "tau=fast is no number"),
+        ("thermal_lag:tau", "write tau=VALUE"),
+        ("thermal_lag:tau=-3", "negative"),
+        ("second_heat_source", "say which: --effect second_heat_source:channel="),
+        ("second_heat_source:channel=bord_temperature", "did you mean 'board_temperature'?"),
+        ("target_displacement:targets=x33+y521", "has no target 'y521'; did you mean 'y52'?"),
+        ("radial_distortion_drift:A4", "has no parameter 'A4'"),
+    ],
+)
+def test_a_wrong_effect_is_named(folder, effect, says):
+    result = run("fit", folder / "M1", "-o", folder / "no.yaml", "--effect", effect)
+    assert isinstance(result.exception, ThermocaldError), result.exception
+    assert says in str(result.exception)
+    assert not (folder / "no.yaml").exists()
+
+
+def test_an_effect_twice_is_refused(folder):
+    both = ("--effect", "creep", "--effect", "creep:x0")
+    result = run("fit", folder / "M1", "-o", folder / "no.yaml", *both)
+    assert "given twice" in str(result.exception)
+
+
+# --- testing a model on another series ---------------------------------------------------------
+
+
+def test_a_model_is_tested_on_another_series(folder):
+    result = run("predict", "--model", folder / "cam.yaml", "--test", folder / "M2", "--json", "-")
+    (found,) = json.loads(result.stdout)["series"]
+    assert found["rms_px"] < 1.1 * found["floor_px"]
+    assert 0.93 < found["coverage"] < 0.97
+
+
+# --- wrong use ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("predict", "--test", "{other}"), "belongs to one camera"),
+        (("predict", "--log", "{other}/epochs.csv"), "the images are of other"),
+        (("correct", "{points}", "--log", "{other}/epochs.csv"), "the images are of other"),
+        (("correct", "{points}", "--log", "{M1}/epochs.csv", "--size", "1920x1080"), "a crop"),
+        (("correct", "{points}", "--log", "{M1}/epochs.csv", "--size", "big"), "WIDTHxHEIGHT"),
+        (("correct", "{images}", "--log", "{M1}/epochs.csv"), "--out is missing"),
+        (("correct", "{images}", "--log", "{M1}/epochs.csv", "--out", "{new}"), "has 640×480 px"),
+        (("correct", "{late}", "--log", "{M1}/epochs.csv", "--out", "{new}"), "outside the temp"),
+        (("correct", "{points}", "--log", "{fahrenheit}"), "looks like fahrenheit"),
+        (("correct", "{points}", "--log", "{hot}"), "ask for extrapolation by name"),
+        (("correct", "{images}", "--log", "{hot}", "--out", "{new}"), "extrapolation by name"),
+        (("predict", "--temperature", "88"), "looks like fahrenheit"),
+        (("predict", "--temperature", "-40"), "ask for extrapolation by name"),
+        (("predict", "--log", "{fahrenheit}"), "looks like fahrenheit"),
+        (("predict", "--test", "{nothing}"), "does not exist"),
+    ],
+)
+def test_wrong_use_is_refused(folder, tmp_path, arguments, says):
+    times = np.loadtxt(folder / "M1" / "epochs.csv", delimiter=",", skiprows=1, usecols=1)
+    begin, end = times[0], times[-1]
+    files = {
+        "points": f"time,x,y\n{begin + 60:.1f},500,400\n",
+        "images": f"time,image\n{begin + 60:.1f},small.png\n",
+        "late": f"time,image\n{end + 9e4:.1f},small.png\n",
+        "fahrenheit": f"time,air\n{begin:.1f},86\n{end:.1f},92\n",
+        "hot": f"time,air\n{begin:.1f},160\n{end:.1f},170\n",
+    }
+    places = {n: folder / n for n in ("M1", "other", "nothing")} | {"new": tmp_path / "new"}
+    for name, text in files.items():
+        places[name] = tmp_path / f"{name}.csv"
+        places[name].write_text(text)
+    cv2.imwrite(str(tmp_path / "small.png"), np.zeros((480, 640), np.uint8))
+    given = [a.format(**places) for a in arguments]
+    result = run(*given, "--model", folder / "cam.yaml")
+    assert isinstance(result.exception, ThermocaldError), result.exception
+    assert says in str(result.exception)
+
+
+def test_two_cameras_are_no_series_of_one(folder, tmp_path):
+    result = run("fit", folder / "M1", folder / "other", "-o", tmp_path / "no.yaml")
+    assert "belongs to one camera" in str(result.exception)
+
+
+def test_binned_points_are_scaled(folder, tmp_path):
+    """Points of 2 × 2 binned images get half the correction."""
+    time = np.loadtxt(folder / "M1" / "epochs.csv", delimiter=",", skiprows=1, usecols=1)[40]
+    moved = {}
+    for size, x, y in (("3280x2464", 2000.5, 800.5), ("1640x1232", 1000.0, 400.0)):
+        (tmp_path / "p.csv").write_text(f"time,x,y\n{time:.2f},{x},{y}\n")
+        done = run("correct", tmp_path / "p.csv", "--model", folder / "cam.yaml", "--log",
+                   folder / "M1" / "epochs.csv", "--size", size,
+                   "--out", tmp_path / "o.csv")  # fmt: skip
+        assert done.exit_code == 0, done.exception
+        table = np.genfromtxt(tmp_path / "o.csv", delimiter=",", names=True)
+        moved[size] = np.array([table["dx"], table["dy"]])
+    assert np.abs(moved["3280x2464"]).max() > 0.5
+    assert moved["1640x1232"] * 2 == pytest.approx(moved["3280x2464"], rel=1e-3, abs=1e-4)
+
+
+def test_far_outside_by_name_is_done_and_said(folder):
+    result = run("predict", "--model", folder / "cam.yaml", "--temperature", -40, "--extrapolate")
+    assert result.exit_code == 0
+    assert "standard deviations are widened" in result.stderr
+
+
+# --- images ------------------------------------------------------------------------------------
+
+
+def correct_images(folder, source, out, *more):
+    """Images at the begin and in the heat, as a camera of 8 × 8 binned pixels takes them."""
+    times = np.loadtxt(folder / "M1" / "epochs.csv", delimiter=",", skiprows=1, usecols=1)
+    (source / "i.csv").write_text(f"time,image\n{times[0]:.2f},a.png\n{times[45]:.2f},b.png\n")
+    return run("correct", source / "i.csv", "--model", folder / "cam.yaml", "--log",
+               folder / "M1" / "epochs.csv", "--size", "410x308", "--out", out, *more)  # fmt: skip
+
+
+@pytest.fixture
+def two_images(tmp_path):
+    image = np.random.default_rng(1).integers(0, 255, (308, 410), np.uint8)
+    for name in ("a.png", "b.png"):
+        cv2.imwrite(str(tmp_path / name), image)
+    return tmp_path
+
+
+def test_images_are_corrected_and_said_how_much(folder, two_images):
+    result = correct_images(folder, two_images, two_images / "out", "--json", "-")
+    document = json.loads(result.stdout)
+    cold, hot = document["images"]
+    assert hot["temperature"] > cold["temperature"] + 5
+    for found in (cold, hot):
+        assert found["largest_correction_px"] >= found["rms_correction_px"] > 0.02
+        assert 0 < found["rms_left_over_px"] < 0.02
+    assert {p.name for p in (two_images / "out").iterdir()} == {"a.png", "b.png"}
+
+
+def test_images_are_never_overwritten(folder, two_images):
+    result = correct_images(folder, two_images, two_images)
+    assert "would be overwritten" in str(result.exception)
+
+
+@pytest.mark.slow
+def test_fit_measures_frames_first(tmp_path):
+    """A recording of frames alone: the rates of the camera that made them, within 4 sd."""
+    simulation = simulated(5, epochs=16, interval=90.0, kind="markers")
+    simulation.write(tmp_path / "M1", with_frames=True)
+    assert not (tmp_path / "M1" / "observations.csv").exists()
+    result = run("fit", tmp_path / "M1", "-o", tmp_path / "m.yaml", "--json", "-")
+    assert result.exit_code == 0, result.exception
+    document = json.loads(result.stdout)
+    assert document["series"][0]["epochs"] == 16
+    for name in ("c", "x0", "y0"):
+        rate = document["rates"][name]
+        assert abs(rate["value"] - simulation.model.rates[name]) < 4 * rate["sd"], name
+
+
+# --- cameras of other programs as initial values -----------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def camera():
+    """The demonstration's camera without what a format may lack, so that all are exact."""
+    field = demonstration_field("markers")
+    model = demonstration_model(field)
+    return CameraModel(model.sensor, model.interior.with_values(A3=0.0, C1=0.0, C2=0.0))
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_camera_of_any_format_is_an_initial_value(tmp_path, camera, name):
+    path = tmp_path / camera_files.file_name("camera", name)
+    camera_files.write(camera, path, name)
+    read = read_camera(path)
+    assert read.sensor.pixel_pitch == pytest.approx(camera.sensor.pixel_pitch)
+    assert read.interior.as_array() == pytest.approx(camera.interior.as_array(), abs=1e-9)
+    assert read.principal_distance == pytest.approx(camera.interior.c)
+
+
+def test_the_program_s_own_description_stays_one(tmp_path):
+    path = tmp_path / "own.yaml"
+    path.write_text("name: a\nwidth: 100\nheight: 80\npixel_pitch: 0.001\nprincipal_distance: 3\n")
+    assert read_camera(path).sensor == Sensor(100, 80, 0.001)
+    assert read_camera(path).interior is None
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory, camera):
+    path = tmp_path_factory.mktemp("photographs")
+    field = demonstration_field("markers")
+    e = demonstration_model(field).exterior
+    scene = Scene(camera.sensor, field)
+    for k, turn in enumerate((0.0, 0.05, -0.05)):
+        pose = ExteriorOrientation(
+            e.omega, e.phi + turn, e.kappa + 20 * turn, e.X0 + 400 * turn, e.Y0, e.Z0
+        )
+        picture = scene.render(camera.interior.as_array(), pose.as_array(), None, [k], 1.0)
+        cv2.imwrite(str(path / f"{k}.png"), picture)
+    write_testfield(path / "field.csv", field)
+    return path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FORMATS)
+def test_calibrate_starts_from_a_camera_of_any_format(photographs, tmp_path, camera, name):
+    path = tmp_path / camera_files.file_name("camera", name)
+    near = CameraModel(camera.sensor, camera.interior.with_values(c=camera.interior.c * 1.01))
+    camera_files.write(near, path, name)
+    images = sorted(photographs.glob("*.png"))
+    result = run("calibrate", *images, "--testfield", photographs / "field.csv", "--camera", path,
+                 "--json", "-")  # fmt: skip
+    assert result.exit_code == 0, result.exception
+    interior = json.loads(result.stdout)["interior"]
+    for key in ("c", "x0", "y0"):
+        assert abs(interior[key] - getattr(camera.interior, key)) < 4 * interior[f"sd_{key}"], key
+
+
+def test_a_file_without_pixel_pitch_asks_for_it(tmp_path, camera):
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 3280 2464 2700 2700 1640 1232\n")
+    (tmp_path / "a.png").write_bytes(b"")
+    arguments = ("calibrate", tmp_path / "a.png", "--testfield", tmp_path / "f.csv", "--camera",
+                 tmp_path / "cameras.txt")  # fmt: skip
+    write_testfield(tmp_path / "f.csv", demonstration_field("markers"))
+    assert "--pixel-pitch" in str(run(*arguments).exception)
+    given = run(*arguments, "--pixel-pitch", camera.sensor.pixel_pitch)
+    assert "no photograph" in str(given.exception)  # the camera was taken

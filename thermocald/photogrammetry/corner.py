@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Array = NDArray[np.float64]
+    Single = NDArray[np.float32]
     Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 __all__ = ["CornerFit", "fit_corners"]
@@ -97,13 +98,9 @@ def _unit(v: Array) -> Array:
     return v / np.where(length > 0, length, 1.0)
 
 
-def _cdf(z: Array) -> Array:
-    return normal_cdf(z.astype(np.float32)).astype(float)
-
-
-def _wedge(h: Array, k: Array, rho: Array) -> Array:
+def _wedge(h: Single, k: Single, rho: Single) -> Single:
     """P(H < h, K < k) of standard normals with correlation rho; h, k (n, m), rho (n, 1)."""
-    value: Array = _cdf(h) * _cdf(k)
+    value: Single = normal_cdf(h) * normal_cdf(k)
     density = np.exp(-0.5 * (h * h + k * k)) / (2 * np.pi)
     he_h, he_k = np.ones_like(h), np.ones_like(k)
     last_h, last_k = np.zeros_like(h), np.zeros_like(k)
@@ -116,24 +113,26 @@ def _wedge(h: Array, k: Array, rho: Array) -> Array:
     return value
 
 
-def _model(p: Array, x: Array, y: Array) -> tuple[Array, Array]:
+def _model(p: Array, x: Array, y: Array) -> tuple[Single, Single]:
     """Grey values (n, m) and derivatives (n, m, 7) by x, y, angle1, angle2, blur, b, a.
 
-    p (n, 7); the angles are those of the inward normals of the two edges; x, y (n, m) px.
+    p (n, 7); the angles are those of the inward normals of the two edges; x, y (n, m) px. Float32:
+    its rounding is a thousandth of a grey value's.
     """
-    cx, cy, t1, t2, s, b, a = (p[:, i, None] for i in range(7))
+    t1, t2, s, b, a = (p[:, i, None].astype(np.float32) for i in range(2, 7))
     c1, s1, c2, s2 = np.cos(t1), np.sin(t1), np.cos(t2), np.sin(t2)
-    dx, dy = x - cx, y - cy
-    h, k = (c1 * dx + s1 * dy) / s, (c2 * dx + s2 * dy) / s
+    dx, dy = ((v - p[:, i, None]).astype(np.float32) for i, v in enumerate((x, y)))
+    h: Single = ((c1 * dx + s1 * dy) / s).astype(np.float32, copy=False)
+    k: Single = ((c2 * dx + s2 * dy) / s).astype(np.float32, copy=False)
     rho = np.clip(c1 * c2 + s1 * s2, -_SLOWEST_CORRELATION, _SLOWEST_CORRELATION)
     root = np.sqrt(1 - rho * rho)
     w = _wedge(h, k, rho)
-    norm = 1 / np.sqrt(2 * np.pi)
-    wh = norm * np.exp(-0.5 * h * h) * _cdf((k - rho * h) / root)
-    wk = norm * np.exp(-0.5 * k * k) * _cdf((h - rho * k) / root)
+    norm = np.float32(1 / np.sqrt(2 * np.pi))
+    wh = norm * np.exp(-0.5 * h * h) * normal_cdf((k - rho * h) / root)
+    wk = norm * np.exp(-0.5 * k * k) * normal_cdf((h - rho * k) / root)
     wr = np.exp(-0.5 * (h * h - 2 * rho * h * k + k * k) / root**2) / (2 * np.pi * root)
     sine = s1 * c2 - c1 * s2  # dρ/dt2 = −dρ/dt1
-    j = np.empty((*h.shape, 7))
+    j = np.empty((*h.shape, 7), np.float32)
     j[..., 0] = -a * (wh * c1 + wk * c2) / s
     j[..., 1] = -a * (wh * s1 + wk * s2) / s
     j[..., 2] = a * (wh * (c1 * dy - s1 * dx) / s - wr * sine)
@@ -172,8 +171,12 @@ def _fit(
     # A margin of two px keeps the blurred bits and neighbours out, but an edge needs two px itself.
     margin = np.maximum(cell - 2.0, 2.0)[:, None]
     use = inside & (np.abs(depth) <= margin) & (np.hypot(dx, dy) <= along[:, None])
+    cut_off = np.any(~inside & (np.hypot(dx, dy) < 3), axis=1)
+    m = use.sum(axis=1)
+    # the pixels of each corner that are used come first: the others are not calculated with
+    first = np.argsort(~use, axis=1, kind="stable")[:, : max(int(m.max()), 1)]
+    px, py, grey, depth, use = (np.take_along_axis(v, first, 1) for v in (px, py, grey, depth, use))
     weight = use.astype(float)
-    m = weight.sum(axis=1)
 
     def share(mask: NDArray[np.bool_]) -> Array:
         part = np.where(use & mask, grey, np.nan)
@@ -195,31 +198,36 @@ def _fit(
     )
     damping = np.full(n, 1e-2)
 
-    def cost(q: Array) -> tuple[Array, Array, Array]:
-        value, j = _model(q, px, py)
-        r = (grey - value) * weight
-        return np.sum(r * r, axis=1), r, j
+    def cost(q: Array, rows: NDArray[np.int64]) -> tuple[Array, Array, Single]:
+        value, j = _model(q, px[rows], py[rows])
+        r = (grey[rows] - value) * weight[rows]
+        return np.sum(r * r, axis=1, dtype=float), r, j
 
-    chi, r, j = cost(p)
+    open_ = np.arange(n)  # corners that still move
+    chi, r, j = cost(p, open_)
     step = np.full((n, 7), np.inf)
     for _ in range(_ITERATIONS):
-        jw = j * weight[..., None]
-        normal_matrix = np.swapaxes(jw, 1, 2) @ j
-        rhs = np.swapaxes(jw, 1, 2) @ r[..., None]
+        j_open = j[open_]
+        jw = j_open * weight[open_, :, None]
+        normal_matrix = np.swapaxes(jw, 1, 2) @ j_open
+        rhs = np.swapaxes(jw, 1, 2) @ r[open_, :, None]
         diagonal = np.einsum("nii->ni", normal_matrix)
-        scaled = normal_matrix + np.eye(7) * (damping[:, None] * diagonal + 1e-9)[:, None, :]
-        step = np.linalg.solve(scaled, rhs)[..., 0]
-        step[:, 4] = np.clip(step[:, 4], -0.4, 0.4)
-        trial = p + step
+        scaled = normal_matrix + np.eye(7) * (damping[open_, None] * diagonal + 1e-9)[:, None, :]
+        now = np.linalg.solve(scaled, rhs)[..., 0]
+        now[:, 4] = np.clip(now[:, 4], -0.4, 0.4)
+        trial = p[open_] + now
         trial[:, 4] = np.clip(trial[:, 4], *_BLUR_LIMITS_PX)
-        trial_chi, trial_r, trial_j = cost(trial)
-        better = trial_chi <= chi * (1 + 1e-12)
-        p = np.where(better[:, None], trial, p)
-        chi = np.where(better, trial_chi, chi)
-        r = np.where(better[:, None], trial_r, r)
-        j = np.where(better[:, None, None], trial_j, j)
-        damping = np.where(better, damping * 0.1, np.minimum(damping * 10, 1e6))
-        if bool(np.all(np.abs(step[:, :2]).max(axis=1, initial=0.0) < _CONVERGED_PX)):
+        trial_chi, trial_r, trial_j = cost(trial, open_)
+        better = trial_chi <= chi[open_] * (1 + 1e-12)
+        won = open_[better]
+        p[won], chi[won] = trial[better], trial_chi[better]
+        r[won], j[won] = trial_r[better], trial_j[better]
+        damping[open_] = np.where(
+            better, damping[open_] * 0.1, np.minimum(damping[open_] * 10, 1e6)
+        )
+        step[open_] = now
+        open_ = open_[np.abs(now[:, :2]).max(axis=1) >= _CONVERGED_PX]
+        if len(open_) == 0:
             break
 
     jw = j * weight[..., None]
@@ -237,7 +245,6 @@ def _fit(
     converged = np.abs(step[:, :2]).max(axis=1, initial=0.0) < 0.02
     angle = np.abs(np.cos(p[:, 2] - p[:, 3]))
     residual_sd = np.sqrt(variance)
-    cut_off = np.any(~inside & (np.hypot(dx, dy) < 3), axis=1)
     reasons = []
     for i in range(n):
         if cut_off[i]:

@@ -6,7 +6,7 @@ recording could show, and how many independent trials that makes is part of the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["Candidate", "candidates"]
+__all__ = ["Candidate", "candidates", "richer_way"]
 
 MOUNT = ("omega", "phi", "kappa")
 # what else than the interior orientation an effect may move, by what EFFECTS says of its cause:
@@ -101,6 +101,14 @@ def candidates(series: Sequence[Evidence]) -> list[Candidate]:
                 else:
                     out.append(Candidate(name, way, "", np.zeros(0), fixed))
     return out
+
+
+def richer_way(term: Term) -> Term | None:
+    """The term in the way of acting that has one coefficient more; None where there is none."""
+    for way in _WAYS.get(term.effect, ()):
+        if len(way) == len(term.parameters) + 1 and set(term.parameters) < set(way):
+            return replace(term, parameters=way)
+    return None
 
 
 def _varies(evidence: Evidence, channel: str) -> bool:

@@ -33,14 +33,17 @@ BLOCKS = 6
 # -2 log L by which a block may be worse off for a cause that is one: of chance, and of what the
 # noise model does not know, as a share of all that the effect explains
 _WORSE, _WORSE_SHARE = 10.0, 0.02
+_PRIOR = 1e-6  # of a coefficient's whole information, where the other blocks hold none
 
 
 def predictive(
     laboratory: Laboratory, fit: Fit, series: Sequence[int], blocks: int = BLOCKS
 ) -> tuple[Array, Array]:
-    """χ² and -2 log likelihood (blocks,) of the blocks at coefficients fitted without them.
+    """χ² and -2 log likelihood (blocks,) of the blocks as predicted without them.
 
-    series: those that take part. Non-linear parameters stay as they are.
+    series: those that take part. Non-linear parameters stay as they are. The coefficients' own
+    uncertainty is in the prediction: a step that happened in the block itself is not foreseen, and
+    not held against its cause.
     """
     chi2, objective = np.zeros(blocks), np.zeros(blocks)
     for k in range(blocks):
@@ -49,11 +52,29 @@ def predictive(
             fit.terms, fit.coefficients, 1, series
         )
         tested = _part(laboratory, masks).fit(fit.terms, fit.coefficients, 1, series)
+        whole = np.diag(_normal(fit, series)[0])
+        own = np.where(whole > 0, _PRIOR * whole, 1.0)  # 1: of a series that takes no part
+        known = _normal(trained, series)[0] + np.diag(own)
+        B, c = _normal(tested, series)
+        g = c - B @ trained.coefficients
+        both = np.linalg.slogdet(known + B)[1] - np.linalg.slogdet(known)[1]
         for s in series:
-            value = tested.chi2_of(s, trained.coefficients)
-            chi2[k] += value
-            objective[k] += value + tested.reduced[s].logdet
+            chi2[k] += tested.chi2_of(s, trained.coefficients)
+            objective[k] += tested.reduced[s].logdet
+        chi2[k] -= float(g @ np.linalg.solve(known + B, g))
+        objective[k] += chi2[k] + both
     return chi2, objective
+
+
+def _normal(fit: Fit, series: Sequence[int]) -> tuple[Array, Array]:
+    """Normal equations A (K, K), c (K,) of all coefficients over some series."""
+    K = len(fit.coefficients)
+    A, c = np.zeros((K, K)), np.zeros(K)
+    for s in series:
+        index = fit.designs[s][2]
+        A[np.ix_(index, index)] += fit.reduced[s].A
+        c[index] += fit.reduced[s].c
+    return A, c
 
 
 def gains(laboratory: Laboratory, fit: Fit, kept: int = 0) -> list[Array]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.discovery.adequacy import names_of
+from thermocald.discovery.candidates import richer_way
 from thermocald.discovery.estimates import (
     acts_on,
     displacement_estimates,
@@ -234,7 +235,7 @@ def _entry(x: Examination, fit: Fit, k: int, before: Gap, after: Gap, first: boo
     term = fit.terms[k]
     e = x.laboratory.series[0]
     effect = catalogue.get(term.effect)
-    estimates = term_estimates(fit, k, e)
+    estimates = _undecided(x, fit, k, term_estimates(fit, k, e))
     without = _score_without(x, k)
     evidence: dict[str, Any] = {
         "score_gain": without,
@@ -257,6 +258,25 @@ def _entry(x: Examination, fit: Fit, k: int, before: Gap, after: Gap, first: boo
         },
         estimates, evidence, _alternatives(x, term, first), before, after, term,
     )  # fmt: skip
+
+
+def _undecided(
+    x: Examination, fit: Fit, k: int, estimates: dict[str, dict[str, Any]]
+) -> dict[str, dict[str, Any]]:
+    """Estimates with the standard deviations they have beside one coefficient more.
+
+    That a lens's A2 drifts by less than the data show does not make A1 as sure as if A2 stood
+    still.
+    """
+    richer = richer_way(fit.terms[k])
+    if richer is None:
+        return estimates
+    terms = (*fit.terms[:k], richer, *fit.terms[k + 1 :])
+    other = term_estimates(fit_first(x.laboratory, terms), k, x.laboratory.series[0])
+    return {
+        name: {**e, "sd": max(e["sd"], other[name]["sd"])} if e["sd"] is not None else e
+        for name, e in estimates.items()
+    }
 
 
 def _score_without(x: Examination, k: int) -> float:

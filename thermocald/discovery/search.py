@@ -34,6 +34,8 @@ __all__ = ["MARGIN", "Scanned", "Search", "Solution"]
 
 # beyond the penalty for the search: what errors of the noise model itself may feign
 MARGIN = 16.0
+# of an effect's best way that another of its ways has to promise
+_WAY_SHARE = 0.95
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,22 +227,14 @@ class Search:
             found = self.scan(number, solution)
             if found is not None and np.isfinite(found.gain):
                 promises.append(found)
-        promises.sort(key=lambda p: -p.net)
-        grown: list[Solution] = []
-        best = promises[0].net if promises else 0.0
-        for rank, promise in enumerate(promises):
-            if promise.net <= 0 or rank >= width:
-                break
-            # a scan is right to some percent: what promises a tenth cannot win
-            if promise.net < 0.1 * best and rank >= 3:
-                break
-            grown.append(
-                self.refine(
-                    (*solution.terms, promise.term),
-                    (*solution.penalties, promise.penalty),
-                    solution.fit,
-                )
+        grown = [
+            self.refine(
+                (*solution.terms, promise.term),
+                (*solution.penalties, promise.penalty),
+                solution.fit,
             )
+            for promise in _worth_fitting(promises, width)
+        ]
         grown.sort(key=lambda s: s.score)
         return grown
 
@@ -257,6 +251,25 @@ class Search:
                 break
             solution = best
         return solution
+
+
+def _worth_fitting(promises: Sequence[Scanned], width: int) -> list[Scanned]:
+    """The `width` most promising effects, each in the ways that promise nearly as much as its best.
+
+    A scan is right to some percent, with a drive to half: what promises a tenth cannot win.
+    """
+    ordered = sorted((p for p in promises if p.net > 0), key=lambda p: -p.net)
+    out: list[Scanned] = []
+    best: dict[str, float] = {}
+    for p in ordered:
+        name = p.candidate.effect
+        if name in best:
+            if p.net > _WAY_SHARE * best[name]:
+                out.append(p)
+        elif len(best) < width and (len(best) < 3 or p.net >= 0.1 * ordered[0].net):
+            best[name] = p.net
+            out.append(p)
+    return out
 
 
 def _given_term(name: str, values: dict[str, Any], series: int) -> Term:

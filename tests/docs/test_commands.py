@@ -94,9 +94,14 @@ STAYS = {"thermocald run --config config.yaml"}
 """Of these, what runs on while the rest of the page is done."""
 
 PATH = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-ENVIRONMENT = {**os.environ, "PATH": PATH, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1",
-               "COLUMNS": "120"}  # fmt: skip
-ADB_IS_ELSEWHERE = {"ANDROID_ADB_SERVER_PORT": "1"}  # `devices` must not start a server
+ENVIRONMENT = {
+    **os.environ,
+    "PATH": PATH,
+    "PYTHONPATH": str(ROOT),
+    "OPENBLAS_NUM_THREADS": "1",
+    "COLUMNS": "120",
+    "FORCE_COLOR": "1",  # `top` draws where it believes in a terminal
+}
 PATIENCE_S = 240.0
 
 
@@ -134,10 +139,10 @@ class Page:
         if command not in UNTIL:
             self.finish(command, process)
             return
-        self.wait(command, process)
         self.staying.append((command, process))
+        self.wait(command, process)
         if command not in STAYS:
-            self.end()
+            self.end(command)
 
     def start(self, command: str, given: str = "") -> subprocess.Popen[str]:
         (self.folder / "given").write_text(given)
@@ -145,7 +150,7 @@ class Page:
             return subprocess.Popen(
                 ["bash", "-euo", "pipefail", "-c", command],
                 cwd=self.folder,
-                env={**ENVIRONMENT, **ADB_IS_ELSEWHERE},
+                env=ENVIRONMENT,
                 stdin=stdin,
                 stdout=output,
                 stderr=subprocess.STDOUT,
@@ -174,12 +179,14 @@ class Page:
             assert time.monotonic() < deadline, f"{self.page}: {command}:\n{self.output()}"
             time.sleep(0.2)
 
-    def end(self) -> None:
-        while self.staying:
-            command, process = self.staying.pop()
-            os.killpg(process.pid, signal.SIGINT)
-            status = process.wait(PATIENCE_S)
-            assert status in (0, 130), f"{command}: {status}"
+    def end(self, only: str = "") -> None:
+        """Ctrl-C for what stays, or for one of them."""
+        for command, process in list(self.staying):
+            if only in ("", command):
+                os.killpg(process.pid, signal.SIGINT)
+                status = process.wait(PATIENCE_S)
+                self.staying.remove((command, process))
+                assert status in (0, 130), f"{command}: {status}"
 
     def kill(self) -> None:
         for _, process in self.staying:

@@ -16,7 +16,12 @@ from typer.testing import CliRunner
 from tests.docs.blocks import ROOT, blocks
 from tests.photogrammetry import network_cases
 from thermocald.cli import application
-from thermocald.photogrammetry.camera_model import CameraModel, InteriorOrientation, Sensor
+from thermocald.photogrammetry.camera_model import (
+    CameraModel,
+    ExteriorOrientation,
+    InteriorOrientation,
+    Sensor,
+)
 from thermocald.simulation.course import Course
 from thermocald.simulation.demonstration import demonstration_field, demonstration_model
 from thermocald.simulation.model import ModelEffect
@@ -116,15 +121,31 @@ def put_config(folder: Path, name: str, store: str = "thermocald.db") -> None:
 def put_photographs(folder: Path) -> None:
     """Eight photographs of the field that was printed into `field/`."""
     nominal = read_testfield(folder / "field" / "testfield.csv")
-    camera = CameraModel(Sensor(1640, 1232, 0.00224), InteriorOrientation(3.05, 0.02, -0.01, -2e-3))
-    scene = Scene(camera.sensor, nominal)
+    corner = bool(np.ptp(nominal.points, axis=0).min() > 0)
+    sensor = Sensor(3280, 2464, 0.00112) if corner else Sensor(1640, 1232, 0.00224)
+    camera = CameraModel(sensor, InteriorOrientation(3.05, 0.02, -0.01, -2e-3))
+    scene = Scene(sensor, nominal)
     (folder / "photos").mkdir(exist_ok=True)
-    distance = 1.05 * float(np.ptp(nominal.points, axis=0).max())
-    stations = network_cases.convergent_stations(nominal.points, 8, distance=distance)
+    if corner:
+        stations = _before_the_corner(nominal.points)
+    else:
+        distance = 1.44 * float(np.ptp(nominal.points, axis=0).max())
+        stations = network_cases.convergent_stations(nominal.points, 8, distance=distance)
     for i, station in enumerate(stations):
         frame = scene.render(camera.interior.as_array(), station.as_array(), seed=i)
         path = str(folder / "photos" / f"{i}.jpg")
         cv2.imwrite(path, frame, [cv2.IMWRITE_JPEG_QUALITY, 95])
+
+
+def _before_the_corner(points: np.ndarray) -> list[ExteriorOrientation]:
+    """Eight stations that see all three sheets, every second one turned by 90°."""
+    rng = np.random.default_rng(0)
+    middle, stations = points.mean(axis=0), []
+    for i in range(8):
+        direction = np.ones(3) + rng.uniform(-0.45, 0.45, 3)
+        where = middle + 750.0 * direction / np.linalg.norm(direction)
+        stations.append(network_cases.looking_at(where, middle, (i % 4) * np.pi / 2))
+    return stations
 
 
 def how_to_daemon(shelf: Path, folder: Path) -> None:

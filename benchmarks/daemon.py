@@ -15,17 +15,18 @@ import sys
 import tempfile
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from thermocald.acquisition.calibrator import Calibrator
 from thermocald.acquisition.live_pipeline import AcquiredEpoch
 from thermocald.acquisition.pipeline import Pipeline
 from thermocald.acquisition.scheduler import Schedule
 from thermocald.analysis.online_observer import OnlineObserver
 from thermocald.hal import SystemClock, VirtualClock, open_device
+from thermocald.photogrammetry.image_file import decode_grey
 
 PERIOD_S = 0.05
 
@@ -112,48 +113,64 @@ def epoch_cost(epochs: int) -> None:
     from thermocald.acquisition.frame_folder import FrameFolder
     from thermocald.cli.run import mock_config
     from thermocald.daemon.epoch_keeper import EpochKeeper
-    from thermocald.daemon.plan import plan_cameras
+    from thermocald.daemon.plan import common_unknowns, plan_cameras
     from thermocald.daemon.store_guard import StoreGuard
 
     clock = VirtualClock()
     config = mock_config()
     with tempfile.TemporaryDirectory() as folder:
-        plan = plan_cameras(config, clock)[0]
+        plan = replace(plan_cameras(config, clock)[0], series="bench")
         thermometer = open_device("thermometer", "mock", {"seed": 2}, clock)
         guard = StoreGuard(Path(folder) / "t.db", durable=True)
         keeper = EpochKeeper(plan, guard, FrameFolder(config.frames), lambda *_: None)
         assert plan.sensor is not None
         assert plan.testfield is not None
         observer = OnlineObserver(plan.sensor, plan.testfield, lambda *_: None)
-        spent: dict[str, list[float]] = {"measure + adjust": [], "online": [], "store": []}
-        calibrator = Calibrator(plan.sensor, plan.testfield, nominal_c=3.04)
+        calibrator, common = plan.calibrator, common_unknowns(plan)
+        assert calibrator is not None
+        assert common is not None
+        steps = ("decode a JPEG", "measure + adjust", "online filter", "common unknowns", "store")
+        spent: dict[str, list[float]] = {name: [] for name in steps}
         skew = []
         with plan.camera, thermometer:
             pipeline = Pipeline(
                 plan.camera, {"temperature": thermometer}, None, clock, period_s=10.0
             )
             for k, (acquired, frame) in enumerate(pipeline.run(epochs)):
+                jpeg = cv2.imencode(".jpg", frame.image)[1].tobytes()
+                z = time.thread_time()
+                decode_grey(jpeg)  # what a phone's frame costs more; the mock's has grey values
                 a = time.thread_time()
                 calibrated = calibrator.calibrate(acquired.epoch, frame.image)
                 b = time.thread_time()
                 observer.observe(calibrated)
                 c = time.thread_time()
+                seen = calibrated.epoch.observations
+                assert seen is not None
+                calibrated = replace(
+                    calibrated, adjustment=common.refine(seen, calibrated.adjustment)
+                )
+                e = time.thread_time()
                 item = AcquiredEpoch(k + 1, frame, True, calibrated.epoch)
                 item.calibrated = calibrated
                 keeper.keep(item)
                 d = time.thread_time()
                 skew.append(acquired.epoch.temperature_time - acquired.epoch.frame_time)
                 if k:  # the first frame is searched as a whole
-                    for name, seconds in zip(spent, (b - a, c - b, d - c), strict=True):
+                    parts = (a - z, b - a, c - b, e - c, d - e)
+                    for name, seconds in zip(spent, parts, strict=True):
                         spent[name].append(seconds)
         guard.close()
     total = sum(statistics.median(s) for s in spent.values())
-    print(f"one 8 MP epoch, CPU time, {len(plan.testfield)} targets, median of {epochs - 1}:")
+    least = sum(min(s) for s in spent.values())
+    print(f"one 8 MP epoch, CPU time, {len(plan.testfield)} targets, {epochs - 1} epochs:")
+    print(f"  {'':20}{'median':>11}{'least':>11}")
     for name, seconds in spent.items():
-        print(f"  {name:20}{1e3 * statistics.median(seconds):8.1f} ms")
+        print(f"  {name:20}{1e3 * statistics.median(seconds):8.1f} ms{1e3 * min(seconds):8.1f} ms")
     print(
-        f"  total {1e3 * total:.1f} ms; at a tenth of this speed {10 * total:.2f} s = "
-        f"{100 * 10 * total / 10.0:.1f} % of a 10 s period (bound 10 %)"
+        f"  total {1e3 * total:.1f} ms, least {1e3 * least:.1f} ms; at a tenth of this speed "
+        f"{10 * total:.2f} s = {100 * total:.1f} % of a 10 s period (bound 10 %), least "
+        f"{100 * least:.1f} %"
     )
     print(f"  temperature minus frame: median {1e3 * statistics.median(skew):.0f} ms")
 
@@ -161,7 +178,7 @@ def epoch_cost(epochs: int) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--ticks", type=int, default=600)
-    parser.add_argument("--epochs", type=int, default=15)
+    parser.add_argument("--epochs", type=int, default=40)
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     rhythm(arguments.ticks)

@@ -57,7 +57,7 @@ def decode(content: str, where: str, family: str = "28") -> tuple[float, bytes]:
     """(°C, scratchpad) of a `w1_slave` file; BadReading says what does not fit."""
     lines = content.split("\n")
     if not content.strip():
-        raise BadReading(f"{where}: empty, the sensor did not answer")
+        raise BadReading(f"{where}: empty: no answer, or one whose CRC the kernel refused")
     try:
         left, right = lines[0].split(" : crc=", 1)
         pad = bytes.fromhex(left)

@@ -61,7 +61,7 @@ def test_crc_of_the_application_note():
 @pytest.mark.parametrize(
     ("content", "why"),
     [
-        ("", "did not answer"),
+        ("", "empty: no answer"),
         ("garbage", "no w1_slave"),
         (CRC_NO, "CRC error"),
         (ZEROS, "all zeros"),

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.hil.machine import Machine
+from tests.hil.one_wire import Adapter, Probe
 from tests.hil.phone import Phone
 
 HERE = Path(__file__).parent
@@ -24,8 +25,13 @@ def pytest_collection_modifyitems(items):
             item.add_marker(pytest.mark.hil)
 
 
+@pytest.fixture(autouse=True)
+def no_leaked_threads():
+    """An instrument that is plugged in again serves on in a new thread; its fixture joins it."""
+
+
 @pytest.fixture(scope="session")
-def report(request):
+def report():
     """A line at the end of the run, for figures that were measured."""
     lines: list[str] = []
     yield lines.append
@@ -57,18 +63,22 @@ def machine(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def video(machine):
-    """v4l2loopback at /dev/video40 and vivid at /dev/video0."""
-    machine.run("modprobe v4l2loopback video_nr=40 card_label=laboratory exclusive_caps=1")
+    """v4l2loopback at /dev/video40 (drivers) and 41 (station), vivid at its lasting name."""
+    machine.run(
+        "modprobe v4l2loopback video_nr=40,41 card_label=laboratory,station exclusive_caps=1,1"
+    )
     machine.run("modprobe vivid n_devs=1")
     node = "/dev/v4l/by-path/platform-vivid.0-video-index0"
-    machine.wait(f"test -c /dev/video40 && test -e {node}")
+    machine.wait(f"test -c /dev/video40 -a -c /dev/video41 && test -e {node}")
     return machine
 
 
 @pytest.fixture(scope="session")
 def i2c_bus(machine):
-    """The number of an SMBus with an LM75 at 0x48 and 0x49 and an MCP9808 at 0x18."""
-    machine.run("modprobe i2c-dev; modprobe i2c-stub chip_addr=0x48,0x49,0x18; modprobe lm75")
+    """The number of an SMBus with two LM75 (0x48, 0x49), an MCP9808 (0x18), a BME280 (0x76)."""
+    machine.run(
+        "modprobe -a i2c-dev lm75 bmp280-i2c; modprobe i2c-stub chip_addr=0x48,0x49,0x18,0x76"
+    )
     return int(
         machine.wait(
             "grep -l 'SMBus stub' /sys/class/i2c-dev/*/name | sed 's/.*i2c-\\([0-9]*\\).*/\\1/' "
@@ -117,6 +127,20 @@ def instrument(machine):
     one.port = machine.wait("ls /dev/serial/by-id/*", 60).split()[0]
     yield one
     one.pull()
+
+
+@pytest.fixture
+def wire(machine):
+    """A DS9490R with two DS18B20, which the guest has found."""
+    machine.run("modprobe xhci-pci")
+    adapter = Adapter(machine.wire, Probe(0xBFE244, 21.5), Probe(0x1B2C3D, -10.125))
+    adapter.plug()
+    names = " ".join(f"-e /sys/bus/w1/devices/{probe.name}/w1_slave -a" for probe in adapter.probes)
+    try:
+        machine.wait(f"test {names} -d /sys", 90)
+        yield adapter
+    finally:
+        adapter.pull()
 
 
 @pytest.fixture

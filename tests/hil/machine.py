@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import shlex
+import shutil
 import socket
 import subprocess
 import time
 from typing import TYPE_CHECKING
+
+from tests.hil import thermal_zone
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -15,22 +18,35 @@ if TYPE_CHECKING:
 __all__ = ["Machine"]
 
 BOOT_S = 240.0
+# The least that NumPy and OpenCV want (x86-64-v2). With "max", which has AVX too, Python and NumPy
+# crashed now and then in the emulation (QEMU 7.2).
+CPU = "Nehalem"
+STORE_SIZE = "48M"  # so that a little frees enough for observations again (20 MB)
+WRITES_BYTES = 4 << 30  # sparse
 
 
 class Machine:
-    """A guest on a disk that is thrown away.
+    """A guest on disks that are thrown away.
 
-    `serial` is a socket behind a USB serial adapter: QEMU plugs the adapter in while somebody is
-    connected to it, and pulls it when he leaves. `share` is /mnt/host in the guest.
+    `store` is an empty file system of its own for the daemon's store, /dev/vdb in the guest, and
+    `writes` the disk to which device mapper logs what is written there, /dev/vdc. `serial` is a
+    socket behind a USB serial adapter: QEMU plugs the adapter in while somebody is connected to it,
+    and pulls it when he leaves; `wire` likewise, for whoever speaks the USB redirection protocol.
+    `share` is /mnt/host in the guest.
     """
 
     def __init__(self, built: Path, folder: Path, accelerator: str = "tcg,thread=multi") -> None:
         self.built, self.folder, self.accelerator = built, folder, accelerator
         folder.mkdir(parents=True, exist_ok=True)
         self.disk = folder / "disk.qcow2"
+        self.empty, self.store = folder / "empty.raw", folder / "store.raw"
+        self.writes = folder / "writes.raw"
         self.share = folder / "share"
         self.share.mkdir(exist_ok=True)
         self.serial = folder / "serial.sock"
+        self.wire = folder / "wire.sock"
+        self.zone = folder / "zone.aml"
+        self.zone.write_bytes(thermal_zone.table())
         self.process: subprocess.Popen[bytes] | None = None
         self._master: subprocess.Popen[bytes] | None = None
         self.port = 0
@@ -44,9 +60,19 @@ class Machine:
                 ["qemu-img", "create", "-q", "-f", "qcow2", "-F", "raw", "-b", base, self.disk],
                 check=True,
             )
+            # all of it is there from the beginning: nothing is written later but what is asked for
+            features = "lazy_itable_init=0,lazy_journal_init=0,nodiscard"
+            subprocess.run(
+                ["mke2fs", "-q", "-t", "ext4", "-m", "0", "-E", features, self.empty, STORE_SIZE],
+                check=True,
+            )
+            shutil.copyfile(self.empty, self.store)
+            with self.writes.open("wb") as file:
+                file.truncate(WRITES_BYTES)
         with socket.create_server(("127.0.0.1", 0)) as free:
             self.port = free.getsockname()[1]
-        self.serial.unlink(missing_ok=True)
+        for path in (self.serial, self.wire):
+            path.unlink(missing_ok=True)
         begin = time.monotonic()
         with (self.folder / "qemu.log").open("ab") as log:
             self.process = subprocess.Popen(
@@ -68,17 +94,22 @@ class Machine:
             "systemd.show_status=0"
         )
         return [
-            *("qemu-system-x86_64", "-M", "q35", "-accel", self.accelerator, "-cpu", "max"),
+            *("qemu-system-x86_64", "-M", "q35", "-accel", self.accelerator, "-cpu", CPU),
             *("-smp", "2", "-m", "1536", "-nodefaults", "-no-user-config", "-display", "none"),
             *("-kernel", str(self.built / "kernel"), "-initrd", str(self.built / "initrd")),
             *("-append", kernel_line),
             *("-drive", f"file={self.disk},if=virtio,format=qcow2,cache=writeback"),
+            *("-drive", f"file={self.store},if=virtio,format=raw,cache=writeback"),
+            *("-drive", f"file={self.writes},if=virtio,format=raw,cache=writeback"),
             *("-netdev", f"user,id=n,restrict=on,hostfwd=tcp:127.0.0.1:{self.port}-:22"),
             *("-device", "virtio-net-pci,netdev=n,romfile="),
             *("-virtfs", f"local,path={self.share},mount_tag=host,security_model=none"),
+            *("-acpitable", f"file={self.zone}"),
             *("-device", "virtio-rng-pci", "-device", "qemu-xhci,id=usb"),
             *("-chardev", f"socket,id=line,path={self.serial},server=on,wait=off"),
             *("-device", "usb-serial,chardev=line,bus=usb.0,id=adapter"),
+            *("-chardev", f"socket,id=wire,path={self.wire},server=on,wait=off"),
+            *("-device", "usb-redir,chardev=wire,bus=usb.0,id=bridge"),
             *("-serial", f"file:{self.folder / 'console'}"),
         ]
 
@@ -145,5 +176,5 @@ class Machine:
 
     def close(self) -> None:
         self.cut_power()
-        for path in (self.disk, self.serial):
+        for path in (self.disk, self.empty, self.store, self.writes, self.serial, self.wire):
             path.unlink(missing_ok=True)

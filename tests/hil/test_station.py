@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import bisect
 import json
+import shutil
 import statistics
 import time
 
@@ -16,14 +17,15 @@ import numpy as np
 import pytest
 
 from tests.hil.frames import subject
-from tests.hil.station import PERIOD_S, SIZE, VIVID, prepare
+from tests.hil.power import replay, wait_for_mark
+from tests.hil.station import CAMERA, PERIOD_S, SIZE, STORE, VIVID, prepare
 
 EPOCHS = 60
-CALIBRATED = 20  # as many must have been by then: an emulated machine is slow at it
+CALIBRATED = 54  # of them, once the daemon has made up for what it put off
 FPS = 4.0
 HOLD = round(PERIOD_S * FPS)
 STAMP_S = 0.005
-STORE = "python3 /mnt/host/guest/store.py"
+VIVID_DRIVER = "/sys/bus/platform/drivers/vivid"
 
 
 class Station:
@@ -43,6 +45,7 @@ class Station:
             "cp /mnt/host/station/*.csv /mnt/host/station/config.yaml /etc/thermocald/"
         )
         run("sh /mnt/host/guest/install_unit.sh /mnt/host/systemd")
+        run("modprobe dm-log-writes && sh /mnt/host/guest/store_disk.sh logged")
         run(
             f"test -e /sys/bus/i2c/devices/{i2c_bus}-0048 || "
             f"echo tmp75 0x48 > /sys/bus/i2c/devices/i2c-{i2c_bus}/new_device"
@@ -50,18 +53,23 @@ class Station:
         run("systemctl start mosquitto", timeout_s=60)
         self.feed()
         probe = "/opt/thermocald/bin/thermocald check /etc/thermocald/config.yaml --probe --json -"
-        self.probed = json.loads(run(f"{probe} 2>/dev/null", timeout_s=240).stdout)
+        self.probed = json.loads(run(f"{probe} 2>/dev/null", check=False, timeout_s=240).stdout)
         run("systemctl start thermocald", timeout_s=240)
+        self.until(lambda status: river(status)["stored"] >= 1, "the first epoch")
 
     def feed(self):
         """Start the camera's feeder; the test field begins to heat."""
         self.machine.run(
             "rm -f /run/feed.log; systemd-run -q --unit=feeder --collect "
-            "python3 /mnt/host/guest/feed.py /dev/video40 /mnt/host/station/frames.npy "
+            f"python3 /mnt/host/guest/feed.py {CAMERA} /mnt/host/station/frames.npy "
             "/mnt/host/station/temperatures.npy /run/feed.log "
             f"--fps {FPS} --hold {HOLD} --bus {self.i2c_bus} --go /run/heating"
         )
-        self.machine.wait("test -s /run/feed.log", 120)
+        try:
+            self.machine.wait("test -s /run/feed.log", 120)
+        except RuntimeError as error:
+            why = self.machine.run("journalctl -u feeder -n 20 --no-pager -o cat").stdout
+            raise AssertionError(f"the feeder does not run:\n{why}") from error
 
     def stop_feeding(self):
         """The camera stalls; a feeder that died could not come back while the daemon looks on."""
@@ -70,9 +78,17 @@ class Station:
     def go_on_feeding(self):
         self.machine.run("systemctl kill -s SIGCONT feeder")
 
-    def stored(self, database=""):
-        out = self.machine.run(f"{STORE} {database}", timeout_s=300).stdout
-        return json.loads(out.strip().splitlines()[-1])
+    def stored(self):
+        """What the store holds, after its own check of the whole file."""
+        return self.machine.python("store.py")
+
+    def numbers(self):
+        """Of the river's epochs in the store, in their order."""
+        return [epoch["number"] for epoch in self.stored()["series"]["river"]]
+
+    def events(self):
+        """Kinds of what happened, as the store tells it."""
+        return [event["kind"] for event in self.stored()["events"]]
 
     def status(self):
         out = self.machine.wait("cat /run/thermocald/status.json", 60)
@@ -85,7 +101,7 @@ class Station:
             status = self.status()
             if condition(status):
                 return status
-            if time.monotonic() > deadline:
+            if time.monotonic() > deadline:  # what went wrong stands there
                 journal = self.machine.run("journalctl -u thermocald -n 20 --no-pager").stdout
                 raise AssertionError(f"not in {timeout_s:g} s: {what}\n{journal}")
             time.sleep(0.5)
@@ -121,6 +137,19 @@ def device_states(status):
             **{k: v["device"] for k, v in status["thermometers"].items()}}  # fmt: skip
 
 
+def caught_up(station, timeout_s=300.0):
+    """Wait until every epoch of the river has been calibrated, as long as it gets on."""
+    deadline, before = time.monotonic() + timeout_s, None
+    while True:
+        statuses = station.machine.python("calibrated.py")
+        if not statuses.get("not_calibrated"):
+            return
+        if time.monotonic() > deadline:
+            raise AssertionError(f"not calibrated in {timeout_s:g} s: {statuses}, {before}")
+        before = statuses
+        time.sleep(1.0)
+
+
 @pytest.fixture(scope="module")
 def series(station):
     """What the store holds after 60 epochs of heating, and the feeder's log."""
@@ -132,9 +161,7 @@ def series(station):
     station.until(
         lambda s: river(s)["waiting"] == 0 and river(s)["device"] == "out", "no frames left", 120
     )
-    station.machine.wait(
-        f'test "$(python3 /mnt/host/guest/calibrated.py)" -ge {CALIBRATED}', timeout_s=300
-    )
+    caught_up(station)
     stored = station.stored()
     log = {}
     for line in station.machine.run("cat /run/feed.log").stdout.splitlines():
@@ -209,7 +236,7 @@ def test_sixty_epochs_are_calibrated(series, report):
     x0 = np.array([e["values"][1] for e in good])
     slope = np.polyfit(celsius, x0, 1)[0]
     true = model.rates["x0"]
-    assert slope == pytest.approx(true, rel=0.25)
+    assert slope == pytest.approx(true, rel=0.1)
     report(
         f"daemon: {len(good)} epochs calibrated, dx0/dT {1e3 * slope:.3f} µm/K, "
         f"true {1e3 * true:.3f} µm/K"
@@ -230,19 +257,24 @@ def test_the_camera_stalls_and_comes_back(station, series):
 def test_the_other_camera_is_unplugged(station):
     """vivid is unbound and bound: its epochs pause, the river's do not."""
     station.until(lambda s: s["cameras"]["yard"]["stored"] > 0, "frames of the yard", 120)
-    station.machine.run("echo vivid.0 > /sys/bus/platform/drivers/vivid/unbind")
+    station.machine.run(f"echo vivid.0 > {VIVID_DRIVER}/unbind")
     out = station.until(lambda s: device_states(s)["yard"] == "out", "yard out")
-    there = river(out)["stored"]
-    station.until(lambda s: river(s)["stored"] > there, "the river goes on")
-    station.machine.run("echo vivid.0 > /sys/bus/platform/drivers/vivid/bind")
+    there, yards = river(out)["stored"], out["cameras"]["yard"]["stored"]
+    still = station.until(lambda s: river(s)["stored"] > there + 1, "the river goes on")
+    assert still["cameras"]["yard"]["stored"] == yards
+    station.machine.run(f"echo vivid.0 > {VIVID_DRIVER}/bind")
     station.machine.wait(f"test -e {VIVID}")
-    station.until(lambda s: device_states(s)["yard"] == "open", "yard back")
+    station.until(lambda s: s["cameras"]["yard"]["stored"] > yards, "epochs of the yard again")
+    assert station.journal("camera yard is out")
     assert station.journal("camera yard is back")
+    yard = [epoch["number"] for epoch in station.stored()["series"]["yard"]]
+    assert yard == list(range(1, len(yard) + 1))
 
 
 def test_thermometers_come_and_go(station):
     """The kernel's driver is unbound, the serial adapter pulled: missing, never made up."""
     bus = f"/sys/bus/i2c/devices/i2c-{station.i2c_bus}"
+    last = station.numbers()[-1]
     station.machine.run(f"echo 0x48 > {bus}/delete_device")
     station.instrument.pull()
     station.until(lambda s: {device_states(s)[k] for k in ("lens", "line")} == {"out"}, "both out")
@@ -253,52 +285,107 @@ def test_thermometers_come_and_go(station):
     station.until(
         lambda s: {device_states(s)[k] for k in ("lens", "line")} == {"open"}, "both back"
     )
-    epochs = station.stored()["series"]["river"]
-    bare = [e for e in epochs if set(e["temperatures"].values()) <= {None}]
-    assert 2 <= len(bare) <= 40
+    there = river(station.status())["stored"]
+    station.until(lambda s: river(s)["stored"] > there + 2, "epochs with temperatures again")
+    stored = station.stored()
+    after = [e for e in stored["series"]["river"] if e["number"] > last]
+    bare = [e for e in after if set(e["temperatures"].values()) <= {None}]
+    assert len(bare) >= 2
+    assert after[-1]["temperatures"]["lens"] is not None
+    assert after[-1]["temperatures"]["line"] == 21.25
     for name in ("lens", "line"):
         assert station.journal(f"thermometer {name} is out")
         assert station.journal(f"thermometer {name} is back")
+        told = [e["text"] for e in stored["events"] if f"thermometer {name} is" in e["text"]]
+        assert [text.split(" is ")[1].split()[0].strip(":") for text in told] == ["out", "back"]
 
 
 def test_the_clock_is_set(station):
-    """Two hours back: the rhythm goes on, the store says that the clock stepped."""
+    """Two hours back, then forwards: the rhythm goes on, the store says that the clock stepped."""
     before = river(station.status())["stored"]
     station.machine.run("date -s '-2 hours'")
     station.until(lambda s: river(s)["stored"] > before + 3, "epochs after the step")
-    stored = station.stored()
-    assert any(event["kind"] == "clock_step" for event in stored["events"])
-    times = [e["frame_time"] for e in stored["series"]["river"]]
-    assert times == sorted(times)
     station.machine.run("date -s '+2 hours'")
+    there = river(station.status())["stored"]
+    station.until(lambda s: river(s)["stored"] > there + 1, "epochs after the step forwards")
+    stored = station.stored()
+    steps = [event["text"] for event in stored["events"] if event["kind"] == "clock_step"]
+    assert len(steps) == 2
+    assert station.journal("the clock was set back by 7[12]..")
+    epochs = stored["series"]["river"][before - 2 :]
+    times = [e["frame_time"] for e in epochs]
+    assert times == sorted(times)
+    assert max(np.diff(times)) < 60.0  # no step of two hours in what is stored
+
+
+def store_is_well(status):
+    return status["store"]["state"] == "ok" and not status["store"]["waiting"]
+
+
+def test_the_stores_disk_is_full(station):
+    """Not a byte is left: results wait in memory; when there is room again none is missing."""
+    station.until(store_is_well, "a well store")
+    # what waits in the -wal file is room that SQLite would use first
+    station.machine.run(
+        f"python3 -c 'import sqlite3; "
+        f'sqlite3.connect("{STORE}/thermocald.db").execute("PRAGMA wal_checkpoint(TRUNCATE)")\'; '
+        f"dd if=/dev/zero of={STORE}/balloon bs=4k; dd if=/dev/zero of={STORE}/rest bs=512; true"
+    )
+    station.until(lambda s: s["store"]["waiting"] >= 3, "results wait in memory")
+    assert station.status()["store"]["state"] == "out"
+    assert "disk is full" in station.journal("results wait in memory")[-1]
+    station.machine.run(f"rm {STORE}/balloon {STORE}/rest")
+    station.until(store_is_well, "a well store again")
+    assert station.status()["store"]["lost"] == 0
+    for told in ("observations no more", "can be written again", "observations are kept again"):
+        assert station.journal(told)
+    kinds = station.events()
+    assert {"store_out", "observations_paused", "observations_resumed"} <= set(kinds)
+    numbers = station.numbers()
+    assert numbers == list(range(1, len(numbers) + 1))
 
 
 def test_a_hung_daemon_is_started_again(station):
     """SIGSTOP: systemd's watchdog ends it, the new one goes on with the next number."""
     pid = station.machine.run("systemctl show -P MainPID thermocald").stdout.strip()
-    last = station.stored()["series"]["river"][-1]["number"]
+    last = station.numbers()[-1]
     station.machine.run(f"kill -STOP {pid}")
-    begin = time.monotonic()
     station.machine.wait(
-        f'test "$(systemctl show -P MainPID thermocald)" != {pid} && '
+        f'new="$(systemctl show -P MainPID thermocald)"; test "$new" != {pid} -a "$new" != 0 && '
         "systemctl is-active -q thermocald",
         300,
     )
-    assert time.monotonic() - begin > 1.0
+    assert station.journal("Watchdog timeout")
     station.until(lambda s: river(s)["stored"] >= 1, "epochs again", 240)
-    numbers = [e["number"] for e in station.stored()["series"]["river"]]
-    assert numbers == sorted(set(numbers))
+    numbers = station.numbers()
+    assert numbers == list(range(1, len(numbers) + 1))
     assert numbers[-1] > last
+    assert station.events().count("started") == 2
 
 
 def test_power_cut(station, report):
-    """The machine dies in the middle of everything: no stored epoch is lost, the file is sound."""
-    acknowledged = station.stored()["series"]["river"][-1]["number"]
-    station.machine.cut_power()
-    station.machine.boot()
-    stored = station.stored()  # reads and checks the whole file
-    assert stored["series"]["river"][-1]["number"] >= acknowledged
+    """The power goes, and with it all that the disk had not flushed: no stored epoch is lost.
+
+    What another process has read of the store counts as stored. A file that nobody flushed shows
+    that something is lost.
+    """
+    machine = station.machine
+    acknowledged = station.numbers()[-1]
+    machine.run(
+        f"head -c 100000 /dev/zero > {STORE}/never-flushed; "
+        "dmsetup message store 0 mark power-cut"
+    )
+    wait_for_mark(machine.writes, "power-cut")
+    machine.cut_power()
+    shutil.copyfile(machine.empty, machine.store)
+    writes = replay(machine.writes, machine.store, "power-cut")
+    machine.boot()
+    machine.run("sh /mnt/host/guest/store_disk.sh plain")
+    numbers = station.numbers()  # reads and checks the whole file
+    assert numbers == list(range(1, len(numbers) + 1))
+    assert numbers[-1] >= acknowledged
+    assert machine.run(f"test -s {STORE}/never-flushed", check=False).returncode == 1
     report(
-        f"power cut: {stored['series']['river'][-1]['number']} epochs there, "
-        f"{acknowledged} had been read before; booted again in {station.machine.boot_s:.0f} s"
+        f"power cut: {numbers[-1]} epochs there, {acknowledged} had been read before; {writes} "
+        f"flushed writes replayed, booted again in {machine.boot_s:.0f} s"
     )

@@ -20,13 +20,26 @@ version=${headers#linux-headers-}
 say "kernel $version"
 
 # the root file system, while the rest goes on
-packages=systemd,systemd-sysv,dbus,udev,kmod,python3,openssh-server,iproute2,procps,e2fsprogs,mosquitto
+packages=systemd,systemd-sysv,dbus,udev,kmod,python3,openssh-server,iproute2,procps,e2fsprogs
+packages=$packages,dmsetup,mosquitto
 mmdebstrap --quiet --variant=minbase --components=main --include=$packages --format=directory \
     --aptopt='APT::Install-Recommends "false"' \
     --dpkgopt='path-exclude=/usr/share/man/*' --dpkgopt='path-exclude=/usr/share/doc/*' \
     --dpkgopt='path-exclude=/usr/share/locale/*' \
     bookworm "$work/root" >"$work/mmdebstrap.log" 2>&1 &
 rootfs=$!
+
+# the libraries, for Debian 12's Python 3.11, likewise
+"$python" - "$checkout/pyproject.toml" >"$work/requirements.txt" <<'X'
+import sys, tomllib
+project = tomllib.load(open(sys.argv[1], "rb"))["project"]
+extras = project["optional-dependencies"]
+print("\n".join(project["dependencies"] + extras["v4l2"] + extras["mqtt"] + extras["dashboard"]))
+X
+"$python" -m pip install -q --disable-pip-version-check --no-warn-script-location \
+    --only-binary :all: --python-version 3.11 --target "$work/site" -r "$work/requirements.txt" \
+    >"$work/pip.log" 2>&1 &
+libraries=$!
 
 # v4l2loopback, built against the headers of the guest's kernel
 mkdir -p "$work/deb"
@@ -37,16 +50,7 @@ loopback=$(echo "$work"/loopback/usr/src/v4l2loopback-*)
 make -s -C "/usr/src/linux-headers-$version" M="$loopback" modules >"$work/loopback.log" 2>&1
 say "v4l2loopback built"
 
-# the libraries, for Debian 12's Python 3.11
-"$python" - "$checkout/pyproject.toml" >"$work/requirements.txt" <<'X'
-import sys, tomllib
-project = tomllib.load(open(sys.argv[1], "rb"))["project"]
-extras = project["optional-dependencies"]
-print("\n".join(project["dependencies"] + extras["v4l2"] + extras["mqtt"] + extras["dashboard"]))
-X
-"$python" -m pip install -q --disable-pip-version-check --no-warn-script-location \
-    --only-binary :all: --python-version 3.11 --target "$work/site" -r "$work/requirements.txt" \
-    >"$work/pip.log" 2>&1
+wait $libraries
 find "$work/site" -depth -type d \( -name tests -o -name __pycache__ \) -exec rm -rf {} +
 say "libraries"
 wait $rootfs
@@ -58,7 +62,8 @@ modules=$root/usr/lib/modules/$version
 mkdir -p "$modules/extra"
 depmod -b "$work/kernel" "$version"
 for name in virtio_pci virtio_blk virtio_net virtio_rng ext4 crc32c_generic 9p 9pnet_virtio \
-    autofs4 loop videodev vivid i2c-dev i2c-stub lm75 xhci-pci ftdi_sio; do
+    autofs4 loop videodev vivid i2c-dev i2c-stub lm75 bmp280-i2c xhci-pci ftdi_sio \
+    dm-log-writes w1_therm ds2490; do
     modprobe -d "$work/kernel" -S "$version" --show-depends "$name" |
         awk '$1 == "insmod" { print $2 }'
 done | sort -u | while read -r file; do

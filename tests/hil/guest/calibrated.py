@@ -1,9 +1,12 @@
-"""How many epochs of the camera `river` have a calibration: a quick look without the program."""
+"""How the epochs of the camera `river` stand: {status: epochs}, without the program."""
 
 import json
 import sqlite3
 
-QUERY = """SELECT count(DISTINCT number) FROM epoch JOIN series s ON s.id = series_id
-           WHERE camera = 'river' AND status = 'ok'"""
-path = "file:/var/lib/thermocald/thermocald.db?mode=ro"
-print(json.dumps(sqlite3.connect(path, uri=True).execute(QUERY).fetchone()[0]))
+# a later calibration of an epoch is a row with a higher revision
+QUERY = """SELECT status, count(*) FROM (
+               SELECT status, max(revision) FROM epoch JOIN series s ON s.id = series_id
+               WHERE camera = 'river' GROUP BY number)
+           GROUP BY status"""
+path = "file:/var/lib/thermocald/store/thermocald.db?mode=ro"
+print(json.dumps(dict(sqlite3.connect(path, uri=True).execute(QUERY).fetchall())))

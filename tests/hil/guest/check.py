@@ -21,6 +21,7 @@ from thermocald.hal import SystemClock, open_device
 
 FEED = ["python3", "/mnt/host/guest/feed.py"]
 LOG = "/run/feed.log"
+TRANSIENT = ("BadReading", "DeviceGone", "DeviceTimeout")
 
 
 def outcome(action):
@@ -117,8 +118,7 @@ def stalls(backend):
         result["stopped"] = outcome(lambda: described(device.capture()))
         process.send_signal(signal.SIGCONT)
         device.close()
-        result["opened"] = until_open(device)  # OpenCV gives the node back up to 10 s later
-        result["continued"] = outcome(lambda: described(device.capture()))
+        result["continued"] = until_captured(device)  # OpenCV gives the node back 10 s later
         process.kill()
         process.wait()
         result["killed"] = outcome(lambda: described(device.capture()))
@@ -197,6 +197,17 @@ def until_open(device):
         time.sleep(0.1)
 
 
+def until_captured(device):
+    """As the daemon does: opened again after each error that may pass; permanent ones end it."""
+    deadline = time.monotonic() + 30
+    while True:
+        last = outcome(lambda: (device.open(), described(device.capture()))[1])
+        if last["error"] not in TRANSIENT or time.monotonic() > deadline:
+            return last
+        device.close()
+        time.sleep(0.25)
+
+
 def thermometer(name, **options):
     return open_device("thermometer", name, options, SystemClock())
 
@@ -267,6 +278,30 @@ def i2c(bus):
     return result
 
 
+# BME280 (BST-BME280-DS001 4.2.2): identity, coefficients of temperature, and 519888 = 25.08 °C
+BME280 = {0xD0: 0x60} | dict(enumerate([0x70, 0x6B, 0x43, 0x67, 0x18, 0xFC], 0x88))
+BME280 |= {0xFA: 0x7E, 0xFB: 0xED, 0xFC: 0x00}
+
+
+def kernel(bus):
+    """The kernel's bmp280 (iio) over i2c-stub, and the firmware's thermal zone."""
+    import smbus2
+
+    bus, result = int(bus), {}
+    with smbus2.SMBus(bus, force=True) as wire:
+        for register, value in BME280.items():
+            wire.write_byte_data(0x76, register, value)
+        folder = f"/sys/bus/i2c/devices/i2c-{bus}"
+        write(f"{folder}/new_device", "bme280 0x76")
+        with thermometer("iio", chip="bme280") as device:
+            result["iio"] = repeated(device)
+            write(f"{folder}/delete_device", "0x76")
+            result["iio unbound"] = outcome(device.read)
+    with thermometer("thermal_zone", zone="acpitz") as device:
+        result["thermal_zone"] = repeated(device)
+    return result
+
+
 def serial_line(port, count=20):
     """A real USB serial adapter's tty; the instrument is on the host."""
     options = {"port": port, "pattern": r"T=(?P<temperature>[-+]?\d+\.\d+)", "command": "T?\r\n"}
@@ -275,12 +310,33 @@ def serial_line(port, count=20):
 
 
 def serial_unplug(port):
-    """Reads until the adapter is pulled, then until it is back."""
     options = {"port": port, "pattern": r"T=(?P<temperature>[-+]?\d+\.\d+)", "command": "T?\r\n"}
-    device = thermometer("serial", timeout_s=2.0, **options)
+    return unplug(thermometer("serial", timeout_s=2.0, **options))
+
+
+def ds18b20(*names, count="4"):
+    """Readings of probes on the kernel's 1-wire bus, with what was not believed."""
+    options = {"sensors": dict(zip(("field", "air"), names, strict=False)), "timeout_s": 10}
+    result = {"readings": []}
+    device = thermometer("ds18b20", **options)
+    result["opened"] = outcome(device.open)
+    for _ in range(int(count)):
+        result["readings"].append(
+            outcome(lambda: (r := device.read()) and [dict(r.values), r.metadata.get("missing")])
+        )
+    device.close()
+    return result
+
+
+def ds18b20_unplug(name):
+    return unplug(thermometer("ds18b20", sensors={"temperature": name}, timeout_s=10))
+
+
+def unplug(device):
+    """Reads until the adapter is pulled, then until it is back."""
     device.open()
     result = {"before": outcome(lambda: dict(device.read().values))}
-    write("/run/serial-ready", "pull")
+    write("/run/cable", "pull")
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline:
         last = outcome(lambda: dict(device.read().values))
@@ -288,16 +344,16 @@ def serial_unplug(port):
             break
         time.sleep(0.05)
     result["pulled"] = last
-    device.close()
-    result["gone"] = outcome(device.open)
-    write("/run/serial-ready", "plug")
-    while time.monotonic() < deadline:
-        last = outcome(lambda: (device.open(), dict(device.read().values))[1])
-        if not last["error"]:
-            break
-        device.close()
-        time.sleep(0.1)
-    result["back"] = last
+    again = lambda: (device.open(), dict(device.read().values))[1]  # noqa: E731
+    for name, wanted in (("gone", "DeviceGone"), ("back", None)):
+        while time.monotonic() < deadline:
+            device.close()
+            last = outcome(again)
+            if last["error"] == wanted:
+                break
+            time.sleep(0.1)
+        result[name] = last
+        write("/run/cable", "plug")
     device.close()
     return result
 
@@ -365,4 +421,6 @@ def jsonl_full():
 
 
 if __name__ == "__main__":
-    print(json.dumps(globals()[sys.argv[1]](*sys.argv[2:])))
+    given = [word for word in sys.argv[2:] if "=" not in word]
+    named = dict(word.split("=", 1) for word in sys.argv[2:] if "=" in word)
+    print(json.dumps(globals()[sys.argv[1]](*given, **named)))

@@ -23,8 +23,9 @@ printf '#!/bin/sh\nexec /usr/bin/python3 -m thermocald "$@"\n' >/opt/thermocald/
 chmod 755 /opt/thermocald/bin/thermocald
 chmod -R a+rX /opt/thermocald /etc/thermocald
 cp "$folder"/thermocald.service /etc/systemd/system/
-# an emulated machine is slow, a test impatient: only the times are the laboratory's
+# an emulated machine is slow, a test impatient: only the times are the laboratory's, and that a
+# crash says where it was
 mkdir -p /etc/systemd/system/thermocald.service.d
-printf '[Service]\nTimeoutStartSec=240\nWatchdogSec=20\nTimeoutAbortSec=5\nRestartSec=1\n' \
+printf '[Service]\nEnvironment=PYTHONFAULTHANDLER=1\nTimeoutStartSec=240\nWatchdogSec=20\nTimeoutAbortSec=5\nRestartSec=1\n' \
     >/etc/systemd/system/thermocald.service.d/times.conf
 systemctl daemon-reload

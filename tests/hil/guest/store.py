@@ -34,7 +34,7 @@ def plain(value):
 def main():
     from thermocald.store.database import Store
 
-    path = Path(sys.argv[1]) if len(sys.argv) > 1 else HOME / "thermocald.db"
+    path = Path(sys.argv[1]) if len(sys.argv) > 1 else HOME / "store/thermocald.db"
     found = {"series": {}, "events": []}
     with Store.open(path) as store:
         store.check()

@@ -1,0 +1,62 @@
+"""What a disk really holds at an instant: its writes replayed as far as they had been flushed.
+
+dm-log-writes logs a write when the flush after it is done, so that everything before a mark is what
+a disk may hold at the worst whose power goes at that instant.
+Source: Linux, Documentation/admin-guide/device-mapper/log-writes.rst, drivers/md/dm-log-writes.c.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+__all__ = ["entries", "replay", "wait_for_mark"]
+
+MAGIC = 0x6A736677736872
+SUPER, ENTRY = struct.Struct("<QQQI"), struct.Struct("<QQQQ")
+DISCARD, MARK = 4, 8
+
+
+def entries(log: Path) -> Iterator[tuple[int, bytes, str]]:
+    """(offset in bytes, data, mark) of each entry, as many as the log's head counts."""
+    with log.open("rb") as file:
+        magic, version, count, size = SUPER.unpack(file.read(SUPER.size))
+        if (magic, version) != (MAGIC, 1):
+            return  # nothing has been written yet
+        at = size
+        for _ in range(count):
+            file.seek(at)
+            sector, sectors, flags, length = ENTRY.unpack(file.read(ENTRY.size))
+            mark = file.read(length).decode() if flags & MARK else ""
+            at += size
+            data = b""
+            if sectors and not flags & DISCARD:
+                file.seek(at)
+                data = file.read(sectors * size)
+                at += sectors * size
+            yield sector * size, data, mark
+
+
+def wait_for_mark(log: Path, mark: str, timeout_s: float = 30.0) -> None:
+    """Until a mark stands in the log; the kernel writes it a little later."""
+    deadline = time.monotonic() + timeout_s
+    while not any(found == mark for _, _, found in entries(log)):
+        if time.monotonic() > deadline:
+            raise RuntimeError(f"{log}: no mark {mark!r} in {timeout_s:g} s")
+        time.sleep(0.2)
+
+
+def replay(log: Path, disk: Path, mark: str) -> int:
+    """Apply the writes before a mark to an image of the disk before them; how many there were."""
+    with disk.open("r+b") as file:
+        for number, (offset, data, found) in enumerate(entries(log)):
+            if found == mark:
+                return number
+            file.seek(offset)
+            file.write(data)
+    raise RuntimeError(f"{log}: there is no mark {mark!r}")

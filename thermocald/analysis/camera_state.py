@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.undistortion import ideal_points
+from thermocald.analysis.undistortion import undistorted_points
 from thermocald.photogrammetry.camera_model import (
     IOP_NAMES,
     CameraModel,
     InteriorOrientation,
-    image_to_px,
     partials,
     project,
 )
@@ -79,10 +78,7 @@ class CameraState:
         image centre.
         """
         target = to or InteriorOrientation(self.interior.c)
-        p = ideal_points(self.sensor, self.values, image_points)
-        p *= target.c
-        p += np.array([target.x0, target.y0])
-        return image_to_px(self.sensor, p)
+        return undistorted_points(self.sensor, self.values, image_points, target)
 
     def as_seen_by(self, image_points: ArrayLike, other: InteriorOrientation) -> Array:
         """Image points (n, 2) px as this camera would have seen them with another IOP."""

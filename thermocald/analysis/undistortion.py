@@ -12,16 +12,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.camera_model import image_to_mm, rays
+from thermocald.photogrammetry.camera_model import rays
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import ArrayLike, NDArray
 
-    from thermocald.photogrammetry.camera_model import Sensor
+    from thermocald.photogrammetry.camera_model import InteriorOrientation, Sensor
 
     Array = NDArray[np.float64]
 
-__all__ = ["ideal_points"]
+__all__ = ["ideal_points", "undistorted_points"]
 
 _BLOCK = 8192
 _DEGREE = 6
@@ -33,18 +35,41 @@ def ideal_points(sensor: Sensor, iop: ArrayLike, image_points: ArrayLike) -> Arr
 
     Raises GeometryError for points beyond the radius at which the distortion folds back.
     """
-    i = np.asarray(iop, dtype=float)
     points = np.asarray(image_points, dtype=float)
-    inverse = _inverse_radial(sensor, i)
     out = np.empty_like(points)
+    for part, x, y in _blocks(sensor, np.asarray(iop, dtype=float), points):
+        out[part, 0], out[part, 1] = x, y
+    return out
+
+
+def undistorted_points(
+    sensor: Sensor, iop: ArrayLike, image_points: ArrayLike, target: InteriorOrientation
+) -> Array:
+    """Image points (n, 2) px → as a camera without distortion saw them, with c, x0, y0 of target.
+
+    Raises GeometryError as `ideal_points`.
+    """
+    points = np.asarray(image_points, dtype=float)
+    (cx, cy), p = sensor.centre, sensor.pixel_pitch
+    cx, cy, scale = cx + target.x0 / p, cy - target.y0 / p, target.c / p
+    out = np.empty_like(points)
+    for part, x, y in _blocks(sensor, np.asarray(iop, dtype=float), points):
+        x *= scale
+        y *= -scale
+        out[part, 0], out[part, 1] = x + cx, y + cy
+    return out
+
+
+def _blocks(sensor: Sensor, i: Array, points: Array) -> Iterator[tuple[slice, Array, Array]]:
+    """Blocks of points, and their x̄/c and ȳ/c."""
+    inverse = _inverse_radial(sensor, i)
     for first in range(0, len(points), _BLOCK):
         part = slice(first, first + _BLOCK)
         found = None if inverse is None else _newton(sensor, i, points[part], inverse)
         if found is None:
             r = rays(sensor, i, points[part])
-            found = r[:, :2] / -r[:, 2:]
-        out[part] = found
-    return out
+            found = r[:, 0] / -r[:, 2], r[:, 1] / -r[:, 2]
+        yield part, *found
 
 
 def _inverse_radial(sensor: Sensor, i: Array) -> Array | None:
@@ -62,10 +87,15 @@ def _inverse_radial(sensor: Sensor, i: Array) -> Array | None:
     return scaled[::-1]
 
 
-def _newton(sensor: Sensor, i: Array, points: Array, inverse: Array) -> Array | None:
+def _newton(
+    sensor: Sensor, i: Array, points: Array, inverse: Array
+) -> tuple[Array, Array] | None:
     c, x0, y0, A1, A2, A3, B1, B2, C1, C2 = (float(v) for v in i)
-    mm = image_to_mm(sensor, points)
-    xm, ym = mm[:, 0] - x0, mm[:, 1] - y0
+    (cx, cy), p = sensor.centre, sensor.pixel_pitch
+    # contiguous, and about the principal point
+    xm, ym = points[:, 0] - (cx + x0 / p), (cy - y0 / p) - points[:, 1]
+    xm *= p
+    ym *= p
     r2 = xm * xm + ym * ym
     turn = np.zeros_like(r2)
     for a in inverse:
@@ -105,4 +135,6 @@ def _newton(sensor: Sensor, i: Array, points: Array, inverse: Array) -> Array | 
                 break
     if not size < _STEP_PX * sensor.pixel_pitch:
         return None
-    return np.stack([x, y], axis=1) / c
+    x /= c
+    y /= c
+    return x, y

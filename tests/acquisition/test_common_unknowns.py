@@ -59,7 +59,7 @@ def run(scene, epochs: int, settings=None, **options):
 @pytest.mark.parametrize("exterior", ["series", "per_epoch"])
 def test_after_the_last_epoch_it_is_the_adjustment_of_the_whole_series(scene, exterior):
     sensor, field, _ = scene
-    results, alone, _, seen = run(scene, 60, still=exterior == "series", offsets=True)
+    results, alone, _, seen = run(scene, 40, still=exterior == "series", offsets=True)
     start = alone[-1]
     settings = SeriesSettings(exterior=exterior, target_noise=False, snooping_alpha=0.001)
     whole = adjust_series(
@@ -77,8 +77,8 @@ def test_after_the_last_epoch_it_is_the_adjustment_of_the_whole_series(scene, ex
 
 
 def test_one_orientation_makes_the_principal_point_ten_times_as_sure_and_truly_so(scene):
-    results, alone, truth, _ = run(scene, 60, still=True, offsets=True)
-    late = slice(30, None)
+    results, alone, truth, _ = run(scene, 40, still=True, offsets=True)
+    late = slice(20, None)
     x0 = np.array([r.values[1] for r in results])[late] - truth[late, 1]
     x0_alone = np.array([r.values[1] for r in alone])[late] - truth[late, 1]
     assert np.std(x0) < 0.25 * np.std(x0_alone)
@@ -92,8 +92,8 @@ def test_one_orientation_makes_the_principal_point_ten_times_as_sure_and_truly_s
 
 
 def test_offsets_take_the_jumps_out_that_hidden_targets_make(scene):
-    with_offsets, alone, truth, _ = run(scene, 60, still=False, offsets=True)
-    late = slice(30, None)
+    with_offsets, alone, truth, _ = run(scene, 40, still=False, offsets=True)
+    late = slice(20, None)
 
     def scatter(results) -> float:
         c = np.array([r.values[0] for r in results])[late] - truth[late, 0]

@@ -147,3 +147,33 @@ def test_the_timers_command_archives_what_has_ended_and_deletes_old_frames(
     assert "one-M1" not in done.stderr
     assert not old.exists()
     assert daemon.events().count("frames_deleted") == 2
+
+
+@pytest.mark.parametrize(("keep", "kept"), [
+    ({"keep": "every_n", "every_n": 5}, [5, 10]), ({"keep": "events"}, list(range(1, 13))),
+    ({"keep": "none"}, []),
+])  # fmt: skip
+def test_the_frames_that_are_wanted_are_kept(daemon, recording, replayed, keep, kept):
+    """Pictures of nothing: every epoch is an event."""
+    import shutil
+
+    import cv2
+    import numpy as np
+
+    folder = daemon.folder / "grey"
+    (folder / "frames").mkdir(parents=True)
+    for name in ("recording.yaml", "testfield.csv"):
+        shutil.copy(recording / name, folder / name)
+    grey = cv2.imencode(".jpg", np.full((64, 64), 128, np.uint8))[1].tobytes()
+    rows = ["epoch,frame_time,temperature_time,temperature,frame"]
+    for k in range(1, 13):
+        (folder / "frames" / f"{k}.jpg").write_bytes(grey)
+        rows.append(f"{k},{1.7e9 + 10 * k},{1.7e9 + 10 * k},25.0,frames/{k}.jpg")
+    (folder / "epochs.csv").write_text("\n".join(rows) + "\n")
+    sections = replayed(folder, period_s=0.05, loop=False)
+    limits = {"folder": str(daemon.folder / "kept"), "min_free_gb": 0.0, **keep}
+    daemon.configure(**sections, frames=limits)
+    daemon.start("--epochs", "12")
+    assert daemon.wait() == 0
+    names = sorted(p.name for p in (daemon.folder / "kept").rglob("*.jpg"))
+    assert names == [f"{k:07d}.jpg" for k in kept]

@@ -61,6 +61,8 @@ def test_the_template_is_the_plain_unit_with_a_name():
     plain = (UNITS / "thermocald.service").read_text().splitlines()[1:]
     template = (UNITS / "thermocald@.service").read_text().splitlines()[1:]
     for a, b in zip(plain, template, strict=True):
+        # not below /run/thermocald, which goes when the plain unit ends
+        b = b.replace("RuntimeDirectory=thermocald-%i", "RuntimeDirectory=thermocald")
         assert b.replace("/%i.yaml", "/config.yaml").replace(" (%i)", "").replace("/%i", "") == a
 
 

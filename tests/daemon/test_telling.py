@@ -193,3 +193,16 @@ def test_status_says_how_it_is_in_json_and_fails_where_nothing_runs(daemon, devi
     killed = status()
     assert killed.returncode == 1
     assert "was killed" in killed.stderr
+
+
+def test_the_daemon_of_a_store_is_found_also_as_one_of_several(tmp_path, monkeypatch):
+    from thermocald.daemon import live_state
+
+    monkeypatch.setattr(live_state, "_RUN", tmp_path / "run")
+    for name in ("thermocald", "thermocald-roof", "other"):
+        folder = tmp_path / "run" / name
+        store = {"store": {"path": str(tmp_path / f"{name}.db")}}
+        live_state.LiveState(folder).write_status(store)
+    for name in ("thermocald", "thermocald-roof"):
+        assert live_state.find_state(tmp_path / f"{name}.db") == tmp_path / "run" / name
+    assert live_state.find_state(tmp_path / "other.db") == tmp_path / "other.db.live"

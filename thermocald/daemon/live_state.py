@@ -30,6 +30,7 @@ __all__ = ["LiveState", "find_state", "plain", "read_state"]
 log = logging.getLogger(__name__)
 
 FORMAT = "thermocald-status/1"
+_RUN = Path("/run")
 _PREVIEW_PX = 1280
 _PREVIEW_QUALITY = 80
 
@@ -148,12 +149,9 @@ def find_state(store: Path) -> Path:
     if (beside / "status.json").exists():
         return beside
     wanted = str(store.absolute())
-    for base in (Path("/run/thermocald"), Path("/run")):
-        for found in sorted(base.glob("thermocald*/status.json")) + sorted(
-            base.glob("status.json")
-        ):
-            if read_state(found.parent).get("store", {}).get("path") == wanted:
-                return found.parent
+    for found in sorted(_RUN.glob("thermocald*/status.json")):  # thermocald-NAME: of the template
+        if read_state(found.parent).get("store", {}).get("path") == wanted:
+            return found.parent
     return beside
 
 

@@ -227,6 +227,9 @@ class Service:
             else:
                 text += f", {last['status']}"
             parts.append(text)
+        if not parts:
+            for name, values in self._station.last_readings.items():
+                parts.append(f"{name}: " + ", ".join(f"{v:.1f} °C" for v in values.values()))
         if self._guard.away:
             parts.append(f"store: {self._guard.away}")
         return "; ".join(parts)[:500]

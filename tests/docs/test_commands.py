@@ -100,7 +100,8 @@ ENVIRONMENT = {
     "PYTHONPATH": str(ROOT),
     "OPENBLAS_NUM_THREADS": "1",
     "COLUMNS": "120",
-    "FORCE_COLOR": "1",  # `top` draws where it believes in a terminal
+    "FORCE_COLOR": "1",  # `top` draws where it believes in a terminal,
+    "TERM": "xterm",  # and one that can move its cursor
 }
 PATIENCE_S = 240.0
 
@@ -117,6 +118,7 @@ class Page:
     def __init__(self, page: str, shelf: Path, folder: Path) -> None:
         self.page, self.shelf, self.folder = page, shelf, folder
         self.staying: list[tuple[str, subprocess.Popen[str]]] = []
+        self.started = 0
 
     def run(self, block: Block) -> None:
         if block.language == "python":
@@ -145,8 +147,9 @@ class Page:
             self.end(command)
 
     def start(self, command: str, given: str = "") -> subprocess.Popen[str]:
+        self.started += 1
         (self.folder / "given").write_text(given)
-        with (self.folder / "given").open() as stdin, (self.folder / "output").open("w") as output:
+        with (self.folder / "given").open() as stdin, self.said.open("w") as output:
             return subprocess.Popen(
                 ["bash", "-euo", "pipefail", "-c", command],
                 cwd=self.folder,
@@ -158,8 +161,13 @@ class Page:
                 start_new_session=True,
             )
 
+    @property
+    def said(self) -> Path:
+        """Where the last command's output goes."""
+        return self.folder / f"output-{self.started}"
+
     def output(self) -> str:
-        return (self.folder / "output").read_text(errors="replace")
+        return self.said.read_text(errors="replace")
 
     def finish(self, command: str, process: subprocess.Popen[str]) -> None:
         try:

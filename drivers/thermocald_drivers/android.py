@@ -124,7 +124,7 @@ class AndroidCamera(Camera):
         self.delete, self.refuse_unlocked = bool(delete), bool(refuse_unlocked)
         self.minimum_free_mb = support.number("minimum_free_mb", minimum_free_mb, 0, 1e6, "MB")
         self._first: dict[str, Any] | None = None
-        self._offset, self._zone, self._offset_sd = 0.0, "", 0.0
+        self._offset, self._zone, self._offset_half = 0.0, "", 0.0
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[dict[str, Any]]:  # noqa: ARG003
@@ -138,7 +138,7 @@ class AndroidCamera(Camera):
         self.phone.connect()
         self._wake()
         self._require_space()
-        self._offset, self._zone, self._offset_sd = self.phone.clock_offset()
+        self._offset, self._zone, self._offset_half = self.phone.clock_offset()
         self.phone.shell(OPEN_APP)
 
     def close(self) -> None:
@@ -172,6 +172,7 @@ class AndroidCamera(Camera):
         monotonic, utc = support.on_clock(self.clock, middle - time.time() + time.monotonic())
         metadata = {**tags, "file": path, "locked": locked, "locked_why": why, "time_from": source}
         metadata["phone_clock_offset_s"] = self._offset
+        metadata["phone_clock_uncertainty_s"] = self._offset_half
         return Frame(
             image=image,
             encoded=jpeg,

@@ -6,6 +6,7 @@ Uses adbutils, which speaks the adb server's protocol (127.0.0.1:5037); the serv
 
 from __future__ import annotations
 
+import math
 import socket
 import struct
 import time
@@ -33,6 +34,8 @@ DENIED = (
 OFFLINE = (
     "offline: re-plug the cable, or `adb reconnect offline`; an unpowered hub is a common cause"
 )
+
+_CLOCK_S = 0.002
 
 
 @dataclass(frozen=True)
@@ -125,14 +128,21 @@ class AdbPhone:
         device = self._connected()
         return bytes(self._call(lambda: device.sync.read_bytes(path)))
 
-    def clock_offset(self, tries: int = 5) -> tuple[float, str, float]:
+    def clock_offset(self, tries: int = 12) -> tuple[float, str, float]:
         """(phone minus this machine in s, the phone's time zone as +hhmm, uncertainty in s).
 
-        The shortest of some round trips: its middle is off by less than half of it.
+        Each round trip bounds the offset by its two ends; the middle of what fits all of them, as
+        soon as that is within 2 ms. A clock that is set meanwhile fits nothing: the shortest then.
         """
-        found = [self._call(self._ask_clock) for _ in range(tries)]
-        offset, zone, half = min(found, key=lambda one: one[2])
-        return offset, zone, half
+        low, high = -math.inf, math.inf
+        found: list[tuple[float, str, float]] = []
+        while len(found) < tries and high - low > 2 * _CLOCK_S:
+            offset, zone, half = self._call(self._ask_clock)
+            found.append((offset, zone, half))
+            low, high = max(low, offset - half), min(high, offset + half)
+        if low > high:
+            return min(found, key=lambda one: one[2])
+        return (low + high) / 2.0, found[-1][1], (high - low) / 2.0
 
     def _ask_clock(self) -> tuple[float, str, float]:
         # the line is opened first: adbutils sleeps 10 ms while opening and closing one, on one side

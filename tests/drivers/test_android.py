@@ -9,6 +9,7 @@ import time
 
 import numpy as np
 import pytest
+from thermocald_drivers.android_phone import AdbPhone
 
 from tests.drivers.fakes.adb_server import AdbServer, FakePhone, photograph
 from thermocald.errors import (
@@ -118,6 +119,27 @@ def test_the_time_is_exifs_with_the_phones_clock_compared(server, phone, offset)
     assert frame.metadata["time_from"] == "exif"
     assert frame.metadata["phone_clock_offset_s"] == pytest.approx(offset, abs=0.003)
     assert frame.utc == pytest.approx(exposed[0] + 1 / 120, abs=0.005)
+
+
+@pytest.mark.parametrize(
+    ("trips", "offset", "half"),
+    [
+        # (s, half of the round trip s): what fits all is narrower than the shortest
+        ([(0.020, 0.025), (-0.015, 0.018), (0.004, 0.006), (-0.001, 0.0045)], 0.0005, 0.0025),
+        ([(0.0, 0.0015)], 0.0, 0.0015),  # close enough at once
+        ([(0.0, 0.02), (3600.0, 0.01)], 3600.0, 0.01),  # set meanwhile: the shortest
+    ],
+)
+def test_the_phones_clock_lies_where_all_round_trips_overlap(trips, offset, half):
+    one = AdbPhone(SERIAL, "127.0.0.1", 1, 1.0, False)
+    left = list(trips)
+
+    def ask():
+        middle, half_trip = left.pop(0) if len(left) > 1 else left[0]
+        return middle, "+0000", half_trip
+
+    one._ask_clock = ask
+    assert one.clock_offset() == (pytest.approx(offset), "+0000", pytest.approx(half))
 
 
 def test_without_fractions_the_trigger_within_that_second(server, phone):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import socket
@@ -75,9 +76,9 @@ def video(machine):
 
 @pytest.fixture(scope="session")
 def i2c_bus(machine):
-    """The number of an SMBus with two LM75 (0x48, 0x49), an MCP9808 (0x18), a BME280 (0x76)."""
+    """The number of an SMBus: LM75 at 0x48, 0x49, MCP9808 0x18, BME280 0x76, TMP117 0x4b."""
     machine.run(
-        "modprobe -a i2c-dev lm75 bmp280-i2c; modprobe i2c-stub chip_addr=0x48,0x49,0x18,0x76"
+        "modprobe -a i2c-dev lm75 bmp280-i2c; modprobe i2c-stub chip_addr=0x48,0x49,0x18,0x76,0x4b"
     )
     return int(
         machine.wait(
@@ -118,15 +119,23 @@ class Instrument:
             self._socket = None
 
 
-@pytest.fixture
-def instrument(machine):
+@contextlib.contextmanager
+def plugged_instrument(machine):
     """The instrument, plugged in, and `port`: its lasting name in the guest."""
-    machine.run("modprobe xhci-pci; modprobe ftdi_sio")
+    machine.run("modprobe -a xhci-pci ftdi_sio")
     one = Instrument(machine.serial)
     one.plug()
-    one.port = machine.wait("ls /dev/serial/by-id/*", 60).split()[0]
-    yield one
-    one.pull()
+    try:
+        one.port = machine.wait("ls /dev/serial/by-id/*", 60).split()[0]
+        yield one
+    finally:
+        one.pull()
+
+
+@pytest.fixture
+def instrument(machine):
+    with plugged_instrument(machine) as one:
+        yield one
 
 
 @pytest.fixture

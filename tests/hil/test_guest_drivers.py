@@ -114,6 +114,15 @@ def test_what_the_kernel_reads(machine, i2c_bus, report):
     report(f"thermal_zone (ACPI firmware): read to value {milliseconds(took)}")
 
 
+def test_chips_that_convert_when_asked(machine, i2c_bus, report):
+    result = check(machine, "registers", i2c_bus)
+    for name, celsius, fastest in (("bme280", 25.08, 0.0), ("tmp117", 25.0625, 0.1245)):
+        for values in result[name]["values"]:
+            assert values == {"temperature": pytest.approx(celsius, abs=0.005)}
+        assert min(result[name]["took_s"]) > fastest
+        report(f"{name}: read to value {milliseconds(result[name]['took_s'])}")
+
+
 def test_serial(machine, instrument, report):
     instrument.celsius = -12.375
     result = check(machine, "serial_line", instrument.port)
@@ -199,8 +208,9 @@ def test_mqtt_with_a_real_broker(machine, report):
     report(f"mqtt (mosquitto): result to acknowledgement {milliseconds(result['took_s'][1:])}")
 
 
-def test_json_lines_on_a_full_disk(machine):
+def test_json_lines_on_a_full_disk(machine, report):
     result = check(machine, "jsonl_full")
     assert "disk is full" in result["last"]["text"]
     assert result["whole"] > 100
     assert result["consecutive"]
+    report(f"jsonl: result to written line {milliseconds(result['took_s'])}")

@@ -57,14 +57,18 @@ def test_a_heating_series(phone, subject, report):
             assert frame.metadata["locked"] is True
             assert frame.metadata["time_from"] == "exif"
             errors.append(frame.utc - (phone.exposures()[epoch + 1] + 0.005))
-    assert max(abs(error) for error in errors) < 0.005  # exposure 0.01 s: its middle
+    # exposure 0.01 s: its middle. On a busy machine the driver cannot compare the clocks to 5 ms,
+    # and says so.
+    uncertainty = frame.metadata["phone_clock_uncertainty_s"]
+    assert max(abs(error) for error in errors) < max(0.005, uncertainty + 0.001)
     assert list(phone.camera_folder.iterdir()) == []
     activities = (phone.state / "activities").read_text().splitlines()
     assert sum("STILL_IMAGE_CAMERA" in line for line in activities) == 1
     report(
         f"android (adbd 34, {WIDTH}x{HEIGHT}): trigger to frame in memory median "
         f"{statistics.median(took):.2f} s (shutter lag 0.12 s, file written for 0.3 s), "
-        f"times off by at most {1e3 * max(map(abs, errors)):.1f} ms; read to value median "
+        f"times off by at most {1e3 * max(map(abs, errors)):.1f} ms (clocks compared to "
+        f"{1e3 * uncertainty:.1f} ms); read to value median "
         f"{1e3 * statistics.median(read):.0f} ms"
     )
 

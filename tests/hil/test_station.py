@@ -16,6 +16,7 @@ import time
 import numpy as np
 import pytest
 
+from tests.hil.conftest import plugged_instrument
 from tests.hil.frames import subject
 from tests.hil.power import replay, wait_for_mark
 from tests.hil.station import CAMERA, PERIOD_S, SIZE, STORE, VIVID, prepare
@@ -116,16 +117,10 @@ class Station:
 
 @pytest.fixture(scope="module")
 def station(machine, video, i2c_bus):
-    from tests.hil.conftest import Instrument
-
-    machine.run("modprobe xhci-pci; modprobe ftdi_sio")
-    instrument = Instrument(machine.serial)
-    instrument.plug()
-    instrument.port = machine.wait("ls /dev/serial/by-id/*", 60).split()[0]
-    one = Station(machine, instrument)
-    one.install(i2c_bus)
-    yield one
-    instrument.pull()
+    with plugged_instrument(machine) as instrument:
+        one = Station(machine, instrument)
+        one.install(i2c_bus)
+        yield one
 
 
 def river(status):

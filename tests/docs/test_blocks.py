@@ -13,10 +13,20 @@ import pytest
 import typer
 import yaml
 
-from tests.docs.blocks import LANGUAGES, PAGES, ROOT, Block, all_blocks, inline_commands, name
+from tests.docs.blocks import (
+    LANGUAGES,
+    PAGES,
+    ROOT,
+    Block,
+    all_blocks,
+    blocks,
+    inline_commands,
+    name,
+)
 from thermocald.cli import application
 from thermocald.config import Config, parse_config
 from thermocald.hal import option_names
+from thermocald.store.recording import read_recording
 
 COMMAND = typer.main.get_command(application())
 STANZAS = set(Config.model_fields)
@@ -84,6 +94,22 @@ def test_yaml_is_valid(block, tmp_path):
         if "testfield" in camera:
             (tmp_path / camera["testfield"]).touch()
     parse_config(document, tmp_path / "config.yaml", option_names)
+
+
+@pytest.mark.parametrize("measured", [False, True])
+def test_the_recording_of_the_how_to_is_read(tmp_path, measured):
+    page = ROOT / "docs/how-to/make-a-recording.md"
+    for block in blocks(page):
+        name, _, content = block.text.partition("\n")
+        if name.startswith("# ") and (measured or name != "# observations.csv"):
+            (tmp_path / name.removeprefix("# ")).write_text(content)
+    (tmp_path / "frames").mkdir()
+    for i in (1, 2, 3):
+        (tmp_path / "frames" / f"000{i}.jpg").touch()
+    recording = read_recording(tmp_path)
+    assert [e.frame.name for e in recording.epochs] == ["0001.jpg", "0002.jpg", "0003.jpg"]
+    assert list(recording.channels) == ["housing"]
+    assert recording.has_observations == measured
 
 
 @pytest.mark.parametrize("block", all_blocks("json") + all_blocks("toml"), ids=identity)

@@ -70,6 +70,48 @@ def test_two_series_are_better_than_one(fitted):
     assert len(both.model.fitted_on) == 2
 
 
+@pytest.mark.slow
+def test_an_event_and_a_phase_belong_to_a_series():
+    """A slip at another time in each series, none in the third; a fan at another phase."""
+    heights = {"c": 1e-4, "x0": 6e-4, "y0": 2e-4}
+    fan = {"P": 143.0, "c": 5e-5, "x0": 4e-4, "y0": -2e-4}
+    instants, phases = (405.0, 805.0, None), (0.9, -2.0, 2.5)
+    series = []
+    for k, (time, phase) in enumerate(zip(instants, phases, strict=True)):
+        listed = [ModelEffect("cyclic_interference", {**fan, "phase": phase})]
+        if time is not None:
+            listed.append(ModelEffect("slip", {"time": time, **heights}))
+        series.append(reduced(simulated(k, f"M{k + 1}", power=9.0 - k, listed=listed)))
+    start = [
+        ModelEffect("cyclic_interference", {**dict.fromkeys(fan, 0.0), "P": 60.0, "phase": 0.0}),
+        ModelEffect("slip", {**dict.fromkeys(heights, 0.0), "time": 100.0}),
+    ]
+    f = fit_thermal_model(series, start)
+    cyclic, slip = f.model.effects
+    assert abs(cyclic.values["P"] - 143.0) < 4 * cyclic.sds["P"]
+    assert abs(slip.values["time"] - 405.0) <= 5.0
+    assert f.sd("slip.x0@1") < 1e-5
+    assert "slip.x0@2" not in f.names
+    assert abs(f.sigma0 - 1.0) < 0.03
+    for s, fitted in zip(series, f.series, strict=True):
+        error = predicted_error(f.model, s, fitted.thermometer_sd)
+        assert error.rms_px <= 1.1 * error.floor_px
+        assert 0.93 <= error.coverage <= 0.97
+
+
+def test_what_readings_leave_open_is_no_signal():
+    """A lamp switched between two readings: the gradient's coefficients are right nevertheless."""
+    gradient = {"c": 2e-3, "x0": 8e-3, "y0": -5e-3}
+    s = simulated(5, listed=[ModelEffect("thermal_gradient", gradient)], power=12.0)
+    f = fit_thermal_model(
+        [reduced(s)], [ModelEffect("thermal_gradient", dict.fromkeys(gradient, 0.0))]
+    )
+    (found,) = f.model.effects
+    assert abs(f.sigma0 - 1.0) < 0.03
+    for key, value in gradient.items():
+        assert abs(found.values[key] - value) < 4 * found.sds[key], key
+
+
 def test_base_model_of_a_driftless_effect(fitted):
     model = fitted[0].model
     assert model.sensor.width == 3280

@@ -8,6 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import yaml
 from typer.testing import CliRunner
 
 from thermocald.cli import application
@@ -44,6 +45,33 @@ def simulated(seed=1, effect=None, epochs=90, interval=20.0, series="M1", kind="
     return Simulation(replace(model, camera=name), device, field, programme, seed)
 
 
+def other_sensor(source, out, width, height, pitch, image_point):
+    """The recording as a camera of another sensor would have made it."""
+    out.mkdir()
+    for name in ("epochs.csv", "testfield.csv"):
+        (out / name).write_text((source / name).read_text())
+    head = yaml.safe_load((source / "recording.yaml").read_text())
+    head["camera"] |= {"width": width, "height": height, "pixel_pitch": pitch}
+    (out / "recording.yaml").write_text(yaml.safe_dump(head, sort_keys=False))
+    rows = (source / "observations.csv").read_text().splitlines()
+    changed = [rows[0]]
+    for row in rows[1:]:
+        epoch, target, *numbers = row.split(",")
+        numbers = image_point(*(float(n) for n in numbers))
+        changed.append(",".join([epoch, target, *(f"{n:.5f}" for n in numbers)]))
+    (out / "observations.csv").write_text("\n".join(changed) + "\n")
+
+
+def with_columns(source, out, order):
+    """The recording with its temperature columns in another order, or fewer."""
+    out.mkdir()
+    for name in ("epochs.csv", "testfield.csv", "observations.csv"):
+        (out / name).write_text((source / name).read_text())
+    head = yaml.safe_load((source / "recording.yaml").read_text())
+    head["temperatures"] = {name: head["temperatures"][name] for name in order}
+    (out / "recording.yaml").write_text(yaml.safe_dump(head, sort_keys=False))
+
+
 def run(*arguments):
     return CliRunner().invoke(application(), [str(a) for a in arguments])
 
@@ -54,6 +82,12 @@ def folder(tmp_path_factory):
     simulated(1).write(path / "M1")
     simulated(2, series="M2").write(path / "M2")
     simulated(3, name="other", epochs=30, interval=60.0).write(path / "other")
+    other_sensor(path / "M2", path / "binned", 1640, 1232, 0.00224,
+                 lambda x, y, sx, sy: ((x - 0.5) / 2, (y - 0.5) / 2, sx / 2, sy / 2))  # fmt: skip
+    other_sensor(path / "M2", path / "crop", 3000, 2000, 0.00112,
+                 lambda x, y, sx, sy: (x - 140, y - 232, sx, sy))  # fmt: skip
+    with_columns(path / "M2", path / "swapped", ("board_temperature", "temperature"))
+    with_columns(path / "M2", path / "board", ("board_temperature",))
     result = run("fit", path / "M1", "-o", path / "cam.yaml")
     assert result.exit_code == 0, result.exception
     return path
@@ -120,8 +154,12 @@ def test_an_effect_twice_is_refused(folder):
 # --- testing a model on another series ---------------------------------------------------------
 
 
-def test_a_model_is_tested_on_another_series(folder):
-    result = run("predict", "--model", folder / "cam.yaml", "--test", folder / "M2", "--json", "-")
+@pytest.mark.parametrize("series", ["M2", "binned", "swapped"])
+def test_a_model_is_tested_on_another_series(folder, series):
+    """Also where pixels were binned, or where another thermometer stands first."""
+    test = ("--test", folder / series, "--json", "-")
+    result = run("predict", "--model", folder / "cam.yaml", *test)
+    assert result.exit_code == 0, result.exception
     (found,) = json.loads(result.stdout)["series"]
     assert found["rms_px"] < 1.1 * found["floor_px"]
     assert 0.93 < found["coverage"] < 0.97
@@ -134,6 +172,8 @@ def test_a_model_is_tested_on_another_series(folder):
     ("arguments", "says"),
     [
         (("predict", "--test", "{other}"), "belongs to one camera"),
+        (("predict", "--test", "{crop}"), "a crop"),
+        (("predict", "--test", "{board}"), "has no temperature column 'temperature'"),
         (("predict", "--log", "{other}/epochs.csv"), "the images are of other"),
         (("correct", "{points}", "--log", "{other}/epochs.csv"), "the images are of other"),
         (("correct", "{points}", "--log", "{M1}/epochs.csv", "--size", "1920x1080"), "a crop"),
@@ -160,7 +200,9 @@ def test_wrong_use_is_refused(folder, tmp_path, arguments, says):
         "fahrenheit": f"time,air\n{begin:.1f},86\n{end:.1f},92\n",
         "hot": f"time,air\n{begin:.1f},160\n{end:.1f},170\n",
     }
-    places = {n: folder / n for n in ("M1", "other", "nothing")} | {"new": tmp_path / "new"}
+    places = {n: folder / n for n in ("M1", "other", "crop", "board", "nothing")} | {
+        "new": tmp_path / "new"
+    }
     for name, text in files.items():
         places[name] = tmp_path / f"{name}.csv"
         places[name].write_text(text)
@@ -174,6 +216,36 @@ def test_wrong_use_is_refused(folder, tmp_path, arguments, says):
 def test_two_cameras_are_no_series_of_one(folder, tmp_path):
     result = run("fit", folder / "M1", folder / "other", "-o", tmp_path / "no.yaml")
     assert "belongs to one camera" in str(result.exception)
+
+
+def test_two_references_are_no_series_of_one(folder, tmp_path):
+    result = run("fit", folder / "M1", folder / "swapped", "-o", tmp_path / "no.yaml")
+    assert "put the same one first" in str(result.exception)
+
+
+def test_two_resolutions_are_no_series_of_one(folder, tmp_path):
+    result = run("fit", folder / "M1", folder / "binned", "-o", tmp_path / "no.yaml")
+    assert "fit series of one resolution" in str(result.exception)
+
+
+def test_the_model_s_own_thermometer_is_taken_from_a_log(folder, tmp_path):
+    """Whichever column stands first; another one where it is named."""
+    rows = (folder / "M1" / "epochs.csv").read_text().splitlines()
+    cells = [row.split(",") for row in rows]
+    own, board = cells[0].index("temperature"), cells[0].index("board_temperature")
+    swapped = ["time,board_temperature,temperature"]
+    swapped += [f"{c[2]},{c[board]},{c[own]}" for c in cells[1:]]
+    (tmp_path / "log.csv").write_text("\n".join(swapped) + "\n")
+    (tmp_path / "p.csv").write_text(f"time,x,y\n{cells[40][2]},500,400\n")
+
+    def moved(*log):
+        run("correct", tmp_path / "p.csv", "--model", folder / "cam.yaml", "--out",
+            tmp_path / "o.csv", "--extrapolate", "--log", *log)  # fmt: skip
+        return np.genfromtxt(tmp_path / "o.csv", delimiter=",", names=True)["dx"]
+
+    first = moved(folder / "M1" / "epochs.csv")
+    assert moved(tmp_path / "log.csv") == pytest.approx(first, abs=1e-3)
+    assert abs(moved(tmp_path / "log.csv", "--column", "board_temperature") - first) > 0.1
 
 
 def test_binned_points_are_scaled(folder, tmp_path):

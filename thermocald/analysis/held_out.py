@@ -20,12 +20,13 @@ from thermocald.analysis.model_search import search_own
 from thermocald.analysis.model_state import FitState, own_of
 from thermocald.analysis.model_system import error_operators, jacobian
 from thermocald.analysis.thermal_model import targets_of
-from thermocald.errors import ConfigurationError
+from thermocald.errors import ConfigurationError, DataError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.analysis.model_series import ModelSeries
+    from thermocald.simulation.history import History
     from thermocald.simulation.model import ThermalModel
 
     Array = NDArray[np.float64]
@@ -52,7 +53,10 @@ class PredictedError:
 def predicted_error(
     model: ThermalModel, series: ModelSeries, thermometer_sd: float
 ) -> PredictedError:
-    """Predict a series; thermometer_sd K of a reading. ConfigurationError for another camera."""
+    """Predict a series; thermometer_sd K of a reading.
+
+    ConfigurationError for another camera, DataError without the model's reference thermometer.
+    """
     if series.sensor != model.sensor or series.camera != model.camera:
         raise ConfigurationError(
             f"the model is of camera {model.camera} ({model.sensor.width}×{model.sensor.height} "
@@ -62,7 +66,7 @@ def predicted_error(
     moving = targets_of(model.effects)
     if moving:
         series = series.displacing(moving)
-    series = replace(series, history=replace(series.history, T0=model.T0))
+    series = replace(series, history=_as_fitted(model, series))
     model, series = _oriented(model, series, thermometer_sd)
     prediction = model.predict(series.history, series.field)
     residuals = series.residuals(prediction)
@@ -82,6 +86,18 @@ def predicted_error(
         float(np.mean(inside)),
         rms * scale,
     )
+
+
+def _as_fitted(model: ThermalModel, series: ModelSeries) -> History:
+    """The series' history with the model's T₀ and reference, whichever column stands first."""
+    history = series.history
+    reference = next(iter(model.validity), history.reference)
+    if reference not in history.readings:
+        raise DataError(
+            f"{series.source}: has no temperature column {reference!r}, which the model was fitted "
+            f"on; there are: {', '.join(history.readings)}"
+        )
+    return replace(history, T0=model.T0, reference=reference)
 
 
 def _oriented(

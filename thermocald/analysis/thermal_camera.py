@@ -121,8 +121,12 @@ class ThermalCamera:
                 f"the images have {width}×{height} px, the model's camera {mine.width}×"
                 f"{mine.height} px: a crop, which cannot be converted; use whole images"
             )
+        if factor == 1.0:
+            return self
         sensor = Sensor(width, height, mine.pixel_pitch * factor)
-        return ThermalCamera(replace(self.model, sensor=sensor))
+        # a target is measured to the same share of the image
+        sigma = self.model.image_sigma / factor
+        return ThermalCamera(replace(self.model, sensor=sensor, image_sigma=sigma))
 
     @cached_property
     def parameters(self) -> tuple[str, ...]:

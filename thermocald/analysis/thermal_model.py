@@ -134,10 +134,22 @@ def _checked(series: Sequence[ModelSeries], listed: Sequence[ModelEffect]) -> li
         raise DataError("there is no series to fit a model to")
     first = series[0]
     for s in series:
-        if s.camera != first.camera or s.sensor != first.sensor:
+        if s.camera != first.camera:
             raise DataError(
                 f"series {s.name} is of camera {s.camera}, series {first.name} of {first.camera}: "
                 "a thermal model belongs to one camera"
+            )
+        if s.sensor != first.sensor:
+            raise DataError(
+                f"series {s.name} has {s.sensor.width}×{s.sensor.height} px of "
+                f"{s.sensor.pixel_pitch:g} mm, series {first.name} {first.sensor.width}×"
+                f"{first.sensor.height} px of {first.sensor.pixel_pitch:g} mm: fit series of one "
+                "resolution; a model is scaled to another when it is used"
+            )
+        if s.history.reference != first.history.reference:
+            raise DataError(
+                f"series {s.name}: the reference temperature is {s.history.reference!r}, in series "
+                f"{first.name} it is {first.history.reference!r}; put the same one first"
             )
     span = max(float(np.ptp(s.history.temperature())) for s in series)
     if span < 1.0:

@@ -58,15 +58,13 @@ def correct(
 
     Example: thermocald correct --model camera.thermal.yaml --log weather.csv points.csv
     """
-    from thermocald.analysis.correction import read_temperature_log
     from thermocald.analysis.thermal_camera import ThermalCamera
-    from thermocald.cli.predict import check_log, warnings_said
+    from thermocald.cli.predict import read_log, warnings_said
 
     thermal = ThermalCamera.load(model)
-    check_log(thermal, log)
+    table = read_log(thermal, log, column)
     if image_size is not None:
         thermal = thermal.for_images(*_size(image_size))
-    table = read_temperature_log(log, column)
     try:
         with points.open(encoding="utf-8-sig") as file:
             header = [n.strip() for n in file.readline().split(",")]

@@ -15,9 +15,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from thermocald.analysis.camera_state import CameraState
+    from thermocald.analysis.correction import TemperatureLog
     from thermocald.analysis.thermal_camera import Along, ThermalCamera
 
-__all__ = ["check_log", "register", "warnings_said"]
+__all__ = ["read_log", "register", "warnings_said"]
 
 
 @contextmanager
@@ -89,8 +90,9 @@ def predict(
             state = thermal.at(temperature, channels=others or None, extrapolate=extrapolate)
             document, lines = _state_document(thermal, state, distance)
         elif log is not None:
-            check_log(thermal, log)
-            document, lines = _along_document(thermal, _log(thermal, log, extrapolate))
+            table = read_log(thermal, log)
+            along = thermal.along(table.times, dict(table.channels), extrapolate=extrapolate)
+            document, lines = _along_document(thermal, along)
         elif test is not None:
             document, lines = _tested(thermal, test)
         else:
@@ -100,15 +102,6 @@ def predict(
         write_json(document, json)
     if json != "-":
         typer.echo("\n".join(lines))
-
-
-def check_log(thermal: ThermalCamera, log: Path) -> None:
-    """ConfigurationError where the log is a recording's, and the recording of another camera."""
-    from thermocald.store.head import read_head
-
-    if log.name == "epochs.csv" and (log.parent / "recording.yaml").is_file():
-        camera = read_head(log.parent).camera
-        thermal.for_images(camera.sensor.width, camera.sensor.height, camera.name)
 
 
 def _tested(thermal: ThermalCamera, path: Path) -> tuple[dict[str, Any], list[str]]:
@@ -132,7 +125,8 @@ def _tested(thermal: ThermalCamera, path: Path) -> tuple[dict[str, Any], list[st
         series = load_model_series(path, targets_of(thermal.model.effects), advance)
     for s in series:
         sd = float(np.median(known)) if known else thermometer_noise(s)
-        error = predicted_error(thermal.model, s, sd)
+        scaled = thermal.for_images(s.sensor.width, s.sensor.height, s.camera)
+        error = predicted_error(scaled.model, s, sd)
         found.append(asdict(error))
         lines.append(
             f"{s.source}: predicted to {error.rms_px:.4f} px (noise alone {error.floor_px:.4f}), "
@@ -146,15 +140,22 @@ def _tested(thermal: ThermalCamera, path: Path) -> tuple[dict[str, Any], list[st
     return document, lines
 
 
-def _log(thermal: ThermalCamera, path: Path, extrapolate: bool) -> Along:
-    """Along a log, in which the model's own reference is T where it has a column of that name."""
-    from thermocald.analysis.correction import read_temperature_log
+def read_log(thermal: ThermalCamera, path: Path, column: str | None = None) -> TemperatureLog:
+    """A temperature log; T is the named column, else the model's own reference, else the first.
 
-    table = read_temperature_log(path)
+    ConfigurationError where the log is of a recording of another camera.
+    """
+    from thermocald.analysis.correction import read_temperature_log
+    from thermocald.store.head import read_head
+
+    if path.name == "epochs.csv" and (path.parent / "recording.yaml").is_file():
+        camera = read_head(path.parent).camera
+        thermal.for_images(camera.sensor.width, camera.sensor.height, camera.name)
+    table = read_temperature_log(path, column)
     reference = next(iter(thermal.model.validity), None)
-    if reference in table.channels and reference != next(iter(table.channels)):
-        table = read_temperature_log(path, reference)
-    return thermal.along(table.times, dict(table.channels), extrapolate=extrapolate)
+    if column is None and reference in table.channels:
+        return read_temperature_log(path, reference)
+    return table
 
 
 def _channels(given: list[str]) -> dict[str, float]:

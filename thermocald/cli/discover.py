@@ -142,10 +142,10 @@ def _plan(
     json: str | None,
 ) -> None:
     from thermocald.cli.common import progress
-    from thermocald.discovery.plan import plan_power, simulated_inputs
+    from thermocald.discovery.plan import plan_power, set_ups
 
     with progress(None, "planning") as advance:
-        inputs = simulated_inputs(recording, model, preset, testfield, programme, seeds)
+        inputs = set_ups(recording, model, preset, testfield, programme, seeds)
         result = plan_power(inputs, strength, lambda: advance(1))
     if json is not None:
         write_json(result.as_json(), json)

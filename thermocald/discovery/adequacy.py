@@ -35,12 +35,14 @@ NEGLIGIBLE_PX = 0.004
 class Adequacy:
     """What a model leaves in one series.
 
-    scores (ORDERS, D): unit normal where nothing is left; directions (P, D): combinations of
+    scores (ORDERS, D): unit normal where nothing is left; amplitudes (ORDERS, P): of the courses
+    in px-scaled columns, which take the rest up; directions (P, D): combinations of
     px-scaled columns; excess: χ² beyond its expectation; significance: in standard deviations;
     misfit_px: RMS over image coordinates of the smooth rest.
     """
 
     scores: Array
+    amplitudes: Array
     directions: Array
     courses: Array
     excess: float
@@ -73,10 +75,12 @@ def examine(laboratory: Laboratory, fit: Fit, series: int) -> Adequacy:
     A, c, B = weighting.scan(courses[:, :, None], directions, (C, V))
     rest = c - B @ x
     scores = np.zeros(rest.shape)
+    amplitudes = np.zeros((ORDERS, len(directions)))
     for j in range(ORDERS):
         # whitened, so that directions that share the thermometer's error count once
         L = np.linalg.cholesky(A[j] + 1e-9 * np.eye(len(A[j])) * np.trace(A[j]) / len(A[j]))
         scores[j] = np.linalg.solve(L, rest[j])
+        amplitudes[j] = directions @ np.linalg.solve(L.T, scores[j])
     total = float(np.sum(scores**2))
     free = scores.size
     excess = max(total - free, 0.0)
@@ -84,6 +88,7 @@ def examine(laboratory: Laboratory, fit: Fit, series: int) -> Adequacy:
     sigma = _mean_sigma(evidence)
     return Adequacy(
         scores,
+        amplitudes,
         directions,
         courses,
         excess,

@@ -37,6 +37,9 @@ MAX_EFFECTS = 2
 BAND = 14.0
 # a model that leaves less than this share of what the base left has the cause
 _LEFT = 0.03
+# the same between a lag and a delay that are shorter than the interval of the readings
+_SHORT_BAND = 120.0
+_LAG_OR_DELAY = ("thermal_lag", "time_offset")
 # slow variances over those of white noise: beyond, what one series shows has to be seen in another
 _WANDERING = 3.0
 # a second effect beside an adequate one has to explain as much, in px RMS and as a share of the
@@ -171,12 +174,27 @@ def _searched(
     rivals: list[Solution] = []
     for s in sorted(seen, key=lambda s: s.score):
         different = sorted(s.names) != sorted(best.names)
-        if different and s.score < best.score + BAND and s.names not in [r.names for r in rivals]:
+        band = _SHORT_BAND if _too_short(laboratory, best, s) else BAND
+        if different and s.score < best.score + band and s.names not in [r.names for r in rivals]:
             rivals.append(s)
     return Examination(
         laboratory, base, best, tuple(ranking), tuple(rivals), base_adequacy, adequacy, adequate,
         tuple(blocks),
     )  # fmt: skip
+
+
+def _too_short(laboratory: Laboratory, best: Solution, other: Solution) -> bool:
+    """The two differ in a lag for a delay, shorter than the interval of the readings.
+
+    What happens between two readings tells them apart, and that nobody has seen.
+    """
+    mine = set(best.names) - set(other.names)
+    theirs = set(other.names) - set(best.names)
+    if {*mine, *theirs} != set(_LAG_OR_DELAY) or not mine or not theirs:
+        return False
+    step = min(float(np.median(np.diff(e.history.times))) for e in laboratory.series)
+    own = [v for t in best.terms if t.effect in _LAG_OR_DELAY for _, v in t.nonlinear]
+    return any(abs(float(v)) < step for v in own)
 
 
 def _unverified(series: Sequence[Evidence]) -> bool:

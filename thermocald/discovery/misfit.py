@@ -6,6 +6,7 @@ level and in noise; each with its significance against the noise of image and th
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,15 +20,39 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["resolve"]
+__all__ = ["Misfit", "resolve"]
 
 
-def resolve(discovery: Discovery, series: int = 0) -> dict[str, Any]:
-    """The base model's misfit in one series.
+@dataclass(frozen=True)
+class Misfit:
+    """A misfit resolved.
 
-    rows: (what, size in px RMS, significance in sigma); targets: those that stand out;
-    regions: {(row, column) of a 3 × 3 raster: px RMS}.
+    rows: (against what, size in px RMS, significance in sigma); targets: those that jumped;
+    regions {(row, column) of a 3 × 3 raster of the image: what a free camera leaves, in units of
+    the noise}.
     """
+
+    rows: tuple[tuple[str, float, float], ...]
+    targets: tuple[str, ...]
+    regions: dict[tuple[int, int], float]
+
+    def as_json(self) -> dict[str, Any]:
+        """As it stands in an effect's evidence."""
+        return {
+            "against": [
+                {"what": what, "rms_px": size, "significance_sigmas": sigmas}
+                for what, size, sigmas in self.rows
+            ],
+            "targets": list(self.targets),
+            "image_regions": [
+                {"row": i, "column": j, "noise_ratio": ratio}
+                for (i, j), ratio in self.regions.items()
+            ],
+        }
+
+
+def resolve(discovery: Discovery, series: int = 0) -> Misfit:
+    """The base model's misfit in one series."""
     x = discovery.examination
     e = x.laboratory.series[series]
     fit = x.base.fit
@@ -69,7 +94,8 @@ def resolve(discovery: Discovery, series: int = 0) -> dict[str, Any]:
     total = x.base_adequacy[series]
     rows.insert(0, ("all slow courses in all parameters", total.misfit_px, total.significance))
     rows.append(("noise level (sigma0)", *_noise(e.sigma0, e.n.astype(float), e.N.shape[1])))
-    return {"rows": rows, "targets": _targets(discovery, series), "regions": _regions(e, sigma)}
+    rows = [(what, float(size), float(sigmas)) for what, size, sigmas in rows]
+    return Misfit(tuple(rows), tuple(_targets(discovery, series)), _regions(e, sigma))
 
 
 def _noise(sigma0: Array, n: Array, columns: int) -> tuple[float, float]:

@@ -21,15 +21,19 @@ from thermocald.discovery.hypothesis import Laboratory, Term
 from thermocald.discovery.source import series_input
 from thermocald.errors import UsageError
 from thermocald.simulation import effects as catalogue
+from thermocald.simulation.history import History
+from thermocald.simulation.model import ModelEffect
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
+    from thermocald.simulation.observations import Simulation
+
     Array = NDArray[np.float64]
 
-__all__ = ["Plan", "plan_power", "simulated_inputs"]
+__all__ = ["Plan", "SetUp", "plan_power", "set_ups"]
 
 
 @dataclass(frozen=True)
@@ -81,14 +85,31 @@ class Plan:
         return out
 
 
-def simulated_inputs(
+@dataclass(frozen=True, eq=False)
+class SetUp:
+    """One recording without any effect but the model's, and the simulation that it came from."""
+
+    source: SeriesInput
+    simulation: Simulation | None = None
+
+    def following(self, term: Term) -> SeriesInput | None:
+        """The recording as it is when the camera follows a drive; None where nothing simulates."""
+        if self.simulation is None:
+            return None
+        model = self.simulation.model
+        effect = ModelEffect(term.effect, dict(term.nonlinear))
+        changed = replace(model, effects=(*model.effects, effect))
+        return _recorded(replace(self.simulation, model=changed))
+
+
+def set_ups(
     recording: Path | None,
     model: Path | None,
     preset: str | None,
     testfield: str | None,
     programme: Path | None,
     seeds: int,
-) -> list[SeriesInput]:
+) -> list[SetUp]:
     """Recordings of the set-up with no effect but the model's, one per seed.
 
     A recording may stand for the set-up: then its own epochs and noise are used, once.
@@ -96,7 +117,7 @@ def simulated_inputs(
     from thermocald.store.recording import read_recording
 
     if recording is not None:
-        return [series_input(read_recording(recording))]
+        return [SetUp(series_input(read_recording(recording)))]
     if preset is None and (model is None or programme is None):
         raise UsageError(
             "--plan needs a recording of the set-up, or --preset, or --model and --programme"
@@ -104,16 +125,22 @@ def simulated_inputs(
     out = []
     for seed in range(seeds):
         simulation = _simulation(model, preset, testfield, programme, seed)
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / f"plan-{seed}"
-            simulation.write(path)
-            out.append(series_input(read_recording(path)))
+        out.append(SetUp(_recorded(simulation), simulation))
     return out
+
+
+def _recorded(simulation: Simulation) -> SeriesInput:
+    from thermocald.store.recording import read_recording
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "plan"
+        simulation.write(path)
+        return series_input(read_recording(path))
 
 
 def _simulation(
     model: Path | None, preset: str | None, testfield: str | None, programme: Path | None, seed: int
-) -> Any:
+) -> Simulation:
     from thermocald.simulation.demonstration import load_field
     from thermocald.simulation.device import CameraDevice, default_heat
     from thermocald.simulation.model_file import read_model
@@ -137,20 +164,24 @@ def _simulation(
 
 
 def plan_power(
-    inputs: Sequence[SeriesInput], strength_px: float, advance: Callable[[], None]
+    inputs: Sequence[SetUp], strength_px: float, advance: Callable[[], None]
 ) -> Plan:
     """Put every effect into every simulated recording and look for it."""
     found: dict[str, dict[str, int]] = {}
     rng = np.random.default_rng(0)
-    for source in inputs:
-        evidence = gather(source)
+    for set_up in inputs:
+        evidence = gather(set_up.source)
         laboratory = Laboratory([evidence])
         done: set[str] = set()
         for candidate in candidates([evidence]):
             if candidate.effect in done:
                 continue
             done.add(candidate.effect)
-            said = _said(_with_effect(laboratory, candidate, strength_px, rng))
+            if candidate.is_drive:
+                changed = _with_drive(set_up, laboratory, candidate, strength_px)
+            else:
+                changed = _with_effect(laboratory, candidate, strength_px, rng)
+            said = _said(changed)
             row = found.setdefault(candidate.effect, {})
             row[said] = row.get(said, 0) + 1
             advance()
@@ -170,35 +201,61 @@ def _with_effect(
 ) -> Evidence:
     """The series with one effect in its normal equations, scaled to what the base leaves over."""
     e = laboratory.series[0]
-    base = laboratory.fit(())
-    parameter = catalogue.get(candidate.effect).nonlinear.get(candidate.name)
-    grid = candidate.grid
-    value = None
-    if len(grid):
-        value = float(grid[int(len(grid) * rng.uniform(0.4, 0.6))])
-        if parameter is not None and candidate.name == "P":
-            value = float(e.times[-1] / rng.uniform(4, 20))
-        if parameter is not None and candidate.name == "d":
-            value = float(3.0 * np.median(np.diff(e.times)))
+    seen = Laboratory([replace(e, history=_as_read(e))])
+    value = _place(candidate, e, rng)
     term = candidate.term(value, 1)
     if candidate.is_event:
-        term = Term(term.effect, term.parameters, (), (((candidate.name, float(value or 0.0)),),))
-    if candidate.is_drive:
-        rates = base.direction(base.blocks[0])[0]
-        course = laboratory.drive_course([term], 0) - laboratory.drive_course([], 0)
-        moved = course[:, None] * rates[None]
-    else:
-        course = laboratory.courses(term, 0)[0][:, 0]
-        direction = np.zeros(len(COLUMNS))
-        direction[[COLUMNS.index(p) for p in term.parameters]] = rng.normal(
-            size=len(term.parameters)
-        )
-        moved = course[:, None] * direction[None]
-    left = _left_over(laboratory, moved)
-    moved = moved * (strength_px / max(left, 1e-12))
+        term = Term(term.effect, term.parameters, (), (((candidate.name, value or 0.0),),))
+    course = seen.courses(term, 0, operators=False)[0][:, 0]
+    direction = np.zeros(len(COLUMNS))
+    direction[[COLUMNS.index(p) for p in term.parameters]] = rng.normal(size=len(term.parameters))
+    moved = course[:, None] * direction[None]
+    return _moved(e, moved * (strength_px / max(_left_over(laboratory, moved), 1e-12)))
+
+
+def _moved(e: Evidence, moved: Array) -> Evidence:
+    """The series with its parameters moved (E, P), px-scaled."""
     b = e.b + np.einsum("epq,eq->ep", e.N, moved)
     values = e.values + moved
     return replace(e, b=b, values=values, yy=np.einsum("ep,ep->e", values, b))
+
+
+def _as_read(evidence: Evidence) -> History:
+    """The readings themselves, where the evidence has them smoothed: a camera feels every kink."""
+    h = evidence.history
+    readings = {n: h.readings[n] + c.deviation for n, c in evidence.channels.items()}
+    return History(h.times, h.reading_times, readings, h.reference, h.T0)
+
+
+def _with_drive(
+    set_up: SetUp, laboratory: Laboratory, candidate: Candidate, strength_px: float
+) -> Evidence:
+    """The series when the camera follows a drive, at the value that leaves the strength.
+
+    Simulated anew where that can be: the truth behind the readings is not in them.
+    """
+    base = laboratory.fit(())
+    rates = base.direction(base.blocks[0])[0]
+    follows = laboratory.drive_course([], 0)
+    sizes = np.abs(candidate.grid)
+    trials: list[tuple[float, Term, Array]] = []
+    for value in np.geomspace(max(float(sizes.min()), 0.01), float(sizes.max()), 60):
+        term = candidate.term(float(value), 1)
+        moved = (laboratory.drive_course([term], 0) - follows)[:, None] * rates[None]
+        off = abs(float(np.log(max(_left_over(laboratory, moved), 1e-9) / strength_px)))
+        trials.append((off, term, moved))
+    _, term, moved = min(trials, key=lambda t: t[0])
+    source = set_up.following(term)
+    return _moved(laboratory.series[0], moved) if source is None else gather(source)
+
+
+def _place(candidate: Candidate, e: Evidence, rng: np.random.Generator) -> float | None:
+    """A non-linear parameter where the effect is well seen, None where there is none."""
+    if not len(candidate.grid):
+        return None
+    if candidate.name == "P":
+        return float(e.times[-1] / rng.uniform(4, 20))
+    return float(candidate.grid[int(len(candidate.grid) * rng.uniform(0.4, 0.6))])
 
 
 def _left_over(laboratory: Laboratory, moved: Array) -> float:

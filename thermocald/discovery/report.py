@@ -132,7 +132,7 @@ def _effect(effect: EffectFound) -> str:
 
 def _where(discovery: Discovery) -> str:
     rows = []
-    for name, value, sigmas in resolve(discovery)["rows"]:
+    for name, value, sigmas in resolve(discovery).rows:
         rows.append(
             f"<tr><td>{escape(name)}</td><td class='n'>{_text(value)}</td>"
             f"<td class='n'>{sigmas:.1f}</td></tr>"

@@ -18,6 +18,7 @@ from thermocald.discovery.estimates import (
 from thermocald.discovery.examination import Examination, examine_series
 from thermocald.discovery.gap import Gap, fit_first, gap_of
 from thermocald.discovery.left_out import left_out
+from thermocald.discovery.misfit import resolve
 from thermocald.discovery.unnamed import describe_unnamed
 from thermocald.simulation import effects as catalogue
 
@@ -102,10 +103,14 @@ class Discovery:
         verify = None
         if first.verify is not None and last.verify is not None:
             verify = {"before": first.verify.as_json(), "after": last.verify.as_json()}
+        effects = [e.as_json() for e in self.effects]
+        if effects:  # where the base model is wrong, told with the first of its causes
+            misfit = resolve(self).as_json()
+            effects[0]["evidence"] = {**effects[0]["evidence"], "base_misfit": misfit}
         return {
             "format": "thermocald-discovery/1",
             "verdict": self.verdict,
-            "effects": [e.as_json() for e in self.effects],
+            "effects": effects,
             "gap": {
                 "fit": {"before": first.fit.as_json(), "after": last.fit.as_json()},
                 "verify": verify,

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.analysis.series_reduction import measured_epochs
 from thermocald.discovery.evidence import Evidence, SeriesInput, gather
 from thermocald.errors import DataError
 from thermocald.photogrammetry.normals import ObservationGrid
@@ -19,15 +20,14 @@ if TYPE_CHECKING:
 __all__ = ["gather_pair", "load_pair", "series_input"]
 
 
-def series_input(recording: Recording) -> SeriesInput:
-    """The arrays of one recording. Raises DataError where its frames have not been measured."""
-    if not recording.has_observations:
-        raise DataError(
-            f"{recording.path}: the frames have not been measured; run `thermocald replay "
-            f"{recording.path} --store series.db` and `thermocald archive` it as a recording first"
-        )
+def series_input(
+    recording: Recording, say: Callable[[str], None] | None = None
+) -> SeriesInput:
+    """The arrays of one recording; its frames are measured where they have not been."""
+    if not recording.has_observations and say is not None:
+        say(f"measuring the {len(recording.columns)} frames of {recording.path}")
+    observations = [e.observations for e in measured_epochs(recording)]
     columns = recording.columns
-    observations = [e.observations for e in recording.epochs]
     camera = recording.camera
     readings = {
         name: values for name, values in columns.temperatures.items() if name in recording.channels
@@ -56,7 +56,7 @@ def load_pair(first: Path, second: Path | None, say: Callable[[str], None]) -> l
         if path is None:
             continue
         say(f"reading {path}")
-        out.append(series_input(read_recording(path)))
+        out.append(series_input(read_recording(path), say))
     if len(out) == 2:
         _same_camera(*out)
     return out

@@ -8,10 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.discovery.adequacy import names_of
+from thermocald.discovery.evidence import COLUMNS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from thermocald.discovery.adequacy import Adequacy
+    from thermocald.discovery.evidence import Evidence
     from thermocald.discovery.examination import Examination
 
     Array = NDArray[np.float64]
@@ -87,8 +90,22 @@ def describe_unnamed(x: Examination) -> Description:
             "correlation": correlation,
             "share_of_first_pattern": float(s[0] ** 2 / np.sum(s**2)),
             "significance_sigmas": float(a.significance),
-            "bridge": {"transferable": False, "orders": len(a.courses)},
+            "bridge": _bridge(a, e),
         },
         course_px,
         direction,
     )
+
+
+def _bridge(a: Adequacy, e: Evidence) -> dict[str, Any]:
+    """What takes the rest up in this series alone: amplitudes of cos(k π t / duration), k = 1, 2, …
+    with t from the first frame, in each parameter's own unit.
+    """
+    amplitudes = a.amplitudes / e.scale
+    moving = [(i, name) for i, name in enumerate(COLUMNS) if amplitudes[:, i].any()]
+    return {
+        "transferable": False,
+        "recording": e.source.name,
+        "duration_s": float(e.times[-1] - e.times[0]),
+        "cosines": {name: [float(v) for v in amplitudes[:, i]] for i, name in moving},
+    }

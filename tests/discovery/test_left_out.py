@@ -1,0 +1,72 @@
+"""Blocks left out: a cause predicts them, a look-alike does not, and an unseen step is forgiven."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.blind.bridge import series_input
+from tests.blind.generator import Case, generate
+from thermocald.discovery.evidence import gather
+from thermocald.discovery.hypothesis import Laboratory, Term
+from thermocald.discovery.left_out import confirmed, gains, left_out
+
+
+def laboratory(effect, seed=91):
+    series, truth = generate(Case((effect,), 0.2, seed, epochs=90))
+    first = gather(series_input(series[0]))
+    second = gather(series_input(series[1]), first.T0, first.scale)
+    return Laboratory([first, second]), truth
+
+
+def test_the_cause_predicts_every_block():
+    lab, _ = laboratory("nonlinear_expansion")
+    fit = lab.refine(lab.fit([Term("nonlinear_expansion")]))
+
+    (gain,) = gains(lab, fit)
+
+    assert confirmed(gain)
+    outside, inside = left_out(lab, fit)
+    assert 0.95 * inside < outside < 1.1 * inside
+
+
+@pytest.mark.parametrize(
+    ("gain", "is_confirmed"),
+    [
+        ([30.0, 5.0, -3.0, 0.0, 20.0, 1.0], True),
+        ([30.0, 5.0, -30.0, 0.0, 20.0, 1.0], False),  # one block speaks against it
+        ([-1.0, -2.0, 1.0, 0.0, 0.0, 0.0], False),  # nothing is predicted
+        ([1e5, 2e4, -300.0, 10.0, 20.0, 1.0], True),  # small against what it explains
+    ],
+)
+def test_what_confirms(gain, is_confirmed):
+    assert confirmed(np.array(gain)) == is_confirmed
+
+
+def test_a_course_that_follows_the_noise_predicts_nothing():
+    """A cycle fitted to a recording without effects, at the period that suits it best."""
+    series, _ = generate(Case((), 0.2, 92, epochs=90, with_m2=False))
+    lab = Laboratory([gather(series_input(series[0]))])
+    trials = [
+        lab.fit([Term("cyclic_interference", nonlinear=(("P", p),))])
+        for p in np.geomspace(40, 400, 60)
+    ]
+
+    (gain,) = gains(lab, min(trials, key=lambda f: f.objective))
+
+    assert gain.sum() < 12  # of six coefficients
+
+
+def test_a_step_within_the_block_left_out_is_no_fault():
+    """Where a slip comes early in M2, the block with it leaves its height undetermined."""
+    lab, truth = laboratory("slip")
+    times = [s["time"] for (s,) in truth["effects"] if s["happens"]]
+    own = [
+        (("time", float(e.times[np.searchsorted(e.times, t)])),)
+        for e, t in zip(lab.series, times, strict=False)
+    ]
+    fresh = tuple(own) + (None,) * (len(lab.series) - len(own))
+
+    (gain,) = gains(lab, lab.refine(lab.fit([Term("slip", fresh=fresh)])))
+
+    assert confirmed(gain)

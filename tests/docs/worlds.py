@@ -28,6 +28,7 @@ from thermocald.simulation.model import ModelEffect
 from thermocald.simulation.model_file import write_model
 from thermocald.simulation.presets import preset_simulation
 from thermocald.simulation.scene import Scene
+from thermocald.simulation.testfields import corner_field
 from thermocald.store.testfield_file import read_testfield
 
 
@@ -175,9 +176,9 @@ def simulation(shelf: Path, folder: Path) -> None:
 
 
 def store(shelf: Path, folder: Path) -> None:
-    """A store with a short measured series."""
+    """A store with a short measured series of a small field."""
     del shelf
-    s = preset_simulation("rpi-v2.1-heating", seed=1)
+    s = preset_simulation("rpi-v2.1-heating", seed=1, field=corner_field("circles", 4, 150.0))
     replace(s, programme=replace(s.programme, epochs=12)).write(folder / "short")
     run("replay", folder / "short", "--store", folder / "thermocald.db")
 

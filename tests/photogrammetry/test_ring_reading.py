@@ -86,7 +86,8 @@ def test_no_code_in_clutter():
 
 @pytest.mark.slow
 def test_no_code_in_a_thousand_frames_of_clutter():
-    assert [f for f in _in_clutter(range(1000)) if f[2]] == []
+    # Not the seeds that the thresholds were found with, which are those below 12,000.
+    assert [f for f in _in_clutter(range(20_000, 21_000)) if f[2]] == []
 
 
 def test_no_code_in_photographs(shared):

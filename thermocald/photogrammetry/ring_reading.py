@@ -50,7 +50,8 @@ _LARGEST_SHIFT = 0.2  # radii, by which perspective and distortion move a ring a
 # less of the ring, less.
 _MISFIT = 0.13
 _MISFIT_LARGE, _MISFIT_EDGE_PX = 0.03, 0.45
-_MISFIT_OF_ONE_ARC = 0.06  # a closed ring with something across it is read as one arc
+# A closed ring with something across it is read as one arc, a line through a dot as two single bits.
+_MISFIT_OF_FEW = 0.06
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -218,7 +219,7 @@ def _read_family(level: Single, maps: LocalMap, bits: int) -> tuple[NDArray[np.i
         )
         misfit[misfit > _allowed(maps)] = np.inf
         one_arc = np.sum(ones != np.roll(ones, 1, axis=1), axis=1) == 2
-        misfit[one_arc & (misfit > _MISFIT_OF_ONE_ARC)] = np.inf
+        misfit[(one_arc | (ones.sum(axis=1) <= 2)) & (misfit > _MISFIT_OF_FEW)] = np.inf
     return codes, misfit
 
 

@@ -50,7 +50,7 @@ _LARGEST_SHIFT = 0.2  # radii, by which perspective and distortion move a ring a
 # less of the ring, less.
 _MISFIT = 0.13
 _MISFIT_LARGE, _MISFIT_EDGE_PX = 0.03, 0.45
-# A closed ring with something across it is read as one arc, a line through a dot as two single bits.
+# A closed ring with something across is read as one arc, a line through a dot as two single bits.
 _MISFIT_OF_FEW = 0.06
 
 

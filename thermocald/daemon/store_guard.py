@@ -13,7 +13,7 @@ from collections import deque
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-from thermocald.errors import StoreError
+from thermocald.errors import StoreError, StoreFullError
 from thermocald.store.database import Store
 from thermocald.store.row import Event
 
@@ -143,8 +143,7 @@ class StoreGuard:
                 if error is None:
                     self._waiting.popleft()
                     self._back()
-                elif not self.away and self._flush_events() and self._probe():
-                    # the store is well: it is this row that it does not take
+                elif self._takes_all_but(error):
                     row = self._waiting.popleft()
                     self.lost += 1
                     log.error("epoch %d was not kept: %s", row.epoch.number, error)
@@ -189,7 +188,13 @@ class StoreGuard:
             log.info(text, extra={"event": "observations_resumed"})
             self._events.append(Event(row.epoch.frame_time, "observations_resumed", text))
 
-    def _probe(self) -> bool:
+    def _takes_all_but(self, error: StoreError) -> bool:
+        """Whether the store is well and it is this row that it does not take.
+
+        On a full disk a row may find no room where an event still does: that row waits.
+        """
+        if self.away or isinstance(error, StoreFullError) or not self._flush_events():
+            return False
         try:
             self.store.add_event(Event(self._waiting[0].epoch.frame_time, "row_refused", "probe"))
         except StoreError:

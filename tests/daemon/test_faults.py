@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import resource
 import shutil
 import signal
@@ -50,7 +51,8 @@ def test_unplugged_and_back_told_once_each_and_no_other_device_waits(daemon, dev
     assert np.sort(away)[-2] < 1.5
     # the other camera went on all the while
     begin = times["one"][int(away.argmax())]
-    assert sum(begin < t < begin + 2.0 for t in times["two"]) >= 5
+    usual = 2.0 / np.mean(np.diff(times["two"]))  # epochs in 2 s
+    assert sum(begin < t < begin + 2.0 for t in times["two"]) >= 0.3 * usual - 1
 
 
 def test_a_hung_capture_trips_the_watchdog_and_holds_nothing_else_up(daemon, devices, supervisor):
@@ -61,9 +63,10 @@ def test_a_hung_capture_trips_the_watchdog_and_holds_nothing_else_up(daemon, dev
     daemon.start("--hang-after", "3", NOTIFY_SOCKET=str(supervisor.path), WATCHDOG_USEC="2000000")
     supervisor.until("READY=1")
     assert "WATCHDOG=1" in supervisor.listen(1.2)
+    # on a busy machine it may take long to open or to calculate, which passes
     daemon.until(lambda: sum(r["device"] == "one" for r in daemon.results()) == 7)
-    before = daemon.log().count("camera one hangs")  # on a busy machine it takes long to open
-    daemon.until(lambda: daemon.log().count("camera one hangs") > before)
+    status = daemon.folder / "thermocald.db.live/status.json"
+    daemon.until(lambda: json.loads(status.read_text())["stalled"] == ["camera one hangs"])
     supervisor.listen(0.5)
     assert "WATCHDOG=1" not in supervisor.listen(2.5)
     count = len([r for r in daemon.results() if r["device"] == "two"])
@@ -81,7 +84,8 @@ def test_a_store_that_cannot_be_written_waits_in_memory(daemon, devices):
     before = resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE)
     resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, (8192, before[1]))
     daemon.until(lambda: "results wait in memory" in daemon.log())
-    time.sleep(2.0)
+    status = daemon.folder / "thermocald.db.live/status.json"
+    daemon.until(lambda: json.loads(status.read_text())["store"]["waiting"] >= 5)
     resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, before)
     daemon.until(lambda: "can be written again" in daemon.log())
     daemon.until(lambda: daemon.results()[-1]["stored"])

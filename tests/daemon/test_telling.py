@@ -141,17 +141,21 @@ def in_a_terminal(daemon, seconds: float, *options: str) -> tuple[str, int]:
         stdin=inner, stdout=inner, stderr=inner,
     )  # fmt: skip
     os.close(inner)
-    seen, end = b"", time.monotonic() + 60
-    until = None
-    while time.monotonic() < (until or end):
+    seen, end, interrupted = b"", time.monotonic() + 90, False
+    until = end
+    while process.poll() is None and time.monotonic() < end:
         if select.select([terminal], [], [], 0.1)[0]:
             try:
                 seen += os.read(terminal, 65536)
             except OSError:
                 break
-        if until is None and b"sigma0" in seen:
+        if until == end and b"sigma0" in seen:
             until = time.monotonic() + seconds
-    process.send_signal(signal.SIGINT)
+        if not interrupted and time.monotonic() > until:
+            interrupted = True
+            process.send_signal(signal.SIGINT)
+    if process.poll() is None:
+        process.kill()
     status = process.wait(30)
     os.close(terminal)
     return seen.decode(errors="replace"), status

@@ -78,7 +78,7 @@ def start(
     path = output / f"{session.camera}-{series}"
     if path.exists():
         raise DataError(f"{path}: the recording exists already; choose another --series")
-    folder = None if mock else _daemon(read)
+    folder = _daemon(read)
     if folder is None:
         output.mkdir(parents=True, exist_ok=True)
         read = take_on_the_desk(read, session)

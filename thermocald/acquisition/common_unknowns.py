@@ -12,6 +12,7 @@ method; `photogrammetry.series` does the same with all epochs at hand.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -39,7 +40,10 @@ if TYPE_CHECKING:
 
 __all__ = ["CommonUnknowns"]
 
+log = logging.getLogger(__name__)
+
 _EOP = np.arange(10, 16)
+_MOST_TARGETS = 300  # 1 GFLOP and 14 MB whenever they are solved for
 _ROUNDS = 4
 _STRAIGHT_PX = 1.0  # a step that the partial derivatives carry to 1e-3 of itself
 _TINY = 1e-12  # px²: a target without sigma has no offset
@@ -66,7 +70,8 @@ class CommonUnknowns:
     """The common unknowns of one series; `refine` takes epochs in any order, one thread at a time.
 
     still: one exterior orientation for all epochs; offsets: one offset per target, with the test
-    field's sigmas as prior. epochs: how many were taken in since the beginning or the last reset.
+    field's sigmas as prior, for up to 300 targets: their normal matrix is a full one. epochs: how
+    many were taken in since the beginning or the last reset.
     """
 
     def __init__(
@@ -81,6 +86,9 @@ class CommonUnknowns:
         self._own = np.array(free + ([] if still else _EOP.tolist()), dtype=np.int64)
         self._still = still
         self._offsets = offsets and bool((testfield.sigmas > 0).any())
+        if self._offsets and len(testfield) > _MOST_TARGETS:
+            log.warning("%d targets are too many for target_offsets", len(testfield))
+            self._offsets = False
         self._at: Partials | None = None
         self._surprised = False
 
@@ -155,7 +163,7 @@ class CommonUnknowns:
         self._at = at = linearise(self._sensor, self._field, values[:10], values[10:])
         first = 6 if self._still else 0
         q = first + (2 * T if self._offsets else 0)
-        self._H, self._h, self._prior = np.zeros((q, q)), np.zeros(q), np.zeros((q, q))
+        self._H, self._h = np.zeros((q, q)), np.zeros(q)
         self._variance = max(apart.sigma0**2, 1e-6)
         self._solved: tuple[int, Array, Array] | None = None
         for i in _EOP if self._still else []:
@@ -166,8 +174,7 @@ class CommonUnknowns:
             variance = self._field.sigmas**2
             xx, yy = ((at.B[:, k] ** 2 * variance).sum(axis=1) + _TINY for k in (0, 1))
             xy = (at.B[:, 0] * at.B[:, 1] * variance).sum(axis=1)
-            inverse = np.stack([yy, xx, -xy], axis=1) / (xx * yy - xy**2)[:, None]
-            _add_blocks(self._prior[first:, first:], inverse)
+            self._prior = np.stack([yy, xx, -xy], axis=1) / (xx * yy - xy**2)[:, None]
         return at
 
     def _reduce(self, at: Partials, weights: Array, points: Array, own: Array) -> _Reduced:
@@ -201,8 +208,11 @@ class CommonUnknowns:
         return _Reduced(Q, QC, Qn, S - C.T @ QC, s - C.T @ Qn, float((Pr * r).sum() - n @ Qn))
 
     def _solve(self, H: Array, h: Array) -> None:
-        """Estimate and cofactors; the prior is weighted against image points."""
-        cofactor = _inverse(H + self._variance * self._prior)
+        """Estimate and cofactors; the prior is weighted against image points, and added to H."""
+        if self._offsets:
+            first = 6 if self._still else 0
+            _add_blocks(H[first:, first:], self._variance * self._prior)
+        cofactor = _inverse(H)
         self._solved = self.epochs + 1, cofactor @ h, cofactor
 
     def _result(

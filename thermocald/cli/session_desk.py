@@ -10,7 +10,7 @@ from thermocald.cli.session_progress import Progress
 from thermocald.errors import ConfigurationError, DataError, DeviceError
 
 if TYPE_CHECKING:
-    from thermocald.config import CameraConfig, Config
+    from thermocald.config import Config
     from thermocald.daemon.session import Session
     from thermocald.daemon.station import Station
 
@@ -22,9 +22,8 @@ def take_on_the_desk(config: Config, session: Session) -> Config:
     from thermocald.daemon.journal import set_up_logging
     from thermocald.daemon.service import Service
 
-    read = _prepare(config, session)
-    one, epochs = read.cameras[0], session.epochs
-    done = _stored(read, one)
+    done, epochs = _stored(config, session), session.epochs
+    read = _prepare(config, session, done)
     set_up_logging("warning")
     if done < epochs:
         if session.check:
@@ -42,7 +41,7 @@ def take_on_the_desk(config: Config, session: Session) -> Config:
             on_turn=lambda station: _turn(station, progress),
         )
         service.run()
-        done = _stored(read, one)
+        done = _stored(config, session)
     if done < epochs:
         raise DataError(
             f"series {session.series} has {done} of {epochs} epochs; the same command goes on "
@@ -59,7 +58,7 @@ def _turn(station: Station, progress: Progress) -> None:
     progress.show(last, camera.link.why if camera.link.state == "out" else "")
 
 
-def _prepare(config: Config, session: Session) -> Config:
+def _prepare(config: Config, session: Session, done: int) -> Config:
     """The configuration with one camera, its thermometers, and the series' name."""
     from thermocald.config import parse_config
 
@@ -71,28 +70,28 @@ def _prepare(config: Config, session: Session) -> Config:
         t for t in document["thermometers"] if t["name"] in chosen["thermometers"]
     ]
     if session.programme:
-        _use_programme(document["outputs"], session)
+        _use_programme(document["outputs"], session.steps(done * chosen["period_s"]))
     return parse_config(document, Path("config.yaml"))
 
 
-def _use_programme(outputs: list[dict[str, Any]], session: Session) -> None:
+def _use_programme(outputs: list[dict[str, Any]], steps: list[dict[str, Any]]) -> None:
     from thermocald.hal import option_names
 
     takers = [o for o in outputs if "programme" in option_names("output", o["driver"])]
     if not takers:
         raise ConfigurationError("--programme: no output of the configuration heats")
     for taker in takers:
-        taker["programme"] = session.steps(0.0)
+        taker["programme"] = steps
 
 
-def _stored(config: Config, one: CameraConfig) -> int:
+def _stored(config: Config, session: Session) -> int:
     from thermocald.store.database import Store
 
     if not config.store.path.exists():
         return 0
     with Store.open(config.store.path) as store:
         for found in store.all_series():
-            if (found.camera, found.name) == (one.name, one.series):
+            if (found.camera, found.name) == (session.camera, session.series):
                 return store.last_epoch(found) or 0
     return 0
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import os
+import pkgutil
 import re
 import subprocess
 import sys
+from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
@@ -84,13 +87,19 @@ class Document(HTMLParser):
             self.text.append(data)
 
 
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """api → the folder of the site, built once."""
+    return cache(lambda api: build(tmp_path_factory.mktemp("site"), api))
+
+
 @pytest.fixture(
     scope="module",
     params=["pages", pytest.param("with modules", marks=pytest.mark.slow)],
 )
-def site(request, tmp_path_factory):
+def site(request, built):
     """{path: Document} of the built site, and its folder."""
-    folder = build(tmp_path_factory.mktemp("site"), api=request.param == "with modules")
+    folder = built(request.param == "with modules")
     return folder, {path: Document(path) for path in sorted(folder.rglob("*.html"))}
 
 
@@ -199,11 +208,8 @@ def keys(model) -> set[str]:
 
 
 @pytest.mark.slow
-def test_every_public_name_is_in_the_modules_reference(tmp_path):
-    import importlib
-    import pkgutil
-
-    folder = build(tmp_path, api=True)
+def test_every_public_name_is_in_the_modules_reference(built):
+    folder = built(True)
     for package in reference.packages():
         page = Document(folder / "reference" / "api" / f"{package}.html")
         for module in pkgutil.iter_modules(importlib.import_module(package).__path__):

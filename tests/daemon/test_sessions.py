@@ -13,6 +13,7 @@ import yaml
 
 from tests.daemon.conftest import ENVIRONMENT
 from thermocald.daemon.control import ask
+from thermocald.daemon.session import Session
 from thermocald.errors import DataError, UsageError
 from thermocald.store.database import Store
 from thermocald.store.recording import read_recording
@@ -237,3 +238,11 @@ def test_reload_leaves_a_session_alone(live, daemon):
     assert "the configuration was read anew" in daemon.log()
     assert daemon.stop() == 0
     assert series_of(daemon.store)["M7"][1] == list(range(1, 13))
+
+
+def test_a_programme_is_taken_up_where_it_was():
+    steps = [{"seconds": 600.0, "hold_c": None}, {"seconds": 1500.0, "hold_c": 45.0}]
+    session = Session.model_validate({**SESSION, "programme": steps})
+    assert session.steps(0.0) == steps
+    assert session.steps(700.0) == [{"seconds": 1400.0, "hold_c": 45.0}]
+    assert session.steps(5000.0) == [{"seconds": 1.0, "hold_c": None}]

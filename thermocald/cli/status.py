@@ -140,7 +140,7 @@ def _headline(document: dict[str, Any]) -> str:
 def _camera(name: str, camera: dict[str, Any]) -> list[str]:
     last = camera.get("last") or {}
     online = last.get("online") or {}
-    state = str(online.get("sentence") or last.get("state", ""))
+    state = str(online.get("sentence") or last.get("state", "" if camera["series"] else "idle"))
     if last and last.get("status") != "ok":
         state = f"{last['status']}: {last.get('reason', '')}"
     return [

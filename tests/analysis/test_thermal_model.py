@@ -17,10 +17,9 @@ from thermocald.analysis.type_model import type_model
 from thermocald.cli import application
 from thermocald.errors import ConfigurationError, DataError, ThermocaldError, UsageError
 from thermocald.photogrammetry.camera_model import project
-from thermocald.simulation import effects
 from thermocald.simulation.course import Course
 from thermocald.simulation.model import ModelEffect
-from thermocald.simulation.presets import preset_names, preset_simulation
+from thermocald.simulation.presets import preset_simulation
 from thermocald.store.recording import read_recording
 
 LAG = ModelEffect("thermal_lag", {"tau": 70.0})
@@ -150,32 +149,6 @@ def test_a_lens_mean_offset_of_targets_is_no_drift():
         assert abs(f.model.rates[n] - s.model.rates[n]) < 3.5 * f.sd(f"rates.{n}")
     # the level's standard deviation knows the field's: some thousandths of a mm
     assert 2e-4 < f.sd("interior.x0") < 5e-3
-
-
-@pytest.mark.parametrize("name", preset_names())
-def test_correction_in_object_space(name):
-    """Fitted to M1, applied to M2's readings: a tenth or less of the uncorrected error at 10 m."""
-    first, second = preset_simulation(name, 1, "M1"), preset_simulation(name, 2, "M2")
-    listed = [
-        replace(e, values=dict.fromkeys(effects.get(e.name).usual, 0.0))
-        for e in first.model.effects
-        if e.name != "defocus"
-    ]
-    f = fit_thermal_model([reduced(first)], listed)
-    camera = ThermalCamera(f.model)
-    along = camera.along(
-        second.reading_times, second.readings, second.frame_times, extrapolate=True
-    )
-    left, uncorrected = [], []
-    truth = ThermalCamera(replace(f.model, validity={})).at(25.0)
-    for i in range(0, len(along), 10):
-        true = replace(truth, values=second.truth.iop[i])
-        begin = replace(truth, values=second.truth.iop[0])
-        # the level is what a calibration at the begin gives, with and without a thermal model
-        predicted = along.values[i] - along.values[0] + second.truth.iop[0]
-        left.append(replace(truth, values=predicted).object_distance(true, 10_000.0).mean())
-        uncorrected.append(begin.object_distance(true, 10_000.0).mean())
-    assert np.mean(left) <= 0.1 * np.mean(uncorrected)
 
 
 def test_refusals(fitted):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import os
 import pkgutil
 import re
@@ -208,7 +209,7 @@ def keys(model) -> set[str]:
 
 
 @pytest.mark.slow
-def test_every_public_name_is_in_the_modules_reference(built):
+def test_every_public_class_and_function_is_in_the_modules_reference(built):
     folder = built(True)
     for package in reference.packages():
         page = Document(folder / "reference" / "api" / f"{package}.html")
@@ -216,8 +217,12 @@ def test_every_public_name_is_in_the_modules_reference(built):
             if module.ispkg or module.name.startswith("_"):
                 continue
             name = f"{package}.{module.name}"
-            for public in getattr(importlib.import_module(name), "__all__", ()):
-                assert f"{name}.{public}" in page.anchors, f"{name}.{public}"
+            source = importlib.import_module(name)
+            for public in getattr(source, "__all__", ()):
+                found = getattr(source, public)
+                # constants and aliases stand where they are documented, or in signatures
+                if inspect.isclass(found) or inspect.isfunction(found):
+                    assert f"{name}.{public}" in page.anchors, f"{name}.{public}"
 
 
 def test_the_makefile_builds_it():

@@ -93,6 +93,10 @@ UNTIL = {
 STAYS = {"thermocald run --config config.yaml"}
 """Of these, what runs on while the rest of the page is done."""
 
+SHOWN = {"docs/tutorial/raspberry-pi.md"}
+"""Pages whose `text` blocks are what the command before them says of this world."""
+
+NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
 PATH = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
 ENVIRONMENT = {
     **os.environ,
@@ -127,6 +131,8 @@ class Page:
             with sqlite3.connect(self.folder / "thermocald.db") as database:
                 assert database.execute(block.text).fetchall()
             database.close()
+        elif block.language == "text" and self.page in SHOWN:
+            self.compare(block)
         for command in block.commands() if block.language == "bash" else ():
             if command not in NOT_RUN and command not in ELSEWHERE:
                 self.command(command)
@@ -179,6 +185,20 @@ class Page:
         assert status == 0, f"{self.page}: {command}: exit status {status}\n{said[-3000:]}"
         assert "Traceback" not in said
         assert "Warning" not in said, said
+
+    def compare(self, block: Block) -> None:
+        """Every line of the block was said, with numbers that agree to a tenth."""
+        said = " ".join(self.output().split())
+        for line in block.text.splitlines():
+            shown = " ".join(line.split())
+            pattern = f"({NUMBER.pattern})".join(map(re.escape, NUMBER.split(shown)))
+            expected = [float(n) for n in NUMBER.findall(shown)]
+            found = [[float(n) for n in m.groups()] for m in re.finditer(pattern, said)]
+            assert found, f"{self.page}:{block.line}: not said: {shown}\n{said[-2000:]}"
+            assert any(f == pytest.approx(expected, rel=0.1, abs=0.005) for f in found), (
+                shown,
+                found,
+            )
 
     def wait(self, command: str, process: subprocess.Popen[str]) -> None:
         deadline = time.monotonic() + PATIENCE_S

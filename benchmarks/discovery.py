@@ -23,8 +23,9 @@ import numpy as np
 from tests.blind.bridge import series_input
 from tests.blind.generator import SINGLE, Case, generate
 from thermocald.discovery.candidates import candidates
-from thermocald.discovery.evidence import COLUMNS, gather
-from thermocald.discovery.hypothesis import Laboratory
+from thermocald.discovery.evidence import COLUMNS
+from thermocald.discovery.laboratory import Laboratory
+from thermocald.discovery.reduction import gather
 from thermocald.discovery.result import discover_series
 
 # what a course in the parameter series can show: image space is not offered to the peers

@@ -24,7 +24,7 @@ import numpy as np
 
 from tests.blind.bridge import series_input
 from tests.blind.generator import OUTSIDE, SINGLE, Case, generate
-from thermocald.discovery.evidence import gather
+from thermocald.discovery.reduction import gather
 from thermocald.discovery.result import Discovery, discover_series
 
 NUMBERS = {

@@ -13,6 +13,17 @@ from thermocald.cli import application
 from thermocald.errors import DataError, UsageError
 
 run = CliRunner()
+PROGRAMME = """
+format: thermocald-programme/1
+name: one lamp cycle
+series: M1
+epochs: 100
+interval: 10.0
+ambient: 22.0
+sources:
+  housing: [{from: 0, to: 60, value: 0}, {from: 60, to: 500, value: 6.0},
+            {from: 500, to: 1100, value: 0}]
+"""
 
 
 @pytest.fixture(scope="module")
@@ -122,3 +133,60 @@ def test_plan(tmp_path):
     assert document["power"]["nonlinear_expansion"] == 1.0
     assert document["power"]["creep"] == 1.0
     assert len(document["power"]) >= 15
+
+
+@pytest.mark.slow
+def test_plan_of_a_preset():
+    """Every effect of 0.1 px is found, or stays with the one that it is mistaken for."""
+    result = discover("--plan", "--preset", "rpi-v2.1-heating", "--seeds", "1", "--json", "-")
+    assert result.exit_code == 0, result.stderr
+    document = json.loads(result.stdout)
+    undecided = {name for pair in document["ambiguous"] for name in pair["effects"]}
+    assert {name for name, power in document["power"].items() if power < 1} <= undecided
+    assert sum(power == 1 for power in document["power"].values()) >= 14
+    assert ["thermal_lag", "time_offset"] in [pair["effects"] for pair in document["ambiguous"]]
+
+
+@pytest.mark.slow
+def test_plan_of_a_programme(recordings, tmp_path):
+    """A model and a programme of one's own stand for the set-up."""
+    model, programme = tmp_path / "model.yaml", tmp_path / "programme.yaml"
+    assert discover(recordings / "M1", "--model-out", model).exit_code == 0
+    programme.write_text(PROGRAMME)
+    result = discover("--plan", "--model", model, "--programme", programme, "--seeds", "1",
+                      "--strength", "0.3", "--json", "-")  # fmt: skip
+    assert result.exit_code == 0, result.stderr
+    assert json.loads(result.stdout)["power"]["creep"] == 1.0
+
+
+@pytest.mark.slow
+def test_frames_are_measured_first(tmp_path):
+    from dataclasses import replace
+
+    from thermocald.simulation.presets import preset_simulation
+
+    simulation = preset_simulation("rpi-v2.1-heating", 3)
+    programme = replace(simulation.programme, epochs=22, interval=60.0)
+    replace(simulation, programme=programme).write(tmp_path / "M1", with_frames=True)
+
+    result = discover(tmp_path / "M1", "--json", "-")
+
+    assert result.exit_code == 0, result.stderr
+    assert "measuring the 22 frames" in result.stderr
+    assert json.loads(result.stdout)["gap"]["fit"]["before"]["rms_px"] < 1.0
+
+
+def test_an_unexplained_misfit_is_bridged_in_the_model(tmp_path):
+    series, _ = generate(Case(("outside",), 0.3, 34, epochs=60, with_m2=False))
+    write(series[0], tmp_path / "M1")
+
+    result = discover(tmp_path / "M1", "--json", "-", "--model-out", tmp_path / "m.yaml")
+
+    (entry,) = json.loads(result.stdout)["effects"]
+    assert entry["effect"] == "unnamed"
+    assert entry["evidence"]["base_misfit"]["against"][0]["rms_px"] > 0.05
+    written = yaml.safe_load((tmp_path / "m.yaml").read_text())
+    assert written.get("effects", []) == []
+    bridge = written["evidence"]["unnamed"]["evidence"]["bridge"]
+    assert bridge["transferable"] is False
+    assert len(bridge["cosines"]["c"]) == 14

@@ -10,7 +10,7 @@ import pytest
 
 from tests.blind.bridge import series_input
 from tests.blind.generator import Case, generate
-from thermocald.discovery.evidence import gather
+from thermocald.discovery.reduction import gather
 
 
 @pytest.fixture

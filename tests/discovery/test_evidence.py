@@ -9,8 +9,10 @@ import pytest
 
 from tests.blind.bridge import series_input
 from tests.blind.generator import Case, generate
-from thermocald.discovery.evidence import condensed, gather
-from thermocald.discovery.hypothesis import Laboratory, Term
+from thermocald.discovery.condensing import condensed
+from thermocald.discovery.hypothesis import Term
+from thermocald.discovery.laboratory import Laboratory
+from thermocald.discovery.reduction import gather
 from thermocald.errors import DataError
 
 

@@ -7,9 +7,10 @@ import pytest
 
 from tests.blind.bridge import series_input
 from tests.blind.generator import Case, generate
-from thermocald.discovery.evidence import gather
-from thermocald.discovery.hypothesis import Laboratory, Term
+from thermocald.discovery.hypothesis import Term
+from thermocald.discovery.laboratory import Laboratory
 from thermocald.discovery.left_out import confirmed, gains, left_out
+from thermocald.discovery.reduction import gather
 
 
 def laboratory(effect, seed=91):

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from thermocald.discovery.evidence import COLUMNS
-from thermocald.discovery.hypothesis import Laboratory, Term
+from thermocald.discovery.hypothesis import Term
+from thermocald.discovery.laboratory import Laboratory
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermocald.discovery.evidence import gather
+from thermocald.discovery.reduction import gather
 from thermocald.discovery.result import discover_series
 from thermocald.discovery.source import series_input
 from thermocald.errors import DataError

@@ -20,7 +20,8 @@ from thermocald.discovery.evidence import COLUMNS
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from thermocald.discovery.hypothesis import Fit, Laboratory
+    from thermocald.discovery.hypothesis import Fit
+    from thermocald.discovery.laboratory import Laboratory
 
     Array = NDArray[np.float64]
 

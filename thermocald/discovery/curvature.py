@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.discovery.evidence import Evidence
-    from thermocald.discovery.hypothesis import Fit, Laboratory
+    from thermocald.discovery.hypothesis import Fit
+    from thermocald.discovery.laboratory import Laboratory
 
     Array = NDArray[np.float64]
 

@@ -8,17 +8,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.discovery.adequacy import Adequacy, examine
+from thermocald.discovery.condensing import condensed
 from thermocald.discovery.curvature import relinearised
-from thermocald.discovery.evidence import condensed, reweighted
-from thermocald.discovery.hypothesis import Laboratory
 from thermocald.discovery.image_space import (
     Displaced,
     NoiseGrowth,
     displaced_targets,
     noise_growth,
 )
+from thermocald.discovery.laboratory import Laboratory
 from thermocald.discovery.left_out import confirmed, gains
 from thermocald.discovery.noise import jumps, slowed, with_jumps
+from thermocald.discovery.reduction import reweighted
 from thermocald.discovery.search import Search, Solution
 
 if TYPE_CHECKING:

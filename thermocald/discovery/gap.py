@@ -20,8 +20,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.discovery.evidence import Evidence
-    from thermocald.discovery.hypothesis import Fit, Laboratory, Term
+    from thermocald.discovery.hypothesis import Fit, Term
     from thermocald.discovery.image_space import Displaced
+    from thermocald.discovery.laboratory import Laboratory
 
     Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.discovery.adequacy import cosines
-from thermocald.discovery.evidence import without_targets
+from thermocald.discovery.reduction import without_targets
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.discovery.gap import rank
-from thermocald.discovery.hypothesis import Laboratory
+from thermocald.discovery.laboratory import Laboratory
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

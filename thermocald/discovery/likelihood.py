@@ -246,6 +246,9 @@ def _blurred(
 
 
 def _level_factor(N0: Array) -> Array:
-    """Cholesky factor; the levels that the field cannot tell apart are held by 1000 px."""
-    factor = np.linalg.cholesky(N0 + 1e-6 * np.eye(len(N0)))
+    """Cholesky factor; the levels that the field cannot tell apart are held by 1000 px, or as
+    loosely as rounding lets them.
+    """
+    held = 1e-6 + 1e-13 * float(np.trace(N0))
+    factor = np.linalg.cholesky(N0 + held * np.eye(len(N0)))
     return np.asarray(factor, dtype=float)

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.discovery.evidence import Evidence
-    from thermocald.discovery.hypothesis import Fit, Laboratory
+    from thermocald.discovery.hypothesis import Fit
+    from thermocald.discovery.laboratory import Laboratory
 
     Array = NDArray[np.float64]
 
@@ -141,6 +142,7 @@ def with_jumps(evidence: Evidence, factors: Array, W: Array) -> Evidence | None:
         return None
     inverse = np.linalg.inv(W)
     T = inverse.T @ np.diag(1.0 / np.sqrt(factors)) @ W.T
-    N = np.einsum("pq,eqr,sr->eps", T, evidence.N, T)
+    N = T @ evidence.N @ T.T
+    N = 0.5 * (N + N.swapaxes(1, 2))
     b = np.einsum("epq,eq->ep", N, evidence.values)
     return replace(evidence, N=N, b=b, yy=np.einsum("ep,ep->e", evidence.values, b))

@@ -15,9 +15,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.discovery.candidates import Candidate, candidates
-from thermocald.discovery.evidence import COLUMNS, Evidence, SeriesInput, gather
+from thermocald.discovery.evidence import COLUMNS, Evidence, SeriesInput
 from thermocald.discovery.examination import examine_series
-from thermocald.discovery.hypothesis import Laboratory, Term
+from thermocald.discovery.hypothesis import Term
+from thermocald.discovery.laboratory import Laboratory
+from thermocald.discovery.new_model import terms_of
+from thermocald.discovery.reduction import gather
 from thermocald.discovery.source import series_input
 from thermocald.errors import UsageError
 from thermocald.simulation import effects as catalogue
@@ -91,6 +94,11 @@ class SetUp:
 
     source: SeriesInput
     simulation: Simulation | None = None
+
+    @property
+    def given(self) -> list[tuple[str, dict[str, Any]]]:
+        """The effects that the model has already."""
+        return [] if self.simulation is None else terms_of(self.simulation.model)
 
     def following(self, term: Term) -> SeriesInput | None:
         """The recording as it is when the camera follows a drive; None where nothing simulates."""
@@ -181,19 +189,21 @@ def plan_power(
                 changed = _with_drive(set_up, laboratory, candidate, strength_px)
             else:
                 changed = _with_effect(laboratory, candidate, strength_px, rng)
-            said = _said(changed)
+            said = _said(changed, set_up.given)
             row = found.setdefault(candidate.effect, {})
             row[said] = row.get(said, 0) + 1
             advance()
     return Plan(found, len(inputs), strength_px)
 
 
-def _said(evidence: Evidence) -> str:
-    x = examine_series([evidence])
+def _said(evidence: Evidence, given: Sequence[tuple[str, dict[str, Any]]]) -> str:
+    """What an examination says beyond the effects that the model has."""
+    x = examine_series([evidence], given=given)
     if not x.adequate:
         return "unexplained"
-    names = ["+".join(x.best.names) or "none", *("+".join(r.names) for r in x.rivals)]
-    return " or ".join(dict.fromkeys(names))
+    known = len(x.base.terms)
+    every = [x.best.names, *(r.names for r in x.rivals)]
+    return " or ".join(dict.fromkeys("+".join(names[known:]) or "none" for names in every))
 
 
 def _with_effect(

@@ -20,13 +20,15 @@ import numpy as np
 
 from thermocald.discovery.candidates import Candidate, candidates
 from thermocald.discovery.evidence import COLUMNS, FIELD_SCALES
-from thermocald.discovery.hypothesis import BASE, EVENTS, OSCILLATIONS, Fit, Laboratory, Term
+from thermocald.discovery.hypothesis import BASE, EVENTS, OSCILLATIONS, Fit, Term
 from thermocald.simulation import effects as catalogue
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
+
+    from thermocald.discovery.laboratory import Laboratory
 
     Array = NDArray[np.float64]
 

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.analysis.series_reduction import measured_epochs
-from thermocald.discovery.evidence import Evidence, SeriesInput, gather
+from thermocald.discovery.evidence import Evidence, SeriesInput
+from thermocald.discovery.reduction import gather
 from thermocald.errors import DataError
 from thermocald.photogrammetry.normals import ObservationGrid
 

@@ -16,12 +16,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
     Array = NDArray[np.float64]
 
-__all__ = ["Channel", "extend", "latent_times", "reading_noise", "smooth_channel"]
+__all__ = [
+    "Channel",
+    "extend",
+    "instruments",
+    "latent_times",
+    "reading_noise",
+    "smooth_channel",
+]
 
 _THIRD = np.array([1.0, -3.0, 3.0, -1.0])
 _SMOOTHING = np.logspace(-1, 5, 19)
@@ -224,3 +233,45 @@ def _whittaker(values: Array, weights: Array, noise: float) -> Array:
         if score < best:
             best, chosen = score, z
     return np.asarray(chosen, dtype=float)
+
+
+def instruments(
+    times: Array, readings: Mapping[str, Array], resolutions: Mapping[str, float | None]
+) -> tuple[Array, dict[str, Channel]]:
+    """All columns on common knots: the readings' instants and the latent ones of each column."""
+    latent = {name: latent_times(times, r, resolutions.get(name)) for name, r in readings.items()}
+    knots, first = np.unique(np.concatenate([times, *latent.values()]), return_index=True)
+    from_reading = first < len(times)
+    channels = {}
+    for name, r in readings.items():
+        on_knots = np.full(len(knots), np.nan)
+        on_knots[from_reading] = r[first[from_reading]]
+        own = np.isin(knots, latent[name])
+        here = from_reading | own
+        part = smooth_channel(knots[here], on_knots[here], own[here], resolutions.get(name))
+        channels[name] = extend(_spread(part, knots, here))
+    return next(iter(channels.values())).times, channels
+
+
+def _spread(channel: Channel, knots: Array, here: NDArray[np.bool_]) -> Channel:
+    """A column's instrument on all knots; those of other columns are NaN and carry nothing."""
+    from scipy.sparse import csr_array
+
+    K, rows = len(knots), np.flatnonzero(here)
+    course, deviation, sd = np.full(K, np.nan), np.zeros(K), np.full(K, 1e-6)
+    real = np.zeros(K, dtype=bool)
+    course[here], deviation[here], sd[here] = channel.course, channel.deviation, channel.sd
+    real[here] = channel.real
+    part = channel.mixing.tocoo()
+    others = np.flatnonzero(~here)
+    mixing = csr_array(
+        (
+            np.concatenate([part.data, np.ones(len(others))]),
+            (
+                np.concatenate([rows[part.row], others]),
+                np.concatenate([rows[part.col], others]),
+            ),
+        ),
+        shape=(K, K),
+    )
+    return Channel(knots, course, deviation, sd, mixing, real, channel.noise)

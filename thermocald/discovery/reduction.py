@@ -1,0 +1,283 @@
+"""The reduction of a series: linearisation, gross errors, offsets of targets, normal equations.
+
+What is constant over the series says nothing about heat: one offset per target (errors of the
+field's coordinates) is taken out here, together with the cameras, so that a target that is hidden
+now and then does not pass for a drift.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.discovery.evidence import Evidence, SeriesInput, solve
+from thermocald.discovery.requirements import (
+    MIN_EPOCHS,
+    MIN_TARGETS,
+    no_temperature,
+    require,
+    require_change,
+)
+from thermocald.discovery.thermometer import Channel, instruments
+from thermocald.errors import DataError
+from thermocald.photogrammetry.adjustment import AdjustmentSettings
+from thermocald.photogrammetry.cold_start import cold_start
+from thermocald.photogrammetry.geometry import GeometryBounds
+from thermocald.photogrammetry.normals import linearise, normal_matrices, right_hand_sides
+from thermocald.photogrammetry.testfield import Observations
+from thermocald.simulation.history import History
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from thermocald.photogrammetry.normals import Partials
+
+    Array = NDArray[np.float64]
+
+__all__ = ["gather", "reweighted", "without_targets"]
+
+_GROSS = 4.5  # standard deviations beyond which a point is a gross error
+# only a place to linearise at is wanted: a weak geometry has one too
+_ANY = AdjustmentSettings(max_rejected=0.9, bounds=GeometryBounds(0, 2.0, 1e9, 1e9, 0.0, 0.0))
+
+
+def gather(source: SeriesInput, T0: float | None = None, scale: Array | None = None) -> Evidence:
+    """Check a series and reduce it; `T0` and `scale` are M1's for M2.
+
+    Raises DataError where the data cannot carry a discovery: it says what is missing.
+    """
+    require(source)
+    times = source.frame_times - source.frame_times[0]
+    reading_times = source.reading_times - source.frame_times[0]
+    usable = np.isfinite(reading_times)
+    reading_times = reading_times[usable]
+    present = {
+        name: np.asarray(r, dtype=float)[usable]
+        for name, r in source.readings.items()
+        if np.isfinite(np.asarray(r, dtype=float)[usable]).sum() >= MIN_EPOCHS
+    }
+    reference = next(iter(source.readings))
+    if reference not in present:
+        raise DataError(no_temperature(source, reference))
+    knots, channels = instruments(reading_times, present, source.resolutions)
+    course = channels[reference].course
+    course = course[np.isfinite(course)]
+    history = History(
+        times,
+        knots,
+        {name: c.course for name, c in channels.items()},
+        reference,
+        float(np.mean(course)) if T0 is None else T0,
+    )
+    require_change(source, reference, channels[reference])
+    return _reduce(source, times, history, channels, scale)
+
+
+def _running_median(values: Array, width: int = 5) -> Array:
+    """Median over time (axis 0) of up to `width` neighbours, NaN ignored."""
+    half = width // 2
+    padded = np.pad(values, ((half, half), *((0, 0),) * (values.ndim - 1)), constant_values=np.nan)
+    stack = np.stack([padded[k : k + len(values)] for k in range(width)])
+    stack.sort(axis=0)  # NaN go to the end
+    count = np.isfinite(stack).sum(axis=0)
+    low = np.maximum(count - 1, 0) // 2
+    high = np.minimum(count // 2, width - 1)
+    pick = np.take_along_axis
+    middle: Array = 0.5 * (pick(stack, low[None], 0)[0] + pick(stack, high[None], 0)[0])
+    return middle
+
+
+def _spikes(misclosure: Array, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Points that leap out of their own neighbours in time while the others do not.
+
+    Found before any adjustment, where a gross error of many pixels would hide itself and others.
+    """
+    d = misclosure - _running_median(misclosure)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        d = d - np.nanmedian(d, axis=1, keepdims=True)  # the whole image may move
+        own = 1.4826 * np.nanmedian(np.abs(d), axis=(1, 2))
+    level = float(np.nanmedian(own)) if np.isfinite(own).any() else 0.0
+    limit = 7.0 * np.fmax(np.nan_to_num(own), level)
+    bad: NDArray[np.bool_] = seen & (np.max(np.abs(np.nan_to_num(d)), axis=2) > limit[:, None])
+    return bad
+
+
+def _linearised(source: SeriesInput) -> Partials:
+    """The linearisation: one camera for the mean image of the series."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        mean = np.nanmedian(source.grid.points, axis=0)
+    # targets seen in half of the epochs carry the orientation
+    often = source.grid.observed.sum(axis=0) >= 0.5 * len(source.frame_times)
+    rows = np.flatnonzero(np.isfinite(mean[:, 0]) & often)
+    seen = Observations(rows, mean[rows], np.full((len(rows), 2), 0.1))
+    found = cold_start(
+        source.sensor, source.field, seen, _ANY, source.principal_distance
+    )
+    if found.interior is None or found.exterior is None:
+        raise DataError(
+            f"{source.name}: the camera cannot be oriented on its mean image: {found.reason}"
+        )
+    return linearise(source.sensor, source.field, found.values[:10], found.values[10:])
+
+
+def _reduce(
+    source: SeriesInput,
+    times: Array,
+    history: History,
+    channels: Mapping[str, Channel],
+    scale: Array | None,
+) -> Evidence:
+    at = _linearised(source)
+    X = source.field.points
+    A = np.concatenate([at.A, at.B * X[:, None, :]], axis=-1)
+    used = source.grid.observed.any(axis=0)
+    if scale is None:
+        scale = np.sqrt(np.mean(np.sum(A[used] ** 2, axis=1), axis=0))
+    A = A / scale
+    misclosure = source.grid.points - at.predicted
+    weights = source.grid.weights
+    seen = source.grid.observed
+    bad = _spikes(misclosure, seen)
+    offsets = np.zeros((len(X), 2))
+    values = np.zeros((len(times), len(scale)))
+    v = misclosure
+    s0: float = 1.0
+    for turn in range(5):
+        w = np.where(bad[..., None], 0.0, weights)
+        N = normal_matrices(w, A)
+        b, _ = right_hand_sides(w, misclosure - offsets, A)
+        values = solve(N, b)
+        v = misclosure - offsets - (values @ A.reshape(-1, len(scale)).T).reshape(misclosure.shape)
+        change = _offset_change(w[..., :2], np.nan_to_num(v), N, A)
+        offsets = offsets + change
+        b, _ = right_hand_sides(w, misclosure - offsets, A)
+        values = solve(N, b)
+        v = misclosure - offsets - (values @ A.reshape(-1, len(scale)).T).reshape(misclosure.shape)
+        if turn >= 1:
+            normal = np.abs(np.nan_to_num(v)) * np.sqrt(weights[..., :2])
+            s0 = 1.4826 * float(np.median(normal[seen & ~bad]))
+            local = np.nan_to_num(v - _running_median(np.where(bad[..., None], np.nan, v)))
+            # noise may grow with heat: each epoch is judged by its own spread
+            spread = np.array(
+                [1.4826 * np.median(x[k]) if k.any() else s0
+                 for x, k in zip(normal, seen & ~bad, strict=True)]
+            )  # fmt: skip
+            limit = _GROSS * np.maximum(spread, s0)[:, None]
+            outlying = np.max(np.abs(local) * np.sqrt(weights[..., :2]), axis=2)
+            bad = seen & (outlying > limit)
+    w = np.where(bad[..., None], 0.0, weights)
+    N = normal_matrices(w, A)
+    b, _ = right_hand_sides(w, misclosure - offsets, A)
+    values = solve(N, b)
+    v = misclosure - offsets - (values @ A.reshape(-1, len(scale)).T).reshape(misclosure.shape)
+    offsets = offsets + _offset_change(w[..., :2], np.nan_to_num(v), N, A)
+    b, lPl = right_hand_sides(w, misclosure - offsets, A)
+    values = solve(N, b)
+    yy = np.einsum("ek,ek->e", values, b)
+    count = (seen & ~bad).sum(axis=1)
+    free = np.maximum(2 * count - len(scale), 1)
+    # one offset per target is estimated too
+    loss = 1.0 - 2 * used.sum() / max(2 * count.sum(), 1)
+    sigma0 = np.sqrt(np.maximum(lPl - yy, 0) / free / loss)
+    enough = count >= MIN_TARGETS
+    variance = float(np.median(sigma0[enough]) ** 2)
+    v = misclosure - offsets - (values @ A.reshape(-1, len(scale)).T).reshape(misclosure.shape)
+    v = np.where((seen & ~bad)[..., None], v, np.nan)
+    weak = ~enough
+    N[weak], b[weak], yy[weak], count[weak] = 0.0, 0.0, 0.0, 0
+    return Evidence(
+        source, times, history, channels, at, scale,
+        N / variance, b / variance, yy / variance, values, v, w / variance, offsets,
+        count, sigma0 / np.sqrt(variance), variance, _slowness(v), int(bad.sum()), columns=A,
+    )  # fmt: skip
+
+
+def _offset_change(weights: Array, v: Array, N: Array, A: Array, turns: int = 60) -> Array:
+    """One offset per target (T, 2) that residuals v (E, T, 2) of free cameras ask for.
+
+    Targets hidden for long pull at the cameras of the other epochs: offsets and cameras are solved
+    together, by conjugate gradients on the offsets alone.
+    """
+    k = A.shape[-1]
+    flat = A.reshape(-1, k)
+    total = weights.sum(axis=0)
+    inverse = 1.0 / np.where(total > 0, total, np.inf)
+
+    def normal(p: Array) -> Array:
+        camera = solve(N, (weights * p).reshape(len(N), -1) @ flat)
+        return np.asarray(np.sum(weights * (p - (camera @ flat.T).reshape(v.shape)), axis=0))
+
+    out = np.zeros(total.shape)
+    r = np.sum(weights * v, axis=0)
+    z = inverse * r
+    p, rz = z, float(np.sum(r * z))
+    for _ in range(turns):
+        if np.max(np.abs(z)) < 1e-5:
+            break
+        q = normal(p)
+        pq = float(np.sum(p * q))
+        if pq <= 0:
+            break
+        out = out + rz / pq * p
+        r = r - rz / pq * q
+        z = inverse * r
+        p, rz = z + float(np.sum(r * z)) / rz * p, float(np.sum(r * z))
+    return out
+
+
+def _slowness(v: Array, lags: int = 20) -> float:
+    """By how much slow variances exceed those of white noise: 1 + 2 Σ autocorrelations.
+
+    From the residuals of all targets together; the mean of each target has been taken out.
+    """
+    E = len(v)
+    lags = min(lags, E // 4)
+    x = v - np.nan_to_num(np.nanmean(v)) if np.isfinite(v).any() else v
+    filled = np.nan_to_num(x)
+    there = np.isfinite(x).astype(float)
+    power = float(np.sum(filled**2) / max(there.sum(), 1.0))
+    total = 1.0
+    for k in range(1, lags + 1):
+        pairs = float(np.sum(there[k:] * there[:-k]))
+        if pairs > 0 and power > 0:
+            r = float(np.sum(filled[k:] * filled[:-k])) / pairs / power
+            total += 2.0 * (r + 1.0 / E)
+    return max(total, 1.0) if total > 1.08 else 1.0
+
+
+def reweighted(evidence: Evidence, noise: Array) -> Evidence:
+    """The same series when the measuring noise of each epoch is `noise` (E,) times the usual."""
+    free = np.maximum(2.0 * evidence.n - evidence.N.shape[1], 0.0)
+    level = np.sum(free * (evidence.sigma0 / noise) ** 2) / max(float(free.sum()), 1.0)
+    noise = noise * np.sqrt(level)
+    factor = 1.0 / noise**2
+    return replace(
+        evidence,
+        N=evidence.N * factor[:, None, None],
+        b=evidence.b * factor[:, None],
+        yy=evidence.yy * factor,
+        weights=evidence.weights * factor[:, None, None],
+        sigma0=evidence.sigma0 / noise,
+    )
+
+
+def without_targets(evidence: Evidence, rows: NDArray[np.int64]) -> Evidence:
+    """The same series as if some targets of the field had never been observed."""
+    source = evidence.source
+    mask = np.zeros(source.grid.observed.shape, dtype=bool)
+    mask[:, rows] = True
+    reduced = _reduce(
+        replace(source, grid=source.grid.reject(mask)),
+        evidence.times,
+        evidence.history,
+        evidence.channels,
+        evidence.scale,
+    )
+    return replace(reduced, source=source, excluded=np.union1d(evidence.excluded, rows))

@@ -1,0 +1,74 @@
+"""What a recording must hold to carry a discovery; the refusals say what is missing."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.errors import DataError
+from thermocald.photogrammetry.orientation import plane_fit
+
+if TYPE_CHECKING:
+    from thermocald.discovery.evidence import SeriesInput
+    from thermocald.discovery.thermometer import Channel
+
+__all__ = ["MIN_EPOCHS", "MIN_TARGETS", "no_temperature", "require", "require_change"]
+
+MIN_EPOCHS = 20
+MIN_TARGETS = 12
+_MIN_DURATION = 120.0  # s
+
+
+def no_temperature(source: SeriesInput, reference: str) -> str:
+    """The sentence for a reference temperature that was hardly ever read."""
+    return (
+        f"{source.name}: the recording has no temperature: the column {reference!r} holds fewer "
+        f"than {MIN_EPOCHS} readings. Discovery compares the camera with a thermometer; record one"
+    )
+
+
+def require(source: SeriesInput) -> None:
+    """Raises DataError where temperature, epochs, duration or field do not carry a discovery."""
+    if not source.readings:
+        raise DataError(
+            f"{source.name}: the recording has no temperature column. Discovery compares the "
+            "camera with a thermometer; record one"
+        )
+    reference = next(iter(source.readings))
+    if np.isfinite(source.readings[reference]).sum() < MIN_EPOCHS and (
+        len(source.frame_times) >= MIN_EPOCHS
+    ):
+        raise DataError(no_temperature(source, reference))
+    seen = source.grid.observed.sum(axis=1)
+    good = int(np.sum(seen >= MIN_TARGETS))
+    if good < MIN_EPOCHS:
+        raise DataError(
+            f"{source.name}: {good} of {len(seen)} epochs have {MIN_TARGETS} targets or more; "
+            f"discovery needs {MIN_EPOCHS} such epochs, better 100"
+        )
+    duration = float(source.frame_times[-1] - source.frame_times[0])
+    if duration < _MIN_DURATION:
+        raise DataError(
+            f"{source.name}: the recording lasts {duration:.0f} s; heat needs minutes to reach a "
+            f"camera, and what moves faster is no thermal effect. Record {_MIN_DURATION:.0f} s at "
+            "least, better half an hour"
+        )
+    rows = source.grid.observed.any(axis=0)
+    if plane_fit(source.field.points[rows])[2]:
+        raise DataError(
+            f"{source.name}: the {int(rows.sum())} targets seen lie in one plane; principal point "
+            "and tilt cannot be told apart on it. Use a field with depth, such as a corner"
+        )
+
+
+def require_change(source: SeriesInput, reference: str, channel: Channel) -> None:
+    """Raises DataError where the reference temperature does not change."""
+    course = channel.course[np.isfinite(channel.course)]
+    change = float(np.ptp(course))
+    if change < max(1.0, 8.0 * channel.noise):
+        raise DataError(
+            f"{source.name}: the temperature {reference!r} is constant within "
+            f"{change:.2f} K; what follows it cannot be told from what does not. "
+            "Record a series in which it changes by 5 K or more"
+        )

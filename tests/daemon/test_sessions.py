@@ -148,6 +148,7 @@ def status_of(daemon) -> dict:
     return json.loads((daemon.live / "status.json").read_text())
 
 
+@pytest.mark.slow
 def test_status_and_stop(live, command, daemon):
     live()
     process = command("start", "--series", "M7", "--start", "warm", "--epochs", "1000", "--no-wait")

@@ -161,6 +161,7 @@ def in_a_terminal(daemon, seconds: float, *options: str) -> tuple[str, int]:
     return seen.decode(errors="replace"), status
 
 
+@pytest.mark.slow
 def test_top_is_always_up_to_date(daemon, devices):
     daemon.configure(**devices())
     daemon.start()

@@ -1,0 +1,161 @@
+"""Tables and the figure of the blind scoring."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from tests.blind.generator import OUTSIDE, SINGLE
+from tests.blind.outcome import Outcome
+
+HEAD = (
+    "| part | cases | exact | exact or listed | lists | parameters within 3 sd | "
+    "gap on M2 closed ≥ 90 % | median CPU s |\n|---|---|---|---|---|---|---|---|"
+)
+FIGURE = "discovery-power.svg"
+
+
+def summary(outcomes: list[Outcome]) -> dict[str, float]:
+    pulls = [abs(p) for o in outcomes for p in o.pulls.values()]
+    closed = [o.gap_closed for o in outcomes if o.gap_closed is not None]
+    return {
+        "cases": len(outcomes),
+        "exact": float(np.mean([o.right for o in outcomes])),
+        "exact_or_listed": float(np.mean([o.right_or_listed for o in outcomes])),
+        "lists": float(np.mean([bool(o.listed) for o in outcomes])),
+        "within_3_sd": float(np.mean([p <= 3 for p in pulls])) if pulls else float("nan"),
+        "gap_closed_90": float(np.mean([c >= 0.9 for c in closed])) if closed else float("nan"),
+        "median_s": float(np.median([o.seconds for o in outcomes])),
+    }
+
+
+def row(part: str, outcomes: list[Outcome]) -> str:
+    """One line of the table."""
+    s = summary(outcomes)
+
+    def share(name: str) -> str:
+        return f"{s[name]:.1%}" if np.isfinite(s[name]) else ""
+
+    return (f"| {part} | {s['cases']:.0f} | {share('exact')} | {share('exact_or_listed')} | "
+            f"{share('lists')} | {share('within_3_sd')} | {share('gap_closed_90')} | "
+            f"{s['median_s']:.2f} |")  # fmt: skip
+
+
+def confusion(outcomes: list[Outcome]) -> str:
+    """Rows: what was hidden; columns: what was said."""
+    rows: dict[str, Counter[str]] = {}
+    for o in outcomes:
+        rows.setdefault("+".join(o.case.effects) or "none", Counter())[
+            "+".join(o.found) or "none"
+        ] += 1
+    said = sorted({c for r in rows.values() for c in r})
+    lines = ["| hidden | right | said instead |", "|---|---|---|"]
+    for name in rows:
+        own = "unnamed" if name == OUTSIDE else "+".join(sorted(name.split("+")))
+        wrong = ", ".join(f"{c} × {rows[name][c]}" for c in said if rows[name][c] and c != own)
+        lines.append(f"| `{name}` | {rows[name][own]} of {rows[name].total()} | {wrong} |")
+    return "\n".join(lines)
+
+
+def power_table(found: dict[str, list[Outcome]]) -> str:
+    """Right names per effect against strength."""
+    parts = sorted((p for p in found if p.startswith("single-")), key=_strength)
+    lines = [
+        "| hidden | " + " | ".join(f"{_strength(p):g} px" for p in parts) + " |",
+        "|---|" + "---|" * len(parts),
+    ]
+    for effect in SINGLE:
+        cells = []
+        for part in parts:
+            own = [o for o in found[part] if o.case.effects == (effect,)]
+            cells.append(f"{sum(o.right for o in own)} of {len(own)}")
+        lines.append(f"| `{effect}` | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def power_figure(found: dict[str, list[Outcome]], path: Path) -> None:
+    """Share of single effects named rightly, and wrongly, against strength in px."""
+    import matplotlib as mpl
+
+    mpl.use("svg")
+    from matplotlib import pyplot as plt
+
+    parts = sorted((p for p in found if p.startswith("single-")), key=_strength)
+    px = [_strength(p) for p in parts]
+    n = np.array([len(found[p]) for p in parts])
+    right = np.array([np.mean([o.right for o in found[p]]) for p in parts])
+    wrong = np.array([np.mean([bool(o.found) and not o.right for o in found[p]]) for p in parts])
+    with mpl.rc_context({"svg.hashsalt": "power"}):
+        figure, axes = plt.subplots(figsize=(6.4, 3.6))
+        for share, label, colour in (
+            (right, "exact name", "#1b6ca8"),
+            (wrong, "another name, or unnamed", "#b8442a"),
+        ):
+            low, high = _interval(share, n)
+            axes.errorbar(px, 100 * share, 100 * np.array([share - low, high - share]),
+                          fmt="o-", color=colour, label=label, capsize=3)  # fmt: skip
+        axes.set(xscale="log", ylim=(-3, 103), xlabel="strength / px RMS left by the base model",
+                 ylabel="share of single effects / %")  # fmt: skip
+        axes.set_xticks(px, [f"{v:g}" for v in px])
+        axes.minorticks_off()
+        axes.grid(alpha=0.3)
+        axes.legend()
+        figure.savefig(path, bbox_inches="tight", metadata={"Date": None})
+        plt.close(figure)
+
+
+def _strength(part: str) -> float:
+    return float(part.partition("-")[2])
+
+
+def _interval(share: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """68 % limits of a share (Wilson 1927)."""
+    middle = (share + 0.5 / n) / (1 + 1 / n)
+    half = np.sqrt(share * (1 - share) / n + 0.25 / n**2) / (1 + 1 / n)
+    return np.minimum(middle - half, share), np.maximum(middle + half, share)
+
+
+def write(path: Path, found: dict[str, list[Outcome]], seeds: Sequence[int]) -> None:
+    """The page of the documents, and the figure beside it."""
+    power_figure(found, path.with_name(FIGURE))
+    parts = "\n".join(row(p, o) for p, o in found.items())
+    matrices = "\n\n".join(f"## {p}\n\n{confusion(o)}" for p, o in found.items())
+    path.write_text(
+        f"""# How well discovery names hidden effects
+
+Blind recordings from a generator (`tests/blind/generator.py`) that shares no code with the program;
+the number of a part is the strength in px: the RMS of image points that the base model, fitted,
+leaves over. None of these seeds was looked at while the program was made. Written, and repeated, by
+
+    {_command(found, seeds)}
+
+with one thread; `--store` keeps what is done, so that it can be interrupted. `hard`: cadence
+jitter, missing epochs and temperatures, wrong coordinates, correlated noise, people walking by, M2
+under another programme. `none2`: thermometer noise doubled. `lists`: alternatives that the data
+cannot exclude were listed.
+
+{HEAD}
+{parts}
+
+## Power
+
+![Share of single effects named against their strength in px]({FIGURE})
+
+Bars: 68 % limits of the share.
+
+{power_table(found)}
+
+{matrices}
+""",
+        encoding="utf-8",
+    )
+
+
+def _command(found: dict[str, list[Outcome]], seeds: Sequence[int]) -> str:
+    return (
+        f"python -m tests.blind.score --first {seeds[0]} --seeds {len(seeds)} "
+        "--write docs/reference/discovery-confusion.md"
+    )

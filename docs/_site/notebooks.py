@@ -30,10 +30,21 @@ def pages() -> dict[str, str | bytes]:
                 parts.append(source)
                 continue
             parts.append(f"```python\n{source}\n```")
-            parts += [_shown(output, path.stem, contents) for output in cell["outputs"]]
+            parts += [_shown(output, path.stem, contents) for output in _joined(cell["outputs"])]
         parts.insert(1, f"*This page is the notebook `examples/{path.name}` as it ran.*")
         contents[f"examples/{path.stem}.md"] = "\n\n".join(parts) + "\n"
     return contents
+
+
+def _joined(outputs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """What was printed in pieces, in one."""
+    found: list[dict[str, Any]] = []
+    for output in outputs:
+        if found and output["output_type"] == found[-1]["output_type"] == "stream":
+            found[-1] = {**found[-1], "text": [*found[-1]["text"], *output["text"]]}
+        else:
+            found.append(output)
+    return found
 
 
 def _shown(output: dict[str, Any], stem: str, contents: dict[str, str | bytes]) -> str:

@@ -44,6 +44,7 @@ NOT_RUN = {
     "make test": "runs this test",
     "make test-slow": "runs this test",
     "make bench": "an hour of measurements; no test's business",
+    "make docs": "tests/docs/test_site.py builds the site",
     "make hil": "root, and an hour for the first time; run by .ci/run",
     "make demo": "sets up an environment; `thermocald demo` is run by the tutorial",
 }

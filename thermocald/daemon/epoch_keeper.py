@@ -143,7 +143,9 @@ class EpochKeeper:
                 extra=calibrated.extra,
             )
         except StoreError as error:
-            log.warning("the calibration of epoch %d waits: %s", epoch.number, error)
+            # that the store is away was told once
+            level = logging.DEBUG if self._guard.away else logging.WARNING
+            log.log(level, "the calibration of epoch %d waits: %s", epoch.number, error)
             self._searched_to = min(self._searched_to, epoch.number - 1)
             return
         wanted = self._frames.wanted(epoch.number, not calibrated.adjustment.ok)

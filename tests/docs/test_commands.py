@@ -83,8 +83,14 @@ def epochs_in(*stores: str):
     return kept
 
 
+def daemon_listens(folder: Path, _: str) -> bool:
+    """Whether it keeps epochs and can be asked."""
+    socket = folder / "thermocald.db.live" / "control.sock"
+    return socket.exists() and epochs_in("thermocald.db")(folder, "")
+
+
 UNTIL = {
-    "thermocald run --config config.yaml": epochs_in("thermocald.db"),
+    "thermocald run --config config.yaml": daemon_listens,
     "thermocald run --mock": epochs_in("thermocald-mock.db"),
     "thermocald top --config config.yaml": lambda _, output: "demo" in output,
     "thermocald dashboard --store thermocald.db": lambda _, output: "http://127.0.0.1" in output,
@@ -212,10 +218,19 @@ class Page:
         """Ctrl-C for what stays, or for one of them."""
         for command, process in list(self.staying):
             if only in ("", command):
-                os.killpg(process.pid, signal.SIGINT)
-                status = process.wait(PATIENCE_S)
+                status = self.interrupted(process)
                 self.staying.remove((command, process))
                 assert status in (0, 130), f"{command}: {status}"
+
+    def interrupted(self, process: subprocess.Popen[str]) -> int:
+        """The exit status after Ctrl-C, and again: Python may lose one in a destructor."""
+        for _ in range(8):
+            os.killpg(process.pid, signal.SIGINT)
+            try:
+                return process.wait(PATIENCE_S / 8)
+            except subprocess.TimeoutExpired:
+                continue
+        raise AssertionError(f"{self.page}: it does not end on Ctrl-C:\n{self.output()[-2000:]}")
 
     def kill(self) -> None:
         for _, process in self.staying:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from tests.blind.generator import SINGLE, Case
-from tests.blind.score import judge, run, summary
+from tests.blind.score import judge, run
+from tests.blind.tables import summary
 
 
 @pytest.mark.parametrize("effect", ["time_offset", "hysteresis", "slip", "second_heat_source"])

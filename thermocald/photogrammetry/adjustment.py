@@ -59,7 +59,6 @@ __all__ = [
 
 DEFAULT_FREE = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2")
 
-_TRUSTED_REDUNDANCY = 20
 _ROUNDS = 12  # of data snooping; each may reject several targets
 _TRUSTED_REDUNDANCY = 20  # from here on the residuals themselves tell the noise
 
@@ -234,7 +233,7 @@ def _result(
     if redundancy < _TRUSTED_REDUNDANCY:
         factor = max(1.0, factor)  # a handful of residuals may be small by luck
     covariance = np.zeros((16, 16))
-    covariance[np.ix_(u, u)] = solution.root @ solution.root.T * factor
+    covariance[u[:, None], u] = solution.root @ solution.root.T * factor
     result = Adjustment(
         "ok",
         "",

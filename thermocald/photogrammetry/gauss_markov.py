@@ -40,6 +40,7 @@ __all__ = [
 _ITERATIONS = 30
 # Standard deviations: a last step by the old partials; leaves less than 1e-3 px in c, x0, y0.
 _CONVERGED = 0.01
+_SMALL = 0.1  # standard deviations: a step that fresh partials carry as well
 _LINEAR = 10.0  # standard deviations that a solution may move without new partials
 _TRUSTED_REDUNDANCY = 20  # from here on the residuals themselves tell the noise
 
@@ -206,8 +207,12 @@ def solve(problem: Problem, start: Array, use: Mask) -> Solution:
         N = flat @ flat.T
         N.flat[:: len(u) + 1] += problem.prior_weight
         root = cofactor_root(N, u)
-        cost = problem.cost(vu, values)
         gradient = problem.gradient(flat, vu, values)
+        half = root.T @ gradient
+        if float(half @ half) < _SMALL**2:
+            residuals = observed - predicted.T
+            return _moved(Solution(values, J, v, rows, residuals, root), u, root @ half)
+        cost = problem.cost(vu, values)
         whole = False
         for step, whole in _trial_steps(N, u, root, gradient):  # noqa: B007  read after it
             trial = values.copy()

@@ -36,7 +36,8 @@ def test_noise_with_quantisation(readings):
 
 
 def test_a_step_is_not_better_than_itself():
-    assert reading_noise(10.0 * np.arange(100), np.full(100, 21.0625), 0.0625) == pytest.approx(0.0625 / np.sqrt(12))
+    noise = reading_noise(10.0 * np.arange(100), np.full(100, 21.0625), 0.0625)
+    assert noise == pytest.approx(0.0625 / np.sqrt(12))
 
 
 def test_kinks_get_a_latent_instant(readings):

@@ -69,9 +69,9 @@ class Channel:
 def reading_noise(times: Array, readings: Array, resolution: float | None) -> float:
     """Standard deviation in K of one reading, quantisation included.
 
-    From third divided differences, as thermometers are not read at even intervals, cut at 2.2 sigma again and again, so that a switched lamp, which spoils
-    four of them, does not count as noise. A thermometer that repeats one step for long has the
-    error of the step.
+    From third divided differences, as thermometers are not read at even intervals, cut at 2.2 sigma
+    again and again, so that a switched lamp, which spoils four of them, does not count as noise. A
+    thermometer that repeats one step for long has the error of the step.
     """
     there = np.isfinite(readings)
     t, values = times[there], readings[there]

@@ -7,6 +7,7 @@ is a command too, and its name and options must exist.
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,7 @@ PAGES = sorted(
         ROOT / "drivers/README.md",
     ]
 )
+NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
 
 
 @dataclass(frozen=True)
@@ -63,8 +65,12 @@ def blocks(page: Path) -> list[Block]:
 
 
 def inline_commands(page: Path) -> list[str]:
-    """Inline code that begins with `thermocald` and a word."""
-    text = re.sub(r"^ *```.*?^ *```\s*$", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+    """Inline code of a page, or of a notebook's text, that begins with `thermocald` and a word."""
+    text = page.read_text(encoding="utf-8")
+    if page.suffix == ".ipynb":
+        cells = json.loads(text)["cells"]
+        text = "\n".join("".join(c["source"]) for c in cells if c["cell_type"] == "markdown")
+    text = re.sub(r"^ *```.*?^ *```\s*$", "", text, flags=re.M | re.S)
     return re.findall(r"`(thermocald [a-z][^`]*)`", text)
 
 

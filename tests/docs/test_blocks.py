@@ -15,6 +15,7 @@ import yaml
 
 from tests.docs.blocks import (
     LANGUAGES,
+    NOTEBOOKS,
     PAGES,
     ROOT,
     Block,
@@ -59,7 +60,7 @@ def thermocald_commands() -> list[tuple[str, str]]:
         for line in block.commands():
             parts = re.split(r"\s*(?:&&|\||;)\s*", line)
             found += [(identity(block), p) for p in parts if p.startswith("thermocald ")]
-    for page in PAGES:
+    for page in (*PAGES, *NOTEBOOKS):
         found += [(name(page), text) for text in inline_commands(page)]
     return found
 

@@ -252,6 +252,7 @@ def runnable(page: Path) -> bool:
 QUICK = {"docs/reference/store.md"}
 
 
+@pytest.mark.timeout(1500)  # a tutorial is several series and their analysis
 @pytest.mark.parametrize(
     "page",
     [

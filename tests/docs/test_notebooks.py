@@ -9,9 +9,7 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
-from tests.docs.blocks import ROOT
-
-NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
+from tests.docs.blocks import NOTEBOOKS, ROOT
 
 # Run before the first cell: what is wrong with a drawing goes to standard error.
 WATCH = """

@@ -24,6 +24,7 @@ from thermocald.discovery.requirements import (
 from thermocald.discovery.thermometer import Channel, instruments
 from thermocald.errors import DataError
 from thermocald.photogrammetry.adjustment import AdjustmentSettings
+from thermocald.photogrammetry.camera_model import IOP_NAMES
 from thermocald.photogrammetry.cold_start import cold_start
 from thermocald.photogrammetry.geometry import GeometryBounds
 from thermocald.photogrammetry.normals import linearise, normal_matrices, right_hand_sides
@@ -42,8 +43,7 @@ if TYPE_CHECKING:
 __all__ = ["gather", "reweighted", "without_targets"]
 
 _GROSS = 4.5  # standard deviations beyond which a point is a gross error
-# only a place to linearise at is wanted: a weak geometry has one too
-_ANY = AdjustmentSettings(max_rejected=0.9, bounds=GeometryBounds(0, 2.0, 1e9, 1e9, 0.0, 0.0))
+_ANY_GEOMETRY = GeometryBounds(0, 2.0, 1e9, 1e9, 0.0, 0.0)
 
 
 def gather(source: SeriesInput, T0: float | None = None, scale: Array | None = None) -> Evidence:
@@ -108,6 +108,16 @@ def _spikes(misclosure: Array, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return bad
 
 
+def _loose(source: SeriesInput) -> AdjustmentSettings:
+    """All ten parameters free: at a place with C1 or C2 held, the principal point makes up for
+    them, and the partials are those of another camera. Weak ones stay near zero.
+    """
+    c = source.principal_distance or source.sensor.width * source.sensor.pixel_pitch
+    spreads = (0.3 / c**2, 0.3 / c**4, 0.3 / c**6, 0.02 / c, 0.02 / c, 0.02, 0.02)
+    priors = {name: (0.0, sd) for name, sd in zip(IOP_NAMES[3:], spreads, strict=True)}
+    return AdjustmentSettings(IOP_NAMES, priors, max_rejected=0.9, bounds=_ANY_GEOMETRY)
+
+
 def _linearised(source: SeriesInput) -> Partials:
     """The linearisation: one camera for the mean image of the series."""
     with warnings.catch_warnings():
@@ -118,7 +128,7 @@ def _linearised(source: SeriesInput) -> Partials:
     rows = np.flatnonzero(np.isfinite(mean[:, 0]) & often)
     seen = Observations(rows, mean[rows], np.full((len(rows), 2), 0.1))
     found = cold_start(
-        source.sensor, source.field, seen, _ANY, source.principal_distance
+        source.sensor, source.field, seen, _loose(source), source.principal_distance
     )
     if found.interior is None or found.exterior is None:
         raise DataError(

@@ -88,3 +88,13 @@ def test_blocks_keep_the_slow_courses(source):
     assert short.N.sum(axis=0) == pytest.approx(e.N.sum(axis=0))
     assert short.b.sum(axis=0) == pytest.approx(e.b.sum(axis=0))
     assert short.averaged(e.times) == pytest.approx(short.times)
+
+
+def test_the_place_of_linearisation_has_all_parameters():
+    """Where C1 of 4e-3 is held at 0, y0 and B2 make up for it, and the drifts come out biased."""
+    series, _ = generate(Case(("affinity_drift",), 0.3, 210, with_m2=False))
+
+    at = gather(series_input(series[0])).at
+
+    assert at.iop[8] == pytest.approx(1.6e-3, abs=4e-4)  # C1 of the base and of the mean T
+    assert abs(at.iop[7]) < 2e-4  # B2, drawn with 1e-4

@@ -61,3 +61,11 @@ def test_a_missing_reading_is_uncertain(readings):
     c = smooth_channel(t, y, np.zeros(len(t), dtype=bool), 0.0625)
     assert c.deviation[50] == 0.0
     assert c.sd[50] > 2 * c.sd[100]
+
+
+def test_thermometers_are_not_read_at_even_intervals():
+    """On a steep course jittered readings differ without any noise."""
+    rng = np.random.default_rng(3)
+    t = 10.0 * np.arange(200) + rng.uniform(-1, 1, 200)
+
+    assert reading_noise(t, 20 + 0.1 * t + rng.normal(0, 0.01, 200), None) < 0.013

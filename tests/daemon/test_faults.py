@@ -88,6 +88,8 @@ def test_a_store_that_cannot_be_written_waits_in_memory(daemon, devices):
     daemon.until(lambda: json.loads(status.read_text())["store"]["waiting"] >= 5)
     resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, before)
     daemon.until(lambda: "can be written again" in daemon.log())
+    # the output's file was closed for it too, and gets what waited when it is opened again
+    daemon.until(lambda: sum(not r["stored"] for r in daemon.results()) >= 5)
     daemon.until(lambda: daemon.results()[-1]["stored"])
     assert daemon.stop() == 0
     results = daemon.results()

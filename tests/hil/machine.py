@@ -94,6 +94,7 @@ class Machine:
             "systemd.show_status=0"
         )
         return [
+            *("setpriv", "--pdeathsig", "KILL"),  # it ends with whoever started it
             *("qemu-system-x86_64", "-M", "q35", "-accel", self.accelerator, "-cpu", CPU),
             *("-smp", "2", "-m", "1536", "-nodefaults", "-no-user-config", "-display", "none"),
             *("-kernel", str(self.built / "kernel"), "-initrd", str(self.built / "initrd")),

@@ -207,7 +207,7 @@ def main() -> None:
             continue
         print(row(part, found[part]), flush=True)
     if a.write:
-        write(a.write, found, seeds)
+        write(a.write, found, seeds, a.done)
 
 
 if __name__ == "__main__":

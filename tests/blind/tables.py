@@ -118,8 +118,11 @@ def _interval(share: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return np.minimum(middle - half, share), np.maximum(middle + half, share)
 
 
-def write(path: Path, found: dict[str, list[Outcome]], seeds: Sequence[int]) -> None:
-    """The page of the documents, and the figure beside it."""
+def write(
+    path: Path, found: dict[str, list[Outcome]], seeds: Sequence[int], partly: bool = False
+) -> None:
+    """The page of the documents, and the figure beside it; partly: not all cases were run."""
+    note = "Not all of its cases have been run yet: the table says how many.\n" if partly else ""
     power_figure(found, path.with_name(FIGURE))
     parts = "\n".join(row(p, o) for p, o in found.items())
     matrices = "\n\n".join(f"## {p}\n\n{confusion(o)}" for p, o in found.items())
@@ -132,7 +135,7 @@ leaves over. None of these seeds was looked at while the program was made. Writt
 
     {_command(found, seeds)}
 
-with one thread; `--store` keeps what is done, so that it can be interrupted. `hard`: cadence
+with one thread; `--store` keeps what is done, so that it can be interrupted. {note}`hard`: cadence
 jitter, missing epochs and temperatures, wrong coordinates, correlated noise, people walking by, M2
 under another programme. `none2`: thermometer noise doubled. `lists`: alternatives that the data
 cannot exclude were listed.

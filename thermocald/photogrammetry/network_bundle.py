@@ -138,6 +138,10 @@ def linearise(
 def normal_equations(
     bundle: Bundle, rays: ImageRays, free: Index, linearised: tuple[Array, Array, Array, Array]
 ) -> NormalEquations:
+    """The normal equations of a bundle in blocks: camera and poses, targets, and between them.
+
+    free: columns of the interior orientation that are estimated; linearised: of `linearise`.
+    """
     v, by_interior, by_pose, by_point = linearised
     by_interior = by_interior[:, :, free]
     k, m, f = len(bundle.centres), len(bundle.points), len(free)

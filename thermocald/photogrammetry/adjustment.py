@@ -196,10 +196,13 @@ def adjust(
     try:
         solution = solve(problem, start, use)
         tests = point_tests(solution, use)
+        back, barred = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
         for _ in range(_ROUNDS):
-            keep = snoop(tests[0], use, len(unknowns), s.snooping_alpha)
+            keep = snoop(tests[0], use, len(unknowns), s.snooping_alpha) & ~barred
             if np.array_equal(keep, use):
                 break
+            barred |= back & use & ~keep  # rejected for the second time: it would go on for ever
+            back |= keep & ~use
             use = keep
             if use.sum() < (1 - s.max_rejected) * n:
                 return failed(

@@ -38,9 +38,7 @@ __all__ = [
 ]
 
 _ITERATIONS = 30
-# Standard deviations: a last step by the old partials; leaves less than 1e-3 px in c, x0, y0.
-_CONVERGED = 0.01
-_SMALL = 0.1  # standard deviations: a step that fresh partials carry as well
+_SMALL = 0.3  # standard deviations: a last step that leaves less than 1e-3 px in c, x0, y0
 _LINEAR = 10.0  # standard deviations that a solution may move without new partials
 _TRUSTED_REDUNDANCY = 20  # from here on the residuals themselves tell the noise
 
@@ -109,7 +107,7 @@ class Problem:
 @dataclass(frozen=True, eq=False)
 class Solution:
     """values (16,); J (u, 2, n) whitened partials and v (2, n) whitened residuals of all points;
-    rows (2, u, n) partials in px and residuals (2, n) px; root (u, u): cofactors = root · rootᵀ.
+    rows (u, 2, n) partials in px and residuals (2, n) px; root (u, u): cofactors = root · rootᵀ.
     """
 
     values: Array
@@ -189,65 +187,64 @@ def cofactor_root(N: Array, unknowns: NDArray[np.int64], damping: float = 0.0) -
 def solve(problem: Problem, start: Array, use: Mask) -> Solution:
     """Gauss-Newton, with shorter or damped steps only where a whole one does not improve.
 
-    start (16,); use (n,) the observations that take part. The last step re-uses the partials: a
-    warm epoch needs them once. Raises NoConvergenceError, GeometryError.
+    start (16,); use (n,) the observations that take part. A warm epoch needs two sets of partials:
+    its last step, by fresh ones, is too small to be looked at. Raises NoConvergenceError,
+    GeometryError.
     """
     u, sensor = problem.unknowns, problem.sensor
-    values = start
+    values, last = start, float("inf")
     observed = problem.observations.points.T
     for _ in range(_ITERATIONS):
         predicted, A, B = partials(sensor, values[:10], values[10:], problem.points)
         if not np.isfinite(predicted[use]).all():
             raise NoConvergenceError("targets came to lie behind the camera during the iteration")
         covariance = point_covariances(problem.observations, B, problem.target_variances)
-        rows = A.transpose(1, 2, 0)[:, u]
-        J = _whiten(covariance, rows).swapaxes(0, 1)
-        v = _whiten(covariance, observed - predicted.T)
+        rows = A.transpose(2, 1, 0)[u]
+        J = _whiten(covariance, rows.swapaxes(0, 1)).swapaxes(0, 1)
+        residuals = observed - predicted.T
+        v = _whiten(covariance, residuals)
         flat, vu = _used(J, v, use)
         N = flat @ flat.T
         N.flat[:: len(u) + 1] += problem.prior_weight
         root = cofactor_root(N, u)
         gradient = problem.gradient(flat, vu, values)
         half = root.T @ gradient
-        if float(half @ half) < _SMALL**2:
-            residuals = observed - predicted.T
+        size = float(np.sqrt(half @ half))  # of the whole step, in standard deviations
+        if size < _SMALL:
             return _moved(Solution(values, J, v, rows, residuals, root), u, root @ half)
+        near, last = size < _LINEAR and size < 0.5 * last, size
+        if near:
+            values = values.copy()
+            values[u] += root @ half
+            continue
         cost = problem.cost(vu, values)
-        whole = False
-        for step, whole in _trial_steps(N, u, root, gradient):  # noqa: B007  read after it
+        for step in _trial_steps(N, u, root, gradient):
             trial = values.copy()
             trial[u] += step
             residuals = observed - project(sensor, trial[:10], trial[10:], problem.points).T
-            v = _whiten(covariance, residuals)
-            _, vu = _used(None, v, use)
+            _, vu = _used(None, _whiten(covariance, residuals), use)
             new = problem.cost(vu, trial)
             if np.isfinite(new) and new <= cost * (1 + 1e-9) + 1e-12:
                 break
         else:
             raise NoConvergenceError("the adjustment does not converge from its start values")
         values = trial
-        gradient = problem.gradient(flat, vu, values)
-        half = root.T @ gradient
-        if whole and float(half @ half) < _CONVERGED**2:
-            return _moved(Solution(values, J, v, rows, residuals, root), u, root @ half)
     raise NoConvergenceError(f"the adjustment did not converge in {_ITERATIONS} iterations")
 
 
-def _trial_steps(
-    N: Array, u: NDArray[np.int64], root: Array, gradient: Array
-) -> Iterator[tuple[Array, bool]]:
-    """Steps to try in turn, and whether each is the whole Gauss-Newton step.
+def _trial_steps(N: Array, u: NDArray[np.int64], root: Array, gradient: Array) -> Iterator[Array]:
+    """Steps to try in turn.
 
     First along its direction, which follows the narrow valleys of correlated parameters, then
     damped (Levenberg-Marquardt).
     """
     whole = root @ (root.T @ gradient)
-    yield whole, True
+    yield whole
     for shortened in (0.5, 0.25, 0.1, 0.03):
-        yield shortened * whole, False
+        yield shortened * whole
     for damping in (1e-6, 1e-4, 1e-2, 1.0, 1e2, 1e4, 1e6):
         damped = cofactor_root(N, u, damping)
-        yield damped @ (damped.T @ gradient), False
+        yield damped @ (damped.T @ gradient)
 
 
 def resolve(problem: Problem, solution: Solution, use: Mask) -> Solution:
@@ -276,7 +273,14 @@ def _moved(s: Solution, unknowns: NDArray[np.int64], step: Array) -> Solution:
     values = s.values.copy()
     values[unknowns] += step
     v = s.v - (step @ s.J.reshape(len(step), -1)).reshape(s.v.shape)
-    return Solution(values, s.J, v, s.rows, s.residuals - step @ s.rows, s.root)
+    return Solution(
+        values,
+        s.J,
+        v,
+        s.rows,
+        s.residuals - (step @ s.rows.reshape(len(step), -1)).reshape(s.v.shape),
+        s.root,
+    )
 
 
 def point_tests(solution: Solution, use: Mask) -> tuple[Array, Array]:

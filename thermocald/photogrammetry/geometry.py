@@ -117,25 +117,22 @@ def weaknesses(
 def _has_depth(points: Array) -> bool:
     """Whether points are certainly no plane: a quick look that spares most epochs the fit."""
     reduced = points - points.sum(axis=0) / len(points)
-    (a, b, c), (_, d, e), (_, _, f) = reduced.T @ reduced
+    (a, b, c), (_, d, e), (_, _, f) = (reduced.T @ reduced).tolist()
     determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
     return bool(determinant > 1e-4 * (a + d + f) ** 3)
 
 
 def _strongest_correlation(covariance: Array, bound: float) -> str:
     variance = covariance.diagonal()
-    u = np.flatnonzero(variance > 0)
-    scale = 1.0 / np.sqrt(variance[u])
-    r = np.abs(covariance[u][:, u] * scale * scale[:, None])
-    r.flat[:: len(u) + 1] = 0.0
+    scale = 1.0 / np.sqrt(np.where(variance > 0, variance, np.inf))
+    r = np.abs(covariance * scale * scale[:, None])
+    r.flat[:: len(r) + 1] = 0.0
     # Only pairs that an IOP takes part in: EOP alone do not spoil the camera.
-    inner = r[u < len(IOP_NAMES)]
-    if inner.size == 0:
-        return ""
-    i, j = np.unravel_index(int(np.argmax(inner)), inner.shape)
+    inner = r[: len(IOP_NAMES)]
+    i, j = divmod(int(inner.argmax()), len(r))
     if inner[i, j] <= bound:
         return ""
     return (
-        f"{PARAMETER_NAMES[u[i]]} and {PARAMETER_NAMES[u[j]]} correlate at {inner[i, j]:.5f} "
+        f"{PARAMETER_NAMES[i]} and {PARAMETER_NAMES[j]} correlate at {inner[i, j]:.5f} "
         f"(bound {bound})"
     )

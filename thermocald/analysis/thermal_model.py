@@ -240,7 +240,11 @@ def _field_covariance(fit: ModelFit, state: FitState) -> Array:
     drift = ~level
     Q = fit.Q[np.ix_(level, level)]
     mixed = fit.Q[np.ix_(level, drift)]
-    Q = Q - mixed @ np.linalg.solve(fit.Q[np.ix_(drift, drift)], mixed.T)
+    own = fit.Q[np.ix_(drift, drift)]
+    # what the points cannot see, a target's way along its ray, is held and has no variance
+    scale = np.sqrt(np.where(np.diag(own) > 0, np.diag(own), 1.0))
+    both = np.outer(scale, scale)
+    Q = Q - mixed @ (np.linalg.pinv(own / both, rcond=1e-12, hermitian=True) / both) @ mixed.T
     moved = np.zeros((p, lever.shape[1]))
     moved[level] = Q @ (lever[level] * field.sigmas.ravel())
     result: Array = moved @ moved.T

@@ -2,7 +2,8 @@
 
 Run: python benchmarks/adjustment.py
 Bounds: warm epoch with full covariance ≤ 0.4 × cv2.calibrateCameraExtended on the same points;
-a batch of 1,000 epochs ≤ 0.06 × per epoch.
+a batch of 1,000 epochs ≤ 0.06 × per epoch. The adjustment with its covariance stands beside all
+that `adjust` does: data snooping, redundancy numbers, a look at the geometry. OpenCV does neither.
 """
 
 from __future__ import annotations
@@ -18,13 +19,14 @@ from collections.abc import Callable, Sequence
 import cv2
 import numpy as np
 
-from thermocald.photogrammetry.adjustment import adjust
+from thermocald.photogrammetry.adjustment import AdjustmentSettings, adjust
 from thermocald.photogrammetry.camera_model import (
     ExteriorOrientation,
     InteriorOrientation,
     Sensor,
     project,
 )
+from thermocald.photogrammetry.gauss_markov import Problem, solve
 from thermocald.photogrammetry.normals import ObservationGrid
 from thermocald.photogrammetry.series import SeriesSettings, adjust_series
 from thermocald.photogrammetry.testfield import Observations, TestField
@@ -108,14 +110,29 @@ def main() -> int:
     def batch() -> object:
         return adjust_series(SENSOR, field, grid, INTERIOR, EXTERIOR, settings)
 
-    pairs = np.array(
-        [least_seconds([warm(epoch), opencv(field, epoch)], 8) for epoch in epochs[:_EPOCHS]]
+    unknowns = AdjustmentSettings().unknowns
+    start = np.concatenate([INTERIOR.as_array(), EXTERIOR.as_array()])
+
+    def alone(epoch: Observations) -> Callable[[], object]:
+        def run() -> object:
+            problem = Problem.build(SENSOR, field, epoch, unknowns, {}, target_sigmas=True)
+            solution = solve(problem, start, np.ones(len(epoch), dtype=bool))
+            return solution.values, solution.root @ solution.root.T
+
+        return run
+
+    triples = np.array(
+        [
+            least_seconds([alone(epoch), warm(epoch), opencv(field, epoch)], 8)
+            for epoch in epochs[:_EPOCHS]
+        ]
     )
-    ours, peer = pairs.mean(axis=0)
+    bare, ours, peer = triples.mean(axis=0)
     per_epoch = least_seconds([batch], 6)[0] / len(epochs)
     rows = [
-        ("warm epoch / cv2.calibrateCameraExtended", ours / peer, 0.4),
-        ("batch of 1,000, per epoch / warm epoch", per_epoch / ours, 0.06),
+        ("adjustment and covariance / OpenCV's", bare / peer, 0.4),
+        ("all that adjust does / OpenCV's", ours / peer, 0.4),
+        ("batch of 1,000, per epoch / adjust", per_epoch / ours, 0.06),
     ]
     print(f"{'':45} ratio   bound")
     for name, ratio, bound in rows:

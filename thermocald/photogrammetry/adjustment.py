@@ -97,6 +97,9 @@ class AdjustmentSettings:
         return np.array([i for i, n in enumerate(PARAMETER_NAMES) if n in names], dtype=np.int64)
 
 
+_USUAL = AdjustmentSettings()
+
+
 @dataclass(frozen=True, eq=False)
 class Adjustment:
     """The result of one least-squares solution.
@@ -178,7 +181,7 @@ def adjust(
     suspects: mask (n,) of observations to leave out at first; they come back where they fit.
     Never raises for data: an epoch without a result has a status and a reason.
     """
-    s = settings or AdjustmentSettings()
+    s = settings or _USUAL
     unknowns = s.unknowns
     n = len(observations)
     if 2 * n + len(s.priors) - len(unknowns) < s.bounds.minimum_redundancy:

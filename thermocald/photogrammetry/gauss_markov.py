@@ -196,7 +196,7 @@ def solve(problem: Problem, start: Array, use: Mask) -> Solution:
     observed = problem.observations.points.T
     for _ in range(_ITERATIONS):
         predicted, A, B = partials(sensor, values[:10], values[10:], problem.points)
-        if not np.isfinite(predicted[use]).all():
+        if not np.isfinite(predicted if use.all() else predicted[use]).all():
             raise NoConvergenceError("targets came to lie behind the camera during the iteration")
         covariance = point_covariances(problem.observations, B, problem.target_variances)
         rows = A.transpose(2, 1, 0)[u]

@@ -156,7 +156,8 @@ def same_rows(*arrays: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         return each, each
     for start in range(0, E, _CHUNK):
         rows = slice(start, start + _CHUNK)
-        if not all(np.array_equal(part[rows], part[first[of[rows]]]) for part in flat):
+        like = first if len(first) == 1 else first[of[rows]]
+        if not all(np.all(part[rows] == part[like]) for part in flat):
             return each, each
     return first, of
 

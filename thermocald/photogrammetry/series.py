@@ -295,7 +295,8 @@ class _Series:
             )
             relative[:, own, own] += excess[own] * sound[:, None]
         # Slow errors: a line through zero in the middle of the series, uncertain at its ends.
-        relative += np.linspace(-0.5, 0.5, len(use))[:, None, None] ** 2 * slow
+        if slow.any():
+            relative += np.linspace(-0.5, 0.5, len(use))[:, None, None] ** 2 * slow
         relative[~sound] = 0.0
         stillness = np.full(len(sigma0), np.nan)
         if s.exterior == "series":

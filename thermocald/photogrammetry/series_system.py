@@ -209,10 +209,11 @@ class SeriesSystem:
         """
         E, own, common = len(self.N), self.own, self.common
         relative = np.zeros((E, 16, 16))
-        cofactors = self.Q.copy()
+        cofactors = self.Q
         level, trend = np.zeros((16, 16)), np.zeros((16, 16))
         width = len(self.Q_common)
         if width:
+            cofactors = cofactors.copy()
             mean, tilt = np.zeros((len(own), width)), np.zeros((len(own), width))
             line = _line_weights(self.good)
             for part, C in self.couplings():
@@ -305,8 +306,9 @@ class SeriesSystem:
 def snoop_series(tests: Array, offered: Mask, used: Mask, unknowns: int, alpha: float) -> Mask:
     """Which image points (E, T) stay, epoch by epoch, as `gauss_markov.snoop` does."""
     n = used.sum(axis=1)
-    ordered = np.sort(np.where(used, tests, np.inf), axis=1)
-    middle = ordered[np.arange(len(n)), np.minimum(n // 2, tests.shape[1] - 1)]
+    half = np.minimum(n // 2, tests.shape[1] - 1)
+    ordered = np.partition(np.where(used, tests, np.inf), np.unique(half), axis=1)
+    middle = ordered[np.arange(len(n)), half]
     variance = np.where(n > 0, middle, 1.0) / (2 * np.log(2))
     variance = np.where(2 * n - unknowns < _TRUSTED_REDUNDANCY, np.maximum(variance, 1), variance)
     limit = (chi2_2d(alpha) * np.maximum(variance, 1e-12))[:, None]

@@ -133,7 +133,9 @@ Blind recordings from a generator (`tests/blind/generator.py`) that shares no co
 the number of a part is the strength in px: the RMS of image points that the base model, fitted,
 leaves over. None of these seeds was looked at while the program was made. Written, and repeated, by
 
-    {_command(found, seeds)}
+```bash
+{_command(found, seeds)}
+```
 
 with one thread; `--store` keeps what is done, so that it can be interrupted. {note}`hard`: cadence
 jitter, missing epochs and temperatures, wrong coordinates, correlated noise, people walking by, M2

@@ -30,6 +30,7 @@ from thermocald.photogrammetry.camera_model import (
 from thermocald.photogrammetry.gauss_markov import (
     NoConvergenceError,
     Problem,
+    Rejections,
     Solution,
     point_tests,
     resolve,
@@ -199,13 +200,12 @@ def adjust(
     try:
         solution = solve(problem, start, use)
         tests = point_tests(solution, use)
-        back, barred = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+        rejections = Rejections(use)
         for _ in range(_ROUNDS):
-            keep = snoop(tests[0], use, len(unknowns), s.snooping_alpha) & ~barred
+            keep = snoop(tests[0], use, len(unknowns), s.snooping_alpha)
+            keep = rejections.settle(use, keep)
             if np.array_equal(keep, use):
                 break
-            barred |= back & use & ~keep  # rejected for the second time: it would go on for ever
-            back |= keep & ~use
             use = keep
             if use.sum() < (1 - s.max_rejected) * n:
                 return failed(

@@ -88,13 +88,13 @@ def _plane(maps: LocalMap, m: Array, ex: Single, ey: Single) -> tuple[Single, ..
     L = shape @ inverse
     # q = (I + m)(J⁻¹e − ½ J⁻¹ H[J⁻¹e, J⁻¹e]) = L e − P[e, e]; what is left out is of third order,
     # and moves no centre. A = ∂q/∂e = L − 2 P[e, ·], and q = ½ (L + A) e.
-    half = 0.5 * L @ maps.second
-    P = np.swapaxes(inverse, 1, 2)[:, None] @ half[:, :, [[0, 1], [1, 2]]] @ inverse[:, None]
     l11, l12, l21, l22 = (L[:, i, k, None].astype(np.float32) for i in (0, 1) for k in (0, 1))
     a11, a12, a21, a22 = l11, l12, l21, l22
     u, v = l11 * ex + l12 * ey, l21 * ex + l22 * ey
     if np.any(maps.second):
-        twice = (2 * P).astype(np.float32)[..., None]
+        bend = (L @ maps.second)[:, :, [[0, 1], [1, 2]]]
+        twice = np.swapaxes(inverse, 1, 2)[:, None] @ bend @ inverse[:, None]  # 2 P
+        twice = twice.astype(np.float32)[..., None]
         (x1, y1), (x2, y2) = (
             (twice[:, i, 0, 0] * ex + twice[:, i, 0, 1] * ey,
              twice[:, i, 1, 0] * ex + twice[:, i, 1, 1] * ey) for i in (0, 1)

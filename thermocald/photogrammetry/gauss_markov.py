@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 __all__ = [
     "NoConvergenceError",
     "Problem",
+    "Rejections",
     "Solution",
     "chi2_2d",
     "cofactor_root",
@@ -300,6 +301,24 @@ def point_tests(solution: Solution, use: Mask) -> tuple[Array, Array]:
     test = np.where(testable, qyy * vx**2 - 2 * qxy * vx * vy + qxx * vy**2, 0.0)
     test /= np.where(testable, determinant, 1.0)
     return test, np.maximum(1 - claimed.T, 0.0)
+
+
+class Rejections:
+    """What data snooping has done so far: a point rejected for the second time stays out.
+
+    A borderline point would otherwise come and go for ever.
+    """
+
+    def __init__(self, used: Mask) -> None:
+        self._back = np.zeros_like(used)
+        self._barred = np.zeros_like(used)
+
+    def settle(self, use: Mask, keep: Mask, part: slice | NDArray[np.int64] = slice(None)) -> Mask:
+        """Which of those that a round would keep do stay; part: the rows that it looked at."""
+        keep = keep & ~self._barred[part]
+        self._barred[part] |= self._back[part] & use & ~keep
+        self._back[part] |= keep & ~use
+        return keep
 
 
 def snoop(test: Array, use: Mask, unknowns: int, alpha: float) -> Mask:

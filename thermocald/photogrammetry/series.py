@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.camera_model import project
+from thermocald.photogrammetry.gauss_markov import Rejections
 from thermocald.photogrammetry.geometry import weaknesses
 from thermocald.photogrammetry.normals import (
     ObservationGrid,
@@ -181,18 +182,15 @@ class _Series:
     ) -> tuple[_Estimate, NDArray[np.bool_]]:
         """Data snooping where all epochs share unknowns: every round solves the series again."""
         variance, offered = 1.0, use
-        back, barred = np.zeros_like(use), np.zeros_like(use)
+        rejections = Rejections(use)
         for _ in range(_ROUNDS):
             tests = estimate.system.point_tests(estimate.residuals, self.grid.weights)
             keep = snoop_series(tests, offered, use, len(self.s.per_epoch), self.s.snooping_alpha)
-            keep &= ~barred
+            keep = rejections.settle(use, keep)
             previous, variance = variance, self.variance(estimate)
             settled = not self.has_offsets or abs(variance / previous - 1) < 0.02
             if settled and np.array_equal(keep, use):
                 break
-            # What is rejected for the second time stays out: it would come and go for ever.
-            barred |= back & use & ~keep
-            back |= keep & ~use
             use = keep
             estimate = self.solve(estimate.values, estimate.offsets, use, variance)
         return estimate, use
@@ -204,20 +202,18 @@ class _Series:
         whole, values, residuals = estimate.system, estimate.values, estimate.residuals
         offered, use = use, use.copy()
         rows, system = np.arange(len(use)), whole
-        back, barred = np.zeros_like(use), np.zeros_like(use)
+        rejections = Rejections(use)
         for turn in range(_ROUNDS):
             part = rows if turn else slice(None)  # a copy of all would cost as much as the tests
             tests = system.point_tests(residuals[part], self.grid.weights[part])
             keep = snoop_series(
                 tests, offered[part], use[part], len(self.s.per_epoch), self.s.snooping_alpha
             )
-            keep &= ~barred[part]
+            keep = rejections.settle(use[part], keep, part)
             changed = (keep != use[part]).any(axis=1)
             rows, keep = rows[changed], keep[changed]
             if len(rows) == 0:
                 break
-            barred[rows] |= back[rows] & use[rows] & ~keep
-            back[rows] |= keep & ~use[rows]
             use[rows] = keep
             weights = _masked(self.grid.weights[rows], keep)
             system = SeriesSystem.build(whole.at, weights, whole.own, whole.common, None)

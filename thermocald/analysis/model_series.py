@@ -20,6 +20,7 @@ from thermocald.photogrammetry.normals import (
     linearise,
     normal_matrices,
     right_hand_sides,
+    sums_of_squares,
 )
 
 if TYPE_CHECKING:
@@ -94,7 +95,8 @@ class ModelSeries:
         if prediction is not None:
             linear = np.einsum("tcp,ep->etc", A, self.corrections(prediction))
             misclosure = misclosure - (self._projected(prediction) - at.predicted - linear)
-        b, lPl = right_hand_sides(weights, misclosure, A)
+        b = right_hand_sides(weights, misclosure, A)
+        lPl = sums_of_squares(weights, misclosure)
         return replace(self, N=normal_matrices(weights, A), b=b, lPl=lPl)
 
     def displacing(self, targets: tuple[str, ...]) -> ModelSeries:

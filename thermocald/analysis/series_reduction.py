@@ -222,7 +222,7 @@ def _gross_errors(grid: ObservationGrid, at: Partials, keep: list[int]) -> NDArr
     for _ in range(_ROUNDS):
         weights = np.where(use[..., None], grid.weights, 0.0)
         N = normal_matrices(weights, at.A)
-        b, _ = right_hand_sides(weights, misclosure - offsets, at.A)
+        b = right_hand_sides(weights, misclosure - offsets, at.A)
         scale = 1.0 / np.sqrt(np.maximum(np.diagonal(N, axis1=1, axis2=2), 1e-300))
         # a weak field determines some parameters badly: those are held, not blown up
         scaled = N * scale[:, :, None] * scale[:, None, :] + 1e-10 * np.eye(N.shape[1])

@@ -27,7 +27,12 @@ from thermocald.photogrammetry.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.camera_model import IOP_NAMES
 from thermocald.photogrammetry.cold_start import cold_start
 from thermocald.photogrammetry.geometry import GeometryBounds
-from thermocald.photogrammetry.normals import linearise, normal_matrices, right_hand_sides
+from thermocald.photogrammetry.normals import (
+    linearise,
+    normal_matrices,
+    right_hand_sides,
+    sums_of_squares,
+)
 from thermocald.photogrammetry.testfield import Observations
 from thermocald.simulation.history import History
 
@@ -127,9 +132,7 @@ def _linearised(source: SeriesInput) -> Partials:
     often = source.grid.observed.sum(axis=0) >= 0.5 * len(source.frame_times)
     rows = np.flatnonzero(np.isfinite(mean[:, 0]) & often)
     seen = Observations(rows, mean[rows], np.full((len(rows), 2), 0.1))
-    found = cold_start(
-        source.sensor, source.field, seen, _loose(source), source.principal_distance
-    )
+    found = cold_start(source.sensor, source.field, seen, _loose(source), source.principal_distance)
     if found.interior is None or found.exterior is None:
         raise DataError(
             f"{source.name}: the camera cannot be oriented on its mean image: {found.reason}"
@@ -162,12 +165,12 @@ def _reduce(
     for turn in range(5):
         w = np.where(bad[..., None], 0.0, weights)
         N = normal_matrices(w, A)
-        b, _ = right_hand_sides(w, misclosure - offsets, A)
+        b = right_hand_sides(w, misclosure - offsets, A)
         values = solve(N, b)
         v = misclosure - offsets - (values @ A.reshape(-1, len(scale)).T).reshape(misclosure.shape)
         change = _offset_change(w[..., :2], np.nan_to_num(v), N, A)
         offsets = offsets + change
-        b, _ = right_hand_sides(w, misclosure - offsets, A)
+        b = right_hand_sides(w, misclosure - offsets, A)
         values = solve(N, b)
         v = misclosure - offsets - (values @ A.reshape(-1, len(scale)).T).reshape(misclosure.shape)
         if turn >= 1:
@@ -184,11 +187,12 @@ def _reduce(
             bad = seen & (outlying > limit)
     w = np.where(bad[..., None], 0.0, weights)
     N = normal_matrices(w, A)
-    b, _ = right_hand_sides(w, misclosure - offsets, A)
+    b = right_hand_sides(w, misclosure - offsets, A)
     values = solve(N, b)
     v = misclosure - offsets - (values @ A.reshape(-1, len(scale)).T).reshape(misclosure.shape)
     offsets = offsets + _offset_change(w[..., :2], np.nan_to_num(v), N, A)
-    b, lPl = right_hand_sides(w, misclosure - offsets, A)
+    b = right_hand_sides(w, misclosure - offsets, A)
+    lPl = sums_of_squares(w, misclosure - offsets)
     values = solve(N, b)
     yy = np.einsum("ek,ek->e", values, b)
     count = (seen & ~bad).sum(axis=1)

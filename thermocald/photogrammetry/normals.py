@@ -37,7 +37,6 @@ __all__ = [
     "same_rows",
     "series_residuals",
     "sums_of_squares",
-    "weighted",
 ]
 
 _UPPER = np.triu_indices(16)
@@ -99,7 +98,9 @@ class ObservationGrid:
 
     def reject(self, mask: NDArray[np.bool_]) -> ObservationGrid:
         """A copy in which the observations of a mask (E, T) have no weight."""
-        return ObservationGrid(self.points, np.where(mask[..., None], 0.0, self.weights))
+        weights = self.weights.copy()
+        weights[mask] = 0.0
+        return ObservationGrid(self.points, weights)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,26 +163,22 @@ def same_rows(*arrays: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return first, of
 
 
-def right_hand_sides(weights: Array, residuals: Array, A: Array) -> tuple[Array, Array]:
-    """Aᵀ P l (E, k) and lᵀ P l (E,) of every epoch; NaN residuals must have weight 0."""
-    Pl = weighted(weights, residuals)
+def right_hand_sides(weights: Array, residuals: Array, A: Array) -> Array:
+    """Aᵀ P l (E, k) of every epoch; NaN residuals must have weight 0."""
+    Pl = _weighted(weights, residuals)
     b: Array = Pl.reshape(len(Pl), -1) @ A.reshape(-1, A.shape[-1])
-    return b, _sums(Pl, residuals)
+    return b
 
 
 def sums_of_squares(weights: Array, residuals: Array) -> Array:
-    """vᵀ P v (E,) of every epoch."""
-    return _sums(weighted(weights, residuals), residuals)
-
-
-def _sums(Pv: Array, v: Array) -> Array:
-    flat = (Pv * v).reshape(len(v), -1)
+    """vᵀ P v (E,) of every epoch; NaN residuals must have weight 0."""
+    flat = (_weighted(weights, residuals) * residuals).reshape(len(residuals), -1)
     total: Array = flat.sum(axis=1)
     # only where targets were not observed: a look at all of them would cost as much as the sum
     return np.nan_to_num(flat).sum(axis=1) if np.isnan(total).any() else total
 
 
-def weighted(weights: Array, residuals: Array) -> Array:
+def _weighted(weights: Array, residuals: Array) -> Array:
     """P v (E, T, 2) of every point, 0 where the weight is."""
     out = np.empty_like(residuals)
     correlated = np.any(weights[..., 2])

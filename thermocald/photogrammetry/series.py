@@ -133,7 +133,7 @@ class _Series:
 
         variance: of unit weight, by which the offsets' prior is weighted against image points.
         """
-        weights = _masked(self.grid.weights, use)
+        weights = self.grid.reject(~use).weights
         system = self._linearised(values, weights, use, variance)
         residuals = self._residuals(values, offsets)
         for _ in range(_ITERATIONS):
@@ -215,7 +215,8 @@ class _Series:
             if len(rows) == 0:
                 break
             use[rows] = keep
-            weights = _masked(self.grid.weights[rows], keep)
+            weights = self.grid.weights[rows]
+            weights[~keep] = 0.0
             system = SeriesSystem.build(whole.at, weights, whole.own, whole.common, None)
             step = system.step(residuals[rows], estimate.offsets)
             values[rows[:, None], whole.own] += step.d_own
@@ -380,13 +381,6 @@ class _Series:
             self.s.bounds,
         )
         return "; ".join(said).replace("{", "(").replace("}", ")")
-
-
-def _masked(weights: Array, use: NDArray[np.bool_]) -> Array:
-    """A copy in which what takes no part has no weight."""
-    out = weights.copy()
-    out[~use] = 0.0
-    return out
 
 
 def _pooled(vPv: Array, redundancy: Array, good: NDArray[np.bool_]) -> float:

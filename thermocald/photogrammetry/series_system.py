@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.gauss_markov import chi2_2d
-from thermocald.photogrammetry.normals import normal_matrices, same_rows, weighted
+from thermocald.photogrammetry.normals import normal_matrices, right_hand_sides, same_rows
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -103,7 +103,7 @@ class SeriesSystem:
 
     def step(self, residuals: Array, offsets: Array) -> Step:
         """One Gauss-Newton step from residuals (E, T, 2) px and the offsets they stand at."""
-        b = self._right_hand_sides(residuals)
+        b = right_hand_sides(self.weights, residuals, self.at.A)
         b[~self.good] = 0.0
         right = b[:, self.own]
         q = len(self.common)
@@ -123,11 +123,6 @@ class SeriesSystem:
         size += float(np.sqrt(max((right * solved).sum(axis=1).max(initial=0.0), 0.0)))
         d_offsets = d_all[q:].reshape(2, -1).T if self.prior is not None else np.zeros_like(offsets)
         return Step(solved, d_all[:q], d_offsets, size)
-
-    def _right_hand_sides(self, residuals: Array) -> Array:
-        Pv = weighted(self.weights, residuals)
-        b: Array = Pv.reshape(len(Pv), -1) @ self.at.A.reshape(-1, self.at.A.shape[-1])
-        return b
 
     def moved(self, residuals: Array, step: Step) -> Array:
         """The residuals (E, T, 2) after a small step, by the partials."""
@@ -293,7 +288,7 @@ class SeriesSystem:
 
         Rao's score test: the gradient by these columns, with the epoch's own parameters reduced.
         """
-        b = self._right_hand_sides(residuals)
+        b = right_hand_sides(self.weights, residuals, self.at.A)
         C = self.N[:, self.own[:, None], columns]
         QC = self.Q @ C
         V = self.N[:, columns[:, None], columns] - np.swapaxes(C, 1, 2) @ QC

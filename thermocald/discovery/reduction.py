@@ -159,20 +159,11 @@ def _reduce(
     seen = source.grid.observed
     bad = _spikes(misclosure, seen)
     offsets = np.zeros((len(X), 2))
-    values = np.zeros((len(times), len(scale)))
-    v = misclosure
     s0: float = 1.0
     for turn in range(5):
-        w = np.where(bad[..., None], 0.0, weights)
+        w = source.grid.reject(bad).weights
         N = normal_matrices(w, A)
-        b = right_hand_sides(w, misclosure - offsets, A)
-        values = solve(N, b)
-        v = misclosure - offsets - (values @ A.reshape(-1, len(scale)).T).reshape(misclosure.shape)
-        change = _offset_change(w[..., :2], np.nan_to_num(v), N, A)
-        offsets = offsets + change
-        b = right_hand_sides(w, misclosure - offsets, A)
-        values = solve(N, b)
-        v = misclosure - offsets - (values @ A.reshape(-1, len(scale)).T).reshape(misclosure.shape)
+        offsets, b, values, v = _offsets_and_cameras(w, N, A, misclosure, offsets)
         if turn >= 1:
             normal = np.abs(np.nan_to_num(v)) * np.sqrt(weights[..., :2])
             s0 = 1.4826 * float(np.median(normal[seen & ~bad]))
@@ -185,15 +176,10 @@ def _reduce(
             limit = _GROSS * np.maximum(spread, s0)[:, None]
             outlying = np.max(np.abs(local) * np.sqrt(weights[..., :2]), axis=2)
             bad = seen & (outlying > limit)
-    w = np.where(bad[..., None], 0.0, weights)
+    w = source.grid.reject(bad).weights
     N = normal_matrices(w, A)
-    b = right_hand_sides(w, misclosure - offsets, A)
-    values = solve(N, b)
-    v = misclosure - offsets - (values @ A.reshape(-1, len(scale)).T).reshape(misclosure.shape)
-    offsets = offsets + _offset_change(w[..., :2], np.nan_to_num(v), N, A)
-    b = right_hand_sides(w, misclosure - offsets, A)
+    offsets, b, values, v = _offsets_and_cameras(w, N, A, misclosure, offsets)
     lPl = sums_of_squares(w, misclosure - offsets)
-    values = solve(N, b)
     yy = np.einsum("ek,ek->e", values, b)
     count = (seen & ~bad).sum(axis=1)
     free = np.maximum(2 * count - len(scale), 1)
@@ -202,7 +188,6 @@ def _reduce(
     sigma0 = np.sqrt(np.maximum(lPl - yy, 0) / free / loss)
     enough = count >= MIN_TARGETS
     variance = float(np.median(sigma0[enough]) ** 2)
-    v = misclosure - offsets - (values @ A.reshape(-1, len(scale)).T).reshape(misclosure.shape)
     v = np.where((seen & ~bad)[..., None], v, np.nan)
     weak = ~enough
     N[weak], b[weak], yy[weak], count[weak] = 0.0, 0.0, 0.0, 0
@@ -211,6 +196,24 @@ def _reduce(
         N / variance, b / variance, yy / variance, values, v, w / variance, offsets,
         count, sigma0 / np.sqrt(variance), variance, _slowness(v), int(bad.sum()), columns=A,
     )  # fmt: skip
+
+
+def _offsets_and_cameras(
+    w: Array, N: Array, A: Array, misclosure: Array, offsets: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Offsets (T, 2) px improved by one step, then the right-hand sides (E, k), the values (E, k)
+    and the residuals (E, T, 2) px that go with them.
+    """
+
+    def cameras(offsets: Array) -> tuple[Array, Array, Array]:
+        left = misclosure - offsets
+        b = right_hand_sides(w, left, A)
+        values = solve(N, b)
+        return b, values, left - (values @ A.reshape(-1, A.shape[-1]).T).reshape(left.shape)
+
+    _, _, v = cameras(offsets)
+    offsets = offsets + _offset_change(w[..., :2], np.nan_to_num(v), N, A)
+    return (offsets, *cameras(offsets))
 
 
 def _offset_change(weights: Array, v: Array, N: Array, A: Array, turns: int = 60) -> Array:

@@ -188,9 +188,14 @@ def rotation(angles: ArrayLike) -> Array:
 
 def camera_coordinates(eop: ArrayLike, points: ArrayLike) -> Array:
     """Object points (..., n, 3) → camera frame (..., n, 3) mm; the camera looks along -Z."""
-    e = np.asarray(eop, dtype=float)
-    shifted = np.asarray(points, dtype=float) - e[..., None, 3:6]
-    turned: Array = shifted @ rotation(e[..., :3])
+    q = _camera_planes(np.asarray(eop, dtype=float), np.asarray(points, dtype=float))
+    return np.swapaxes(q, -1, -2)
+
+
+def _camera_planes(eop: Array, points: Array) -> Array:
+    """The camera coordinates as (..., 3, n): what follows writes memory in one run."""
+    R = rotation(eop[..., :3])
+    turned: Array = np.swapaxes(R, -1, -2) @ (np.swapaxes(points, -1, -2) - eop[..., 3:6, None])
     return turned
 
 
@@ -211,25 +216,39 @@ def image_to_px(sensor: Sensor, points_mm: ArrayLike) -> Array:
 
 def _as_px(sensor: Sensor, x: Array, y: Array) -> Array:
     """Coordinates in mm about the image centre as image points (..., 2) px."""
-    out = np.empty((*x.shape, 2))
+    out = np.empty((2, *x.shape))
     scale = 1.0 / sensor.pixel_pitch
-    np.multiply(x, scale, out=out[..., 0])
-    np.multiply(y, -scale, out=out[..., 1])
-    out[..., 0] += (sensor.width - 1) / 2
-    out[..., 1] += (sensor.height - 1) / 2
-    return out
+    np.multiply(x, scale, out=out[0])
+    np.multiply(y, -scale, out=out[1])
+    out[0] += (sensor.width - 1) / 2
+    out[1] += (sensor.height - 1) / 2
+    return np.moveaxis(out, 0, -1)
 
 
 def _distort(iop: Array, x: Array, y: Array) -> tuple[Array, Array]:
     """Ideal points (mm, about the principal point) → measured points (mm, about the centre)."""
     _, x0, y0, A1, A2, A3, B1, B2, C1, C2 = (iop[..., None, j] for j in range(10))
-    r2 = x * x + y * y
-    radial = r2 * (A1 + r2 * (A2 + r2 * A3))
-    xy = x * y
-    return (
-        x0 + x * (1 + radial) + B1 * (r2 + 2 * x * x) + 2 * B2 * xy + C1 * x + C2 * y,
-        y0 + y * (1 + radial) + B2 * (r2 + 2 * y * y) + 2 * B1 * xy,
-    )
+    # x' = x·h + B1·r² + ..., y' = y·h + B2·r² + ...: what both have in common, and in place
+    r2, other = x * x, y * y
+    r2 += other
+    h = r2 * A3
+    h += A2
+    h *= r2
+    h += A1
+    h *= r2
+    h += 1.0
+    for factor, part in ((2 * B1, x), (2 * B2, y)):
+        h += np.multiply(part, factor, out=other)
+    xd = x * h
+    xd += np.multiply(r2, B1, out=other)
+    if C1.any() or C2.any():
+        xd += C1 * x + C2 * y
+    xd += x0
+    h *= y
+    r2 *= B2
+    h += r2
+    h += y0
+    return xd, h
 
 
 def project(sensor: Sensor, iop: ArrayLike, eop: ArrayLike, points: ArrayLike) -> Array:
@@ -239,10 +258,12 @@ def project(sensor: Sensor, iop: ArrayLike, eop: ArrayLike, points: ArrayLike) -
     points that are not in front of the camera.
     """
     i = np.asarray(iop, dtype=float)
-    q = camera_coordinates(eop, points)
-    depth = np.where(q[..., 2] < 0, -q[..., 2], np.nan)
-    scale = i[..., None, 0] / depth
-    x, y = _distort(i, scale * q[..., 0], scale * q[..., 1])
+    q = _camera_planes(np.asarray(eop, dtype=float), np.asarray(points, dtype=float))
+    x, y, z = q[..., 0, :], q[..., 1, :], q[..., 2, :]
+    if not (z < 0).all():
+        z = np.where(z < 0, z, np.nan)
+    scale = -i[..., 0, None] / z
+    x, y = _distort(i, scale * x, scale * y)
     return _as_px(sensor, x, y)
 
 

@@ -24,6 +24,7 @@ from thermocald.photogrammetry.geometry import weaknesses
 from thermocald.photogrammetry.normals import (
     ObservationGrid,
     linearise,
+    planes,
     series_residuals,
     sums_of_squares,
 )
@@ -59,6 +60,7 @@ __all__ = ["SeriesAdjustment", "SeriesSettings", "adjust_series"]
 
 _ITERATIONS = 15
 _SMALL = 0.1  # standard deviations: a last step that the partials carry to 1e-3
+_NEAR = 10.0  # standard deviations: by what the residuals follow a step by the partials
 _ROUNDS = 8  # of data snooping
 _RELINEARISE_PX = 1.0  # movement of the mean that changes the partials by more than about 1e-3
 _ENOUGH_FOR_NOISE = 20  # epochs
@@ -133,9 +135,8 @@ class _Series:
 
         variance: of unit weight, by which the offsets' prior is weighted against image points.
         """
-        weights = self.grid.reject(~use).weights
-        system = self._linearised(values, weights, use, variance)
-        residuals = self._residuals(values, offsets)
+        system = self._linearised(values, use, variance)
+        residuals = self._residuals(values, offsets, planes(2, *use.shape))
         for _ in range(_ITERATIONS):
             step = system.step(residuals, offsets)
             values = values.copy()
@@ -143,15 +144,15 @@ class _Series:
             values[:, system.common] += step.d_common
             offsets = offsets + step.d_offsets
             if step.size < _SMALL:
-                residuals = system.moved(residuals, step)
+                system.move(residuals, step)
                 return _Estimate(values, offsets, residuals, system)
-            residuals = self._residuals(values, offsets)
+            residuals = self._residuals(values, offsets, residuals)
             moved = np.zeros(16)
             moved[system.common] = step.d_common
             if system.good.any():
                 moved[system.own] = np.median(step.d_own[system.good], axis=0)
             if np.abs(system.at.A @ moved).max(initial=0.0) > _RELINEARISE_PX:
-                system = self._linearised(values, weights, use, variance)
+                system = self._linearised(values, use, variance)
         return _Estimate(values, offsets, residuals, system)
 
     def snoop(
@@ -164,9 +165,9 @@ class _Series:
     def with_target_noise(self, estimate: _Estimate, use: NDArray[np.bool_]) -> _Series:
         """The series with every target's weights from the scatter of its own residuals."""
         ratios = noise_ratios(
-            estimate.residuals, estimate.system.weights, use, self._redundancy_share(use)
+            estimate.residuals, self.grid.weights, use, self._redundancy_share(use)
         )
-        weights = self.grid.weights.copy()
+        weights = self.grid.weights.copy(order="K")
         weights[..., :2] /= ratios
         weights[..., 2] /= np.sqrt(ratios.prod(axis=1))
         return replace(self, grid=ObservationGrid(self.grid.points, weights))
@@ -184,7 +185,7 @@ class _Series:
         variance, offered = 1.0, use
         rejections = Rejections(use)
         for _ in range(_ROUNDS):
-            tests = estimate.system.point_tests(estimate.residuals, self.grid.weights)
+            tests = estimate.system.point_tests(estimate.residuals)
             keep = snoop_series(tests, offered, use, len(self.s.per_epoch), self.s.snooping_alpha)
             keep = rejections.settle(use, keep)
             previous, variance = variance, self.variance(estimate)
@@ -199,47 +200,59 @@ class _Series:
         self, estimate: _Estimate, use: NDArray[np.bool_]
     ) -> tuple[_Estimate, NDArray[np.bool_]]:
         """Data snooping where epochs share nothing: only those that changed are solved again."""
-        whole, values, residuals = estimate.system, estimate.values, estimate.residuals
-        offered, use = use, use.copy()
-        rows, system = np.arange(len(use)), whole
+        values, residuals = estimate.values, estimate.residuals
+        system = whole = replace(estimate.system, use=use.copy())
+        offered, use, rows = use, whole.use, np.arange(len(use))
         rejections = Rejections(use)
-        for turn in range(_ROUNDS):
-            part = rows if turn else slice(None)  # a copy of all would cost as much as the tests
-            tests = system.point_tests(residuals[part], self.grid.weights[part])
+        part: slice | NDArray[np.int64] = slice(None)  # without a copy
+        for _ in range(_ROUNDS):
+            tests = system.point_tests(residuals[part])
             keep = snoop_series(
                 tests, offered[part], use[part], len(self.s.per_epoch), self.s.snooping_alpha
             )
             keep = rejections.settle(use[part], keep, part)
             changed = (keep != use[part]).any(axis=1)
-            rows, keep = rows[changed], keep[changed]
+            part = rows = rows[changed]
             if len(rows) == 0:
                 break
-            use[rows] = keep
-            weights = self.grid.weights[rows]
-            weights[~keep] = 0.0
-            system = SeriesSystem.build(whole.at, weights, whole.own, whole.common, None)
-            step = system.step(residuals[rows], estimate.offsets)
-            values[rows[:, None], whole.own] += step.d_own
-            residuals[rows] = system.moved(residuals[rows], step)
+            system = SeriesSystem.build(
+                whole.at, self.grid.weights[rows], keep[changed], whole.own, whole.common, None
+            )
+            some = replace(self, grid=ObservationGrid(self.grid.points[rows], system.weights))
+            values[rows], residuals[rows] = some._without(system, values[rows], residuals[rows])
             whole.replace(rows, system)
         return _Estimate(values, estimate.offsets, residuals, whole), use
 
-    def _linearised(
-        self, values: Array, weights: Array, use: NDArray[np.bool_], variance: float
-    ) -> SeriesSystem:
+    def _without(self, system: SeriesSystem, values: Array, left: Array) -> tuple[Array, Array]:
+        """Values (E, 16) and residuals (E, T, 2) of epochs of which points were taken out."""
+        offsets = np.zeros((left.shape[1], 2))
+        for _ in range(_ITERATIONS):
+            step = system.step(left, offsets)
+            values[:, system.own] += step.d_own
+            if step.size < _NEAR:
+                system.move(left, step)
+                break
+            left = self._residuals(values, offsets, left)
+        return values, left
+
+    def _linearised(self, values: Array, use: NDArray[np.bool_], variance: float) -> SeriesSystem:
         used = use.any(axis=1)
         mean = np.median(values[used] if used.any() else values, axis=0)
         at = linearise(self.sensor, self.testfield, mean[:10], mean[10:])
         prior = self._offset_prior(at) * variance if self.has_offsets else None
-        return SeriesSystem.build(at, weights, self.s.per_epoch, self.s.common, prior)
+        return SeriesSystem.build(
+            at, self.grid.weights, use, self.s.per_epoch, self.s.common, prior
+        )
 
-    def _residuals(self, values: Array, offsets: Array) -> Array:
+    def _residuals(self, values: Array, offsets: Array, out: Array) -> Array:
         if (values == values[:1]).all():
             first = project(self.sensor, values[0, :10], values[0, 10:], self.testfield.points)
-            out = self.grid.points - first
+            np.subtract(self.grid.points, first, out=out)
         else:
-            out = series_residuals(self.sensor, self.grid, self.testfield.points, values)
-        return out - offsets if self.has_offsets else out
+            series_residuals(self.sensor, self.grid, self.testfield.points, values, out)
+        if self.has_offsets:
+            out -= offsets
+        return out
 
     def _offset_prior(self, at: Partials) -> Array:
         """Inverse covariance (T, 3) px⁻² of the offsets, from that of the object coordinates."""
@@ -253,9 +266,9 @@ class _Series:
 
     def _sums(self, estimate: _Estimate) -> tuple[Array, Array]:
         """Weighted sum of squares (E,) and redundancy (E,) of every epoch."""
-        w = estimate.system.weights
-        vPv = sums_of_squares(w, estimate.residuals)
-        n = (w[..., 0] > 0).sum(axis=1) * estimate.system.good
+        use = estimate.system.use
+        vPv = sums_of_squares(self.grid.weights, estimate.residuals, use)
+        n = use.sum(axis=1) * estimate.system.good
         share = estimate.system.common_share() * n / max(int(n.sum()), 1)
         return vPv, 2 * n - len(self.s.per_epoch) - share
 

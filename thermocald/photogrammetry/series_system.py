@@ -9,13 +9,19 @@ method.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermocald.photogrammetry.gauss_markov import chi2_2d
-from thermocald.photogrammetry.normals import normal_matrices, right_hand_sides, same_rows
+from thermocald.photogrammetry.normals import (
+    chunks,
+    normal_matrices,
+    products,
+    right_hand_sides,
+    same_rows,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -45,18 +51,20 @@ class Step:
     size: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class SeriesSystem:
     """Normal equations at one linearisation.
 
-    weights (E, T, 3), 0 where a point takes no part; own (p,), common (q,): columns; N (E, 16, 16);
-    Q (E, p, p): cofactors of an epoch's own parameters, the common ones held; good (E,): epochs
-    that carry theirs; Q_common (q + 2T, q + 2T), or (q, q) without offsets; prior (T, 3) px⁻² of
-    the offsets, or None.
+    weights (E, T, 3): a priori; use (E, T): which points take part; own (p,), common (q,): columns;
+    N (E, 16, 16), empty where nothing is common; Q (E, p, p): cofactors of an epoch's own
+    parameters, the common ones held; good (E,): epochs that carry theirs; Q_common: (q, q), or with
+    offsets (q + 2T, q + 2T); prior (T, 3) px⁻² of the offsets, or None; alike: which epochs have
+    the same matrices, as of `same_rows`, or None where that is no longer known.
     """
 
     at: Partials
     weights: Array
+    use: Mask
     own: Columns
     common: Columns
     N: Array
@@ -64,24 +72,35 @@ class SeriesSystem:
     good: Mask
     Q_common: Array
     prior: Array | None
+    alike: tuple[Columns, Columns] | None
 
     @classmethod
     def build(
-        cls, at: Partials, weights: Array, own: Columns, common: Columns, prior: Array | None
+        cls,
+        at: Partials,
+        weights: Array,
+        use: Mask,
+        own: Columns,
+        common: Columns,
+        prior: Array | None,
     ) -> SeriesSystem:
         """Form, invert, and reduce the normal equations."""
-        first, of = same_rows(weights)
-        N = normal_matrices(weights[first], at.A)
+        first, of = _alike(weights, use)
+        N = normal_matrices(_used(weights[first], use[first]), at.A)
         Q, good = _invert(N[:, own[:, None], own])
-        good &= (weights[first, :, 0] > 0).any(axis=1)
-        N, Q, good = N[of], Q[of], good[of]
-        system = cls(at, weights, own, common, N, Q, good, np.empty((0, 0)), prior)
-        full = _common_matrix(system)
+        good &= use[first].any(axis=1)
+        Q, good = Q[of], good[of]
+        if len(common) == 0 and prior is None:
+            none = np.empty((0, 0))
+            return cls(at, weights, use, own, common, N[:0], Q, good, none, None, (first, of))
+        N = N[of]
+        full = _common_matrix(at.A, N[good], _used(weights, use)[good], common, prior)
+        system = cls(at, weights, use, own, common, N, Q, good, full, prior, (first, of))
         for part, C in system.couplings():
             half = np.swapaxes(np.linalg.cholesky(Q[part]), 1, 2) @ C
             half = half.reshape(-1, half.shape[-1])
             full -= half.T @ half
-        return cls(at, weights, own, common, N, Q, good, _inverse(full), prior)
+        return replace(system, Q_common=_inverse(full))
 
     def couplings(self) -> Iterator[tuple[NDArray[np.int64], Array]]:
         """Chunks of good epochs and their blocks (e, p, q + 2T) of own with common unknowns."""
@@ -97,13 +116,13 @@ class SeriesSystem:
         parameters = self.N[part][:, self.own[:, None], self.common]
         if self.prior is None:
             return parameters
-        wx, wy, wxy = (self.weights[part][:, None, :, k] for k in range(3))
+        wx, wy, wxy = np.moveaxis(_used(self.weights[part], self.use[part]), -1, 0)[:, :, None]
         ax, ay = self.at.A[:, 0, self.own].T, self.at.A[:, 1, self.own].T
         return np.concatenate([parameters, wx * ax + wxy * ay, wxy * ax + wy * ay], axis=2)
 
     def step(self, residuals: Array, offsets: Array) -> Step:
         """One Gauss-Newton step from residuals (E, T, 2) px and the offsets they stand at."""
-        b = right_hand_sides(self.weights, residuals, self.at.A)
+        b = right_hand_sides(self.weights, residuals, self.at.A, self.use)
         b[~self.good] = 0.0
         right = b[:, self.own]
         q = len(self.common)
@@ -124,22 +143,26 @@ class SeriesSystem:
         d_offsets = d_all[q:].reshape(2, -1).T if self.prior is not None else np.zeros_like(offsets)
         return Step(solved, d_all[:q], d_offsets, size)
 
-    def moved(self, residuals: Array, step: Step) -> Array:
-        """The residuals (E, T, 2) after a small step, by the partials."""
-        change = step.d_own @ self.at.A[..., self.own].reshape(-1, len(self.own)).T
-        moved: Array = residuals - change.reshape(residuals.shape)
+    def move(self, residuals: Array, step: Step) -> None:
+        """Carry the residuals (E, T, 2) through a small step by the partials, in place."""
         if self.prior is not None or len(self.common):
-            moved -= self.at.A[..., self.common] @ step.d_common + step.d_offsets
-        return moved
+            residuals -= self.at.A[..., self.common] @ step.d_common + step.d_offsets
+        Ax, Ay = self.at.A[:, 0, self.own].T, self.at.A[:, 1, self.own].T
+        for part in chunks(*residuals.shape[:2]):
+            residuals[part, :, 0] -= step.d_own[part] @ Ax
+            residuals[part, :, 1] -= step.d_own[part] @ Ay
 
     def replace(self, rows: NDArray[np.int64], part: SeriesSystem) -> None:
-        """Put some epochs' blocks in from another system of the same linearisation, in place."""
-        self.weights[rows], self.N[rows] = part.weights, part.N
-        self.Q[rows], self.good[rows] = part.Q, part.good
+        """Put some epochs in from another system of the same linearisation, in place.
+
+        Only where nothing is common: the common unknowns would not follow.
+        """
+        self.use[rows], self.Q[rows], self.good[rows] = part.use, part.Q, part.good
+        self.alike = None
 
     def _offset_gradient(self, residuals: Array, offsets: Array) -> Array:
         assert self.prior is not None
-        w = self.weights[self.good]
+        w = _used(self.weights[self.good], self.use[self.good])
         v = np.nan_to_num(residuals[self.good])
         x = (w[..., 0] * v[..., 0] + w[..., 2] * v[..., 1]).sum(axis=0)
         y = (w[..., 2] * v[..., 0] + w[..., 1] * v[..., 1]).sum(axis=0)
@@ -147,39 +170,47 @@ class SeriesSystem:
         y -= self.prior[:, 2] * offsets[:, 0] + self.prior[:, 1] * offsets[:, 1]
         return np.concatenate([x, y])
 
-    def point_tests(self, residuals: Array, weights: Array) -> Array:
+    def point_tests(self, residuals: Array) -> Array:
         """Chi-square (2) of every image point (E, T) against its epoch.
 
-        weights (E, T, 3): a priori, also of the points that take no part; those are tested as
-        check points. The common unknowns are taken as known, as they rest on all epochs.
+        Points that take no part are tested as check points. The common unknowns are taken as known,
+        as they rest on all epochs.
         """
-        first, of = same_rows(self.weights, weights)
-        inverse, testable = self._test_weights(first, weights[first])
-        if len(first) > 1:
-            inverse, testable = inverse[:, of], testable[of]
-        x, y = residuals[..., 0], residuals[..., 1]
-        xx, yy, xy = inverse
-        test: Array = np.where(testable, (xx * x + xy * y) * x + yy * y * y, 0.0)
+        first, of = self.alike or _alike(self.weights, self.use)
+        E, T = residuals.shape[:2]
+        pairs = products(self.at.A[..., self.own])
+        shared = self._test_weights(first, pairs) if len(first) < E else None
+        test = np.empty((E, T))
+        for part in chunks(E, T):
+            if shared is None:
+                xx, yy, xy = self._test_weights(part, pairs)
+            else:
+                xx, yy, xy = shared if len(first) == 1 else shared[:, of[part]]
+            x, y = residuals[part, :, 0], residuals[part, :, 1]
+            out = np.multiply(xx, x, out=test[part])
+            out += xy * y
+            out *= x
+            out += yy * y * y
+        test[np.isnan(test)] = 0.0
         return test
 
-    def _test_weights(self, epochs: Columns, weights: Array) -> tuple[Array, Mask]:
-        """Inverse covariance (3, M, T) of the residuals, xx, yy, twice xy, and which have one."""
+    def _test_weights(self, epochs: slice | Columns, products: tuple[Array, Array, Array]) -> Array:
+        """Inverse covariance (3, M, T) of the residuals, xx, yy, twice xy; 0 without a test."""
+        weights = self.weights[epochs]
         rows, columns = np.triu_indices(len(self.own))
         Q = self.Q[epochs][:, rows, columns] * np.where(rows == columns, 1.0, 2.0)
-        ax, ay = self.at.A[:, 0, self.own], self.at.A[:, 1, self.own]
-        sign = np.where(self.weights[epochs, :, 0] > 0, -1.0, 1.0)
-        lxx = sign * (Q @ (ax[:, rows] * ax[:, columns]).T)
-        lyy = sign * (Q @ (ay[:, rows] * ay[:, columns]).T)
-        mixed = 0.5 * (ax[:, rows] * ay[:, columns] + ay[:, rows] * ax[:, columns])
-        lxy = sign * (Q @ mixed.T)
+        sign = np.where(self.use[epochs], -1.0, 1.0)
+        lxx, lyy, lxy = (sign * (Q @ pairs.T) for pairs in products)
         offered = weights[..., 0] > 0
         wx, wy, wxy = (np.where(offered, weights[..., k], k < 2) for k in range(3))
         determinant = wx * wy - wxy * wxy
         vxx, vyy = wy / determinant + lxx, wx / determinant + lyy
-        vxy = lxy - wxy / determinant
+        vxy = 0.5 * lxy - wxy / determinant
         d = vxx * vyy - vxy * vxy
-        testable = offered & (d > 1e-9 / determinant)
-        return np.stack([vyy, vxx, -2 * vxy]) / np.where(testable, d, 1.0), testable
+        d[~(offered & (d > 1e-9 / determinant))] = np.inf
+        inverse = np.stack([vyy, vxx, -2 * vxy])
+        inverse /= d
+        return inverse
 
     def common_share(self) -> float:
         """How many of the observations the common unknowns use up."""
@@ -202,8 +233,7 @@ class SeriesSystem:
         An epoch's parameters depend on the common unknowns by -G; what of G is the same in all
         epochs cancels in differences within the series, the rest is the epoch's own.
         """
-        E, own, common = len(self.N), self.own, self.common
-        relative = np.zeros((E, 16, 16))
+        own, common = self.own, self.common
         cofactors = self.Q
         level, trend = np.zeros((16, 16)), np.zeros((16, 16))
         width = len(self.Q_common)
@@ -228,7 +258,7 @@ class SeriesSystem:
             level[common[:, None], common] = common_root @ common_root.T
             level[own[:, None], common] = -own_level @ common_root.T
             level[common[:, None], own] = level[own[:, None], common].T
-        relative[:, own[:, None], own] = cofactors
+        relative = _among_all(cofactors, own)
         relative[~self.good] = 0.0
         return relative, level, trend
 
@@ -240,9 +270,9 @@ class SeriesSystem:
         Σ Q Aᵀ W (I - H)⁻¹ e eᵀ (I - H)⁻¹ W A Q over the groups.
         """
         out = np.zeros((16, 16))
-        w = np.sqrt(self.weights[self.good].mean(axis=0)[:, :2]) if self.good.any() else None
-        if w is None:
+        if not self.good.any():
             return out
+        w = np.sqrt(_used(self.weights, self.use)[self.good].mean(axis=0)[:, :2])
         J = self.at.A[..., self.own] * w[..., None]
         inverse, good = _invert(np.einsum("tkp,tkq->pq", J, J)[None])
         if not good[0]:
@@ -265,8 +295,7 @@ class SeriesSystem:
 
     def correlated(self, pairs: CorrelatedPairs) -> Array:
         """What correlated errors add to the covariance (E, 16, 16) of own parameters."""
-        added = np.zeros((len(self.N), 16, 16))
-        extra = pairs.normal_matrices(self.weights, self.at.A[..., self.own])
+        extra = pairs.normal_matrices(_used(self.weights, self.use), self.at.A[..., self.own])
         own = self.Q @ extra @ self.Q
         # Covariances from epochs that do not see the same targets may be indefinite together: drawn
         # in so that they take at most three fifths off the variance of any combination.
@@ -274,8 +303,7 @@ class SeriesSystem:
         least = np.linalg.eigvalsh(root @ own @ np.swapaxes(root, 1, 2))[:, 0]
         drawn = np.where(self.good, np.minimum(1.0, 0.6 / np.maximum(-least, 1e-9)), 0.0)
         drawn[least >= 0] = 1.0
-        added[:, self.own[:, None], self.own] = drawn[:, None, None] * own
-        return added
+        return _among_all(drawn[:, None, None] * own, self.own)
 
     def offset_cofactors(self) -> Array:
         """Cofactors (T, 2) px² of the offsets in x and y; NaN without offsets."""
@@ -288,7 +316,7 @@ class SeriesSystem:
 
         Rao's score test: the gradient by these columns, with the epoch's own parameters reduced.
         """
-        b = right_hand_sides(self.weights, residuals, self.at.A)
+        b = right_hand_sides(self.weights, residuals, self.at.A, self.use)
         C = self.N[:, self.own[:, None], columns]
         QC = self.Q @ C
         V = self.N[:, columns[:, None], columns] - np.swapaxes(C, 1, 2) @ QC
@@ -298,18 +326,47 @@ class SeriesSystem:
         return np.where(good & self.good, score, np.nan)
 
 
+def _used(weights: Array, use: Mask) -> Array:
+    """Weights (E, T, 3), 0 where a point takes no part."""
+    used: Array = weights * use[..., None]
+    return used
+
+
+def _among_all(Q: Array, own: Columns) -> Array:
+    """Matrices (E, p, p) of some parameters as those of all (E, 16, 16), 0 for the others."""
+    whole = np.zeros((len(Q), 16, 16))
+    runs = np.split(np.arange(len(own)), np.flatnonzero(np.diff(own) > 1) + 1)
+    for rows in runs:
+        for columns in runs:
+            a, b = (
+                slice(own[rows[0]], own[rows[-1]] + 1),
+                slice(own[columns[0]], own[columns[-1]] + 1),
+            )
+            whole[:, a, b] = Q[:, rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    return whole
+
+
 def snoop_series(tests: Array, offered: Mask, used: Mask, unknowns: int, alpha: float) -> Mask:
     """Which image points (E, T) stay, epoch by epoch, as `gauss_markov.snoop` does."""
+    keep = np.empty_like(used)
+    for part in chunks(*used.shape):
+        keep[part] = _staying(tests[part], offered[part], used[part], unknowns, alpha)
+    return keep
+
+
+def _staying(tests: Array, offered: Mask, used: Mask, unknowns: int, alpha: float) -> Mask:
     n = used.sum(axis=1)
     half = np.minimum(n // 2, tests.shape[1] - 1)
-    ordered = np.partition(np.where(used, tests, np.inf), np.unique(half), axis=1)
+    ordered = np.where(used, tests, np.inf)
+    ordered.partition(np.unique(half), axis=1)
     middle = ordered[np.arange(len(n)), half]
     variance = np.where(n > 0, middle, 1.0) / (2 * np.log(2))
     variance = np.where(2 * n - unknowns < _TRUSTED_REDUNDANCY, np.maximum(variance, 1), variance)
     limit = (chi2_2d(alpha) * np.maximum(variance, 1e-12))[:, None]
     worst = np.where(used, tests, 0.0).max(axis=1, initial=0.0)[:, None]
-    suspicious = used & (tests > limit) & (tests >= 0.5 * worst)
-    keep: Mask = offered & (used | (tests <= limit)) & ~suspicious
+    small = tests <= limit
+    suspicious = used & ~small & (tests >= 0.5 * worst)
+    keep: Mask = offered & (used | small) & ~suspicious
     return keep
 
 
@@ -323,23 +380,29 @@ def _line_weights(good: Mask) -> Array:
     return weights
 
 
-def _common_matrix(system: SeriesSystem) -> Array:
+def _alike(weights: Array, use: Mask) -> tuple[Columns, Columns]:
+    """Epochs of which the same points take part with the same weights, as of `same_rows`."""
+    return same_rows(np.packbits(use, axis=1), *np.moveaxis(weights, -1, 0))
+
+
+def _common_matrix(
+    A: Array, N: Array, weights: Array, common: Columns, prior: Array | None
+) -> Array:
     """The common unknowns' own block, over all good epochs, with the offsets' prior."""
-    common, good = system.common, system.good
     q = len(common)
-    parameters: Array = system.N[good][:, common[:, None], common].sum(axis=0)
-    if system.prior is None:
+    parameters: Array = N[:, common[:, None], common].sum(axis=0)
+    if prior is None:
         return parameters
-    weights = system.weights[good].sum(axis=0)
-    A = system.at.A[..., common]
-    T = len(weights)
+    w = weights.sum(axis=0)
+    A = A[..., common]
+    T = len(w)
     full = np.zeros((q + 2 * T, q + 2 * T))
     full[:q, :q] = parameters
     x, y = np.arange(q, q + T), np.arange(q + T, q + 2 * T)
-    full[x, x] = weights[:, 0] + system.prior[:, 0]
-    full[y, y] = weights[:, 1] + system.prior[:, 1]
-    full[x, y] = full[y, x] = weights[:, 2] + system.prior[:, 2]
-    wx, wy, wxy = (weights[:, k, None] for k in range(3))
+    full[x, x] = w[:, 0] + prior[:, 0]
+    full[y, y] = w[:, 1] + prior[:, 1]
+    full[x, y] = full[y, x] = w[:, 2] + prior[:, 2]
+    wx, wy, wxy = (w[:, k, None] for k in range(3))
     full[x, :q] = wx * A[:, 0] + wxy * A[:, 1]
     full[y, :q] = wxy * A[:, 0] + wy * A[:, 1]
     full[:q, q:] = full[q:, :q].T

@@ -51,6 +51,12 @@ IOP_NAMES = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2", "C1", "C2")
 EOP_NAMES = ("omega", "phi", "kappa", "X0", "Y0", "Z0")
 PARAMETER_NAMES = IOP_NAMES + EOP_NAMES
 
+_UPWARDS = np.array([1.0, -1.0])  # image coordinates in mm go up, in px down
+_TURNS = np.array([-1.0, 1.0, 1.0])
+_SLOPE = np.array([2.0, 4.0, 6.0])  # of r², r⁴, r⁶ along r, over r
+_BEND = np.array([[6, 0], [0, 2], [0, 2], [2, 0], [2, 0], [0, 6]], dtype=float)
+"""By B1 and B2 from x and y: the elements xx, xy, yy of the Jacobian of the decentring part."""
+
 _RAY_TOLERANCE_PX = 1e-9
 _RAY_ITERATIONS = 50
 
@@ -188,30 +194,24 @@ def rotation(angles: ArrayLike) -> Array:
 
 def camera_coordinates(eop: ArrayLike, points: ArrayLike) -> Array:
     """Object points (..., n, 3) → camera frame (..., n, 3) mm; the camera looks along -Z."""
-    q = _camera_planes(np.asarray(eop, dtype=float), np.asarray(points, dtype=float))
-    return np.swapaxes(q, -1, -2)
+    e = np.asarray(eop, dtype=float)
+    return _turned(rotation(e[..., :3]), e, np.asarray(points, dtype=float)).swapaxes(-1, -2)
 
 
-def _camera_planes(eop: Array, points: Array) -> Array:
+def _turned(R: Array, eop: Array, points: Array) -> Array:
     """The camera coordinates as (..., 3, n): what follows writes memory in one run."""
-    R = rotation(eop[..., :3])
-    turned: Array = np.swapaxes(R, -1, -2) @ (np.swapaxes(points, -1, -2) - eop[..., 3:6, None])
+    turned: Array = R.swapaxes(-1, -2) @ (points.swapaxes(-1, -2) - eop[..., 3:6, None])
     return turned
 
 
 def image_to_mm(sensor: Sensor, image_points: ArrayLike) -> Array:
     """Image points px (y down) → mm (origin at the image centre, y up)."""
-    return (np.asarray(image_points, dtype=float) - sensor.centre) * (
-        sensor.pixel_pitch * np.array([1.0, -1.0])
-    )
+    return (np.asarray(image_points, dtype=float) - sensor.centre) * (sensor.pixel_pitch * _UPWARDS)
 
 
 def image_to_px(sensor: Sensor, points_mm: ArrayLike) -> Array:
     """The inverse of `image_to_mm`."""
-    return (
-        np.asarray(points_mm, dtype=float) / (sensor.pixel_pitch * np.array([1.0, -1.0]))
-        + sensor.centre
-    )
+    return np.asarray(points_mm, dtype=float) / (sensor.pixel_pitch * _UPWARDS) + sensor.centre
 
 
 def _as_px(sensor: Sensor, x: Array, y: Array) -> Array:
@@ -222,7 +222,7 @@ def _as_px(sensor: Sensor, x: Array, y: Array) -> Array:
     np.multiply(y, -scale, out=out[1])
     out[0] += (sensor.width - 1) / 2
     out[1] += (sensor.height - 1) / 2
-    return np.moveaxis(out, 0, -1)
+    return out.transpose(*range(1, out.ndim), 0)
 
 
 def _distort(iop: Array, x: Array, y: Array) -> tuple[Array, Array]:
@@ -258,7 +258,8 @@ def project(sensor: Sensor, iop: ArrayLike, eop: ArrayLike, points: ArrayLike) -
     points that are not in front of the camera.
     """
     i = np.asarray(iop, dtype=float)
-    q = _camera_planes(np.asarray(eop, dtype=float), np.asarray(points, dtype=float))
+    e = np.asarray(eop, dtype=float)
+    q = _turned(rotation(e[..., :3]), e, np.asarray(points, dtype=float))
     x, y, z = q[..., 0, :], q[..., 1, :], q[..., 2, :]
     if not (z < 0).all():
         z = np.where(z < 0, z, np.nan)
@@ -294,9 +295,11 @@ def partials(
     R = rotation(e[..., :3])
     # Components stand before points, (..., 3, n), so that every line below writes memory in one
     # run; the callers see (..., n, 2, 16) through `_points_first`.
-    q = np.swapaxes((np.asarray(points, dtype=float) - e[..., None, 3:6]) @ R, -1, -2)
+    q = _turned(R, e, np.asarray(points, dtype=float))
     depth = -q[..., 2, :]
-    inverse_depth = 1.0 / np.where(depth > 0, depth, np.nan)
+    if not (depth > 0).all():
+        depth = np.where(depth > 0, depth, np.nan)
+    inverse_depth = 1.0 / depth
     uv = q[..., :2, :] * inverse_depth[..., None, :]
     ideal = i[..., 0, None, None] * uv
     x, y = ideal[..., 0, :], ideal[..., 1, :]
@@ -304,52 +307,61 @@ def partials(
     squares = np.empty((*batch, 3, n))  # x², xy, y²
     np.multiply(ideal, x[..., None, :], out=squares[..., :2, :])
     np.multiply(y, y, out=squares[..., 2, :])
-    powers = np.empty((*batch, 3, n))  # r², r⁴, r⁶
-    r2, r4 = powers[..., 0, :], powers[..., 1, :]
+    powers = np.empty((*batch, 4, n))  # 1, r², r⁴, r⁶
+    powers[..., 0, :] = 1.0
+    r2, r4 = powers[..., 1, :], powers[..., 2, :]
     np.add(squares[..., 0, :], squares[..., 2, :], out=r2)
     np.multiply(r2, r2, out=r4)
-    np.multiply(r2, r4, out=powers[..., 2, :])
+    np.multiply(r2, r4, out=powers[..., 3, :])
 
     # The image point is linear in x0 to C2: first their partials, then by them the point itself.
     out = np.zeros((2, *batch, 16, n))
     out[0, ..., 1, :] = out[1, ..., 2, :] = 1.0
     twice = 2 * squares
     for axis in range(2):
-        np.multiply(ideal[..., axis, None, :], powers, out=out[axis, ..., 3:6, :])
+        np.multiply(ideal[..., axis, None, :], powers[..., 1:, :], out=out[axis, ..., 3:6, :])
         np.add(r2, twice[..., 2 * axis, :], out=out[axis, ..., 6 + axis, :])
         out[axis, ..., 7 - axis, :] = twice[..., 1, :]
     out[0, ..., 8:10, :] = ideal
     moved = (i[..., None, 1:] @ out[..., 1:10, :])[..., 0, :]
     xd, yd = x + moved[0], y + moved[1]
 
-    # By the camera coordinates: ∂(x', y')/∂(x̄, ȳ) with ∂/∂c as its third component
-    _, _, _, A1, A2, A3, B1, B2, C1, C2 = (i[..., None, j] for j in range(10))
-    slope = 2 * A1 + (4 * A2) * r2 + (6 * A3) * r4
-    radial = (i[..., None, 3:6] @ powers)[..., 0, :] + 1
+    # ∂(x', y')/∂(x̄, ȳ), symmetric but for C1 and C2: radial and slope·x², the bend of B1 and B2
+    factors = np.zeros((*batch, 2, 4))
+    factors[..., 0, 0] = 1.0
+    factors[..., 0, 1:] = i[..., 3:6]
+    np.multiply(i[..., 3:6], _SLOPE, out=factors[..., 1, :3])
+    radial_and_slope = factors @ powers
+    jacobian = squares  # xx, xy, yy
+    jacobian *= radial_and_slope[..., 1, None, :]
+    jacobian += (_BEND @ i[..., 6:8, None]).reshape(*batch, 3, 2) @ ideal
+    jacobian[..., ::2, :] += radial_and_slope[..., 0, None, :]
+
+    # By the camera coordinates: the same with ∂/∂c as its third component
     by_ideal = np.empty((2, *batch, 3, n))
-    jxx, jxy, jyx, jyy = (by_ideal[row, ..., k, :] for row in range(2) for k in range(2))
-    np.add(slope * squares[..., 0, :] + radial, C1 + 6 * B1 * x + 2 * B2 * y, out=jxx)
-    np.add(slope * squares[..., 2, :] + radial, 6 * B2 * y + 2 * B1 * x, out=jyy)
-    np.add(slope * squares[..., 1, :], 2 * B1 * y + 2 * B2 * x, out=jyx)
-    np.add(jyx, C2, out=jxy)
-    u, v = uv[..., 0, :], uv[..., 1, :]
-    jx, jy, by_c = (by_ideal[..., k, :] for k in range(3))
-    np.add(jx * u, jy * v, out=by_c)
+    np.add(jacobian[..., :2, :], i[..., 8:10, None], out=by_ideal[0, ..., :2, :])
+    by_ideal[1, ..., :2, :] = jacobian[..., 1:, :]
+    scale = (_UPWARDS / sensor.pixel_pitch).reshape(2, *(1,) * (out.ndim - 1))
+    by_ideal[..., :2, :] *= scale
+    by_c = by_ideal[..., 2, :]
+    pair = by_ideal[..., :2, :] * uv
+    np.add(pair[..., 0, :], pair[..., 1, :], out=by_c)
+    out[..., 1:10, :] *= scale
     out[..., 0, :] = by_c
-    scale = (np.array([1.0, -1.0]) / sensor.pixel_pitch).reshape(2, *(1,) * (out.ndim - 1))
-    out[..., :10, :] *= scale
-    by_ideal *= scale
 
     # By the object point D = R · (c / depth · by_ideal); a small turn about the axis w changes q by
     # q × w, which D sees as w · (D × q).
     by_point = R @ (by_ideal * (i[..., 0, None] * inverse_depth)[..., None, :])
     np.negative(by_point, out=out[..., 13:16, :])
+    crosswise = uv[..., ::-1, :]
     moment = np.empty((2, *batch, 3, n))
-    np.add(jy, by_c * v, out=moment[..., 0, :])
-    np.add(jx, by_c * u, out=moment[..., 1, :])
-    np.subtract(jx * v, jy * u, out=moment[..., 2, :])
-    axes = np.swapaxes(_rotation_axes(e), -1, -2) @ R * i[..., 0, None, None]
-    out[..., 10:13, :] = (axes * [-1.0, 1.0, 1.0]) @ moment
+    np.multiply(by_c[..., None, :], crosswise, out=moment[..., :2, :])
+    moment[..., :2, :] += by_ideal[..., 1::-1, :]
+    np.multiply(by_ideal[..., :2, :], crosswise, out=pair)
+    np.subtract(pair[..., 0, :], pair[..., 1, :], out=moment[..., 2, :])
+    np.matmul(
+        _turning_axes(e, R) * (i[..., 0, None, None] * _TURNS), moment, out=out[..., 10:13, :]
+    )
     return _as_px(sensor, xd, yd), _points_first(out), _points_first(by_point)
 
 
@@ -359,15 +371,13 @@ def _points_first(array: Array) -> Array:
     return array.transpose(*range(1, last - 1), last, 0, last - 1)
 
 
-def _rotation_axes(eop: Array) -> Array:
-    """The object-space axes (..., 3, 3) about which omega, phi, kappa turn the camera (columns)."""
-    so, sp = np.sin(eop[..., 0]), np.sin(eop[..., 1])
-    co, cp = np.cos(eop[..., 0]), np.cos(eop[..., 1])
-    w = np.zeros((*eop.shape[:-1], 3, 3))
-    w[..., 0, 0] = 1.0
-    w[..., 1, 1], w[..., 2, 1] = co, so
-    w[..., 0, 2], w[..., 1, 2], w[..., 2, 2] = sp, -so * cp, co * cp
-    return w
+def _turning_axes(eop: Array, R: Array) -> Array:
+    """The axes (..., 3, 3) about which omega, phi, kappa turn the camera, in its frame (rows)."""
+    axes = np.zeros(R.shape)
+    axes[..., 0, :] = R[..., 0, :]
+    axes[..., 1, 0], axes[..., 1, 1] = np.sin(eop[..., 2]), np.cos(eop[..., 2])
+    axes[..., 2, 2] = 1.0
+    return axes
 
 
 def rays(sensor: Sensor, iop: ArrayLike, image_points: ArrayLike) -> Array:

@@ -15,6 +15,7 @@ geodetic networks; the elimination as Mikhail and Ackermann (1976), chapter 11.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -94,8 +95,15 @@ class AdjustmentSettings:
     @property
     def unknowns(self) -> NDArray[np.int64]:
         """Positions of the unknowns in `PARAMETER_NAMES`."""
-        names = set(self.free) | (set(EOP_NAMES) if self.exterior_free else set())
-        return np.array([i for i, n in enumerate(PARAMETER_NAMES) if n in names], dtype=np.int64)
+        return _positions(tuple(self.free), self.exterior_free)
+
+
+@lru_cache(maxsize=64)
+def _positions(free: tuple[str, ...], exterior_free: bool) -> NDArray[np.int64]:
+    names = {*free, *(EOP_NAMES if exterior_free else ())}
+    rows = np.array([i for i, n in enumerate(PARAMETER_NAMES) if n in names], dtype=np.int64)
+    rows.flags.writeable = False
+    return rows
 
 
 _USUAL = AdjustmentSettings()
@@ -234,7 +242,9 @@ def _result(
 ) -> Adjustment:
     u = problem.unknowns
     redundancy = 2 * int(use.sum()) + len(s.priors) - len(u)
-    sigma0 = float(np.sqrt(problem.cost(solution.v[:, use], solution.values) / redundancy))
+    sigma0 = float(
+        np.sqrt(problem.cost(solution.whitened[-1][:, use], solution.values) / redundancy)
+    )
     factor = sigma0**2 if s.scale == "posterior" else 1.0
     if redundancy < _TRUSTED_REDUNDANCY:
         factor = max(1.0, factor)  # a handful of residuals may be small by luck

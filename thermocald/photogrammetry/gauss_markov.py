@@ -5,7 +5,7 @@ The working half of `adjustment`: arrays only, no judgement.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -92,11 +92,18 @@ class Problem:
             value,
         )
 
-    def gradient(self, flat: Array, v: Array, values: Array) -> Array:
-        """Jᵀ v with the priors' share (u,)."""
-        g: Array = flat @ v.ravel()
-        g += self.prior_weight * (self.prior_value - values[self.unknowns])
-        return g
+    def sums(self, whitened: Array, use: Mask, values: Array) -> tuple[Array, Array, float]:
+        """Normal matrix (u, u), gradient (u,) and sum of squares of the points that take part.
+
+        whitened (u + 1, 2, n): the partials and the residuals.
+        """
+        part = whitened if use.all() else whitened[..., use]
+        flat = part.reshape(len(part), -1)
+        products = flat @ flat.T
+        N, gradient = products[:-1, :-1], products[:-1, -1]
+        N.flat[:: len(N) + 1] += self.prior_weight
+        gradient += self.prior_weight * (self.prior_value - values[self.unknowns])
+        return N, gradient, float(products[-1, -1])
 
     def cost(self, v: Array, values: Array) -> float:
         """Weighted sum of squared residuals, the priors' included."""
@@ -107,16 +114,19 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """values (16,); J (u, 2, n) whitened partials and v (2, n) whitened residuals of all points;
-    rows (u, 2, n) partials in px and residuals (2, n) px; root (u, u): cofactors = root · rootᵀ.
+    """values (16,); whitened (u + 1, 2, n): partials and, last, residuals of all points, those that
+    take no part too; covariance (n, 3) px² of the points; root (u, u): cofactors = root · rootᵀ.
     """
 
     values: Array
-    J: Array
-    v: Array
-    rows: Array
-    residuals: Array
+    whitened: Array
+    covariance: Array
     root: Array
+
+    @property
+    def residuals(self) -> Array:
+        """Residuals (2, n) px."""
+        return _coloured(self.covariance, self.whitened[-1])
 
 
 def chi2_2d(alpha: float) -> float:
@@ -128,30 +138,37 @@ def point_covariances(
     observations: Observations, B: Array | None, target_variances: Array | None
 ) -> Array:
     """Covariance (n, 3) px² of each image point, xx, yy, xy, its object coordinates' included."""
-    out = np.zeros((len(observations), 3))
-    out[:, :2] = observations.sigmas**2
+    out = np.zeros((3, len(observations)))
+    np.square(observations.sigmas.T, out=out[:2])
     if observations.covariances is not None:
-        out[:, 2] = observations.covariances
+        out[2] = observations.covariances
     if B is not None and target_variances is not None:
-        out[:, 0] += (B[:, 0] ** 2 * target_variances).sum(axis=1)
-        out[:, 1] += (B[:, 1] ** 2 * target_variances).sum(axis=1)
-        out[:, 2] += (B[:, 0] * B[:, 1] * target_variances).sum(axis=1)
-    return out
+        out[0] += (B[:, 0] ** 2 * target_variances).sum(axis=1)
+        out[1] += (B[:, 1] ** 2 * target_variances).sum(axis=1)
+        out[2] += (B[:, 0] * B[:, 1] * target_variances).sum(axis=1)
+    return out.T
 
 
-def _whiten(covariance: Array, pair: Array) -> Array:
-    """Multiply (2, ..., n) components by the inverse Cholesky factor of each point's covariance."""
-    if not covariance[:, 2].any():
-        whitened: Array = pair / np.sqrt(
-            covariance[:, :2].T.reshape(2, *(1,) * (pair.ndim - 2), -1)
-        )
+def _whiten(covariance: Array, pairs: Array) -> Array:
+    """Multiply pairs (..., 2, n) by the inverse Cholesky factor of each point's covariance."""
+    xx, yy, xy = covariance.T
+    if not xy.any():
+        whitened: Array = pairs * (1.0 / np.sqrt(covariance.T[:2]))
         return whitened
-    slope = covariance[:, 2] / covariance[:, 0]
-    out = np.empty_like(pair)
-    np.divide(pair[0], np.sqrt(covariance[:, 0]), out=out[0])
-    out[1] = pair[1] - slope * pair[0]
-    out[1] /= np.sqrt(covariance[:, 1] - covariance[:, 2] * slope)
+    slope = xy / xx
+    out = np.empty_like(pairs)
+    np.divide(pairs[..., 0, :], np.sqrt(xx), out=out[..., 0, :])
+    np.subtract(pairs[..., 1, :], slope * pairs[..., 0, :], out=out[..., 1, :])
+    out[..., 1, :] /= np.sqrt(yy - xy * slope)
     return out
+
+
+def _coloured(covariance: Array, pair: Array) -> Array:
+    """The inverse of `_whiten` for one pair (2, n)."""
+    xx, yy, xy = covariance.T
+    slope = xy / xx
+    x = pair[0] * np.sqrt(xx)
+    return np.stack([x, pair[1] * np.sqrt(yy - xy * slope) + slope * x])
 
 
 def cofactor_root(N: Array, unknowns: NDArray[np.int64], damping: float = 0.0) -> Array:
@@ -195,36 +212,32 @@ def solve(problem: Problem, start: Array, use: Mask) -> Solution:
     u, sensor = problem.unknowns, problem.sensor
     values, last = start, float("inf")
     observed = problem.observations.points.T
+    pairs = np.empty((len(u) + 1, *observed.shape))  # the partials and the residuals, px
     for _ in range(_ITERATIONS):
         predicted, A, B = partials(sensor, values[:10], values[10:], problem.points)
-        if not np.isfinite(predicted if use.all() else predicted[use]).all():
-            raise NoConvergenceError("targets came to lie behind the camera during the iteration")
         covariance = point_covariances(problem.observations, B, problem.target_variances)
-        rows = A.transpose(2, 1, 0)[u]
-        J = _whiten(covariance, rows.swapaxes(0, 1)).swapaxes(0, 1)
-        residuals = observed - predicted.T
-        v = _whiten(covariance, residuals)
-        flat, vu = _used(J, v, use)
-        N = flat @ flat.T
-        N.flat[:: len(u) + 1] += problem.prior_weight
+        pairs[:-1] = A.transpose(2, 1, 0)[u]
+        np.subtract(observed, predicted.T, out=pairs[-1])
+        whitened = _whiten(covariance, pairs)
+        N, gradient, squares = problem.sums(whitened, use, values)
+        if not np.isfinite(squares):
+            raise NoConvergenceError("targets came to lie behind the camera during the iteration")
         root = cofactor_root(N, u)
-        gradient = problem.gradient(flat, vu, values)
         half = root.T @ gradient
         size = float(np.sqrt(half @ half))  # of the whole step, in standard deviations
         if size < _SMALL:
-            return _moved(Solution(values, J, v, rows, residuals, root), u, root @ half)
+            return _moved(Solution(values, whitened, covariance, root), u, root @ half)
         near, last = size < _LINEAR and size < 0.5 * last, size
         if near:
             values = values.copy()
             values[u] += root @ half
             continue
-        cost = problem.cost(vu, values)
+        cost = problem.cost(whitened[-1][:, use], values)
         for step in _trial_steps(N, u, root, gradient):
             trial = values.copy()
             trial[u] += step
             residuals = observed - project(sensor, trial[:10], trial[10:], problem.points).T
-            _, vu = _used(None, _whiten(covariance, residuals), use)
-            new = problem.cost(vu, trial)
+            new = problem.cost(_whiten(covariance, residuals)[:, use], trial)
             if np.isfinite(new) and new <= cost * (1 + 1e-9) + 1e-12:
                 break
         else:
@@ -250,38 +263,20 @@ def _trial_steps(N: Array, u: NDArray[np.int64], root: Array, gradient: Array) -
 
 def resolve(problem: Problem, solution: Solution, use: Mask) -> Solution:
     """The solution with other observations: by the same partials where it hardly moves."""
-    flat, v = _used(solution.J, solution.v, use)
-    N = flat @ flat.T
-    N.flat[:: len(N) + 1] += problem.prior_weight
+    N, gradient, _ = problem.sums(solution.whitened, use, solution.values)
     root = cofactor_root(N, problem.unknowns)
-    half = root.T @ problem.gradient(flat, v, solution.values)
+    half = root.T @ gradient
     if float(half @ half) > _LINEAR**2:
         return solve(problem, solution.values, use)
-    moved = _moved(solution, problem.unknowns, root @ half)
-    return Solution(moved.values, moved.J, moved.v, moved.rows, moved.residuals, root)
-
-
-def _used(J: Array | None, v: Array, use: Mask) -> tuple[Array, Array]:
-    if use.all():
-        flat = v if J is None else J.reshape(len(J), -1)
-        return flat, v
-    flat = v if J is None else J[..., use].reshape(len(J), -1)
-    return flat, v[:, use]
+    return _moved(replace(solution, root=root), problem.unknowns, root @ half)
 
 
 def _moved(s: Solution, unknowns: NDArray[np.int64], step: Array) -> Solution:
     """A solution after a small step, its residuals by the partials."""
-    values = s.values.copy()
+    values, whitened = s.values.copy(), s.whitened.copy()
     values[unknowns] += step
-    v = s.v - (step @ s.J.reshape(len(step), -1)).reshape(s.v.shape)
-    return Solution(
-        values,
-        s.J,
-        v,
-        s.rows,
-        s.residuals - (step @ s.rows.reshape(len(step), -1)).reshape(s.v.shape),
-        s.root,
-    )
+    whitened[-1] -= (step @ s.whitened[:-1].reshape(len(step), -1)).reshape(whitened[-1].shape)
+    return Solution(values, whitened, s.covariance, s.root)
 
 
 def point_tests(solution: Solution, use: Mask) -> tuple[Array, Array]:
@@ -289,17 +284,17 @@ def point_tests(solution: Solution, use: Mask) -> tuple[Array, Array]:
 
     A point that takes part has the residual covariance I - h'h, one that does not I + h'h.
     """
-    h = (solution.root.T @ solution.J.reshape(len(solution.root), -1)).reshape(solution.J.shape)
+    u, n = len(solution.root), len(use)
+    h = solution.root.T @ solution.whitened[:-1].reshape(u, -1)
+    claimed = np.einsum("uk,uk->k", h, h).reshape(2, n)
     sign = np.where(use, -1.0, 1.0)
-    claimed = (h * h).sum(axis=0)
     qxx, qyy = 1 + sign * claimed
-    qxy = sign * (h[:, 0] * h[:, 1]).sum(axis=0)
-    vx, vy = solution.v
+    qxy = sign * np.einsum("un,un->n", h[:, :n], h[:, n:])
+    vx, vy = solution.whitened[-1]
     determinant = qxx * qyy - qxy**2
     # A point that alone carries a parameter has no residual: it cannot be tested.
-    testable = determinant > 1e-9
-    test = np.where(testable, qyy * vx**2 - 2 * qxy * vx * vy + qxx * vy**2, 0.0)
-    test /= np.where(testable, determinant, 1.0)
+    determinant[determinant <= 1e-9] = np.inf
+    test = (qyy * vx**2 - 2 * qxy * vx * vy + qxx * vy**2) / determinant
     return test, np.maximum(1 - claimed.T, 0.0)
 
 

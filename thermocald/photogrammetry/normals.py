@@ -45,7 +45,7 @@ __all__ = [
     "sums_of_squares",
 ]
 
-_CHUNK_POINTS = 10_000  # worked on at a time, in the processor's cache
+_CHUNK_POINTS = 20_000  # worked on at a time, in the processor's cache
 
 
 @dataclass(frozen=True, eq=False)

@@ -86,11 +86,14 @@ class SeriesSystem:
     ) -> SeriesSystem:
         """Form, invert, and reduce the normal equations."""
         first, of = _alike(weights, use)
-        N = normal_matrices(_used(weights[first], use[first]), at.A)
-        Q, good = _invert(N[:, own[:, None], own])
+        w = _used(weights[first], use[first])
+        apart = len(common) == 0 and prior is None
+        N = normal_matrices(w, at.A[..., own] if apart else at.A)
+        Q, good = _invert(N if apart else N[:, own[:, None], own])
         good &= use[first].any(axis=1)
-        Q, good = Q[of], good[of]
-        if len(common) == 0 and prior is None:
+        if len(first) < len(of):
+            Q, good = Q[of], good[of]
+        if apart:
             none = np.empty((0, 0))
             return cls(at, weights, use, own, common, N[:0], Q, good, none, None, (first, of))
         N = N[of]

@@ -56,14 +56,23 @@ def test_partials_by_object_points_are_differences(points):
         assert np.abs(difference - analytic[:, :, axis]).max() < 1e-7 * np.abs(analytic).max()
 
 
-def test_epochs_are_vectorised(points):
-    iop = IOP + np.random.default_rng(2).normal(0, 1e-4, (3, 4, 10))
-    eop = np.broadcast_to(EOP, (3, 4, 6))
-    image, by_parameter, by_point = partials(SENSOR, iop, eop, points)
-    one, one_parameter, one_point = partials(SENSOR, iop[2, 1], EOP, points)
-    np.testing.assert_allclose(image[2, 1], one, rtol=0, atol=1e-9)
+@pytest.mark.parametrize("per_epoch", ["iop", "eop", "points", "iop eop", "iop eop points"])
+def test_epochs_are_vectorised(points, per_epoch):
+    rng = np.random.default_rng(2)
+    shared = {"iop": IOP, "eop": EOP, "points": points}
+    several = {
+        name: value + rng.normal(0, 1e-4, (3, 4, *value.shape)) if name in per_epoch else value
+        for name, value in shared.items()
+    }
+    one = {name: v[2, 1] if name in per_epoch else v for name, v in several.items()}
+    image, by_parameter, by_point = partials(SENSOR, *several.values())
+    expected, one_parameter, one_point = partials(SENSOR, *one.values())
+    np.testing.assert_allclose(image[2, 1], expected, rtol=0, atol=1e-9)
     np.testing.assert_allclose(by_parameter[2, 1], one_parameter, rtol=1e-12, atol=1e-9)
     np.testing.assert_allclose(by_point[2, 1], one_point, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(
+        project(SENSOR, *several.values())[2, 1], expected, rtol=0, atol=1e-9
+    )
 
 
 def test_inverse_returns_the_ray(points):

@@ -334,7 +334,7 @@ def partials(
     radial_and_slope = factors @ powers
     jacobian = squares  # xx, xy, yy
     jacobian *= radial_and_slope[..., 1, None, :]
-    jacobian += (_BEND @ i[..., 6:8, None]).reshape(*batch, 3, 2) @ ideal
+    jacobian += (_BEND @ i[..., 6:8, None]).reshape(*i.shape[:-1], 3, 2) @ ideal
     jacobian[..., ::2, :] += radial_and_slope[..., 0, None, :]
 
     # By the camera coordinates: the same with ∂/∂c as its third component

@@ -361,7 +361,7 @@ def _staying(tests: Array, offered: Mask, used: Mask, unknowns: int, alpha: floa
     n = used.sum(axis=1)
     half = np.minimum(n // 2, tests.shape[1] - 1)
     ordered = np.where(used, tests, np.inf)
-    ordered.partition(np.unique(half), axis=1)
+    ordered.sort(axis=1)
     middle = ordered[np.arange(len(n)), half]
     variance = np.where(n > 0, middle, 1.0) / (2 * np.log(2))
     variance = np.where(2 * n - unknowns < _TRUSTED_REDUNDANCY, np.maximum(variance, 1), variance)
@@ -414,6 +414,13 @@ def _common_matrix(
 
 def _invert(N: Array) -> tuple[Array, Mask]:
     """Inverse of each matrix (E, p, p), scaled to a unit diagonal; which could be inverted."""
+    inverse, good = np.empty(N.shape), np.empty(len(N), dtype=bool)
+    for part in chunks(len(N), N.shape[-1] ** 2):
+        inverse[part], good[part] = _inverses(N[part])
+    return inverse, good
+
+
+def _inverses(N: Array) -> tuple[Array, Mask]:
     p = N.shape[-1]
     diagonal = np.diagonal(N, axis1=1, axis2=2)
     good = np.asarray((diagonal > 0).all(axis=1))
@@ -430,9 +437,11 @@ def _invert(N: Array) -> tuple[Array, Mask]:
         good &= ~singular
     left = np.diagonal(inverse, axis1=1, axis2=2)
     good &= ((left > 0) & (left < 1e13)).all(axis=1)
-    inverse = 0.5 * (inverse + np.swapaxes(inverse, 1, 2)) * both
-    inverse[~good] = np.eye(p)
-    return inverse, good
+    symmetric = np.asarray(inverse + np.swapaxes(inverse, 1, 2), dtype=np.float64)
+    symmetric *= both
+    symmetric *= 0.5
+    symmetric[~good] = np.eye(p)
+    return symmetric, good
 
 
 def _inverse(N: Array) -> Array:

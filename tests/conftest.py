@@ -1,7 +1,8 @@
-"""Fixtures for all tests: the reference data beside the checkout, and no leaked thread."""
+"""Fixtures for all tests: the reference data beside the checkout, a browser, no leaked thread."""
 
 from __future__ import annotations
 
+import shutil
 import threading
 import time
 from pathlib import Path
@@ -16,6 +17,55 @@ def shared() -> Path:
     if not (folder / "data").is_dir():
         pytest.skip(f"the reference data are absent: {folder / 'data'} does not exist")
     return folder
+
+
+_QUIET = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """Headless Chromium; skips where there is none."""
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    path = shutil.which("chromium") or shutil.which("google-chrome")
+    if path is None:
+        pytest.skip("no Chromium: apt-get install chromium")
+    with sync_api.sync_playwright() as play:
+        opened = play.chromium.launch(executable_path=path, args=_QUIET)
+        yield opened
+        opened.close()
+
+
+@pytest.fixture
+def page_of(browser):
+    """(url, options) → its page; what the console complains of and what leaves it is `problems`."""
+    pages = []
+
+    def open_(url: str, width: int = 1280, height: int = 900, **options):
+        page = browser.new_page(viewport={"width": width, "height": height}, **options)
+        pages.append(page)
+        page.problems = []
+        page.on(
+            "console", lambda m: m.type in ("error", "warning") and page.problems.append(m.text)
+        )
+        page.on("pageerror", lambda e: page.problems.append(str(e)))
+        page.on(
+            "request",
+            lambda r: not r.url.startswith((url, "data:", "blob:")) and page.problems.append(r.url),
+        )
+        page.goto(url)
+        return page
+
+    yield open_
+    for page in pages:
+        page.close()
 
 
 @pytest.fixture(autouse=True)

@@ -9,7 +9,13 @@ from tests.blind.score import judge, run
 from tests.blind.tables import summary
 
 
-@pytest.mark.parametrize("effect", ["time_offset", "hysteresis", "slip", "second_heat_source"])
+def slow(effect: str):
+    return pytest.param(effect, marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize(
+    "effect", ["time_offset", slow("hysteresis"), slow("slip"), "second_heat_source"]
+)
 def test_some_single_effects(effect):
     assert judge(Case((effect,), 0.1, 41)).right
 

@@ -113,6 +113,30 @@ class Daemon:
 
 
 @pytest.fixture
+def spawn():
+    """(folder, arguments) → a running `thermocald …`; what still runs after the test is killed."""
+    started = []
+
+    def start(folder: Path, *arguments: str) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "thermocald", *arguments],
+            cwd=folder,
+            env=ENVIRONMENT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        started.append(process)
+        return process
+
+    yield start
+    for process in started:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+@pytest.fixture
 def daemon(tmp_path: Path):
     daemon = Daemon(tmp_path)
     yield daemon

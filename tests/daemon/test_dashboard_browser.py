@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import socket
 
@@ -11,16 +10,6 @@ import pytest
 
 pytestmark = pytest.mark.slow
 
-_FLAGS = [
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
 _UNLABELLED = """() => [...document.querySelectorAll('a, button, select, input, [tabindex="0"]')]
   .filter(e => e.offsetParent !== null && !e.closest('.js-plotly-plot'))
   .filter(e => !(e.textContent.trim() || e.getAttribute('aria-label')
@@ -29,39 +18,6 @@ _UNLABELLED = """() => [...document.querySelectorAll('a, button, select, input, 
 _WIDER = "() => document.documentElement.scrollWidth > document.documentElement.clientWidth + 1"
 _DRAWN = """() => [...document.querySelectorAll('#course .scatterlayer path.js-line')]
   .filter(p => (p.getAttribute('d') || '').length > 20 && p.getBBox().width > 0).length"""
-
-
-@pytest.fixture
-def browser():
-    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    path = shutil.which("chromium") or shutil.which("google-chrome")
-    if path is None:
-        pytest.skip("no Chromium: apt-get install chromium")
-    with sync_api.sync_playwright() as play:
-        opened = play.chromium.launch(executable_path=path, args=_FLAGS)
-        yield opened
-        opened.close()
-
-
-@pytest.fixture
-def page_of(browser):
-    """Opens a page; what the console complains of and what leaves the machine is in `problems`."""
-
-    def open_(url: str, width: int = 1280, scheme: str = "light"):
-        page = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
-        page.problems = []
-        page.on(
-            "console", lambda m: m.type in ("error", "warning") and page.problems.append(m.text)
-        )
-        page.on("pageerror", lambda e: page.problems.append(str(e)))
-        page.on(
-            "request",
-            lambda r: not r.url.startswith((url, "data:", "blob:")) and page.problems.append(r.url),
-        )
-        page.goto(url)
-        return page
-
-    return open_
 
 
 @pytest.fixture
@@ -108,7 +64,7 @@ def test_it_is_live_on_desk_and_phone_light_and_dark(daemon, shown, page_of):
     light = page.evaluate("getComputedStyle(document.body).backgroundColor")
     assert page.problems == []
 
-    phone = page_of(shown, width=390, scheme="dark")
+    phone = page_of(shown, width=390, color_scheme="dark")
     phone.wait_for_function("() => document.querySelector('#figures dd') !== null")
     phone.wait_for_function(f"() => ({_DRAWN})() >= 5", timeout=30000)
     assert not phone.evaluate(_WIDER)

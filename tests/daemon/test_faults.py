@@ -55,6 +55,7 @@ def test_unplugged_and_back_told_once_each_and_no_other_device_waits(daemon, dev
     assert sum(begin < t < begin + 2.0 for t in times["two"]) >= 0.3 * usual - 1
 
 
+@pytest.mark.slow  # it waits: for the watchdog, and at the end for the hung thread
 def test_a_hung_capture_trips_the_watchdog_and_holds_nothing_else_up(daemon, devices, supervisor):
     hangs = [{"kind": "timeout", "at": 8}]
     sections = devices(camera=hangs, timeout_s=3600.0)

@@ -85,14 +85,16 @@ def test_readings_wait_for_a_store_that_cannot_be_written(daemon, devices):
     before = resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE)
     resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, (8192, before[1]))
     daemon.until(lambda: "results wait in memory" in daemon.log())
+    begin = time.time()
+    time.sleep(4.0)
+    end = time.time()
     resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, before)
     daemon.until(lambda: "can be written again" in daemon.log())
     assert daemon.stop() == 0
     times = [r.utc for r in readings_of(daemon)]
     assert times == sorted(times)
-    gaps = [b - a for a, b in pairwise(times)]
-    # no reading of the time in which nothing could be written is missing: ticks are 0.2 s
-    assert max(gaps) < 5.0  # on a busy machine ticks are skipped
+    # those of the time in which nothing could be written: 20 ticks, fewer on a busy machine
+    assert sum(begin < t < end for t in times) >= 10
 
 
 @pytest.fixture

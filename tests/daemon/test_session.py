@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import signal
-import subprocess
-import sys
 import time
 
 import pytest
@@ -16,29 +13,16 @@ from thermocald.store.recording import read_recording
 
 
 @pytest.fixture
-def session(tmp_path, devices):
+def session(tmp_path, devices, spawn):
     """options → a running `thermocald session start` in a folder with a configuration."""
-    started = []
 
     def start(*options: str, **configured):
         sections = {**devices(period_s=0.3, name="phone-1", **configured), "outputs": []}
         document = {"store": {"path": "t.db"}, "frames": {"keep": "none"}, **sections}
         (tmp_path / "config.yaml").write_text(yaml.safe_dump(document))
-        process = subprocess.Popen(
-            [sys.executable, "-m", "thermocald", "session", "start", *options],
-            cwd=tmp_path,
-            env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        started.append(process)
-        return process
+        return spawn(tmp_path, "session", "start", *options)
 
-    yield start
-    for process in started:
-        if process.poll() is None:
-            process.kill()
-        process.communicate()
+    return start
 
 
 def test_it_is_checked_taken_interrupted_resumed_and_archived(session, tmp_path):

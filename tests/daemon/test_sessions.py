@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import json
 import signal
-import subprocess
-import sys
 import time
+from functools import partial
 
 import pytest
 import yaml
 
-from tests.daemon.conftest import ENVIRONMENT
 from thermocald.daemon.control import ask
 from thermocald.daemon.session import Session
 from thermocald.errors import DataError, UsageError
@@ -41,24 +39,9 @@ def live(daemon, devices):
 
 
 @pytest.fixture
-def command(daemon):
+def command(daemon, spawn):
     """options → `thermocald session …` in the daemon's folder, running."""
-    started = []
-
-    def start(*options: str):
-        process = subprocess.Popen(
-            [sys.executable, "-m", "thermocald", "session", *options],
-            cwd=daemon.folder, env=ENVIRONMENT,
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
-        started.append(process)
-        return process
-
-    yield start
-    for process in started:
-        if process.poll() is None:
-            process.kill()
-        process.communicate()
+    return partial(spawn, daemon.folder, "session")
 
 
 def series_of(path) -> dict[str, tuple[str, list[int]]]:

@@ -225,14 +225,14 @@ class Page:
                 assert status in (0, 130), f"{command}: {status}"
 
     def interrupted(self, process: subprocess.Popen[str]) -> int:
-        """The exit status after Ctrl-C, and again: Python may lose one in a destructor."""
-        for _ in range(8):
-            os.killpg(process.pid, signal.SIGINT)
-            try:
-                return process.wait(PATIENCE_S / 8)
-            except subprocess.TimeoutExpired:
-                continue
-        raise AssertionError(f"{self.page}: it does not end on Ctrl-C:\n{self.output()[-2000:]}")
+        """The exit status after Ctrl-C."""
+        os.killpg(process.pid, signal.SIGINT)
+        try:
+            return process.wait(PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(
+                f"{self.page}: it does not end on Ctrl-C:\n{self.output()[-2000:]}"
+            ) from None
 
     def kill(self) -> None:
         for _, process in self.staying:

@@ -1,20 +1,9 @@
 """The report in a real browser, at desk and phone width: no console error, no empty plot."""
 
-import shutil
-
 import pytest
 
 from thermocald.output.study_report import render_report
 
-_FLAGS = [
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
 _WIDTHS = {"desk": (1280, 900), "phone": (390, 844)}
 # A drawing is empty when it holds no stroke that is longer than an axis tick.
 _EMPTY_DRAWINGS = """() => [...document.querySelectorAll('figure .panel svg')].filter(svg => {
@@ -30,40 +19,16 @@ _EMPTY_PLOTS = """() => [...document.querySelectorAll('.js-plotly-plot')].filter
 }).length"""
 
 
-@pytest.fixture(scope="module")
-def browser():
-    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    path = shutil.which("chromium") or shutil.which("google-chrome")
-    if path is None:
-        pytest.skip("no Chromium: apt-get install chromium")
-    with sync_api.sync_playwright() as play:
-        opened = play.chromium.launch(executable_path=path, args=_FLAGS)
-        yield opened
-        opened.close()
-
-
 @pytest.fixture
-def open_page(browser, tmp_path):
-    pages = []
+def open_page(page_of, tmp_path):
+    """(html, desk or phone) → the page from a file, without a network."""
 
     def open_(html, width):
         file = tmp_path / "report.html"
         file.write_text(html, encoding="utf-8")
-        size = _WIDTHS[width]
-        page = browser.new_page(viewport={"width": size[0], "height": size[1]}, offline=True)
-        page.problems = []
-        page.on(
-            "console", lambda m: m.type in ("error", "warning") and page.problems.append(m.text)
-        )
-        page.on("pageerror", lambda e: page.problems.append(str(e)))
-        page.on("request", lambda r: r.url.startswith("http") and page.problems.append(r.url))
-        page.goto(file.as_uri())
-        pages.append(page)
-        return page
+        return page_of(file.as_uri(), *_WIDTHS[width], offline=True)
 
-    yield open_
-    for page in pages:
-        page.close()
+    return open_
 
 
 @pytest.mark.slow

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import signal
 import time
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -58,10 +60,15 @@ def top(
     from rich.console import Console
     from rich.live import Live
 
-    with Live(render(read_status(config, store)), console=Console(), screen=False) as live:
-        while True:
-            time.sleep(interval)
-            live.update(render(read_status(config, store)))
+    # A KeyboardInterrupt could be raised in a destructor, where Python only prints it.
+    ended = Event()
+    before = signal.signal(signal.SIGINT, lambda *_: ended.set())
+    try:
+        with Live(render(read_status(config, store)), console=Console(), screen=False) as live:
+            while not ended.wait(interval):
+                live.update(render(read_status(config, store)))
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def read_status(config: Path | None, store: Path | None) -> dict[str, Any]:

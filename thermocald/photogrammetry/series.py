@@ -20,7 +20,6 @@ import numpy as np
 
 from thermocald.photogrammetry.camera_model import project
 from thermocald.photogrammetry.gauss_markov import Rejections
-from thermocald.photogrammetry.geometry import weaknesses
 from thermocald.photogrammetry.normals import (
     ObservationGrid,
     linearise,
@@ -33,7 +32,9 @@ from thermocald.photogrammetry.series_result import (
     SeriesAdjustment,
     SeriesSettings,
 )
-from thermocald.photogrammetry.series_system import SeriesSystem, snoop_series
+from thermocald.photogrammetry.series_snooping import point_tests, snoop_series
+from thermocald.photogrammetry.series_status import enough_targets, judge
+from thermocald.photogrammetry.series_system import SeriesSystem
 from thermocald.photogrammetry.target_noise import (
     correlated_pairs,
     excess_scatter,
@@ -64,7 +65,6 @@ _NEAR = 10.0  # standard deviations: by what the residuals follow a step by the 
 _ROUNDS = 8  # of data snooping
 _RELINEARISE_PX = 1.0  # movement of the mean that changes the partials by more than about 1e-3
 _ENOUGH_FOR_NOISE = 20  # epochs
-_FEW = 0.6  # share of a series' targets below which an epoch's geometry is looked at by itself
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ def adjust_series(
     seen = np.flatnonzero(epochs.observed.any(axis=0))
     series = _Series(sensor, testfield.subset(seen), epochs.targets(seen), s)
     start = np.concatenate([interior.as_array(), exterior.as_array()])
-    use = series.grid.observed & series.enough[:, None]
+    use = series.grid.observed & enough_targets(series.grid, s)[:, None]
     values = np.tile(start, (len(use), 1))
     estimate = series.solve(values, np.zeros((len(seen), 2)), use, 1.0)
     if s.snooping_alpha > 0:
@@ -115,13 +115,6 @@ class _Series:
     testfield: TestField
     grid: ObservationGrid
     s: SeriesSettings
-
-    @property
-    def enough(self) -> NDArray[np.bool_]:
-        """(E,): epochs with enough targets for their own parameters."""
-        count = 2 * self.grid.observed.sum(axis=1) - len(self.s.per_epoch)
-        enough: NDArray[np.bool_] = count >= self.s.bounds.minimum_redundancy
-        return enough
 
     @property
     def has_offsets(self) -> bool:
@@ -185,7 +178,7 @@ class _Series:
         variance, offered = 1.0, use
         rejections = Rejections(use)
         for _ in range(_ROUNDS):
-            tests = estimate.system.point_tests(estimate.residuals)
+            tests = point_tests(estimate.system, estimate.residuals)
             keep = snoop_series(tests, offered, use, len(self.s.per_epoch), self.s.snooping_alpha)
             keep = rejections.settle(use, keep)
             previous, variance = variance, self.variance(estimate)
@@ -206,7 +199,7 @@ class _Series:
         rejections = Rejections(use)
         part: slice | NDArray[np.int64] = slice(None)  # without a copy
         for _ in range(_ROUNDS):
-            tests = system.point_tests(residuals[part])
+            tests = point_tests(system, residuals[part])
             keep = snoop_series(
                 tests, offered[part], use[part], len(self.s.per_epoch), self.s.snooping_alpha
             )
@@ -315,7 +308,9 @@ class _Series:
             )
         values = estimate.values.copy()
         observed = self.grid.observed
-        status, reasons = self._judge(estimate, use, relative)
+        status, reasons = judge(
+            self.sensor, self.testfield, self.grid, s, values, use, sound, relative
+        )
         values[[word != "ok" for word in status]] = np.nan
         return SeriesAdjustment(
             s, values, relative, level, sigma0, redundancy, use, observed & ~use,
@@ -323,77 +318,6 @@ class _Series:
             np.sqrt(system.offset_cofactors() * pooled), tuple(status), tuple(reasons), stillness,
             np.sqrt(excess), np.sqrt(np.diag(trend)),
         )  # fmt: skip
-
-    def _judge(
-        self, estimate: _Estimate, use: NDArray[np.bool_], covariance: Array
-    ) -> tuple[list[str], list[str]]:
-        """Status and reason of every epoch."""
-        observed, bounds = self.grid.observed, self.s.bounds
-        offered, used = observed.sum(axis=1), use.sum(axis=1)
-        status, reasons = ["ok"] * len(use), [""] * len(use)
-
-        def say(rows: NDArray[np.bool_], word: str, sentence: str) -> None:
-            for row in np.flatnonzero(rows):
-                if status[row] == "ok":
-                    status[row] = word
-                    reasons[row] = sentence.format(n=offered[row], bad=offered[row] - used[row])
-
-        say(offered == 0, "no_observations", "no target was measured")
-        say(
-            ~self.enough,
-            "too_few_targets",
-            f"{{n}} targets for {len(self.s.per_epoch)} unknowns of the epoch leave too little "
-            "redundancy: show more targets or hold parameters fixed",
-        )
-        say(
-            used < (1 - self.s.max_rejected) * offered,
-            "too_many_rejected",
-            "{bad} of {n} targets contradict the others: a moved test field, a wrong one, or a "
-            "blurred image",
-        )
-        say(~estimate.system.good, "weak_geometry", "these targets cannot carry the parameters")
-        variance = np.diagonal(covariance, axis1=1, axis2=2)
-        c, pitch = estimate.values[:, 0], self.sensor.pixel_pitch
-        say(
-            np.sqrt(variance[:, 0]) > bounds.relative_sd_c * c,
-            "weak_geometry",
-            f"the principal distance is known to worse than {bounds.relative_sd_c:.1%}",
-        )
-        say(
-            np.sqrt(variance[:, 1:3].max(axis=1)) > bounds.sd_point_px * pitch,
-            "weak_geometry",
-            f"the principal point is known to worse than {bounds.sd_point_px:.0f} px",
-        )
-        # Geometry is that of the series' targets; only epochs that see few of them are looked at
-        # one by one.
-        ever = use.any(axis=0).sum()
-        few = (used < _FEW * ever) & (np.array(status) == "ok")
-        typical = int(np.argmax(used))
-        for row in {typical, *map(int, np.flatnonzero(few))}:
-            if status[row] != "ok":
-                continue
-            said = self._weaknesses(estimate, use[row], covariance[row], row)
-            if said and row == typical:
-                say(np.ones(len(use), dtype=bool), "weak_geometry", said)
-            elif said:
-                status[row], reasons[row] = "weak_geometry", said
-        return status, reasons
-
-    def _weaknesses(
-        self, estimate: _Estimate, used: NDArray[np.bool_], covariance: Array, row: int
-    ) -> str:
-        """What `geometry.weaknesses` says of one epoch."""
-        values = estimate.values[row]
-        said = weaknesses(
-            self.sensor,
-            self.testfield.points[used],
-            self.grid.points[row, used],
-            values,
-            covariance,
-            self.s.free,
-            self.s.bounds,
-        )
-        return "; ".join(said).replace("{", "(").replace("}", ")")
 
 
 def _pooled(vPv: Array, redundancy: Array, good: NDArray[np.bool_]) -> float:

@@ -14,11 +14,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.gauss_markov import chi2_2d
+from thermocald.photogrammetry.cofactors import (
+    among_all,
+    cofactors,
+    inverse_of_determined,
+    root_of,
+)
 from thermocald.photogrammetry.normals import (
     chunks,
     normal_matrices,
-    products,
     right_hand_sides,
     same_rows,
 )
@@ -35,10 +39,9 @@ if TYPE_CHECKING:
     Mask = NDArray[np.bool_]
     Columns = NDArray[np.int64]
 
-__all__ = ["SeriesSystem", "Step", "snoop_series"]
+__all__ = ["SeriesSystem", "Step", "alike"]
 
 _CHUNK = 128  # epochs whose couplings with the offsets are held at a time
-_TRUSTED_REDUNDANCY = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,11 +88,11 @@ class SeriesSystem:
         prior: Array | None,
     ) -> SeriesSystem:
         """Form, invert, and reduce the normal equations."""
-        first, of = _alike(weights, use)
+        first, of = alike(weights, use)
         w = _used(weights[first], use[first])
         apart = len(common) == 0 and prior is None
         N = normal_matrices(w, at.A[..., own] if apart else at.A)
-        Q, good = _invert(N if apart else N[:, own[:, None], own])
+        Q, good = cofactors(N if apart else N[:, own[:, None], own])
         good &= use[first].any(axis=1)
         if len(first) < len(of):
             Q, good = Q[of], good[of]
@@ -103,7 +106,7 @@ class SeriesSystem:
             half = np.swapaxes(np.linalg.cholesky(Q[part]), 1, 2) @ C
             half = half.reshape(-1, half.shape[-1])
             full -= half.T @ half
-        return replace(system, Q_common=_inverse(full))
+        return replace(system, Q_common=inverse_of_determined(full))
 
     def couplings(self) -> Iterator[tuple[NDArray[np.int64], Array]]:
         """Chunks of good epochs and their blocks (e, p, q + 2T) of own with common unknowns."""
@@ -173,48 +176,6 @@ class SeriesSystem:
         y -= self.prior[:, 2] * offsets[:, 0] + self.prior[:, 1] * offsets[:, 1]
         return np.concatenate([x, y])
 
-    def point_tests(self, residuals: Array) -> Array:
-        """Chi-square (2) of every image point (E, T) against its epoch.
-
-        Points that take no part are tested as check points. The common unknowns are taken as known,
-        as they rest on all epochs.
-        """
-        first, of = self.alike or _alike(self.weights, self.use)
-        E, T = residuals.shape[:2]
-        pairs = products(self.at.A[..., self.own])
-        shared = self._test_weights(first, pairs) if len(first) < E else None
-        test = np.empty((E, T))
-        for part in chunks(E, T):
-            if shared is None:
-                xx, yy, xy = self._test_weights(part, pairs)
-            else:
-                xx, yy, xy = shared if len(first) == 1 else shared[:, of[part]]
-            x, y = residuals[part, :, 0], residuals[part, :, 1]
-            out = np.multiply(xx, x, out=test[part])
-            out += xy * y
-            out *= x
-            out += yy * y * y
-        test[np.isnan(test)] = 0.0
-        return test
-
-    def _test_weights(self, epochs: slice | Columns, products: tuple[Array, Array, Array]) -> Array:
-        """Inverse covariance (3, M, T) of the residuals, xx, yy, twice xy; 0 without a test."""
-        weights = self.weights[epochs]
-        rows, columns = np.triu_indices(len(self.own))
-        Q = self.Q[epochs][:, rows, columns] * np.where(rows == columns, 1.0, 2.0)
-        sign = np.where(self.use[epochs], -1.0, 1.0)
-        lxx, lyy, lxy = (sign * (Q @ pairs.T) for pairs in products)
-        offered = weights[..., 0] > 0
-        wx, wy, wxy = (np.where(offered, weights[..., k], k < 2) for k in range(3))
-        determinant = wx * wy - wxy * wxy
-        vxx, vyy = wy / determinant + lxx, wx / determinant + lyy
-        vxy = 0.5 * lxy - wxy / determinant
-        d = vxx * vyy - vxy * vxy
-        d[~(offered & (d > 1e-9 / determinant))] = np.inf
-        inverse = np.stack([vyy, vxx, -2 * vxy])
-        inverse /= d
-        return inverse
-
     def common_share(self) -> float:
         """How many of the observations the common unknowns use up."""
         q = len(self.common)
@@ -249,7 +210,7 @@ class SeriesSystem:
                 mean += G.sum(axis=0)
                 tilt += np.tensordot(line[part], G, axes=1)
             mean /= max(int(self.good.sum()), 1)
-            root = _root(self.Q_common)
+            root = root_of(self.Q_common)
             own_tilt = tilt @ root
             trend[own[:, None], own] = own_tilt @ own_tilt.T
             for part, C in self.couplings():
@@ -261,7 +222,7 @@ class SeriesSystem:
             level[common[:, None], common] = common_root @ common_root.T
             level[own[:, None], common] = -own_level @ common_root.T
             level[common[:, None], own] = level[own[:, None], common].T
-        relative = _among_all(cofactors, own)
+        relative = among_all(cofactors, own)
         relative[~self.good] = 0.0
         return relative, level, trend
 
@@ -277,7 +238,7 @@ class SeriesSystem:
             return out
         w = np.sqrt(_used(self.weights, self.use)[self.good].mean(axis=0)[:, :2])
         J = self.at.A[..., self.own] * w[..., None]
-        inverse, good = _invert(np.einsum("tkp,tkq->pq", J, J)[None])
+        inverse, good = cofactors(np.einsum("tkp,tkq->pq", J, J)[None])
         if not good[0]:
             return out
         total = np.zeros((len(self.own), len(self.own)))
@@ -306,7 +267,7 @@ class SeriesSystem:
         least = np.linalg.eigvalsh(root @ own @ np.swapaxes(root, 1, 2))[:, 0]
         drawn = np.where(self.good, np.minimum(1.0, 0.6 / np.maximum(-least, 1e-9)), 0.0)
         drawn[least >= 0] = 1.0
-        return _among_all(drawn[:, None, None] * own, self.own)
+        return among_all(drawn[:, None, None] * own, self.own)
 
     def offset_cofactors(self) -> Array:
         """Cofactors (T, 2) px² of the offsets in x and y; NaN without offsets."""
@@ -324,7 +285,7 @@ class SeriesSystem:
         QC = self.Q @ C
         V = self.N[:, columns[:, None], columns] - np.swapaxes(C, 1, 2) @ QC
         g = b[:, columns] - np.einsum("epi,ep->ei", QC, b[:, self.own])
-        inverse, good = _invert(V)
+        inverse, good = cofactors(V)
         score = np.einsum("ei,eij,ej->e", g, inverse, g)
         return np.where(good & self.good, score, np.nan)
 
@@ -333,44 +294,6 @@ def _used(weights: Array, use: Mask) -> Array:
     """Weights (E, T, 3), 0 where a point takes no part."""
     used: Array = weights * use[..., None]
     return used
-
-
-def _among_all(Q: Array, own: Columns) -> Array:
-    """Matrices (E, p, p) of some parameters as those of all (E, 16, 16), 0 for the others."""
-    whole = np.zeros((len(Q), 16, 16))
-    runs = np.split(np.arange(len(own)), np.flatnonzero(np.diff(own) > 1) + 1)
-    for rows in runs:
-        for columns in runs:
-            a, b = (
-                slice(own[rows[0]], own[rows[-1]] + 1),
-                slice(own[columns[0]], own[columns[-1]] + 1),
-            )
-            whole[:, a, b] = Q[:, rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    return whole
-
-
-def snoop_series(tests: Array, offered: Mask, used: Mask, unknowns: int, alpha: float) -> Mask:
-    """Which image points (E, T) stay, epoch by epoch, as `gauss_markov.snoop` does."""
-    keep = np.empty_like(used)
-    for part in chunks(*used.shape):
-        keep[part] = _staying(tests[part], offered[part], used[part], unknowns, alpha)
-    return keep
-
-
-def _staying(tests: Array, offered: Mask, used: Mask, unknowns: int, alpha: float) -> Mask:
-    n = used.sum(axis=1)
-    half = np.minimum(n // 2, tests.shape[1] - 1)
-    ordered = np.where(used, tests, np.inf)
-    ordered.sort(axis=1)
-    middle = ordered[np.arange(len(n)), half]
-    variance = np.where(n > 0, middle, 1.0) / (2 * np.log(2))
-    variance = np.where(2 * n - unknowns < _TRUSTED_REDUNDANCY, np.maximum(variance, 1), variance)
-    limit = (chi2_2d(alpha) * np.maximum(variance, 1e-12))[:, None]
-    worst = np.where(used, tests, 0.0).max(axis=1, initial=0.0)[:, None]
-    small = tests <= limit
-    suspicious = used & ~small & (tests >= 0.5 * worst)
-    keep: Mask = offered & (used | small) & ~suspicious
-    return keep
 
 
 def _line_weights(good: Mask) -> Array:
@@ -383,7 +306,7 @@ def _line_weights(good: Mask) -> Array:
     return weights
 
 
-def _alike(weights: Array, use: Mask) -> tuple[Columns, Columns]:
+def alike(weights: Array, use: Mask) -> tuple[Columns, Columns]:
     """Epochs of which the same points take part with the same weights, as of `same_rows`."""
     return same_rows(np.packbits(use, axis=1), *np.moveaxis(weights, -1, 0))
 
@@ -410,63 +333,3 @@ def _common_matrix(
     full[y, :q] = wxy * A[:, 0] + wy * A[:, 1]
     full[:q, q:] = full[q:, :q].T
     return full
-
-
-def _invert(N: Array) -> tuple[Array, Mask]:
-    """Inverse of each matrix (E, p, p), scaled to a unit diagonal; which could be inverted."""
-    inverse, good = np.empty(N.shape), np.empty(len(N), dtype=bool)
-    for part in chunks(len(N), N.shape[-1] ** 2):
-        inverse[part], good[part] = _inverses(N[part])
-    return inverse, good
-
-
-def _inverses(N: Array) -> tuple[Array, Mask]:
-    p = N.shape[-1]
-    diagonal = np.diagonal(N, axis1=1, axis2=2)
-    good = np.asarray((diagonal > 0).all(axis=1))
-    scale = 1.0 / np.sqrt(np.where(good[:, None], diagonal, 1.0))
-    both = scale[:, :, None] * scale[:, None, :]
-    scaled = N * both
-    scaled[~good] = np.eye(p)
-    try:
-        inverse = np.linalg.inv(scaled)
-    except np.linalg.LinAlgError:
-        singular = np.linalg.eigvalsh(scaled)[:, 0] < 1e-13
-        scaled[singular] = np.eye(p)
-        inverse = np.linalg.inv(scaled)
-        good &= ~singular
-    left = np.diagonal(inverse, axis1=1, axis2=2)
-    good &= ((left > 0) & (left < 1e13)).all(axis=1)
-    symmetric = np.asarray(inverse + np.swapaxes(inverse, 1, 2), dtype=np.float64)
-    symmetric *= both
-    symmetric *= 0.5
-    symmetric[~good] = np.eye(p)
-    return symmetric, good
-
-
-def _inverse(N: Array) -> Array:
-    """Inverse of one matrix, by the parameters that it determines."""
-    if len(N) == 0:
-        return N
-    scale = 1.0 / np.sqrt(np.clip(np.diag(N), 1e-300, None))
-    both = np.outer(scale, scale)
-    try:
-        factor = np.linalg.cholesky(N * both)
-        if factor.diagonal().min() > 1e-6:
-            triangle = np.linalg.inv(factor)
-            regular: Array = (triangle.T @ triangle) * both
-            return regular
-    except np.linalg.LinAlgError:
-        pass
-    inverse: Array = np.linalg.pinv(N * both, rcond=1e-13, hermitian=True) * both
-    return inverse
-
-
-def _root(Q: Array) -> Array:
-    """A root of a covariance, Q = root · rootᵀ."""
-    try:
-        triangle: Array = np.linalg.cholesky(Q).astype(np.float64, copy=False)
-    except np.linalg.LinAlgError:  # only semi-definite
-        values, vectors = np.linalg.eigh(Q)
-        triangle = vectors * np.sqrt(np.clip(values, 0.0, None))
-    return triangle

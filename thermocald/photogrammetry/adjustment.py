@@ -212,7 +212,7 @@ def adjust(
         for _ in range(_ROUNDS):
             keep = snoop(tests[0], use, len(unknowns), s.snooping_alpha)
             keep = rejections.settle(use, keep)
-            if np.array_equal(keep, use):
+            if keep is use:
                 break
             use = keep
             if use.sum() < (1 - s.max_rejected) * n:
@@ -242,9 +242,12 @@ def _result(
 ) -> Adjustment:
     u = problem.unknowns
     redundancy = 2 * int(use.sum()) + len(s.priors) - len(u)
-    sigma0 = float(
-        np.sqrt(problem.cost(solution.whitened[-1][:, use], solution.values) / redundancy)
-    )
+    v, points, observed = solution.whitened[-1], problem.points, problem.observations.points
+    rejected: tuple[int, ...] = ()
+    if not use.all():
+        v, points, observed = v[:, use], points[use], observed[use]
+        rejected = tuple(problem.observations.targets[~use].tolist())
+    sigma0 = float(np.sqrt(problem.cost(v, solution.values) / redundancy))
     factor = sigma0**2 if s.scale == "posterior" else 1.0
     if redundancy < _TRUSTED_REDUNDANCY:
         factor = max(1.0, factor)  # a handful of residuals may be small by luck
@@ -263,12 +266,12 @@ def _result(
         solution.residuals.T,
         redundancy_numbers,
         test,
-        tuple(int(t) for t in problem.observations.targets[~use]),
+        rejected,
     )
     reasons = weaknesses(
         problem.sensor,
-        problem.points[use],
-        problem.observations.points[use],
+        points,
+        observed,
         solution.values,
         covariance,
         s.free,

@@ -101,8 +101,9 @@ class Problem:
         flat = part.reshape(len(part), -1)
         products = flat @ flat.T
         N, gradient = products[:-1, :-1], products[:-1, -1]
-        N.flat[:: len(N) + 1] += self.prior_weight
-        gradient += self.prior_weight * (self.prior_value - values[self.unknowns])
+        if self.prior_weight.any():
+            N.flat[:: len(N) + 1] += self.prior_weight
+            gradient += self.prior_weight * (self.prior_value - values[self.unknowns])
         return N, gradient, float(products[-1, -1])
 
     def cost(self, v: Array, values: Array) -> float:
@@ -166,6 +167,9 @@ def _whiten(covariance: Array, pairs: Array) -> Array:
 def _coloured(covariance: Array, pair: Array) -> Array:
     """The inverse of `_whiten` for one pair (2, n)."""
     xx, yy, xy = covariance.T
+    if not xy.any():
+        coloured: Array = pair * np.sqrt(covariance.T[:2])
+        return coloured
     slope = xy / xx
     x = pair[0] * np.sqrt(xx)
     return np.stack([x, pair[1] * np.sqrt(yy - xy * slope) + slope * x])
@@ -309,11 +313,16 @@ class Rejections:
         self._barred = np.zeros_like(used)
 
     def settle(self, use: Mask, keep: Mask, part: slice | NDArray[np.int64] = slice(None)) -> Mask:
-        """Which of those that a round would keep do stay; part: the rows that it looked at."""
+        """Which of those that a round would keep do stay, `use` itself where nothing changes.
+
+        part: the rows that the round looked at.
+        """
+        if np.array_equal(keep, use):
+            return use
         keep = keep & ~self._barred[part]
         self._barred[part] |= self._back[part] & use & ~keep
         self._back[part] |= keep & ~use
-        return keep
+        return use if np.array_equal(keep, use) else keep
 
 
 def snoop(test: Array, use: Mask, unknowns: int, alpha: float) -> Mask:
@@ -324,8 +333,9 @@ def snoop(test: Array, use: Mask, unknowns: int, alpha: float) -> Mask:
     if alpha <= 0:
         return use
     n = int(use.sum())
+    used = test if n == len(use) else test[use]
     # Median of chi-square(2) is 2 ln 2: a scale that the gross errors do not reach.
-    variance = float(np.partition(test[use], n // 2)[n // 2]) / (2 * np.log(2))
+    variance = float(np.partition(used, n // 2)[n // 2]) / (2 * np.log(2))
     if 2 * n - unknowns < _TRUSTED_REDUNDANCY:
         variance = max(1.0, variance)
     limit = chi2_2d(alpha) * max(variance, 1e-12)
@@ -333,5 +343,5 @@ def snoop(test: Array, use: Mask, unknowns: int, alpha: float) -> Mask:
     suspicious = use & (test > limit)
     if suspicious.any():
         # One gross error lifts its neighbours: only those near the worst go at once.
-        keep[suspicious & (test >= 0.5 * test[use].max())] = False
+        keep[suspicious & (test >= 0.5 * used.max())] = False
     return keep

@@ -116,7 +116,7 @@ def weaknesses(
 
 def _has_depth(points: Array) -> bool:
     """Whether points are certainly no plane: a quick look that spares most epochs the fit."""
-    reduced = points - points.sum(axis=0) / len(points)
+    reduced = points - np.full(len(points), 1.0 / len(points)) @ points
     (a, b, c), (_, d, e), (_, _, f) = (reduced.T @ reduced).tolist()
     determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
     return bool(determinant > 1e-4 * (a + d + f) ** 3)

@@ -234,6 +234,23 @@ def replayed():
     return make
 
 
+@pytest.fixture(scope="session")
+def shim(tmp_path_factory):
+    """name → the shared object of a C file beside this one, for LD_PRELOAD."""
+    compiler = shutil.which("cc") or shutil.which("gcc")
+    if compiler is None:
+        pytest.skip("no C compiler: what the system tells a process cannot be changed")
+
+    def build(name: str) -> str:
+        path = tmp_path_factory.mktemp("shim") / f"{name}.so"
+        source = Path(__file__).with_name(f"{name}.c")
+        command = [compiler, "-shared", "-fPIC", "-O1", "-o", path, source, "-ldl"]
+        subprocess.run(command, check=True)
+        return str(path)
+
+    return build
+
+
 @pytest.fixture
 def small_disk(tmp_path: Path):
     """MB → the folder of a disk of that size; skips where nothing can be mounted."""

@@ -6,12 +6,7 @@ tell it. Not real: the kernel's clock itself: file times and its word on synchro
 
 from __future__ import annotations
 
-import shutil
-import subprocess
-from pathlib import Path
-
 import numpy as np
-import pytest
 
 from thermocald.store.archive import archive_series
 from thermocald.store.database import Store
@@ -20,22 +15,11 @@ from thermocald.store.recording import read_recording
 HOUR = 3600.0
 
 
-@pytest.fixture(scope="session")
-def shim(tmp_path_factory) -> Path:
-    compiler = shutil.which("cc") or shutil.which("gcc")
-    if compiler is None:
-        pytest.skip("no C compiler: the clock of a process cannot be moved")
-    path = tmp_path_factory.mktemp("shim") / "clock_offset.so"
-    source = Path(__file__).with_name("clock_offset.c")
-    subprocess.run([compiler, "-shared", "-fPIC", "-O1", "-o", path, source, "-ldl"], check=True)
-    return path
-
-
 def test_an_hour_forth_and_back_loses_and_disorders_nothing(daemon, devices, shim, tmp_path):
     offset = tmp_path / "offset"
     offset.write_text("0")
     daemon.configure(**devices(period_s=0.3))
-    daemon.start(LD_PRELOAD=str(shim), CLOCK_OFFSET_FILE=str(offset))
+    daemon.start(LD_PRELOAD=shim("clock_offset"), CLOCK_OFFSET_FILE=str(offset))
     daemon.until(lambda: len(daemon.results()) > 4)
     for hours, steps in ((1, 1), (-1, 2), (0, 3)):
         # written over, since the process holds the file open

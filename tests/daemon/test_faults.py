@@ -101,6 +101,33 @@ def test_a_store_that_cannot_be_written_waits_in_memory(daemon, devices):
     assert daemon.log().count("can be written again") == 1
 
 
+@pytest.mark.parametrize("failing", ["write", "sync"])
+def test_a_disk_that_fails_beneath_the_store_loses_nothing(
+    daemon, devices, shim, tmp_path, failing
+):
+    """Input/output errors: of writes, and of the flush that a commit is worth nothing without."""
+    asked = tmp_path / "asked"
+    daemon.configure(**devices())
+    daemon.start(
+        LD_PRELOAD=shim("disk_error"), DISK_ERROR_OF=str(daemon.store), DISK_ERROR_FILE=str(asked)
+    )
+    daemon.until(lambda: len(daemon.results()) > 3)
+    asked.write_text(failing)
+    daemon.until(lambda: "results wait in memory" in daemon.log())
+    status = daemon.folder / "thermocald.db.live/status.json"
+    daemon.until(lambda: json.loads(status.read_text())["store"]["waiting"] >= 5)
+    told = daemon.results()[-1]["epoch"]
+    asked.unlink()
+    daemon.until(lambda: "can be written again" in daemon.log())
+    daemon.until(lambda: daemon.results()[-1]["stored"])
+    daemon.kill()  # what is in the store now is all that there is
+    numbers, _ = daemon.stored()
+    assert numbers == list(range(1, len(numbers) + 1))
+    assert len(numbers) >= told
+    assert daemon.log().count("results wait in memory") == 1
+    assert "Traceback" not in daemon.log()
+
+
 def test_on_a_read_only_file_system_it_says_so_and_leaves_the_rest_to_the_restart(
     daemon, devices, small_disk
 ):

@@ -21,7 +21,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 
 from tests.blind.bridge import series_input
-from tests.blind.generator import SINGLE, Case, generate
+from tests.blind.case import SINGLE, Case
+from tests.blind.generator import generate
 from thermocald.discovery.candidates import candidates
 from thermocald.discovery.evidence import COLUMNS
 from thermocald.discovery.laboratory import Laboratory

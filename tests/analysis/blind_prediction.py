@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from typer.testing import CliRunner
 
-from tests.blind.generator import SINGLE, Case, generate, write
+from tests.blind.case import SINGLE, Case
+from tests.blind.generator import generate, write
 from thermocald.analysis.held_out import predicted_error
 from thermocald.analysis.series_reduction import model_series
 from thermocald.analysis.thermal_model import targets_of

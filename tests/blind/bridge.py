@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from tests.blind.generator import CAMERAS, Series
+from tests.blind.case import CAMERAS
+from tests.blind.generator import Series
 from thermocald.discovery.evidence import SeriesInput
 from thermocald.photogrammetry.camera_model import Sensor
 from thermocald.photogrammetry.normals import ObservationGrid

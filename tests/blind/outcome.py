@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from tests.blind.generator import Case
+from tests.blind.case import Case
 
 
 @dataclass

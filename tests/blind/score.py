@@ -22,7 +22,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 
 from tests.blind.bridge import series_input
-from tests.blind.generator import OUTSIDE, SINGLE, Case, generate
+from tests.blind.case import OUTSIDE, SINGLE, Case
+from tests.blind.generator import generate
 from tests.blind.outcome import Outcome
 from tests.blind.tables import row, write
 from thermocald.discovery.reduction import gather

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.blind.generator import OUTSIDE, SINGLE
+from tests.blind.case import OUTSIDE, SINGLE
 from tests.blind.outcome import Outcome
 
 HEAD = (

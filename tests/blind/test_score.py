@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.blind.generator import SINGLE, Case
+from tests.blind.case import SINGLE, Case
 from tests.blind.score import judge, run
 from tests.blind.tables import summary
 

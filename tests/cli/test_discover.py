@@ -8,7 +8,8 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from tests.blind.generator import Case, generate, write
+from tests.blind.case import Case
+from tests.blind.generator import generate, write
 from thermocald.cli import application
 from thermocald.errors import DataError, UsageError
 

@@ -9,7 +9,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import pytest
 
 from tests.blind.bridge import series_input
-from tests.blind.generator import Case, generate
+from tests.blind.case import Case
+from tests.blind.generator import generate
 from thermocald.discovery.reduction import gather
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from tests.blind.bridge import series_input
-from tests.blind.generator import Case, generate
+from tests.blind.case import Case
+from tests.blind.generator import generate
 from thermocald.discovery.hypothesis import Term
 from thermocald.discovery.laboratory import Laboratory
 from thermocald.discovery.left_out import confirmed, gains, left_out

@@ -1,0 +1,38 @@
+"""What a blind recording shall hide, and on which camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+SINGLE = (
+    "thermal_lag", "time_offset", "nonlinear_expansion", "softening", "thermal_gradient",
+    "permanent_set", "hysteresis", "self_heating", "creep", "slip", "cyclic_interference",
+    "second_heat_source", "defocus", "housing_tilt", "radial_distortion_drift",
+    "decentering_drift", "affinity_drift", "test_field_expansion", "target_displacement",
+)  # fmt: skip
+OUTSIDE = "outside"
+PROGRAMMES = ("lamp", "lamp2", "selfwarming", "steps", "ramp")
+
+# name: (width, height, pitch mm, c mm, A1)
+CAMERAS = {
+    "rpi-v2.1": (3280, 2464, 0.00112, 3.04, -2.5e-3),
+    "nexus5": (3264, 2448, 0.0014, 3.97, 1.2e-3),
+    "galaxy-s8": (4032, 3024, 0.0014, 4.25, 8.0e-4),
+}
+
+
+@dataclass
+class Case:
+    """What is asked for."""
+
+    effects: tuple[str, ...] = ()
+    strength_px: float = 0.3
+    seed: int = 0
+    hard: bool = False
+    noise_px: float = 0.04
+    thermometer_k: float = 0.04
+    epochs: int = 180
+    interval: float = 10.0
+    camera: str | None = None
+    programmes: tuple[str, str] | None = None
+    with_m2: bool = True

@@ -1,0 +1,229 @@
+"""The camera of the generator: its base, its rates, and the effect that it hides."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from tests.blind.case import CAMERAS, OUTSIDE, Case
+from tests.blind.world import backlash, delayed, image, lagged
+
+
+@dataclass
+class Camera:
+    """The physical truth of one camera: base, rates, hidden effects with their constants."""
+
+    sensor: tuple[int, int, float]
+    base: np.ndarray
+    rates: np.ndarray  # (16,) per K
+    T0: float
+    effects: list[dict] = field(default_factory=list)
+
+
+def _view(rng: np.random.Generator, c: float) -> np.ndarray:
+    """A camera that looks into the corner: (6,) EOP."""
+    target = np.array([225.0, 225.0, 225.0]) + rng.normal(0, 12, 3)
+    direction = np.array([1.0, 1.0, 1.0]) + rng.normal(0, 0.08, 3)
+    place = target + direction / np.linalg.norm(direction) * 1050.0 * rng.uniform(0.95, 1.1)
+    z = (place - target) / np.linalg.norm(place - target)
+    x = np.cross([0.0, 0.0, 1.0], z)
+    x /= np.linalg.norm(x)
+    y = np.cross(z, x)
+    a = rng.uniform(-0.15, 0.15)
+    R = np.stack([np.cos(a) * x + np.sin(a) * y, -np.sin(a) * x + np.cos(a) * y, z], 1)
+    phi = np.arcsin(R[0, 2])
+    return np.array([np.arctan2(-R[1, 2], R[2, 2]), phi, np.arctan2(-R[0, 1], R[0, 0]), *place])
+
+
+def make_camera(rng: np.random.Generator, case: Case) -> tuple[str, Camera]:
+    name = case.camera or rng.choice(sorted(CAMERAS))
+    width, height, pitch, c, A1 = CAMERAS[name]
+    base = np.zeros(16)
+    base[0] = c * rng.uniform(0.99, 1.01)
+    base[1:3] = rng.normal(0, 15 * pitch, 2)
+    base[3] = A1 * rng.uniform(0.7, 1.3)
+    base[4] = rng.normal(0, 1e-4)
+    base[6:8] = rng.normal(0, 1e-4, 2)
+    base[8:10] = rng.normal(0, 2e-4, 2)
+    base[10:] = _view(rng, c)
+    rates = np.zeros(16)
+    rates[0] = rng.choice([-1, 1]) * c * rng.uniform(4e-5, 1.5e-4)
+    way = rng.uniform(0, 2 * np.pi)
+    rates[1:3] = rng.uniform(0.25, 0.9) * pitch * np.array([np.cos(way), np.sin(way)])
+    return name, Camera((width, height, pitch), base, rates, 20.0)
+
+
+def _direction(rng: np.random.Generator, camera: Camera) -> np.ndarray:
+    """A random mix of c, x0, y0 in which every part is worth about as much in the image."""
+    v = rng.normal(size=3)
+    v /= np.linalg.norm(v)
+    out = np.zeros(16)
+    out[0] = v[0] * 2.5 * camera.sensor[2]
+    out[1:3] = v[1:] * camera.sensor[2]
+    return out
+
+
+def hide(rng: np.random.Generator, name: str, camera: Camera, truth: dict) -> dict:
+    """Draw the constants of one effect; its size is scaled afterwards."""
+    e: dict = {"effect": name, "size": 1.0}
+    if name == "thermal_lag":
+        e["tau"] = float(np.exp(rng.uniform(np.log(25), np.log(240))))
+    elif name == "time_offset":
+        e["d"] = float(rng.choice([-1, 1]) * rng.uniform(8, 60))
+    elif name == "hysteresis":
+        e["half_width"] = float(rng.uniform(0.4, 2.5))
+    elif name == "softening":
+        e["T_k"] = float(truth["T_quantile"](rng.uniform(0.35, 0.7)))
+    elif name == "self_heating":
+        e["tau"] = float(np.exp(rng.uniform(np.log(60), np.log(600))))
+    elif name == "cyclic_interference":
+        e["P"] = float(np.exp(rng.uniform(np.log(45), np.log(500))))
+    elif name == "second_heat_source":
+        e["channel"] = "board_temperature"
+    elif name == "target_displacement":
+        e["targets"] = sorted(int(v) for v in rng.choice(147, rng.integers(1, 5), replace=False))
+        e["vector"] = rng.normal(size=3)
+    elif name == "defocus":
+        e["coldest"] = truth["coldest"]  # one law of noise for the camera, not one per series
+    if name in ("nonlinear_expansion", "softening", "thermal_gradient", "permanent_set",
+                "self_heating", "creep", "slip", "cyclic_interference", "second_heat_source",
+                OUTSIDE):  # fmt: skip
+        e["along"] = _direction(rng, camera)
+    elif name == "housing_tilt":
+        e["along"] = np.zeros(16)
+        e["along"][10:13] = rng.normal(size=3) * 1e-5
+    elif name == "radial_distortion_drift":
+        e["along"] = np.zeros(16)
+        e["along"][3] = 1e-5
+        if rng.random() < 0.4:
+            e["along"][4] = rng.normal() * 2e-6
+    elif name == "decentering_drift":
+        e["along"] = np.zeros(16)
+        e["along"][6:8] = rng.normal(size=2) * 1e-5
+    elif name == "affinity_drift":
+        e["along"] = np.zeros(16)
+        e["along"][8:10] = rng.normal(size=2) * 1e-5
+    elif name == "test_field_expansion":
+        e["axes"] = rng.uniform(0.2, 1.0, 3) * 1e-5
+    return e
+
+
+def fresh(rng: np.random.Generator, e: dict, first: bool, seconds: int) -> dict:
+    """What belongs to one series: instants and phases."""
+    f = dict(e)
+    if e["effect"] in ("slip", "target_displacement"):
+        f["time"] = float(rng.uniform(0.2, 0.8) * seconds)
+        f["happens"] = first or rng.random() < 0.6
+    if e["effect"] == "cyclic_interference":
+        f["phase"] = float(rng.uniform(0, 2 * np.pi))
+    return f
+
+
+def true_parameters(
+    camera: Camera,
+    effects: list[dict],
+    climate_: dict[str, np.ndarray],
+    unknown: np.ndarray,
+    frames: np.ndarray,
+    points: np.ndarray,
+    eop: np.ndarray,
+    offsets: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Parameters (E, 16), object points (E, n, 3) and noise factor (E,) at the frames."""
+    T = climate_["temperature"]
+    t = np.arange(len(T), dtype=float)
+    drive = T
+    for e in effects:
+        size = e["size"]
+        if e["effect"] == "thermal_lag":
+            drive = lagged(drive, max(e["tau"] * size, 1e-3))
+        elif e["effect"] == "time_offset":
+            drive = delayed(drive, e["d"] * size)
+        elif e["effect"] == "hysteresis":
+            drive = backlash(drive, e["half_width"] * size)
+    extra = np.zeros((len(t), 16))
+    scale = np.zeros((len(t), 3))
+    noise = np.ones(len(t))
+    moved = []
+    for e in effects:
+        name, size = e["effect"], e["size"]
+        course = None
+        if name == "nonlinear_expansion":
+            course = (T - camera.T0) ** 2 / 100.0
+        elif name == "softening":
+            course = np.maximum(T - e["T_k"], 0)
+        elif name == "thermal_gradient":
+            course = np.gradient(T) * 100
+        elif name == "permanent_set":
+            course = np.maximum.accumulate(T)
+        elif name == "self_heating":
+            course = 1 - np.exp(-t / e["tau"])
+        elif name == "creep":
+            course = t / 1000
+        elif name == "slip":
+            course = (t >= e["time"]).astype(float) * e["happens"]
+        elif name == "cyclic_interference":
+            course = np.sin(2 * np.pi * t / e["P"] + e["phase"])
+        elif name == "second_heat_source":
+            course = climate_[e["channel"]]
+        elif name in (
+            "housing_tilt",
+            "radial_distortion_drift",
+            "decentering_drift",
+            "affinity_drift",
+        ):
+            course = T - camera.T0
+        elif name == OUTSIDE:
+            course = unknown
+        elif name == "test_field_expansion":
+            scale += size * (T - camera.T0)[:, None] * e["axes"]
+        elif name == "defocus":
+            noise = noise * (1 + size * np.clip(T - e["coldest"], 0, None) * 0.02)
+        elif name == "target_displacement" and e["happens"]:
+            moved.append((e["targets"], size * np.asarray(e["vector"]), e["time"]))
+        if course is not None and "along" in e:
+            extra += size * course[:, None] * e["along"]
+
+    def at(v: np.ndarray) -> np.ndarray:
+        return np.interp(frames, t, v)
+
+    p = np.tile(camera.base, (len(frames), 1))
+    p[:, 10:] = eop
+    p += offsets
+    p += at(drive - camera.T0)[:, None] * camera.rates
+    p += np.stack(
+        [at(extra[:, j]) if extra[:, j].any() else np.zeros(len(frames)) for j in range(16)], 1
+    )
+    if any(e["effect"] == "slip" for e in effects):  # a step is not interpolated
+        for e in effects:
+            if e["effect"] == "slip":
+                s = e["size"] * e["happens"]
+                p -= s * at((t >= e["time"]).astype(float))[:, None] * e["along"]
+                p += s * (frames >= e["time"])[:, None] * e["along"]
+    X = points[None] * (1 + np.stack([at(scale[:, k]) for k in range(3)], 1))[:, None, :]
+    for rows, vector, time in moved:
+        X[:, rows] += (frames >= time)[:, None, None] * vector
+    return p, X, at(noise)
+
+
+def left_over(
+    uv: np.ndarray, camera: Camera, points: np.ndarray, eop: np.ndarray, T: np.ndarray
+) -> float:
+    """RMS px that the base model, fitted to noise-free image points, leaves over."""
+    p0 = camera.base.copy()
+    p0[10:] = eop
+    steps = np.array([1e-4, 1e-4, 1e-4, 1e-6, 1e-7, 1e-8, 1e-6, 1e-6, 1e-6, 1e-6,
+                      1e-6, 1e-6, 1e-6, 1e-2, 1e-2, 1e-2])  # fmt: skip
+    both = np.vstack([p0 + np.diag(steps), p0 - np.diag(steps)])
+    f = image(np.broadcast_to(points, (32, *points.shape)), both, camera.sensor)
+    J = ((f[:16] - f[16:]) / (2 * steps)[:, None, None]).reshape(16, -1).T
+    J = J / np.linalg.norm(J, axis=0)
+    y = (uv - uv.mean(0)).reshape(len(uv), -1)
+    T = T - T.mean()
+    # the constants take the mean of each epoch's image; rates of c, x0, y0 take the part along T
+    slope = (T @ y) / (T @ T)
+    G = J[:, :3]
+    y = y - np.outer(T, G @ np.linalg.lstsq(G, slope, rcond=None)[0])
+    # the mean is taken by IOP and EOP as far as they can; the rest is a target offset, also base
+    return float(np.sqrt(np.mean(y**2)))

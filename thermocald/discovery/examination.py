@@ -38,9 +38,9 @@ MAX_EFFECTS = 2
 BAND = 14.0
 # a model that leaves less than this share of what the base left has the cause
 _LEFT = 0.03
-# the same between a lag and a delay that are shorter than the interval of the readings
-_SHORT_BAND = 120.0
 _LAG_OR_DELAY = ("thermal_lag", "time_offset")
+# by how much worse (χ²) a lag may fit than a delay, or a delay than a lag, and not be excluded
+_SWAP_BAND = 120.0
 # slow variances over those of white noise: beyond, what one series shows has to be seen in another
 _WANDERING = 3.0
 # a second effect beside an adequate one has to explain as much, in px RMS and as a share of the
@@ -167,6 +167,7 @@ def _searched(
     seen = [s for s in seen if len(s.terms) <= len(best.terms)]
     if len(best.terms) > len(base.terms):
         best, seen = _contest(search, best, seen)
+        best, seen = _lag_or_delay(search, best, seen)
     best, blocks = _confirmed(search, base, best)
     adequacy = _adequacies(laboratory, best)
     adequate = _adequate(adequacy, base_adequacy)
@@ -175,8 +176,10 @@ def _searched(
     rivals: list[Solution] = []
     for s in sorted(seen, key=lambda s: s.score):
         different = sorted(s.names) != sorted(best.names)
-        band = _SHORT_BAND if _too_short(laboratory, best, s) else BAND
-        if different and s.score < best.score + band and s.names not in [r.names for r in rivals]:
+        close = s.score < best.score + BAND
+        if _swapped(best, s):
+            close = s.fit.chi2 < best.fit.chi2 + _SWAP_BAND
+        if different and close and s.names not in [r.names for r in rivals]:
             rivals.append(s)
     return Examination(
         laboratory, base, best, tuple(ranking), tuple(rivals), base_adequacy, adequacy, adequate,
@@ -184,18 +187,42 @@ def _searched(
     )  # fmt: skip
 
 
-def _too_short(laboratory: Laboratory, best: Solution, other: Solution) -> bool:
-    """The two differ in a lag for a delay, shorter than the interval of the readings.
+def _lag_or_delay(
+    search: Search, best: Solution, seen: list[Solution]
+) -> tuple[Solution, list[Solution]]:
+    """Of a lag and a delay the one that fits better, and both among the solutions seen.
 
-    What happens between two readings tells them apart, and that nobody has seen.
+    The likelihood holds every course of the temperature for equally probable. A lag smooths the
+    thermometer's noise, a delay does not; so a smooth image, which all temperatures give, would
+    speak for a lag whatever the cause. Between these two the fit alone decides.
     """
-    mine = set(best.names) - set(other.names)
-    theirs = set(other.names) - set(best.names)
-    if {*mine, *theirs} != set(_LAG_OR_DELAY) or not mine or not theirs:
-        return False
-    step = min(float(np.median(np.diff(e.history.times))) for e in laboratory.series)
-    own = [v for t in best.terms if t.effect in _LAG_OR_DELAY for _, v in t.nonlinear]
-    return any(abs(float(v)) < step for v in own)
+    other = _with_the_other(search, best)
+    if other is None:
+        return best, seen
+    if other.fit.chi2 < best.fit.chi2 - 0.5 * _SWAP_BAND:
+        return other, [*seen, other]
+    return best, [*seen, other]
+
+
+def _with_the_other(search: Search, solution: Solution) -> Solution | None:
+    """The solution with a delay in place of its lag, or a lag in place of its delay."""
+    for i, term in enumerate(solution.terms):
+        if term.effect not in _LAG_OR_DELAY:
+            continue
+        name = _LAG_OR_DELAY[1 - _LAG_OR_DELAY.index(term.effect)]
+        seconds = float(term.nonlinear[0][1])
+        if seconds <= 0 or name in solution.names:
+            return None
+        candidate = next(c for c in search.candidates if c.effect == name)
+        swapped = candidate.term(seconds, len(search.laboratory.series))
+        terms = (*solution.terms[:i], swapped, *solution.terms[i + 1 :])
+        return search.refine(terms, solution.penalties, solution.fit)
+    return None
+
+
+def _swapped(one: Solution, other: Solution) -> bool:
+    """Whether the two differ in a lag for a delay only."""
+    return {*one.names} ^ {*other.names} == {*_LAG_OR_DELAY}
 
 
 def _unverified(series: Sequence[Evidence]) -> bool:

@@ -39,7 +39,7 @@ BAND = 14.0
 # a model that leaves less than this share of what the base left has the cause
 _LEFT = 0.03
 _LAG_OR_DELAY = ("thermal_lag", "time_offset")
-# by how much worse (χ²) a lag may fit than a delay, or a delay than a lag, and not be excluded
+# by how much worse (χ²) another way of following the temperature may fit and not be excluded
 _SWAP_BAND = 120.0
 # slow variances over those of white noise: beyond, what one series shows has to be seen in another
 _WANDERING = 3.0
@@ -221,8 +221,10 @@ def _with_the_other(search: Search, solution: Solution) -> Solution | None:
 
 
 def _swapped(one: Solution, other: Solution) -> bool:
-    """Whether the two differ in a lag for a delay only."""
-    return {*one.names} ^ {*other.names} == {*_LAG_OR_DELAY}
+    """Whether the two differ in one way of following the temperature for another only."""
+    mine = [t for t in one.terms if t.effect not in other.names]
+    theirs = [t for t in other.terms if t.effect not in one.names]
+    return len(mine) == len(theirs) == 1 and mine[0].is_drive and theirs[0].is_drive
 
 
 def _unverified(series: Sequence[Evidence]) -> bool:

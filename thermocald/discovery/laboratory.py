@@ -15,6 +15,7 @@ from thermocald.discovery.evidence import COLUMNS
 from thermocald.discovery.hypothesis import BASE, EVENTS, OSCILLATIONS, Block, Fit, Term
 from thermocald.discovery.likelihood import Carried, Reduced, Weighting, prepare
 from thermocald.simulation import effects as catalogue
+from thermocald.simulation.effects.hysteresis import Hysteresis
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -189,13 +190,34 @@ class Laboratory:
             else:
                 _, operator, channel = self.courses(terms[block.term], series, terms)
             if operator is not None and d.any():
-                unresolved = None
-                if block.term >= 0 and terms[block.term].effect == "thermal_gradient":
-                    unresolved = (
-                        self.series[series].channels[channel].slope_jump(self.series[series].times)
-                    )
+                unresolved = self._unresolved(terms, block, series)
                 carried.append(Carried(d, operator, channel, unresolved))
         return prepare(self.series[series], carried, self.thermometer_factor)
+
+    def _unresolved(self, terms: Sequence[Term], block: Block, series: int) -> Array | None:
+        """What a course leaves open at single epochs (E,), beside the readings' errors; or None.
+
+        The rate beside a switched lamp; where a play turns, which reading was the extreme.
+        """
+        evidence = self.series[series]
+        history = evidence.history
+        instrument = evidence.channels[history.reference]
+        if block.term >= 0:
+            if terms[block.term].effect != "thermal_gradient":
+                return None
+            return instrument.slope_jump(evidence.times)
+        drives = [t for t in terms if t.is_drive]
+        play = catalogue.get(drives[-1].effect) if drives else None
+        if not isinstance(play, Hysteresis):
+            return None
+        before, _ = self._through(terms, series, last=False, operators=False)
+        turns = evidence.averaged(
+            play.turns(before, **(drives[-1].values(series) or {})).astype(float)
+        )
+        step = float(np.median(np.diff(history.reading_times[instrument.real])))
+        bend = 0.5 * step * instrument.slope_jump(evidence.times)
+        out: Array = turns * np.sqrt(instrument.noise**2 + bend**2)
+        return out
 
     def fit(
         self,

@@ -37,6 +37,7 @@ __all__ = [
     "lag_matrix",
     "play",
     "play_matrix",
+    "play_turns",
     "running_maximum",
     "running_maximum_matrix",
     "slope_matrix",
@@ -322,6 +323,25 @@ def play_matrix(knots: Array, values: Array, half_width: float, at: Array) -> cs
     now = values[left] * (1.0 - share) + values[right] * share
     moving = (states[left] < now - half_width) | (states[left] > now + half_width)
     return _switched(knots, at, moving, source[left])
+
+
+def play_turns(knots: Array, values: Array, half_width: float, at: Array) -> NDArray[np.bool_]:
+    """Where the play rests after a turn and is near either end of that rest, (E,).
+
+    Which reading was the highest, and when the play is used up, is not sure there.
+    """
+    states = _play_states(values, half_width)
+    left, right, share = _edges(knots, at)
+    now = values[left] * (1.0 - share) + values[right] * share
+    resting = (states[left] >= now - half_width) & (states[left] <= now + half_width)
+    resting &= states[left] != states[0]  # at the begin it has not turned
+    near = np.zeros(len(at), dtype=bool)
+    begins = np.flatnonzero(np.diff(resting.astype(int), prepend=0) > 0)
+    ends = np.flatnonzero(np.diff(resting.astype(int), append=0) < 0)
+    for begin, end in zip(begins, ends, strict=True):
+        near[begin : begin + 2] = True
+        near[max(end - 1, begin) : end + 2] = True
+    return near
 
 
 def running_maximum(knots: Array, values: Array, at: Array) -> Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from thermocald.simulation.effects.base import Effect, Parameter, spoken
-from thermocald.simulation.history import play, play_matrix
+from thermocald.simulation.history import play, play_matrix, play_turns
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -46,6 +46,11 @@ class Hysteresis(Effect):
     def sensitivity(self, history: History, half_width: float = 1.0, **_: Any) -> csr_array:
         p = history.polygon()
         return play_matrix(p.times, p.values, half_width, history.times) @ p.matrix
+
+    def turns(self, history: History, half_width: float = 1.0, **_: Any) -> NDArray[np.bool_]:
+        """Epochs (E,) at either end of a rest after a turn: its linearisation is not sure there."""
+        p = history.polygon()
+        return play_turns(p.times, p.values, half_width, history.times)
 
     def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
         return (

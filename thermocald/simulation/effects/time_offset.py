@@ -29,7 +29,7 @@ class TimeOffset(Effect):
     name = "time_offset"
     noun = "a time offset"
     kind = "drive"
-    nonlinear: ClassVar[Mapping[str, Parameter]] = {"d": Parameter("s", -120.0, 300.0, 10.0)}
+    nonlinear: ClassVar[Mapping[str, Parameter]] = {"d": Parameter("s", -300.0, 300.0, 10.0)}
     behaviour: ClassVar[Mapping[str, str]] = {
         "hold": "stops at once after the delay",
         "rate": "shifts the whole curve by the same time, its tips stay sharp",

@@ -68,6 +68,29 @@ def test_a_small_lag_and_a_small_delay_stay_alternatives(evidence_of):
     assert "experiment" in found.effects[0].alternatives[0]
 
 
+def test_a_delay_is_no_lag_because_the_temperature_was_smooth(evidence_of):
+    """A lag smooths the thermometer's noise, and a smooth image would speak for it: d is 10 s."""
+    evidence, _ = evidence_of("time_offset", px=0.3, seed=330)
+    found = discover_series(evidence)
+    assert [e.effect for e in found.effects] == ["time_offset"]
+
+
+def test_under_a_steady_ramp_lag_and_delay_stay_alternatives(evidence_of):
+    evidence, _ = evidence_of("time_offset", px=0.3, seed=321)
+    found = discover_series(evidence)
+    names = {found.effects[0].effect, *found.effects[0].alternative_names}
+    assert {"thermal_lag", "time_offset"} <= names
+
+
+def test_a_play_shorter_than_an_interval_is_named(evidence_of):
+    """Where it turns nobody saw the extreme; taken for sure, that spoke against every play."""
+    evidence, truth = evidence_of("hysteresis", px=0.1, seed=360)
+    found = discover_series(evidence)
+    assert [e.effect for e in found.effects] == ["hysteresis"]
+    said = found.effects[0].estimates["half_width"]
+    assert abs(said["value"] - truth["effects"][0][0]["half_width"]) < 3 * said["sd"]
+
+
 def test_document(evidence_of):
     evidence, truth = evidence_of("thermal_lag", seed=25)
     said: list[str] = []

@@ -14,7 +14,7 @@ from thermocald.photogrammetry.camera_model import (
 )
 from thermocald.simulation import effects
 from thermocald.simulation.effects.base import Effect
-from thermocald.simulation.history import History
+from thermocald.simulation.history import History, play, play_turns
 from thermocald.simulation.model import ModelEffect, ThermalModel
 from thermocald.simulation.testfields import corner_field
 
@@ -321,3 +321,12 @@ def test_names_of_iop_and_units_agree():
             assert set(effect.linear) <= set(PARAMETER_NAMES)
             assert set(effect.usual) <= set(effect.linear)
             assert any(n in IOP_NAMES or n in ("omega", "phi", "kappa") for n in effect.usual)
+
+
+def test_a_play_is_unsure_at_both_ends_of_its_rest_and_nowhere_else():
+    knots = np.arange(0.0, 400.0, 10.0)
+    T = np.interp(knots, [0.0, 200.0, 390.0], [0.0, 20.0, 1.0])  # up and down by 0.1 K/s
+    rest = play(knots, T, 3.0, knots)
+    resting = np.flatnonzero((rest == rest[20]) & (knots > 200.0))  # 60 s: 6 K to the other side
+    near = np.flatnonzero(play_turns(knots, T, 3.0, knots))
+    assert set(near) == {resting[0], resting[1], resting[-2], resting[-1], resting[-1] + 1}

@@ -316,13 +316,23 @@ def _play_states(values: Array, half_width: float) -> Array:
 
 def play_matrix(knots: Array, values: Array, half_width: float, at: Array) -> csr_array:
     """∂ play / ∂ values (E, K): each output hangs on the reading that moved it last."""
+    moving, source, _ = _play_moves(knots, values, half_width, at)
+    return _switched(knots, at, moving, source)
+
+
+def _play_moves(
+    knots: Array, values: Array, half_width: float, at: Array
+) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.bool_]]:
+    """Whether the play moves since the knot before each instant (E,), the knot that moved it last
+    until then (E,), and whether the instant is that very knot (E,).
+    """
     states = _play_states(values, half_width)
     moved = np.append(True, states[1:] != states[:-1])
     source = np.maximum.accumulate(np.where(moved, np.arange(len(values)), 0))
     left, right, share = _edges(knots, at)
     now = values[left] * (1.0 - share) + values[right] * share
     moving = (states[left] < now - half_width) | (states[left] > now + half_width)
-    return _switched(knots, at, moving, source[left])
+    return moving, source[left], (share == 0) & moved[left]
 
 
 def play_turns(knots: Array, values: Array, half_width: float, at: Array) -> NDArray[np.bool_]:
@@ -330,11 +340,8 @@ def play_turns(knots: Array, values: Array, half_width: float, at: Array) -> NDA
 
     Which reading was the highest, and when the play is used up, is not sure there.
     """
-    states = _play_states(values, half_width)
-    left, right, share = _edges(knots, at)
-    now = values[left] * (1.0 - share) + values[right] * share
-    resting = (states[left] >= now - half_width) & (states[left] <= now + half_width)
-    resting &= states[left] != states[0]  # at the begin it has not turned
+    moving, source, just_moved = _play_moves(knots, values, half_width, at)
+    resting = ~moving & ~just_moved & (source > 0)  # at the begin it has not turned
     near = np.zeros(len(at), dtype=bool)
     begins = np.flatnonzero(np.diff(resting.astype(int), prepend=0) > 0)
     ends = np.flatnonzero(np.diff(resting.astype(int), append=0) < 0)

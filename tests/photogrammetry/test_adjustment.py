@@ -98,6 +98,23 @@ def test_same_interior_as_opencv():
     assert np.abs(moved).max() < 5e-3
 
 
+def test_it_ends_where_full_convergence_ends():
+    """To 1e-4 px in c, x0, y0, though the last step is made with the partials before it."""
+    rng, field = np.random.default_rng(23), scene.corner_field()
+    settings = AdjustmentSettings(snooping_alpha=0.0)
+    for _ in range(60):
+        observations = scene.observe(field, rng)
+        first = last = adjust(
+            scene.SENSOR, field, observations, scene.INTERIOR, scene.EXTERIOR, settings
+        )
+        for _ in range(3):
+            last = adjust(
+                scene.SENSOR, field, observations, last.interior, last.exterior, settings
+            )
+        change = np.abs(first.values - last.values)[:3] / scene.SENSOR.pixel_pitch
+        assert change.max() < 1e-4
+
+
 def test_priors_and_held_parameters():
     field = scene.corner_field()
     obs = scene.observe(field, np.random.default_rng(4))

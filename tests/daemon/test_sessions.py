@@ -97,7 +97,7 @@ def test_a_daemon_that_is_killed_goes_on_with_the_session(live):
 
 @pytest.mark.slow
 def test_it_pauses_while_the_phone_is_away_and_the_command_survives_a_restart(live, command):
-    daemon = live(series=None, camera=[{"kind": "unplugged", "at": 4, "for_s": 3.0}])
+    daemon = live(series=None, camera=[{"kind": "unplugged", "at": 4, "for_s": 8.0}])
     process = command("start", "--camera", "phone-1", "--series", "M7", "--epochs", "12",
                       "--no-report", "--no-check")  # fmt: skip
     daemon.until(lambda: daemon.session().get("state") == "paused")

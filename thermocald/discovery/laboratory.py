@@ -15,7 +15,6 @@ from thermocald.discovery.evidence import COLUMNS
 from thermocald.discovery.hypothesis import BASE, EVENTS, OSCILLATIONS, Block, Fit, Term
 from thermocald.discovery.likelihood import Carried, Reduced, Weighting, prepare
 from thermocald.simulation import effects as catalogue
-from thermocald.simulation.effects.hysteresis import Hysteresis
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -207,16 +206,17 @@ class Laboratory:
                 return None
             return instrument.slope_jump(evidence.times)
         drives = [t for t in terms if t.is_drive]
-        play = catalogue.get(drives[-1].effect) if drives else None
-        if not isinstance(play, Hysteresis):
+        if not drives:
             return None
         before, _ = self._through(terms, series, last=False, operators=False)
-        turns = evidence.averaged(
-            play.turns(before, **(drives[-1].values(series) or {})).astype(float)
-        )
+        last = catalogue.get(drives[-1].effect)
+        turns = last.turns(before, **(drives[-1].values(series) or {}))
+        if not turns.any():
+            return None
         step = float(np.median(np.diff(history.reading_times[instrument.real])))
         bend = 0.5 * step * instrument.slope_jump(evidence.times)
-        out: Array = turns * np.sqrt(instrument.noise**2 + bend**2)
+        shares = evidence.averaged(turns.astype(float))
+        out: Array = shares * np.sqrt(instrument.noise**2 + bend**2)
         return out
 
     def fit(

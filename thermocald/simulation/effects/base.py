@@ -206,6 +206,13 @@ class Effect(ABC):
         """
         return np.zeros(len(history.times))
 
+    def turns(self, history: History, **nonlinear: Any) -> NDArray[np.bool_]:  # noqa: ARG002
+        """Epochs (E,) in which the course hangs on which reading was an extreme.
+
+        What `sensitivity` says is not sure there.
+        """
+        return np.zeros(len(history.times), dtype=bool)
+
     def _course(self, history: History, **nonlinear: Any) -> Array:
         if self.kind == "drive":
             return self.drive(history, **nonlinear)

@@ -48,7 +48,6 @@ class Hysteresis(Effect):
         return play_matrix(p.times, p.values, half_width, history.times) @ p.matrix
 
     def turns(self, history: History, half_width: float = 1.0, **_: Any) -> NDArray[np.bool_]:
-        """Epochs (E,) at either end of a rest after a turn: its linearisation is not sure there."""
         p = history.polygon()
         return play_turns(p.times, p.values, half_width, history.times)
 

@@ -24,9 +24,9 @@ import numpy as np
 from thermocald.acquisition.live_pipeline import AcquiredEpoch
 from thermocald.acquisition.pipeline import Pipeline
 from thermocald.acquisition.scheduler import Schedule
-from thermocald.analysis.online_observer import OnlineObserver
+from thermocald.analysis.online.observer import OnlineObserver
 from thermocald.hal import SystemClock, VirtualClock, open_device
-from thermocald.photogrammetry.image_file import decode_grey
+from thermocald.photogrammetry.targets.image_file import decode_grey
 
 PERIOD_S = 0.05
 

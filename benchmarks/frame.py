@@ -23,9 +23,9 @@ import simplejpeg
 
 from tests.photogrammetry.exact_rendering import noisy
 from tests.photogrammetry.fields import PI_CAMERA, PI_SENSOR, corner_field, draw, station
-from thermocald.photogrammetry.adjustment import Adjustment, adjust
-from thermocald.photogrammetry.measurement import Prior, measure
-from thermocald.photogrammetry.tracking import Tracker
+from thermocald.photogrammetry.epoch.adjustment import Adjustment, adjust
+from thermocald.photogrammetry.frame.measurement import Prior, measure
+from thermocald.photogrammetry.frame.tracking import Tracker
 
 if TYPE_CHECKING:
     from collections.abc import Callable

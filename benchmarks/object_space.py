@@ -18,11 +18,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thermocald.analysis.model_series import ModelSeries
-from thermocald.analysis.reference import QUOTED
-from thermocald.analysis.series_reduction import reduce_series
-from thermocald.analysis.thermal_camera import ThermalCamera
-from thermocald.analysis.thermal_model import fit_thermal_model
+from thermocald.analysis.study.reference import QUOTED
+from thermocald.analysis.thermal.reduction import reduce_series
+from thermocald.analysis.thermal.series import ModelSeries
+from thermocald.analysis.thermal.thermal_camera import ThermalCamera
+from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.simulation import effects
 from thermocald.simulation.model import ModelEffect
 from thermocald.simulation.observations import Simulation

@@ -23,14 +23,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.epoch import Epoch
-from thermocald.photogrammetry.camera_model import Sensor
-from thermocald.photogrammetry.testfield import Observations, TestField
-from thermocald.store.columns import build_missing_chunks
-from thermocald.store.database import Store
-from thermocald.store.epoch_table import StoredEpoch, insert_epoch
-from thermocald.store.head import CameraSpec, Channel, Head
-from thermocald.store.recording import RecordingWriter, open_recording
-from thermocald.store.row import EpochResult
+from thermocald.photogrammetry.camera.camera_model import Sensor
+from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.store.database.columns import build_missing_chunks
+from thermocald.store.database.epoch_table import StoredEpoch, insert_epoch
+from thermocald.store.database.row import EpochResult
+from thermocald.store.database.store import Store
+from thermocald.store.recording.head import CameraSpec, Channel, Head
+from thermocald.store.recording.reader import RecordingWriter, open_recording
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -124,7 +124,7 @@ def columns_ratio(folder: Path, epochs: int) -> tuple[float, float, float]:
 def end_to_end(folder: Path, epochs: int) -> tuple[float, dict[str, float]]:
     """Ratio of read + adjust + store to the adjustments alone, and ms per epoch of each."""
     from benchmarks.adjustment import EXTERIOR, INTERIOR, SENSOR, corner_field, observe
-    from thermocald.photogrammetry.adjustment import adjust
+    from thermocald.photogrammetry.epoch.adjustment import adjust
 
     field = corner_field()
     rng = np.random.default_rng(4)

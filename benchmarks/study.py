@@ -16,10 +16,10 @@ import time
 
 import numpy as np
 
-from thermocald.analysis.measured import MeasuredSeries, Thermometer
-from thermocald.analysis.study import study
-from thermocald.output.study_report import render_report
-from thermocald.photogrammetry.camera_model import Sensor
+from thermocald.analysis.study.measured import MeasuredSeries, Thermometer
+from thermocald.analysis.study.study import study
+from thermocald.output.study.report import render_report
+from thermocald.photogrammetry.camera.camera_model import Sensor
 
 YEAR = 3_153_600
 BASE = np.array([3.04, 0.012, -0.018, -0.004, 5e-4, 0.0, 1e-4, -2e-4, 0.0, 0.0])

@@ -22,9 +22,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from thermocald.analysis.series_reduction import reduce_series
-from thermocald.analysis.thermal_camera import ThermalCamera
-from thermocald.analysis.thermal_model import FittedModel, fit_thermal_model
+from thermocald.analysis.thermal.reduction import reduce_series
+from thermocald.analysis.thermal.thermal_camera import ThermalCamera
+from thermocald.analysis.thermal.thermal_model import FittedModel, fit_thermal_model
 from thermocald.simulation.course import Course
 from thermocald.simulation.model import ModelEffect
 from thermocald.simulation.presets import preset_simulation

@@ -14,8 +14,8 @@ from thermocald import config as module
 from thermocald.config import Config, load_config, parse_config
 from thermocald.errors import ConfigurationError
 from thermocald.hal import option_names
-from thermocald.photogrammetry.adjustment import DEFAULT_FREE, AdjustmentSettings
-from thermocald.photogrammetry.camera_model import IOP_NAMES, PARAMETER_NAMES
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, PARAMETER_NAMES
+from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
 from thermocald.yaml_file import dump_yaml
 
 

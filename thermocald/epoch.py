@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from thermocald.photogrammetry.testfield import Observations
+    from thermocald.photogrammetry.field.testfield import Observations
 
 __all__ = ["Epoch"]
 

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.hal import Clock
-    from thermocald.photogrammetry.testfield import TestField
+    from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.simulation.model import Prediction, ThermalModel
     from thermocald.simulation.scene import Scene
 

@@ -11,7 +11,7 @@ RecordingEndedError, which no retry mends; what could not be taken then is a Bad
 Frames keep the instants at which they were taken: `utc` is the recorded one, `monotonic` the same
 on the clock's monotonic scale. A JPEG comes as it was recorded, in `encoded`. A recording of
 measurements gives frames without a picture, whose `metadata["observations"]` hold what
-`thermocald.photogrammetry.exchange` reads. `metadata["epoch"]` is the epoch's number.
+`thermocald.photogrammetry.field.exchange` reads. `metadata["epoch"]` is the epoch's number.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from thermocald.epoch import Epoch
     from thermocald.hal import Clock
-    from thermocald.store.recording import Recording
+    from thermocald.store.recording.reader import Recording
 
 __all__ = ["RecordingEndedError", "ReplayCamera", "ReplayThermometer"]
 
@@ -57,7 +57,7 @@ class _Replay(Device):
         if not self._path.is_dir():
             raise DeviceNotFound(f"{self._path}: there is no such recording")
         if self._recording is None:
-            from thermocald.store.recording import open_recording
+            from thermocald.store.recording.reader import open_recording
 
             self._recording = open_recording(self._path)
             self._epochs = self._recording.iter_epochs()
@@ -99,7 +99,7 @@ class ReplayCamera(_Replay, Camera):
         monotonic, utc = self._instants(epoch.frame_time)
         metadata: dict[str, Any] = {"epoch": epoch.number}
         if epoch.observations is not None and self._recording is not None:
-            from thermocald.photogrammetry.exchange import observations_to_lists
+            from thermocald.photogrammetry.field.exchange import observations_to_lists
 
             field = self._recording.testfield
             metadata["observations"] = observations_to_lists(epoch.observations, field)

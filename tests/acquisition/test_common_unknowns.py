@@ -7,10 +7,14 @@ import pytest
 
 from thermocald.acquisition.calibrator import Calibrator
 from thermocald.acquisition.common_unknowns import CommonUnknowns
-from thermocald.photogrammetry.adjustment import AdjustmentSettings
-from thermocald.photogrammetry.camera_model import ExteriorOrientation, InteriorOrientation, project
-from thermocald.photogrammetry.series import SeriesSettings, adjust_series
-from thermocald.photogrammetry.testfield import Observations, TestField
+from thermocald.photogrammetry.camera.camera_model import (
+    ExteriorOrientation,
+    InteriorOrientation,
+    project,
+)
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
+from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.photogrammetry.series.adjustment import SeriesSettings, adjust_series
 from thermocald.simulation.demonstration import demonstration_model
 from thermocald.simulation.testfields import corner_field
 

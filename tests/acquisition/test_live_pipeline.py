@@ -13,7 +13,7 @@ from thermocald.acquisition.live_pipeline import LivePipeline
 from thermocald.acquisition.pairing import Readings
 from thermocald.epoch import Epoch
 from thermocald.hal import Frame, SystemClock
-from thermocald.photogrammetry.adjustment import failed
+from thermocald.photogrammetry.epoch.adjustment import failed
 
 
 class SlowCalibrator:

@@ -17,13 +17,13 @@ from typer.testing import CliRunner
 
 from tests.blind.case import SINGLE, Case
 from tests.blind.generator import generate, write
-from thermocald.analysis.held_out import predicted_error
-from thermocald.analysis.series_reduction import model_series
-from thermocald.analysis.thermal_model import targets_of
+from thermocald.analysis.thermal.prediction_test import predicted_error
+from thermocald.analysis.thermal.reduction import model_series
+from thermocald.analysis.thermal.thermal_model import targets_of
 from thermocald.cli import application
 from thermocald.simulation.model import ModelEffect
 from thermocald.simulation.model_file import read_model
-from thermocald.store.recording import read_recording
+from thermocald.store.recording.reader import read_recording
 
 if TYPE_CHECKING:
     from pathlib import Path

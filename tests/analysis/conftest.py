@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from thermocald.analysis.measured import MeasuredSeries, Thermometer
-from thermocald.photogrammetry.camera_model import IOP_NAMES, Sensor
+from thermocald.analysis.study.measured import MeasuredSeries, Thermometer
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 
 NEXUS = Sensor(3264, 2448, 0.0014)
 INTERIOR = np.array([3.97, 0.01, -0.02, -2e-3, 3e-4, 0.0, 2e-4, -1e-4, 0.0, 0.0])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from thermocald.analysis.autocorrelation import noise_autocorrelation
+from thermocald.analysis.statistics.autocorrelation import noise_autocorrelation
 
 
 def test_white_noise_counts_fully():

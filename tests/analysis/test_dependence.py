@@ -5,7 +5,7 @@ import pytest
 from scipy import signal, stats
 from statsmodels.stats.multitest import multipletests
 
-from thermocald.analysis.dependence import (
+from thermocald.analysis.statistics.dependence import (
     correlation_matrix,
     dependence,
     holm,

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from thermocald.analysis.depth_of_field import circle_of_confusion, depth_of_field
-from thermocald.photogrammetry.camera_model import Sensor
+from thermocald.analysis.study.depth_of_field import circle_of_confusion, depth_of_field
+from thermocald.photogrammetry.camera.camera_model import Sensor
 
 
 def blur(f, f_number, focus, distance):

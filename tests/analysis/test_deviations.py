@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from thermocald.analysis.deviations import deviation, image_displacement
-from thermocald.analysis.object_plane import image_raster
-from thermocald.photogrammetry.camera_model import Sensor
+from thermocald.analysis.study.deviations import deviation, image_displacement
+from thermocald.analysis.study.object_plane import image_raster
+from thermocald.photogrammetry.camera.camera_model import Sensor
 
 SENSOR = Sensor(3264, 2448, 0.0014)
 

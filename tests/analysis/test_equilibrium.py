@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermocald.analysis.equilibrium import EquilibriumWatch, fit_approach, slope
+from thermocald.analysis.online.equilibrium import EquilibriumWatch, fit_approach, slope
 
 
 def test_a_slope_scatters_as_its_sd_says():

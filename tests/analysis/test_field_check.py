@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermocald.analysis.field_check import (
+from thermocald.analysis.field.check import (
     FREE,
     check_field,
     precision,
@@ -13,16 +13,16 @@ from thermocald.analysis.field_check import (
     usual_station,
 )
 from thermocald.errors import GeometryError
-from thermocald.output.testfield_layout import Design, field_of, lay_out, paper_size
-from thermocald.photogrammetry.adjustment import AdjustmentSettings, adjust
-from thermocald.photogrammetry.camera_model import (
+from thermocald.output.testfield.layout import Design, field_of, lay_out, paper_size
+from thermocald.photogrammetry.camera.camera_model import (
     IOP_NAMES,
     CameraModel,
     ExteriorOrientation,
     InteriorOrientation,
     Sensor,
 )
-from thermocald.photogrammetry.testfield import Observations, TestField
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, adjust
+from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.simulation.testfields import corner_field
 
 CAMERA = CameraModel(

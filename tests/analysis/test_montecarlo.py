@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from thermocald.analysis import montecarlo
-from thermocald.analysis.montecarlo import draw_root, plane_errors, simulate_errors
-from thermocald.analysis.object_plane import image_raster, on_plane, plane_jacobian, propagate
+from thermocald.analysis.study import montecarlo
+from thermocald.analysis.study.montecarlo import draw_root, plane_errors, simulate_errors
+from thermocald.analysis.study.object_plane import image_raster, on_plane, plane_jacobian, propagate
 from thermocald.errors import GeometryError
-from thermocald.photogrammetry.camera_model import Sensor
+from thermocald.photogrammetry.camera.camera_model import Sensor
 
 SENSOR = Sensor(3264, 2448, 0.0014)
 IOP = np.array([3.97, 0.021, -0.034, 0.0051, -4e-4, 1e-5, 1.2e-4, -0.9e-4, 0.0, 0.0])

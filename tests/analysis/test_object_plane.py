@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from thermocald.analysis.object_plane import (
+from thermocald.analysis.study.object_plane import (
     DistanceLaw,
     image_raster,
     on_plane,
     plane_jacobian,
     propagate,
 )
-from thermocald.photogrammetry.camera_model import Sensor
+from thermocald.photogrammetry.camera.camera_model import Sensor
 
 SENSOR = Sensor(3264, 2448, 0.0014)
 IOP = np.array([3.97, 0.021, -0.034, 0.0051, -4e-4, 1e-5, 1.2e-4, -0.9e-4, 1e-4, -2e-4])

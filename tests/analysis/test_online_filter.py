@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermocald.analysis.online_filter import FilterSettings, OnlineFilter, chi2_quantile
-from thermocald.analysis.online_observer import given_exterior
-from thermocald.photogrammetry.adjustment import adjust
-from thermocald.photogrammetry.camera_model import (
+from thermocald.analysis.online.filter import FilterSettings, OnlineFilter, chi2_quantile
+from thermocald.analysis.online.observer import given_exterior
+from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     InteriorOrientation,
     project,
 )
-from thermocald.photogrammetry.testfield import Observations
+from thermocald.photogrammetry.epoch.adjustment import adjust
+from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.simulation.demonstration import demonstration_model
 from thermocald.simulation.testfields import corner_field
 
@@ -132,7 +132,7 @@ def test_chi2_quantiles():
 
 
 def test_an_epoch_without_a_result_changes_nothing(camera):
-    from thermocald.photogrammetry.adjustment import failed
+    from thermocald.photogrammetry.epoch.adjustment import failed
 
     found = OnlineFilter(camera.sensor, FilterSettings())
     assert found.update(failed("bad_frame", ""), 25.0) is None

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from thermocald.analysis.measured import Thermometer
-from thermocald.analysis.series_study import StudySettings, study_series
-from thermocald.analysis.study import study
+from thermocald.analysis.study.measured import Thermometer
+from thermocald.analysis.study.series_study import StudySettings, study_series
+from thermocald.analysis.study.study import study
 
 SETTINGS = StudySettings(sets=2000)
 

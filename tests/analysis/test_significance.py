@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal, stats
 
-from thermocald.analysis.significance import (
+from thermocald.analysis.statistics.significance import (
     drift_test,
     moving_f_test,
     moving_mean,

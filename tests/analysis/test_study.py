@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from thermocald.analysis.series_study import StudySettings
-from thermocald.analysis.study import study
+from thermocald.analysis.study.series_study import StudySettings
+from thermocald.analysis.study.study import study
 
 
 def test_labels_make_cameras_and_series_are_pooled(warm_up):

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermocald.analysis.study_input import load_series
+from thermocald.analysis.study.input import load_series
 from thermocald.errors import DataError
-from thermocald.photogrammetry.camera_model import IOP_NAMES
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.simulation.presets import preset_simulation
-from thermocald.store.database import Store
-from thermocald.store.row import EpochResult
+from thermocald.store.database.row import EpochResult
+from thermocald.store.database.store import Store
 
 FREE = ("c", "x0", "y0", "A1", "A2", "B1", "B2")
 
@@ -48,7 +48,7 @@ def test_the_thermometers_noise_may_be_given(recording):
 
 
 def test_a_store_is_read_in_columns_without_broken_epochs(recording, tmp_path):
-    from thermocald.store.recording import open_recording
+    from thermocald.store.recording.reader import open_recording
 
     opened = open_recording(recording)
     covariance = np.diag(np.append(np.full(8, 1e-8), np.zeros(8)))
@@ -75,7 +75,7 @@ def test_a_store_is_read_in_columns_without_broken_epochs(recording, tmp_path):
 
 
 def test_a_store_without_any_result_is_one_error(recording, tmp_path):
-    from thermocald.store.recording import open_recording
+    from thermocald.store.recording.reader import open_recording
 
     opened = open_recording(recording)
     with Store.open(tmp_path / "s.db", "append", durable=False) as store:

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from thermocald.analysis.thermal_camera import ExtrapolationWarning, ThermalCamera
-from thermocald.analysis.undistortion import ideal_points
-from thermocald.analysis.warm_up import warm_up
+from thermocald.analysis.camera.undistortion import ideal_points
+from thermocald.analysis.thermal.thermal_camera import ExtrapolationWarning, ThermalCamera
+from thermocald.analysis.thermal.warm_up import warm_up
 from thermocald.errors import ConfigurationError, DataError, UsageError
-from thermocald.photogrammetry.camera_model import InteriorOrientation, Sensor, rays
+from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor, rays
 from thermocald.simulation.demonstration import demonstration_field, demonstration_model
 from thermocald.simulation.model import ModelEffect
 from thermocald.simulation.model_file import write_model

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from thermocald.analysis.held_out import predicted_error
-from thermocald.analysis.series_reduction import model_series, reduce_series
-from thermocald.analysis.thermal_camera import ThermalCamera
-from thermocald.analysis.thermal_model import fit_thermal_model
-from thermocald.analysis.type_model import type_model
+from thermocald.analysis.thermal.prediction_test import predicted_error
+from thermocald.analysis.thermal.reduction import model_series, reduce_series
+from thermocald.analysis.thermal.thermal_camera import ThermalCamera
+from thermocald.analysis.thermal.thermal_model import fit_thermal_model
+from thermocald.analysis.thermal.type_model import type_model
 from thermocald.cli import application
 from thermocald.errors import ConfigurationError, DataError, ThermocaldError, UsageError
-from thermocald.photogrammetry.camera_model import project
+from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.simulation.course import Course
 from thermocald.simulation.model import ModelEffect
 from thermocald.simulation.presets import preset_simulation
-from thermocald.store.recording import read_recording
+from thermocald.store.recording.reader import read_recording
 
 LAG = ModelEffect("thermal_lag", {"tau": 70.0})
 START = ModelEffect("thermal_lag", {"tau": 10.0})

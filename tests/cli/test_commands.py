@@ -117,10 +117,10 @@ def test_wrong_use_is_one_line(recording, tmp_path, arguments, status, words):
 
 def test_photographs_of_markers_give_the_camera(tmp_path):
     """Three rendered photographs of a corner field: c, x0, y0 within 4 sd of the truth."""
-    from thermocald.photogrammetry.camera_model import ExteriorOrientation
+    from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation
     from thermocald.simulation.demonstration import demonstration_field, demonstration_model
     from thermocald.simulation.scene import Scene
-    from thermocald.store.testfield_file import write_testfield
+    from thermocald.store.recording.testfield_file import write_testfield
 
     field = demonstration_field("markers")
     model = demonstration_model(field)
@@ -209,6 +209,6 @@ def test_the_daemon_s_imports_stay_small():
     """
     ours = resident_mb(
         "thermocald.acquisition.calibrator, thermocald.config, thermocald.hal, "
-        "thermocald.store.database, thermocald.acquisition.pipeline"
+        "thermocald.store.database.store, thermocald.acquisition.pipeline"
     )
     assert ours - resident_mb("numpy, cv2") < 80 - 41

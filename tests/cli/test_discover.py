@@ -77,7 +77,7 @@ def test_simulate_runs_the_new_model(recordings, tmp_path):
     from thermocald.discovery.source import series_input
     from thermocald.simulation.history import History
     from thermocald.simulation.model_file import read_model
-    from thermocald.store.recording import read_recording
+    from thermocald.store.recording.reader import read_recording
 
     model = tmp_path / "model.yaml"
     assert discover(recordings / "M1", "--model-out", model).exit_code == 0
@@ -89,7 +89,7 @@ def test_simulate_runs_the_new_model(recordings, tmp_path):
 
     import numpy as np
 
-    from thermocald.photogrammetry.camera_model import project
+    from thermocald.photogrammetry.camera.camera_model import project
 
     source = series_input(recording)
     uv = project(source.sensor, predicted.iop, predicted.eop, source.field.points)

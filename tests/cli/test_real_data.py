@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
-from thermocald.analysis.photographs import calibrate_observations
-from thermocald.photogrammetry.adjustment import AdjustmentSettings
-from thermocald.photogrammetry.camera_model import Sensor
-from thermocald.photogrammetry.testfield import Observations, TestField
+from thermocald.analysis.camera.photographs import calibrate_observations
+from thermocald.photogrammetry.camera.camera_model import Sensor
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
+from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 
 def run(*arguments):

@@ -13,10 +13,10 @@ from typer.testing import CliRunner
 from tests.photogrammetry import network_cases as cases
 from thermocald.cli import camera, testfield
 from thermocald.errors import ConfigurationError, GeometryError, ThermocaldError, UsageError
-from thermocald.photogrammetry.camera_model import CameraModel, InteriorOrientation, Sensor
-from thermocald.photogrammetry.testfield import TestField
+from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
+from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.simulation.scene import Scene
-from thermocald.store.testfield_file import read_testfield
+from thermocald.store.recording.testfield_file import read_testfield
 
 
 @pytest.fixture(scope="module")

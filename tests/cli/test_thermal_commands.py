@@ -15,7 +15,7 @@ from thermocald.cli import application
 from thermocald.cli.options import read_camera
 from thermocald.errors import ThermocaldError
 from thermocald.output import camera_files
-from thermocald.photogrammetry.camera_model import CameraModel, ExteriorOrientation, Sensor
+from thermocald.photogrammetry.camera.camera_model import CameraModel, ExteriorOrientation, Sensor
 from thermocald.simulation.course import Course
 from thermocald.simulation.demonstration import demonstration_field, demonstration_model
 from thermocald.simulation.device import CameraDevice, default_heat
@@ -23,7 +23,7 @@ from thermocald.simulation.model import ModelEffect
 from thermocald.simulation.observations import Simulation
 from thermocald.simulation.programme import Programme
 from thermocald.simulation.scene import Scene
-from thermocald.store.testfield_file import write_testfield
+from thermocald.store.recording.testfield_file import write_testfield
 
 FORMATS = tuple(camera_files.FORMATS)
 

@@ -18,13 +18,13 @@ import pytest
 import yaml
 
 from thermocald.epoch import Epoch
-from thermocald.photogrammetry.camera_model import Sensor, project
-from thermocald.photogrammetry.testfield import Observations
+from thermocald.photogrammetry.camera.camera_model import Sensor, project
+from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.simulation.demonstration import demonstration_field, demonstration_model
 from thermocald.simulation.model_file import write_model
 from thermocald.simulation.testfields import corner_field
-from thermocald.store.database import Store
-from thermocald.store.recording import CameraSpec, Channel, write_recording
+from thermocald.store.database.store import Store
+from thermocald.store.recording.reader import CameraSpec, Channel, write_recording
 
 ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
@@ -214,7 +214,7 @@ def replayed():
     """A recording as devices of a configuration."""
 
     def make(path: Path, period_s: float = 0.05, loop: bool = True):
-        from thermocald.store.head import read_head
+        from thermocald.store.recording.head import read_head
 
         sensor = read_head(path).camera.sensor
         replay = {"driver": "replay", "recording": str(path), "loop": loop, "period_s": period_s}

@@ -15,7 +15,7 @@ def main() -> None:
     import thermocald_drivers.jsonl
     import thermocald_drivers.replay  # noqa: F401
 
-    import thermocald.analysis.online_observer
+    import thermocald.analysis.online.observer
     import thermocald.cli
     import thermocald.daemon.service
 

@@ -12,9 +12,9 @@ import pytest
 
 from tests.daemon.conftest import ENVIRONMENT, fast_run, make_recording
 from thermocald.config import CalibrationConfig
-from thermocald.photogrammetry.testfield import TestField
-from thermocald.store.database import Store
-from thermocald.store.recording import read_recording, write_recording
+from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.store.database.store import Store
+from thermocald.store.recording.reader import read_recording, write_recording
 
 EPOCHS = 24
 PLAIN = {"target_offsets": False}

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from tests.daemon.conftest import ENVIRONMENT, fast_run, make_recording
-from thermocald.photogrammetry.camera_model import project
+from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.simulation.demonstration import demonstration_field, demonstration_model
-from thermocald.store.database import Store
-from thermocald.store.recording import read_recording, write_recording
+from thermocald.store.database.store import Store
+from thermocald.store.recording.reader import read_recording, write_recording
 
 EPOCHS, WHEN = 70, 41
 HAPPENS = ("nothing", "knock", "slip", "wrong_lens", "target_moved")

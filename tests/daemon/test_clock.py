@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from thermocald.store.archive import archive_series
-from thermocald.store.database import Store
-from thermocald.store.recording import read_recording
+from thermocald.store.database.archive import archive_series
+from thermocald.store.database.store import Store
+from thermocald.store.recording.reader import read_recording
 
 HOUR = 3600.0
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from tests.daemon.conftest import ENVIRONMENT, fast_run, make_recording
-from thermocald.store.database import Store
+from thermocald.store.database.store import Store
 
 pytestmark = pytest.mark.slow
 

@@ -12,7 +12,7 @@ import time
 import numpy as np
 import pytest
 
-from thermocald.store.database import Store
+from thermocald.store.database.store import Store
 
 
 def test_killed_and_restarted_nothing_committed_is_lost(daemon, recording, replayed):

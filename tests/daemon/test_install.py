@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from thermocald.store.database import Store
+from thermocald.store.database.store import Store
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -15,8 +15,8 @@ import pytest
 
 from tests.daemon.conftest import ENVIRONMENT
 from thermocald.errors import StoreError
-from thermocald.store.database import Store
-from thermocald.store.recording import read_recording
+from thermocald.store.database.store import Store
+from thermocald.store.recording.reader import read_recording
 
 UNITS = Path(__file__).resolve().parents[2] / "systemd"
 

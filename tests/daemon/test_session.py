@@ -8,8 +8,8 @@ import time
 import pytest
 import yaml
 
-from thermocald.store.database import Store
-from thermocald.store.recording import read_recording
+from thermocald.store.database.store import Store
+from thermocald.store.recording.reader import read_recording
 
 
 @pytest.fixture

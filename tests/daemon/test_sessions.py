@@ -13,8 +13,8 @@ import yaml
 from thermocald.daemon.control import ask
 from thermocald.daemon.session import Session
 from thermocald.errors import DataError, UsageError
-from thermocald.store.database import Store
-from thermocald.store.recording import read_recording
+from thermocald.store.database.store import Store
+from thermocald.store.recording.reader import read_recording
 
 SESSION = {"camera": "phone-1", "series": "M7", "start": "cold", "epochs": 8}
 

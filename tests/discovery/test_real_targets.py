@@ -11,7 +11,7 @@ from thermocald.discovery.reduction import gather
 from thermocald.discovery.result import discover_series
 from thermocald.discovery.source import series_input
 from thermocald.errors import DataError
-from thermocald.store.recording import read_recording
+from thermocald.store.recording.reader import read_recording
 
 CAMERAS = ("aviary-cam0", "aviary-cam1", "aviary-cam2", "aviary-cam6")
 

@@ -27,7 +27,7 @@ from tests.docs.blocks import (
 from thermocald.cli import application
 from thermocald.config import Config, parse_config
 from thermocald.hal import option_names
-from thermocald.store.recording import read_recording
+from thermocald.store.recording.reader import read_recording
 
 COMMAND = typer.main.get_command(application())
 STANZAS = set(Config.model_fields)

@@ -18,7 +18,7 @@ import pytest
 
 from tests.docs.blocks import PAGES, ROOT, Block, all_blocks, blocks, name
 from tests.docs.worlds import AFTER, WORLDS
-from thermocald.store.database import Store
+from thermocald.store.database.store import Store
 
 ROOT_NEEDED = "changes the machine: needs root, and a package index"
 NOT_RUN = {

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.object_space import BOUND, HEADER, measure
 from tests.docs.blocks import ROOT
-from thermocald.analysis.reference import QUOTED
+from thermocald.analysis.study.reference import QUOTED
 from thermocald.simulation.presets import preset_names
 
 PAGE = (ROOT / "docs/explanation/object-space.md").read_text()

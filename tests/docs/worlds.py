@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from tests.docs.blocks import ROOT, blocks
 from tests.photogrammetry import network_cases
 from thermocald.cli import application
-from thermocald.photogrammetry.camera_model import (
+from thermocald.photogrammetry.camera.camera_model import (
     CameraModel,
     ExteriorOrientation,
     InteriorOrientation,
@@ -29,7 +29,7 @@ from thermocald.simulation.model_file import write_model
 from thermocald.simulation.presets import preset_simulation
 from thermocald.simulation.scene import Scene
 from thermocald.simulation.testfields import corner_field
-from thermocald.store.testfield_file import read_testfield
+from thermocald.store.recording.testfield_file import read_testfield
 
 
 def run(*arguments: object) -> None:

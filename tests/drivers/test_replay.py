@@ -9,11 +9,11 @@ from thermocald_drivers.replay import RecordingEndedError
 from thermocald.epoch import Epoch
 from thermocald.errors import BadReading, ConfigurationError, DeviceNotFound, PermanentDeviceError
 from thermocald.hal import VirtualClock, open_device
-from thermocald.photogrammetry.camera_model import Sensor
-from thermocald.photogrammetry.exchange import observations_from_lists
-from thermocald.photogrammetry.testfield import Observations, TestField
-from thermocald.store.head import CameraSpec, Channel, Head
-from thermocald.store.recording import RecordingWriter, read_recording
+from thermocald.photogrammetry.camera.camera_model import Sensor
+from thermocald.photogrammetry.field.exchange import observations_from_lists
+from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.store.recording.head import CameraSpec, Channel, Head
+from thermocald.store.recording.reader import RecordingWriter, read_recording
 
 BEGIN = 1.6e9
 IMAGE = np.arange(48 * 64, dtype=np.uint8).reshape(48, 64)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.camera_model import Sensor
+from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.simulation.demonstration import demonstration_field, demonstration_model
 from thermocald.simulation.history import History
 from thermocald.simulation.scene import Scene
@@ -15,7 +15,7 @@ from thermocald.simulation.scene import Scene
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from thermocald.photogrammetry.testfield import TestField
+    from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.simulation.model import ThermalModel
 
 __all__ = ["heating", "subject"]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from thermocald.analysis.study import StudySettings, study
+from thermocald.analysis.study.study import StudySettings, study
 
 _SPEC = importlib.util.spec_from_file_location(
     "warm_up_series", Path(__file__).parents[1] / "analysis" / "conftest.py"

@@ -12,11 +12,11 @@ import pytest
 from thermocald.epoch import Epoch
 from thermocald.errors import ConfigurationError
 from thermocald.output.dashboard import serve
-from thermocald.photogrammetry.camera_model import Sensor
-from thermocald.photogrammetry.testfield import TestField
-from thermocald.store.database import Store
-from thermocald.store.head import CameraSpec, Channel, Head
-from thermocald.store.row import EpochResult, Event
+from thermocald.photogrammetry.camera.camera_model import Sensor
+from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.store.database.row import EpochResult, Event
+from thermocald.store.database.store import Store
+from thermocald.store.recording.head import CameraSpec, Channel, Head
 
 TOKEN = "a-token-of-enough-characters"
 DEVICE = {"device": "open", "why": "", "faults": 0}

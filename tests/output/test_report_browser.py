@@ -2,7 +2,7 @@
 
 import pytest
 
-from thermocald.output.study_report import render_report
+from thermocald.output.study.report import render_report
 
 _WIDTHS = {"desk": (1280, 900), "phone": (390, 844)}
 # A drawing is empty when it holds no stroke that is longer than an axis tick.

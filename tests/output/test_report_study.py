@@ -8,13 +8,13 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from thermocald.analysis.measured import Clip
-from thermocald.analysis.study import StudySettings, study
+from thermocald.analysis.study.measured import Clip
+from thermocald.analysis.study.study import StudySettings, study
 from thermocald.errors import DataError
-from thermocald.output.clips import cut_clip
-from thermocald.output.study_document import study_document
-from thermocald.output.study_report import render_report, save_figures, write_report
-from thermocald.photogrammetry.camera_model import IOP_NAMES
+from thermocald.output.figures.clips import cut_clip
+from thermocald.output.study.document import study_document
+from thermocald.output.study.report import render_report, save_figures, write_report
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 
 
 class Page(HTMLParser):

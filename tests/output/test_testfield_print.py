@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from thermocald.errors import UsageError
-from thermocald.output.testfield_layout import TRIM, Design, field_of, lay_out, paper_size
-from thermocald.output.testfield_print import default_diameter, print_testfield
-from thermocald.photogrammetry import ring_code
-from thermocald.store.testfield_file import read_testfield
+from thermocald.output.testfield.layout import TRIM, Design, field_of, lay_out, paper_size
+from thermocald.output.testfield.print import default_diameter, print_testfield
+from thermocald.photogrammetry.targets import ring_code
+from thermocald.store.recording.testfield_file import read_testfield
 
 DPI = 200
 MM = DPI / 25.4  # px

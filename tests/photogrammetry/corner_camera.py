@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from thermocald.photogrammetry.camera_model import (
+from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     InteriorOrientation,
     Sensor,
     project,
 )
-from thermocald.photogrammetry.testfield import Observations, TestField
+from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 SENSOR = Sensor(3280, 2464, 0.00112)
 INTERIOR = InteriorOrientation(3.04, 0.02, -0.03, -5e-3, 4e-4, -1e-5, 3e-4, -2e-4)

@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from thermocald.photogrammetry import ring_code
-from thermocald.photogrammetry.camera_model import CameraModel, ExteriorOrientation
+from thermocald.photogrammetry.camera.camera_model import CameraModel, ExteriorOrientation
+from thermocald.photogrammetry.targets import ring_code
 
 VERTICES = 720
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from tests.photogrammetry.exact_rendering import Scene, look_at
-from thermocald.photogrammetry import ring_code
-from thermocald.photogrammetry.camera_model import CameraModel, InteriorOrientation, Sensor
-from thermocald.photogrammetry.testfield import TestField
+from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
+from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.photogrammetry.targets import ring_code
 
 PI_SENSOR = Sensor(3280, 2464, 0.00112)
 PI_CAMERA = CameraModel(

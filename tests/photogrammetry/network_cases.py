@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from thermocald.photogrammetry.camera_model import (
+from thermocald.photogrammetry.camera.camera_model import (
     CameraModel,
     ExteriorOrientation,
     InteriorOrientation,
     Sensor,
 )
-from thermocald.photogrammetry.network import Photo
-from thermocald.photogrammetry.testfield import Observations
+from thermocald.photogrammetry.field.testfield import Observations
+from thermocald.photogrammetry.network.adjustment import Photo
 
 SENSOR = Sensor(3280, 2464, 0.00112)
 INTERIOR = InteriorOrientation(

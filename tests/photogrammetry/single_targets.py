@@ -13,9 +13,9 @@ import numpy as np
 
 from tests.photogrammetry.exact_rendering import Scene, noisy
 from tests.photogrammetry.fields import PI_CAMERA, PI_SENSOR
-from thermocald.photogrammetry import ring_code
-from thermocald.photogrammetry.camera_model import ExteriorOrientation
-from thermocald.photogrammetry.outline import LocalMap, local_maps
+from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation
+from thermocald.photogrammetry.targets import ring_code
+from thermocald.photogrammetry.targets.outline import LocalMap, local_maps
 
 AT_ORIGIN = ExteriorOrientation(0, 0, 0, 0, 0, 0)
 PAPER, INK = 190.0, 40.0

@@ -9,14 +9,14 @@ import cv2
 import numpy as np
 import pytest
 
-from thermocald.photogrammetry.adjustment import AdjustmentSettings, adjust
-from thermocald.photogrammetry.camera_model import (
+from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     InteriorOrientation,
     partials,
 )
-from thermocald.photogrammetry.cold_start import cold_start, pose_only
-from thermocald.photogrammetry.testfield import Observations, TestField
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, adjust
+from thermocald.photogrammetry.epoch.cold_start import cold_start, pose_only
+from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 FREE = np.array([0, 1, 2, 3, 4, 5, 6, 7, 10, 11, 12, 13, 14, 15])
 TRUTH = np.concatenate([scene.INTERIOR.as_array(), scene.EXTERIOR.as_array()])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from thermocald.errors import GeometryError
-from thermocald.photogrammetry.camera_model import (
+from thermocald.photogrammetry.camera.camera_model import (
     PARAMETER_NAMES,
     CameraModel,
     ExteriorOrientation,

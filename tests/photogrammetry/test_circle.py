@@ -9,9 +9,9 @@ import pytest
 from tests.photogrammetry.exact_rendering import Scene, noisy
 from tests.photogrammetry.fields import PI_CAMERA, PI_SENSOR
 from tests.photogrammetry.single_targets import AT_ORIGIN, SIZE, SingleTargets, single_targets
-from thermocald.photogrammetry.circle import fit_circles
-from thermocald.photogrammetry.noise import NoiseModel
-from thermocald.photogrammetry.outline import local_maps
+from thermocald.photogrammetry.targets.circle import fit_circles
+from thermocald.photogrammetry.targets.noise import NoiseModel
+from thermocald.photogrammetry.targets.outline import local_maps
 
 NOISE = 2.0
 KNOWN_NOISE = NoiseModel(NOISE**2 + 1 / 12)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from tests.photogrammetry.single_targets import SingleTargets, single_targets
-from thermocald.photogrammetry.circle import fit_circles
-from thermocald.photogrammetry.gradient_weights import GradientWeights
-from thermocald.photogrammetry.noise import NoiseModel
+from thermocald.photogrammetry.frame.gradient_weights import GradientWeights
+from thermocald.photogrammetry.targets.circle import fit_circles
+from thermocald.photogrammetry.targets.noise import NoiseModel
 
 NOISE = NoiseModel(4 + 1 / 12)
 

@@ -9,14 +9,14 @@ import pytest
 from tests.photogrammetry.exact_rendering import Scene, look_at, noisy
 from tests.photogrammetry.fields import SMALL_CAMERA, SMALL_SENSOR, draw_marker
 from thermocald.errors import TestFieldError
-from thermocald.photogrammetry.markers import (
+from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.photogrammetry.targets.markers import (
     locate_markers,
     marker_rows,
     measure_corners,
     measure_markers,
     parse_marker,
 )
-from thermocald.photogrammetry.testfield import TestField
 
 APRILTAG, ARUCO = "DICT_APRILTAG_36h11", "DICT_5X5_50"
 

@@ -19,9 +19,9 @@ from tests.photogrammetry.fields import (
     station,
 )
 from thermocald.errors import TestFieldError
-from thermocald.photogrammetry.measurement import Prior, measure
-from thermocald.photogrammetry.outline import local_maps
-from thermocald.photogrammetry.testfield import TestField
+from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.photogrammetry.frame.measurement import Prior, measure
+from thermocald.photogrammetry.targets.outline import local_maps
 
 FIELD, NORMALS = small_field()
 STATION = station(800.0)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tests.photogrammetry.fields import corner_field
-from thermocald.photogrammetry.planes import field_normals, target_normals
-from thermocald.photogrammetry.testfield import TestField
+from thermocald.photogrammetry.field.planes import field_normals, target_normals
+from thermocald.photogrammetry.field.testfield import TestField
 
 
 @pytest.mark.parametrize(

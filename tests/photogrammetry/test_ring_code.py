@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from thermocald.errors import TestFieldError
-from thermocald.photogrammetry import ring_code
+from thermocald.photogrammetry.targets import ring_code
 
 
 def _rule(bits: int) -> list[int]:

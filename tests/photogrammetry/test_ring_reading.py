@@ -10,9 +10,9 @@ from tests.photogrammetry.clutter import clutter
 from tests.photogrammetry.exact_rendering import noisy
 from tests.photogrammetry.fields import PI_SENSOR
 from tests.photogrammetry.single_targets import single_targets
-from thermocald.photogrammetry import ring_code
-from thermocald.photogrammetry.detection import find_circles
-from thermocald.photogrammetry.ring_reading import read_codes
+from thermocald.photogrammetry.targets import ring_code
+from thermocald.photogrammetry.targets.detection import find_circles
+from thermocald.photogrammetry.targets.ring_reading import read_codes
 
 
 def _codes(image, ink=-1, **options) -> set[tuple[int, int]]:

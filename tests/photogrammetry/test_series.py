@@ -8,11 +8,11 @@ import corner_camera as scene
 import numpy as np
 import pytest
 
-from thermocald.photogrammetry.adjustment import adjust
-from thermocald.photogrammetry.camera_model import project
-from thermocald.photogrammetry.normals import ObservationGrid
-from thermocald.photogrammetry.series import SeriesSettings, adjust_series
-from thermocald.photogrammetry.testfield import Observations, TestField
+from thermocald.photogrammetry.camera.camera_model import project
+from thermocald.photogrammetry.epoch.adjustment import adjust
+from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.photogrammetry.series.adjustment import SeriesSettings, adjust_series
+from thermocald.photogrammetry.series.normals import ObservationGrid
 
 OWN = np.arange(8)
 

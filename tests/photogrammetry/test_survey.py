@@ -8,11 +8,11 @@ import pytest
 
 from tests.photogrammetry import network_cases as cases
 from thermocald.errors import GeometryError, ImageError
-from thermocald.output.testfield_layout import TRIM, Design, field_of, lay_out, paper_size
-from thermocald.photogrammetry.camera_model import CameraModel, InteriorOrientation, Sensor
-from thermocald.photogrammetry.network import Distance
-from thermocald.photogrammetry.survey import Picture, survey
-from thermocald.photogrammetry.testfield import TestField
+from thermocald.output.testfield.layout import TRIM, Design, field_of, lay_out, paper_size
+from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
+from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.photogrammetry.network.adjustment import Distance
+from thermocald.photogrammetry.survey.survey import Picture, survey
 from thermocald.simulation.scene import Scene
 
 # The binned mode of a Raspberry Pi camera v2.1.
@@ -166,7 +166,7 @@ def test_corner_put_up_by_hand():
 
 def _print_on_paper(tmp_path, design, dpi):
     """The raster of a print, and the function from the sheet's mm to its pixels."""
-    from thermocald.output.testfield_print import print_testfield
+    from thermocald.output.testfield.print import print_testfield
 
     pdfium = pytest.importorskip("pypdfium2")
     printed = print_testfield(design, tmp_path)

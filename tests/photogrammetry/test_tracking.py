@@ -7,10 +7,10 @@ import pytest
 
 from tests.photogrammetry.exact_rendering import noisy
 from tests.photogrammetry.fields import SMALL_CAMERA, SMALL_SENSOR, draw, small_field, station
-from thermocald.photogrammetry import tracking
-from thermocald.photogrammetry.camera_model import CameraModel
-from thermocald.photogrammetry.measurement import Prior
-from thermocald.photogrammetry.tracking import Tracker
+from thermocald.photogrammetry.camera.camera_model import CameraModel
+from thermocald.photogrammetry.frame import tracking
+from thermocald.photogrammetry.frame.measurement import Prior
+from thermocald.photogrammetry.frame.tracking import Tracker
 
 FIELD, NORMALS = small_field()
 STATION = station(800.0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from thermocald.errors import ConfigurationError
-from thermocald.photogrammetry.camera_model import (
+from thermocald.photogrammetry.camera.camera_model import (
     IOP_NAMES,
     PARAMETER_NAMES,
     InteriorOrientation,

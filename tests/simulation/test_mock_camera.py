@@ -7,8 +7,8 @@ import pytest
 
 from thermocald.errors import BadReading, ConfigurationError, DeviceGone, DeviceTimeout
 from thermocald.hal import VirtualClock, load_driver
-from thermocald.photogrammetry.camera_model import project
-from thermocald.photogrammetry.markers import measure_markers
+from thermocald.photogrammetry.camera.camera_model import project
+from thermocald.photogrammetry.targets.markers import measure_markers
 from thermocald.simulation.model import ModelEffect
 from thermocald.simulation.model_file import write_model
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from thermocald.errors import ConfigurationError, GeometryError
-from thermocald.photogrammetry.camera_model import Sensor
+from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.simulation.course import Course
 from thermocald.simulation.demonstration import demonstration_field, demonstration_model
 from thermocald.simulation.device import CameraDevice, Measuring, default_heat
@@ -16,7 +16,7 @@ from thermocald.simulation.model import ModelEffect
 from thermocald.simulation.observations import Simulation
 from thermocald.simulation.programme import Programme
 from thermocald.simulation.thermometer import SimulatedThermometer
-from thermocald.store.recording import read_recording
+from thermocald.store.recording.reader import read_recording
 
 
 def simulation(epochs=180, seed=1, effects=(), measuring=None, field=None, **changes):
@@ -122,7 +122,7 @@ def test_seed_decides_everything(tmp_path):
 
 
 def test_frames_can_be_measured(tmp_path):
-    from thermocald.photogrammetry.markers import measure_markers
+    from thermocald.photogrammetry.targets.markers import measure_markers
 
     field = demonstration_field("markers")
     s = simulation(epochs=2, field=field)

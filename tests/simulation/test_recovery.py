@@ -13,8 +13,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermocald.analysis.series_reduction import model_series
-from thermocald.analysis.thermal_model import fit_thermal_model
+from thermocald.analysis.thermal.reduction import model_series
+from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.simulation import effects
 from thermocald.simulation.course import Course
 from thermocald.simulation.demonstration import demonstration_field, demonstration_model
@@ -22,7 +22,7 @@ from thermocald.simulation.device import CameraDevice, default_heat
 from thermocald.simulation.model import ModelEffect
 from thermocald.simulation.observations import Simulation
 from thermocald.simulation.programme import Programme
-from thermocald.store.recording import read_recording
+from thermocald.store.recording.reader import read_recording
 
 PX = 0.00112
 

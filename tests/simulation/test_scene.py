@@ -8,14 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
-from thermocald.photogrammetry.camera_model import (
+from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     InteriorOrientation,
     Sensor,
     project,
 )
-from thermocald.photogrammetry.markers import measure_markers
-from thermocald.photogrammetry.testfield import TestField
+from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.photogrammetry.targets.markers import measure_markers
 from thermocald.simulation import portable
 from thermocald.simulation.demonstration import demonstration_field, demonstration_model
 from thermocald.simulation.raster import coverage, windows_around
@@ -199,7 +199,7 @@ def test_portable_arithmetic_is_right():
 
 def test_a_coded_field_is_measured_from_nothing():
     """Drawn the way it is read: found by ring codes, measured with the true centres' sigmas."""
-    from thermocald.photogrammetry.measurement import Prior, measure
+    from thermocald.photogrammetry.frame.measurement import Prior, measure
 
     field = demonstration_field("circles")
     model = demonstration_model(field)

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from thermocald.epoch import Epoch
-from thermocald.photogrammetry.camera_model import Sensor
-from thermocald.photogrammetry.testfield import Observations, TestField
-from thermocald.store.database import Store
-from thermocald.store.head import CameraSpec, Channel, Head
-from thermocald.store.recording import write_recording
-from thermocald.store.row import EpochResult
+from thermocald.photogrammetry.camera.camera_model import Sensor
+from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.store.database.row import EpochResult
+from thermocald.store.database.store import Store
+from thermocald.store.recording.head import CameraSpec, Channel, Head
+from thermocald.store.recording.reader import write_recording
 
 if TYPE_CHECKING:
     from pathlib import Path

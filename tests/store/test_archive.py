@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermocald.store.archive import archive_series, clock_corrections
-from thermocald.store.recording import read_recording
+from thermocald.store.database.archive import archive_series, clock_corrections
+from thermocald.store.recording.reader import read_recording
 
 
 def test_a_series_becomes_a_recording(filled, tmp_path, make_epoch):

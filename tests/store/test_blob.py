@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from thermocald.errors import StoreError
-from thermocald.photogrammetry.testfield import Observations
-from thermocald.store.blob import (
+from thermocald.photogrammetry.field.testfield import Observations
+from thermocald.store.database.blob import (
     POINT_QUANTUM_PX,
     pack_covariance,
     pack_observations,

@@ -12,8 +12,8 @@ import pytest
 
 from benchmarks import store as benchmark
 from thermocald.epoch import Epoch
-from thermocald.photogrammetry.testfield import Observations
-from thermocald.store.recording import RecordingWriter
+from thermocald.photogrammetry.field.testfield import Observations
+from thermocald.store.recording.reader import RecordingWriter
 
 DAY = 8640
 
@@ -47,7 +47,7 @@ READ = textwrap.dedent(
     """
     import sys
     from pathlib import Path
-    import thermocald.store.recording as module
+    import thermocald.store.recording.reader as module
 
     def peak_mb():
         status = Path("/proc/self/status").read_text()

@@ -7,9 +7,9 @@ import pytest
 
 from thermocald.epoch import Epoch
 from thermocald.errors import StoreError
-from thermocald.store import columns
-from thermocald.store.database import Store
-from thermocald.store.row import EpochResult
+from thermocald.store.database import columns
+from thermocald.store.database.row import EpochResult
+from thermocald.store.database.store import Store
 
 CHUNK = 16
 MERGED = 4

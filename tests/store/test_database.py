@@ -11,11 +11,11 @@ import pytest
 
 from thermocald.epoch import Epoch
 from thermocald.errors import StoreError, StoreVersionError
-from thermocald.photogrammetry.camera_model import PARAMETER_NAMES
-from thermocald.store.database import Store
-from thermocald.store.recording import read_recording, temperature_at_frame, write_recording
-from thermocald.store.row import NOT_CALIBRATED, EpochResult, Event
-from thermocald.store.testfield_file import parse_testfield
+from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
+from thermocald.store.database.row import NOT_CALIBRATED, EpochResult, Event
+from thermocald.store.database.store import Store
+from thermocald.store.recording.reader import read_recording, temperature_at_frame, write_recording
+from thermocald.store.recording.testfield_file import parse_testfield
 
 
 def test_an_epoch_comes_back_as_it_was(filled, make_epoch, make_result):

@@ -11,8 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from thermocald.errors import ThermocaldError
-from thermocald.store.database import Store
-from thermocald.store.recording import open_recording, read_recording, read_testfield
+from thermocald.store.database.store import Store
+from thermocald.store.recording.reader import open_recording, read_recording, read_testfield
 
 FILES = ["recording.yaml", "epochs.csv", "testfield.csv", "observations.csv"]
 QUICK = settings(

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from thermocald.errors import StoreError, StoreFullError
-from thermocald.store.database import Store
+from thermocald.store.database.store import Store
 
 # Appends for ever, and says after each commit what it has committed.
 WRITER = textwrap.dedent(
@@ -24,9 +24,9 @@ WRITER = textwrap.dedent(
     from pathlib import Path
     import numpy as np
     from thermocald.epoch import Epoch
-    from thermocald.photogrammetry.testfield import Observations
-    from thermocald.store.database import Store
-    from thermocald.store.row import EpochResult
+    from thermocald.photogrammetry.field.testfield import Observations
+    from thermocald.store.database.store import Store
+    from thermocald.store.database.row import EpochResult
 
     with Store.open(Path(sys.argv[1]), "append", durable=False) as store:
         series = store.find_series()
@@ -129,7 +129,7 @@ def test_space_again_after_a_full_disk(store_path, head, field, make_epoch, make
 
 def test_a_recording_on_a_full_disk_leaves_nothing(tmp_path, head, field, make_epoch, small_disk):
     from thermocald.errors import RecordingError
-    from thermocald.store.recording import write_recording
+    from thermocald.store.recording.reader import write_recording
 
     with pytest.raises(RecordingError, match="cannot be written"):
         write_recording(
@@ -170,11 +170,11 @@ FULL = textwrap.dedent(
     import numpy as np
     from thermocald.epoch import Epoch
     from thermocald.errors import StoreFullError
-    from thermocald.photogrammetry.camera_model import Sensor
-    from thermocald.photogrammetry.testfield import Observations, TestField
-    from thermocald.store.database import Store
-    from thermocald.store.head import CameraSpec, Head
-    from thermocald.store.row import EpochResult
+    from thermocald.photogrammetry.camera.camera_model import Sensor
+    from thermocald.photogrammetry.field.testfield import Observations, TestField
+    from thermocald.store.database.store import Store
+    from thermocald.store.recording.head import CameraSpec, Head
+    from thermocald.store.database.row import EpochResult
 
     disk = Path(sys.argv[1])
     (disk / "filler").write_bytes(bytes(600_000))

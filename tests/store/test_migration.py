@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from thermocald.errors import StoreError
-from thermocald.store import columns, schema
-from thermocald.store.database import Store
+from thermocald.store.database import columns, schema
+from thermocald.store.database.store import Store
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from thermocald.epoch import Epoch
-from thermocald.store.readings import (
+from thermocald.store.recording.readings import (
     interpolate_readings,
     temperature_at_frame,
     temperatures_at_frame,

@@ -10,10 +10,10 @@ import pytest
 
 from thermocald.epoch import Epoch
 from thermocald.errors import RecordingError
-from thermocald.photogrammetry.camera_model import InteriorOrientation
-from thermocald.photogrammetry.testfield import Observations, TestField
-from thermocald.store import recording as module
-from thermocald.store.recording import (
+from thermocald.photogrammetry.camera.camera_model import InteriorOrientation
+from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.store.recording import reader as module
+from thermocald.store.recording.reader import (
     RecordingWriter,
     open_recording,
     read_recording,

@@ -11,12 +11,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.adjustment import Adjustment, AdjustmentSettings, adjust, failed
-from thermocald.photogrammetry.cold_start import cold_start, pose_only
-from thermocald.photogrammetry.focus import frame_figures
-from thermocald.photogrammetry.image_file import decode_grey
-from thermocald.photogrammetry.measurement import Prior
-from thermocald.photogrammetry.tracking import Tracker
+from thermocald.photogrammetry.epoch.adjustment import (
+    Adjustment,
+    AdjustmentSettings,
+    adjust,
+    failed,
+)
+from thermocald.photogrammetry.epoch.cold_start import cold_start, pose_only
+from thermocald.photogrammetry.frame.focus import frame_figures
+from thermocald.photogrammetry.frame.measurement import Prior
+from thermocald.photogrammetry.frame.tracking import Tracker
+from thermocald.photogrammetry.targets.image_file import decode_grey
 
 if TYPE_CHECKING:
     from typing import Any
@@ -24,8 +29,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.epoch import Epoch
-    from thermocald.photogrammetry.camera_model import InteriorOrientation, Sensor
-    from thermocald.photogrammetry.testfield import Observations, TestField
+    from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
+    from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 __all__ = ["CalibratedEpoch", "Calibrator"]
 

@@ -18,23 +18,23 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.adjustment import failed
-from thermocald.photogrammetry.camera_model import (
+from thermocald.photogrammetry.camera.camera_model import (
     IOP_NAMES,
     PARAMETER_NAMES,
     ExteriorOrientation,
     InteriorOrientation,
     project,
 )
-from thermocald.photogrammetry.normals import ObservationGrid, linearise
+from thermocald.photogrammetry.epoch.adjustment import failed
+from thermocald.photogrammetry.series.normals import ObservationGrid, linearise
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from thermocald.photogrammetry.adjustment import Adjustment, AdjustmentSettings
-    from thermocald.photogrammetry.camera_model import Sensor
-    from thermocald.photogrammetry.normals import Partials
-    from thermocald.photogrammetry.testfield import Observations, TestField
+    from thermocald.photogrammetry.camera.camera_model import Sensor
+    from thermocald.photogrammetry.epoch.adjustment import Adjustment, AdjustmentSettings
+    from thermocald.photogrammetry.field.testfield import Observations, TestField
+    from thermocald.photogrammetry.series.normals import Partials
 
     Array = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Literal, Protocol
 
 from thermocald.acquisition.calibrator import CalibratedEpoch
 from thermocald.acquisition.pipeline import calibrate_frame, make_epoch
-from thermocald.photogrammetry.adjustment import failed
+from thermocald.photogrammetry.epoch.adjustment import failed
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

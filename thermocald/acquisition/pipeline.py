@@ -29,9 +29,9 @@ from thermocald.acquisition.pairing import pair_readings
 from thermocald.acquisition.scheduler import Schedule
 from thermocald.epoch import Epoch
 from thermocald.errors import DataError
-from thermocald.photogrammetry.adjustment import failed
-from thermocald.photogrammetry.exchange import observations_from_lists
-from thermocald.photogrammetry.image_file import decode_grey
+from thermocald.photogrammetry.epoch.adjustment import failed
+from thermocald.photogrammetry.field.exchange import observations_from_lists
+from thermocald.photogrammetry.targets.image_file import decode_grey
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -59,8 +59,8 @@ def archive(
     Example: thermocald archive thermocald.db --to recordings
     """
     from thermocald.config import load_config
-    from thermocald.store.archive import archive_readings, archive_series
-    from thermocald.store.database import Store
+    from thermocald.store.database.archive import archive_readings, archive_series
+    from thermocald.store.database.store import Store
 
     read = None
     if retention and config is None:
@@ -118,7 +118,7 @@ def _retention(config: Config) -> list[str]:
         return [str(sentence) for sentence in told["deleted"]]
     from thermocald.acquisition.frame_folder import FrameFolder
     from thermocald.daemon.store_guard import StoreGuard
-    from thermocald.store.row import Event
+    from thermocald.store.database.row import Event
 
     guard = StoreGuard(config.store.path)
     try:

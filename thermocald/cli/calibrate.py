@@ -18,10 +18,10 @@ from thermocald.cli.options import (
     read_camera,
 )
 from thermocald.errors import DataError, ImageError, UsageError
-from thermocald.photogrammetry.camera_model import EOP_NAMES, IOP_NAMES, Sensor
+from thermocald.photogrammetry.camera.camera_model import EOP_NAMES, IOP_NAMES, Sensor
 
 if TYPE_CHECKING:
-    from thermocald.analysis.photographs import PhotographResult, Photographs
+    from thermocald.analysis.camera.photographs import PhotographResult, Photographs
 
 __all__ = ["register"]
 
@@ -56,8 +56,8 @@ def calibrate(
 
     Example: thermocald calibrate a.jpg b.jpg --testfield testfield.csv --camera rpi.yaml --json -
     """
-    from thermocald.analysis.photographs import calibrate_photographs
-    from thermocald.store.recording import read_testfield
+    from thermocald.analysis.camera.photographs import calibrate_photographs
+    from thermocald.store.recording.reader import read_testfield
 
     if not images:
         raise UsageError("give at least one photograph")
@@ -84,7 +84,7 @@ def calibrate(
 
 def _unknown_camera(images: list[Path]) -> CameraFile:
     """A camera of which only the size of the image is known: its pixel counts as 1 µm."""
-    from thermocald.photogrammetry.image_file import decode_grey
+    from thermocald.photogrammetry.targets.image_file import decode_grey
 
     first: ImageError | None = None
     for path in images:

@@ -63,7 +63,7 @@ def check(
 
 
 def _recording(path: Path) -> dict[str, Any]:
-    from thermocald.store.recording import read_recording
+    from thermocald.store.recording.reader import read_recording
 
     recording = read_recording(path)
     columns = recording.columns
@@ -144,7 +144,7 @@ def _config(path: Path, probe: bool) -> dict[str, Any]:
 
 
 def _store(path: Path) -> dict[str, Any]:
-    from thermocald.store.database import Store
+    from thermocald.store.database.store import Store
 
     with Store.open(path) as store:
         say(f"{path}: reading the whole file")

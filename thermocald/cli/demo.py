@@ -20,7 +20,7 @@ from thermocald.errors import DataError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from thermocald.analysis.series_table import SeriesTable
+    from thermocald.analysis.series.table import SeriesTable
 
     Array = NDArray[np.float64]
 
@@ -88,12 +88,12 @@ def _acquire(out: Path, epochs: int, seed: int) -> _Run:
     """The pipeline on a virtual clock, kept in a store and a recording."""
     from thermocald.acquisition.calibrator import Calibrator
     from thermocald.acquisition.pipeline import Pipeline
-    from thermocald.analysis.stored_series import stored_table
+    from thermocald.analysis.series.stored import stored_table
     from thermocald.hal import VirtualClock, open_device
-    from thermocald.photogrammetry.adjustment import AdjustmentSettings
-    from thermocald.store.database import Store
-    from thermocald.store.recording import CameraSpec, Channel, Head, RecordingWriter
-    from thermocald.store.row import EpochResult
+    from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
+    from thermocald.store.database.row import EpochResult
+    from thermocald.store.database.store import Store
+    from thermocald.store.recording.reader import CameraSpec, Channel, Head, RecordingWriter
 
     clock = VirtualClock()
     camera = open_device("camera", "mock", {"seed": seed}, clock)
@@ -138,7 +138,7 @@ def _acquire(out: Path, epochs: int, seed: int) -> _Run:
 
 def _compare(run: _Run) -> list[dict[str, Any]]:
     """Per kelvin and over the series: the drift put in and the drift found."""
-    from thermocald.photogrammetry.camera_model import IOP_NAMES
+    from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 
     table, ok = run.table, run.table.ok & np.isfinite(run.table.temperature)
     t = table.temperature[ok] - table.temperature[ok].mean()

@@ -17,7 +17,7 @@ from thermocald.errors import ConfigurationError, UsageError
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from thermocald.analysis.model_series import ModelSeries
+    from thermocald.analysis.thermal.series import ModelSeries
     from thermocald.simulation.model import ModelEffect
 
 __all__ = ["check_names", "parse_effect"]

@@ -12,9 +12,9 @@ from thermocald.errors import UsageError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from thermocald.analysis.held_out import PredictedError
-    from thermocald.analysis.model_series import ModelSeries
-    from thermocald.analysis.thermal_model import FittedModel
+    from thermocald.analysis.thermal.prediction_test import PredictedError
+    from thermocald.analysis.thermal.series import ModelSeries
+    from thermocald.analysis.thermal.thermal_model import FittedModel
     from thermocald.simulation.model import ModelEffect
 
 __all__ = ["register"]
@@ -80,8 +80,8 @@ def fit(
 def _read(
     inputs: list[Path], listed: list[ModelEffect], advance: Callable[[int], None]
 ) -> list[ModelSeries]:
-    from thermocald.analysis.series_reduction import load_model_series
-    from thermocald.analysis.thermal_model import targets_of
+    from thermocald.analysis.thermal.reduction import load_model_series
+    from thermocald.analysis.thermal.thermal_model import targets_of
 
     for path in inputs:
         if not path.exists():
@@ -113,8 +113,8 @@ def _one(
     series: list[ModelSeries], listed: list[ModelEffect], T0: float | None
 ) -> tuple[FittedModel, list[PredictedError]]:
     """The fit to everything, and the error on what a fit to the rest predicts."""
-    from thermocald.analysis.held_out import predicted_error
-    from thermocald.analysis.thermal_model import fit_thermal_model
+    from thermocald.analysis.thermal.prediction_test import predicted_error
+    from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 
     fitted = fit_thermal_model(series, listed, T0)
     held = []
@@ -154,8 +154,8 @@ def _type(
 ) -> tuple[Any, dict[str, Any]]:
     import numpy as np
 
-    from thermocald.analysis.thermal_model import fit_thermal_model
-    from thermocald.analysis.type_model import type_model
+    from thermocald.analysis.thermal.thermal_model import fit_thermal_model
+    from thermocald.analysis.thermal.type_model import type_model
     from thermocald.simulation.model_file import model_document
 
     cameras = list(dict.fromkeys(s.camera for s in series))

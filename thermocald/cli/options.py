@@ -9,8 +9,8 @@ from typing import Annotated
 import typer
 
 from thermocald.errors import ConfigurationError, UsageError
-from thermocald.photogrammetry.adjustment import DEFAULT_FREE, AdjustmentSettings
-from thermocald.photogrammetry.camera_model import IOP_NAMES, InteriorOrientation, Sensor
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, InteriorOrientation, Sensor
+from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
 from thermocald.yaml_file import read_yaml
 
 __all__ = ["CameraFile", "ExteriorOption", "FreeOption", "JsonOption", "free_names", "read_camera"]

@@ -14,9 +14,9 @@ from thermocald.errors import UsageError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from thermocald.analysis.camera_state import CameraState
-    from thermocald.analysis.correction import TemperatureLog
-    from thermocald.analysis.thermal_camera import Along, ThermalCamera
+    from thermocald.analysis.camera.correction import TemperatureLog
+    from thermocald.analysis.camera.state import CameraState
+    from thermocald.analysis.thermal.thermal_camera import Along, ThermalCamera
 
 __all__ = ["read_log", "register", "warnings_said"]
 
@@ -78,7 +78,7 @@ def predict(
 
     Example: thermocald predict --model camera.thermal.yaml --temperature 35
     """
-    from thermocald.analysis.thermal_camera import ThermalCamera
+    from thermocald.analysis.thermal.thermal_camera import ThermalCamera
     from thermocald.cli.common import write_json
 
     if sum(option is not None for option in (temperature, log, test, programme)) != 1:
@@ -110,10 +110,10 @@ def _tested(thermal: ThermalCamera, path: Path) -> tuple[dict[str, Any], list[st
 
     import numpy as np
 
-    from thermocald.analysis.held_out import predicted_error
-    from thermocald.analysis.model_noise import thermometer_noise
-    from thermocald.analysis.series_reduction import load_model_series
-    from thermocald.analysis.thermal_model import targets_of
+    from thermocald.analysis.thermal.noise import thermometer_noise
+    from thermocald.analysis.thermal.prediction_test import predicted_error
+    from thermocald.analysis.thermal.reduction import load_model_series
+    from thermocald.analysis.thermal.thermal_model import targets_of
     from thermocald.cli.common import progress
 
     if not path.exists():
@@ -145,8 +145,8 @@ def read_log(thermal: ThermalCamera, path: Path, column: str | None = None) -> T
 
     ConfigurationError where the log is of a recording of another camera.
     """
-    from thermocald.analysis.correction import read_temperature_log
-    from thermocald.store.head import read_head
+    from thermocald.analysis.camera.correction import read_temperature_log
+    from thermocald.store.recording.head import read_head
 
     if path.name == "epochs.csv" and (path.parent / "recording.yaml").is_file():
         camera = read_head(path.parent).camera
@@ -176,7 +176,7 @@ def _state_document(
 ) -> tuple[dict[str, Any], list[str]]:
     import numpy as np
 
-    from thermocald.photogrammetry.camera_model import IOP_NAMES
+    from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
     from thermocald.simulation.effects.base import PARAMETER_UNITS
 
     error = state.object_error(distance * 1000.0)
@@ -211,7 +211,7 @@ def _state_document(
 
 
 def _along_document(thermal: ThermalCamera, along: Along) -> tuple[dict[str, Any], list[str]]:
-    from thermocald.photogrammetry.camera_model import IOP_NAMES
+    from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 
     sds = along.sd
     header = ["time", "temperature", *IOP_NAMES, *(f"sd_{n}" for n in IOP_NAMES), "extrapolated_K"]
@@ -235,7 +235,7 @@ def _along_document(thermal: ThermalCamera, along: Along) -> tuple[dict[str, Any
 def _advice(
     thermal: ThermalCamera, programme: Path, camera: Path | None, distance: float, wanted: float
 ) -> tuple[dict[str, Any], list[str]]:
-    from thermocald.analysis.warm_up import warm_up
+    from thermocald.analysis.thermal.warm_up import warm_up
     from thermocald.simulation.demonstration import demonstration_field
     from thermocald.simulation.device import CameraDevice, default_heat, read_camera_device
     from thermocald.simulation.observations import Simulation

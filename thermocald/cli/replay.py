@@ -19,9 +19,9 @@ from thermocald.cli.options import (
 from thermocald.errors import DataError, UsageError
 
 if TYPE_CHECKING:
-    from thermocald.analysis.drift import Course
-    from thermocald.analysis.series_table import SeriesTable
-    from thermocald.photogrammetry.adjustment import AdjustmentSettings
+    from thermocald.analysis.series.drift import Course
+    from thermocald.analysis.series.table import SeriesTable
+    from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 
 __all__ = ["register"]
 
@@ -46,14 +46,14 @@ def replay(
 
     Example: thermocald replay rpi-heating-M1 --store thermocald.db
     """
-    from thermocald.analysis.drift import settled
-    from thermocald.store.recording import open_recording
+    from thermocald.analysis.series.drift import settled
+    from thermocald.store.recording.reader import open_recording
 
     _check_exterior(exterior)
     settings = adjustment_settings(free)
     opened = open_recording(_existing(recording))
     if store is not None:
-        from thermocald.analysis.stored_series import replay_into
+        from thermocald.analysis.series.stored import replay_into
 
         with progress(len(opened.columns), "calibrating") as advance:
             table = replay_into(store, opened, settings, exterior, advance)
@@ -85,8 +85,8 @@ def export(
 
     Example: thermocald export rpi-heating-M1 --format csv > M1.csv
     """
-    from thermocald.analysis.drift import settled
-    from thermocald.analysis.series_table import CSV_COLUMNS, csv_text
+    from thermocald.analysis.series.drift import settled
+    from thermocald.analysis.series.table import CSV_COLUMNS, csv_text
 
     _check_exterior(exterior)
     if format_ not in ("csv", "json"):
@@ -95,7 +95,7 @@ def export(
     if _existing(source).is_dir():
         table = _recording_table(source, settings, exterior)
     else:
-        from thermocald.analysis.stored_series import stored_table
+        from thermocald.analysis.series.stored import stored_table
 
         table = stored_table(source, series, settings, exterior)
     table, _ = settled(table)
@@ -129,13 +129,13 @@ def _check_exterior(exterior: str) -> None:
 def _recording_table(path: Path, settings: AdjustmentSettings, exterior: str) -> SeriesTable:
     """Calibrate a recording in memory: its epochs one by one, then the series."""
     from thermocald.acquisition.calibrator import Calibrator
-    from thermocald.analysis.series_table import (
+    from thermocald.analysis.series.table import (
         calibrate_epochs,
         frame_temperatures,
         settings_for_series,
         table_of_series,
     )
-    from thermocald.store.recording import open_recording
+    from thermocald.store.recording.reader import open_recording
 
     recording = open_recording(path)
     columns, camera = recording.columns, recording.camera

@@ -112,7 +112,7 @@ def mock_config() -> Config:
 
 def recording_config(path: Path, *, loop: bool = False) -> Config:
     """A recording as camera and thermometer."""
-    from thermocald.store.head import read_head
+    from thermocald.store.recording.head import read_head
 
     head = read_head(path)
     sensor = head.camera.sensor

@@ -236,8 +236,8 @@ def _take_in_the_daemon(folder: Path, session: Session, wait: bool) -> None:
 
 
 def _finish(config: Config, session: Session, path: Path, report: bool) -> None:
-    from thermocald.store.archive import archive_series
-    from thermocald.store.database import Store
+    from thermocald.store.database.archive import archive_series
+    from thermocald.store.database.store import Store
 
     with Store.open(config.store.path) as store:
         found = store.find_series(session.camera, session.series)
@@ -246,9 +246,9 @@ def _finish(config: Config, session: Session, path: Path, report: bool) -> None:
     say(f"\nrecording: {path} ({int(np.sum(status == 'ok'))} of {len(status)} epochs calibrated)")
     if not report:
         return
-    from thermocald.analysis.study import study
-    from thermocald.analysis.study_input import load_series
-    from thermocald.output.study_report import render_report, write_report
+    from thermocald.analysis.study.input import load_series
+    from thermocald.analysis.study.study import study
+    from thermocald.output.study.report import render_report, write_report
 
     target = path.with_suffix(".html")
     title = f"{session.camera}, series {session.series}"

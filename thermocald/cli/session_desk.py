@@ -85,7 +85,7 @@ def _use_programme(outputs: list[dict[str, Any]], steps: list[dict[str, Any]]) -
 
 
 def _stored(config: Config, session: Session) -> int:
-    from thermocald.store.database import Store
+    from thermocald.store.database.store import Store
 
     if not config.store.path.exists():
         return 0

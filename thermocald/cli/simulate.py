@@ -11,7 +11,7 @@ import typer
 from thermocald.errors import UsageError
 
 if TYPE_CHECKING:
-    from thermocald.photogrammetry.testfield import TestField
+    from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.simulation.observations import Simulation
 
 __all__ = ["register"]

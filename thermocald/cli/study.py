@@ -12,9 +12,9 @@ from thermocald.cli.options import DEFAULT_FREE_TEXT, FreeOption, free_names
 from thermocald.errors import DataError, UsageError
 
 if TYPE_CHECKING:
-    from thermocald.analysis.measured import MeasuredSeries
-    from thermocald.analysis.reference import Comparison
-    from thermocald.analysis.study import Study, StudySettings
+    from thermocald.analysis.study.measured import MeasuredSeries
+    from thermocald.analysis.study.reference import Comparison
+    from thermocald.analysis.study.study import Study, StudySettings
 
 __all__ = ["register"]
 
@@ -90,7 +90,7 @@ def study(
 
     Example: thermocald study M1 M2 --report study.html --json study.json
     """
-    from thermocald.analysis.study import StudySettings
+    from thermocald.analysis.study.study import StudySettings
 
     if reference == bool(inputs):
         raise UsageError(
@@ -129,8 +129,8 @@ def study(
 def _study(
     inputs: list[str], settings: StudySettings, exterior: str, free: tuple[str, ...]
 ) -> Study:
-    from thermocald.analysis.study import study as run
-    from thermocald.analysis.study_input import load_series
+    from thermocald.analysis.study.input import load_series
+    from thermocald.analysis.study.study import study as run
 
     series: list[MeasuredSeries] = []
     for text in inputs:
@@ -146,7 +146,7 @@ def _epochs(path: Path) -> int | None:
     """How many epochs a recording has; None for a store, which is read at once."""
     if not path.is_dir():
         return None
-    from thermocald.store.recording import open_recording
+    from thermocald.store.recording.reader import open_recording
 
     return len(open_recording(path).columns)
 
@@ -164,8 +164,8 @@ def _labelled(text: str) -> tuple[str | None, Path]:
 
 
 def _reference(settings: StudySettings) -> tuple[Study, list[Comparison]]:
-    from thermocald.analysis.reference import QUOTED, SERIES, compare, reference_studies
-    from thermocald.analysis.study import Study
+    from thermocald.analysis.study.reference import QUOTED, SERIES, compare, reference_studies
+    from thermocald.analysis.study.study import Study
 
     with progress(len(QUOTED) * len(SERIES), "simulating, adjusting, studying") as advance:
         cameras = reference_studies(settings, advance=advance)
@@ -180,7 +180,7 @@ def _write(
     figures: Path | None,
     title: str,
 ) -> None:
-    from thermocald.output.study_document import study_document
+    from thermocald.output.study.document import study_document
 
     if json is not None:
         document = study_document(result)
@@ -189,12 +189,12 @@ def _write(
         write_json(document, json)
     written = []
     if report is not None:
-        from thermocald.output.study_report import render_report, write_report
+        from thermocald.output.study.report import render_report, write_report
 
         write_report(report, render_report(result, title))
         written.append(str(report))
     if figures is not None:
-        from thermocald.output.study_report import save_figures
+        from thermocald.output.study.report import save_figures
 
         written.append(f"{len(save_figures(result, figures))} figures in {figures}")
     if json == "-":
@@ -230,7 +230,7 @@ def _print_comparisons(comparisons: list[Comparison]) -> None:
 
 
 def _print_summary(result: Study) -> None:
-    from thermocald.output.study_summary import summary
+    from thermocald.output.study.summary import summary
 
     for camera in result.cameras:
         typer.echo(camera.label)

@@ -15,9 +15,9 @@ from thermocald.cli.testfield_options import (
 )
 
 if TYPE_CHECKING:
-    from thermocald.analysis.field_check import FieldCheck
-    from thermocald.photogrammetry.camera_model import CameraModel
-    from thermocald.photogrammetry.testfield import TestField
+    from thermocald.analysis.field.check import FieldCheck
+    from thermocald.photogrammetry.camera.camera_model import CameraModel
+    from thermocald.photogrammetry.field.testfield import TestField
 
 __all__ = ["check"]
 
@@ -53,9 +53,9 @@ def check(
     """
     import numpy as np
 
-    from thermocald.analysis.field_check import check_field, station_at, usual_station
+    from thermocald.analysis.field.check import check_field, station_at, usual_station
     from thermocald.cli.common import write_json
-    from thermocald.store.testfield_file import read_testfield
+    from thermocald.store.recording.testfield_file import read_testfield
 
     targets = read_testfield(field)
     model = _camera(camera, pixel_pitch)
@@ -76,7 +76,11 @@ def check(
 
 def _camera(file: Path | None, pixel_pitch: float | None) -> CameraModel:
     from thermocald.output import camera_files
-    from thermocald.photogrammetry.camera_model import CameraModel, InteriorOrientation, Sensor
+    from thermocald.photogrammetry.camera.camera_model import (
+        CameraModel,
+        InteriorOrientation,
+        Sensor,
+    )
 
     if file is not None:
         return camera_files.read(file, pixel_pitch=pixel_pitch).model
@@ -88,7 +92,7 @@ def _camera(file: Path | None, pixel_pitch: float | None) -> CameraModel:
 def _check_document(
     result: FieldCheck, field: TestField, model: CameraModel, sigma: float
 ) -> dict[str, Any]:
-    from thermocald.analysis.field_check import FREE
+    from thermocald.analysis.field.check import FREE
 
     def finite(value: float) -> float | None:
         return float(value) if value < 1e300 else None

@@ -10,7 +10,7 @@ import typer
 from thermocald.cli.testfield_options import Json
 
 if TYPE_CHECKING:
-    from thermocald.output.testfield_print import Printed
+    from thermocald.output.testfield.print import Printed
 
 __all__ = ["print_"]
 
@@ -56,8 +56,8 @@ def print_(
     Example: thermocald testfield print --paper A3 --corner --out field
     """
     from thermocald.cli.common import write_json
-    from thermocald.output.testfield_layout import Design, paper_size
-    from thermocald.output.testfield_print import default_diameter, print_testfield
+    from thermocald.output.testfield.layout import Design, paper_size
+    from thermocald.output.testfield.print import default_diameter, print_testfield
 
     page = paper_size(paper, landscape=landscape)
     design = Design(

@@ -16,8 +16,8 @@ from thermocald.cli.testfield_options import (
 from thermocald.errors import UsageError
 
 if TYPE_CHECKING:
-    from thermocald.photogrammetry.network import Distance
-    from thermocald.photogrammetry.survey import Survey
+    from thermocald.photogrammetry.network.adjustment import Distance
+    from thermocald.photogrammetry.survey.survey import Survey
 
 __all__ = ["survey"]
 
@@ -65,9 +65,9 @@ def survey(
     """
     from thermocald.cli.common import write_json
     from thermocald.output import camera_files
-    from thermocald.photogrammetry.camera_model import IOP_NAMES
-    from thermocald.photogrammetry.survey import survey as run
-    from thermocald.store.testfield_file import read_testfield, write_testfield
+    from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
+    from thermocald.photogrammetry.survey.survey import survey as run
+    from thermocald.store.recording.testfield_file import read_testfield, write_testfield
 
     measured = _distances(scale, scale_sd, distances)
     pictures = [_picture(path) for path in _photos(photos)]
@@ -120,7 +120,7 @@ def _photos(paths: list[Path]) -> list[Path]:
 def _picture(path: Path) -> Any:
     """A picture that is read when it is needed, as the sensor saw it."""
     from thermocald.errors import ImageError
-    from thermocald.photogrammetry.survey import Picture
+    from thermocald.photogrammetry.survey.survey import Picture
 
     def load() -> Any:
         import cv2
@@ -143,7 +143,7 @@ def _picture(path: Path) -> Any:
 def _distances(
     scale: tuple[str, str, float] | None, sigma: float, file: Path | None
 ) -> list[Distance]:
-    from thermocald.photogrammetry.network import Distance
+    from thermocald.photogrammetry.network.adjustment import Distance
 
     found = [] if scale is None else [Distance(scale[0], scale[1], scale[2], sigma)]
     if file is not None:
@@ -159,7 +159,7 @@ def _distances(
 def _read_distances(path: Path) -> list[Distance]:
     import csv
 
-    from thermocald.photogrammetry.network import Distance
+    from thermocald.photogrammetry.network.adjustment import Distance
 
     try:
         with path.open(encoding="utf-8", newline="") as stream:
@@ -179,7 +179,7 @@ def _read_distances(path: Path) -> list[Distance]:
 
 
 def _survey_document(result: Survey, out: Path) -> dict[str, Any]:
-    from thermocald.photogrammetry.network_checks import advice
+    from thermocald.photogrammetry.network.checks import advice
 
     n = result.network
     targets = []

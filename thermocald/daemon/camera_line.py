@@ -23,7 +23,7 @@ from thermocald.acquisition.live_pipeline import LivePipeline
 from thermocald.daemon.epoch_keeper import EpochKeeper
 from thermocald.daemon.plan import common_unknowns
 from thermocald.errors import ConfigurationError
-from thermocald.store.row import Event
+from thermocald.store.database.row import Event
 
 if TYPE_CHECKING:
     from thermocald.acquisition.calibrator import CalibratedEpoch
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from thermocald.daemon.plan import CameraPlan
     from thermocald.daemon.station import Station
     from thermocald.hal import Frame
-    from thermocald.photogrammetry.testfield import Observations
+    from thermocald.photogrammetry.field.testfield import Observations
 
 __all__ = ["CameraLine", "SeriesRun", "link_status"]
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 from thermocald.daemon.plan import check_series, series_head
 from thermocald.daemon.store_guard import Row
 from thermocald.errors import StoreError
-from thermocald.photogrammetry.camera_model import PARAMETER_NAMES
-from thermocald.store.row import NOT_CALIBRATED, EpochResult, Event
+from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
+from thermocald.store.database.row import NOT_CALIBRATED, EpochResult, Event
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from thermocald.daemon.plan import CameraPlan
     from thermocald.daemon.store_guard import StoreGuard
     from thermocald.epoch import Epoch
-    from thermocald.photogrammetry.testfield import Observations
-    from thermocald.store.row import StoredSeries
+    from thermocald.photogrammetry.field.testfield import Observations
+    from thermocald.store.database.row import StoredSeries
 
 __all__ = ["EpochKeeper", "result_row"]
 

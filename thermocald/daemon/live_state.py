@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from thermocald.acquisition.calibrator import CalibratedEpoch
     from thermocald.hal import Frame
-    from thermocald.photogrammetry.testfield import TestField
+    from thermocald.photogrammetry.field.testfield import TestField
 
 __all__ = ["LiveState", "find_state", "plain", "read_state"]
 
@@ -97,7 +97,7 @@ def _beside(store: Path) -> Path:
 def _preview(frame: Frame) -> bytes | None:
     import cv2
 
-    from thermocald.photogrammetry.image_file import decode_grey
+    from thermocald.photogrammetry.targets.image_file import decode_grey
 
     try:
         image = frame.image if frame.image is not None else decode_grey(frame.encoded or b"")

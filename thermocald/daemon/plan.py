@@ -11,12 +11,12 @@ from thermocald.acquisition.calibrator import Calibrator
 from thermocald.acquisition.common_unknowns import CommonUnknowns
 from thermocald.errors import ConfigurationError
 from thermocald.hal import open_device
-from thermocald.photogrammetry.adjustment import AdjustmentSettings
-from thermocald.photogrammetry.camera_model import InteriorOrientation, Sensor
-from thermocald.photogrammetry.geometry import GeometryBounds
-from thermocald.photogrammetry.testfield import TestField
-from thermocald.store.head import CameraSpec, Channel, Head
-from thermocald.store.recording import read_testfield
+from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
+from thermocald.photogrammetry.epoch.geometry import GeometryBounds
+from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.store.recording.head import CameraSpec, Channel, Head
+from thermocald.store.recording.reader import read_testfield
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

@@ -34,7 +34,7 @@ from thermocald.daemon.station import Station
 from thermocald.daemon.store_guard import StoreGuard
 from thermocald.errors import DataError, ThermocaldError
 from thermocald.hal import option_names
-from thermocald.store.row import Event
+from thermocald.store.database.row import Event
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from thermocald.config import Name  # noqa: TC001 - pydantic reads it at run time
 from thermocald.errors import ConfigurationError, DataError, ThermocaldError, UsageError
-from thermocald.store.row import Event
+from thermocald.store.database.row import Event
 
 if TYPE_CHECKING:
     from thermocald.daemon.camera_line import CameraLine

@@ -23,7 +23,7 @@ from thermocald.daemon.output_loop import OutputLoop
 from thermocald.daemon.plan import plan_cameras
 from thermocald.errors import ConfigurationError
 from thermocald.hal import open_device, option_names
-from thermocald.store.row import Event, LoggedReading
+from thermocald.store.database.row import Event, LoggedReading
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from thermocald.daemon.plan import CameraPlan
     from thermocald.daemon.store_guard import StoreGuard
     from thermocald.hal import Thermometer
-    from thermocald.store.row import StoredSeries
+    from thermocald.store.database.row import StoredSeries
 
 __all__ = ["Station"]
 
@@ -214,7 +214,7 @@ class Station:
         """The online estimate of a camera; None if it is only acquired."""
         if plan.sensor is None or plan.testfield is None:
             return None
-        from thermocald.analysis.online_observer import OnlineObserver
+        from thermocald.analysis.online.observer import OnlineObserver
 
         def tell(kind: str, text: str, utc: float, epoch: int) -> None:
             series: StoredSeries | None = keeper.series

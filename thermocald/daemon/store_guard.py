@@ -14,15 +14,15 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from thermocald.errors import StoreError, StoreFullError
-from thermocald.store.database import Store
-from thermocald.store.row import Event
+from thermocald.store.database.row import Event
+from thermocald.store.database.store import Store
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
     from thermocald.epoch import Epoch
-    from thermocald.store.row import EpochResult, LoggedReading, StoredSeries
+    from thermocald.store.database.row import EpochResult, LoggedReading, StoredSeries
 
 __all__ = ["Row", "StoreGuard"]
 

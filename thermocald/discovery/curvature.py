@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.camera_model import project
+from thermocald.photogrammetry.camera.camera_model import project
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

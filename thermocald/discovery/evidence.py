@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.camera_model import PARAMETER_NAMES
+from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
     from thermocald.discovery.thermometer import Channel
-    from thermocald.photogrammetry.camera_model import Sensor
-    from thermocald.photogrammetry.normals import ObservationGrid, Partials
-    from thermocald.photogrammetry.testfield import TestField
+    from thermocald.photogrammetry.camera.camera_model import Sensor
+    from thermocald.photogrammetry.field.testfield import TestField
+    from thermocald.photogrammetry.series.normals import ObservationGrid, Partials
     from thermocald.simulation.history import History
 
     Array = NDArray[np.float64]

@@ -10,7 +10,7 @@ import numpy as np
 from thermocald.discovery.estimates import model_values
 from thermocald.discovery.evidence import COLUMNS
 from thermocald.discovery.hypothesis import BASE
-from thermocald.photogrammetry.camera_model import (
+from thermocald.photogrammetry.camera.camera_model import (
     EOP_NAMES,
     IOP_NAMES,
     PARAMETER_NAMES,

@@ -122,7 +122,7 @@ def set_ups(
 
     A recording may stand for the set-up: then its own epochs and noise are used, once.
     """
-    from thermocald.store.recording import read_recording
+    from thermocald.store.recording.reader import read_recording
 
     if recording is not None:
         return [SetUp(series_input(read_recording(recording)))]
@@ -138,7 +138,7 @@ def set_ups(
 
 
 def _recorded(simulation: Simulation) -> SeriesInput:
-    from thermocald.store.recording import read_recording
+    from thermocald.store.recording.reader import read_recording
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "plan"

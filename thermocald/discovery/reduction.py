@@ -23,17 +23,17 @@ from thermocald.discovery.requirements import (
 )
 from thermocald.discovery.thermometer import Channel, instruments
 from thermocald.errors import DataError
-from thermocald.photogrammetry.adjustment import AdjustmentSettings
-from thermocald.photogrammetry.camera_model import IOP_NAMES
-from thermocald.photogrammetry.cold_start import cold_start
-from thermocald.photogrammetry.geometry import GeometryBounds
-from thermocald.photogrammetry.normals import (
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
+from thermocald.photogrammetry.epoch.cold_start import cold_start
+from thermocald.photogrammetry.epoch.geometry import GeometryBounds
+from thermocald.photogrammetry.field.testfield import Observations
+from thermocald.photogrammetry.series.normals import (
     linearise,
     normal_matrices,
     right_hand_sides,
     sums_of_squares,
 )
-from thermocald.photogrammetry.testfield import Observations
 from thermocald.simulation.history import History
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from thermocald.photogrammetry.normals import Partials
+    from thermocald.photogrammetry.series.normals import Partials
 
     Array = NDArray[np.float64]
 

@@ -6,17 +6,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.series_reduction import measured_epochs
+from thermocald.analysis.thermal.reduction import measured_epochs
 from thermocald.discovery.evidence import Evidence, SeriesInput
 from thermocald.discovery.reduction import gather
 from thermocald.errors import DataError
-from thermocald.photogrammetry.normals import ObservationGrid
+from thermocald.photogrammetry.series.normals import ObservationGrid
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from thermocald.store.recording import Recording
+    from thermocald.store.recording.reader import Recording
 
 __all__ = ["gather_pair", "load_pair", "series_input"]
 
@@ -50,7 +50,7 @@ def series_input(
 
 def load_pair(first: Path, second: Path | None, say: Callable[[str], None]) -> list[SeriesInput]:
     """Read M1, and M2 where it is given; refuses an M2 of another camera or thermometer."""
-    from thermocald.store.recording import read_recording
+    from thermocald.store.recording.reader import read_recording
 
     out = []
     for path in (first, second):

@@ -9,13 +9,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
 
-from thermocald.photogrammetry.camera_model import InteriorOrientation, Sensor
+from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
 from thermocald.simulation.model import ThermalModel
 from thermocald.simulation.testfields import corner_field, corner_view
-from thermocald.store.recording import read_testfield
+from thermocald.store.recording.reader import read_testfield
 
 if TYPE_CHECKING:
-    from thermocald.photogrammetry.testfield import TestField
+    from thermocald.photogrammetry.field.testfield import TestField
 
 __all__ = ["FieldKind", "demonstration_field", "demonstration_model", "load_field"]
 

@@ -25,7 +25,7 @@ from __future__ import annotations
 from dataclasses import astuple, dataclass, field
 from typing import TYPE_CHECKING
 
-from thermocald.photogrammetry.camera_model import EOP_NAMES, ExteriorOrientation, Sensor
+from thermocald.photogrammetry.camera.camera_model import EOP_NAMES, ExteriorOrientation, Sensor
 from thermocald.simulation.effects.base import PARAMETER_UNITS
 from thermocald.simulation.heat import HeatNetwork, Link, read_network
 from thermocald.simulation.model_file import read_sensor

@@ -20,11 +20,11 @@ import numpy as np
 
 from thermocald.epoch import Epoch
 from thermocald.errors import ConfigurationError, GeometryError
-from thermocald.photogrammetry.camera_model import ExteriorOrientation, project
-from thermocald.photogrammetry.testfield import Observations, TestField
+from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation, project
+from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.simulation.history import History
 from thermocald.simulation.testfields import corner_view
-from thermocald.store.recording import CameraSpec, Channel, Head, RecordingWriter
+from thermocald.store.recording.reader import CameraSpec, Channel, Head, RecordingWriter
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

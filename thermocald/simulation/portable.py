@@ -15,7 +15,7 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-    from thermocald.photogrammetry.camera_model import Sensor
+    from thermocald.photogrammetry.camera.camera_model import Sensor
 
     Array = NDArray[np.float64]
 

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.errors import ConfigurationError
-from thermocald.photogrammetry.camera_model import InteriorOrientation, Sensor
+from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
 from thermocald.simulation.course import Course
 from thermocald.simulation.device import CameraDevice, Measuring
 from thermocald.simulation.heat import HeatNetwork, Link
@@ -39,7 +39,7 @@ from thermocald.simulation.thermometer import SimulatedThermometer
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from thermocald.photogrammetry.testfield import TestField
+    from thermocald.photogrammetry.field.testfield import TestField
 
 __all__ = ["PRESETS", "Preset", "preset_names", "preset_simulation"]
 

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from thermocald.photogrammetry.camera_model import Sensor
-    from thermocald.photogrammetry.testfield import TestField
+    from thermocald.photogrammetry.camera.camera_model import Sensor
+    from thermocald.photogrammetry.field.testfield import TestField
 
     Array = NDArray[np.float64]
 

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from thermocald.photogrammetry import ring_code
-from thermocald.photogrammetry.markers import is_marker, parse_marker
+from thermocald.photogrammetry.targets import ring_code
+from thermocald.photogrammetry.targets.markers import is_marker, parse_marker
 from thermocald.simulation.portable import sin_cos
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from thermocald.photogrammetry.testfield import TestField
+    from thermocald.photogrammetry.field.testfield import TestField
 
     Array = NDArray[np.float64]
     Integers = NDArray[np.int64]

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from thermocald.errors import ConfigurationError
-from thermocald.photogrammetry import ring_code
-from thermocald.photogrammetry.camera_model import ExteriorOrientation
-from thermocald.photogrammetry.testfield import TestField
+from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation
+from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.photogrammetry.targets import ring_code
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

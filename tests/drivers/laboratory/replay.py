@@ -9,10 +9,10 @@ import numpy as np
 from tests.drivers.laboratory.bench import Bench
 from thermocald.epoch import Epoch
 from thermocald.hal import VirtualClock
-from thermocald.photogrammetry.camera_model import Sensor
-from thermocald.photogrammetry.testfield import TestField
-from thermocald.store.head import CameraSpec, Channel, Head
-from thermocald.store.recording import RecordingWriter
+from thermocald.photogrammetry.camera.camera_model import Sensor
+from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.store.recording.head import CameraSpec, Channel, Head
+from thermocald.store.recording.reader import RecordingWriter
 
 
 @contextmanager

@@ -32,7 +32,7 @@ def plain(value):
 
 
 def main():
-    from thermocald.store.database import Store
+    from thermocald.store.database.store import Store
 
     path = Path(sys.argv[1]) if len(sys.argv) > 1 else HOME / "store/thermocald.db"
     found = {"series": {}, "events": []}

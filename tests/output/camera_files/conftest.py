@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermocald.photogrammetry.camera_model import CameraModel, InteriorOrientation, Sensor
+from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 
 _SENSOR = Sensor(3280, 2464, 0.00112)
 _PLAIN = InteriorOrientation(
@@ -51,7 +51,7 @@ def view():
 
 def pixels_of(model, view):
     """The truth: our own projection of points in OpenCV's axes."""
-    from thermocald.photogrammetry.camera_model import ExteriorOrientation
+    from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation
 
     pose = ExteriorOrientation(0, 0, 0, 0, 0, 0)
     return model.project(pose, view * [1, -1, -1])

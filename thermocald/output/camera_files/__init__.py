@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from thermocald.photogrammetry.camera_model import CameraModel
+    from thermocald.photogrammetry.camera.camera_model import CameraModel
 
     Array = NDArray[np.float64]
 

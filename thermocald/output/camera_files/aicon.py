@@ -31,14 +31,18 @@ from thermocald.output.camera_files.camera_record import (
     import_family,
     number,
 )
-from thermocald.photogrammetry.conversions import to_family
-from thermocald.photogrammetry.model_families import MeasuredPoint
+from thermocald.photogrammetry.camera.conversions import to_family
+from thermocald.photogrammetry.camera.model_families import MeasuredPoint
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from thermocald.photogrammetry.camera_model import CameraModel, InteriorOrientation, Sensor
-    from thermocald.photogrammetry.conversions import Family
+    from thermocald.photogrammetry.camera.camera_model import (
+        CameraModel,
+        InteriorOrientation,
+        Sensor,
+    )
+    from thermocald.photogrammetry.camera.conversions import Family
 
     Array = NDArray[np.float64]
 

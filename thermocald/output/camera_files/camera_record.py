@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.errors import ConfigurationError
-from thermocald.photogrammetry.camera_model import CameraModel, InteriorOrientation, Sensor
-from thermocald.photogrammetry.conversions import Family, from_family
+from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
+from thermocald.photogrammetry.camera.conversions import Family, from_family
 
 if TYPE_CHECKING:
     from collections.abc import Callable

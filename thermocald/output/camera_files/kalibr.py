@@ -14,8 +14,8 @@ from thermocald.output.camera_files.camera_record import (
     import_family,
     numbers,
 )
-from thermocald.photogrammetry.conversions import to_family
-from thermocald.photogrammetry.model_families import BrownOpenCV
+from thermocald.photogrammetry.camera.conversions import to_family
+from thermocald.photogrammetry.camera.model_families import BrownOpenCV
 
 __all__ = ["FORMAT"]
 

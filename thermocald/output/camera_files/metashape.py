@@ -20,8 +20,8 @@ from thermocald.output.camera_files.camera_record import (
     number,
     numbers,
 )
-from thermocald.photogrammetry.conversions import to_family
-from thermocald.photogrammetry.model_families import Metashape
+from thermocald.photogrammetry.camera.conversions import to_family
+from thermocald.photogrammetry.camera.model_families import Metashape
 
 __all__ = ["FORMAT"]
 

@@ -14,7 +14,7 @@ from thermocald.output.camera_files.camera_record import (
     number,
     numbers,
 )
-from thermocald.photogrammetry.camera_model import (
+from thermocald.photogrammetry.camera.camera_model import (
     IOP_NAMES,
     CameraModel,
     InteriorOrientation,

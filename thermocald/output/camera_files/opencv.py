@@ -22,8 +22,8 @@ from thermocald.output.camera_files.camera_record import (
     number,
     numbers,
 )
-from thermocald.photogrammetry.conversions import to_family
-from thermocald.photogrammetry.model_families import BrownOpenCV
+from thermocald.photogrammetry.camera.conversions import to_family
+from thermocald.photogrammetry.camera.model_families import BrownOpenCV
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

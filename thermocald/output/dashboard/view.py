@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.errors import DataError, StoreError
-from thermocald.photogrammetry.camera_model import PARAMETER_NAMES
-from thermocald.store.database import Store
+from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
+from thermocald.store.database.store import Store
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from thermocald.store.row import StoredSeries
+    from thermocald.store.database.row import StoredSeries
 
     Array = NDArray[np.float64]
 

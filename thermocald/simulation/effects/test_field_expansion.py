@@ -12,7 +12,7 @@ from thermocald.simulation.effects.base import Influence, Proportional
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from thermocald.photogrammetry.testfield import TestField
+    from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.simulation.history import History
 
 __all__ = ["TestFieldExpansion"]

@@ -1,0 +1,1 @@
+"""One camera at one time: calibrated, undistorted, corrected."""

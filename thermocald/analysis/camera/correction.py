@@ -1,0 +1,266 @@
+"""Correcting what was measured before: image points and images as one steady camera had seen them.
+
+A point that was measured at some time becomes the point that the camera would have measured at the
+model's reference temperature (or another): through its ray, with the interior orientation that the
+temperature log gives for that time. The error left over comes from the model's parameters, as far
+as they do not cancel between both temperatures, and from the thermometer.
+"""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.analysis.camera.undistortion import ideal_points
+from thermocald.errors import DataError
+from thermocald.photogrammetry.camera.camera_model import partials, project, rays
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from thermocald.analysis.thermal.thermal_camera import Along, ThermalCamera
+    from thermocald.photogrammetry.camera.camera_model import Sensor
+
+    Array = NDArray[np.float64]
+
+__all__ = [
+    "Corrected",
+    "ImageCorrection",
+    "TemperatureLog",
+    "correct_points",
+    "image_corrections",
+    "parse_time",
+    "read_rows",
+    "read_temperature_log",
+]
+
+_TIME_NAMES = ("time", "temperature_time", "frame_time", "timestamp")
+_OTHER_UNITS = ("fahrenheit", "degf", "°f", "_f", "kelvin", "degk", "_k")
+_NOT_TEMPERATURES = ("epoch", "frame")
+_BLOCK = 100_000
+_SAMPLE = 997  # points of an image that tell how much it is corrected
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TemperatureLog:
+    """times (R,) s UTC, ascending; channels {name: (R,) °C}, NaN where empty, the first is T."""
+
+    times: Array
+    channels: dict[str, Array]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Corrected:
+    """points (n, 2) px as they would have been; sds (n, 2) px of the correction; temperature (n,)
+    °C; extrapolated (n,) K outside what the model was fitted on.
+    """
+
+    points: Array
+    sds: Array
+    temperature: Array
+    extrapolated: Array
+
+
+def parse_time(text: str) -> float:
+    """Seconds since 1970 UTC, from a number or an ISO 8601 date (UTC where it names no zone)."""
+    try:
+        return float(text)
+    except ValueError:
+        moment = datetime.fromisoformat(text.strip())
+        return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+
+
+def read_temperature_log(path: Path, reference: str | None = None) -> TemperatureLog:
+    """Read a CSV of times and temperatures °C; an `epochs.csv` of a recording is one.
+
+    reference: the column that is T, by default the first. DataError names file, line and column;
+    other units than °C are refused where the column's name gives them away.
+    """
+    header, rows = _table(path)
+    time_column = next((n for n in _TIME_NAMES if n in header), None)
+    if time_column is None:
+        raise DataError(f"{path}: there is no time column; call it one of {', '.join(_TIME_NAMES)}")
+    names = [n for n in header if n not in (*_TIME_NAMES, *_NOT_TEMPERATURES)]
+    for name in names:
+        if name.lower().endswith(_OTHER_UNITS) or "fahrenheit" in name.lower():
+            raise DataError(f"{path}, column {name}: temperatures must be °C; convert them")
+    if reference is not None and reference not in names:
+        raise DataError(f"{path}: there is no column {reference!r}; there are: {', '.join(names)}")
+    if not names:
+        raise DataError(f"{path}: there is no temperature column")
+    ordered = [reference, *(n for n in names if n != reference)] if reference else names
+    times: list[float] = []
+    values: list[list[float]] = []
+    for line, row in rows:
+        if not row[time_column]:
+            continue
+        times.append(_number(path, line, time_column, row[time_column], parse_time))
+        if len(times) > 1 and times[-1] < times[-2]:
+            raise DataError(f"{path}, line {line}, column {time_column}: time runs backwards")
+        values.append(
+            [_number(path, line, n, row[n], float) if row[n] else np.nan for n in ordered]
+        )
+    if not times:
+        raise DataError(f"{path}: holds no rows")
+    columns = np.array(values)
+    return TemperatureLog(np.array(times), {n: columns[:, i] for i, n in enumerate(ordered)})
+
+
+def _table(path: Path) -> tuple[list[str], Iterator[tuple[int, dict[str, str]]]]:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as cause:
+        what = cause.strerror if isinstance(cause, OSError) else "is not UTF-8 text"
+        raise DataError(f"{path}: cannot be read: {what}") from cause
+    reader = csv.DictReader(text.splitlines())
+    header = [n.strip() for n in reader.fieldnames or ()]
+    reader.fieldnames = header
+
+    def rows() -> Iterator[tuple[int, dict[str, str]]]:
+        for row in reader:
+            if None in row or any(v is None for v in row.values()):
+                raise DataError(f"{path}, line {reader.line_num}: has not {len(header)} columns")
+            yield reader.line_num, {k: (v or "").strip() for k, v in row.items()}
+
+    return header, rows()
+
+
+def read_rows(path: Path, needed: tuple[str, ...]) -> tuple[list[str], list[dict[str, str]], Array]:
+    """A CSV with a time column and others: header, rows, numbers (n, len(needed)), time first."""
+    header, rows = _table(path)
+    missing = [n for n in needed if n not in header]
+    if missing:
+        raise DataError(f"{path}: there is no column {missing[0]!r}; there are {', '.join(header)}")
+    kept, numbers = [], []
+    for line, row in rows:
+        kept.append(row)
+        numbers.append(
+            [_number(path, line, n, row[n], parse_time if n == "time" else float) for n in needed]
+        )
+    if not kept:
+        raise DataError(f"{path}: holds no rows")
+    return header, kept, np.array(numbers)
+
+
+def _number(path: Path, line: int, column: str, text: str, parse: Any) -> float:
+    try:
+        value = float(parse(text))
+    except ValueError:
+        value = float("nan")
+    if not np.isfinite(value):
+        raise DataError(f"{path}, line {line}, column {column}: {text!r} is no number")
+    return value
+
+
+def correct_points(
+    camera: ThermalCamera,
+    log: TemperatureLog,
+    times: Array,
+    points: Array,
+    to: float | None = None,
+    temperature_sd: float = 0.0,
+    extrapolate: bool = False,
+) -> Corrected:
+    """Image points (n, 2) px measured at times (n,) s → as at temperature `to` (default T₀).
+
+    temperature_sd K: of a reading of the log. DataError for times outside the log.
+    """
+    target = camera.model.T0 if to is None else to
+    _inside(log, times)
+    unique, place = np.unique(times, return_inverse=True)
+    along = camera.along(
+        log.times, dict(log.channels), unique, extrapolate, relative_to=target,
+        temperature_sd=temperature_sd,
+    )  # fmt: skip
+    steady = camera.at(target, extrapolate=True).values
+    sensor = camera.model.sensor
+    corrected, sds = np.empty_like(points), np.empty_like(points)
+    for first in range(0, len(points), _BLOCK):
+        rows = slice(first, first + _BLOCK)
+        state = along.values[place[rows]]
+        r = rays(sensor, state, points[rows, None, :])
+        direction = r / -r[..., 2:]
+        corrected[rows] = project(sensor, steady, np.zeros(6), direction[:, 0])
+        _, J, _ = partials(sensor, steady, np.zeros(6), direction[:, 0])
+        J = J[:, :, :10]
+        covariance = along.covariance[place[rows]]
+        sds[rows] = np.sqrt(np.einsum("ncp,npq,ncq->nc", J, covariance, J, optimize=True))
+    return Corrected(corrected, sds, along.temperatures[place], along.extrapolated[place])
+
+
+def _inside(log: TemperatureLog, times: Array) -> None:
+    begin, end = float(log.times[0]), float(log.times[-1])
+    step = float(np.median(np.diff(log.times))) if len(log.times) > 1 else 0.0
+    outside = (times < begin - step) | (times > end + step)
+    if outside.any():
+        raise DataError(
+            f"{int(outside.sum())} of {len(times)} rows were measured outside the temperature log "
+            f"({begin:.0f} to {end:.0f} s), the first at {times[outside][0]:.0f} s"
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageCorrection:
+    """For one image: maps x, y (H, W) of `cv2.remap` that turn it into one at the wanted
+    temperature; temperature °C; largest and rms shift px; left_over: rms sd px of the correction,
+    both over a grid of points; extrapolated K.
+    """
+
+    map_x: NDArray[np.float32]
+    map_y: NDArray[np.float32]
+    temperature: float
+    rms_px: float
+    largest_px: float
+    left_over_px: float
+    extrapolated: float
+
+
+def image_corrections(
+    camera: ThermalCamera,
+    log: TemperatureLog,
+    times: Array,
+    to: float | None = None,
+    temperature_sd: float = 0.0,
+    extrapolate: bool = False,
+) -> Iterator[ImageCorrection]:
+    """One correction per time; arguments as those of `correct_points`, errors before the first."""
+    _inside(log, times)
+    target = camera.model.T0 if to is None else to
+    steady = camera.at(target, extrapolate=True).values
+    along = camera.along(
+        log.times, dict(log.channels), times, extrapolate, relative_to=target,
+        temperature_sd=temperature_sd,
+    )  # fmt: skip
+    return _maps(camera.model.sensor, steady, along)
+
+
+def _maps(sensor: Sensor, steady: Array, along: Along) -> Iterator[ImageCorrection]:
+    v, u = np.mgrid[0 : sensor.height, 0 : sensor.width]
+    grid = np.stack([u.ravel(), v.ravel()], axis=1).astype(float)
+    ideal = ideal_points(sensor, steady, grid)
+    direction = np.concatenate([ideal, np.full((len(ideal), 1), -1.0)], axis=1)
+    sample = np.linspace(0, len(grid) - 1, _SAMPLE).astype(int)
+    _, J, _ = partials(sensor, steady, np.zeros(6), direction[sample])
+    J = J[:, :, :10]
+    shape = (sensor.height, sensor.width)
+    for i, values in enumerate(along.values):
+        seen = project(sensor, values, np.zeros(6), direction)
+        shift = np.linalg.norm(seen[sample] - grid[sample], axis=1)
+        variance = np.einsum("ncp,pq,ncq->nc", J, along.covariance[i], J, optimize=True)
+        maps = seen.astype(np.float32)
+        yield ImageCorrection(
+            maps[:, 0].reshape(shape),
+            maps[:, 1].reshape(shape),
+            float(along.temperatures[i]),
+            float(np.sqrt(np.mean(shift**2))),
+            float(shift.max()),
+            float(np.sqrt(np.mean(variance))),
+            float(along.extrapolated[i]),
+        )

@@ -1,0 +1,140 @@
+"""Undistorting many image points of one camera at once.
+
+`camera_model.rays` is exact for any point and any number of cameras. For a million points of one
+camera this is several times faster and as exact: a polynomial turns the radial distortion round
+well enough that two Newton steps are left, in blocks that stay in the processor's cache. Blocks in
+which that does not converge to 1e-9 px are given to `rays`, which says so where no answer exists.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.photogrammetry.camera.camera_model import rays
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
+
+    Array = NDArray[np.float64]
+
+__all__ = ["ideal_points", "undistorted_points"]
+
+_BLOCK = 8192
+_DEGREE = 6
+_STEP_PX = 3e-6  # a second Newton step below this leaves less than 1e-9 px
+
+
+def ideal_points(sensor: Sensor, iop: ArrayLike, image_points: ArrayLike) -> Array:
+    """Image points (n, 2) px → x̄/c, ȳ/c (n, 2): tangents of the angles to the optical axis.
+
+    Raises GeometryError for points beyond the radius at which the distortion folds back.
+    """
+    points = np.asarray(image_points, dtype=float)
+    out = np.empty_like(points)
+    for part, x, y in _blocks(sensor, np.asarray(iop, dtype=float), points):
+        out[part, 0], out[part, 1] = x, y
+    return out
+
+
+def undistorted_points(
+    sensor: Sensor, iop: ArrayLike, image_points: ArrayLike, target: InteriorOrientation
+) -> Array:
+    """Image points (n, 2) px → as a camera without distortion saw them, with c, x0, y0 of target.
+
+    Raises GeometryError as `ideal_points`.
+    """
+    points = np.asarray(image_points, dtype=float)
+    (cx, cy), p = sensor.centre, sensor.pixel_pitch
+    cx, cy, scale = cx + target.x0 / p, cy - target.y0 / p, target.c / p
+    out = np.empty_like(points)
+    for part, x, y in _blocks(sensor, np.asarray(iop, dtype=float), points):
+        x *= scale
+        y *= -scale
+        out[part, 0], out[part, 1] = x + cx, y + cy
+    return out
+
+
+def _blocks(sensor: Sensor, i: Array, points: Array) -> Iterator[tuple[slice, Array, Array]]:
+    """Blocks of points, and their x̄/c and ȳ/c."""
+    inverse = _inverse_radial(sensor, i)
+    for first in range(0, len(points), _BLOCK):
+        part = slice(first, first + _BLOCK)
+        found = None if inverse is None else _newton(sensor, i, points[part], inverse)
+        if found is None:
+            r = rays(sensor, i, points[part])
+            found = r[:, 0] / -r[:, 2], r[:, 1] / -r[:, 2]
+        yield part, *found
+
+
+def _inverse_radial(sensor: Sensor, i: Array) -> Array | None:
+    """Coefficients of r̄ = r (1 + a₁ r² + …), highest first; None where the distortion folds."""
+    corner = np.hypot(sensor.width, sensor.height) * sensor.pixel_pitch / 2
+    r = np.linspace(0.0, 1.1 * corner, 80)[1:]
+    r2 = r * r
+    slope = 1 + r2 * (3 * i[3] + r2 * (5 * i[4] + r2 * 7 * i[5]))
+    if np.any(slope <= 0.1):
+        return None
+    distorted = r * (1 + r2 * (i[3] + r2 * (i[4] + r2 * i[5])))
+    powers = (distorted[:, None] / corner) ** (2 * np.arange(1, _DEGREE + 1))
+    found = np.linalg.lstsq(powers, r / distorted - 1, rcond=None)[0]
+    scaled: Array = found / corner ** (2 * np.arange(1, _DEGREE + 1))
+    return scaled[::-1]
+
+
+def _newton(
+    sensor: Sensor, i: Array, points: Array, inverse: Array
+) -> tuple[Array, Array] | None:
+    c, x0, y0, A1, A2, A3, B1, B2, C1, C2 = (float(v) for v in i)
+    (cx, cy), p = sensor.centre, sensor.pixel_pitch
+    # contiguous, and about the principal point
+    xm, ym = points[:, 0] - (cx + x0 / p), (cy - y0 / p) - points[:, 1]
+    xm *= p
+    ym *= p
+    r2 = xm * xm + ym * ym
+    turn = np.zeros_like(r2)
+    for a in inverse:
+        turn += a
+        turn *= r2
+    turn += 1.0
+    x, y = xm * turn, ym * turn
+    x2, y2, xy = x * x, y * y, x * y
+    r2 = x2 + y2
+    radial = r2 * (A1 + r2 * (A2 + r2 * A3))
+    slope = 2 * (A1 + r2 * (2 * A2 + 3 * r2 * A3))
+    jxx = (1 + C1) + radial + slope * x2 + (6 * B1) * x + (2 * B2) * y
+    jyy = 1 + radial + slope * y2 + (6 * B2) * y + (2 * B1) * x
+    cross = slope * xy + (2 * B1) * y + (2 * B2) * x
+    jxy = cross + C2
+    determinant = 1.0 / (jxx * jyy - jxy * cross)
+    jxx *= determinant
+    jxy *= determinant
+    jyy *= determinant
+    cross *= determinant
+    size = np.inf
+    for step in range(3):
+        if step:
+            x2, y2, xy = x * x, y * y, x * y
+            r2 = x2 + y2
+            radial = r2 * (A1 + r2 * (A2 + r2 * A3))
+        rx = xm - x * ((1 + C1) + radial) - B1 * (r2 + 2 * x2) - (2 * B2) * xy - C2 * y
+        ry = ym - y * (1 + radial) - B2 * (r2 + 2 * y2) - (2 * B1) * xy
+        # the Jacobian stays that of the first step: it changes by less than the step itself
+        dx = jyy * rx - jxy * ry
+        dy = jxx * ry - cross * rx
+        x += dx
+        y += dy
+        if step:
+            size = max(float(np.abs(dx).max()), float(np.abs(dy).max()))
+            if size < _STEP_PX * sensor.pixel_pitch:
+                break
+    if not size < _STEP_PX * sensor.pixel_pitch:
+        return None
+    x /= c
+    y /= c
+    return x, y

@@ -1,0 +1,1 @@
+"""What a test field and a camera position can give."""

@@ -1,0 +1,154 @@
+"""What to add to a test field, or what to change; every proposal is computed before it is made."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.analysis.field.check import CELLS, MIN_SIZE_PX, FieldCheck, precision
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from thermocald.photogrammetry.camera.camera_model import CameraModel, ExteriorOrientation
+    from thermocald.photogrammetry.field.testfield import TestField
+
+    Array = NDArray[np.float64]
+
+__all__ = ["advise"]
+
+_WORTH = 0.85  # a proposal must bring a standard deviation below this share of what it is
+_RAISED = 0.25  # of the distance: how far in front of the field proposed targets stand
+_GOOD_SIZE_PX = 12.0
+_FEW = 40
+_FLAT = 0.02  # depth of a field over its distance below which it is a plane
+
+
+def advise(camera: CameraModel, field: TestField, check: FieldCheck, sigma_px: float) -> list[str]:
+    """Sentences, the most helpful first; none if nothing would help by a seventh."""
+    points, sigmas = field.points[check.visible], field.sigmas[check.visible]
+    typical = np.broadcast_to(np.median(sigmas, axis=0), (1, 3))
+    now = check.precision.epoch
+    proposals: list[tuple[float, str]] = []
+
+    def propose(added: Array, what: str) -> None:
+        both = np.concatenate([points, added])
+        spread = np.concatenate([sigmas, np.repeat(typical, len(added), axis=0)])
+        then = precision(camera, check.station, both, spread, sigma_px).epoch
+        gain = _compare(now, then)
+        best = int(np.argmin(gain))
+        if gain[best] < _WORTH and np.all(np.isfinite(then[:3])):
+            proposals.append((float(gain[best]), f"{what}: {_change(camera, best, now, then)}"))
+
+    near = check.distance * (1 - _RAISED)
+    propose(
+        _along(camera, check.station, _spread(camera, 4, 2), near),
+        f"8 targets standing {check.distance * _RAISED:.0f} mm in front of the field, spread over "
+        "the image",
+    )
+    empty = [
+        (column, row)
+        for row in range(CELLS[1])
+        for column in range(CELLS[0])
+        if check.cells[row, column] == 0
+    ]
+    if empty:
+        middles = np.array([((c + 0.5) / CELLS[0], (r + 0.5) / CELLS[1]) for c, r in empty])
+        size = np.array([camera.sensor.width, camera.sensor.height])
+        propose(
+            _beside(camera, check, middles * size - 0.5, points),
+            f"{len(empty)} targets in the empty parts of the image ({_where(empty)})",
+        )
+    if len(points) < _FEW:
+        propose(points, f"twice as many targets ({len(points)} are visible)")
+    sentences = [text for _, text in sorted(proposals)]
+    return sentences + _remarks(check)
+
+
+def _compare(now: Array, then: Array) -> Array:
+    """What standard deviations of c, x0, y0 become, as shares (3,) of what they are."""
+    gain = np.ones(3)
+    for i in range(3):
+        if np.isfinite(then[i]):
+            gain[i] = then[i] / now[i] if np.isfinite(now[i]) else 0.0
+    return gain
+
+
+def _remarks(check: FieldCheck) -> list[str]:
+    """What is wrong with the targets themselves."""
+    notes = []
+    if check.flatness < _FLAT:
+        notes.append(
+            "the field is one plane: no single image of it tells c, x0, and y0 from where the "
+            "camera stands, from wherever it is taken; only changes within a series can be seen"
+        )
+    too_small = sum("smaller" in reason for reason in check.hidden.values())
+    if too_small:
+        notes.append(
+            f"{too_small} targets are smaller than {MIN_SIZE_PX:g} px: come nearer or print larger"
+        )
+    elif len(check.sizes) and np.median(check.sizes) < _GOOD_SIZE_PX:
+        notes.append(
+            f"targets are {np.median(check.sizes):.0f} px across (median), {_GOOD_SIZE_PX:.0f} to "
+            "40 px are measured best: come nearer or print larger"
+        )
+    outside = sum("outside" in reason for reason in check.hidden.values())
+    if outside:
+        notes.append(f"{outside} targets are outside of the image: step back, or look elsewhere")
+    level, epoch = check.precision.level[:3], check.precision.epoch[:3]
+    if np.all(np.isfinite(level)) and np.any(level > 2 * epoch):
+        notes.append(
+            "the test field's own uncertainty is larger than what the image could give: survey it "
+            "(thermocald testfield survey)"
+        )
+    return notes
+
+
+def _change(camera: CameraModel, which: int, now: Array, then: Array) -> str:
+    name = ("c", "x0", "y0")[which]
+    pitch = camera.sensor.pixel_pitch
+    before = f"{now[which] / pitch:.2g} px" if np.isfinite(now[which]) else "not determined"
+    return f"sd({name}) of one image {before} → {then[which] / pitch:.2g} px"
+
+
+def _spread(camera: CameraModel, columns: int, rows: int) -> Array:
+    """Image points (n, 2) px in the middles of so many parts of the image."""
+    x = (np.arange(columns) + 0.5) / columns * camera.sensor.width - 0.5
+    y = (np.arange(rows) + 0.5) / rows * camera.sensor.height - 0.5
+    u, v = np.meshgrid(x, y)
+    return np.column_stack([u.ravel(), v.ravel()])
+
+
+def _along(
+    camera: CameraModel, station: ExteriorOrientation, image_points: Array, depth: float
+) -> Array:
+    """Object points (n, 3) mm that appear at image points in some depth."""
+    rays = camera.rays(image_points)
+    placed: Array = station.centre + (rays * (depth / -rays[:, 2:])) @ station.rotation.T
+    return placed
+
+
+def _beside(camera: CameraModel, check: FieldCheck, image_points: Array, points: Array) -> Array:
+    """Object points (n, 3) mm that appear at image points: on the field's plane if it is one (and
+    is in view there), else in its mean depth.
+    """
+    placed = _along(camera, check.station, image_points, check.distance)
+    if check.flatness >= _FLAT:
+        return placed
+    centre = points.mean(axis=0)
+    normal = np.linalg.svd(points - centre, full_matrices=False)[2][2]
+    rays = placed - check.station.centre
+    with np.errstate(divide="ignore"):
+        reach = ((centre - check.station.centre) @ normal) / (rays @ normal)
+    sensible = (reach > 0.4) & (reach < 2.5)
+    result: Array = check.station.centre + rays * np.where(sensible, reach, 1.0)[:, None]
+    return result
+
+
+def _where(empty: list[tuple[int, int]]) -> str:
+    """Parts of the image in words."""
+    rows = ("upper", "middle", "lower")
+    columns = ("left", "centre left", "centre right", "right")
+    words = [f"{rows[r]} {columns[c]}" for c, r in empty]
+    return ", ".join(words[:4]) + (f" and {len(words) - 4} more" if len(words) > 4 else "")

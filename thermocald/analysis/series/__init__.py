@@ -1,0 +1,1 @@
+"""The table of a series, and whether the camera moved in it."""

@@ -1,0 +1,171 @@
+"""Did the camera move in this series, and are its standard deviations true?
+
+A straight line in time per parameter, with the autocorrelation of its residuals taken into account,
+and the scatter of the epochs beside what the adjustment said of them. A drift is claimed only where
+chance gives its like in less than one series of a hundred, all parameters together (Holm), and
+where it does not rest on a single marker or target: a board that gives way is not the camera.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.analysis.statistics.autocorrelation import noise_autocorrelation
+from thermocald.analysis.statistics.dependence import holm, pearson_p_value
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
+from thermocald.photogrammetry.series.target_noise import slow_errors
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from thermocald.analysis.series.table import SeriesTable
+
+    Array = NDArray[np.float64]
+
+__all__ = ["Course", "courses", "settled"]
+
+_LEVEL = 0.01
+_FEWEST = 10
+_LEAST_WARMING_K = 0.5  # below, the thermometer's own noise is all there is
+_SUSPECTS = 5  # groups that are left out in turn
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """One parameter over a series, in its own unit.
+
+    mean; scatter: standard deviation over the epochs; sd: stated by the adjustments, RMS; change:
+    of a straight line from the first to the last epoch, with sd_change; p: that chance gives as
+    much, corrected for the number of parameters; drifts: p below 1 %, with and without any single
+    group of targets; rests_on: the group without which there would be no drift, or "";
+    per_kelvin, p_temperature: slope on the reference temperature and its p-value, corrected, NaN
+    where that is constant or not known.
+    """
+
+    name: str
+    mean: float
+    scatter: float
+    sd: float
+    change: float
+    sd_change: float
+    p: float
+    drifts: bool
+    rests_on: str = ""
+    per_kelvin: float = float("nan")
+    p_temperature: float = float("nan")
+
+    @property
+    def moves(self) -> bool:
+        """Whether the camera moved: in time, or with its temperature."""
+        return self.drifts or self.p_temperature < _LEVEL
+
+
+def courses(table: SeriesTable, names: tuple[str, ...] = ("c", "x0", "y0")) -> list[Course]:
+    """How parameters went over a series; those that were held are left out."""
+    found = []
+    ok = table.ok
+    t = table.frame_time[ok]
+    for name in names:
+        column = IOP_NAMES.index(name)
+        y, sd = table.values[ok, column], table.sd[ok, column]
+        if len(y) < _FEWEST or not np.isfinite(sd).all() or np.ptp(t) == 0:
+            continue
+        tilt = table.adjustment.trend_sd[column] if table.adjustment is not None else 0.0
+        found.append((name, y, sd, *_line(t, y, float(tilt))))
+    corrected = holm([p for *_, p in found])
+    warm = _with_temperature(table.temperature[ok], [y for _, y, *_ in found])
+    result = []
+    for (name, y, sd, change, sd_change, _), p, (slope, p_warm) in zip(
+        found, corrected, warm, strict=True
+    ):
+        rests_on = _single_support(table, name, sd_change, len(found)) if p < _LEVEL else ""
+        result.append(
+            Course(
+                name,
+                float(y.mean()),
+                float(y.std(ddof=1)),
+                float(np.sqrt(np.mean(sd**2))),
+                change,
+                sd_change,
+                p,
+                p < _LEVEL and not rests_on,
+                rests_on,
+                slope,
+                p_warm,
+            )
+        )
+    return result
+
+
+def _with_temperature(temperature: Array, columns: list[Array]) -> list[tuple[float, float]]:
+    """Slope per kelvin and corrected p-value of each column (n,); NaN without a temperature."""
+    have = np.isfinite(temperature)
+    unknown = [(float("nan"), float("nan"))] * len(columns)
+    if have.sum() < _FEWEST or np.ptp(temperature[have]) < _LEAST_WARMING_K:
+        return unknown
+    t = temperature[have] - temperature[have].mean()
+    slopes, ps = [], []
+    for y in columns:
+        slopes.append(float(y[have] @ t / (t @ t)))
+        n = noise_autocorrelation(y[have], t).n_effective
+        ps.append(pearson_p_value(float(np.corrcoef(y[have], t)[0, 1]), n))
+    return list(zip(slopes, holm(ps), strict=True)) if columns else []
+
+
+def settled(table: SeriesTable) -> tuple[SeriesTable, list[Course]]:
+    """The table without a group of targets that alone makes a parameter drift, and its courses."""
+    found = courses(table)
+    moving = next((c.rests_on for c in found if c.rests_on), "")
+    if not moving or table.without is None:
+        return table, found
+    left = replace(table.without(table.groups[moving], False), left_out=(moving,))
+    return left, courses(left)
+
+
+def _single_support(table: SeriesTable, name: str, sd_change: float, tests: int) -> str:
+    """The group of targets without which a parameter drifts least, if it then does not, or ""."""
+    if table.without is None or len(table.groups) < 3:
+        return ""
+    column = IOP_NAMES.index(name)
+    best, best_p = "", 0.0
+    for first in _suspects(table):
+        rows = table.groups[first]
+        left = table.without(rows, True)
+        good = left.ok
+        if good.sum() < _FEWEST:
+            continue
+        _, _, p = _line(left.frame_time[good], left.values[good, column], sd_change)
+        if p > best_p:
+            best, best_p = first, p
+    return best if best_p * tests >= _LEVEL else ""
+
+
+def _suspects(table: SeriesTable) -> list[str]:
+    """The groups whose own residuals wander most over the series."""
+    if table.adjustment is None:
+        return []
+    slow = slow_errors(table.adjustment.residuals, table.adjustment.observed)
+    size = {first: float(np.nansum(slow[rows] ** 2)) for first, rows in table.groups.items()}
+    return sorted(size, key=lambda first: -size[first])[:_SUSPECTS]
+
+
+def _line(t: Array, y: Array, tilt_sd: float) -> tuple[float, float, float]:
+    """Change of a straight line over the series, its sd and its p-value.
+
+    tilt_sd: the part of the change's sd that all epochs share: targets hidden at the end and not
+    at the beginning tilt the line by their coordinate errors.
+    """
+    from scipy.stats import t as student
+
+    x = t - t.mean()
+    slope = float(x @ y / (x @ x))
+    n = noise_autocorrelation(y, x).n_effective
+    residual = y - y.mean() - slope * x
+    freedom = max(n - 2.0, 1.0)
+    span = float(np.ptp(t))
+    own = float(np.sqrt(np.mean(residual**2) / freedom)) / float(x.std()) * span
+    sd = float(np.hypot(own, tilt_sd))
+    return slope * span, sd, float(2 * student.sf(abs(slope) * span / sd, freedom))

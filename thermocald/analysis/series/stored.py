@@ -1,0 +1,136 @@
+"""Series in a store: a recording replayed into one, and the table of what is stored."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.acquisition.calibrator import Calibrator
+from thermocald.analysis.series.table import SeriesTable, settings_for_series, table_of_series
+from thermocald.errors import DataError, UsageError
+from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
+from thermocald.store.database.row import EpochResult
+from thermocald.store.database.store import Store
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
+    from thermocald.store.database.row import StoredSeries
+    from thermocald.store.recording.reader import Recording
+
+__all__ = ["replay_into", "stored_table"]
+
+
+def replay_into(
+    path: Path,
+    recording: Recording,
+    settings: AdjustmentSettings,
+    exterior: str,
+    advance: Callable[[int], None],
+) -> SeriesTable:
+    """Calibrate a recording's epochs into a store, from where an earlier replay stopped.
+
+    Raises StoreError; DataError where the store's series of this name is of something else.
+    """
+    camera = recording.camera
+    # A replay can be repeated: the end of the process must not lose anything, a power cut may.
+    with Store.open(path, "append", durable=False) as store:
+        series = _series(store, recording, settings)
+        last = store.last_epoch(series)
+        calibrator = Calibrator(
+            camera.sensor,
+            recording.testfield,
+            settings,
+            nominal_c=camera.principal_distance,
+            interior=camera.interior,
+        )
+        for epoch in recording.iter_epochs():
+            if last is None or epoch.number > last:
+                done = calibrator.calibrate(epoch)
+                store.append(
+                    series,
+                    done.epoch,
+                    EpochResult.from_adjustment(done.adjustment),
+                    extra=done.extra,
+                )
+            advance(1)
+        return _table(store, series, settings, exterior)
+
+
+def stored_table(
+    path: Path, name: str | None, settings: AdjustmentSettings, exterior: str
+) -> SeriesTable:
+    """The table of one series of a store; name: `CAMERA/SERIES`, `SERIES`, None: the only one."""
+    with Store.open(path) as store:
+        camera, _, series_name = (name or "").rpartition("/")
+        series = store.find_series(camera or None, series_name or None)
+        return _table(store, series, settings, exterior)
+
+
+def _series(store: Store, recording: Recording, settings: AdjustmentSettings) -> StoredSeries:
+    wanted = {"exterior": "per_epoch", "free": list(settings.free)}
+    for series in store.all_series():
+        if (series.camera, series.name) != (recording.camera.name, recording.series):
+            continue
+        if series.head != recording.head or series.testfield.names != recording.testfield.names:
+            raise DataError(
+                f"{store.path}: holds a series {series.camera}/{series.name} of another recording; "
+                "use another store, or change `series` in recording.yaml"
+            )
+        if series.settings.get("free") != wanted["free"]:
+            raise UsageError(
+                f"{store.path}: series {series.name!r} was calibrated with --free "
+                f"{','.join(series.settings.get('free', []))}; keep to that, or use another store"
+            )
+        return series
+    return store.create_series(
+        recording.head, recording.testfield, settings=wanted, created_utc=time.time()
+    )
+
+
+def _table(
+    store: Store, series: StoredSeries, settings: AdjustmentSettings, exterior: str
+) -> SeriesTable:
+    names = ["epoch", "frame_time", "sigma0", "n_observations", "n_rejected", "status"]
+    names += [*PARAMETER_NAMES, *(f"sd_{name}" for name in PARAMETER_NAMES)]
+    columns = store.series_columns(series, names)
+    at_frame = store.temperatures_at_frame(series)
+    size = len(columns["epoch"])
+    if size == 0:
+        raise DataError(f"{store.path}: series {series.name!r} has no epochs")
+    ok = columns["status"] == "ok"
+    reasons = [""] * size
+    if not ok.all():
+        rows = {int(n): i for i, n in enumerate(columns["epoch"])}
+        for stored in store.epochs(series, details=False):
+            reasons[rows[stored.epoch.number]] = stored.result.reason
+    values = np.column_stack([columns[name] for name in PARAMETER_NAMES])
+    sd = np.column_stack([columns[f"sd_{name}"] for name in PARAMETER_NAMES])
+    values[~ok], sd[~ok] = np.nan, np.nan
+    apart = SeriesTable(
+        columns["epoch"].astype(np.int64),
+        columns["frame_time"],
+        next(iter(at_frame.values()), np.full(size, np.nan)),
+        values,
+        sd,
+        np.where(ok, columns["sigma0"], np.nan),
+        columns["n_observations"].astype(np.int64),
+        columns["n_rejected"].astype(np.int64),
+        tuple(str(word) for word in columns["status"]),
+        tuple(reasons),
+        "per_epoch",
+    )
+    if not ok.any():
+        return apart
+    observations = [stored.epoch.observations for stored in store.epochs(series)]
+    return table_of_series(
+        series.head,
+        series.testfield,
+        apart,
+        observations,
+        settings_for_series(settings, exterior),
+    )

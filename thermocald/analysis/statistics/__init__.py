@@ -1,0 +1,1 @@
+"""Statistics of time series: correlation, lines, significance."""

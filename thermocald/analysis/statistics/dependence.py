@@ -1,0 +1,164 @@
+"""How a parameter depends on the temperature: correlation, its significance, and the slope.
+
+Pearson's r with the t-test as the reference has it (Elias et al. 2020, section 4.3), which counts
+every epoch as independent, and beside it with the effective number of values that the
+autocorrelation of the residuals leaves. The slope is fitted with the thermometer's noise counted.
+p-values are corrected for the number of parameters by Holm's method.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.analysis.statistics.autocorrelation import noise_autocorrelation
+from thermocald.analysis.statistics.straight_line import fit_straight_line
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+__all__ = [
+    "Dependence",
+    "correlation_matrix",
+    "dependence",
+    "holm",
+    "pearson_p_value",
+    "thermometer_noise",
+]
+
+_LEAST_EFFECTIVE = 3.0
+_CHANCE = 0.01
+_NOISY = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Dependence:
+    """One parameter against one temperature; slope in parameter units per K.
+
+    p_naive counts all n epochs as independent; p_value counts `n_effective`, and is 1 where fewer
+    than three are left; sd_slope holds thermometer noise, the adjustments' sds, scatter beyond both
+    and autocorrelation; misfit: scatter over what the two noises explain.
+    """
+
+    n: int
+    r: float
+    p_naive: float
+    n_effective: float
+    lag_one: float
+    p_value: float
+    slope: float
+    sd_slope: float
+    misfit: float
+
+
+def pearson_p_value(r: float, n: float) -> float:
+    """Two-sided p-value of Pearson's r by the t-test with n - 2 degrees of freedom."""
+    from scipy.stats import t
+
+    if n < _LEAST_EFFECTIVE:
+        return 1.0
+    if abs(r) >= 1.0:
+        return 0.0
+    return float(2 * t.sf(abs(r) * np.sqrt((n - 2) / (1 - r * r)), n - 2))
+
+
+def dependence(values: Array, sds: Array, temperature: Array, temperature_sd: float) -> Dependence:
+    """Correlation and slope of values (n,) with sds (n,) on temperature (n,) °C.
+
+    All finite, in order of time; temperature_sd: noise of the thermometer, K. Raises ValueError for
+    fewer than 4 epochs, or where values or temperature are constant.
+    """
+    from scipy.stats import chi2
+
+    n = len(values)
+    if n < 4 or not np.ptp(values) > 0 or not np.ptp(temperature) > 0:
+        raise ValueError("a dependence needs four epochs, values and a temperature that vary")
+    x, y = temperature - temperature.mean(), values - values.mean()
+    r = float(np.clip(np.dot(x, y) / np.sqrt(np.dot(x, x) * np.dot(y, y)), -1.0, 1.0))
+
+    line = fit_straight_line(temperature, values, temperature_sd, sds)
+    misfit = line.misfit
+    if line.chi2 > chi2.isf(_CHANCE, line.degrees):
+        # What the line does not explain is scatter of the parameter, not of the thermometer. Not
+        # done for what is chance: weight taken from the thermometer's noise flattens the line.
+        unexplained = (misfit**2 - 1) * float(
+            np.mean(np.square(sds)) + (line.slope * temperature_sd) ** 2
+        )
+        line = fit_straight_line(
+            temperature, values, temperature_sd, sds, float(np.sqrt(unexplained))
+        )
+    if temperature_sd**2 < _NOISY * float(np.var(temperature)):
+        noise = noise_autocorrelation(values, temperature)
+    else:
+        # The line fitted with each model of the noise would be flattened by the thermometer's, and
+        # what it leaves of the dependence would look like slow noise.
+        residual = values - line.slope * temperature
+        noise = noise_autocorrelation(residual, temperature, fitted=True)
+    return Dependence(
+        n,
+        r,
+        pearson_p_value(r, n),
+        noise.n_effective,
+        noise.lag_one,
+        pearson_p_value(r, noise.n_effective),
+        line.slope,
+        line.sd_slope * float(np.sqrt(n / noise.n_effective)),
+        misfit,
+    )
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """p-values corrected for their number: Holm (1979), step-down."""
+    p = np.asarray(p_values, dtype=float)
+    order = np.argsort(p, kind="stable")
+    stepped = np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1))
+    corrected = np.empty_like(p)
+    corrected[order] = np.minimum(stepped, 1.0)
+    return [float(v) for v in corrected]
+
+
+def correlation_matrix(columns: Sequence[Array]) -> Array:
+    """Pearson's r of each column (n,) with each (k, k); NaN for constant columns.
+
+    Epochs where either value is NaN are left out pair by pair.
+    """
+    k = len(columns)
+    matrix = np.full((k, k), np.nan)
+    finite = [np.isfinite(column) for column in columns]
+    whole = [bool(f.all()) and np.ptp(c) > 0 for f, c in zip(finite, columns, strict=True)]
+    for i in range(k):
+        for j in range(i, k):
+            a, b = columns[i], columns[j]
+            if not (whole[i] and whole[j]):
+                both = finite[i] & finite[j]
+                a, b = a[both], b[both]
+                if len(a) < 3 or not (np.ptp(a) > 0 and np.ptp(b) > 0):
+                    continue
+            a, b = a - a.mean(), b - b.mean()
+            r = np.dot(a, b) / np.sqrt(np.dot(a, a) * np.dot(b, b))
+            matrix[i, j] = matrix[j, i] = np.clip(r, -1.0, 1.0)
+    return matrix
+
+
+def thermometer_noise(temperature: Array, resolution: float | None = None) -> float:
+    """Noise of a thermometer in K from its own readings (n,), NaN left out.
+
+    From second differences, which a slow temperature leaves alone, without the largest 2 % (jumps
+    of the temperature itself); never below the noise of its resolution (K), resolution/√12.
+    """
+    floor = resolution / np.sqrt(12.0) if resolution else 0.0
+    t = temperature[np.isfinite(temperature)]
+    if len(t) < 5:
+        return float(floor)
+    second = np.sort(np.square(t[1:-1] - 0.5 * (t[:-2] + t[2:])))
+    kept = second[: max(1, int(np.ceil(0.98 * len(second))))]
+    # 1.5 is the variance of a second difference of unit noise; 0.873 what is left of the mean of a
+    # chi-square variable of one degree of freedom without its largest 2 %.
+    share = 0.873 if len(kept) < len(second) else 1.0
+    return float(max(floor, np.sqrt(np.mean(kept) / (1.5 * share))))

@@ -1,0 +1,1 @@
+"""The study of one or several cameras, after Elias et al. 2020."""

@@ -1,0 +1,339 @@
+"""Measured series for the study, from recordings and stores.
+
+With `exterior="series"` all epochs are adjusted together from their observations, one exterior
+orientation for the camera that stood still. A series too long for that, or `exterior="per_epoch"`
+from a store, is read as it was stored, column by column, with a sample of its covariance matrices.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.acquisition.calibrator import Calibrator
+from thermocald.analysis.series.stored import stored_table
+from thermocald.analysis.series.table import (
+    calibrate_epochs,
+    settings_for_series,
+    table_of_series,
+)
+from thermocald.analysis.statistics.correlations import correlations_of
+from thermocald.analysis.statistics.dependence import thermometer_noise
+from thermocald.analysis.study.measured import Clip, MeasuredSeries, Thermometer
+from thermocald.errors import DataError
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
+from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
+from thermocald.store.database.store import Store
+from thermocald.store.recording.reader import open_recording
+from thermocald.store.recording.readings import interpolate_readings
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from thermocald.analysis.series.table import SeriesTable
+    from thermocald.photogrammetry.field.testfield import Observations
+    from thermocald.store.database.row import StoredSeries
+    from thermocald.store.recording.head import Head
+    from thermocald.store.recording.reader import Recording
+
+    Array = NDArray[np.float64]
+
+__all__ = ["from_recording", "from_store", "load_series"]
+
+_MOST_MATRICES = 5000
+_MOST_TOGETHER = 50_000  # epochs
+
+
+def load_series(
+    path: Path,
+    label: str | None = None,
+    thermometer_sd: float | None = None,
+    exterior: str = "series",
+    free: Sequence[str] = DEFAULT_FREE,
+    advance: Callable[[int], None] | None = None,
+) -> list[MeasuredSeries]:
+    """Every series of a recording (a folder) or a store (a file).
+
+    label: what the study treats as one camera, by default the camera's name, in a store with the
+    start condition; thermometer_sd: K, by default from the readings; free: IOP to estimate, for a
+    recording (a store knows its own); advance: told how many epochs of a recording are done.
+    Raises DataError where nothing can be studied.
+    """
+    if path.is_dir():
+        recording = open_recording(path)
+        return [from_recording(recording, label, thermometer_sd, exterior, free, advance)]
+    with Store.open(path) as store:
+        found = [
+            from_store(store, one, label, thermometer_sd, exterior) for one in store.all_series()
+        ]
+    if not found:
+        raise DataError(f"{path}: the store holds no series")
+    return found
+
+
+def from_recording(
+    recording: Recording,
+    label: str | None = None,
+    thermometer_sd: float | None = None,
+    exterior: str = "series",
+    free: Sequence[str] = DEFAULT_FREE,
+    advance: Callable[[int], None] | None = None,
+) -> MeasuredSeries:
+    """A recording, its frames measured where they are not, adjusted as one series."""
+    columns, camera = recording.columns, recording.camera
+    settings = AdjustmentSettings(free=tuple(free))
+    calibrator = Calibrator(
+        camera.sensor,
+        recording.testfield,
+        settings,
+        nominal_c=camera.principal_distance,
+        interior=camera.interior,
+    )
+    apart, observations = calibrate_epochs(recording.iter_epochs(), calibrator, {}, advance)
+    table = table_of_series(
+        recording.head,
+        recording.testfield,
+        apart,
+        observations,
+        settings_for_series(settings, exterior),
+    )
+    thermometers = [
+        _thermometer(
+            name,
+            columns.frame_time,
+            columns.temperature_time,
+            columns.temperatures[name],
+            channel.resolution,
+            thermometer_sd,
+        )
+        for name, channel in recording.channels.items()
+    ]
+    framed = [i for i, ok in enumerate(table.ok) if ok and columns.frames[i]]
+    clip = None
+    if len(framed) > 1:
+        first, last = framed[0], framed[-1]
+        clip = _clip(
+            (recording.path / columns.frames[first], recording.path / columns.frames[last]),
+            (int(columns.numbers[first]), int(columns.numbers[last])),
+            (observations[first], observations[last]),
+            recording.testfield.names,
+            camera.sensor.centre,
+        )
+    return _from_table(
+        recording.head, str(recording.path), table, thermometers, label or camera.name, clip
+    )
+
+
+def from_store(
+    store: Store,
+    series: StoredSeries,
+    label: str | None = None,
+    thermometer_sd: float | None = None,
+    exterior: str = "series",
+) -> MeasuredSeries:
+    """One series of a store; DataError where no epoch has a result."""
+    start = f"-{series.start}" if series.start else ""
+    label = label or series.camera + start
+    count = len(store.series_columns(series, ["epoch"])["epoch"])
+    if exterior == "series" and 0 < count <= _MOST_TOGETHER:
+        free = tuple(series.settings.get("free", DEFAULT_FREE))
+        table = stored_table(
+            store.path, f"{series.camera}/{series.name}", AdjustmentSettings(free=free), "series"
+        )
+        thermometers = _stored_thermometers(store, series, table.frame_time, thermometer_sd)
+        source = f"{store.path}: {series.camera}/{series.name}"
+        clip = _stored_clip(store, series, table.number[table.ok])
+        return _from_table(series.head, source, table, thermometers, label, clip)
+    return _from_columns(store, series, label, thermometer_sd)
+
+
+def _from_columns(
+    store: Store, series: StoredSeries, label: str, thermometer_sd: float | None
+) -> MeasuredSeries:
+    """A series as it was stored; one column at a time, for a year of epochs must fit."""
+
+    def column(name: str) -> Array:
+        values: Array = store.series_columns(series, [name])[name]
+        return values
+
+    ok, lost = _judged(store.series_columns(series, ["status"])["status"])
+    source = f"{store.path}: {series.camera}/{series.name}"
+    if not ok.any():
+        raise DataError(f"{source}: no epoch has a result ({_in_words(lost)})")
+    count = int(ok.sum())
+    values, sds = np.empty((count, 10), order="F"), np.empty((count, 10), order="F")
+    for k, name in enumerate(IOP_NAMES):
+        values[:, k] = column(name)[ok]
+        sds[:, k] = column(f"sd_{name}")[ok]
+    whole = _whole(np.ones(count, dtype=bool), values, sds, lost)
+    if not whole.all():
+        ok[ok] = whole
+        values, sds, count = values[whole], sds[whole], int(whole.sum())
+    if not count:
+        raise DataError(f"{source}: no epoch has a result ({_in_words(lost)})")
+    number = column("epoch")[ok].astype(np.int64)
+    frame_time = column("frame_time")[ok]
+    rows = _spread(count, _MOST_MATRICES)
+    covariances = store.covariances(series, number[rows].tolist())[:, :10, :10]
+    have = np.isfinite(covariances).all(axis=(1, 2))
+    return MeasuredSeries(
+        label,
+        series.name,
+        series.camera,
+        series.head.camera.sensor,
+        source,
+        number,
+        frame_time - frame_time[0],
+        tuple(_stored_thermometers(store, series, frame_time, thermometer_sd)),
+        values,
+        sds,
+        column("sigma0")[ok],
+        column("redundancy")[ok],
+        correlations_of(covariances[have]),
+        rows[have],
+        str(series.settings.get("exterior", "per_epoch")),
+        lost,
+        _stored_clip(store, series, number),
+    )
+
+
+def _from_table(
+    head: Head,
+    source: str,
+    table: SeriesTable,
+    thermometers: Sequence[Thermometer],
+    label: str,
+    clip: Clip | None,
+) -> MeasuredSeries:
+    """A series that was adjusted together; thermometers at the instants of all its epochs."""
+    adjustment = table.adjustment
+    assert adjustment is not None  # table_of_series always has one
+    ok, lost = _judged(np.array(table.status))
+    ok = _whole(ok, table.values[:, :10], table.sd[:, :10], lost)
+    if not ok.any():
+        why = next((reason for reason in table.reasons if reason), _in_words(lost))
+        raise DataError(f"{source}: no epoch has a result: {why}")
+    rows = _spread(int(ok.sum()), _MOST_MATRICES)
+    covariances = adjustment.covariance[np.flatnonzero(ok)[rows]][:, :10, :10]
+    time_s = table.frame_time[ok]
+    return MeasuredSeries(
+        label,
+        head.series,
+        head.camera.name,
+        head.camera.sensor,
+        source,
+        table.number[ok],
+        time_s - time_s[0],
+        tuple(Thermometer(t.name, t.values[ok], t.sd) for t in thermometers),
+        np.asfortranarray(table.values[ok, :10]),
+        np.asfortranarray(table.sd[ok, :10]),
+        table.sigma0[ok],
+        adjustment.redundancy[ok],
+        correlations_of(covariances),
+        rows,
+        table.exterior,
+        lost,
+        clip,
+    )
+
+
+def _thermometer(
+    name: str,
+    frame_time: Array,
+    reading_time: Array,
+    readings: Array,
+    resolution: float | None,
+    sd: float | None,
+) -> Thermometer:
+    values = interpolate_readings(frame_time, reading_time, readings)
+    return Thermometer(name, values, thermometer_noise(readings, resolution) if sd is None else sd)
+
+
+def _stored_thermometers(
+    store: Store, series: StoredSeries, frame_time: Array, sd: float | None
+) -> list[Thermometer]:
+    reading_time = store.series_columns(series, ["temperature_time"])["temperature_time"]
+    return [
+        _thermometer(
+            name,
+            frame_time,
+            reading_time,
+            store.series_columns(series, [name])[name],
+            channel.resolution,
+            sd,
+        )
+        for name, channel in series.head.channels.items()
+    ]
+
+
+def _judged(status: NDArray[np.str_]) -> tuple[NDArray[np.bool_], dict[str, int]]:
+    """Which epochs have a result, and how many have none for which reason."""
+    ok = status == "ok"
+    words, counts = np.unique(status[~ok], return_counts=True)
+    return ok, {str(word).replace("_", " "): int(n) for word, n in zip(words, counts, strict=True)}
+
+
+def _whole(
+    ok: NDArray[np.bool_], values: Array, sds: Array, lost: dict[str, int]
+) -> NDArray[np.bool_]:
+    """Of the epochs with a result, those with a number wherever others have one; counts the rest.
+
+    A covariance matrix at the edge of singularity can have negative variances, that is no sd.
+    """
+    whole = ok.copy()
+    for k in range(values.shape[1]):
+        whole &= np.isfinite(values[:, k])
+        has = np.isfinite(sds[:, k])
+        if (has & ok).any():
+            whole &= has
+    missing = int(np.count_nonzero(ok & ~whole))
+    if missing:
+        lost["no standard deviation"] = missing
+    return whole
+
+
+def _in_words(lost: Mapping[str, int]) -> str:
+    return ", ".join(f"{n} × {reason}" for reason, n in lost.items()) or "it has no epochs"
+
+
+def _spread(count: int, most: int) -> NDArray[np.int64]:
+    """Up to `most` rows evenly over `count`."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
+
+
+def _stored_clip(store: Store, series: StoredSeries, number: NDArray[np.int64]) -> Clip | None:
+    first, last = (next(store.epochs(series, int(n), int(n))).epoch for n in number[[0, -1]])
+    if first.frame is None or last.frame is None:
+        return None
+    folder = store.path.parent
+    return _clip(
+        (folder / first.frame, folder / last.frame),
+        (first.number, last.number),
+        (first.observations, last.observations),
+        series.testfield.names,
+        series.head.camera.sensor.centre,
+    )
+
+
+def _clip(
+    frames: tuple[Path, Path],
+    numbers: tuple[int, int],
+    observations: tuple[Observations | None, Observations | None],
+    names: Sequence[str],
+    centre: Array,
+) -> Clip | None:
+    """A clip about the target nearest to the image centre that both ends show; None without."""
+    first, last = observations
+    if first is None or last is None or not all(path.is_file() for path in frames):
+        return None
+    both = np.isin(first.targets, last.targets)
+    if not both.any():
+        return None
+    points = first.points[both]
+    k = int(np.argmin(np.linalg.norm(points - centre, axis=1)))
+    target = names[int(first.targets[both][k])]
+    return Clip(target, *frames, *numbers, (float(points[k, 0]), float(points[k, 1])))

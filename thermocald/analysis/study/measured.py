@@ -1,0 +1,99 @@
+"""A measured series as the study reads it: columns of numbers, whoever calibrated the epochs.
+
+Only epochs with a result are rows; what the others lacked is counted by reason. Standard deviations
+are those that one epoch adds to its series: what all epochs share (the exterior orientation, the
+test field) cancels in every comparison between epochs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from thermocald.photogrammetry.camera.camera_model import Sensor
+
+    Array = NDArray[np.float64]
+
+__all__ = ["Clip", "MeasuredSeries", "Thermometer"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Thermometer:
+    """One channel at the instants of the frames: values (E,) °C, NaN where missing; noise sd K."""
+
+    name: str
+    values: Array
+    sd: float
+
+
+@dataclass(frozen=True, slots=True)
+class Clip:
+    """Where to cut the image around one target in the first and the last frame that exist.
+
+    first, last: image files; first_epoch, last_epoch: their numbers; centre: px in the first.
+    """
+
+    target: str
+    first: Path
+    last: Path
+    first_epoch: int
+    last_epoch: int
+    centre: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredSeries:
+    """The epochs with a result of one series of one camera.
+
+    label: what the study treats as one camera; name: the series; number (E,), time_s (E,): s since
+    the first epoch of the series; thermometers: the first is the reference; values (E, 10): IOP;
+    sds (E, 10): NaN where held fixed; sigma0, redundancy (E,); correlations (m, 10, 10) of the IOP
+    in the adjustments of the epochs `correlation_rows` (m,), a sample where a series is long;
+    exterior: `series` or `per_epoch`; without_result: {reason: epochs}.
+    """
+
+    label: str
+    name: str
+    camera: str
+    sensor: Sensor
+    source: str
+    number: NDArray[np.int64]
+    time_s: Array
+    thermometers: tuple[Thermometer, ...]
+    values: Array
+    sds: Array
+    sigma0: Array
+    redundancy: Array
+    correlations: Array
+    correlation_rows: NDArray[np.int64]
+    exterior: str
+    without_result: Mapping[str, int] = field(default_factory=dict)
+    clip: Clip | None = None
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """The IOP that were estimated, in their order."""
+        return tuple(name for k, name in enumerate(IOP_NAMES) if bool(np.any(self.sds[:, k] > 0)))
+
+    @property
+    def reference(self) -> Thermometer | None:
+        """The reference thermometer, if there is one."""
+        return self.thermometers[0] if self.thermometers else None
+
+    @property
+    def interval_s(self) -> float:
+        """Median time between epochs, NaN for a single one."""
+        return float(np.median(np.diff(self.time_s))) if len(self) > 1 else float("nan")

@@ -1,0 +1,332 @@
+"""One measured series studied: deviations, significance, temperature dependence.
+
+Everything that cannot be computed is said in `notes`, in words, and is None in its place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.analysis.statistics.dependence import (
+    Dependence,
+    correlation_matrix,
+    dependence,
+    holm,
+)
+from thermocald.analysis.statistics.significance import (
+    DriftTest,
+    drift_test,
+    moving_f_test,
+    unbroken_windows,
+)
+from thermocald.analysis.study.depth_of_field import (
+    DepthOfField,
+    circle_of_confusion,
+    depth_of_field,
+)
+from thermocald.analysis.study.deviations import (
+    Deviation,
+    deviation,
+    image_displacement,
+    sd_of_sigma0,
+)
+from thermocald.analysis.study.object_plane import image_raster
+from thermocald.errors import GeometryError
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from thermocald.analysis.study.measured import MeasuredSeries, Thermometer
+
+    Array = NDArray[np.float64]
+
+__all__ = [
+    "ChannelStudy",
+    "FocusChange",
+    "SeriesStudy",
+    "Significance",
+    "StudySettings",
+    "study_series",
+]
+
+_COURSE = 500
+_GAP_IN_INTERVALS = 1.5
+_LEAST_DEPENDENCE = 4
+
+
+@dataclass(frozen=True, slots=True)
+class StudySettings:
+    """What the user may choose; lengths mm, temperatures K.
+
+    window, alpha: of the F-test; sets, seed, distance_mm, raster, clusters_mm: of the Monte-Carlo;
+    focus_mm, f_number, confusion_mm: of the depth of field, None: 1/2000 of the image diagonal;
+    thermometer_sd: None takes it from the readings themselves.
+    """
+
+    window: int = 31
+    alpha: float = 0.05
+    sets: int = 50_000
+    seed: int = 0
+    distance_mm: float = 10_000.0
+    raster: int = 3
+    clusters_mm: tuple[float, ...] = (15.0, 50.0, 100.0)
+    focus_mm: float = 1000.0
+    f_number: float = 2.0
+    confusion_mm: float | None = None
+    thermometer_sd: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Significance:
+    """The moving F-test of one parameter, summed up, and the test for the whole series.
+
+    success_ratio over `tests` instants, `left_out` had no window; degrees of freedom of the
+    variance and (median) of the mean squared sd; critical: median; course (k, 2): time s, ratio of
+    the variances, thinned for drawing; drift: None where there is none.
+    """
+
+    success_ratio: float
+    tests: int
+    left_out: int
+    degrees_variance: int
+    degrees_sd: float
+    critical: float
+    median_ratio: float
+    course: Array
+    drift: DriftTest | None
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelStudy:
+    """One thermometer: the dependence of every free parameter and of sigma0 on it.
+
+    p_holm: the p-values, autocorrelation counted, corrected for the number of parameters; empty
+    with `reason` where the temperature says nothing.
+    """
+
+    thermometer: Thermometer
+    dependences: Mapping[str, Dependence]
+    p_holm: Mapping[str, float]
+    p_naive_holm: Mapping[str, float]
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class FocusChange:
+    """Depth of field at the first and the last epoch, mm, and the change with its sd."""
+
+    first: DepthOfField
+    last: DepthOfField
+    change: float
+    sd_change: float
+    confusion: float
+
+
+@dataclass(frozen=True, eq=False)
+class SeriesStudy:
+    """What one series says.
+
+    deviations: by IOP, `sigma0`, and thermometer; raster, displacement (k, 2) px: image
+    points of a still scene, first to last epoch, y down; columns, matrix (n, n): Pearson's r among
+    free IOP, sigma0 and thermometers.
+    """
+
+    series: MeasuredSeries
+    deviations: Mapping[str, Deviation]
+    focus: FocusChange | None
+    raster: Array
+    displacement: Array | None
+    significance: Mapping[str, Significance]
+    channels: tuple[ChannelStudy, ...]
+    columns: tuple[str, ...]
+    matrix: Array
+    notes: tuple[str, ...]
+
+
+def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy:
+    """Study one series; never raises for data, but says what they do not allow."""
+    notes = _circumstances(series)
+    deviations = _deviations(series)
+    significance = _significance(series, settings, notes)
+    channels = tuple(_channel(series, t) for t in series.thermometers)
+    notes += [c.reason for c in channels if c.reason]
+    raster = image_raster(series.sensor)
+    displacement = None
+    if len(series) > 1:
+        try:
+            displacement = image_displacement(
+                series.sensor, series.values[0], series.values[-1], raster
+            )
+        except GeometryError as error:
+            notes.append(f"The movement of the image cannot be computed: {error}.")
+    names = (*series.free, "sigma0", *(t.name for t in series.thermometers))
+    columns = [
+        *(series.values[:, IOP_NAMES.index(name)] for name in series.free),
+        series.sigma0,
+        *(t.values for t in series.thermometers),
+    ]
+    return SeriesStudy(
+        series,
+        deviations,
+        _focus(series, settings, deviations, notes),
+        raster,
+        displacement,
+        significance,
+        channels,
+        names,
+        correlation_matrix(columns),
+        tuple(notes),
+    )
+
+
+def _circumstances(series: MeasuredSeries) -> list[str]:
+    """What a reader must know of the series before its numbers."""
+    notes = []
+    lost = sum(series.without_result.values())
+    if lost:
+        reasons = ", ".join(f"{n} × {reason}" for reason, n in series.without_result.items())
+        notes.append(f"{lost} of {lost + len(series)} epochs have no result ({reasons}).")
+    if len(series) == 1:
+        notes.append("The series has a single epoch: nothing can be said about change.")
+    elif len(series) > 1:
+        steps = np.diff(series.time_s)
+        gaps = steps > _GAP_IN_INTERVALS * series.interval_s
+        if gaps.any():
+            count = int(gaps.sum())
+            notes.append(
+                f"The series has {count} gap{'s' if count > 1 else ''}, the longest of "
+                f"{float(steps.max()):.3g} s at an interval of {series.interval_s:.3g} s; windows "
+                "across them are not tested, and correlation between neighbours counts epochs, "
+                "not seconds."
+            )
+    held = [name for name in IOP_NAMES if name not in series.free]
+    if held:
+        notes.append(
+            f"{', '.join(held)} {'was' if len(held) == 1 else 'were'} held fixed in the "
+            "adjustment: not tested, not correlated, not varied in the simulation."
+        )
+    if series.exterior == "per_epoch":
+        notes.append(
+            "Every epoch has an exterior orientation of its own: its movements and the principal "
+            "point's are told apart only weakly, and the standard deviations say so."
+        )
+    if not series.thermometers:
+        notes.append("The series has no temperature: no dependence on it can be computed.")
+    return notes
+
+
+def _deviations(series: MeasuredSeries) -> dict[str, Deviation]:
+    columns = {
+        name: (series.values[:, k], series.sds[:, k])
+        for k, name in enumerate(IOP_NAMES)
+        if name in series.free
+    }
+    columns["sigma0"] = series.sigma0, sd_of_sigma0(series.sigma0, series.redundancy)
+    for t in series.thermometers:
+        columns[t.name] = t.values, np.full(len(series), t.sd)
+    found = {name: deviation(values, sds) for name, (values, sds) in columns.items()}
+    return {name: d for name, d in found.items() if d is not None}
+
+
+def _significance(
+    series: MeasuredSeries, settings: StudySettings, notes: list[str]
+) -> dict[str, Significance]:
+    starts = unbroken_windows(series.time_s, settings.window)
+    if not len(starts):
+        notes.append(
+            f"The F-test needs {settings.window} consecutive epochs; the series has {len(series)}"
+            f"{' but too many gaps' if len(series) >= settings.window else ''}: not tested."
+        )
+        return {}
+    result = {}
+    for name in series.free:
+        k = IOP_NAMES.index(name)
+        values, sds = series.values[:, k], series.sds[:, k]
+        test = moving_f_test(
+            values, sds, series.redundancy, series.time_s, settings.window, settings.alpha
+        )
+        drift = drift_test(values, sds, series.redundancy, seed=settings.seed)
+        course = np.column_stack([series.time_s[test.index], test.ratio])
+        result[name] = Significance(
+            test.success_ratio,
+            len(test.index),
+            test.left_out,
+            test.degrees_variance,
+            float(np.median(test.degrees_sd)),
+            float(np.median(test.critical)),
+            float(np.median(test.ratio)),
+            course[:: max(1, -(-len(course) // _COURSE))].copy(),
+            drift,
+        )
+    return result
+
+
+def _channel(series: MeasuredSeries, thermometer: Thermometer) -> ChannelStudy:
+    """All parameters against one thermometer, or why there is nothing to say."""
+    name, sd = thermometer.name, thermometer.sd
+    finite = np.isfinite(thermometer.values)
+    # No copies of a year of epochs where none is missing.
+    have = slice(None) if finite.all() else finite
+    t = thermometer.values[have]
+    reason = ""
+    if len(t) < _LEAST_DEPENDENCE:
+        reason = f"{name} was read at {len(t)} epochs: too few for a dependence on it."
+    elif not np.ptp(t) > 0:
+        reason = f"{name} stayed at {t[0]:.2f} °C: no dependence on it can be computed."
+    elif float(np.var(t, ddof=1)) < 2 * sd**2:
+        reason = (
+            f"{name} varied by {np.std(t, ddof=1):.3f} K, which its noise of {sd:.3f} K explains: "
+            "no dependence on it can be told."
+        )
+    if reason:
+        return ChannelStudy(thermometer, {}, {}, {}, reason)
+    columns = {n: (series.values[:, IOP_NAMES.index(n)], series.sds[:, IOP_NAMES.index(n)])
+               for n in series.free}  # fmt: skip
+    columns["sigma0"] = series.sigma0, sd_of_sigma0(series.sigma0, series.redundancy)
+    found = {
+        column: dependence(values[have], sds[have], t, sd)
+        for column, (values, sds) in columns.items()
+        if np.ptp(values[have]) > 0
+    }
+    return ChannelStudy(
+        thermometer,
+        found,
+        dict(zip(found, holm([d.p_value for d in found.values()]), strict=True)),
+        dict(zip(found, holm([d.p_naive for d in found.values()]), strict=True)),
+    )
+
+
+def _focus(
+    series: MeasuredSeries,
+    settings: StudySettings,
+    deviations: Mapping[str, Deviation],
+    notes: list[str],
+) -> FocusChange | None:
+    if "c" not in deviations:
+        notes.append("The principal distance did not change or was held: no change of focus.")
+        return None
+    confusion = settings.confusion_mm or circle_of_confusion(series.sensor)
+    c = deviations["c"]
+    try:
+        first, last, nudged = (
+            depth_of_field(value, settings.focus_mm, settings.f_number, confusion)
+            for value in (c.first, c.last, c.first * (1 + 1e-6))
+        )
+    except ValueError as error:
+        notes.append(f"The depth of field cannot be computed: {error}.")
+        return None
+    change = last.depth - first.depth
+    if not np.isfinite(change):
+        notes.append(
+            f"Focused at {settings.focus_mm / 1000:g} m everything up to infinity is sharp: the "
+            "depth of field has no end that could change."
+        )
+        return None
+    slope = (nudged.depth - first.depth) / (c.first * 1e-6)
+    return FocusChange(first, last, change, abs(slope) * c.sd_change, confusion)

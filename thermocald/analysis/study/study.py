@@ -1,0 +1,170 @@
+"""The study of one or several cameras: section 4 of Elias et al. 2020 for one's own.
+
+Series with one label are one camera: their correlations are pooled, and one Monte-Carlo is drawn
+from both. The reference treats a cold- and a warm-started camera as two; so do labels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.analysis.statistics.correlations import IopCorrelations, median_correlations
+from thermocald.analysis.study.montecarlo import MonteCarlo, draw_root, simulate_errors
+from thermocald.analysis.study.object_plane import DistanceLaw, plane_jacobian, propagate
+from thermocald.analysis.study.series_study import SeriesStudy, StudySettings, study_series
+from thermocald.errors import GeometryError
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from thermocald.analysis.study.measured import MeasuredSeries
+
+    Array = NDArray[np.float64]
+
+__all__ = ["CameraStudy", "FirstOrder", "Study", "StudySettings", "study", "study_camera"]
+
+
+@dataclass(frozen=True, eq=False)
+class FirstOrder:
+    """The same covariance propagated to first order, per raster point (k,), mm.
+
+    covariance (k, 2, 2) mm²; mean; expected_largest: of as many draws as the Monte-Carlo had;
+    shares (m+1,): of the clusters over all points.
+    """
+
+    covariance: Array
+    mean: Array
+    expected_largest: Array
+    shares: Array
+
+
+@dataclass(frozen=True, eq=False)
+class CameraStudy:
+    """One camera (label): its series, and what they say together.
+
+    iop (10,): mean over the series; sds (10,): standard deviations over time, 0 where held, pooled
+    over the series; correlations: None where no epoch has a covariance matrix.
+    """
+
+    label: str
+    series: tuple[SeriesStudy, ...]
+    iop: Array
+    sds: Array
+    correlations: IopCorrelations | None
+    montecarlo: MonteCarlo | None
+    first_order: FirstOrder | None
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """All cameras of one command."""
+
+    settings: StudySettings
+    cameras: tuple[CameraStudy, ...]
+
+
+def study(
+    series: Sequence[MeasuredSeries],
+    settings: StudySettings | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Study:
+    """Study every camera; `progress` is told how many sets of IOP were simulated."""
+    s = settings or StudySettings()
+    labels = dict.fromkeys(one.label for one in series)
+    cameras = [
+        study_camera(label, [one for one in series if one.label == label], s, progress)
+        for label in labels
+    ]
+    return Study(s, tuple(cameras))
+
+
+def study_camera(
+    label: str,
+    series: Sequence[MeasuredSeries],
+    settings: StudySettings,
+    progress: Callable[[int], None] | None = None,
+) -> CameraStudy:
+    """Study the series of one camera together."""
+    notes: list[str] = []
+    studies = tuple(study_series(one, settings) for one in series)
+    iop = np.mean([np.mean(one.values, axis=0) for one in series], axis=0)
+    sds = sds_over_time(series)
+    correlations = None
+    if any(len(one.correlations) for one in series):
+        correlations = median_correlations([one.correlations for one in series])
+    else:
+        notes.append("No epoch has a covariance matrix: correlations of the IOP are not known.")
+    montecarlo = first_order = None
+    if correlations is None or not (sds > 0).any():
+        notes.append(
+            "No Monte-Carlo: it needs a parameter that varies over two epochs or more, and the "
+            "correlations."
+        )
+    else:
+        try:
+            montecarlo, first_order = _object_space(
+                series[0], iop, sds, correlations.median, settings, progress
+            )
+        except GeometryError as error:
+            notes.append(f"No Monte-Carlo: {error}.")
+    if montecarlo is not None and montecarlo.folded:
+        notes.append(
+            f"{montecarlo.folded} of {montecarlo.sets} drawn sets of IOP fold the image over "
+            "itself and were left out."
+        )
+    return CameraStudy(
+        label, studies, iop, sds, correlations, montecarlo, first_order, tuple(notes)
+    )
+
+
+def sds_over_time(series: Sequence[MeasuredSeries]) -> Array:
+    """Standard deviations (10,) of the IOP over time, about each series' own mean; 0 where held."""
+    squares, degrees = np.zeros(10), 0
+    for one in series:
+        if len(one) > 1:
+            for name in one.free:
+                k = IOP_NAMES.index(name)
+                squares[k] += np.var(one.values[:, k]) * len(one)
+            degrees += len(one) - 1
+    return np.asarray(np.sqrt(squares / max(degrees, 1)))
+
+
+def _object_space(
+    one: MeasuredSeries,
+    iop: Array,
+    sds: Array,
+    correlation: Array,
+    s: StudySettings,
+    progress: Callable[[int], None] | None,
+) -> tuple[MonteCarlo, FirstOrder]:
+    montecarlo = simulate_errors(
+        one.sensor,
+        iop,
+        sds,
+        correlation,
+        sets=s.sets,
+        seed=s.seed,
+        distance_mm=s.distance_mm,
+        raster=s.raster,
+        clusters_mm=s.clusters_mm,
+        progress=progress,
+    )
+    root = draw_root(sds, correlation)
+    jacobian = plane_jacobian(one.sensor, iop, montecarlo.image_points, s.distance_mm)
+    covariance = propagate(jacobian, root.T @ root)
+    law = DistanceLaw(np.sqrt(np.maximum(np.linalg.eigvalsh(covariance), 0.0)))
+    below = np.mean(law.cumulative(s.clusters_mm), axis=0)
+    first_order = FirstOrder(
+        covariance,
+        law.mean(),
+        law.expected_maximum(s.sets),
+        np.diff(below, prepend=0.0, append=1.0),
+    )
+    return montecarlo, first_order

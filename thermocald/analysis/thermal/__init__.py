@@ -1,0 +1,1 @@
+"""The thermal model of a camera: fitted, tested, and used."""

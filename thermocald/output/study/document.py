@@ -1,0 +1,201 @@
+"""A study as one JSON document (CONVENTIONS §4): units of the model, `sd_<name>` beside a value."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
+
+if TYPE_CHECKING:
+    from thermocald.analysis.study.series_study import ChannelStudy, SeriesStudy, Significance
+    from thermocald.analysis.study.study import CameraStudy, Study
+
+__all__ = ["FORMAT", "study_document"]
+
+FORMAT = "thermocald-study/1"
+
+
+def study_document(study: Study) -> dict[str, Any]:
+    """Everything the study computed; null where something could not be, `notes` says why."""
+    s = study.settings
+    document: dict[str, Any] = _finite(
+        {
+            "format": FORMAT,
+            "settings": {
+                "window": s.window,
+                "alpha": s.alpha,
+                "sets": s.sets,
+                "seed": s.seed,
+                "distance_mm": s.distance_mm,
+                "raster": s.raster,
+                "clusters_mm": list(s.clusters_mm),
+                "focus_mm": s.focus_mm,
+                "f_number": s.f_number,
+                "confusion_mm": s.confusion_mm,
+                "thermometer_sd": s.thermometer_sd,
+            },
+            "cameras": [_camera(camera) for camera in study.cameras],
+        }
+    )
+    return document
+
+
+def _camera(camera: CameraStudy) -> dict[str, Any]:
+    correlations = None
+    if camera.correlations is not None:
+        correlations = {
+            "parameters": list(IOP_NAMES),
+            "median": camera.correlations.median.tolist(),
+            "noise": camera.correlations.noise.tolist(),
+            "largest_deviation": camera.correlations.largest.tolist(),
+            "epochs": camera.correlations.epochs,
+        }
+    return {
+        "label": camera.label,
+        "series": [_series(one) for one in camera.series],
+        "interior_orientation": dict(zip(IOP_NAMES, camera.iop.tolist(), strict=True)),
+        "sd_over_time": dict(zip(IOP_NAMES, camera.sds.tolist(), strict=True)),
+        "iop_correlations": correlations,
+        "object_space": _object_space(camera),
+        "notes": list(camera.notes),
+    }
+
+
+def _series(study: SeriesStudy) -> dict[str, Any]:
+    s = study.series
+    focus = study.focus
+    return {
+        "name": s.name,
+        "camera": s.camera,
+        "source": s.source,
+        "epochs": len(s),
+        "without_result": dict(s.without_result),
+        "exterior": s.exterior,
+        "free": list(s.free),
+        "deviations": {
+            name: {
+                "first": d.first,
+                "last": d.last,
+                "change": d.change,
+                "sd_change": d.sd_change,
+                "largest": d.largest,
+                "sd_over_time": d.sd_over_time,
+            }
+            for name, d in study.deviations.items()
+        },
+        "depth_of_field": None
+        if focus is None
+        else {
+            "near_first_mm": focus.first.near,
+            "far_first_mm": focus.first.far,
+            "near_last_mm": focus.last.near,
+            "far_last_mm": focus.last.far,
+            "change_mm": focus.change,
+            "sd_change_mm": focus.sd_change,
+            "confusion_mm": focus.confusion,
+        },
+        "image_displacement_px": None
+        if study.displacement is None
+        else {"points": study.raster.tolist(), "displacement": study.displacement.tolist()},
+        "significance": {name: _significance(t) for name, t in study.significance.items()},
+        "temperature_dependence": {
+            channel.thermometer.name: _channel(channel) for channel in study.channels
+        },
+        "correlation_matrix": {"columns": list(study.columns), "r": study.matrix.tolist()},
+        "notes": list(study.notes),
+    }
+
+
+def _significance(test: Significance) -> dict[str, Any]:
+    return {
+        "success_ratio": test.success_ratio,
+        "tests": test.tests,
+        "left_out": test.left_out,
+        "degrees_variance": test.degrees_variance,
+        "degrees_sd": test.degrees_sd,
+        "critical_ratio": test.critical,
+        "median_ratio": test.median_ratio,
+        "drift_test": None
+        if test.drift is None
+        else {
+            "variance_ratio": test.drift.statistic,
+            "p": test.drift.p_value,
+            "surrogates": test.drift.surrogates,
+            "epochs": test.drift.epochs,
+        },
+    }
+
+
+def _channel(channel: ChannelStudy) -> dict[str, Any]:
+    return {
+        "sd_thermometer": channel.thermometer.sd,
+        "reason": channel.reason or None,
+        "parameters": {
+            name: {
+                "n": d.n,
+                "r": d.r,
+                "p_naive": d.p_naive,
+                "p_naive_holm": channel.p_naive_holm[name],
+                "n_effective": d.n_effective,
+                "residual_lag_one": d.lag_one,
+                "p": d.p_value,
+                "p_holm": channel.p_holm[name],
+                "slope": d.slope,
+                "sd_slope": d.sd_slope,
+                "scatter_over_noise": d.misfit,
+            }
+            for name, d in channel.dependences.items()
+        },
+    }
+
+
+def _object_space(camera: CameraStudy) -> dict[str, Any] | None:
+    mc, first = camera.montecarlo, camera.first_order
+    if mc is None or first is None:
+        return None
+    return {
+        "sets": mc.sets,
+        "seed": mc.seed,
+        "distance_mm": mc.distance_mm,
+        "clusters_mm": list(mc.clusters_mm),
+        "shares": mc.shares.tolist(),
+        "mean_mm": mc.overall_mean,
+        "mean_of_maxima_mm": mc.mean_largest,
+        "folded_sets": mc.folded,
+        "points": [
+            {
+                "image_point_px": mc.image_points[k].tolist(),
+                "expected_mm": mc.expected[k].tolist(),
+                "counts": mc.counts[k].tolist(),
+                "mean_mm": float(mc.mean[k]),
+                "largest_mm": float(mc.largest[k]),
+                "bias_mm": mc.mean_error[k].tolist(),
+                "covariance_mm2": mc.covariance[k].tolist(),
+                "first_order": {
+                    "mean_mm": float(first.mean[k]),
+                    "expected_largest_mm": float(first.expected_largest[k]),
+                    "covariance_mm2": first.covariance[k].tolist(),
+                },
+            }
+            for k in range(len(mc.image_points))
+        ],
+        "first_order": {
+            "shares": first.shares.tolist(),
+            "mean_mm": float(first.mean.mean()),
+            "mean_of_maxima_mm": float(first.expected_largest.mean()),
+        },
+    }
+
+
+def _finite(value: Any) -> Any:
+    """The same with null for NaN and infinity, which JSON does not have."""
+    if isinstance(value, dict):
+        return {key: _finite(v) for key, v in value.items()}
+    if isinstance(value, list):
+        return [_finite(v) for v in value]
+    if isinstance(value, float | np.floating):
+        return float(value) if math.isfinite(value) else None
+    return value

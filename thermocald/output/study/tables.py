@@ -1,0 +1,352 @@
+"""The tables of a study's report: headings and cells as text, ready to be copied."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.output.figures.numbers import (
+    UNITS,
+    coefficient,
+    p_text,
+    parameter_label,
+    percent,
+    plain,
+    rounded,
+    with_sd,
+)
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
+
+if TYPE_CHECKING:
+    from thermocald.analysis.study.deviations import Deviation
+    from thermocald.analysis.study.series_study import ChannelStudy, SeriesStudy, StudySettings
+    from thermocald.analysis.study.study import CameraStudy
+
+__all__ = [
+    "Table",
+    "cluster_table",
+    "correlation_noise_table",
+    "dependence_tables",
+    "deviation_table",
+    "focus_table",
+    "overview_table",
+    "point_table",
+    "significance_table",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Headings and rows of text; note: what the columns mean."""
+
+    title: str
+    headings: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    note: str = ""
+
+
+def overview_table(camera: CameraStudy) -> Table:
+    """What was measured."""
+    rows = []
+    for study in camera.series:
+        s = study.series
+        lost = sum(s.without_result.values())
+        t = study.deviations.get(s.reference.name) if s.reference else None
+        rows.append(
+            (
+                s.name,
+                s.camera,
+                f"{s.sensor.width} × {s.sensor.height} px of {s.sensor.pixel_pitch * 1000:g} µm",
+                f"{len(s)}" + (f" of {len(s) + lost}" if lost else ""),
+                f"{(s.time_s[-1] - s.time_s[0]) / 60:.1f} min",
+                f"{s.interval_s:.1f} s" if len(s) > 1 else "–",
+                f"{t.first:.1f} to {t.last:.1f} °C" if t else "–",
+                ", ".join(parameter_label(name) for name in s.free),
+            )
+        )
+    return Table(
+        "Series",
+        (
+            "series",
+            "camera",
+            "sensor",
+            "epochs",
+            "duration",
+            "interval",
+            "temperature",
+            "estimated",
+        ),
+        tuple(rows),
+    )
+
+
+def deviation_table(camera: CameraStudy) -> Table:
+    """Last minus first (Table 2)."""
+    names = list(dict.fromkeys(n for study in camera.series for n in study.deviations))
+    rows = []
+    for name in names:
+        for study in camera.series:
+            d = study.deviations.get(name)
+            if d is None:
+                continue
+            unit = UNITS.get(name, "K")
+            # Positions are given in mm, their changes in µm.
+            k, change_unit = (1000.0, "µm") if unit == "mm" else (1.0, unit)
+            level_unit = "°C" if unit == "K" else unit
+            rows.append(
+                (
+                    parameter_label(name),
+                    study.series.name,
+                    rounded(d.first, d.sd_change, level_unit),
+                    rounded(d.last, d.sd_change, level_unit),
+                    with_sd(k * d.change, k * d.sd_change, change_unit),
+                    _in_pixels(name, d, study.series.sensor.pixel_pitch),
+                    plain(k * d.largest, change_unit, 3),
+                    plain(k * d.sd_over_time, change_unit, 3),
+                )
+            )
+    return Table(
+        "Deviations, last minus first epoch",
+        (
+            "parameter",
+            "series",
+            "first",
+            "last",
+            "last − first ± sd",
+            "in px",
+            "largest",
+            "sd over time",
+        ),
+        tuple(rows),
+        "The standard deviation beside a difference is that of the two adjustments (for "
+        "temperatures: of the two readings). Largest is the greatest departure from the first "
+        "epoch; sd over time is what the simulation below draws from.",
+    )
+
+
+def _in_pixels(name: str, d: Deviation, pitch: float) -> str:
+    return with_sd(d.change / pitch, d.sd_change / pitch) if name in ("c", "x0", "y0") else ""
+
+
+def focus_table(camera: CameraStudy, settings: StudySettings) -> Table | None:
+    """Change of the depth of field."""
+    rows = [
+        (
+            study.series.name,
+            f"{f.first.near:.0f} to {plain(f.first.far, digits=4)} mm",
+            f"{f.last.near:.0f} to {plain(f.last.far, digits=4)} mm",
+            with_sd(f.change, f.sd_change, "mm"),
+        )
+        for study in camera.series
+        if (f := study.focus) is not None
+    ]
+    if not rows:
+        return None
+    confusion = next(s.focus.confusion for s in camera.series if s.focus is not None)
+    return Table(
+        f"Depth of field, focused at {settings.focus_mm / 1000:g} m",
+        ("series", "sharp at first", "sharp at last", "change ± sd"),
+        tuple(rows),
+        f"For f/{settings.f_number:g} and a circle of confusion of {confusion * 1000:.1f} µm, the "
+        "principal distance taken as focal length.",
+    )
+
+
+def significance_table(camera: CameraStudy, settings: StudySettings) -> Table | None:
+    """Success ratios of the F-test and the p-value of the whole series (Tables 4 and 5)."""
+    tested = [study for study in camera.series if study.significance]
+    if not tested:
+        return None
+    rows = []
+    for name in IOP_NAMES:
+        for study in tested:
+            test = study.significance.get(name)
+            if test is not None:
+                rows.append(
+                    (
+                        parameter_label(name),
+                        study.series.name,
+                        percent(test.success_ratio),
+                        plain(test.median_ratio, digits=3),
+                        f"{test.critical:.3f}",
+                        f"{test.degrees_variance}; {test.degrees_sd:.0f}",
+                        f"{test.tests} ({test.left_out})",
+                        p_text(test.drift.p_value) if test.drift else "–",
+                    )
+                )
+    return Table(
+        "Is the variation greater than the uncertainty?",
+        (
+            "parameter",
+            "series",
+            "success ratio",
+            "median variance ratio",
+            "limit",
+            "degrees of freedom",
+            "instants tested (left out)",
+            "p, whole series",
+        ),
+        tuple(rows),
+        f"F-test at each instant: variance of {settings.window} consecutive epochs against the "
+        f"mean of their squared standard deviations, one-sided at α = {settings.alpha:g}. "
+        f"Neighbouring windows share {settings.window - 1} of {settings.window} epochs, so "
+        "their tests are not independent and the success ratio is no probability; of a parameter "
+        "that does not drift, about α of the instants succeed by chance. The last column is a "
+        "probability: it compares the variance of the whole series with those of simulated series "
+        "that do not drift but have the same standard deviations and autocorrelation.",
+    )
+
+
+def dependence_tables(camera: CameraStudy) -> list[Table]:
+    """Correlation and slope on each thermometer (the reference's section 4.3)."""
+    return [
+        _dependence_table(study, channel)
+        for study in camera.series
+        for channel in study.channels
+        if channel.dependences
+    ]
+
+
+def _dependence_table(study: SeriesStudy, channel: ChannelStudy) -> Table:
+    rows = []
+    for name, d in channel.dependences.items():
+        k, unit = (1000.0, "µm") if UNITS[name] == "mm" else (1.0, UNITS[name])
+        pitch = study.series.sensor.pixel_pitch
+        in_px = with_sd(d.slope / pitch, d.sd_slope / pitch) if name in ("c", "x0", "y0") else ""
+        rows.append(
+            (
+                parameter_label(name),
+                coefficient(d.r),
+                f"{d.n}",
+                f"{d.n_effective:.0f}",
+                p_text(channel.p_naive_holm[name]),
+                p_text(channel.p_holm[name]),
+                with_sd(k * d.slope, k * d.sd_slope, f"{unit}/K" if unit else "1/K"),
+                in_px,
+                f"{d.misfit:.1f}",
+            )
+        )
+    t = channel.thermometer
+    return Table(
+        f"Dependence on {parameter_label(t.name)}, {study.series.name}",
+        (
+            "parameter",
+            "r",
+            "n",
+            "n effective",
+            "p naive",
+            "p",
+            "slope ± sd",
+            "px/K",
+            "scatter / noise",
+        ),
+        tuple(rows),
+        f"r: Pearson's correlation. p naive counts every epoch as independent; p counts the "
+        "effective number that the autocorrelation of the residuals leaves; both are corrected for "
+        "the number of parameters (Holm). The slope counts the thermometer's noise of "
+        f"{plain(t.sd, 'K', 2)}. Scatter / noise above 1: the straight line does not explain all.",
+    )
+
+
+def correlation_noise_table(camera: CameraStudy) -> Table | None:
+    """Noise of the correlation coefficients over the epochs (section 4.3)."""
+    if camera.correlations is None:
+        return None
+    free = [k for k in range(10) if camera.sds[k] > 0]
+    median, noise, largest = (
+        camera.correlations.median,
+        camera.correlations.noise,
+        camera.correlations.largest,
+    )
+    rows = [
+        (
+            f"{parameter_label(IOP_NAMES[i])}, {parameter_label(IOP_NAMES[j])}",
+            coefficient(float(median[i, j])),
+            f"{noise[i, j]:.4f}",
+            f"{largest[i, j]:.4f}",
+        )
+        for a, i in enumerate(free)
+        for j in free[a + 1 :]
+    ]
+    return Table(
+        "Correlations of the interior orientation",
+        ("pair", "median", "noise (sd)", "largest deviation"),
+        tuple(rows),
+        f"From {camera.correlations.epochs} covariance matrices of the adjustments.",
+    )
+
+
+def cluster_table(camera: CameraStudy) -> Table | None:
+    """Shares of the errors, means, maxima (Table 7)."""
+    mc, first = camera.montecarlo, camera.first_order
+    if mc is None or first is None:
+        return None
+    cm = [limit / 10 for limit in mc.clusters_mm]
+    names = [f"< {cm[0]:g} cm"]
+    names += [f"{a:g}–{b:g} cm" for a, b in pairwise(cm)]
+    names.append(f"> {cm[-1]:g} cm")
+
+    def row(label: str, shares: object, mean: float, largest: float) -> tuple[str, ...]:
+        shown = [percent(float(v), 1) for v in np.asarray(shares, dtype=float)]
+        return (label, *shown, f"{mean / 10:.2f} cm", f"{largest / 10:.1f} cm")
+
+    return Table(
+        f"Errors on a plane at {mc.distance_mm / 1000:g} m",
+        ("", *names, "mean", "mean of maxima"),
+        (
+            row("simulated", mc.shares, mc.overall_mean, mc.mean_largest),
+            row(
+                "first order",
+                np.maximum(first.shares, 0.0),
+                float(first.mean.mean()),
+                float(first.expected_largest.mean()),
+            ),
+        ),
+        f"{mc.sets:,} sets of interior orientation, seed {mc.seed}, {len(mc.image_points)} image "
+        "points. First order is the analytic propagation of the same covariance: where it differs "
+        "from the simulation, linear error propagation fails. The mean of maxima depends on the "
+        "number of sets and, by some per cent, on the seed.",
+    )
+
+
+def point_table(camera: CameraStudy) -> Table | None:
+    """Errors per raster point (Figure 11)."""
+    mc, first = camera.montecarlo, camera.first_order
+    if mc is None or first is None:
+        return None
+    rows = []
+    for k, point in enumerate(mc.image_points):
+        values, vectors = np.linalg.eigh(mc.covariance[k])
+        major = vectors[:, 1]
+        angle = float(np.degrees(np.arctan2(major[1], major[0]))) % 180
+        rows.append(
+            (
+                f"{point[0]:.0f}, {point[1]:.0f}",
+                f"{mc.mean[k] / 10:.2f}",
+                f"{first.mean[k] / 10:.2f}",
+                f"{mc.largest[k] / 10:.1f}",
+                f"{first.expected_largest[k] / 10:.1f}",
+                f"{np.sqrt(values[1]) / 10:.2f} × {np.sqrt(max(values[0], 0.0)) / 10:.2f}",
+                f"{angle:.0f}°",
+                f"{np.linalg.norm(mc.mean_error[k]):.2f}",
+            )
+        )
+    return Table(
+        "Errors by image point",
+        (
+            "image point px",
+            "mean cm",
+            "mean cm, first order",
+            "largest cm",
+            "largest cm, first order",
+            "ellipse sd cm",
+            "direction",
+            "bias mm",
+        ),
+        tuple(rows),
+        "Direction of the longer axis, from X (right) towards Y (up) as the camera looks. "
+        "Bias is what the mean error vector keeps: an effect of second order.",
+    )

@@ -1,0 +1,1 @@
+"""Test fields laid out, drawn, and printed."""

@@ -1,0 +1,299 @@
+"""Where the targets of a printed test field lie: on a sheet, and the sheets in space.
+
+A sheet is a square grid of coded targets with a plain circle in the middle of each mesh; markers of
+OpenCV's dictionaries may take some of the grid's places. Sheet coordinates are mm from the lower
+left corner of the trimmed sheet, x right, y up, as a viewer sees it.
+
+Three sheets form a corner: the floor (XY, seen from +Z), the left wall (YZ, seen from +X) and the
+right wall (XZ, seen from +Y), trimmed edges meeting at the axes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.errors import UsageError
+from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.photogrammetry.targets import ring_code
+from thermocald.photogrammetry.targets.markers import parse_marker
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+__all__ = [
+    "PAPERS",
+    "Design",
+    "Marker",
+    "Sheet",
+    "Target",
+    "field_of",
+    "lay_out",
+    "paper_size",
+]
+
+PAPERS = {
+    "A0": (841.0, 1189.0),
+    "A1": (594.0, 841.0),
+    "A2": (420.0, 594.0),
+    "A3": (297.0, 420.0),
+    "A4": (210.0, 297.0),
+}
+TRIM = 8.0
+"""Width of the edge outside the crop marks, mm; most printers leave 5 mm of it white."""
+STRIP = 14.0
+"""Width of the strips at the left and lower edge that hold the rulers and the legend, mm."""
+_PITCH = 8.5
+"""Grid pitch in radii of a disc: the rings' white surround and a plain circle fit in between."""
+_MAX_SIDE = 5000.0
+_MARKER_SIDE = 6.0
+"""Side of a marker in radii of a disc; its white surround then still fits into the pitch."""
+# What a print is worth before it has been surveyed (1 sigma): the printer's own raggedness, its
+# scale error over the distance from the sheet's centre, paper that is not flat, sheets that are
+# put up by hand.
+_SIGMA_PRINT, _SIGMA_SCALE, _SIGMA_FLAT, _SIGMA_MOUNT = 0.1, 0.003, 1.0, 3.0
+
+
+class _OutOfCodes(UsageError):
+    """There are fewer codes than places on the sheets."""
+
+
+@dataclass(frozen=True, slots=True)
+class Design:
+    """What is wanted of a print.
+
+    page: size (width, height) mm; diameter of the discs mm; bits of the ring codes (12 or 14, 0 for
+    none, None for the fewest that suffice), from the `first_code`-th on; whether plain circles
+    stand in between; a marker dictionary, and every how many-th place of the grid is a marker;
+    light targets on black; 1 sheet or the 3 of a corner; pitch of the grid mm, None for the least.
+    """
+
+    page: tuple[float, float]
+    diameter: float
+    bits: int | None = None
+    plain: bool = True
+    dictionary: str | None = None
+    marker_every: int = 5
+    light: bool = False
+    sheets: int = 1
+    first_code: int = 0
+    pitch: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """A circle on a sheet: centre mm; its ring code or an empty string."""
+
+    name: str
+    x: float
+    y: float
+    code: str
+
+
+@dataclass(frozen=True, slots=True)
+class Marker:
+    """A marker on a sheet: centre and side mm; `DICT_…:17`."""
+
+    name: str
+    x: float
+    y: float
+    side: float
+    code: str
+
+    def corners(self) -> Array:
+        """The corners (4, 2) mm in OpenCV's order: clockwise from the upper left."""
+        h = self.side / 2
+        square = np.array([[-h, h], [h, h], [h, -h], [-h, -h]])
+        placed: Array = square + np.array([self.x, self.y])
+        return placed
+
+
+@dataclass(frozen=True, slots=True)
+class Sheet:
+    """One sheet: its title, trimmed size (width, height) mm, and what is on it."""
+
+    title: str
+    design: Design
+    size: tuple[float, float]
+    targets: tuple[Target, ...]
+    markers: tuple[Marker, ...]
+
+    @property
+    def scale_bar(self) -> tuple[Target, Target] | None:
+        """The two targets whose distance is to be measured: the longest level one between codes."""
+        coded = [t for t in self.targets if t.code] or list(self.targets)
+        if len(coded) < 2:
+            return None
+        lowest = min(t.y for t in coded)
+        row = sorted((t for t in coded if t.y == lowest), key=lambda t: t.x)
+        if len(row) < 2:
+            row = sorted(coded, key=lambda t: t.y)
+        return row[0], row[-1]
+
+
+def paper_size(text: str, *, landscape: bool = False) -> tuple[float, float]:
+    """`A3` or `300x400` (width × height, mm) → page size in mm; UsageError for anything else."""
+    name = text.strip().upper()
+    if name in PAPERS:
+        w, h = PAPERS[name]
+        return (h, w) if landscape else (w, h)
+    parts = name.replace("×", "X").split("X")
+    try:
+        w, h = (float(part) for part in parts)
+    except ValueError:
+        raise UsageError(
+            f"paper {text!r}: give one of {', '.join(sorted(PAPERS))}, or WIDTHxHEIGHT in mm"
+        ) from None
+    if not (60 <= w <= _MAX_SIDE and 60 <= h <= _MAX_SIDE):
+        raise UsageError(f"paper {text!r}: both sides must be between 60 and {_MAX_SIDE:.0f} mm")
+    return (max(w, h), min(w, h)) if landscape else (w, h)
+
+
+def lay_out(design: Design) -> tuple[Sheet, ...]:
+    """The sheets of a design; UsageError where it does not fit, or runs out of codes."""
+    if design.bits is None:
+        try:
+            return lay_out(replace(design, bits=12))
+        except _OutOfCodes:
+            return lay_out(replace(design, bits=14))
+    _check(design)
+    width, height = (side - 2 * TRIM for side in design.page)
+    r = design.diameter / 2
+    pitch = design.pitch if design.pitch is not None else _PITCH * r
+    reach = 4 * r if design.bits or design.dictionary else 2 * r
+    low = STRIP + reach
+    nx = int((width - low - reach) / pitch) + 1 if width > low + reach else 0
+    ny = int((height - low - reach) / pitch) + 1 if height > low + reach else 0
+    if nx < 2 or ny < 2:
+        raise UsageError(
+            f"discs of {design.diameter:g} mm on {design.page[0]:g} × {design.page[1]:g} mm paper "
+            f"leave room for {nx} × {ny} targets: take smaller discs or larger paper"
+        )
+    x = low + (width - low - reach - (nx - 1) * pitch) / 2 + pitch * np.arange(nx)
+    y = low + (height - low - reach - (ny - 1) * pitch) / 2 + pitch * np.arange(ny)
+    codes = _codes(design)
+    marker_ids = _marker_ids(design)
+    plain_number = 0
+    titles = (
+        ["sheet"] if design.sheets == 1 else ["floor (XY)", "left wall (YZ)", "right wall (XZ)"]
+    )
+    sheets = []
+    for title in titles:
+        targets, markers = [], []
+        for j in range(ny):
+            for i in range(nx):
+                if (
+                    design.dictionary
+                    and (i + 2 * j) % design.marker_every == design.marker_every // 2
+                ):
+                    code = next(marker_ids)
+                    name = "M" + code.rpartition(":")[2]
+                    markers.append(Marker(name, x[i], y[j], _MARKER_SIDE * r, code))
+                elif design.bits:
+                    code = next(codes)
+                    name = f"R{code.rpartition(':')[2]}"
+                    targets.append(Target(name, float(x[i]), float(y[j]), code))
+                else:
+                    plain_number += 1
+                    targets.append(Target(f"P{plain_number}", float(x[i]), float(y[j]), ""))
+        if design.plain and design.bits:
+            for j in range(ny - 1):
+                for i in range(nx - 1):
+                    plain_number += 1
+                    middle = float(x[i] + pitch / 2), float(y[j] + pitch / 2)
+                    targets.append(Target(f"P{plain_number}", *middle, ""))
+        sheets.append(Sheet(title, design, (width, height), tuple(targets), tuple(markers)))
+    return tuple(sheets)
+
+
+def _check(design: Design) -> None:
+    if not 2 <= design.diameter <= 200:
+        raise UsageError(f"disc diameter {design.diameter:g} mm: between 2 and 200 mm are possible")
+    if design.bits not in (0, *ring_code.BITS):
+        raise UsageError(f"ring codes of {design.bits} bits: there are 12 and 14, and 0 for none")
+    if not design.bits and design.dictionary is None:
+        raise UsageError(
+            "plain circles alone cannot be identified: add ring codes (--bits 12) or markers "
+            "(--markers DICT_APRILTAG_36h11)"
+        )
+    if design.sheets not in (1, 3):
+        raise UsageError(f"{design.sheets} sheets: one, or the three of a corner")
+    if design.marker_every < 2:
+        raise UsageError(f"a marker at every {design.marker_every}-th place: at least every second")
+    least = _PITCH * design.diameter / 2
+    if design.pitch is not None and design.pitch < least - 1e-9:
+        raise UsageError(
+            f"pitch {design.pitch:g} mm: discs of {design.diameter:g} mm need {least:g} mm"
+        )
+
+
+def _codes(design: Design) -> Iterator[str]:
+    if design.bits:
+        available = ring_code.codes(design.bits)
+        for number in available[design.first_code :]:
+            yield ring_code.write(design.bits, number)
+        raise _OutOfCodes(
+            f"the field needs more than the {len(available) - design.first_code} ring codes of "
+            f"{design.bits} bits that are left: "
+            + ("take --bits 14, or " if design.bits == 12 else "take ")
+            + "larger discs, smaller paper, or markers in between"
+        )
+
+
+def _marker_ids(design: Design) -> Iterator[str]:
+    if design.dictionary is None:
+        return
+    import cv2
+
+    number = getattr(cv2.aruco, design.dictionary, None)
+    if number is None or not design.dictionary.startswith("DICT_"):
+        known = [n for n in dir(cv2.aruco) if n.startswith("DICT_")]
+        raise UsageError(f"no marker dictionary {design.dictionary!r}: {', '.join(sorted(known))}")
+    count = len(cv2.aruco.getPredefinedDictionary(number).bytesList)
+    for i in range(count):
+        code = f"{design.dictionary}:{i}"
+        parse_marker(code)
+        yield code
+    raise UsageError(f"the field needs more than the {count} markers of {design.dictionary}")
+
+
+def _placement(sheets: Sequence[Sheet], k: int) -> tuple[Array, Array]:
+    """Where a sheet lies: its origin (3,) mm, and the space directions of its x and y (2, 3)."""
+    if len(sheets) == 1 or k == 0:
+        return np.zeros(3), np.eye(3)[:2]
+    if k == 1:
+        return np.zeros(3), np.eye(3)[1:]
+    return np.array([sheets[k].size[0], 0.0, 0.0]), np.array([[-1.0, 0, 0], [0, 0, 1.0]])
+
+
+def field_of(sheets: Sequence[Sheet]) -> TestField:
+    """The nominal test field of the sheets, with the standard deviations of an unsurveyed print."""
+    names, points, sigmas, diameters, kinds, codes = [], [], [], [], [], []
+    mount = _SIGMA_MOUNT if len(sheets) > 1 else 0.0
+    for k, sheet in enumerate(sheets):
+        origin, axes = _placement(sheets, k)
+        rows = [
+            (t.name, (t.x, t.y), sheet.design.diameter, "circle", t.code) for t in sheet.targets
+        ]
+        rows += [
+            (f"{m.name}.{i}", tuple(corner), float("nan"), "marker_corner", f"{m.code}:{i}")
+            for m in sheet.markers
+            for i, corner in enumerate(m.corners())
+        ]
+        for name, xy, diameter, kind, code in rows:
+            local = np.asarray(xy) - np.asarray(sheet.size) / 2
+            in_plane = np.hypot(_SIGMA_PRINT, _SIGMA_SCALE * local) @ np.abs(axes)
+            normal = _SIGMA_FLAT * np.abs(np.cross(axes[0], axes[1]))
+            names.append(name)
+            points.append(origin + np.asarray(xy) @ axes)
+            sigmas.append(np.sqrt(in_plane**2 + normal**2 + mount**2))
+            diameters.append(diameter)
+            kinds.append(kind)
+            codes.append(code)
+    return TestField.build(names, np.array(points), np.array(sigmas), diameters, kinds, codes)

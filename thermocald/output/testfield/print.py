@@ -1,0 +1,63 @@
+"""`thermocald testfield print`: a folder with the sheets to print and the test field they are."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from thermocald.errors import UsageError
+from thermocald.output.testfield.drawing import write_pdf, write_svg
+from thermocald.output.testfield.layout import field_of, lay_out
+from thermocald.store.recording.testfield_file import write_testfield
+
+if TYPE_CHECKING:
+    from thermocald.output.testfield.layout import Design, Sheet
+    from thermocald.photogrammetry.field.testfield import TestField
+
+__all__ = ["Printed", "default_diameter", "print_testfield"]
+
+
+@dataclass(frozen=True, slots=True)
+class Printed:
+    """What was written: the files, the sheets, the nominal field."""
+
+    files: tuple[Path, ...]
+    sheets: tuple[Sheet, ...]
+    field: TestField
+
+
+def default_diameter(page: tuple[float, float]) -> float:
+    """A disc diameter for a page size (mm): about a hundred targets on a sheet, mm."""
+    return max(3.0, round(min(page) / 34))
+
+
+def print_testfield(design: Design, folder: Path) -> Printed:
+    """Write `testfield.pdf`, one SVG per sheet, and `testfield.csv` into a folder.
+
+    All files appear, or none; files of these names are replaced, others stay.
+    """
+    sheets = lay_out(design)
+    field = field_of(sheets)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(prefix=".testfield-", dir=folder))
+    except OSError as cause:
+        raise UsageError(f"{folder}: cannot be written into: {cause.strerror}") from cause
+    try:
+        names = ["testfield.pdf"]
+        write_pdf(sheets, work / "testfield.pdf")
+        for i, sheet in enumerate(sheets, start=1):
+            name = "testfield.svg" if len(sheets) == 1 else f"testfield-{i}.svg"
+            write_svg(sheet, work / name)
+            names.append(name)
+        write_testfield(work / "testfield.csv", field)
+        names.append("testfield.csv")
+        for name in names:
+            os.replace(work / name, folder / name)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    return Printed(tuple(folder / name for name in names), sheets, field)

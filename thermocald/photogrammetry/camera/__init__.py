@@ -1,0 +1,1 @@
+"""The camera: its model, and the models of other programs."""

@@ -1,0 +1,1 @@
+"""One epoch, or several photographs: least-squares adjustment and its diagnosis."""

@@ -1,0 +1,282 @@
+"""Least-squares adjustment of one epoch (Gauss-Markov), with data snooping and diagnosis.
+
+The observations are image points with their a-priori covariance; object coordinates are
+observations too: eliminated point by point, their covariance adds B Σ Bᵀ to that of the image
+point, which is the same solution. Gross errors are found by Baarda's data snooping on the two
+coordinates of a point together.
+
+The covariance holds the noise of the image points and, per epoch, that of the object coordinates.
+It does not hold errors of the camera model.
+
+Source: Luhmann et al. (2014), section 2.4; Baarda, W. (1968): A testing procedure for use in
+geodetic networks; the elimination as Mikhail and Ackermann (1976), chapter 11.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from thermocald.errors import ConfigurationError, GeometryError
+from thermocald.photogrammetry.camera.camera_model import (
+    EOP_NAMES,
+    IOP_NAMES,
+    PARAMETER_NAMES,
+    ExteriorOrientation,
+    InteriorOrientation,
+)
+from thermocald.photogrammetry.epoch.gauss_markov import (
+    NoConvergenceError,
+    Problem,
+    Rejections,
+    Solution,
+    point_tests,
+    resolve,
+    snoop,
+    solve,
+)
+from thermocald.photogrammetry.epoch.geometry import GeometryBounds, weaknesses
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from thermocald.photogrammetry.camera.camera_model import Sensor
+    from thermocald.photogrammetry.field.testfield import Observations, TestField
+
+    Array = NDArray[np.float64]
+    Mask = NDArray[np.bool_]
+
+__all__ = [
+    "DEFAULT_FREE",
+    "Adjustment",
+    "AdjustmentSettings",
+    "adjust",
+    "failed",
+]
+
+DEFAULT_FREE = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2")
+
+_ROUNDS = 12  # of data snooping; each may reject several targets
+_TRUSTED_REDUNDANCY = 20  # from here on the residuals themselves tell the noise
+
+
+@dataclass(frozen=True, slots=True)
+class AdjustmentSettings:
+    """What is estimated and what is tested.
+
+    free: names of IOP to estimate, the others keep their start values; priors: {name: (value, sd)}
+    in the parameter's unit; exterior_free: False holds the EOP too; target_sigmas: whether the
+    sigmas of object coordinates count; snooping_alpha: error probability of a single test, 0
+    switches it off; max_rejected: share of the targets beyond which the epoch fails;
+    scale: covariance with the a-posteriori sigma0, or a priori with 1.
+    """
+
+    free: tuple[str, ...] = DEFAULT_FREE
+    priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    exterior_free: bool = True
+    target_sigmas: bool = True
+    snooping_alpha: float = 0.001
+    max_rejected: float = 0.35
+    scale: Literal["posterior", "prior"] = "posterior"
+    bounds: GeometryBounds = field(default_factory=GeometryBounds)
+
+    def __post_init__(self) -> None:
+        for name in (*self.free, *self.priors):
+            if name not in PARAMETER_NAMES:
+                raise ConfigurationError(
+                    f"{name!r} is no parameter; there are {', '.join(PARAMETER_NAMES)}"
+                )
+
+    @property
+    def unknowns(self) -> NDArray[np.int64]:
+        """Positions of the unknowns in `PARAMETER_NAMES`."""
+        return _positions(tuple(self.free), self.exterior_free)
+
+
+@lru_cache(maxsize=64)
+def _positions(free: tuple[str, ...], exterior_free: bool) -> NDArray[np.int64]:
+    names = {*free, *(EOP_NAMES if exterior_free else ())}
+    rows = np.array([i for i, n in enumerate(PARAMETER_NAMES) if n in names], dtype=np.int64)
+    rows.flags.writeable = False
+    return rows
+
+
+_USUAL = AdjustmentSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class Adjustment:
+    """The result of one least-squares solution.
+
+    status: `ok`, or one word for why there is no result, and `reason` in a sentence. covariance
+    (16, 16) in the order of `PARAMETER_NAMES`, zero for what was held; residuals (n, 2) px,
+    measured minus adjusted, of all targets in `targets`; redundancy_numbers (n, 2), 0 to 1, of the
+    rejected too (as check points); test_values (n,): chi-square with 2 degrees of freedom;
+    rejected: rows of the test field.
+    """
+
+    status: str
+    reason: str
+    interior: InteriorOrientation | None
+    exterior: ExteriorOrientation | None
+    covariance: Array
+    free: tuple[str, ...]
+    sigma0: float
+    redundancy: int
+    targets: NDArray[np.int64]
+    residuals: Array
+    redundancy_numbers: Array
+    test_values: Array
+    rejected: tuple[int, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether there is a result that may be used."""
+        return self.status == "ok"
+
+    @property
+    def n_observations(self) -> int:
+        """Targets offered, the rejected included."""
+        return len(self.targets)
+
+    @property
+    def values(self) -> Array:
+        """The 16 parameters; NaN where there is none."""
+        if self.interior is None or self.exterior is None:
+            return np.full(16, np.nan)
+        return np.concatenate([self.interior.as_array(), self.exterior.as_array()])
+
+    @property
+    def sd(self) -> Array:
+        """Standard deviations (16,), NaN where a parameter was held."""
+        variance = np.diag(self.covariance)
+        return np.sqrt(np.where(variance > 0, variance, np.nan))
+
+    @property
+    def correlations(self) -> Array:
+        """Correlation coefficients (16, 16), NaN where a parameter was held."""
+        s = self.sd
+        return self.covariance / np.outer(s, s)
+
+
+def failed(
+    status: str, reason: str, observations: Observations | None = None, free: tuple[str, ...] = ()
+) -> Adjustment:
+    """An epoch without a result."""
+    targets = np.empty(0, dtype=np.int64) if observations is None else observations.targets
+    n = len(targets)
+    return Adjustment(
+        status, reason, None, None, np.zeros((16, 16)), free, float("nan"), 0, targets,
+        np.full((n, 2), np.nan), np.full((n, 2), np.nan), np.full(n, np.nan), (),
+    )  # fmt: skip
+
+
+def adjust(
+    sensor: Sensor,
+    testfield: TestField,
+    observations: Observations,
+    interior: InteriorOrientation,
+    exterior: ExteriorOrientation,
+    settings: AdjustmentSettings | None = None,
+    suspects: Mask | None = None,
+) -> Adjustment:
+    """Adjust one epoch from start values.
+
+    suspects: mask (n,) of observations to leave out at first; they come back where they fit.
+    Never raises for data: an epoch without a result has a status and a reason.
+    """
+    s = settings or _USUAL
+    unknowns = s.unknowns
+    n = len(observations)
+    if 2 * n + len(s.priors) - len(unknowns) < s.bounds.minimum_redundancy:
+        return failed(
+            "too_few_targets",
+            f"{n} targets for {len(unknowns)} unknowns leave a redundancy of "
+            f"{2 * n + len(s.priors) - len(unknowns)}; at least {s.bounds.minimum_redundancy} "
+            "is needed: show more targets or hold parameters fixed",
+            observations,
+            s.free,
+        )
+    start = np.concatenate([interior.as_array(), exterior.as_array()])
+    problem = Problem.build(sensor, testfield, observations, unknowns, s.priors, s.target_sigmas)
+    use = np.ones(n, dtype=bool) if suspects is None else ~suspects
+    try:
+        solution = solve(problem, start, use)
+        tests = point_tests(solution, use)
+        rejections = Rejections(use)
+        for _ in range(_ROUNDS):
+            keep = snoop(tests[0], use, len(unknowns), s.snooping_alpha)
+            keep = rejections.settle(use, keep)
+            if keep is use:
+                break
+            use = keep
+            if use.sum() < (1 - s.max_rejected) * n:
+                return failed(
+                    "too_many_rejected",
+                    f"{n - int(use.sum())} of {n} targets contradict the others: a moved test "
+                    "field, a wrong one, or a blurred image",
+                    observations,
+                    s.free,
+                )
+            solution = resolve(problem, solution, use)
+            tests = point_tests(solution, use)
+    except GeometryError as error:
+        return failed("weak_geometry", str(error), observations, s.free)
+    except NoConvergenceError as error:
+        return failed("no_convergence", str(error), observations, s.free)
+    return _result(problem, solution, s, use, *tests)
+
+
+def _result(
+    problem: Problem,
+    solution: Solution,
+    s: AdjustmentSettings,
+    use: Mask,
+    test: Array,
+    redundancy_numbers: Array,
+) -> Adjustment:
+    u = problem.unknowns
+    redundancy = 2 * int(use.sum()) + len(s.priors) - len(u)
+    v, points, observed = solution.whitened[-1], problem.points, problem.observations.points
+    rejected: tuple[int, ...] = ()
+    if not use.all():
+        v, points, observed = v[:, use], points[use], observed[use]
+        rejected = tuple(problem.observations.targets[~use].tolist())
+    sigma0 = float(np.sqrt(problem.cost(v, solution.values) / redundancy))
+    factor = sigma0**2 if s.scale == "posterior" else 1.0
+    if redundancy < _TRUSTED_REDUNDANCY:
+        factor = max(1.0, factor)  # a handful of residuals may be small by luck
+    covariance = np.zeros((16, 16))
+    covariance[u[:, None], u] = solution.root @ solution.root.T * factor
+    result = Adjustment(
+        "ok",
+        "",
+        InteriorOrientation.from_array(solution.values[:10]),
+        ExteriorOrientation.from_array(solution.values[10:]),
+        covariance,
+        tuple(n for n in IOP_NAMES if n in s.free),
+        sigma0,
+        redundancy,
+        problem.observations.targets,
+        solution.residuals.T,
+        redundancy_numbers,
+        test,
+        rejected,
+    )
+    reasons = weaknesses(
+        problem.sensor,
+        points,
+        observed,
+        solution.values,
+        covariance,
+        s.free,
+        s.bounds,
+    )
+    if reasons:
+        return replace(result, status="weak_geometry", reason="; ".join(reasons))
+    return result

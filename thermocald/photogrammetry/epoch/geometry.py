@@ -1,0 +1,138 @@
+"""Whether the geometry carries what was estimated: weak geometry is said, not hidden.
+
+An adjustment of a frontal plane, or of targets in one corner of the image, converges and gives
+small residuals; its parameters are nevertheless not those of the camera. Every bound stands in the
+reason, with the figure that broke it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, PARAMETER_NAMES, rotation
+from thermocald.photogrammetry.orientation.approximate import plane_fit
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from numpy.typing import NDArray
+
+    from thermocald.photogrammetry.camera.camera_model import Sensor
+
+    Array = NDArray[np.float64]
+
+__all__ = ["GeometryBounds", "image_coverage", "obliqueness_deg", "weaknesses"]
+
+
+@dataclass(frozen=True, slots=True)
+class GeometryBounds:
+    """Bounds beyond which an epoch is called weak.
+
+    minimum_redundancy: of the adjustment; correlation: largest |coefficient| between two estimated
+    parameters; relative_sd_c: sd(c)/c; sd_point_px: sd of x0, y0; coverage: share of the image
+    inside the targets' hull; plane_obliqueness_deg: angle between the optical axis and the normal
+    of a plane field.
+    """
+
+    minimum_redundancy: int = 6
+    correlation: float = 0.9999
+    relative_sd_c: float = 0.01
+    sd_point_px: float = 25.0
+    coverage: float = 0.10
+    plane_obliqueness_deg: float = 15.0
+
+
+def image_coverage(sensor: Sensor, image_points: Array) -> float:
+    """Share of the image area inside the convex hull of image points (n, 2)."""
+    import cv2
+
+    hull = cv2.convexHull(np.ascontiguousarray(image_points, dtype=np.float32))
+    return float(cv2.contourArea(hull)) / (sensor.width * sensor.height)
+
+
+def obliqueness_deg(eop: Array, normal: Array) -> float:
+    """Angle between the optical axis and a plane's normal, 0 for a frontal view."""
+    axis = rotation(eop[:3])[:, 2]
+    return float(np.degrees(np.arccos(min(1.0, abs(float(axis @ normal))))))
+
+
+def weaknesses(
+    sensor: Sensor,
+    points: Array,
+    image_points: Array,
+    values: Array,
+    covariance: Array,
+    free: Iterable[str],
+    bounds: GeometryBounds,
+) -> list[str]:
+    """Why the geometry does not carry the free IOP of a result; empty where it does.
+
+    points (n, 3) mm and image_points (n, 2) px of the targets that took part; values (16,) and
+    covariance (16, 16) of the adjustment. Held parameters are not blamed: a pose alone needs far
+    less.
+    """
+    reasons: list[str] = []
+    sd = np.sqrt(covariance.diagonal())
+    free = set(free)
+    if "c" in free:
+        if sd[0] > bounds.relative_sd_c * values[0]:
+            reasons.append(
+                f"the principal distance is known to {sd[0] / values[0]:.1%} only "
+                f"(bound {bounds.relative_sd_c:.1%})"
+            )
+        if _has_depth(points):
+            flat = False
+        else:
+            _, axes, flat = plane_fit(points)
+        if flat:
+            angle = obliqueness_deg(values[10:], axes[2])
+            if angle < bounds.plane_obliqueness_deg:
+                reasons.append(
+                    f"one plane seen at {angle:.0f}° from frontal (at least "
+                    f"{bounds.plane_obliqueness_deg:.0f}° are needed): principal distance and "
+                    "distance to the field cannot be told apart"
+                )
+    for name, column in (("x0", 1), ("y0", 2)):
+        size = sd[column] / sensor.pixel_pitch
+        if name in free and size > bounds.sd_point_px:
+            reasons.append(
+                f"{name} is known to {size:.0f} px only (bound {bounds.sd_point_px:.0f} px)"
+            )
+    if free & {"x0", "y0", "A1", "A2", "A3", "B1", "B2"}:
+        coverage = image_coverage(sensor, image_points)
+        if coverage < bounds.coverage:
+            reasons.append(
+                f"the targets cover {coverage:.1%} of the image (at least {bounds.coverage:.0%} "
+                "are needed)"
+            )
+    pair = _strongest_correlation(covariance, bounds.correlation)
+    if pair:
+        reasons.append(pair)
+    return reasons
+
+
+def _has_depth(points: Array) -> bool:
+    """Whether points are certainly no plane: a quick look that spares most epochs the fit."""
+    reduced = points - np.full(len(points), 1.0 / len(points)) @ points
+    (a, b, c), (_, d, e), (_, _, f) = (reduced.T @ reduced).tolist()
+    determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
+    return bool(determinant > 1e-4 * (a + d + f) ** 3)
+
+
+def _strongest_correlation(covariance: Array, bound: float) -> str:
+    variance = covariance.diagonal()
+    scale = 1.0 / np.sqrt(np.where(variance > 0, variance, np.inf))
+    r = np.abs(covariance * scale * scale[:, None])
+    r.flat[:: len(r) + 1] = 0.0
+    # Only pairs that an IOP takes part in: EOP alone do not spoil the camera.
+    inner = r[: len(IOP_NAMES)]
+    i, j = divmod(int(inner.argmax()), len(r))
+    if inner[i, j] <= bound:
+        return ""
+    return (
+        f"{PARAMETER_NAMES[i]} and {PARAMETER_NAMES[j]} correlate at {inner[i, j]:.5f} "
+        f"(bound {bound})"
+    )

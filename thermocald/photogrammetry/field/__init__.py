@@ -1,0 +1,1 @@
+"""The test field: targets, their planes, and observations by target name."""

@@ -1,0 +1,115 @@
+"""The plane that each target of a field lies in, from its neighbours.
+
+A test field's file has no normals. Targets are printed on sheets, so sheets are looked for: of all
+planes through a target and two of its neighbours the one that holds most targets nearby is a sheet;
+its targets are taken away, and the search goes on. (Majorities among neighbours alone fail in a
+corner, where a plane across the edge holds the outermost rows of both sheets.) The normal is that
+of the plane through a target's nearest on its own sheet, so that a sheet may be bent a little. A
+target on no sheet has no normal: its eccentricity cannot be known, and is left out.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from thermocald.photogrammetry.field.testfield import TestField
+
+    Array = NDArray[np.float64]
+
+__all__ = ["field_normals", "target_normals"]
+
+_NEIGHBOURS = 8
+_FLATNESS = 0.03  # of the distance between neighbours
+_FEWEST = 6  # targets on a sheet; three always are in a plane, five sometimes by chance
+_PLATE = 4  # targets of a small plate, or at the rim of a sheet
+_LOOSE = 0.03  # flatness of a target with its nearest where no sheet was found
+_COMPACT = 1.6  # how much farther than the nearest the others may be for that
+_LOCAL = 8
+
+
+@lru_cache(maxsize=16)
+def field_normals(testfield: TestField) -> Array:
+    """`target_normals` of a field's circles, by row; NaN for what is no circle."""
+    circles = np.array([kind == "circle" for kind in testfield.kinds], dtype=bool)
+    normals = np.full((len(testfield), 3), np.nan)
+    # Marker corners lie on the sheets too and help where circles are few.
+    everything = target_normals(testfield.points)
+    normals[circles] = everything[circles]
+    normals.setflags(write=False)
+    return normals
+
+
+def target_normals(points: Array) -> Array:
+    """Unit normals (n, 3), of either sign, of targets at points (n, 3) mm; NaN for no plane."""
+    n = len(points)
+    normals = np.full((n, 3), np.nan)
+    if n < _PLATE:
+        return normals
+    distance = np.linalg.norm(points[:, None] - points[None], axis=2)
+    near = np.argsort(distance, axis=1, kind="stable")[:, 1 : _NEIGHBOURS + 1]
+    spacing = float(np.median(np.take_along_axis(distance, near, 1)[:, 0]))
+    if spacing == 0:
+        return normals
+    tolerance = _FLATNESS * spacing
+    closeness = np.exp(-((distance / (3 * spacing)) ** 2))
+    seeds, planes = _planes_of_neighbours(points, near, spacing)
+    if len(seeds) == 0:
+        return normals
+    offset = np.sum(planes * points[seeds], axis=1)
+    holds = np.empty((len(seeds), n), dtype=bool)
+    for i in range(0, len(seeds), 4096):
+        s = slice(i, i + 4096)
+        holds[s] = np.abs(planes[s] @ points.T - offset[s, None]) < tolerance
+    left = np.ones(n, dtype=bool)
+    while left.sum() >= _FEWEST:
+        score = np.einsum("ij,ij->i", closeness[seeds], holds & left)
+        best = int(np.argmax(score))
+        sheet = np.nonzero(holds[best] & left)[0]
+        if len(sheet) < _FEWEST:
+            break
+        for row in sheet.tolist():
+            local = sheet[np.argsort(distance[row, sheet], kind="stable")[:_LOCAL]]
+            spread = points[local] - points[local].mean(axis=0)
+            _, size, axes = np.linalg.svd(spread)
+            # A single row of targets does not say how its sheet is turned about it.
+            normals[row] = axes[2] if size[1] > 0.1 * size[0] else planes[best]
+        left[sheet] = False
+    for row in np.nonzero(left)[0].tolist():
+        # The rim of a sheet that bends, or a small plate of its own.
+        local = np.argsort(distance[row], kind="stable")[:_PLATE]
+        spread = points[local] - points[local].mean(axis=0)
+        _, size, axes = np.linalg.svd(spread)
+        compact = distance[row, local[-1]] < _COMPACT * distance[row, local[1]]
+        if (
+            compact
+            and size[1] > 0.1 * size[0]
+            and np.abs(spread @ axes[2]).max() < _LOOSE * spacing
+        ):
+            normals[row] = axes[2]
+    return normals
+
+
+def _planes_of_neighbours(
+    points: Array, near: NDArray[np.int64], spacing: float
+) -> tuple[NDArray[np.int64], Array]:
+    """Planes through each point and two of its neighbours: the points, and unit normals (m, 3)."""
+    pairs = np.array(list(combinations(range(near.shape[1]), 2)), dtype=np.int64).reshape(-1, 2)
+    d = points[near] - points[:, None]
+    cross = np.cross(d[:, pairs[:, 0]], d[:, pairs[:, 1]])
+    size = np.linalg.norm(cross, axis=2)
+    length = np.linalg.norm(d, axis=2)
+    usable = size > 0.2 * np.maximum(length[:, pairs[:, 0]] * length[:, pairs[:, 1]], spacing**2)
+    seeds, which = np.nonzero(usable)
+    planes = cross[seeds, which] / size[seeds, which, None]
+    # The same plane comes from many pairs; a coarse raster of directions per point is enough.
+    sign = np.where(planes @ np.array([1.0, 1e-3, 1e-6]) < 0, -1.0, 1.0)[:, None]
+    key = np.column_stack([seeds, np.rint(planes * sign * 200).astype(np.int64)])
+    _, first = np.unique(key, axis=0, return_index=True)
+    return seeds[first], planes[first]

@@ -1,0 +1,243 @@
+"""Tracking a static camera's targets from epoch to epoch.
+
+    first frame ─► measure (full search) ─► weights
+    next frames ─► fixed weights in windows ─► moved or disturbed ones fitted anew ─► observations
+                        └─► too many lost ─► full search, and the measurement says so
+
+A tracker is the only thing here with a state: what the last epoch knew. It holds no images.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.photogrammetry.field.testfield import Observations
+from thermocald.photogrammetry.frame.gradient_weights import GradientWeights
+from thermocald.photogrammetry.frame.measurement import (
+    Measurement,
+    Prior,
+    join,
+    measure,
+    predicted_maps,
+)
+from thermocald.photogrammetry.targets import ring_code
+from thermocald.photogrammetry.targets.circle import fit_circles
+from thermocald.photogrammetry.targets.frame_status import OK, inspect_frame
+from thermocald.photogrammetry.targets.markers import measure_corners
+
+if TYPE_CHECKING:
+    from typing import Any
+
+    from numpy.typing import NDArray
+
+    from thermocald.photogrammetry.field.testfield import TestField
+    from thermocald.photogrammetry.targets.markers import MarkerCorners
+    from thermocald.photogrammetry.targets.noise import NoiseModel
+    from thermocald.photogrammetry.targets.outline import LocalMap
+
+    Array = NDArray[np.float64]
+    Image = NDArray[np.uint8] | NDArray[np.uint16]
+
+__all__ = ["RENEWED_AT_PX", "TrackedMeasurement", "Tracker"]
+
+RENEWED_AT_PX = 0.15
+"""A target that has moved by more since its weights were made gets new ones."""
+_LARGEST_BLUR_CHANGE = 0.1
+_LARGEST_LIGHT_CHANGE = 0.2  # of the contrast
+_NEARLY_SATURATED = 0.97
+_ITERATIONS = 6
+_MISFIT = 1.5  # of the epoch's median: something happens at this target, look closely
+_LOST_SHARE = 0.3
+_RENEW_SHARE = 0.1
+_FEWEST = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackedMeasurement(Measurement):
+    """A measurement, and how it came about: `searched` says why the whole frame was searched,
+    empty where only windows were read; renewed: how many targets got new weights.
+    """
+
+    searched: str = ""
+    renewed: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Circles:
+    """The circles that are tracked: rows of the field, outlines, weights, and who is seen."""
+
+    rows: NDArray[np.int64]
+    maps: LocalMap
+    coded: NDArray[np.bool_]
+    weights: GradientWeights
+    noise: NoiseModel
+    seen: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _State:
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    seen: int
+    circles: _Circles | None
+    markers: MarkerCorners | None
+
+
+class Tracker:
+    """Measures the frames of one camera and one test field, one after the other."""
+
+    def __init__(
+        self, testfield: TestField, prior: Prior | None = None, eccentricity: bool = True
+    ) -> None:
+        self._testfield = testfield
+        self._prior = prior or Prior()
+        self._eccentricity = eccentricity
+        self._state: _State | None = None
+
+    def reset(self) -> None:
+        """Forget what was tracked: the next frame is searched."""
+        self._state = None
+
+    def measure(self, image: NDArray[Any]) -> TrackedMeasurement:
+        """Measure a frame (H, W), grey, 8 or 16 bit; never raises for what a camera delivers."""
+        state = self._state
+        if state is None:
+            return self._search(image, "nothing is tracked yet")
+        if image.shape != state.shape:
+            size = (state.shape[1], state.shape[0])
+            status = inspect_frame(image, size)
+            return TrackedMeasurement(_none(), status)
+        if image.dtype != state.dtype:
+            return self._search(image, f"the frame is {image.dtype}, it was {state.dtype}")
+        return self._track(image, state) or self._search(
+            image, f"too many of {state.seen} targets were lost"
+        )
+
+    def _search(self, image: NDArray[Any], why: str) -> TrackedMeasurement:
+        found = measure(image, self._testfield, self._prior, self._eccentricity)
+        # A frame that shows nothing says nothing about where the targets are: keep what is known.
+        if found.status.ok:
+            self._state = _State(
+                image.shape, image.dtype, len(found.observations),
+                self._begin(image, found), found.markers if found.markers else None,
+            )  # fmt: skip
+        return TrackedMeasurement(
+            found.observations, found.status, found.missed, found.orientation, found.markers, why
+        )
+
+    def _begin(self, image: Image, found: Measurement) -> _Circles | None:
+        """Outlines and weights for every circle in view, measured or not."""
+        if found.orientation is None:
+            return None
+        rows, maps = predicted_maps(self._testfield, found.orientation, self._eccentricity)
+        if len(rows) == 0:
+            return None
+        coded = np.array([ring_code.is_ring(self._testfield.codes[r]) for r in rows], dtype=bool)
+        seen = np.isin(rows, found.observations.targets)
+        at = np.searchsorted(found.observations.targets, rows[seen])
+        centre = maps.centre.copy()
+        centre[seen] = found.observations.points[at]
+        maps = maps.at(centre)
+        blur = float(np.nanmedian(found.observations.quality["blur"]))
+        fit = fit_circles(image, maps, coded, blur)
+        seen &= fit.good
+        if seen.sum() < _FEWEST:
+            return None
+        # A target that is hidden now keeps typical values for the time when it comes back.
+        p = np.where(seen[:, None], fit.parameters, np.median(fit.parameters[seen], axis=0))
+        p[~seen, :2] = maps.centre[~seen]
+        weights = GradientWeights.build(image, maps, coded, p, fit.noise)
+        return _Circles(rows, maps, coded, weights, fit.noise, seen)
+
+    def _track(self, image: Image, state: _State) -> TrackedMeasurement | None:
+        """Measure in windows; None where too many targets are lost."""
+        missed: dict[int, str] = {}
+        corners, circles, renewed = _none(), state.circles, 0
+        found = _none()
+        markers = state.markers
+        if markers is not None:
+            corners = measure_corners(image, markers, missed)
+            markers = markers.moved(corners)
+        if circles is not None:
+            tracked = _track_circles(image, circles, missed)
+            if tracked is None:
+                return None
+            found, circles, renewed = tracked
+        both = join(corners, found)
+        if len(both) < max(_FEWEST, (1 - _LOST_SHARE) * state.seen):
+            return None
+        self._state = replace(state, seen=len(both), circles=circles, markers=markers)
+        return TrackedMeasurement(both, OK, missed, None, markers, "", renewed)
+
+
+def _track_circles(
+    image: Image, state: _Circles, missed: dict[int, str]
+) -> tuple[Observations, _Circles, int] | None:
+    """Observations, the new state, and how many weights were renewed; None where all is lost."""
+    step = state.weights.apply(image)
+    old, p, seen = state.weights.parameters, step.parameters, state.seen
+    covariances, misfit = step.covariances, step.misfit
+    top = float(np.iinfo(image.dtype).max)
+    level = max(float(np.median(misfit[seen])) if seen.any() else 1.0, 1.0)
+    disturbed = (
+        (step.moved > RENEWED_AT_PX)
+        | (misfit > _MISFIT * level)
+        | (np.abs(p[:, 5] - old[:, 5]) > _LARGEST_BLUR_CHANGE * old[:, 5])
+        | (np.abs(p[:, 6:8] - old[:, 6:8]).max(axis=1) > _LARGEST_LIGHT_CHANGE * np.abs(old[:, 7]))
+        | (np.maximum(p[:, 6], p[:, 6] + p[:, 7]) > _NEARLY_SATURATED * top)
+        | ~np.isfinite(p).all(axis=1)
+    )
+    again = disturbed | ~seen
+    calm = ~again
+    reasons = np.full(len(p), "", dtype=object)
+    saturation = np.zeros(len(p))
+    # Where the calm ones went, the others went too.
+    shift = np.median(p[calm, :2] - old[calm, :2], axis=0) if calm.any() else np.zeros(2)
+    if again.any():
+        which = np.nonzero(again)[0]
+        blur = float(np.median(old[:, 5]))
+        fit = fit_circles(
+            image, state.maps.select(which).at(old[which, :2] + shift), state.coded[which], blur,
+            state.noise, iterations=_ITERATIONS,
+        )  # fmt: skip
+        p[which], covariances[which], misfit[which] = fit.parameters, fit.covariances, fit.misfit
+        reasons[which] = fit.reasons
+        saturation[which] = fit.saturation
+    good = reasons == ""
+    if good.sum() < (1 - _LOST_SHARE) * seen.sum():
+        return None
+    weights, renewed = state.weights, 0
+    if np.sum(again & good) > _RENEW_SHARE * good.sum():
+        base = np.where(good[:, None], p, old)
+        base[~good, :2] += shift
+        weights = GradientWeights.build(image, state.maps, state.coded, base, state.noise)
+        renewed = int(np.sum(again & good))
+    # The noise may have changed since the weights were made; the calm targets tell by how much.
+    factor = float(np.median(misfit[calm])) ** 2 if calm.any() else 1.0
+    scale = np.where(again, 1.0, factor)
+    c = (covariances * scale[:, None, None])[good]
+    observations = Observations(
+        state.rows[good].astype(np.int64),
+        p[good, :2],
+        np.sqrt(np.stack([c[:, 0, 0], c[:, 1, 1]], axis=-1)),
+        c[:, 0, 1],
+        {
+            "blur": p[good, 5],
+            "contrast": p[good, 7],
+            "grey": p[good, 6],
+            "noise": np.sqrt(factor * state.noise.variance(p[good, 6])).astype(float),
+            "saturation": saturation[good],
+            "misfit": misfit[good],
+        },
+    )
+    missed.update({int(r): str(w) for r, w in zip(state.rows, reasons, strict=True) if w})
+    return observations, replace(state, weights=weights, seen=good), renewed
+
+
+def _none() -> Observations:
+    return Observations(
+        np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
+    )

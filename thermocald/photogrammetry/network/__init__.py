@@ -1,0 +1,1 @@
+"""A network of photographs: target coordinates in three dimensions."""

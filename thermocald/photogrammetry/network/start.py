@@ -1,0 +1,309 @@
+"""Approximate values for a network: from nothing but the photographs, or from nominal coordinates.
+
+Without nominal coordinates one pair is oriented relatively (essential matrix), the others follow
+one by one by resection on the targets intersected so far. With nominal coordinates every
+photograph is resected by itself. All of it works on rays of an approximate interior orientation,
+and tolerates wrong identifications.
+
+Source: Nistér, D. (2004): An efficient solution to the five-point relative pose problem; Terzakis,
+G., Lourakis, M. (2020): A consistently fast and globally optimal solution to the perspective-n-
+point problem (both as implemented in OpenCV).
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.errors import GeometryError
+from thermocald.photogrammetry.camera.camera_model import InteriorOrientation
+from thermocald.photogrammetry.camera.camera_model import rays as camera_rays
+from thermocald.photogrammetry.network.bundle import Bundle, ImageRays, residuals, solve
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    from thermocald.photogrammetry.camera.camera_model import Sensor
+
+    Array = NDArray[np.float64]
+    Index = NDArray[np.int64]
+
+__all__ = ["approximate"]
+
+_FLIP = np.diag([1.0, -1.0, -1.0])  # our camera axes to OpenCV's
+_INLIER_PX = 6.0
+_MIN_RESECTION = 6
+_MIN_PAIR = 8
+# Principal distances to try, in image widths, where nothing is known: wide angle to tele.
+_TRIAL_DISTANCES = (0.75, 1.0, 1.35, 0.55, 2.0, 3.0)
+# A plane field has a second, false relative orientation per pair: three good pairs are tried.
+_GOOD_PAIRS, _PAIRS = 3, 12
+_GOOD_MEDIAN_PX = 0.5
+_GOOD_MISSING = 4  # twentieths of the image points that may be left out of a good start
+
+
+class _Start:
+    """A network under construction: poses by photo, targets by number, both as found so far."""
+
+    def __init__(self, sensor: Sensor, interior: Array, rays: ImageRays, n_targets: int) -> None:
+        self.sensor, self.interior, self.rays = sensor, interior, rays
+        direction = camera_rays(sensor, interior, rays.points) @ _FLIP
+        self.normalised: Array = direction[:, :2] / direction[:, 2:]
+        self.directions = direction
+        self.threshold = _INLIER_PX * sensor.pixel_pitch / float(interior[0])
+        self.poses: dict[int, tuple[Array, Array]] = {}  # OpenCV: x_camera = R x + t
+        self.points = np.full((n_targets, 3), np.nan)
+
+    def rows(self, photo: int) -> Index:
+        """The rays of one photograph."""
+        return np.flatnonzero(self.rays.photo == photo)
+
+    def resect(self, photo: int) -> bool:
+        """Orient one photograph on the targets known so far; False if it cannot be done."""
+        import cv2
+
+        rows = self.rows(photo)
+        rows = rows[np.isfinite(self.points[self.rays.target[rows], 0])]
+        if len(rows) < _MIN_RESECTION:
+            return False
+        known, image = self.points[self.rays.target[rows]], self.normalised[rows]
+        cv2.setRNGSeed(1)
+        try:
+            found, turn, t, inliers = cv2.solvePnPRansac(
+                known, image[:, None, :], np.eye(3), None, iterationsCount=200,
+                reprojectionError=self.threshold, confidence=0.999, flags=cv2.SOLVEPNP_SQPNP,
+            )  # fmt: skip
+        except cv2.error:  # degenerate points fail an assertion in there
+            return False
+        if not found or inliers is None or len(inliers) < max(_MIN_RESECTION, len(rows) // 3):
+            return False
+        keep = inliers.ravel()
+        turn, t = cv2.solvePnPRefineLM(
+            known[keep], image[keep][:, None, :], np.eye(3), None, turn, t
+        )
+        self.poses[photo] = (np.asarray(cv2.Rodrigues(turn)[0], dtype=float), _vector(t))
+        return True
+
+    def intersect(self, min_angle: float = np.radians(2.0)) -> None:
+        """Intersect every target that oriented photographs see under a sufficient angle."""
+        oriented = np.isin(self.rays.photo, list(self.poses))
+        for target in np.unique(self.rays.target[oriented]):
+            rows = np.flatnonzero(oriented & (self.rays.target == target))
+            if len(rows) < 2:
+                continue
+            R = np.array([self.poses[int(p)][0] for p in self.rays.photo[rows]])
+            t = np.array([self.poses[int(p)][1] for p in self.rays.photo[rows]])
+            d = np.einsum("nji,nj->ni", R, self.directions[rows])
+            d /= np.linalg.norm(d, axis=1, keepdims=True)
+            if np.arccos(np.clip((d @ d.T).min(), -1, 1)) < min_angle:
+                continue
+            X0 = -np.einsum("nji,nj->ni", R, t)
+            P = np.eye(3) - d[:, :, None] * d[:, None, :]
+            x = np.linalg.solve(P.sum(axis=0), np.einsum("nij,nj->i", P, X0))
+            if np.all(np.einsum("ni,ni->n", x - X0, d) > 0):
+                self.points[target] = x
+
+    def bundle(self) -> tuple[Bundle, list[int], ImageRays]:
+        """The bundle so far, its photographs, and its rays (renumbered photos, all targets)."""
+        photos = sorted(self.poses)
+        number = np.full(int(self.rays.photo.max()) + 1, -1)
+        number[photos] = np.arange(len(photos))
+        keep = (number[self.rays.photo] >= 0) & np.isfinite(self.points[self.rays.target, 0])
+        used = self.rays.select(keep)
+        used = ImageRays(number[used.photo], used.target, used.points, used.whitening)
+        R = np.array([self.poses[p][0] for p in photos])
+        t = np.array([self.poses[p][1] for p in photos])
+        centres = -np.einsum("nji,nj->ni", R, t)
+        points = np.where(np.isfinite(self.points), self.points, 0.0)
+        return Bundle(self.interior, np.swapaxes(R, 1, 2) @ _FLIP, centres, points), photos, used
+
+    def refine(self, iterations: int = 4) -> None:
+        """A few robust iterations over what is there, the interior orientation held."""
+        bundle, photos, used = self.bundle()
+        bundle, _ = solve(
+            self.sensor, bundle, used, np.array([], dtype=int), robust=True, iterations=iterations
+        )
+        R = _FLIP @ np.swapaxes(bundle.rotations, 1, 2)
+        for i, photo in enumerate(photos):
+            self.poses[photo] = (R[i], -R[i] @ bundle.centres[i])
+        known = np.isfinite(self.points[:, 0])
+        self.points[known] = bundle.points[known]
+
+    def extend(self) -> None:
+        """Add photographs, the one that sees most known targets first, until none can be added."""
+        tried: set[int] = set()
+        photos = {int(p) for p in np.unique(self.rays.photo)}
+        while remaining := photos - set(self.poses) - tried:
+            known = np.isfinite(self.points[self.rays.target, 0])
+            counts = {p: int(known[self.rays.photo == p].sum()) for p in remaining}
+            best = max(sorted(counts), key=lambda p: counts[p])
+            if not self.resect(best):
+                tried.add(best)
+                continue
+            tried.clear()
+            self.intersect()
+            if len(self.poses) <= 8 or len(self.poses) % 4 == 0:
+                self.refine()
+        self.intersect()
+
+
+def _vector(t: ArrayLike) -> Array:
+    return np.asarray(t, dtype=float).ravel()
+
+
+def _pairs(rays: ImageRays, normalised: Array) -> list[tuple[int, int]]:
+    """Pairs of photographs to begin with, the most promising first.
+
+    Promising: many common targets, and directions to them that no rotation alone explains, which
+    tells a base from a turn on the spot.
+    """
+    photos = np.unique(rays.photo)
+    by_photo = {
+        int(p): dict(
+            zip(rays.target[rays.photo == p], np.flatnonzero(rays.photo == p), strict=True)
+        )
+        for p in photos
+    }
+    scored = []
+    for a, b in combinations(by_photo, 2):
+        common = sorted(set(by_photo[a]) & set(by_photo[b]))
+        if len(common) < _MIN_PAIR:
+            continue
+        d1, d2 = (
+            np.column_stack([normalised[[by_photo[i][t] for t in common]], np.ones(len(common))])
+            for i in (a, b)
+        )
+        d1 /= np.linalg.norm(d1, axis=1, keepdims=True)
+        d2 /= np.linalg.norm(d2, axis=1, keepdims=True)
+        U, _, Vt = np.linalg.svd(d1.T @ d2)
+        turned = d2 @ (U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt).T
+        parallax = float(np.median(np.linalg.norm(d1 - turned, axis=1)))
+        scored.append((len(common) * min(parallax, 0.3), a, b))
+    return [(a, b) for _, a, b in sorted(scored, key=lambda row: -row[0])]
+
+
+def _from_pair(start: _Start, pair: tuple[int, int]) -> bool:
+    """Begin with a pair, then add all photographs that can be; False if the pair is of no use."""
+    import cv2
+
+    a, b = (start.rows(p) for p in pair)
+    _, ia, ib = np.intersect1d(start.rays.target[a], start.rays.target[b], return_indices=True)
+    first, second = start.normalised[a[ia]], start.normalised[b[ib]]
+    cv2.setRNGSeed(1)
+    E, mask = cv2.findEssentialMat(
+        first, second, focal=1.0, pp=(0.0, 0.0), method=cv2.RANSAC, prob=0.9999,
+        threshold=start.threshold,
+    )  # fmt: skip
+    if E is None or E.shape != (3, 3):
+        return False
+    n, R, t, _ = cv2.recoverPose(E, first, second, focal=1.0, pp=(0.0, 0.0), mask=mask)
+    # a pair that disagrees in half of its targets is no pair, whatever its parallax promised
+    if n < max(_MIN_PAIR, len(ia) // 2):
+        return False
+    start.poses = {
+        pair[0]: (np.eye(3), np.zeros(3)),
+        pair[1]: (np.asarray(R, dtype=float), _vector(t)),
+    }
+    start.points[:] = np.nan
+    start.intersect()
+    if np.isfinite(start.points[:, 0]).sum() < _MIN_PAIR:
+        return False
+    try:
+        start.refine()
+        start.extend()
+    except GeometryError:
+        return False
+    return True
+
+
+def _from_nominal(start: _Start, nominal: Array) -> bool:
+    """Resect every photograph on nominal coordinates (m, 3) mm (NaN: unknown), then intersect."""
+    start.points[:] = nominal
+    for photo in np.unique(start.rays.photo):
+        start.resect(int(photo))
+    if len(start.poses) < 2:
+        return False
+    # from here on the photographs speak, and targets without nominal coordinates join
+    start.points[:] = np.nan
+    start.intersect()
+    try:
+        start.refine()
+        start.extend()
+    except GeometryError:
+        return False
+    return True
+
+
+def approximate(
+    sensor: Sensor,
+    rays: ImageRays,
+    n_targets: int,
+    interior: InteriorOrientation | None,
+    nominal: Array | None,
+    free: Index,
+) -> tuple[Bundle, list[int], ImageRays]:
+    """The best of the approximate networks: most image points, then smallest residuals.
+
+    interior: approximate, several are tried if None; nominal (n_targets, 3) mm or None; free: the
+    interior parameters that may be determined. Returns the bundle, the photographs that are in it
+    and their rays, renumbered. Raises GeometryError if nothing can be oriented.
+    """
+    width_mm = max(sensor.width, sensor.height) * sensor.pixel_pitch
+    trials = (
+        [InteriorOrientation(c=ratio * width_mm) for ratio in _TRIAL_DISTANCES]
+        if interior is None
+        else [interior]
+    )
+    best: tuple[int, float, Bundle, list[int], ImageRays] | None = None
+    for trial in trials:
+        start = _Start(sensor, trial.as_array(), rays, n_targets)
+        ways: list[tuple[int, int] | None] = [] if nominal is None else [None]
+        ways += list(_pairs(rays, start.normalised)[:_PAIRS])
+        good = 0
+        for way in ways:
+            found = _begin(start, way, nominal, free)
+            if found is None:
+                continue
+            bundle, photos, used = found
+            plain = ImageRays(
+                used.photo, used.target, used.points,
+                np.broadcast_to(np.eye(2), (len(used), 2, 2)),
+            )  # fmt: skip
+            median = float(np.median(np.linalg.norm(residuals(sensor, bundle, plain), axis=1)))
+            # five percent more or fewer image points decide nothing
+            missing = round(20 * (1 - len(used) / len(rays)))
+            if best is None or (missing, median) < best[:2]:
+                best = (missing, median, bundle, photos, used)
+            good += 1
+            if best[0] <= _GOOD_MISSING and best[1] < _GOOD_MEDIAN_PX:
+                return best[2:]
+            if good == _GOOD_PAIRS:
+                break
+    if best is None:
+        raise GeometryError(
+            "no two photographs can be oriented to each other: at least two must show 8 common "
+            "targets from clearly different places, and three are needed"
+        )
+    return best[2:]
+
+
+def _begin(
+    start: _Start, pair: tuple[int, int] | None, nominal: Array | None, free: Index
+) -> tuple[Bundle, list[int], ImageRays] | None:
+    """A network begun with a pair (None: on the nominal coordinates), roughly adjusted, or None."""
+    if pair is not None:
+        done = _from_pair(start, pair)
+    else:
+        done = nominal is not None and _from_nominal(start, np.asarray(nominal, dtype=float))
+    if not done:
+        return None
+    bundle, photos, used = start.bundle()
+    try:
+        for stage in ([0], [0, 1, 2, 3], range(len(bundle.interior))):
+            some = free[np.isin(free, stage)]
+            bundle, _ = solve(start.sensor, bundle, used, some, robust=True, iterations=15)
+    except GeometryError:
+        return None
+    return bundle, photos, used

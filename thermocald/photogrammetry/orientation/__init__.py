@@ -1,0 +1,1 @@
+"""Approximate orientation, and the identification of targets that rests on it."""

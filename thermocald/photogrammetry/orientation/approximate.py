@@ -1,0 +1,209 @@
+"""Approximate orientation from nothing: no initial values from the user.
+
+The resection itself is OpenCV's (SQPnP inside RANSAC); what it lacks is the principal distance. It
+comes from the camera's data sheet where that is known, from a direct linear transformation where
+the field has depth, and otherwise from a search over fields of view; whoever explains most targets
+best wins.
+
+Source: Terzakis and Lourakis (2020), SQPnP; Abdel-Aziz and Karara (1971), DLT.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+from thermocald.errors import GeometryError
+from thermocald.photogrammetry.camera.camera_model import (
+    ExteriorOrientation,
+    InteriorOrientation,
+    image_to_mm,
+    project,
+    rays,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    from thermocald.photogrammetry.camera.camera_model import Sensor
+
+    Array = NDArray[np.float64]
+
+__all__ = ["approximate_orientation", "plane_fit", "resection"]
+
+_FLIP = np.diag([1.0, -1.0, -1.0])  # OpenCV's camera looks along +Z with y down
+_FIELDS_OF_VIEW_DEG = (18.0, 25.0, 33.0, 42.0, 52.0, 62.0, 73.0, 85.0, 98.0)
+_TOLERANCE = 0.005  # of the image width: distortion is not known yet
+_MINIMUM = 4
+
+
+def approximate_orientation(
+    sensor: Sensor,
+    field_points: ArrayLike,
+    image_points: ArrayLike,
+    nominal_c: float | None = None,
+    interior: InteriorOrientation | None = None,
+) -> tuple[InteriorOrientation, ExteriorOrientation, NDArray[np.bool_]]:
+    """Interior and exterior orientation good enough to start an adjustment.
+
+    field_points (n, 3) mm, image_points (n, 2) px, in pairs, gross errors allowed; nominal_c mm,
+    from the camera's data sheet; `interior` is taken as it stands where given.
+    Returns the orientations and a mask (n,) of the pairs that fit.
+    Raises GeometryError with fewer than four pairs, or where no orientation explains them.
+    """
+    X = np.ascontiguousarray(field_points, dtype=float)
+    uv = np.ascontiguousarray(image_points, dtype=float)
+    if len(X) < _MINIMUM:
+        raise GeometryError(
+            f"too few targets for an orientation: {len(X)}, at least {_MINIMUM} are needed"
+        )
+    best: tuple[float, InteriorOrientation, ExteriorOrientation, NDArray[np.bool_]] | None = None
+    for candidate in _interiors(sensor, X, uv, nominal_c, interior):
+        found = _robust_resection(sensor, candidate, X, uv)
+        if found is None:
+            continue
+        exterior, residuals = found
+        tolerance = _TOLERANCE * sensor.width
+        score = float(np.minimum(residuals, tolerance).mean())
+        if best is None or score < best[0]:
+            best = (score, candidate, exterior, residuals < tolerance)
+    if best is None or best[3].sum() < _MINIMUM:
+        raise GeometryError(
+            f"no orientation explains the {len(X)} targets: check that the test field belongs to "
+            "these images, and its units (mm)"
+        )
+    return best[1:]
+
+
+def _interiors(
+    sensor: Sensor,
+    X: Array,
+    uv: Array,
+    nominal_c: float | None,
+    interior: InteriorOrientation | None,
+) -> list[InteriorOrientation]:
+    if interior is not None:
+        return [interior]
+    width_mm = sensor.width * sensor.pixel_pitch
+    if nominal_c is not None:
+        return [InteriorOrientation(nominal_c * f) for f in (1.0, 0.97, 1.03, 0.93, 1.07)]
+    views = np.radians(np.array(_FIELDS_OF_VIEW_DEG))
+    lengths = list(width_mm / 2 / np.tan(views / 2))
+    direct = _direct_linear_transformation(sensor, X, uv)
+    if direct is not None and lengths[-1] / 2 < direct < lengths[0] * 2:
+        lengths += [direct]
+    coarse = [InteriorOrientation(float(c)) for c in lengths]
+    scores = []
+    for candidate in coarse:
+        found = _robust_resection(sensor, candidate, X, uv)
+        scores.append(np.inf if found is None else float(np.median(found[1])))
+    c = coarse[int(np.argmin(scores))].c
+    return [InteriorOrientation(c * f) for f in (1.0, 0.96, 1.04, 0.92, 1.08, 0.88, 1.12)]
+
+
+def _robust_resection(
+    sensor: Sensor, interior: InteriorOrientation, X: Array, uv: Array
+) -> tuple[ExteriorOrientation, Array] | None:
+    """RANSAC resection; the exterior orientation and each pair's residual in px, or None."""
+    try:
+        direction = rays(sensor, interior.as_array(), uv)
+    except GeometryError:
+        return None
+    ideal = np.ascontiguousarray(direction[:, :2] / -direction[:, 2:] * [1.0, -1.0])
+    cv2.setRNGSeed(0)
+    threshold = _TOLERANCE * sensor.width * sensor.pixel_pitch / interior.c
+    try:
+        ok, rvec, tvec, inliers = cv2.solvePnPRansac(
+            X, ideal, np.eye(3), None, iterationsCount=300, reprojectionError=threshold,
+            confidence=0.9999, flags=cv2.SOLVEPNP_SQPNP,
+        )  # fmt: skip
+    except cv2.error:
+        return None
+    if not ok or inliers is None or len(inliers) < _MINIMUM:
+        return None
+    rows = inliers.ravel()
+    rvec, tvec = cv2.solvePnPRefineLM(X[rows], ideal[rows], np.eye(3), None, rvec, tvec)
+    exterior = _from_opencv(rvec, tvec)
+    predicted = project(sensor, interior.as_array(), exterior.as_array(), X)
+    residuals = np.linalg.norm(np.nan_to_num(predicted - uv, nan=1e9), axis=1)
+    return exterior, residuals
+
+
+def _from_opencv(rvec: NDArray[Any], tvec: NDArray[Any]) -> ExteriorOrientation:
+    R = cv2.Rodrigues(rvec)[0]
+    return ExteriorOrientation.from_rotation(R.T @ _FLIP, (-R.T @ tvec).ravel())
+
+
+def resection(
+    sensor: Sensor, interior: InteriorOrientation, field_points: ArrayLike, image_points: ArrayLike
+) -> list[tuple[float, ExteriorOrientation]]:
+    """All exterior orientations that explain a plane target, best first, with their RMS in px.
+
+    A plane target has two; where the second fits as well as the first, the pose is ambiguous.
+    Points that are not in one plane have one. Source: Collins and Bartoli (2014), IPPE.
+    """
+    X = np.ascontiguousarray(field_points, dtype=float)
+    uv = np.asarray(image_points, dtype=float)
+    direction = rays(sensor, interior.as_array(), uv)
+    ideal = np.ascontiguousarray(direction[:, :2] / -direction[:, 2:] * [1.0, -1.0])
+    centre, axes, flat = plane_fit(X)
+    if flat:
+        local = np.ascontiguousarray((X - centre) @ axes.T)
+        local[:, 2] = 0.0
+        _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
+            local, ideal, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+        )
+        poses = []
+        for rvec, tvec in zip(rvecs, tvecs, strict=True):
+            R = cv2.Rodrigues(rvec)[0] @ axes
+            poses.append(
+                ExteriorOrientation.from_rotation(R.T @ _FLIP, centre - R.T @ tvec.ravel())
+            )
+    else:
+        _, rvec, tvec = cv2.solvePnP(X, ideal, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP)
+        poses = [_from_opencv(*cv2.solvePnPRefineLM(X, ideal, np.eye(3), None, rvec, tvec))]
+    solutions = []
+    for pose in poses:
+        predicted = project(sensor, interior.as_array(), pose.as_array(), X)
+        rms = float(np.sqrt(np.mean(np.nan_to_num(predicted - uv, nan=1e6) ** 2)))
+        solutions.append((rms, pose))
+    return sorted(solutions, key=lambda s: s[0])
+
+
+def plane_fit(points: ArrayLike, tolerance: float = 0.002) -> tuple[Array, Array, bool]:
+    """Centre (3,), axes (3, 3; rows, right-handed, the last the normal), and whether it is flat.
+
+    Flat: the RMS distance from the plane is below `tolerance` of the RMS extent in it.
+    """
+    X = np.asarray(points, dtype=float)
+    centre = X.mean(axis=0)
+    reduced = X - centre
+    s2, vectors = np.linalg.eigh(reduced.T @ reduced)
+    axes = vectors.T[::-1].copy()
+    (a, b, c), (d, e, f) = axes[0], axes[1]
+    axes[2] = (b * f - c * e, c * d - a * f, a * e - b * d)  # right-handed
+    return centre, axes, bool(s2[0] <= tolerance**2 * max(s2[2], 1e-300))
+
+
+def _direct_linear_transformation(sensor: Sensor, X: Array, uv: Array) -> float | None:
+    """Principal distance in mm from a DLT, None where the field has no depth."""
+    if len(X) < 6 or plane_fit(X, 0.02)[2]:
+        return None
+    centre, scale = X.mean(axis=0), X.std()
+    x = image_to_mm(sensor, uv)
+    size = np.abs(x).max()
+    h = np.column_stack([(X - centre) / scale, np.ones(len(X))])
+    zero = np.zeros_like(h)
+    rows = np.vstack(
+        [
+            np.hstack([h, zero, -h * (x[:, :1] / size)]),
+            np.hstack([zero, h, -h * (x[:, 1:] / size)]),
+        ]
+    )
+    P = np.linalg.svd(rows)[2][-1].reshape(3, 4)
+    KKt = P[:, :3] @ P[:, :3].T
+    KKt /= KKt[2, 2]
+    f2 = (KKt[0, 0] - KKt[0, 2] ** 2 + KKt[1, 1] - KKt[1, 2] ** 2) / 2
+    return float(np.sqrt(f2) * size) if f2 > 0 else None

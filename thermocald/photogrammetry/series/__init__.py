@@ -1,0 +1,1 @@
+"""A whole series adjusted together: epochs and their common unknowns."""

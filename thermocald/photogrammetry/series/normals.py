@@ -1,0 +1,252 @@
+"""Normal equations of many epochs at one common linearisation point.
+
+A static camera sees the same field in every epoch, so the partial derivatives are one array for the
+whole series and each epoch differs only in its weights and residuals. All normal matrices are then
+one matrix product: (epochs × targets) · (targets × products of partials). Everything that follows
+(series adjustment, filter, discovery) works on these sums.
+
+In memory the coordinates stand before the epochs, so that every operation on all x, or on all
+weights of x, runs through one stretch of it; callers see the shapes that are documented.
+
+Source: Luhmann et al. (2014), section 2.4.4; the reduction of common unknowns as Mikhail and
+Ackermann (1976), Observations and Least Squares, chapter 10.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.photogrammetry.camera.camera_model import partials, project
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from thermocald.photogrammetry.camera.camera_model import Sensor
+    from thermocald.photogrammetry.field.testfield import Observations, TestField
+
+    Array = NDArray[np.float64]
+
+__all__ = [
+    "ObservationGrid",
+    "Partials",
+    "chunks",
+    "linearise",
+    "normal_matrices",
+    "planes",
+    "products",
+    "right_hand_sides",
+    "same_rows",
+    "series_residuals",
+    "sums_of_squares",
+]
+
+_CHUNK_POINTS = 20_000  # worked on at a time, in the processor's cache
+
+
+@dataclass(frozen=True, eq=False)
+class ObservationGrid:
+    """The observations of many epochs on one grid of epochs × targets of the test field.
+
+    points (E, T, 2) px, NaN where a target was not observed; weights (E, T, 3) px⁻²: the elements
+    xx, yy, xy of each point's inverse covariance, 0 where it was not observed or is rejected.
+    """
+
+    points: Array
+    weights: Array
+
+    @classmethod
+    def from_observations(
+        cls, field: TestField, epochs: Sequence[Observations | None]
+    ) -> ObservationGrid:
+        """Lay the epochs' observations out; an epoch that is None stays empty."""
+        points = planes(2, len(epochs), len(field))
+        points[...] = np.nan
+        weights = planes(3, len(epochs), len(field))
+        weights[...] = 0.0
+        present = [(e, obs) for e, obs in enumerate(epochs) if obs is not None and len(obs)]
+        if present:
+            counts = [len(obs) for _, obs in present]
+            rows = np.repeat([e for e, _ in present], counts)
+            columns = np.concatenate([obs.targets for _, obs in present])
+            variance = np.concatenate([obs.sigmas for _, obs in present]) ** 2
+            points[rows, columns] = np.concatenate([obs.points for _, obs in present])
+            inverse = np.zeros((len(rows), 3))
+            if all(obs.covariances is None for _, obs in present):
+                np.divide(1.0, variance, out=inverse[:, :2])
+            else:
+                xy = np.concatenate(
+                    [
+                        np.zeros(len(o)) if o.covariances is None else o.covariances
+                        for _, o in present
+                    ]
+                )
+                determinant = variance[:, 0] * variance[:, 1] - xy**2
+                inverse[:, :2] = variance[:, ::-1] / determinant[:, None]
+                inverse[:, 2] = -xy / determinant
+            weights[rows, columns] = inverse
+        return cls(points, weights)
+
+    @property
+    def observed(self) -> NDArray[np.bool_]:
+        """(E, T): what takes part."""
+        return self.weights[..., 0] > 0
+
+    def targets(self, columns: NDArray[np.int64]) -> ObservationGrid:
+        """Some of the targets."""
+        if len(columns) == self.points.shape[1]:
+            return self
+        return ObservationGrid(self.points[:, columns], self.weights[:, columns])
+
+    def reject(self, mask: NDArray[np.bool_]) -> ObservationGrid:
+        """The same, the observations of a mask (E, T) without weight."""
+        if not mask.any():
+            return self
+        weights = self.weights.copy(order="K")
+        weights[mask] = 0.0
+        return ObservationGrid(self.points, weights)
+
+
+@dataclass(frozen=True, eq=False)
+class Partials:
+    """The linearisation: iop (10,), eop (6,), predicted (T, 2) px, A (T, 2, 16), B (T, 2, 3)."""
+
+    iop: Array
+    eop: Array
+    predicted: Array
+    A: Array
+    B: Array
+
+
+def linearise(sensor: Sensor, field: TestField, iop: ArrayLike, eop: ArrayLike) -> Partials:
+    """The partial derivatives of all targets at one point; targets out of sight get zeros."""
+    i, e = np.asarray(iop, dtype=float), np.asarray(eop, dtype=float)
+    predicted, A, B = partials(sensor, i, e, field.points)
+    seen = np.isfinite(predicted[:, 0])
+    A[~seen], B[~seen] = 0.0, 0.0
+    return Partials(i, e, predicted, A, B)
+
+
+def normal_matrices(weights: Array, A: Array) -> Array:
+    """Σ Aᵀ P A of every epoch: weights (E, T, 3), A (T, 2, k) → (E, k, k)."""
+    k = A.shape[-1]
+    rows, columns = np.triu_indices(k)
+    xx, yy, xy = products(A)
+    if np.array_equal(weights[..., 0], weights[..., 1]):
+        flat = weights[..., 0] @ (xx + yy)
+    else:
+        flat = weights[..., 0] @ xx + weights[..., 1] @ yy
+    if np.any(weights[..., 2]):
+        flat += weights[..., 2] @ xy
+    pair = np.empty((k, k), dtype=np.int64)  # where in `flat` an element stands
+    pair[rows, columns] = pair[columns, rows] = np.arange(len(rows))
+    N: Array = np.take(flat, pair, axis=1)
+    return N
+
+
+def products(A: Array) -> tuple[Array, Array, Array]:
+    """Of partials (T, 2, k) in x, in y, and of x with y, for each pair of parameters (T, k(k+1)/2).
+
+    The pairs are those of `np.triu_indices(k)`.
+    """
+    rows, columns = np.triu_indices(A.shape[-1])
+    x, y = np.ascontiguousarray(A[:, 0].T), np.ascontiguousarray(A[:, 1].T)
+    xy = x[rows] * y[columns]
+    xy += y[rows] * x[columns]
+    return (x[rows] * x[columns]).T, (y[rows] * y[columns]).T, xy.T
+
+
+def planes(components: int, epochs: int, targets: int) -> Array:
+    """Fresh memory (epochs, targets, components), one component after the other."""
+    return np.moveaxis(np.empty((components, epochs, targets)), 0, -1)
+
+
+def chunks(epochs: int, targets: int) -> Iterator[slice]:
+    """The epochs in parts whose points stay in the processor's cache.
+
+    The arrays of a long series would also have to be fetched from the system, page by page.
+    """
+    size = max(_CHUNK_POINTS // max(targets, 1), 1)
+    return (slice(start, start + size) for start in range(0, epochs, size))
+
+
+def same_rows(*arrays: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Which rows of arrays (E, ...) are the same: representatives (M,), and whose each is (E,).
+
+    Epochs that see the same targets with the same weights have the same normal matrix.
+    """
+    E = len(arrays[0])
+    rng = np.random.default_rng(0)
+    mark = np.sum([array @ rng.random(array.shape[1]) for array in arrays], axis=0)
+    _, first, of = np.unique(mark, return_index=True, return_inverse=True)
+    each = np.arange(E)
+    if 2 * len(first) > E:
+        return each, each
+    for part in chunks(E, max(array.shape[1] for array in arrays)):
+        like = first if len(first) == 1 else first[of[part]]
+        if not all(np.all(array[part] == array[like]) for array in arrays):
+            return each, each
+    return first, of
+
+
+def right_hand_sides(
+    weights: Array, residuals: Array, A: Array, use: NDArray[np.bool_] | None = None
+) -> Array:
+    """Aᵀ P l (E, k) of every epoch; use (E, T): what takes part, or all that has a weight.
+
+    NaN residuals must not take part.
+    """
+    E, T = residuals.shape[:2]
+    b = np.empty((E, A.shape[-1]))
+    for part in chunks(E, T):
+        x, y = _weighted(weights[part], residuals[part], None if use is None else use[part])
+        np.matmul(x, A[:, 0], out=b[part])
+        b[part] += y @ A[:, 1]
+    return b
+
+
+def sums_of_squares(
+    weights: Array, residuals: Array, use: NDArray[np.bool_] | None = None
+) -> Array:
+    """vᵀ P v (E,) of every epoch; use as in `right_hand_sides`."""
+    E, T = residuals.shape[:2]
+    total = np.empty(E)
+    for part in chunks(E, T):
+        v = residuals[part]
+        x, y = _weighted(weights[part], v, None if use is None else use[part])
+        x *= v[..., 0]
+        y *= v[..., 1]
+        x += y
+        x.sum(axis=1, out=total[part])
+        # only where targets were not observed: a look at all would cost as much as the sum
+        if np.isnan(total[part]).any():
+            np.nansum(x, axis=1, out=total[part])
+    return total
+
+
+def _weighted(weights: Array, residuals: Array, use: NDArray[np.bool_] | None) -> Array:
+    """P v (2, E, T) of every point, 0 where it takes no part."""
+    out = np.empty((2, *residuals.shape[:2]))
+    correlated = weights[..., 2].any()
+    for k in range(2):
+        np.multiply(weights[..., k], residuals[..., k], out=out[k])
+        if correlated:
+            out[k] += weights[..., 2] * residuals[..., 1 - k]
+    unused = weights[..., 0] == 0 if use is None else ~use
+    if unused.any():
+        out[:, unused] = 0.0
+    return out
+
+
+def series_residuals(
+    sensor: Sensor, grid: ObservationGrid, field_points: Array, values: Array, out: Array
+) -> Array:
+    """Measured minus predicted (E, T, 2) px at each epoch's own parameters (E, 16), into `out`."""
+    for part in chunks(*grid.points.shape[:2]):
+        predicted = project(sensor, values[part, :10], values[part, 10:], field_points)
+        np.subtract(grid.points[part], predicted, out=out[part])
+    return out

@@ -1,0 +1,165 @@
+"""What an adjusted series is: what was estimated per epoch and what once, and the result.
+
+Two standard deviations come out of it. That of a difference within the series holds the noise of
+the epoch and the differences of visibility; the *level*, what all epochs have in common (the EOP's
+and the targets' uncertainty), is stated beside it and cancels in every drift.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from thermocald.photogrammetry.camera.camera_model import (
+    IOP_NAMES,
+    PARAMETER_NAMES,
+    ExteriorOrientation,
+    InteriorOrientation,
+)
+from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, Adjustment
+from thermocald.photogrammetry.epoch.geometry import GeometryBounds
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+__all__ = ["EOP_COLUMNS", "SeriesAdjustment", "SeriesSettings"]
+
+EOP_COLUMNS = np.arange(10, 16)
+"""Positions of the exterior orientation in `PARAMETER_NAMES`."""
+
+
+@dataclass(frozen=True, slots=True)
+class SeriesSettings:
+    """What is estimated per epoch and what once.
+
+    exterior: `series` for a camera that stands still; free: IOP per epoch, the others are held;
+    target_offsets: a constant offset per target, with the test field's sigmas as prior;
+    target_noise: the measuring noise, also its correlations within a marker and what neighbouring
+    epochs scatter beyond it, from the series' own scatter where it is long enough; snooping_alpha,
+    max_rejected, scale, bounds as in `AdjustmentSettings`.
+    """
+
+    exterior: Literal["per_epoch", "series"] = "series"
+    free: tuple[str, ...] = DEFAULT_FREE
+    target_offsets: bool = True
+    target_noise: bool = True
+    snooping_alpha: float = 0.002
+    max_rejected: float = 0.35
+    scale: Literal["posterior", "prior"] = "posterior"
+    bounds: GeometryBounds = field(default_factory=GeometryBounds)
+
+    @property
+    def per_epoch(self) -> NDArray[np.int64]:
+        """Positions of the parameters that every epoch has of its own."""
+        own = [i for i, name in enumerate(IOP_NAMES) if name in self.free]
+        if self.exterior == "per_epoch":
+            own += list(EOP_COLUMNS)
+        return np.array(own, dtype=np.int64)
+
+    @property
+    def common(self) -> NDArray[np.int64]:
+        """Positions of the parameters that are estimated once."""
+        return EOP_COLUMNS if self.exterior == "series" else np.empty(0, dtype=np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class SeriesAdjustment:
+    """The adjusted series; rows are epochs, parameters in the order of `PARAMETER_NAMES`.
+
+    values (E, 16), NaN where an epoch has no result; covariance (E, 16, 16): relative to the
+    series; level_covariance (16, 16): common to all epochs; sigma0 (E,); redundancy (E,);
+    observed, rejected (E, T); residuals (E, T, 2) px; offsets, offset_sds (T, 2) px, NaN where
+    none was estimated; status, reasons: per epoch; stillness (E,): chi-square with 6 degrees of
+    freedom of the epoch's own EOP against the series', NaN where the EOP are per epoch; excess_sd
+    (16,): by how much neighbouring epochs scatter beyond their noise because the set-up trembles
+    or the light flickers; contained in the covariance, 0 where it is not significant; trend_sd
+    (16,): what a straight line from the first epoch to the last owes to targets: their coordinates'
+    uncertainty where the visible ones changed on the way, and slow errors of their own.
+    """
+
+    settings: SeriesSettings
+    values: Array
+    covariance: Array
+    level_covariance: Array
+    sigma0: Array
+    redundancy: Array
+    observed: NDArray[np.bool_]
+    rejected: NDArray[np.bool_]
+    residuals: Array
+    offsets: Array
+    offset_sds: Array
+    status: tuple[str, ...]
+    reasons: tuple[str, ...]
+    stillness: Array
+    excess_sd: Array
+    trend_sd: Array
+
+    @property
+    def sd(self) -> Array:
+        """Standard deviations (E, 16), NaN where held; common parameters have their level's."""
+        variance = np.diagonal(self.covariance, axis1=1, axis2=2).copy()
+        level = np.diag(self.level_covariance)
+        common = self.settings.common
+        variance[:, common] = level[common]
+        out: Array = np.sqrt(np.where(variance > 0, variance, np.nan))
+        out[~self.ok] = np.nan
+        return out
+
+    @property
+    def level_sd(self) -> Array:
+        """Standard deviation (16,) of what all epochs have in common."""
+        return np.sqrt(np.clip(np.diag(self.level_covariance), 0.0, None))
+
+    @property
+    def ok(self) -> NDArray[np.bool_]:
+        """(E,): epochs with a result."""
+        return np.array([s == "ok" for s in self.status], dtype=bool)
+
+    def spread(self, targets: NDArray[np.int64], n: int) -> SeriesAdjustment:
+        """The same with its columns of targets put where they stand in a larger test field."""
+        if len(targets) == n:
+            return self
+
+        def wide(array: NDArray[Any], axis: int, fill: Any) -> NDArray[Any]:
+            shape = list(array.shape)
+            shape[axis] = n
+            out = np.full(shape, fill, dtype=array.dtype)
+            out[(slice(None),) * axis + (targets,)] = array
+            return out
+
+        return replace(
+            self,
+            observed=wide(self.observed, 1, False),
+            rejected=wide(self.rejected, 1, False),
+            residuals=wide(self.residuals, 1, np.nan),
+            offsets=wide(self.offsets, 0, np.nan),
+            offset_sds=wide(self.offset_sds, 0, np.nan),
+        )
+
+    def epoch(self, row: int) -> Adjustment:
+        """One epoch as an `Adjustment`, for the store and the exports."""
+        ok = self.status[row] == "ok"
+        targets = np.flatnonzero(self.observed[row] | self.rejected[row])
+        covariance = self.covariance[row].copy()
+        common = np.ix_(self.settings.common, self.settings.common)
+        covariance[common] = self.level_covariance[common]
+        n = len(targets)
+        return Adjustment(
+            self.status[row],
+            self.reasons[row],
+            InteriorOrientation.from_array(self.values[row, :10]) if ok else None,
+            ExteriorOrientation.from_array(self.values[row, 10:]) if ok else None,
+            covariance if ok else np.zeros((16, 16)),
+            tuple(PARAMETER_NAMES[i] for i in self.settings.per_epoch if i < 10),
+            float(self.sigma0[row]),
+            int(self.redundancy[row]) if ok else 0,
+            targets,
+            self.residuals[row, targets],
+            np.full((n, 2), np.nan),
+            np.full(n, np.nan),
+            tuple(int(t) for t in np.flatnonzero(self.rejected[row])),
+        )

@@ -1,0 +1,97 @@
+"""Data snooping in a series: every point against its own epoch, and which of them stay.
+
+As `gauss_markov.point_tests` and `gauss_markov.snoop` do for one epoch, for all epochs at once.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.photogrammetry.epoch.gauss_markov import chi2_2d
+from thermocald.photogrammetry.series.normals import chunks, products
+from thermocald.photogrammetry.series.system import alike
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from thermocald.photogrammetry.series.system import SeriesSystem
+
+    Array = NDArray[np.float64]
+    Mask = NDArray[np.bool_]
+    Columns = NDArray[np.int64]
+
+__all__ = ["point_tests", "snoop_series"]
+
+_TRUSTED_REDUNDANCY = 20  # from here on the residuals themselves tell the noise
+
+
+def point_tests(system: SeriesSystem, residuals: Array) -> Array:
+    """Chi-square (2) of every image point (E, T) against its epoch.
+
+    Points that take no part are tested as check points. The common unknowns are taken as known,
+    as they rest on all epochs.
+    """
+    first, of = system.alike or alike(system.weights, system.use)
+    E, T = residuals.shape[:2]
+    pairs = products(system.at.A[..., system.own])
+    shared = _test_weights(system, first, pairs) if len(first) < E else None
+    test = np.empty((E, T))
+    for part in chunks(E, T):
+        if shared is None:
+            xx, yy, xy = _test_weights(system, part, pairs)
+        else:
+            xx, yy, xy = shared if len(first) == 1 else shared[:, of[part]]
+        x, y = residuals[part, :, 0], residuals[part, :, 1]
+        out = np.multiply(xx, x, out=test[part])
+        out += xy * y
+        out *= x
+        out += yy * y * y
+    test[np.isnan(test)] = 0.0
+    return test
+
+
+def _test_weights(
+    system: SeriesSystem, epochs: slice | Columns, products: tuple[Array, Array, Array]
+) -> Array:
+    """Inverse covariance (3, M, T) of the residuals, xx, yy, twice xy; 0 without a test."""
+    weights = system.weights[epochs]
+    rows, columns = np.triu_indices(len(system.own))
+    Q = system.Q[epochs][:, rows, columns] * np.where(rows == columns, 1.0, 2.0)
+    sign = np.where(system.use[epochs], -1.0, 1.0)
+    lxx, lyy, lxy = (sign * (Q @ pairs.T) for pairs in products)
+    offered = weights[..., 0] > 0
+    wx, wy, wxy = (np.where(offered, weights[..., k], k < 2) for k in range(3))
+    determinant = wx * wy - wxy * wxy
+    vxx, vyy = wy / determinant + lxx, wx / determinant + lyy
+    vxy = 0.5 * lxy - wxy / determinant
+    d = vxx * vyy - vxy * vxy
+    d[~(offered & (d > 1e-9 / determinant))] = np.inf
+    inverse = np.stack([vyy, vxx, -2 * vxy])
+    inverse /= d
+    return inverse
+
+
+def snoop_series(tests: Array, offered: Mask, used: Mask, unknowns: int, alpha: float) -> Mask:
+    """Which image points (E, T) stay, epoch by epoch, as `gauss_markov.snoop` does."""
+    keep = np.empty_like(used)
+    for part in chunks(*used.shape):
+        keep[part] = _staying(tests[part], offered[part], used[part], unknowns, alpha)
+    return keep
+
+
+def _staying(tests: Array, offered: Mask, used: Mask, unknowns: int, alpha: float) -> Mask:
+    n = used.sum(axis=1)
+    half = np.minimum(n // 2, tests.shape[1] - 1)
+    ordered = np.where(used, tests, np.inf)
+    ordered.sort(axis=1)
+    middle = ordered[np.arange(len(n)), half]
+    variance = np.where(n > 0, middle, 1.0) / (2 * np.log(2))
+    variance = np.where(2 * n - unknowns < _TRUSTED_REDUNDANCY, np.maximum(variance, 1), variance)
+    limit = (chi2_2d(alpha) * np.maximum(variance, 1e-12))[:, None]
+    worst = np.where(used, tests, 0.0).max(axis=1, initial=0.0)[:, None]
+    small = tests <= limit
+    suspicious = used & ~small & (tests >= 0.5 * worst)
+    keep: Mask = offered & (used | small) & ~suspicious
+    return keep

@@ -1,0 +1,1 @@
+"""The survey of a test field, from photographs to coordinates."""

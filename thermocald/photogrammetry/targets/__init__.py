@@ -1,0 +1,1 @@
+"""Targets in an image: detected, identified by their codes, and measured."""

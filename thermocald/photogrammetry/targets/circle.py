@@ -1,0 +1,360 @@
+"""Circular targets, measured by fitting a blurred disc to the grey values about each outline.
+
+Gauss-Newton on the ten parameters of `blurred_disc`, many targets at once, only pixels near the
+outline; each centre gets the covariance of its own fit with the noise of the frame (`noise`), so
+that it stands at the Cramér-Rao bound and says so truthfully. What the measured centre means is
+the local map's affair (`outline`): with a camera the projected 3D centre, without one the centre
+of the ellipse.
+
+Targets that cannot be measured get a reason instead of a number.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.photogrammetry.targets.blurred_disc import blurred_disc, edge_distance
+from thermocald.photogrammetry.targets.noise import NoiseModel, estimate_noise
+from thermocald.photogrammetry.targets.ring_code import RING_INNER
+from thermocald.photogrammetry.targets.scratch import scratch
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from thermocald.photogrammetry.targets.outline import LocalMap
+
+    Array = NDArray[np.float64]
+    Single = NDArray[np.float32]
+    Image = NDArray[np.uint8] | NDArray[np.uint16]
+
+__all__ = ["CircleFit", "Windows", "fit_circles", "windows"]
+
+REACH_PX = 4.0
+"""Pixels farther from the outline carry nothing about the centre."""
+_SMALLEST_SEMI_AXIS_PX = 1.8
+_LARGEST_SATURATION = 0.05
+_LARGEST_MOVE = 0.6  # of the minor semi-axis, and at least two px
+_LARGEST_SHAPE = 0.35
+_CONVERGED_PX = 0.03
+_BLUR_SETTLED_PX = 0.1
+_FLAT = 0.003  # of the contrast per px of movement
+_FEWEST_FOR_LEVEL = 8
+_ITERATIONS = 12
+_THIN = 3
+_RING_CLEARANCE = 2.6  # standard deviations of the blur between a used pixel and the code ring
+_MISFIT = 2.0  # residual sd over the frame's noise beyond which something covers the target
+_MISFIT_CONTRAST = 0.015
+_FEWEST_PIXELS = 24
+_STEP_LIMITS = np.array([1.0, 1.0, 0.15, 0.15, 0.15, 0.5, np.inf, np.inf, 0.02, 0.02])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CircleFit:
+    """n circles as fitted: parameters (n, 10) as `blurred_disc`, covariances (n, 2, 2) px² of the
+    centres, misfit (n,) residual sd over the frame's noise, saturation (n,) share of the pixels
+    used; reasons: n words, empty where the fit is good; noise: of the frame.
+    """
+
+    parameters: Array
+    covariances: Array
+    misfit: Array
+    saturation: Array
+    reasons: tuple[str, ...]
+    noise: NoiseModel
+
+    @property
+    def points(self) -> Array:
+        """Centres (n, 2) px."""
+        return self.parameters[:, :2]
+
+    @property
+    def good(self) -> NDArray[np.bool_]:
+        """Which fits are good (n,)."""
+        return np.array([not reason for reason in self.reasons], dtype=bool)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Windows:
+    """The pixels about some targets.
+
+    rows (n,) of the targets; pixel (n, k): place in the flat image; origin (n, 2) px; x, y relative
+    to it, grey, weight (n, k); k is padded, the padding has weight 0. begin (n, 10): parameters to
+    begin with; cut (n,): whether the image's edge cuts the target.
+    """
+
+    rows: NDArray[np.int64]
+    pixel: NDArray[np.int64]
+    origin: Array
+    x: Single
+    y: Single
+    grey: Single
+    weight: Single
+    begin: Array
+    cut: NDArray[np.bool_]
+
+    def thinned(self) -> Windows:
+        """The same with every third pixel."""
+        x, y, grey, weight = (
+            np.ascontiguousarray(a[:, ::_THIN]) for a in (self.x, self.y, self.grey, self.weight)
+        )
+        return replace(self, x=x, y=y, grey=grey, weight=weight)
+
+
+def windows(
+    image: Image,
+    maps: LocalMap,
+    coded: NDArray[np.bool_],
+    blur: float = 0.9,
+    reach: float = REACH_PX,
+    chunk_pixels: int = 60_000,
+) -> Iterator[Windows]:
+    """The pixels near each outline, targets of like size together.
+
+    coded (n,): targets with a code ring, which is kept out at `blur` px.
+    """
+    height, width = image.shape
+    reach_px = max(reach, 4.0 * blur)
+    half = np.ceil(maps.half_extent + reach_px).astype(int)
+    # Targets of like size and like shape share a window.
+    order = np.lexsort((half[:, 0], half.max(axis=1) // 3))
+    levels = _background_and_contrast(image, maps)
+    sizes = half[order].tolist()
+    flat = image.ravel()
+    start = 0
+    while start < len(order):
+        stop, (hx, hy) = start + 1, sizes[start]
+        largest = 1.5 * (2 * hx + 1) * (2 * hy + 1)
+        while stop < len(order):
+            wider, higher = max(hx, sizes[stop][0]), max(hy, sizes[stop][1])
+            area = (2 * wider + 1) * (2 * higher + 1)
+            if (stop + 1 - start) * area > chunk_pixels or area > largest:
+                break
+            stop, hx, hy = stop + 1, wider, higher
+        rows = order[start:stop]
+        start = stop
+        part = maps.select(rows)
+        ox, oy = np.arange(-hx, hx + 1), np.arange(-hy, hy + 1)
+        lx, ly = np.tile(ox, len(oy))[None], np.repeat(oy, len(ox))[None]
+        origin = np.rint(part.centre).astype(np.int64)
+        centre = (part.centre - origin).astype(np.float32)
+        x, y = lx.astype(np.float32) - centre[:, :1], ly.astype(np.float32) - centre[:, 1:]
+        d, rho = edge_distance(part.linear, x, y)
+        use = np.abs(d) <= reach_px  # the ellipse alone is good enough to choose pixels by
+        if np.any(coded[rows]):
+            # d = (1 − ρ)/|∇ρ|, so the ring's inner edge is (2 − ρ)/|∇ρ| = d (2 − ρ)/(1 − ρ) away
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ring = np.where(rho > 1, d * (RING_INNER - rho) / (1 - rho), np.inf)
+            use &= ~coded[rows, None] | (ring >= _RING_CLEARANCE * blur)
+        cut = np.zeros(len(rows), dtype=bool)
+        reach_xy = np.array([hx, hy])
+        if np.any(origin < reach_xy) or np.any(origin + reach_xy >= (width, height)):
+            ix, iy = lx + origin[:, :1], ly + origin[:, 1:]
+            inside = (ix >= 0) & (ix < width) & (iy >= 0) & (iy < height)
+            cut = np.any(~inside & (d > -2.0), axis=1)
+            use &= inside
+        count = use.sum(axis=1)
+        k = max(int(count.max()), 1)
+        # The pixels used, moved to the front of each row.
+        where = np.flatnonzero(use)
+        row = np.repeat(np.arange(len(rows)), count)
+        place = np.arange(len(where)) + (k * np.arange(len(rows)) - (np.cumsum(count) - count))[row]
+        shape = (len(rows), k)
+        at = np.zeros(shape, dtype=np.int64)
+        at.ravel()[place] = where - row * use.shape[1]
+        weight = np.zeros(shape, dtype=np.float32)
+        weight.ravel()[place] = 1.0
+        base = origin[:, 1:] * width + origin[:, :1]
+        pixel = np.where(weight > 0, (ly * width + lx)[0].take(at) + base, 0)
+        grey = flat.take(pixel).astype(np.float32)
+        begin = np.zeros((len(rows), 10))
+        begin[:, :2] = part.centre
+        begin[:, 5] = blur
+        begin[:, 6:8] = levels[rows]
+        yield Windows(
+            rows, pixel, origin.astype(float), lx[0].astype(np.float32).take(at),
+            ly[0].astype(np.float32).take(at), grey, weight, begin, cut,
+        )  # fmt: skip
+
+
+def _background_and_contrast(image: Image, maps: LocalMap) -> Array:
+    """Both (n, 2) DN, from the centre and from eight points a little outside of the outline."""
+    turn = np.arange(8) * (np.pi / 4)
+    out = 1 + np.minimum(2.5 / maps.semi_axes[:, 1], 0.5)
+    around = (maps.linear @ np.stack([np.cos(turn), np.sin(turn)])) * out[:, None, None]
+    at = np.concatenate([np.zeros((len(maps), 2, 1)), around], axis=2) + maps.centre[:, :, None]
+    high = np.array([image.shape[1] - 1, image.shape[0] - 1])[:, None]
+    x, y = np.moveaxis(np.clip(np.rint(at), 0, high).astype(np.int64), 1, 0)
+    grey = image[y, x].astype(float)
+    background = np.median(grey[:, 1:], axis=1)
+    contrast = grey[:, 0] - background
+    contrast += np.abs(contrast) < 1
+    return np.stack([background, contrast], axis=1)
+
+
+def fit_circles(
+    image: Image,
+    maps: LocalMap,
+    coded: NDArray[np.bool_] | None = None,
+    blur: float = 0.9,
+    noise: NoiseModel | None = None,
+    start: Array | None = None,
+    iterations: int = _ITERATIONS,
+) -> CircleFit:
+    """Fit circles whose outlines are about where `maps` says.
+
+    image (H, W) grey, 8 or 16 bit; coded (n,): which have a code ring; blur: px, to begin with;
+    noise: as known from earlier frames, else estimated from this one; start (n, 10): parameters
+    to begin with.
+    """
+    n = len(maps)
+    coded = np.zeros(n, dtype=bool) if coded is None else coded
+    parts = list(windows(image, maps, coded, blur)) if n else []
+    parameters = np.zeros((n, 10))
+    work = scratch("partials", (2, 10 * max((w.x.size for w in parts), default=0)), np.float32)
+    greys, residuals = [np.zeros(0, dtype=np.float32)], [np.zeros(0, dtype=np.float32)]
+    # One step with a third of the pixels brings the fit near, and its residuals where the image is
+    # flat tell how the noise grows with the light; all pixels then finish it.
+    for w in parts:
+        begin = w.begin if start is None else start[w.rows]
+        thin = w.thinned()
+        f = _gauss_newton(
+            thin, maps.select(w.rows), begin, noise, 1, _CONVERGED_PX, work, noise is None
+        )
+        parameters[w.rows] = f.parameters
+        if noise is None:
+            greys.append(f.value[f.flat])
+            residuals.append(f.residual[f.flat])
+    given = noise is not None
+    if noise is None:
+        noise = estimate_noise(np.concatenate(greys), np.concatenate(residuals), 3 * n)
+    normal = np.zeros((n, 10, 10))
+    pixels, square, saturation, last_step = (np.zeros(n) for _ in range(4))
+    cut = np.zeros(n, dtype=bool)
+    top = np.iinfo(image.dtype).max
+    for w in parts:
+        begin = parameters[w.rows]
+        f = _gauss_newton(w, maps.select(w.rows), begin, noise, iterations, _CONVERGED_PX, work)
+        parameters[w.rows], normal[w.rows], last_step[w.rows] = f.parameters, f.normal, f.step
+        pixels[w.rows] = w.weight.sum(axis=1)
+        weight = w.weight / noise.variance(f.value)
+        square[w.rows] = np.sum(weight * f.residual * f.residual, axis=1)
+        saturation[w.rows] = np.sum(w.weight * (w.grey >= top), axis=1)
+        cut[w.rows] = w.cut
+    saturation /= np.maximum(pixels, 1)
+    variance = square / np.maximum(pixels - 10, 1)
+    if not given and n >= _FEWEST_FOR_LEVEL:
+        # Its level is that of all residuals: paper and compression make noise at edges too.
+        level = float(np.median(variance))
+        noise, variance, normal = noise.scaled(level), variance / level, normal / level
+    # A target that is noisier than the frame by more than chance has its own noise.
+    own = np.where(variance > 1 + 4 * np.sqrt(2 / np.maximum(pixels, 1)), variance, 1.0)
+    covariances = _centre_covariance(normal) * np.maximum(own, 1.0)[:, None, None]
+    fit = CircleFit(parameters, covariances, np.sqrt(variance), saturation, ("",) * n, noise)
+    return replace(fit, reasons=_reasons(fit, maps, cut, pixels, last_step))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    parameters: Array
+    value: Single
+    residual: Single
+    normal: Array
+    step: Array
+    flat: NDArray[np.bool_]
+
+
+def _gauss_newton(
+    w: Windows,
+    maps: LocalMap,
+    begin: Array,
+    noise: NoiseModel | None,
+    rounds: int,
+    tolerance_px: float,
+    work: Single,
+    tells_noise: bool = False,
+) -> _Fit:
+    """Iterate until the centres stand; value and residual are those after the last step.
+
+    work (2, m): memory for the partials; asking the system for it anew costs more than the sums.
+    """
+    p = begin.copy()
+    p[:, :2] -= w.origin
+    shape = (len(p), 10, w.x.shape[1])
+    j, jw = (row[: np.prod(shape)].reshape(shape) for row in work)
+    for _ in range(max(rounds, 1)):
+        value, _ = blurred_disc(maps, p, w.x, w.y, out=j)
+        weight = w.weight if noise is None else w.weight / noise.variance(value)
+        np.multiply(j, weight[:, None, :], out=jw)
+        residual = w.grey - value
+        N = (jw @ np.swapaxes(j, 1, 2)).astype(float)
+        delta = _limited(N, (jw @ residual[..., None])[..., 0])
+        p = p + delta
+        p[:, 5] = np.clip(p[:, 5], 0.2, 6.0)
+        p[:, 2:5] = np.clip(p[:, 2:5], -0.6, 0.6)
+        step = np.abs(delta[:, :2]).max(axis=1)
+        if bool(np.all(step < tolerance_px) and np.all(np.abs(delta[:, 5]) < _BLUR_SETTLED_PX)):
+            break
+    change = (np.swapaxes(j, 1, 2) @ delta[..., None].astype(np.float32))[..., 0]
+    p[:, :2] += w.origin
+    flat = np.zeros(0, dtype=bool)
+    if tells_noise:
+        # Where a px of movement would change the grey value by next to nothing.
+        slope = np.maximum(np.abs(j[:, 0]), np.abs(j[:, 1]))
+        flat = (w.weight > 0) & (slope < _FLAT * np.abs(p[:, 7, None]))
+    return _Fit(p, value + change, residual - change, N, step, flat)
+
+
+def _limited(N: Array, rhs: NDArray[np.floating[Any]]) -> Array:
+    delta: Array = np.clip(_solve(N, rhs), -_STEP_LIMITS, _STEP_LIMITS)
+    return delta
+
+
+def _solve(N: Array, rhs: NDArray[np.floating[Any]]) -> Array:
+    scale = np.sqrt(np.maximum(np.einsum("nii->ni", N), 1e-12))
+    scaled = N / (scale[:, :, None] * scale[:, None, :]) + 1e-9 * np.eye(N.shape[-1])
+    solution: Array = np.linalg.solve(scaled, (rhs / scale)[..., None])[..., 0] / scale
+    return solution
+
+
+def _centre_covariance(N: Array) -> Array:
+    scale = np.sqrt(np.maximum(np.einsum("nii->ni", N), 1e-12))
+    inverse = np.linalg.inv(
+        N / (scale[:, :, None] * scale[:, None, :]) + 1e-12 * np.eye(N.shape[-1])
+    )
+    part: Array = inverse[:, :2, :2] / (scale[:, :2, None] * scale[:, None, :2])
+    return part
+
+
+def _reasons(
+    fit: CircleFit, maps: LocalMap, cut: NDArray[np.bool_], pixels: Array, step: Array
+) -> tuple[str, ...]:
+    minor = maps.semi_axes[:, 1]
+    p = fit.parameters
+    move = np.hypot(*(p[:, :2] - maps.centre).T)
+    noise_sd = np.sqrt(fit.noise.variance(np.maximum(p[:, 6], p[:, 6] + p[:, 7])))
+    shape = np.abs(p[:, 2:5]).max(axis=1, initial=0.0)
+    misfit_dn = fit.misfit * noise_sd
+    covered = (fit.misfit > _MISFIT) & (misfit_dn > _MISFIT_CONTRAST * np.abs(p[:, 7]))
+    tests = (
+        (cut, "cut off by the image's edge"),
+        ((minor < _SMALLEST_SEMI_AXIS_PX) | (pixels < _FEWEST_PIXELS), "too small"),
+        (fit.saturation > _LARGEST_SATURATION, "saturated"),
+        (~np.isfinite(p).all(axis=1) | (np.abs(p[:, 7]) < 6 * noise_sd), "too little contrast"),
+        (p[:, 5] > np.maximum(0.75 * minor, 1.2), "too blurred for its size"),
+        (
+            (move > np.maximum(_LARGEST_MOVE * minor, 2.0))
+            | (step > 0.05)
+            | (shape > _LARGEST_SHAPE),
+            "no circle where the target should be",
+        ),
+        (covered, "covered in part or disturbed"),
+    )
+    reasons = np.full(len(p), "", dtype=object)
+    for bad, word in reversed(tests):
+        reasons[bad] = word
+    return tuple(reasons.tolist())

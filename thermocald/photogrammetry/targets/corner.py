@@ -1,0 +1,268 @@
+"""Corners of markers, measured by fitting a blurred wedge to the grey values around each.
+
+A corner is where two straight edges meet; blurred by the optics it is the probability that a
+bivariate normal variate lies in a quadrant, with the cosine between the edges' normals as its
+correlation. Position, both edge directions, blur, background, and contrast are estimated by
+Levenberg's method for all corners at once; the covariance is that of least squares with the
+variance of the fit's own residuals, so that it is true where the noise is white. A JPEG's noise is
+not: there the standard deviations are too small by a factor that this module cannot know.
+
+Source: the quadrant probability as Mehler's tetrachoric series; the idea of fitting a parametric
+grey-value corner, Deriche, R. and Giraudon, G. (1993): A computational approach for corner and
+vertex detection, IJCV 10(2), 101–124.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.photogrammetry.targets.blurred_disc import normal_cdf
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+    Single = NDArray[np.float32]
+    Image = NDArray[np.uint8] | NDArray[np.uint16]
+
+__all__ = ["CornerFit", "fit_corners"]
+
+_SERIES_TERMS = 9
+_ITERATIONS = 20
+_CONVERGED_PX = 2e-4
+_LARGEST_MOVE_PX = 1.5
+_LARGEST_MOVE_SHARE = 0.015  # of the marker's side: an outline cut short in a reduced image
+_BLUR_LIMITS_PX = (0.3, 4.0)
+_SLOWEST_CORRELATION = 0.93  # the series is not good enough for edges that meet at less than 22°
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CornerFit:
+    """Corners as fitted: points (n, 2) px, covariances (n, 2, 2) px², blur (n,) px, contrast and
+    background (n,) DN, residual_sd (n,) DN, saturation (n,) share of the pixels that were used;
+    reasons: n words, empty where the fit is good.
+    """
+
+    points: Array
+    covariances: Array
+    blur: Array
+    contrast: Array
+    background: Array
+    residual_sd: Array
+    saturation: Array
+    reasons: tuple[str, ...]
+
+
+def fit_corners(
+    image: Image,
+    corners: Array,
+    before: Array,
+    after: Array,
+    cell: Array,
+    reach: float = 10.0,
+    chunk: int = 256,
+) -> CornerFit:
+    """Fit corners (n, 2) px whose neighbours along the outline are `before` and `after` (n, 2) px.
+
+    cell (n,) px: width of the marker's border and of the quiet zone about it; nothing beyond is
+    looked at. reach: px, how far along the edges pixels are used.
+    """
+    if len(corners) == 0:
+        none = np.zeros(0)
+        return CornerFit(np.zeros((0, 2)), np.zeros((0, 2, 2)), *(none,) * 5, ())
+    parts = []
+    for i in range(0, len(corners), chunk):
+        s = slice(i, i + chunk)
+        parts.append(_fit(image, corners[s], before[s], after[s], cell[s], reach))
+
+    def joined(name: str) -> Array:
+        return np.concatenate([getattr(part, name) for part in parts])
+
+    return CornerFit(
+        joined("points"),
+        joined("covariances"),
+        joined("blur"),
+        joined("contrast"),
+        joined("background"),
+        joined("residual_sd"),
+        joined("saturation"),
+        tuple(reason for part in parts for reason in part.reasons),
+    )
+
+
+def _unit(v: Array) -> Array:
+    length: Array = np.linalg.norm(v, axis=-1, keepdims=True)
+    return v / np.where(length > 0, length, 1.0)
+
+
+def _wedge(h: Single, k: Single, rho: Single) -> Single:
+    """P(H < h, K < k) of standard normals with correlation rho; h, k (n, m), rho (n, 1)."""
+    value: Single = normal_cdf(h) * normal_cdf(k)
+    density = np.exp(-0.5 * (h * h + k * k)) / (2 * np.pi)
+    he_h, he_k = np.ones_like(h), np.ones_like(k)
+    last_h, last_k = np.zeros_like(h), np.zeros_like(k)
+    factor = rho * density
+    for n in range(1, _SERIES_TERMS + 1):
+        value += factor * he_h * he_k
+        he_h, last_h = h * he_h - (n - 1) * last_h, he_h
+        he_k, last_k = k * he_k - (n - 1) * last_k, he_k
+        factor = factor * rho / (n + 1)
+    return value
+
+
+def _model(p: Array, x: Array, y: Array) -> tuple[Single, Single]:
+    """Grey values (n, m) and derivatives (n, m, 7) by x, y, angle1, angle2, blur, b, a.
+
+    p (n, 7); the angles are those of the inward normals of the two edges; x, y (n, m) px. Float32:
+    its rounding is a thousandth of a grey value's.
+    """
+    t1, t2, s, b, a = (p[:, i, None].astype(np.float32) for i in range(2, 7))
+    c1, s1, c2, s2 = np.cos(t1), np.sin(t1), np.cos(t2), np.sin(t2)
+    dx, dy = ((v - p[:, i, None]).astype(np.float32) for i, v in enumerate((x, y)))
+    h: Single = ((c1 * dx + s1 * dy) / s).astype(np.float32, copy=False)
+    k: Single = ((c2 * dx + s2 * dy) / s).astype(np.float32, copy=False)
+    rho = np.clip(c1 * c2 + s1 * s2, -_SLOWEST_CORRELATION, _SLOWEST_CORRELATION)
+    root = np.sqrt(1 - rho * rho)
+    w = _wedge(h, k, rho)
+    norm = np.float32(1 / np.sqrt(2 * np.pi))
+    wh = norm * np.exp(-0.5 * h * h) * normal_cdf((k - rho * h) / root)
+    wk = norm * np.exp(-0.5 * k * k) * normal_cdf((h - rho * k) / root)
+    wr = np.exp(-0.5 * (h * h - 2 * rho * h * k + k * k) / root**2) / (2 * np.pi * root)
+    sine = s1 * c2 - c1 * s2  # dρ/dt2 = −dρ/dt1
+    j = np.empty((*h.shape, 7), np.float32)
+    j[..., 0] = -a * (wh * c1 + wk * c2) / s
+    j[..., 1] = -a * (wh * s1 + wk * s2) / s
+    j[..., 2] = a * (wh * (c1 * dy - s1 * dx) / s - wr * sine)
+    j[..., 3] = a * (wk * (c2 * dy - s2 * dx) / s + wr * sine)
+    j[..., 4] = -a * (wh * h + wk * k) / s
+    j[..., 5] = 1.0
+    j[..., 6] = w
+    return b + a * w, j
+
+
+def _fit(
+    image: Image, corners: Array, before: Array, after: Array, cell: Array, reach: float
+) -> CornerFit:
+    n = len(corners)
+    height, width = image.shape
+    sides = np.stack([before - corners, after - corners])
+    side = np.linalg.norm(sides, axis=-1).min(axis=0)
+    along = np.minimum(0.45 * side, reach)
+    half = int(np.ceil(along.max()))
+    offset = np.arange(-half, half + 1)
+    origin = np.rint(corners).astype(int)
+    x = (origin[:, 0, None, None] + offset[None, None, :]).repeat(len(offset), 1).reshape(n, -1)
+    y = (origin[:, 1, None, None] + offset[None, :, None]).repeat(len(offset), 2).reshape(n, -1)
+    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    grey = image[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)].astype(float)
+
+    # Inward normals of the two edges: perpendicular to one side, towards the other.
+    normals = []
+    for edge, other in ((sides[0], sides[1]), (sides[1], sides[0])):
+        normal = _unit(np.stack([-edge[:, 1], edge[:, 0]], axis=-1))
+        normals.append(normal * np.sign(np.sum(normal * other, axis=-1, keepdims=True)))
+    px, py = x.astype(float), y.astype(float)
+    dx, dy = px - corners[:, 0, None], py - corners[:, 1, None]
+    d1, d2 = (m[:, 0, None] * dx + m[:, 1, None] * dy for m in normals)
+    depth = np.minimum(d1, d2)
+    # A margin of two px keeps the blurred bits and neighbours out, but an edge needs two px itself.
+    margin = np.maximum(cell - 2.0, 2.0)[:, None]
+    use = inside & (np.abs(depth) <= margin) & (np.hypot(dx, dy) <= along[:, None])
+    cut_off = np.any(~inside & (np.hypot(dx, dy) < 3), axis=1)
+    m = use.sum(axis=1)
+    # the pixels of each corner that are used come first: the others are not calculated with
+    first = np.argsort(~use, axis=1, kind="stable")[:, : max(int(m.max()), 1)]
+    px, py, grey, depth, use = (np.take_along_axis(v, first, 1) for v in (px, py, grey, depth, use))
+    weight = use.astype(float)
+
+    def share(mask: NDArray[np.bool_]) -> Array:
+        part = np.where(use & mask, grey, np.nan)
+        empty = ~np.isfinite(part).any(axis=1)
+        part[empty] = grey[empty]
+        median: Array = np.nanmedian(part, axis=1)
+        return median
+
+    background = share(depth < -1)
+    contrast = share(depth > 1) - background
+    p = np.column_stack(
+        [
+            corners,
+            *(np.arctan2(v[:, 1], v[:, 0]) for v in normals),
+            np.full(n, 1.2),
+            background,
+            np.where(np.abs(contrast) < 1, 1.0, contrast),
+        ]
+    )
+    damping = np.full(n, 1e-2)
+
+    def cost(q: Array, rows: NDArray[np.int64]) -> tuple[Array, Array, Single]:
+        value, j = _model(q, px[rows], py[rows])
+        r = (grey[rows] - value) * weight[rows]
+        return np.sum(r * r, axis=1, dtype=float), r, j
+
+    open_ = np.arange(n)  # corners that still move
+    chi, r, j = cost(p, open_)
+    step = np.full((n, 7), np.inf)
+    for _ in range(_ITERATIONS):
+        j_open = j[open_]
+        jw = j_open * weight[open_, :, None]
+        normal_matrix = np.swapaxes(jw, 1, 2) @ j_open
+        rhs = np.swapaxes(jw, 1, 2) @ r[open_, :, None]
+        diagonal = np.einsum("nii->ni", normal_matrix)
+        scaled = normal_matrix + np.eye(7) * (damping[open_, None] * diagonal + 1e-9)[:, None, :]
+        now = np.linalg.solve(scaled, rhs)[..., 0]
+        now[:, 4] = np.clip(now[:, 4], -0.4, 0.4)
+        trial = p[open_] + now
+        trial[:, 4] = np.clip(trial[:, 4], *_BLUR_LIMITS_PX)
+        trial_chi, trial_r, trial_j = cost(trial, open_)
+        better = trial_chi <= chi[open_] * (1 + 1e-12)
+        won = open_[better]
+        p[won], chi[won] = trial[better], trial_chi[better]
+        r[won], j[won] = trial_r[better], trial_j[better]
+        damping[open_] = np.where(
+            better, damping[open_] * 0.1, np.minimum(damping[open_] * 10, 1e6)
+        )
+        step[open_] = now
+        open_ = open_[np.abs(now[:, :2]).max(axis=1) >= _CONVERGED_PX]
+        if len(open_) == 0:
+            break
+
+    jw = j * weight[..., None]
+    normal_matrix = np.swapaxes(jw, 1, 2) @ j
+    scale = np.sqrt(np.maximum(np.einsum("nii->ni", normal_matrix), 1e-12))
+    conditioned = normal_matrix / (scale[:, :, None] * scale[:, None, :])
+    inverse = np.linalg.inv(conditioned + 1e-12 * np.eye(7))
+    inverse = inverse / (scale[:, :, None] * scale[:, None, :])
+    variance = chi / np.maximum(m - 7, 1)
+    covariances = inverse[:, :2, :2] * variance[:, None, None]
+    top = np.iinfo(image.dtype).max
+    saturation = np.sum(use & (grey >= top), axis=1) / np.maximum(m, 1)
+
+    move = np.hypot(*(p[:, :2] - corners).T)
+    converged = np.abs(step[:, :2]).max(axis=1, initial=0.0) < 0.02
+    angle = np.abs(np.cos(p[:, 2] - p[:, 3]))
+    residual_sd = np.sqrt(variance)
+    reasons = []
+    for i in range(n):
+        if cut_off[i]:
+            reasons.append("cut off by the image's edge")
+        elif m[i] < 20:
+            reasons.append("too small")
+        elif not np.isfinite(p[i]).all() or not converged[i]:
+            reasons.append("the fit does not converge")
+        elif move[i] > _LARGEST_MOVE_PX + _LARGEST_MOVE_SHARE * side[i]:
+            reasons.append("no corner where the marker has one")
+        elif angle[i] > 0.95:
+            reasons.append("too oblique")
+        elif abs(p[i, 6]) < 5 * residual_sd[i]:
+            reasons.append("too little contrast")
+        else:
+            reasons.append("")
+    # The fitted width holds the pixel's own.
+    blur = np.sqrt(np.maximum(p[:, 4] ** 2 - 1 / 12, 0.0))
+    return CornerFit(
+        p[:, :2], covariances, blur, p[:, 6], p[:, 5], residual_sd, saturation, tuple(reasons)
+    )

@@ -1,0 +1,273 @@
+"""Square markers of OpenCV's dictionaries: found, identified, and their corners measured.
+
+A test field names marker corners in its `code` column as `DICT_APRILTAG_36h11:17:0`: dictionary,
+marker, corner in OpenCV's order (clockwise in the image of an upright marker, beginning at its top
+left; OpenCV's AprilTags are turned by 180° against the printed original). Detection is OpenCV's,
+in a reduced image where the frame is large; the corner positions are our own fit (`corner`).
+
+A marker that is seen twice in an image is dropped: one of the two is not what it says.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+from thermocald.errors import TestFieldError
+from thermocald.photogrammetry.field.testfield import Observations
+from thermocald.photogrammetry.targets.corner import fit_corners
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from thermocald.photogrammetry.field.testfield import TestField
+
+    Array = NDArray[np.float64]
+    Image = NDArray[np.uint8] | NDArray[np.uint16]
+
+__all__ = [
+    "DetectedMarkers",
+    "MarkerCorners",
+    "detect_markers",
+    "is_marker",
+    "locate_markers",
+    "marker_rows",
+    "measure_corners",
+    "measure_markers",
+    "parse_marker",
+    "to_8_bit",
+]
+
+_LARGE_PIXELS = 3_000_000
+_SMALLEST_SIDE_PX = 16.0
+
+
+def is_marker(code: str) -> bool:
+    """Whether a test field's code names a marker or one of its corners."""
+    return code.startswith("DICT_")
+
+
+def parse_marker(code: str) -> tuple[str, int, int | None]:
+    """`DICT_5X5_50:17:0` → ("DICT_5X5_50", 17, 0); the corner is None for `DICT_5X5_50:17`.
+
+    TestFieldError where OpenCV has no such dictionary, or the dictionary no such marker.
+    """
+    parts = code.split(":")
+    numbers = parts[1:]
+    if len(parts) not in (2, 3) or not all(n.isascii() and n.isdigit() for n in numbers):
+        raise TestFieldError(
+            f"{code!r} is no marker code: write DICT_APRILTAG_36h11:17:0 for corner 0 of marker 17"
+        )
+    dictionary = _dictionary(parts[0])
+    marker = int(numbers[0])
+    corner = int(numbers[1]) if len(numbers) == 2 else None
+    if marker >= len(dictionary.bytesList):
+        raise TestFieldError(
+            f"{code!r}: {parts[0]} has markers 0 to {len(dictionary.bytesList) - 1}"
+        )
+    if corner is not None and corner > 3:
+        raise TestFieldError(f"{code!r}: a marker has corners 0 to 3")
+    return parts[0], marker, corner
+
+
+@cache
+def _dictionary(name: str) -> Any:
+    number = getattr(cv2.aruco, name, None)
+    if not name.startswith("DICT_") or not isinstance(number, int):
+        raise TestFieldError(
+            f"{name!r} is no dictionary of OpenCV's; DICT_4X4_50, DICT_5X5_1000, or "
+            "DICT_APRILTAG_36h11 are"
+        )
+    return cv2.aruco.getPredefinedDictionary(number)
+
+
+@cache
+def _detector(name: str) -> Any:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
+    parameters.minMarkerPerimeterRate = 0.01
+    # A bit is read from a third of its cell: the default of eight px a cell gives blur a chance.
+    return cv2.aruco.ArucoDetector(_dictionary(name), parameters)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DetectedMarkers:
+    """Markers of one dictionary: numbers (m,), corners (m, 4, 2) px, good to about a pixel."""
+
+    dictionary: str
+    numbers: NDArray[np.int64]
+    corners: Array
+
+
+def to_8_bit(image: Image) -> NDArray[np.uint8]:
+    """The image itself, or a 16-bit one scaled so that its brightest value is 255."""
+    if image.dtype == np.uint8:
+        return image  # type: ignore[return-value]
+    return cv2.convertScaleAbs(image, alpha=255.0 / max(int(image.max()), 1))  # type: ignore[return-value]
+
+
+def detect_markers(
+    image: Image, dictionary: str, expected: frozenset[int] | None = None
+) -> DetectedMarkers:
+    """Find the markers of one dictionary in an image; `expected` numbers, others are ignored.
+
+    A number that is found twice is dropped. A large image is searched at half its size first, and
+    at full size where that found less than half of what is expected.
+    """
+    grey = to_8_bit(image)
+    scales = (2, 1) if grey.size > _LARGE_PIXELS else (1,)
+    best: dict[int, Array] = {}
+    for scale in scales:
+        small = cv2.resize(grey, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA)
+        found, numbers, _ = _detector(dictionary).detectMarkers(small if scale > 1 else grey)
+        seen: defaultdict[int, list[Array]] = defaultdict(list)
+        if numbers is not None:
+            for number, corners in zip(numbers.ravel().tolist(), found, strict=True):
+                if expected is None or number in expected:
+                    # cv2.resize maps pixel centres as x = scale·x' + (scale − 1)/2.
+                    at = scale * corners.reshape(4, 2).astype(float) + (scale - 1) / 2
+                    seen[number].append(at)
+        single = {number: at[0] for number, at in seen.items() if _one_place(at)}
+        if len(single) > len(best):
+            best = single
+        if len(best) > 0.5 * (len(expected) if expected is not None else 0) and best:
+            break
+    numbers = np.array(sorted(best), dtype=np.int64)
+    corners = np.array([best[n] for n in numbers.tolist()]).reshape(-1, 4, 2)
+    return DetectedMarkers(dictionary, numbers, corners)
+
+
+def _one_place(found: list[Array]) -> bool:
+    """Whether all finds of one number are the same find (OpenCV may report inner and outer)."""
+    first = found[0]
+    size = np.linalg.norm(first[0] - first[2])
+    return all(bool(np.linalg.norm(f.mean(0) - first.mean(0)) < 0.1 * size) for f in found[1:])
+
+
+def marker_rows(testfield: TestField) -> dict[str, dict[tuple[int, int], int]]:
+    """{dictionary: {(marker, corner): row of the test field}}."""
+    rows: dict[str, dict[tuple[int, int], int]] = {}
+    for row, code in enumerate(testfield.codes):
+        if is_marker(code):
+            dictionary, marker, corner = parse_marker(code)
+            if corner is None:
+                continue
+            corners = rows.setdefault(dictionary, {})
+            if (marker, corner) in corners:
+                raise TestFieldError(
+                    f"code {code!r} stands twice in the test field, at targets "
+                    f"{testfield.names[corners[marker, corner]]!r} and {testfield.names[row]!r}"
+                )
+            corners[marker, corner] = row
+    return rows
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerCorners:
+    """Marker corners as found: rows (n,) of the test field, corners (n, 2) px and their neighbours
+    along the outline, before and after (n, 2) px; cell (n,) px, width of the marker's border.
+    """
+
+    rows: NDArray[np.int64]
+    corners: Array
+    before: Array
+    after: Array
+    cell: Array
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def moved(self, found: Observations) -> MarkerCorners:
+        """With corners and neighbours moved by what `found` says of these corners."""
+        at = {int(row): i for i, row in enumerate(found.targets)}
+        shift = np.array(
+            [
+                found.points[at[row]] - corner if row in at else (np.nan, np.nan)
+                for row, corner in zip(self.rows.tolist(), self.corners, strict=True)
+            ]
+        ).reshape(-1, 2)
+        if np.isfinite(shift).any():
+            shift = np.where(np.isfinite(shift), shift, np.nanmedian(shift, axis=0))
+        else:
+            shift = np.zeros_like(shift)
+        return MarkerCorners(
+            self.rows, self.corners + shift, self.before + shift, self.after + shift, self.cell
+        )
+
+
+def locate_markers(
+    image: Image, testfield: TestField, missed: dict[int, str] | None = None
+) -> MarkerCorners:
+    """Find a test field's markers; `missed` receives {row: reason} for corners not found."""
+    missed = {} if missed is None else missed
+    rows: list[int] = []
+    corners, before, after, cell = [], [], [], []
+    for dictionary, known in marker_rows(testfield).items():
+        expected = frozenset(marker for marker, _ in known)
+        found = detect_markers(image, dictionary, expected)
+        cells = _dictionary(dictionary).markerSize + 2
+        for number, quad in zip(found.numbers.tolist(), found.corners, strict=True):
+            side = np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1).min()
+            for k in range(4):
+                row = known.get((number, k))
+                if row is not None and side >= _SMALLEST_SIDE_PX:
+                    rows.append(row)
+                    corners.append(quad[k])
+                    before.append(quad[k - 1])
+                    after.append(quad[(k + 1) % 4])
+                    cell.append(side / cells)
+                elif row is not None:
+                    missed[row] = "too small"
+        missing = expected.difference(found.numbers.tolist())
+        missed.update({r: "not found" for (m, _), r in known.items() if m in missing})
+    return MarkerCorners(
+        np.array(rows, dtype=np.int64), _xy(corners), _xy(before), _xy(after),
+        np.array(cell, dtype=float),
+    )  # fmt: skip
+
+
+def measure_corners(
+    image: Image, found: MarkerCorners, missed: dict[int, str] | None = None
+) -> Observations:
+    """Measure marker corners where they were found; `missed` receives reasons for the others."""
+    missed = {} if missed is None else missed
+    fit = fit_corners(image, found.corners, found.before, found.after, found.cell)
+    rows = found.rows.tolist()
+    missed.update({row: why for row, why in zip(rows, fit.reasons, strict=True) if why})
+    order = sorted((row, i) for i, row in enumerate(rows) if not fit.reasons[i])
+    keep = np.array([i for _, i in order], dtype=np.int64)
+    return Observations(
+        np.array([row for row, _ in order], dtype=np.int64),
+        fit.points[keep],
+        np.sqrt(np.stack([fit.covariances[keep, 0, 0], fit.covariances[keep, 1, 1]], axis=-1)),
+        fit.covariances[keep, 0, 1],
+        {
+            "blur": fit.blur[keep],
+            "contrast": fit.contrast[keep],
+            "grey": fit.background[keep],
+            "noise": fit.residual_sd[keep],
+            "saturation": fit.saturation[keep],
+        },
+    )
+
+
+def measure_markers(
+    image: Image, testfield: TestField, missed: dict[int, str] | None = None
+) -> Observations:
+    """Measure the marker corners of a test field in an image (H, W), grey, 8 or 16 bit.
+
+    Returns the corners found, with standard deviation and covariance of each, and as quality
+    `blur` px, `contrast`, `grey` (background), `noise` DN, `saturation` (share of pixels).
+    `missed` receives {row: reason} for corners of markers that were found but not measured, and
+    for those not found at all.
+    """
+    return measure_corners(image, locate_markers(image, testfield, missed), missed)
+
+
+def _xy(points: list[Array]) -> Array:
+    return np.array(points, dtype=float).reshape(-1, 2)

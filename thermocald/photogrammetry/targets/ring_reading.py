@@ -1,0 +1,291 @@
+"""Ring codes read about circles that were found in a frame.
+
+About each candidate the grey values are sampled on circles in the ellipse's own frame. A coded
+target has its disc in one grey, a gap about it in the other, background outside of its ring, and
+in the ring transitions that all lie on a raster of 12 or of 14 bits. What is read is then drawn,
+blurred, and compared with the samples. Only a ring that passes all of it and whose code exists is
+a coded target: the codes have little redundancy of their own (`ring_code`), their shape has much.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from thermocald.photogrammetry.targets import ring_code
+from thermocald.photogrammetry.targets.blurred_disc import normal_cdf
+from thermocald.photogrammetry.targets.outline import LocalMap
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from thermocald.photogrammetry.targets.detection import Candidates
+
+    Array = NDArray[np.float64]
+    Single = NDArray[np.float32]
+
+__all__ = ["CodedTargets", "read_codes"]
+
+_ANGLES = 84  # a multiple of 12 and of 14
+_COARSE_ANGLES = 28
+_COARSE_RADII = (0.5, 1.5, 2.5, 3.4)
+_EDGE_RADII = (0.55, 0.65, 0.75, 0.85, 0.95, 1.05, 1.15, 1.25, 1.35, 1.45)
+_RADII = (1.75, 2.05, 2.25, 2.5, 2.75, 2.95, 3.25)
+_MIDDLE = slice(2, 5)
+_INSIDE, _OUTSIDE = 0.6, 0.4  # level of a sample, 0 background, 1 ink
+_LEAST_RELIEF = 0.35  # of the ring, against none about a plain circle
+_SHARE = 0.85  # of the samples on a circle that must agree
+_LEAST_CONTRAST_DN = 10.0
+_SMALLEST_SEMI_AXIS_PX = 2.6  # a gap of less cannot be seen
+_RASTER_PX = 0.5  # by how much a transition may miss the raster, and by how many turns
+_RASTER_TURNS = 0.006
+_BLURS_PX = (0.8, 1.4)
+_LARGEST_SHIFT = 0.2  # radii, by which perspective and distortion move a ring against its disc
+# RMS of samples against what was read, in levels: at most, and for large targets, whose edges fill
+# less of the ring, less.
+_MISFIT = 0.13
+_MISFIT_LARGE, _MISFIT_EDGE_PX = 0.03, 0.45
+# A closed ring with something across is read as one arc, a line through a dot as two single bits.
+_MISFIT_OF_FEW = 0.06
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CodedTargets:
+    """Coded targets: bits, numbers (m,), and the row (m,) of each among the candidates."""
+
+    bits: NDArray[np.int64]
+    numbers: NDArray[np.int64]
+    rows: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+
+def read_codes(
+    image: NDArray[np.uint8],
+    candidates: Candidates,
+    known: frozenset[tuple[int, int]] | None = None,
+) -> CodedTargets:
+    """The ring codes about candidates; `known` (bits, number), all others are ignored.
+
+    Both families are always read, since a ring of one may pass for one of the other. A code that
+    is read at two places is dropped: one of the two is not what it says.
+    """
+    rows, gap, contrast = _disc_and_gap(image, candidates)
+    maps = _sized(image, candidates.maps.select(rows), gap, contrast)
+    level = _sample(image, maps, _RADII, _ANGLES)
+    level = (level - gap[:, None, None]) / contrast[:, None, None]
+    raster = np.array(ring_code.BITS, dtype=np.int64)
+    readings = [_read_family(level, maps, n) for n in raster.tolist()]
+    numbers = np.array([r[0] for r in readings]).reshape(len(raster), len(rows))
+    misfits = np.array([r[1] for r in readings]).reshape(len(raster), len(rows))
+    best, at = np.argmin(misfits, axis=0), np.arange(len(rows))
+    misfit = misfits[best, at]
+    misfits[best, at] = np.inf
+    # A ring that fits both families can be trusted with neither.
+    good = np.isfinite(misfit) & (
+        misfits.min(axis=0, initial=np.inf) > 1.2 * np.where(np.isfinite(misfit), misfit, 0)
+    )
+    bits, number, rows = raster[best][good], numbers[best, at][good], rows[good]
+    found = list(zip(bits.tolist(), number.tolist(), strict=True))
+    count = Counter(found)
+    keep = np.array(
+        [i for i, c in enumerate(found) if count[c] == 1 and (known is None or c in known)],
+        dtype=np.int64,
+    )
+    return CodedTargets(bits[keep], number[keep], rows[keep])
+
+
+def _disc_and_gap(
+    image: NDArray[np.uint8], candidates: Candidates
+) -> tuple[NDArray[np.int64], Single, Single]:
+    """Candidates with disc, gap, something in the ring, background outside, and all in the image.
+
+    Returns their rows, the grey value of the gap, and the contrast.
+    """
+    height, width = image.shape
+    reach = candidates.maps.half_extent * ring_code.RING_OUTER
+    low, high = candidates.maps.centre - reach, candidates.maps.centre + reach
+    inside = np.all((low > 0) & (high < (width - 1, height - 1)), axis=1)
+    large = candidates.maps.semi_axes[:, 1] >= _SMALLEST_SEMI_AXIS_PX
+    rows = np.nonzero(inside & large)[0]
+    grey = _sample(image, candidates.maps.select(rows), _COARSE_RADII, _COARSE_ANGLES)
+    ink, gap = grey[:, 0].mean(axis=1), grey[:, 1].mean(axis=1)
+    contrast = ink - gap
+    enough = contrast * candidates.ink[rows] >= _LEAST_CONTRAST_DN
+    level = (grey - gap[:, None, None]) / np.where(enough, contrast, 1.0)[:, None, None]
+    passed = (
+        enough
+        & (np.mean(level[:, 0] > _INSIDE, axis=1) >= _SHARE)
+        & (np.mean(level[:, 1] < _OUTSIDE, axis=1) >= _SHARE)
+        & (np.ptp(level[:, 2], axis=1) > _LEAST_RELIEF)
+        & (np.mean(level[:, 3] < _OUTSIDE, axis=1) >= _SHARE)
+    )
+    return rows[passed], gap[passed], contrast[passed]
+
+
+def _sized(image: NDArray[np.uint8], maps: LocalMap, gap: Single, contrast: Single) -> LocalMap:
+    """The maps with the size that the discs have at half of their contrast.
+
+    A contour lies where its threshold does, which may be a pixel off.
+    """
+    level = _sample(image, maps, _EDGE_RADII, _COARSE_ANGLES)
+    level = (level - gap[:, None, None]) / contrast[:, None, None]
+    # The disc reaches as far as ink goes: its level, summed outwards.
+    step = _EDGE_RADII[1] - _EDGE_RADII[0]
+    radius = _EDGE_RADII[0] - step / 2 + np.clip(level, 0, 1).sum(axis=1) * step
+    turn = 2 * np.pi * np.arange(_COARSE_ANGLES) / _COARSE_ANGLES
+    across = 1 / np.linalg.norm(
+        np.swapaxes(np.linalg.inv(maps.linear), 1, 2) @ np.stack([np.cos(turn), np.sin(turn)]),
+        axis=1,
+    )
+    excess = np.median((radius - 1) * across, axis=1)
+    axes = np.linalg.norm(maps.linear, axis=1)
+    factor = np.maximum(1 + excess[:, None] / axes, 0.5)
+    return LocalMap(maps.centre, maps.linear * factor[:, None, :], maps.second)
+
+
+def _sample(
+    image: NDArray[np.uint8], maps: LocalMap, radii: tuple[float, ...], angles: int
+) -> Single:
+    """Grey values (n, radii, angles) on circles about discs, clockwise from the first axis."""
+    turn = 2 * np.pi * np.arange(angles) / angles
+    circle = np.stack([np.cos(turn), np.sin(turn)])
+    grey = np.empty((len(maps), len(radii), angles), dtype=np.float32)
+    chunk = 32_000 // len(radii)  # cv2.remap takes no more rows
+    for i in range(0, len(maps), chunk):
+        part = slice(i, i + chunk)
+        around = (maps.linear[part] @ circle).astype(np.float32)[:, None]
+        around = around * np.array(radii, dtype=np.float32)[:, None, None]
+        around += maps.centre[part].astype(np.float32)[:, None, :, None]
+        x, y = (np.ascontiguousarray(around[:, :, k]).reshape(-1, angles) for k in (0, 1))
+        grey[part] = cv2.remap(image, x, y, cv2.INTER_LINEAR).reshape(-1, len(radii), angles)
+    return grey
+
+
+@cache
+def _code_table(bits: int) -> NDArray[np.int64]:
+    """The code of each number of so many bits, -1 where it is none."""
+    table = np.full(1 << bits, -1, dtype=np.int64)
+    codes = np.array(ring_code.codes(bits))
+    for k in range(bits):
+        table[((codes << k) | (codes >> (bits - k))) & ((1 << bits) - 1)] = codes
+    return table
+
+
+def _read_family(level: Single, maps: LocalMap, bits: int) -> tuple[NDArray[np.int64], Array]:
+    """Codes (n,) read with a raster of so many bits, -1 for none, and the misfit (n,) of what was
+    read, infinite where nothing was.
+    """
+    n = len(level)
+    ring = level[:, _MIDDLE].mean(axis=1)
+    after = np.roll(ring, -1, axis=1)
+    crosses = (ring > 0.5) != (after > 0.5)
+    target, at = np.nonzero(crosses)
+    level_at = ring[target, at]
+    place = at + (0.5 - level_at) / (after[target, at] - level_at)
+    phase = 2 * np.pi * place * bits / _ANGLES
+    cosine, sine = np.bincount(target, np.cos(phase), n), np.bincount(target, np.sin(phase), n)
+    offset = np.arctan2(sine, cosine) / (2 * np.pi * bits)  # in turns: where the raster begins
+    off = np.zeros(n)
+    np.maximum.at(
+        off, target, np.abs((phase / (2 * np.pi) - offset[target] * bits + 0.5) % 1 - 0.5) / bits
+    )
+    # A pixel is the larger an angle the smaller the target: along its shortest semi-axis.
+    allowed = _RASTER_TURNS + _RASTER_PX / (2 * np.pi * 2.5 * maps.semi_axes[:, 1])
+    on_raster = off < np.minimum(allowed, 0.3 / bits)
+
+    turns = np.arange(_ANGLES) / _ANGLES
+    position = ((turns - offset[:, None]) % 1.0) * bits
+    which = np.minimum(position.astype(np.int64), bits - 1)
+    within = position - which
+    middle = np.abs(within - 0.5) < 0.3
+    segment = (np.arange(n)[:, None] * bits + which)[middle]
+    ink = np.bincount(segment, ring[middle], n * bits)
+    samples = np.bincount(segment, minlength=n * bits)
+    ones = (ink > 0.5 * samples).reshape(n, bits)
+    codes = _code_table(bits)[ones @ (1 << np.arange(bits - 1, -1, -1))]
+    readable = on_raster & (codes >= 0)
+    misfit = np.full(n, np.inf)
+    rows = np.nonzero(readable)[0]
+    if len(rows):
+        misfit[rows] = _misfit(
+            level[rows], maps.select(rows), ones[rows], which[rows], within[rows]
+        )
+        misfit[misfit > _allowed(maps)] = np.inf
+        one_arc = np.sum(ones != np.roll(ones, 1, axis=1), axis=1) == 2
+        misfit[(one_arc | (ones.sum(axis=1) <= 2)) & (misfit > _MISFIT_OF_FEW)] = np.inf
+    return codes, misfit
+
+
+def _allowed(maps: LocalMap) -> Array:
+    allowed: Array = _MISFIT_LARGE + _MISFIT_EDGE_PX / maps.semi_axes[:, 1]
+    return np.minimum(allowed, _MISFIT)
+
+
+def _misfit(
+    level: Single,
+    maps: LocalMap,
+    ones: NDArray[np.bool_],
+    which: NDArray[np.int64],
+    within: Array,
+) -> Array:
+    """RMS (n,) of the samples against the ring that was read, drawn with one of two blurs."""
+    bits = ones.shape[1]
+    mine = np.take_along_axis(ones, which, 1)
+    left = np.take_along_axis(ones, (which - 1) % bits, 1) != mine
+    right = np.take_along_axis(ones, (which + 1) % bits, 1) != mine
+    # Angle to the nearest transition in rad, positive on ink; a bit farther off will do for far.
+    angle = np.minimum(np.where(left, within, within + 1), np.where(right, 1 - within, 2 - within))
+    angle = np.where(mine, angle, -angle) * (2 * np.pi / bits)
+    turn = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
+    u = np.stack([np.cos(turn), np.sin(turn)])
+    # How many px a radius is: across the circles, and across a radial edge at that radius.
+    across = 1 / np.linalg.norm(np.swapaxes(np.linalg.inv(maps.linear), 1, 2) @ u, axis=1)
+    along = np.abs(np.linalg.det(maps.linear))[:, None] / np.linalg.norm(maps.linear @ u, axis=1)
+    across, side = across.astype(np.float32), (angle * along).astype(np.float32)
+    rho = np.array(_RADII, dtype=np.float32)[:, None]
+    misfit = np.full(len(level), np.inf)
+    for blur in _BLURS_PX:
+        left = np.nonzero(misfit > _allowed(maps))[0]
+        if len(left) == 0:
+            break
+        scale = (across[left] / np.float32(blur))[:, None]
+        drawn = normal_cdf((rho - np.float32(ring_code.RING_INNER)) * scale)
+        drawn += normal_cdf((np.float32(ring_code.RING_OUTER) - rho) * scale)
+        drawn -= np.float32(1)
+        drawn *= normal_cdf(rho * (side[left] / np.float32(blur))[:, None])
+        misfit[left] = np.minimum(misfit[left], _rms_after_shift(level[left], drawn))
+    return misfit
+
+
+def _rms_after_shift(level: Single, drawn: Single) -> Array:
+    """RMS (n,) of level minus drawn (n, radii, angles) after the ring may shift, turn, and grow."""
+    n = len(level)
+    turn = (2 * np.pi * np.arange(_ANGLES) / _ANGLES).astype(np.float32)
+    radii = np.array(_RADII, dtype=np.float32)
+    rho, cosine, sine = radii[:, None], np.cos(turn), np.sin(turn)
+    outwards = np.gradient(drawn, radii, axis=1)
+    around = np.roll(drawn, -1, axis=2) - np.roll(drawn, 1, axis=2)
+    around *= np.float32(_ANGLES / (4 * np.pi))
+    design = np.stack(
+        [
+            outwards * cosine - around * sine / rho,
+            outwards * sine + around * cosine / rho,
+            around,
+            outwards * rho,
+        ],
+        axis=1,
+    ).reshape(n, 4, -1)
+    residual = (level - drawn).reshape(n, -1)
+    normal = design @ np.swapaxes(design, 1, 2) + 1e-3 * np.eye(4, dtype=np.float32)
+    shift = np.linalg.solve(normal, (design @ residual[..., None]))[..., 0]
+    shift = np.clip(shift, -_LARGEST_SHIFT, _LARGEST_SHIFT)
+    left = residual - (shift[:, None] @ design)[:, 0]
+    rms: Array = np.sqrt(np.mean(left * left, axis=1))
+    return rms

@@ -1,0 +1,108 @@
+"""A series of the store as a recording."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.errors import DataError
+from thermocald.store.recording.writer import RecordingWriter
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from thermocald.epoch import Epoch
+    from thermocald.store.database.row import StoredSeries
+    from thermocald.store.database.store import Store
+
+    Array = NDArray[np.float64]
+
+__all__ = ["archive_readings", "archive_series", "clock_corrections"]
+
+
+def clock_corrections(frame_time: Array, interval: float) -> Array:
+    """Seconds (E,) to add to times (E,) so that they never run backwards.
+
+    Where the clock was set back, what was taken before is moved to end one interval earlier than
+    what follows: the later setting is the better known one. Zero where nothing was set back.
+    """
+    corrections = np.zeros(len(frame_time))
+    for last in np.flatnonzero(np.diff(frame_time) < 0)[::-1]:
+        corrections[: last + 1] += frame_time[last + 1] - interval - frame_time[last]
+    return corrections
+
+
+def archive_series(
+    store: Store, series: StoredSeries, path: Path, frames: Path | None = None
+) -> None:
+    """Write a series as a recording, in constant memory.
+
+    frames: the folder that relative paths of frames refer to; a frame that was not kept is left
+    out. The head also holds what the store knows of the series: `start`, `device`, `calibration`.
+    Times that ran backwards are mended (`clock_corrections`), the head then holds `clock_set_back`
+    [{epoch, seconds}]. Raises RecordingError, StoreError.
+    """
+    columns = store.series_columns(series, ["epoch", "frame_time"])
+    corrections = clock_corrections(columns["frame_time"], series.head.interval)
+    known = {"start": series.start, "device": series.identity, "calibration": series.settings}
+    told = {key: value for key, value in known.items() if value}
+    head = replace(series.head, extra={**series.head.extra, **told})
+    if set_back := np.flatnonzero(np.diff(corrections)).tolist():
+        steps = [
+            {
+                "epoch": int(columns["epoch"][i + 1]),
+                "seconds": float(corrections[i] - corrections[i + 1]),
+            }
+            for i in set_back
+        ]
+        head = replace(head, extra={**head.extra, "clock_set_back": steps})
+    by_number = dict(zip(columns["epoch"].tolist(), corrections.tolist(), strict=True))
+    with RecordingWriter(path, head, series.testfield) as writer:
+        for stored in store.epochs(series):
+            epoch = _with_frame(stored.epoch, frames)
+            shift = by_number[epoch.number]
+            if shift:
+                epoch = replace(
+                    epoch,
+                    frame_time=epoch.frame_time + shift,
+                    temperature_time=epoch.temperature_time + shift,
+                )
+            writer.append(epoch)
+
+
+def archive_readings(store: Store, folder: Path) -> dict[str, Path]:
+    """Write what thermometers said apart from epochs, {thermometer: `thermometer-<name>.csv`}.
+
+    Columns: time (s UTC), clock_trusted, one per channel (°C, empty where it was not read). Raises
+    StoreError, DataError if the folder cannot be written.
+    """
+    channels: dict[str, dict[str, None]] = {}
+    for reading in store.readings():
+        channels.setdefault(reading.thermometer, {}).update(dict.fromkeys(reading.values))
+    written: dict[str, Path] = {}
+    for name, columns in channels.items():
+        written[name] = folder / f"thermometer-{name}.csv"
+        partial = folder / f".thermometer-{name}.csv.partial"
+        try:
+            with partial.open("w", encoding="utf-8", newline="") as file:
+                rows = csv.writer(file, lineterminator="\n")
+                rows.writerow(["time", "clock_trusted", *columns])
+                for reading in store.readings(name):
+                    values = [reading.values.get(channel, "") for channel in columns]
+                    rows.writerow([f"{reading.utc:.6f}", int(reading.clock_trusted), *values])
+            partial.replace(written[name])
+        except OSError as error:
+            raise DataError(f"{written[name]}: cannot be written: {error.strerror}") from error
+    return written
+
+
+def _with_frame(epoch: Epoch, frames: Path | None) -> Epoch:
+    if epoch.frame is None:
+        return epoch
+    path = epoch.frame if frames is None else frames / epoch.frame
+    return replace(epoch, frame=path if path.is_file() else None)

@@ -1,0 +1,364 @@
+"""The store: everything of a daemon in one SQLite file.
+
+Several cameras, each with series of epochs. An epoch is one transaction: a killed writer loses at
+most the epoch in hand. Nothing is changed or deleted: a later calibration of an epoch is a further
+revision, and triggers in the file refuse everything else.
+"""
+
+from __future__ import annotations
+
+import threading
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from thermocald.errors import StoreError, StoreFullError
+from thermocald.store.database import columns as column_chunks
+from thermocald.store.database.connection import Mode, connect, in_words
+from thermocald.store.database.epoch_columns import FIXED, status_codes
+from thermocald.store.database.epoch_table import (
+    StoredEpoch,
+    insert_epoch,
+    select_covariance,
+    select_epochs,
+)
+from thermocald.store.database.row import (
+    NOT_CALIBRATED,
+    EpochResult,
+    Event,
+    LoggedReading,
+    StoredSeries,
+)
+from thermocald.store.database.series_table import (
+    insert_events,
+    insert_readings,
+    insert_series,
+    select_events,
+    select_readings,
+    select_series,
+)
+from thermocald.store.recording.readings import interpolate_readings
+
+if TYPE_CHECKING:
+    import sqlite3
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from pathlib import Path
+    from types import TracebackType
+
+    from numpy.typing import NDArray
+
+    from thermocald.epoch import Epoch
+    from thermocald.photogrammetry.field.testfield import Observations, TestField
+    from thermocald.store.recording.head import Head
+
+    Array = NDArray[np.float64]
+
+__all__ = ["Store"]
+
+
+class Store:
+    """An open store; use `Store.open` and a `with` block. Threads may share it."""
+
+    def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
+        self.path = path
+        self._db = connection
+        self._lock = threading.RLock()
+        self._ends: dict[int, tuple[int, int]] = {}  # series → last number, rows in no chunk
+
+    @classmethod
+    def open(cls, path: Path, mode: Mode = "read", *, durable: bool = True) -> Self:
+        """Open a store; for appending it is made if it does not exist.
+
+        durable: what is committed survives a power cut; False: the end of the process only, for
+        what can be computed again. Raises StoreError, StoreVersionError.
+        """
+        return cls(path, connect(path, mode, durable=durable))
+
+    def close(self) -> None:
+        """Close the file; may be called twice."""
+        with self._lock, in_words(self.path, "the store cannot be closed"):
+            self._db.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def create_series(
+        self,
+        head: Head,
+        testfield: TestField,
+        *,
+        start: str = "",
+        identity: Mapping[str, Any] | None = None,
+        settings: Mapping[str, Any] | None = None,
+        created_utc: float = 0.0,
+    ) -> StoredSeries:
+        """Begin a series; StoreError if the camera has one of this name already."""
+        if taken := {*FIXED, *_DERIVED} & set(head.channels):
+            raise StoreError(f"a temperature channel cannot be called {min(taken)!r}")
+        with self._transaction(f"series {head.series!r} was not begun"):
+            if self._select_series(head.camera.name, head.series):
+                raise StoreError(
+                    f"{self.path}: camera {head.camera.name!r} has a series {head.series!r} "
+                    "already; choose another name"
+                )
+            insert_series(
+                self._db, head, testfield, start, identity or {}, settings or {}, created_utc
+            )
+        return self.find_series(head.camera.name, head.series)
+
+    def all_series(self) -> list[StoredSeries]:
+        """All series, in the order in which they were begun."""
+        return self._select_series()
+
+    def find_series(self, camera: str | None = None, name: str | None = None) -> StoredSeries:
+        """The one series of a camera and a name, either of which may be left open.
+
+        Raises StoreError, listing what there is, if none or several fit.
+        """
+        found = self._select_series(camera, name)
+        if len(found) != 1:
+            there = ", ".join(f"{s.camera}/{s.name}" for s in self.all_series()) or "none"
+            raise StoreError(
+                f"{self.path}: {'several series fit' if found else 'there is no such series'}; "
+                f"camera/series in this store: {there}"
+            )
+        return found[0]
+
+    def append(
+        self,
+        series: StoredSeries,
+        epoch: Epoch,
+        result: EpochResult | None = None,
+        *,
+        extra: Mapping[str, float] | None = None,
+        clock_trusted: bool = True,
+        events: Iterable[Event] = (),
+    ) -> None:
+        """Keep one epoch, its result and what happened meanwhile, in one transaction.
+
+        result: None if it is to be calibrated later, by `amend`. extra: further columns such as
+        blur. Keeps nothing of the epoch and raises StoreError if its number does not come after the
+        last one, StoreFullError if the disk is full: an epoch without observations is smaller.
+        """
+        if taken := {*FIXED, *_DERIVED, *series.head.channels} & set(extra or ()):
+            raise StoreError(f"an extra column cannot be called {min(taken)!r}")
+        stored = StoredEpoch(
+            epoch, result or EpochResult(NOT_CALIBRATED), extra or {}, clock_trusted, 0
+        )
+        happened = list(events)
+        try:
+            self._append(series, stored, happened)
+        except StoreFullError:
+            # what waits in the -wal file may be the room that is missing
+            self.checkpoint()
+            self._append(series, stored, happened)
+
+    def _append(self, series: StoredSeries, stored: StoredEpoch, events: list[Event]) -> None:
+        epoch = stored.epoch
+        with self._transaction(f"epoch {epoch.number} of series {series.name!r} was not kept"):
+            last, loose = self._ends.get(series.id) or self._end(series)
+            if epoch.number <= last:
+                raise StoreError(
+                    f"{self.path}: epoch {epoch.number} of series {series.name!r} comes after "
+                    f"epoch {last}; numbers must increase"
+                )
+            insert_epoch(self._db, series.id, stored)
+            insert_events(self._db, events)
+            full = loose + 1 >= column_chunks.CHUNK
+            if full:
+                column_chunks.build_missing_chunks(self._db, series.id)
+        self._ends[series.id] = (epoch.number, 0 if full else loose + 1)
+
+    def amend(
+        self,
+        series: StoredSeries,
+        number: int,
+        result: EpochResult,
+        *,
+        observations: Observations | None = None,
+        extra: Mapping[str, float] | None = None,
+    ) -> None:
+        """Keep a later calibration of an epoch; `observations`, `extra` None: as they were."""
+        with self._transaction(f"the calibration of epoch {number} was not kept"):
+            then = next(select_epochs(self._db, series.id, number, number, details=False), None)
+            if then is None:
+                raise StoreError(f"{self.path}: series {series.name!r} has no epoch {number}")
+            stored = StoredEpoch(
+                replace(then.epoch, observations=observations),
+                result,
+                then.extra if extra is None else extra,
+                then.clock_trusted,
+                then.revision + 1,
+            )
+            epoch_id = insert_epoch(self._db, series.id, stored)
+            column_chunks.note_amended(self._db, series.id, number, epoch_id)
+
+    def add_event(self, event: Event) -> None:
+        """Log something that happened apart from an epoch."""
+        with self._transaction("an event was not kept"):
+            insert_events(self._db, [event])
+
+    def add_readings(self, readings: Sequence[LoggedReading]) -> None:
+        """Keep what thermometers said apart from epochs, in one transaction."""
+        with self._transaction("readings were not kept"):
+            insert_readings(self._db, readings)
+
+    def readings(
+        self, thermometer: str | None = None, since_utc: float = 0.0
+    ) -> Iterator[LoggedReading]:
+        """Readings apart from epochs, in the order they were kept."""
+        with in_words(self.path, "readings cannot be read", reading=True):
+            yield from select_readings(self._db, thermometer, since_utc)
+
+    def rebuild_columns(self, series: StoredSeries) -> None:
+        """Derive the column chunks anew: after many `amend`s reading is faster for it."""
+        with self._transaction("the columns were not rebuilt"):
+            column_chunks.rebuild_chunks(self._db, series.id)
+
+    def last_epoch(self, series: StoredSeries) -> int | None:
+        """The number of the last epoch kept, None if there is none: where to resume."""
+        last = self._end(series)[0]
+        return None if last < 0 else last
+
+    def epochs(
+        self,
+        series: StoredSeries,
+        first: int = 0,
+        last: int | None = None,
+        *,
+        details: bool = True,
+    ) -> Iterator[StoredEpoch]:
+        """The epochs numbered `first` to `last`, one after the other, in constant memory.
+
+        details: False leaves out observations and covariances, and is faster.
+        """
+        with in_words(self.path, "epochs cannot be read", reading=True):
+            yield from select_epochs(self._db, series.id, first, last, details=details)
+
+    def observations(
+        self, series: StoredSeries, numbers: Iterable[int]
+    ) -> Iterator[Observations | None]:
+        """The observations of some epochs; StoreError for a number that is not there."""
+        for number in numbers:
+            stored = next(self.epochs(series, number, number), None)
+            if stored is None:
+                raise StoreError(f"{self.path}: series {series.name!r} has no epoch {number}")
+            yield stored.epoch.observations
+
+    def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
+        """(E, 16, 16) covariances of some epochs, NaN for those without a result."""
+        result = np.full((len(numbers), 16, 16), np.nan)
+        with self._lock, in_words(self.path, "covariances cannot be read", reading=True):
+            for i, number in enumerate(numbers):
+                covariance = select_covariance(self._db, series.id, int(number))
+                if covariance is not None:
+                    result[i] = covariance
+        return result
+
+    def column_names(self, series: StoredSeries) -> list[str]:
+        """What `series_columns` can give, but extra columns."""
+        return ["epoch", *FIXED[1:], "status", *series.head.channels]
+
+    def series_columns(self, series: StoredSeries, names: Sequence[str]) -> dict[str, NDArray[Any]]:
+        """Columns over all epochs by name, (E,) each: a million epochs in a fraction of a second.
+
+        Names are those of `column_names` and of extra columns: `epoch`, `frame_time`, `c`, `sd_c`,
+        `sigma0`, a temperature channel (°C as read; see `temperatures_at_frame`), `blur` …; numbers
+        are float64, NaN where an epoch has none; `status` is text.
+        """
+        source = {name: _source(name, series) for name in names}
+        with self._lock, in_words(self.path, "columns cannot be read", reading=True):
+            columns: dict[str, NDArray[Any]] = dict(
+                column_chunks.read_columns(
+                    self._db, series.id, list(dict.fromkeys(source.values()))
+                )
+            )
+            if "status" in columns:
+                codes = status_codes(self._db)
+                words = np.array([codes.get(i, "") for i in range(max(codes, default=0) + 1)])
+                columns["status"] = words[columns["status"].astype(np.int64)]
+        return {name: columns[source[name]] for name in names}
+
+    def temperatures_at_frame(self, series: StoredSeries) -> dict[str, Array]:
+        """Every channel brought to the instants of the frames, {name: (E,) °C}."""
+        names = ["frame_time", "temperature_time", *series.head.channels]
+        columns = self.series_columns(series, names)
+        return {
+            name: interpolate_readings(
+                columns["frame_time"], columns["temperature_time"], columns[name]
+            )
+            for name in series.head.channels
+        }
+
+    def events(self, series: StoredSeries | None = None, since_utc: float = 0.0) -> list[Event]:
+        """What happened, oldest first; of one series, or all."""
+        with self._lock, in_words(self.path, "events cannot be read", reading=True):
+            return select_events(self._db, None if series is None else series.id, since_utc)
+
+    def checkpoint(self) -> bool:
+        """Move what is in the -wal file into the store; False if a reader or the disk forbids."""
+        try:
+            ((busy, _, _),) = self._query("PRAGMA wal_checkpoint(TRUNCATE)", ())
+        except StoreFullError:
+            return False
+        return not busy
+
+    def check(self) -> None:
+        """Read the whole file; StoreError if it is damaged."""
+        ((verdict,), *_) = self._query("PRAGMA integrity_check", ())
+        if verdict != "ok":
+            raise StoreError(f"{self.path}: is damaged: {verdict}")
+
+    def _select_series(
+        self, camera: str | None = None, name: str | None = None
+    ) -> list[StoredSeries]:
+        with self._lock, in_words(self.path, "the series cannot be read", reading=True):
+            return select_series(self._db, self.path, camera, name)
+
+    def _end(self, series: StoredSeries) -> tuple[int, int]:
+        """The last epoch number of a series (-1: none) and how many rows are in no chunk."""
+        ((last,),) = self._query(
+            "SELECT ifnull(max(number), -1) FROM epoch WHERE series_id = ?", (series.id,)
+        )
+        with self._lock, in_words(self.path, "the store cannot be read", reading=True):
+            return int(last), column_chunks.loose_rows(self._db, series.id)
+
+    def _query(self, statement: str, values: Sequence[Any]) -> list[tuple[Any, ...]]:
+        with self._lock, in_words(self.path, "the store cannot be read", reading=True):
+            return self._db.execute(statement, values).fetchall()
+
+    @contextmanager
+    def _transaction(self, failed: str) -> Iterator[None]:
+        """All or nothing; `failed` begins the message of the error."""
+        with self._lock, in_words(self.path, failed):
+            self._db.execute("BEGIN IMMEDIATE")
+            try:
+                yield
+                self._db.execute("COMMIT")
+            except BaseException:
+                # SQLite has rolled back by itself after some errors, such as a full disk
+                if self._db.in_transaction:
+                    self._db.execute("ROLLBACK")
+                raise
+
+
+_DERIVED = ("epoch", "status")
+
+
+def _source(name: str, series: StoredSeries) -> str:
+    """The name in the chunks of a column by its public name."""
+    if name == "epoch":
+        return "number"
+    if name in FIXED or name == "status":
+        return name
+    return f"temperatures.{name}" if name in series.head.channels else f"extra.{name}"

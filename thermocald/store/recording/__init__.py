@@ -1,0 +1,1 @@
+"""A recording: the open folder format, read and written."""

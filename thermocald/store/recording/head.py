@@ -1,0 +1,230 @@
+"""`recording.yaml` (CONVENTIONS §3): what a recording says about itself."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from thermocald.errors import RecordingError
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, InteriorOrientation, Sensor
+from thermocald.yaml_file import dump_yaml, read_yaml
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+__all__ = [
+    "FORMAT",
+    "CameraSpec",
+    "Channel",
+    "Head",
+    "head_document",
+    "head_yaml",
+    "parse_head",
+    "read_head",
+]
+
+FORMAT = "thermocald-recording/1"
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSpec:
+    """A camera: name, sensor, and what is known of its interior orientation beforehand.
+
+    principal_distance: mm, nominal, or None; interior: initial values, or None.
+    """
+
+    name: str
+    sensor: Sensor
+    principal_distance: float | None = None
+    interior: InteriorOrientation | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A temperature column: its unit, always degC, and the thermometer's resolution in K."""
+
+    unit: str = "degC"
+    resolution: float | None = None
+
+
+@dataclass(frozen=True)
+class Head:
+    """What `recording.yaml` holds.
+
+    name, series: as the user calls them; interval: s, nominal; channels: the temperature columns,
+    the first is the reference; extra: keys that the format does not know, kept as they are.
+    """
+
+    name: str
+    series: str
+    interval: float
+    camera: CameraSpec
+    channels: Mapping[str, Channel] = field(default_factory=dict)
+    extra: Mapping[str, Any] = field(default_factory=dict)
+
+
+class _Reader:
+    """One mapping of the file; errors name file and dotted key."""
+
+    def __init__(self, path: Path, mapping: Mapping[str, Any], prefix: str = "") -> None:
+        self._path = path
+        self._mapping = mapping
+        self._prefix = prefix
+
+    def fail(self, key: str, message: str) -> RecordingError:
+        return RecordingError(f"{self._path}, key {self._prefix}{key}: {message}")
+
+    def text(self, key: str, default: str | None = None) -> str:
+        value = self._mapping.get(key, default)
+        if value is None:
+            raise self.fail(key, "is missing")
+        if isinstance(value, bool) or not isinstance(value, str | int | float):
+            raise self.fail(key, "must be text")
+        return str(value)
+
+    def positive(self, key: str, unit: str) -> float:
+        value = self.number(key)
+        if value is None:
+            raise self.fail(key, "is missing")
+        if value <= 0:
+            raise self.fail(key, f"is {value:g} {unit}; it must be above 0")
+        return value
+
+    def number(self, key: str) -> float | None:
+        value = self._mapping.get(key)
+        if value is None:
+            return None
+        try:
+            # PyYAML reads 1e-3 as text, since YAML 1.1 wants a point
+            number = float(value) if isinstance(value, str | int | float) else math.nan
+        except (ValueError, OverflowError):
+            number = math.nan
+        if isinstance(value, bool) or not math.isfinite(number):
+            raise self.fail(key, f"{str(value)[:40]!r} is not a finite number")
+        return number
+
+    def size(self, key: str) -> int:
+        value = self.positive(key, "px")
+        if value != int(value) or value > 100_000:
+            raise self.fail(key, f"is {value:g} px; it must be a whole number up to 100000")
+        return int(value)
+
+    def inner(self, key: str) -> tuple[Mapping[str, Any], _Reader]:
+        value = self._mapping.get(key)
+        if not isinstance(value, dict):
+            raise self.fail(key, "is missing" if value is None else "must hold `key: value` pairs")
+        return value, _Reader(self._path, value, f"{self._prefix}{key}.")
+
+
+def read_head(folder: Path) -> Head:
+    """Read `recording.yaml` of a folder; raises RecordingError naming file and key."""
+    path = folder / "recording.yaml"
+    if not folder.is_dir():
+        raise RecordingError(f"{folder}: is no folder; a recording is a folder with recording.yaml")
+    if not path.is_file():
+        raise RecordingError(f"{folder}: is no recording: recording.yaml is missing")
+    return parse_head(read_yaml(path, RecordingError), path)
+
+
+def parse_head(document: Mapping[str, Any], path: Path) -> Head:
+    """The head in a mapping of `recording.yaml`; `path` is for the messages."""
+    top = _Reader(path, document)
+    found = top.text("format")
+    if found != FORMAT:
+        raise top.fail("format", f"is {found[:60]!r}; this program reads {FORMAT!r}")
+    known = {"format", "name", "series", "interval", "camera", "temperatures"}
+    return Head(
+        name=top.text("name", path.resolve().parent.name),
+        series=top.text("series", "M1"),
+        interval=top.positive("interval", "s"),
+        camera=_camera(top),
+        channels=_channels(top) if "temperatures" in document else {},
+        extra=_plain(top, {key: value for key, value in document.items() if key not in known}),
+    )
+
+
+def _plain(top: _Reader, extra: Mapping[str, Any]) -> dict[str, Any]:
+    """Unknown keys as JSON would keep them: a date of YAML becomes text, as it will in a store."""
+    try:
+        plain: dict[str, Any] = json.loads(json.dumps(extra, default=str))
+    except TypeError as cause:
+        raise top.fail(next(iter(extra)), f"or another unknown key: {cause}") from cause
+    return plain
+
+
+def _camera(top: _Reader) -> CameraSpec:
+    mapping, camera = top.inner("camera")
+    pitch = camera.positive("pixel_pitch", "mm")
+    if pitch > 0.1:
+        raise camera.fail("pixel_pitch", f"is {pitch:g} mm; pixels are a few thousandths of a mm")
+    sensor = Sensor(camera.size("width"), camera.size("height"), pitch)
+    distance = None
+    if mapping.get("principal_distance") is not None:
+        distance = camera.positive("principal_distance", "mm")
+    interior = None
+    if mapping.get("interior") is not None:
+        values, reader = camera.inner("interior")
+        for key in values:
+            if key not in IOP_NAMES:
+                raise reader.fail(key, f"is unknown; known are {', '.join(IOP_NAMES)}")
+        reader.positive("c", "mm")
+        interior = InteriorOrientation.from_mapping({k: reader.number(k) or 0.0 for k in values})
+    return CameraSpec(camera.text("name", "camera"), sensor, distance, interior)
+
+
+def _channels(top: _Reader) -> dict[str, Channel]:
+    mapping, reader = top.inner("temperatures")
+    channels: dict[str, Channel] = {}
+    for name, value in mapping.items():
+        if not isinstance(name, str):
+            raise reader.fail(str(name), "a column's name must be text")
+        if value is not None and not isinstance(value, dict):
+            raise reader.fail(name, "must hold `unit: degC, resolution: …`")
+        inner = _Reader(top._path, value or {}, f"temperatures.{name}.")
+        unit = inner.text("unit", "degC")
+        if unit != "degC":
+            raise inner.fail("unit", f"is {unit!r}; temperatures must be in degC: convert them")
+        resolution = (
+            None if inner.number("resolution") is None else inner.positive("resolution", "K")
+        )
+        channels[name] = Channel(unit, resolution)
+    return channels
+
+
+def head_document(head: Head) -> dict[str, Any]:
+    """The mapping that `recording.yaml` holds; JSON-able where `extra` is."""
+    sensor = head.camera.sensor
+    camera: dict[str, Any] = {
+        "name": head.camera.name,
+        "width": sensor.width,
+        "height": sensor.height,
+        "pixel_pitch": sensor.pixel_pitch,
+    }
+    if head.camera.principal_distance is not None:
+        camera["principal_distance"] = head.camera.principal_distance
+    if head.camera.interior is not None:
+        values = head.camera.interior.as_array().tolist()
+        camera["interior"] = dict(zip(IOP_NAMES, values, strict=True))
+    temperatures = {
+        name: {"unit": channel.unit}
+        | ({} if channel.resolution is None else {"resolution": channel.resolution})
+        for name, channel in head.channels.items()
+    }
+    document: dict[str, Any] = {
+        "format": FORMAT,
+        "name": head.name,
+        "series": head.series,
+        "interval": head.interval,
+        "camera": camera,
+    }
+    if temperatures:
+        document["temperatures"] = temperatures
+    return {**document, **head.extra}
+
+
+def head_yaml(head: Head) -> str:
+    """The text of `recording.yaml`."""
+    return dump_yaml(head_document(head))

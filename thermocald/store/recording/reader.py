@@ -1,0 +1,272 @@
+"""A recording: a series as an open folder that replays without hardware (CONVENTIONS §3)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, overload
+
+import numpy as np
+
+from thermocald.epoch import Epoch
+from thermocald.errors import RecordingError
+from thermocald.store.recording.head import CameraSpec, Channel, Head, read_head
+from thermocald.store.recording.observation_file import ObservationFile, ObservationTable
+from thermocald.store.recording.readings import (
+    interpolate_readings,
+    temperature_at_frame,
+    temperatures_at_frame,
+)
+from thermocald.store.recording.table import Table
+from thermocald.store.recording.testfield_file import (
+    read_testfield,
+    require_millimetres,
+    write_testfield,
+)
+from thermocald.store.recording.writer import RecordingWriter, write_recording
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from thermocald.photogrammetry.field.testfield import TestField
+
+    Array = NDArray[np.float64]
+
+__all__ = [
+    "CameraSpec",
+    "Channel",
+    "EpochColumns",
+    "Head",
+    "Recording",
+    "RecordingWriter",
+    "interpolate_readings",
+    "open_recording",
+    "read_recording",
+    "read_testfield",
+    "temperature_at_frame",
+    "temperatures_at_frame",
+    "write_recording",
+    "write_testfield",
+]
+
+# Above this size (a day of 150 targets every 10 s) `iter_epochs` streams instead of loading.
+_STREAMED_ABOVE_BYTES = 100_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EpochColumns:
+    """`epochs.csv` in columns.
+
+    numbers (E,), frame_time (E,), temperature_time (E,) s, temperatures {channel: (E,) °C} with
+    NaN where there is none; frames: E relative paths, "" for none; extra: unknown columns as text.
+    """
+
+    numbers: NDArray[np.int64]
+    frame_time: Array
+    temperature_time: Array
+    temperatures: dict[str, Array]
+    frames: tuple[str, ...]
+    extra: dict[str, tuple[str, ...]]
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def at_frame(self, channel: str) -> Array:
+        """A channel's temperature at the frames' instants, (E,) °C."""
+        readings = self.temperatures[channel]
+        return interpolate_readings(self.frame_time, self.temperature_time, readings)
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A recording as read: head, test field, epochs. `epochs[i]` is built when it is asked for."""
+
+    path: Path
+    head: Head
+    testfield: TestField
+    columns: EpochColumns
+    has_observations: bool
+
+    @property
+    def name(self) -> str:
+        return self.head.name
+
+    @property
+    def series(self) -> str:
+        return self.head.series
+
+    @property
+    def interval(self) -> float:
+        return self.head.interval
+
+    @property
+    def camera(self) -> CameraSpec:
+        return self.head.camera
+
+    @property
+    def channels(self) -> Mapping[str, Channel]:
+        return self.head.channels
+
+    @property
+    def extra(self) -> Mapping[str, Any]:
+        return self.head.extra
+
+    @cached_property
+    def epochs(self) -> Sequence[Epoch]:
+        """All epochs with their observations, which are read now if they were not."""
+        return _Epochs(self, self._observation_file.load() if self.has_observations else None)
+
+    def iter_epochs(self) -> Iterator[Epoch]:
+        """One epoch after the other; a recording of months in constant memory.
+
+        Then the rows of observations.csv must stand in the order of the epochs.
+        """
+        size = self._observation_path.stat().st_size if self.has_observations else 0
+        if "epochs" in self.__dict__ or size < _STREAMED_ABOVE_BYTES:
+            yield from self.epochs
+            return
+        for i, observations in enumerate(self._observation_file.stream()):
+            yield _epoch(self, i, observations)
+
+    @property
+    def _observation_path(self) -> Path:
+        return self.path / "observations.csv"
+
+    @property
+    def _observation_file(self) -> ObservationFile:
+        return ObservationFile(self._observation_path, self.testfield, self.columns.numbers)
+
+
+class _Epochs(Sequence[Epoch]):
+    """Epochs over columns: a day of them costs arrays, not a million objects."""
+
+    def __init__(self, recording: Recording, table: ObservationTable | None) -> None:
+        self._recording = recording
+        self._table = table
+
+    def __len__(self) -> int:
+        return len(self._recording.columns)
+
+    @overload
+    def __getitem__(self, index: int) -> Epoch: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Epoch]: ...
+
+    def __getitem__(self, index: int | slice) -> Epoch | list[Epoch]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        i = range(len(self))[index]
+        return _epoch(self._recording, i, self._table.observations(i) if self._table else None)
+
+
+def _epoch(recording: Recording, i: int, observations: Any) -> Epoch:
+    columns = recording.columns
+    frame = columns.frames[i]
+    return Epoch(
+        number=int(columns.numbers[i]),
+        frame_time=float(columns.frame_time[i]),
+        temperature_time=float(columns.temperature_time[i]),
+        temperatures={name: float(t[i]) for name, t in columns.temperatures.items()},
+        frame=recording.path / frame if frame else None,
+        observations=observations,
+        note="" if frame or observations is not None else "neither frame nor observations",
+    )
+
+
+def open_recording(path: Path) -> Recording:
+    """Read everything but the observations, which `epochs` or `iter_epochs` will.
+
+    Raises RecordingError or TestFieldError naming file, line and column.
+    """
+    head = read_head(path)
+    field = read_testfield(path / "testfield.csv")
+    require_millimetres(field, str(path / "testfield.csv"), head.camera.principal_distance)
+    has_observations = (path / "observations.csv").exists()
+    columns = _read_epochs(path, list(head.channels))
+    if not has_observations and not any(columns.frames):
+        raise RecordingError(
+            f"{path}: has neither observations.csv nor frames named in epochs.csv; there is "
+            "nothing to calibrate from"
+        )
+    return Recording(path, head, field, columns, has_observations)
+
+
+def read_recording(path: Path) -> Recording:
+    """Read and check a whole recording; nothing is half-read.
+
+    Raises RecordingError or TestFieldError naming file, line and column.
+    """
+    recording = open_recording(path)
+    _ = recording.epochs
+    return recording
+
+
+def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
+    required = ["epoch", "frame_time", *(["temperature_time", *channels] if channels else [])]
+    table = Table(folder / "epochs.csv", [*required, "frame"])
+    extra_names = [
+        n for n in table.columns if n and n not in {*required, "temperature_time", "frame"}
+    ]
+    numbers: list[NDArray[np.int64]] = []
+    times: dict[str, list[Array]] = {"frame_time": [], "temperature_time": []}
+    temperatures: dict[str, list[Array]] = {name: [] for name in channels}
+    frames: list[str] = []
+    extra: dict[str, list[str]] = {name: [] for name in extra_names}
+    previous = {"epoch": -1.0, "frame_time": -np.inf, "temperature_time": -np.inf}
+    for chunk in table.chunks():
+        numbers.append(chunk.integers("epoch"))
+        repeated = _steps(numbers[-1], previous["epoch"]) <= 0
+        chunk.check("epoch", repeated, "stands twice or after a later one; numbers must increase")
+        previous["epoch"] = float(numbers[-1][-1])
+        for name, columns in times.items():
+            if name not in table.columns:
+                columns.append(np.full(len(chunk), np.nan))
+                continue
+            columns.append(chunk.numbers(name, empty_is_nan=name == "temperature_time"))
+            latest = _running_latest(columns[-1], previous[name])
+            chunk.check(
+                name,
+                columns[-1] < latest[:-1],
+                lambda row, v=columns[-1], l=latest: (  # type: ignore[misc]  # noqa: E741
+                    f"time runs backwards: {v[row]:.3f} s after {l[row]:.3f} s"
+                ),
+            )
+            previous[name] = float(latest[-1])
+        for name, readings in temperatures.items():
+            readings.append(chunk.numbers(name, empty_is_nan=True))
+            untimed = np.isfinite(readings[-1]) & np.isnan(times["temperature_time"][-1])
+            chunk.check("temperature_time", untimed, f"is empty although {name} was read")
+            chunk.check(name, readings[-1] < -273.15, "is below absolute zero")
+        for row, text in enumerate(chunk.text("frame")):
+            frame = text.strip()
+            if frame and not os.path.isfile(os.path.join(folder, frame)):
+                chunk.fail(row, "frame", f"{frame!r} is missing; leave it empty if it was not kept")
+            frames.append(frame)
+        for name in extra_names:
+            extra[name].extend(chunk.text(name))
+    if not numbers:
+        raise RecordingError(f"{folder / 'epochs.csv'}: holds no epochs")
+    joined = {name: np.concatenate(columns) for name, columns in times.items()}
+    return EpochColumns(
+        np.concatenate(numbers),
+        joined["frame_time"],
+        joined["temperature_time"],
+        {name: np.concatenate(readings) for name, readings in temperatures.items()},
+        tuple(frames),
+        {name: tuple(values) for name, values in extra.items()},
+    )
+
+
+def _steps(values: NDArray[np.int64], previous: float) -> Array:
+    return np.diff(np.concatenate([[previous], values.astype(float)]))
+
+
+def _running_latest(values: Array, previous: float) -> Array:
+    """The latest time before each row, and after the last one; NaN rows are passed over."""
+    return np.fmax.accumulate(np.concatenate([[previous], values]))

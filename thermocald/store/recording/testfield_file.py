@@ -1,0 +1,143 @@
+"""`testfield.csv` (CONVENTIONS §3): reading, validating, writing."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.errors import TestFieldError
+from thermocald.photogrammetry.field.testfield import KINDS, TestField
+from thermocald.store.recording.table import Table
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+__all__ = [
+    "parse_testfield",
+    "read_testfield",
+    "require_millimetres",
+    "testfield_csv",
+    "write_testfield",
+]
+
+_REQUIRED = ("target", "X", "Y", "Z", "diameter", "sX", "sY", "sZ")
+
+# No camera of ours can look at a field smaller than this; one in metres is (a room: 6 "mm").
+_SMALLEST_FIELD_MM = 25.0
+# A lens images nothing sharp that is smaller than a few principal distances across.
+_SMALLEST_FIELD_IN_PRINCIPAL_DISTANCES = 5.0
+
+
+def read_testfield(path: Path) -> TestField:
+    """Read `testfield.csv`.
+
+    Raises TestFieldError, naming file, line and column, where a column is missing, a number is
+    none, a target stands twice or the coordinates look like metres.
+    """
+    field = _read(Table(path, _REQUIRED, TestFieldError))
+    require_millimetres(field, str(path))
+    return field
+
+
+def parse_testfield(text: str, path: Path) -> TestField:
+    """A test field that was accepted before, from the text of a `testfield.csv`.
+
+    It may be empty: the series of a camera that is only acquired. path: for the messages. Errors
+    as `read_testfield`.
+    """
+    return _read(Table(path, _REQUIRED, TestFieldError, text), may_be_empty=True)
+
+
+def _read(table: Table, *, may_be_empty: bool = False) -> TestField:
+    names: list[str] = []
+    columns: dict[str, list[float]] = {name: [] for name in _REQUIRED[1:]}
+    kinds: list[str] = []
+    codes: list[str] = []
+    lines: dict[str, int] = {}
+    for chunk in table.chunks():
+        for row, text in enumerate(chunk.text("target")):
+            name = text.strip()
+            if not name:
+                chunk.fail(row, "target", "is empty; every target needs a name")
+            if name in lines:
+                chunk.fail(row, "target", f"target {name!r} stands twice")
+            lines[name] = row
+            names.append(name)
+        for column, values in columns.items():
+            numbers = chunk.numbers(column, empty_is_nan=column == "diameter")
+            if column == "diameter":
+                chunk.check(column, numbers <= 0, "a diameter must be above 0 mm, or left empty")
+            if column.startswith("s"):
+                chunk.check(column, numbers < 0, "a standard deviation must not be negative")
+            values.extend(numbers.tolist())
+        empty = ("",) * len(chunk)
+        for row, text in enumerate(chunk.text("kind") if "kind" in table.columns else empty):
+            kind = text.strip() or KINDS[0]
+            if kind not in KINDS:
+                chunk.fail(row, "kind", f"{kind!r} is unknown; it is one of {', '.join(KINDS)}")
+            kinds.append(kind)
+        found = chunk.text("code") if "code" in table.columns else empty
+        codes.extend(code.strip() for code in found)
+    if not names and not may_be_empty:
+        raise TestFieldError(f"{table.path}: holds no targets")
+    return TestField.build(
+        names,
+        np.array([columns["X"], columns["Y"], columns["Z"]]).T,
+        np.array([columns["sX"], columns["sY"], columns["sZ"]]).T,
+        columns["diameter"],
+        kinds,
+        codes,
+    )
+
+
+def require_millimetres(
+    field: TestField, where: str, principal_distance: float | None = None
+) -> None:
+    """Raise TestFieldError if a field is so small that its coordinates must be metres.
+
+    principal_distance: mm, of the camera that looks at it, None where unknown.
+    """
+    if len(field) < 2:
+        return
+    extent = float(np.linalg.norm(np.ptp(field.points, axis=0)))
+    smallest = _SMALLEST_FIELD_MM
+    if principal_distance is not None:
+        smallest = max(smallest, _SMALLEST_FIELD_IN_PRINCIPAL_DISTANCES * principal_distance)
+    if extent < smallest:
+        raise TestFieldError(
+            f"{where}: the test field is {extent:.4g} mm across, less than the {smallest:.4g} mm "
+            "that a camera can see sharply: coordinates in metres? Write X, Y, Z, diameter, "
+            "sX, sY, sZ in mm (metres times 1000)"
+        )
+
+
+def testfield_csv(field: TestField) -> str:
+    """A test field as the text of `testfield.csv`; numbers keep every digit."""
+    with_codes = any(field.codes)
+    with_kinds = with_codes or any(kind != KINDS[0] for kind in field.kinds)
+    header = [*_REQUIRED, *(["kind"] if with_kinds else []), *(["code"] if with_codes else [])]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    for i, name in enumerate(field.names):
+        diameter = field.diameters[i]
+        row: list[object] = [name, *field.points[i].tolist()]
+        row += ["" if np.isnan(diameter) else float(diameter), *field.sigmas[i].tolist()]
+        row += [field.kinds[i]] * with_kinds + [field.codes[i]] * with_codes
+        writer.writerow(row)
+    return text.getvalue()
+
+
+def write_testfield(path: Path, field: TestField) -> None:
+    """Write `testfield.csv`; an existing file is replaced as a whole or not at all."""
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        partial.write_text(testfield_csv(field), encoding="utf-8")
+        os.replace(partial, path)
+    except OSError as cause:
+        partial.unlink(missing_ok=True)
+        raise TestFieldError(f"{path}: cannot be written: {cause.strerror}") from cause

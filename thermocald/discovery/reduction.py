@@ -184,7 +184,7 @@ def _reduce(
     count = (seen & ~bad).sum(axis=1)
     free = np.maximum(2 * count - len(scale), 1)
     # one offset per target is estimated too
-    loss = 1.0 - 2 * used.sum() / max(2 * count.sum(), 1)
+    loss = 1.0 - 2 * int(used.sum()) / max(2 * int(count.sum()), 1)
     sigma0 = np.sqrt(np.maximum(lPl - yy, 0) / free / loss)
     enough = count >= MIN_TARGETS
     variance = float(np.median(sigma0[enough]) ** 2)

@@ -109,7 +109,7 @@ def noise_autocorrelation(
     best = int(np.argmin(deviance))
     return Autocorrelation(
         n,
-        float(n / max(1.0, np.exp(plausible @ np.log(inflation)))),
+        n / max(1.0, float(np.exp(plausible @ np.log(inflation)))),
         float(phi[best]),
         float(coloured[best]),
         phi,

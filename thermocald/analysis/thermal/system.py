@@ -73,7 +73,7 @@ class Share:
         delta = self.delta + self.J @ step
         for c, S in self.operators:
             delta = delta + (S @ change)[:, None] * c
-        probes = np.random.default_rng(0).choice([-1.0, 1.0], (len(self.h), _PROBES))
+        probes = np.random.default_rng(0).choice(np.array([-1.0, 1.0]), (len(self.h), _PROBES))
         back = solve(probes)
         trace = float(np.sum(probes * back)) / _PROBES
         lever = solve(np.ascontiguousarray(self.C.T))

@@ -139,7 +139,7 @@ class SeriesSystem:
         for part, C in self.couplings():
             total -= np.einsum("epi,ep->i", C, solved[part])
         d_all = self.Q_common @ total
-        size = float(np.sqrt(max(total @ d_all, 0.0)))
+        size = float(np.sqrt(max(float(total @ d_all), 0.0)))
         if len(d_all):
             for part, C in self.couplings():
                 right[part] -= C @ d_all

@@ -93,8 +93,9 @@ def _plane(maps: LocalMap, m: Array, ex: Single, ey: Single) -> tuple[Single, ..
     u, v = l11 * ex + l12 * ey, l21 * ex + l22 * ey
     if np.any(maps.second):
         bend = (L @ maps.second)[:, :, [[0, 1], [1, 2]]]
-        twice = np.swapaxes(inverse, 1, 2)[:, None] @ bend @ inverse[:, None]  # 2 P
-        twice = twice.astype(np.float32)[..., None]
+        twice = (  # 2 P
+            np.swapaxes(inverse, 1, 2)[:, None] @ bend @ inverse[:, None]
+        ).astype(np.float32)[..., None]
         (x1, y1), (x2, y2) = (
             (twice[:, i, 0, 0] * ex + twice[:, i, 0, 1] * ey,
              twice[:, i, 1, 0] * ex + twice[:, i, 1, 1] * ey) for i in (0, 1)

@@ -57,6 +57,6 @@ def test_it_runs_from_the_wheel_alone(installed, tmp_path):
 
 def test_the_wheel_has_the_page_and_the_reports_templates(installed):
     (package,) = (installed.parents[1] / "lib").glob("python*/site-packages/thermocald")
-    for folder in ("output/dashboard/static", "output/templates"):
+    for folder in ("output/dashboard/static", "output/study/templates"):
         here = {p.name for p in (ROOT / "thermocald" / folder).iterdir() if p.is_file()}
         assert here <= {p.name for p in (package / folder).iterdir()}

@@ -10,7 +10,7 @@ import typer
 from thermocald.errors import DataError, ImageError, UsageError
 
 if TYPE_CHECKING:
-    from thermocald.analysis.camera.correction import TemperatureLog
+    from thermocald.analysis.thermal.correction import TemperatureLog
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 
 __all__ = ["register"]
@@ -101,7 +101,7 @@ def _points(
 
     import numpy as np
 
-    from thermocald.analysis.camera.correction import correct_points, read_rows
+    from thermocald.analysis.thermal.correction import correct_points, read_rows
     from thermocald.cli.common import write_json, write_text
 
     header, rows, numbers = read_rows(path, ("time", "x", "y"))
@@ -157,7 +157,7 @@ def _images(
 ) -> None:
     import cv2
 
-    from thermocald.analysis.camera.correction import image_corrections, read_rows
+    from thermocald.analysis.thermal.correction import image_corrections, read_rows
     from thermocald.cli.common import progress, write_json
 
     _, rows, numbers = read_rows(path, ("time",))

@@ -14,8 +14,8 @@ from thermocald.errors import UsageError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from thermocald.analysis.camera.correction import TemperatureLog
     from thermocald.analysis.camera.state import CameraState
+    from thermocald.analysis.thermal.correction import TemperatureLog
     from thermocald.analysis.thermal.thermal_camera import Along, ThermalCamera
 
 __all__ = ["read_log", "register", "warnings_said"]
@@ -145,7 +145,7 @@ def read_log(thermal: ThermalCamera, path: Path, column: str | None = None) -> T
 
     ConfigurationError where the log is of a recording of another camera.
     """
-    from thermocald.analysis.camera.correction import read_temperature_log
+    from thermocald.analysis.thermal.correction import read_temperature_log
     from thermocald.store.recording.head import read_head
 
     if path.name == "epochs.csv" and (path.parent / "recording.yaml").is_file():

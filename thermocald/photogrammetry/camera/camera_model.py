@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 
 from thermocald.errors import GeometryError
+from thermocald.photogrammetry.parameters import EOP_NAMES, IOP_NAMES, PARAMETER_NAMES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -46,10 +47,6 @@ __all__ = [
     "rays",
     "rotation",
 ]
-
-IOP_NAMES = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2", "C1", "C2")
-EOP_NAMES = ("omega", "phi", "kappa", "X0", "Y0", "Z0")
-PARAMETER_NAMES = IOP_NAMES + EOP_NAMES
 
 _UPWARDS = np.array([1.0, -1.0])  # image coordinates in mm go up, in px down
 _TURNS = np.array([-1.0, 1.0, 1.0])

@@ -14,12 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.series.cofactors import (
-    among_all,
-    cofactors,
-    inverse_of_determined,
-    root_of,
-)
+from thermocald.photogrammetry.linalg import inverse_of_determined, root_of
+from thermocald.photogrammetry.series.cofactors import among_all, cofactors
 from thermocald.photogrammetry.series.normals import (
     chunks,
     normal_matrices,

@@ -59,8 +59,7 @@ def store(tmp_path_factory):
                        "pixel_pitch_mm": sensor.pixel_pitch},
         })  # fmt: skip
     thermometers = [
-        {"name": f"t-{c['name']}", "driver": "replay", "recording": c["recording"]}
-        for c in cameras
+        {"name": f"t-{c['name']}", "driver": "replay", "recording": c["recording"]} for c in cameras
     ]
     document = {"cameras": cameras, "thermometers": thermometers, "frames": {"keep": "none"},
                 "store": {"durable": False}}  # fmt: skip

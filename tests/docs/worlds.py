@@ -101,9 +101,7 @@ def put_heat(folder: Path, camera: str) -> None:
 def put_config(folder: Path, name: str, store: str = "thermocald.db") -> None:
     """A configuration in place of the page's: its names, and a rendered camera that is quick."""
     small = demonstration_model(demonstration_field("markers"))
-    write_model(
-        folder / "small.thermal.yaml", replace(small, sensor=Sensor(820, 616, 0.00448))
-    )
+    write_model(folder / "small.thermal.yaml", replace(small, sensor=Sensor(820, 616, 0.00448)))
     mock = {
         "name": name, "driver": "mock", "period_s": 0.25, "thermometers": ["housing"],
         "latency_s": 0.02, "principal_distance_mm": 3.04,

@@ -367,8 +367,7 @@ def test_power_cut(station, report):
     machine = station.machine
     acknowledged = station.numbers()[-1]
     machine.run(
-        f"head -c 100000 /dev/zero > {STORE}/never-flushed; "
-        "dmsetup message store 0 mark power-cut"
+        f"head -c 100000 /dev/zero > {STORE}/never-flushed; dmsetup message store 0 mark power-cut"
     )
     wait_for_mark(machine.writes, "power-cut")
     machine.cut_power()

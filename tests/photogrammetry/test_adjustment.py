@@ -108,9 +108,7 @@ def test_it_ends_where_full_convergence_ends():
             scene.SENSOR, field, observations, scene.INTERIOR, scene.EXTERIOR, settings
         )
         for _ in range(3):
-            last = adjust(
-                scene.SENSOR, field, observations, last.interior, last.exterior, settings
-            )
+            last = adjust(scene.SENSOR, field, observations, last.interior, last.exterior, settings)
         change = np.abs(first.values - last.values)[:3] / scene.SENSOR.pixel_pitch
         assert change.max() < 1e-4
 

@@ -134,9 +134,7 @@ def test_epochs_by_themselves_are_those_of_the_epoch_adjustment(hidden, correlat
     for obs in observations[::7]:
         obs.points[rng.choice(len(obs), 2, replace=False)] += rng.uniform(0.3, 20.0, (2, 2))
     covariance = correlation * scene.SIGMA_PX**2
-    observations = [
-        replace(obs, covariances=np.full(len(obs), covariance)) for obs in observations
-    ]
+    observations = [replace(obs, covariances=np.full(len(obs), covariance)) for obs in observations]
     settings = SeriesSettings(exterior="per_epoch", target_offsets=False, target_noise=False,
                               snooping_alpha=0.001)  # fmt: skip
     grid = ObservationGrid.from_observations(field, observations)

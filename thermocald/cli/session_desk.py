@@ -29,9 +29,7 @@ def take_on_the_desk(config: Config, session: Session) -> Config:
         if session.check:
             _check(read)
         if done:
-            say(
-                f"series {session.series} has {done} epochs; {epochs - done} are still to be taken"
-            )
+            say(f"series {session.series} has {done} epochs; {epochs - done} are still to be taken")
         progress = Progress(epochs, done)
         service = Service(
             read,

@@ -203,9 +203,7 @@ class CameraLine:
 
     def _capture(self) -> None:
         station, run = self.station, self.run
-        if run is not None and (
-            run.full or (station.fast and not run.pipeline.wait_for_room(1.0))
-        ):
+        if run is not None and (run.full or (station.fast and not run.pipeline.wait_for_room(1.0))):
             return
         frame = self.plan.camera.capture()
         if station.fast:

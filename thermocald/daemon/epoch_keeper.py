@@ -110,9 +110,7 @@ class EpochKeeper:
         result, extra = None, {}
         path = None
         if self._frames.wanted(epoch.number, eventful) or put_off:
-            path = self._frames.keep(
-                self.plan.name, self.plan.series, epoch.number, acquired.frame
-            )
+            path = self._frames.keep(self.plan.name, self.plan.series, epoch.number, acquired.frame)
             self.kept_frames += path is not None
         if calibrated is not None:
             result = EpochResult.from_adjustment(calibrated.adjustment)

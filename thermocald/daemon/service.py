@@ -303,4 +303,3 @@ class Service:
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
-

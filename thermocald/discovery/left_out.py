@@ -48,9 +48,7 @@ def predictive(
     chi2, objective = np.zeros(blocks), np.zeros(blocks)
     for k in range(blocks):
         masks = [_block(e, k, blocks) for e in laboratory.series]
-        trained = _part(laboratory, [~m for m in masks]).fit(
-            fit.terms, fit.coefficients, 1, series
-        )
+        trained = _part(laboratory, [~m for m in masks]).fit(fit.terms, fit.coefficients, 1, series)
         tested = _part(laboratory, masks).fit(fit.terms, fit.coefficients, 1, series)
         whole = np.diag(_normal(fit, series)[0])
         own = np.where(whole > 0, _PRIOR * whole, 1.0)  # 1: of a series that takes no part

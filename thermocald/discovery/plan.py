@@ -171,9 +171,7 @@ def _simulation(
     return Simulation(thermal, device, chosen, read_programme(programme), seed)
 
 
-def plan_power(
-    inputs: Sequence[SetUp], strength_px: float, advance: Callable[[], None]
-) -> Plan:
+def plan_power(inputs: Sequence[SetUp], strength_px: float, advance: Callable[[], None]) -> Plan:
     """Put every effect into every simulated recording and look for it."""
     found: dict[str, dict[str, int]] = {}
     rng = np.random.default_rng(0)

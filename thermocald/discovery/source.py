@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["gather_pair", "load_pair", "series_input"]
 
 
-def series_input(
-    recording: Recording, say: Callable[[str], None] | None = None
-) -> SeriesInput:
+def series_input(recording: Recording, say: Callable[[str], None] | None = None) -> SeriesInput:
     """The arrays of one recording; its frames are measured where they have not been."""
     if not recording.has_observations and say is not None:
         say(f"measuring the {len(recording.columns)} frames of {recording.path}")

@@ -87,9 +87,7 @@ def _inverse_radial(sensor: Sensor, i: Array) -> Array | None:
     return scaled[::-1]
 
 
-def _newton(
-    sensor: Sensor, i: Array, points: Array, inverse: Array
-) -> tuple[Array, Array] | None:
+def _newton(sensor: Sensor, i: Array, points: Array, inverse: Array) -> tuple[Array, Array] | None:
     c, x0, y0, A1, A2, A3, B1, B2, C1, C2 = (float(v) for v in i)
     (cx, cy), p = sensor.centre, sensor.pixel_pitch
     # contiguous, and about the principal point

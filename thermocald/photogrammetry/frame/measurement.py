@@ -9,6 +9,7 @@ itself, and plain circles need no search.
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -54,6 +55,12 @@ _GROSS_PX = 3.0
 _USUAL_BLUR_PX = 0.9
 _WIDE_BLUR_PX = 1.1
 _SETTLED_PX = 0.002
+_REMEDIES = {
+    "saturated": "expose less, paper should be at three quarters of full scale",
+    "too little contrast": "more light, or expose longer",
+    "too blurred for its size": "focus, then fix the focus",
+    "too small": "go nearer, or print larger targets",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -310,10 +317,22 @@ def _finish(
             "circles alone cannot be told apart",
         )
     elif n == 0:
-        status = FrameStatus("nothing_found", "no target of the test field is found in the frame")
+        status = FrameStatus("nothing_found", _why_nothing(missed))
     elif n < _FEWEST:
         status = FrameStatus("too_few", f"only {n} targets are found in the frame")
     return Measurement(observations, status, missed, orientation)
+
+
+def _why_nothing(missed: dict[int, str]) -> str:
+    """What keeps the targets that are seen from being measured, by the most frequent reason."""
+    reasons = [why for why in missed.values() if why != "not found"]
+    if not reasons:
+        return "no target of the test field is found in the frame"
+    word, count = Counter(reasons).most_common(1)[0]
+    remedy = _REMEDIES.get(word)
+    return f"{len(reasons)} targets are seen and none can be measured; {count} are {word}" + (
+        f": {remedy}" if remedy else ""
+    )
 
 
 def join(first: Observations, second: Observations) -> Observations:

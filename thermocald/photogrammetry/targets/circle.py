@@ -49,6 +49,9 @@ _THIN = 3
 _RING_CLEARANCE = 2.6  # standard deviations of the blur between a used pixel and the code ring
 _MISFIT = 2.0  # residual sd over the frame's noise beyond which something covers the target
 _MISFIT_CONTRAST = 0.015
+# An image sharper than any lens makes it (reduced, or drawn) shows the pixels' squares, which the
+# model rounds off: up to so much of the contrast at no blur, nothing from half a pixel on.
+_MISFIT_SQUARES, _ROUND_FROM_PX = 0.035, 0.5
 _FEWEST_PIXELS = 24
 _STEP_LIMITS = np.array([1.0, 1.0, 0.15, 0.15, 0.15, 0.5, np.inf, np.inf, 0.02, 0.02])
 
@@ -339,7 +342,9 @@ def _reasons(
     noise_sd = np.sqrt(fit.noise.variance(np.maximum(p[:, 6], p[:, 6] + p[:, 7])))
     shape = np.abs(p[:, 2:5]).max(axis=1, initial=0.0)
     misfit_dn = fit.misfit * noise_sd
-    covered = (fit.misfit > _MISFIT) & (misfit_dn > _MISFIT_CONTRAST * np.abs(p[:, 7]))
+    sharpness = np.clip(1 - p[:, 5] / _ROUND_FROM_PX, 0, 1)
+    excused = (_MISFIT_CONTRAST + _MISFIT_SQUARES * sharpness) * np.abs(p[:, 7])
+    covered = (fit.misfit > _MISFIT) & (misfit_dn > excused)
     tests = (
         (cut, "cut off by the image's edge"),
         ((minor < _SMALLEST_SEMI_AXIS_PX) | (pixels < _FEWEST_PIXELS), "too small"),

@@ -34,6 +34,7 @@ __all__ = ["CodedTargets", "read_codes"]
 _ANGLES = 84  # a multiple of 12 and of 14
 _COARSE_ANGLES = 28
 _COARSE_RADII = (0.5, 1.5, 2.5, 3.4)
+_PROFILE, _PROFILE_STEP, _PROFILE_REACH = (0.5, 3.55), 0.05, 0.45
 _EDGE_RADII = (0.55, 0.65, 0.75, 0.85, 0.95, 1.05, 1.15, 1.25, 1.35, 1.45)
 _RADII = (1.75, 2.05, 2.25, 2.5, 2.75, 2.95, 3.25)
 _MIDDLE = slice(2, 5)
@@ -78,20 +79,16 @@ def read_codes(
     """
     rows, gap, contrast = _disc_and_gap(image, candidates)
     maps = _sized(image, candidates.maps.select(rows), gap, contrast)
-    level = _sample(image, maps, _RADII, _ANGLES)
-    level = (level - gap[:, None, None]) / contrast[:, None, None]
-    raster = np.array(ring_code.BITS, dtype=np.int64)
-    readings = [_read_family(level, maps, n) for n in raster.tolist()]
-    numbers = np.array([r[0] for r in readings]).reshape(len(raster), len(rows))
-    misfits = np.array([r[1] for r in readings]).reshape(len(raster), len(rows))
-    best, at = np.argmin(misfits, axis=0), np.arange(len(rows))
-    misfit = misfits[best, at]
-    misfits[best, at] = np.inf
-    # A ring that fits both families can be trusted with neither.
-    good = np.isfinite(misfit) & (
-        misfits.min(axis=0, initial=np.inf) > 1.2 * np.where(np.isfinite(misfit), misfit, 0)
-    )
-    bits, number, rows = raster[best][good], numbers[best, at][good], rows[good]
+    bits, number = _read(image, maps, gap, contrast)
+    # Seen from near and aslant, a ring is not concentric with its disc: by pixels if it is large.
+    left = np.nonzero(bits == 0)[0]
+    if len(left):
+        grey = gap[left], contrast[left]
+        bits[left], number[left] = _read(
+            image, in_perspective(image, maps.select(left), *grey), *grey
+        )
+    good = bits > 0
+    bits, number, rows = bits[good], number[good], rows[good]
     found = list(zip(bits.tolist(), number.tolist(), strict=True))
     count = Counter(found)
     keep = np.array(
@@ -99,6 +96,26 @@ def read_codes(
         dtype=np.int64,
     )
     return CodedTargets(bits[keep], number[keep], rows[keep])
+
+
+def _read(
+    image: NDArray[np.uint8], maps: LocalMap, gap: Single, contrast: Single
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Bits (n,), 0 where no code can be trusted, and numbers (n,) of the codes about discs."""
+    level = _sample(image, maps, _RADII, _ANGLES)
+    level = (level - gap[:, None, None]) / contrast[:, None, None]
+    families = np.array(ring_code.BITS, dtype=np.int64)
+    readings = [_read_family(level, maps, n) for n in families.tolist()]
+    numbers = np.array([r[0] for r in readings]).reshape(len(families), len(maps))
+    misfits = np.array([r[1] for r in readings]).reshape(len(families), len(maps))
+    best, at = np.argmin(misfits, axis=0), np.arange(len(maps))
+    misfit = misfits[best, at]
+    misfits[best, at] = np.inf
+    # A ring that fits both families can be trusted with neither.
+    good = np.isfinite(misfit) & (
+        misfits.min(axis=0, initial=np.inf) > 1.2 * np.where(np.isfinite(misfit), misfit, 0)
+    )
+    return np.where(good, families[best], 0), numbers[best, at]
 
 
 def _disc_and_gap(
@@ -150,6 +167,59 @@ def _sized(image: NDArray[np.uint8], maps: LocalMap, gap: Single, contrast: Sing
     return LocalMap(maps.centre, maps.linear * factor[:, None, :], maps.second)
 
 
+def in_perspective(
+    image: NDArray[np.uint8], maps: LocalMap, gap: Single, contrast: Single
+) -> LocalMap:
+    """The maps (n,) of discs with the perspective in which their rings are seen.
+
+    gap, contrast (n,) DN. The edges of disc and ring are looked for along each radius; those of a
+    target seen in perspective w about a centre that is e off lie at R − e·u − uᵀA u R − (w·u) R²
+    instead of at R = 1, 2, 3, with u the direction and A the ellipse's error. What the ring says
+    is of no matter here.
+    """
+    rho = np.arange(_PROFILE[0], _PROFILE[1], _PROFILE_STEP)
+    level = _sample(image, maps, tuple(rho.tolist()), _ANGLES)
+    level = (level - gap[:, None, None]) / contrast[:, None, None]
+    turn = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
+    u = np.stack([np.cos(turn), np.sin(turn)])
+    # away from the ends of an arc, whose corners are rounded by blur
+    ring = level[:, np.argmin(np.abs(rho - 2.5))] > _INSIDE
+    ring &= np.roll(ring, 2, axis=1) & np.roll(ring, -2, axis=1)
+    normal, rhs = np.zeros((len(maps), 7, 7)), np.zeros((len(maps), 7))
+    for radius, rising in (
+        (1.0, False),
+        (ring_code.RING_INNER, True),
+        (ring_code.RING_OUTER, False),
+    ):
+        window = np.abs(rho - radius) < _PROFILE_REACH
+        part = level[:, window] if rising else 1 - level[:, window]
+        crossing = (part[:, :-1] < 0.5) & (part[:, 1:] >= 0.5)
+        known = crossing.sum(axis=1) == 1
+        if radius > 1:
+            known &= ring
+        first = np.argmax(crossing, axis=1)[:, None]
+        below = np.take_along_axis(part, first, 1)[:, 0]
+        above = np.take_along_axis(part, first + 1, 1)[:, 0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            place = rho[window][first[:, 0]] + _PROFILE_STEP * (0.5 - below) / (above - below)
+        short = np.where(known, radius - place, 0.0)
+        design = np.stack(
+            [
+                u[0], u[1], radius * u[0] ** 2, 2 * radius * u[0] * u[1], radius * u[1] ** 2,
+                radius**2 * u[0], radius**2 * u[1],
+            ]
+        )  # fmt: skip
+        normal += (design * known[:, None]) @ design.T
+        rhs += short @ design.T
+    ex, ey, a, b, d, *w = np.linalg.solve(normal + 1e-3 * np.eye(7), rhs[..., None])[..., 0].T
+    e, shape = np.stack([ex, ey], axis=-1), np.stack([a, b, b, d], axis=-1).reshape(-1, 2, 2)
+    linear = maps.linear @ (np.eye(2) - shape)
+    first, second = linear[:, :, 0], linear[:, :, 1]
+    ws, wt = w[0][:, None], w[1][:, None]
+    bend = np.stack([-2 * ws * first, -ws * second - wt * first, -2 * wt * second], axis=-1)
+    return LocalMap(maps.centre - (maps.linear @ e[..., None])[..., 0], linear, bend)
+
+
 def _sample(
     image: NDArray[np.uint8], maps: LocalMap, radii: tuple[float, ...], angles: int
 ) -> Single:
@@ -158,10 +228,14 @@ def _sample(
     circle = np.stack([np.cos(turn), np.sin(turn)])
     grey = np.empty((len(maps), len(radii), angles), dtype=np.float32)
     chunk = 32_000 // len(radii)  # cv2.remap takes no more rows
+    rho = np.array(radii, dtype=np.float32)[:, None, None]
+    bend = np.stack([circle[0] ** 2, 2 * circle[0] * circle[1], circle[1] ** 2]) / 2
+    bent = bool(np.any(maps.second))
     for i in range(0, len(maps), chunk):
         part = slice(i, i + chunk)
-        around = (maps.linear[part] @ circle).astype(np.float32)[:, None]
-        around = around * np.array(radii, dtype=np.float32)[:, None, None]
+        around = (maps.linear[part] @ circle).astype(np.float32)[:, None] * rho
+        if bent:
+            around += (maps.second[part] @ bend).astype(np.float32)[:, None] * rho**2
         around += maps.centre[part].astype(np.float32)[:, None, :, None]
         x, y = (np.ascontiguousarray(around[:, :, k]).reshape(-1, angles) for k in (0, 1))
         grey[part] = cv2.remap(image, x, y, cv2.INTER_LINEAR).reshape(-1, len(radii), angles)

@@ -31,6 +31,7 @@ _PARAMETERS = ", ".join(
     f"{sql_name(name)} REAL, {sql_name('sd_' + name)} REAL" for name in PARAMETER_NAMES
 )
 
+
 # Append-only is promised by the file itself, not by this program alone.
 def _append_only(table: str) -> list[str]:
     return [

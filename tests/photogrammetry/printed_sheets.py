@@ -1,0 +1,131 @@
+"""Photographs of a printed test field, taken of the PDF itself: pages rasterised, sheets put up.
+
+Shares nothing with the drawing or with `thermocald.simulation` but the page: every pixel's ray is
+cut with the sheets' planes and looks up the rasterised page there. Four rays a pixel and a Gaussian
+make it a lens.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from thermocald.photogrammetry.camera_model import CameraModel, ExteriorOrientation
+
+FINER = 2
+GRID_PX = 8
+BEYOND = 120.0
+
+
+@cache
+def rasterised(pdf: Path, page: int, dpi: float) -> np.ndarray:
+    """One page as a grey image (H, W)."""
+    pdfium = pytest.importorskip("pypdfium2")
+    document = pdfium.PdfDocument(pdf)
+    try:
+        bitmap = document[page].render(scale=dpi / 72, grayscale=True)
+        return bitmap.to_numpy().copy().reshape(bitmap.height, bitmap.width)
+    finally:
+        document.close()
+
+
+def page_count(pdf: Path) -> int:
+    pdfium = pytest.importorskip("pypdfium2")
+    document = pdfium.PdfDocument(pdf)
+    try:
+        return len(document)
+    finally:
+        document.close()
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A page put up: its image (H, W), its size mm, the place (3,) mm of the page's lower left
+    corner, and the directions (2, 3) of the page's x and y.
+    """
+
+    image: np.ndarray
+    size: tuple[float, float]
+    origin: np.ndarray
+    axes: np.ndarray
+
+
+def photograph(
+    sheets: list[Sheet],
+    camera: CameraModel,
+    exterior: ExteriorOrientation,
+    *,
+    blur: float = 0.7,
+    noise: float = 1.5,
+    seed: int = 0,
+    paper: float = 205.0,
+    ink: float = 35.0,
+) -> np.ndarray:
+    """A frame (H, W), 8 bit, from a place that sees no sheet through another."""
+    w, h = camera.sensor.width, camera.sensor.height
+    image = np.full((h * FINER, w * FINER), BEYOND, np.float32)
+    for sheet in sheets:
+        if (exterior.centre - sheet.origin) @ np.cross(*sheet.axes) > 0:
+            u, v = _places(sheet, camera, exterior)
+            rows, columns = sheet.image.shape
+            hit = (u >= -0.5) & (v >= -0.5) & (u <= columns - 0.5) & (v <= rows - 0.5)
+            page = cv2.remap(sheet.image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            np.copyto(image, page * np.float32((paper - ink) / 255) + np.float32(ink), where=hit)
+    image = cv2.GaussianBlur(image, (0, 0), blur * FINER)
+    small = cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA)
+    if noise:
+        small += np.random.default_rng(seed).standard_normal(small.shape, np.float32) * noise
+    return np.clip(np.rint(small), 0, 255).astype(np.uint8)
+
+
+def _places(
+    sheet: Sheet, camera: CameraModel, exterior: ExteriorOrientation
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where on the sheet's image (px) every ray arrives, between those of a grid of pixels."""
+    w, h = camera.sensor.width, camera.sensor.height
+    at = [np.arange(-1, -(-n // GRID_PX) + 1) * GRID_PX + (GRID_PX - 1) / 2 for n in (w, h)]
+    u, v = np.meshgrid(*at)
+    rays = camera.rays(np.column_stack([u.ravel(), v.ravel()])) @ exterior.rotation.T
+    normal = np.cross(*sheet.axes)
+    with np.errstate(divide="ignore"):
+        reach = ((sheet.origin - exterior.centre) @ normal) / (rays @ normal)
+    hits = exterior.centre - sheet.origin + rays * reach[:, None]
+    rows, columns = sheet.image.shape
+    x = hits @ sheet.axes[0] * (columns / sheet.size[0]) - 0.5
+    y = (sheet.size[1] - hits @ sheet.axes[1]) * (rows / sheet.size[1]) - 0.5
+    away = (reach <= 0) | (np.abs(x) > 1e5) | (np.abs(y) > 1e5)
+    fine = []
+    for place in (x, y):
+        coarse = np.where(away, -1e6, place).astype(np.float32).reshape(len(at[1]), len(at[0]))
+        step = GRID_PX * FINER
+        size = (coarse.shape[1] * step, coarse.shape[0] * step)
+        whole = cv2.resize(coarse, size, interpolation=cv2.INTER_LINEAR)
+        fine.append(np.ascontiguousarray(whole[step : step + h * FINER, step : step + w * FINER]))
+    return fine[0], fine[1]
+
+
+def put_up(pdf: Path, page_mm: tuple[float, float], trim: float, dpi: float = 150.0) -> list[Sheet]:
+    """The pages of a printed PDF as a flat sheet, or cut along the crop marks and made a corner:
+    floor, left wall, right wall. trim: mm of the page outside of the crop marks.
+    """
+    pages = [rasterised(pdf, i, dpi) for i in range(min(page_count(pdf), 3))]
+    if len(pages) < 3:
+        return [Sheet(pages[0], page_mm, np.array([-trim, -trim, 0.0]), np.eye(3)[:2])]
+    px = [image.shape[1] / page_mm[0] * trim for image in pages]
+    size = (page_mm[0] - 2 * trim, page_mm[1] - 2 * trim)
+    cut = [_cut(image, round(p)) for image, p in zip(pages, px, strict=True)]
+    e = np.eye(3)
+    return [
+        Sheet(cut[0], size, np.zeros(3), e[:2]),
+        Sheet(cut[1], size, np.zeros(3), e[1:]),
+        Sheet(cut[2], size, np.array([size[0], 0.0, 0.0]), np.stack([-e[0], e[2]])),
+    ]
+
+
+def _cut(image: np.ndarray, margin: int) -> np.ndarray:
+    return np.ascontiguousarray(image[margin:-margin, margin:-margin])

@@ -1,0 +1,81 @@
+"""What is found of a printed sheet does not depend on how many pixels it is seen with."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.photogrammetry.network_cases import looking_at
+from tests.photogrammetry.printed_sheets import photograph, put_up
+from thermocald.output.testfield_layout import TRIM, Design, paper_size
+from thermocald.output.testfield_print import print_testfield
+from thermocald.photogrammetry.camera_model import CameraModel, InteriorOrientation, Sensor
+from thermocald.photogrammetry.measurement import measure
+
+CAMERA = CameraModel(Sensor(3280, 2464, 0.00112), InteriorOrientation(3.04, A1=-2e-3))
+PAGE = paper_size("A3", landscape=True)
+STANDS = {
+    "near and aslant": (120.0, -150.0, 330.0),
+    "very oblique": (0.0, -300.0, 250.0),
+    "straight": (0.0, 0.0, 380.0),
+    "far": (300.0, 0.0, 600.0),
+}
+
+
+@pytest.fixture(scope="module")
+def sheet(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sheet")
+    printed = print_testfield(Design(PAGE, 12.0), folder)
+    return printed.field, put_up(folder / "testfield.pdf", PAGE, TRIM)
+
+
+def frame_from(sheet, stand, noise=0.0):
+    field, sheets = sheet
+    middle = field.points.mean(axis=0)
+    station = looking_at(middle + np.array(STANDS[stand]), middle, 0.4)
+    seen = CAMERA.sensor.contains(CAMERA.project(station, field.points), 30.0).sum()
+    return photograph(sheets, CAMERA, station, noise=noise, blur=0.4), int(seen)
+
+
+def found_at(frame, field, scale):
+    small = cv2.resize(frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return len(measure(frame if scale == 1 else small, field).observations)
+
+
+def test_a_tilted_sheet_is_found_whole_at_every_scale(sheet):
+    frame, seen = frame_from(sheet, "near and aslant")
+    found = [found_at(frame, sheet[0], scale) for scale in (1.0, 0.9, 0.75, 0.5, 0.25)]
+    assert min(found) >= 0.97 * seen >= 50
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stand", STANDS)
+@pytest.mark.parametrize("noise", [0.0, 2.0])
+def test_fifty_scales(sheet, stand, noise):
+    frame, seen = frame_from(sheet, stand, noise)
+    found = [found_at(frame, sheet[0], scale) for scale in np.linspace(0.2, 1.0, 50)]
+    assert min(found) >= 0.97 * seen, found
+    assert seen >= 50
+
+
+def test_a_saturated_sheet_says_so(sheet):
+    frame, _ = frame_from(sheet, "straight")
+    bright = np.clip(frame.astype(float) * 1.6, 0, 255).astype(np.uint8)
+    status = measure(bright, sheet[0]).status
+    assert status.word == "nothing_found"
+    assert "saturated" in status.reason
+    assert "expose" in status.reason
+
+
+def test_the_photographs_of_the_sheet_are_true(sheet):
+    """The targets are where the camera model has them: what stands above can be relied upon."""
+    field, sheets = sheet
+    middle = field.points.mean(axis=0)
+    station = looking_at(middle + np.array(STANDS["straight"]), middle, 0.4)
+    found = measure(photograph(sheets, CAMERA, station, noise=1.0), field).observations
+    truth = CAMERA.project(station, field.points[found.targets])
+    off = found.points - truth
+    # the page's raster is not the printer's: up to half a pixel of 150 dpi at its edges
+    assert np.abs(off).max() < 1.0
+    assert np.abs(off - off.mean(axis=0)).max() < 0.35

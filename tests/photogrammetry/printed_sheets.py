@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from thermocald.photogrammetry.camera_model import CameraModel, ExteriorOrientation
+from thermocald.photogrammetry.camera.camera_model import CameraModel, ExteriorOrientation
 
 FINER = 2
 GRID_PX = 8

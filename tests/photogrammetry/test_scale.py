@@ -8,10 +8,10 @@ import pytest
 
 from tests.photogrammetry.network_cases import looking_at
 from tests.photogrammetry.printed_sheets import photograph, put_up
-from thermocald.output.testfield_layout import TRIM, Design, paper_size
-from thermocald.output.testfield_print import print_testfield
-from thermocald.photogrammetry.camera_model import CameraModel, InteriorOrientation, Sensor
-from thermocald.photogrammetry.measurement import measure
+from thermocald.output.testfield.layout import TRIM, Design, paper_size
+from thermocald.output.testfield.print import print_testfield
+from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
+from thermocald.photogrammetry.frame.measurement import measure
 
 CAMERA = CameraModel(Sensor(3280, 2464, 0.00112), InteriorOrientation(3.04, A1=-2e-3))
 PAGE = paper_size("A3", landscape=True)

@@ -17,7 +17,8 @@
         start_server: true            # where none runs
     thermometers:
       - {name: pixel, driver: android, serial: 0A1B2C3D4E,
-         sensors: {temperature: battery, skin: "thermal:skin", soc: "zone:cpu-0-0"}}
+         sensors: {temperature: battery, skin: "thermal:skin", soc: "zone:cpu-0-0"},
+         units: {soc: thousandths}}    # of a battery or zone: degC, tenths, thousandths
 
 Before the first frame: set the camera app to its manual (pro) mode, fix focus, ISO and exposure
 time. The driver wakes and unlocks the phone (not through a PIN), opens the camera app once and
@@ -41,7 +42,13 @@ from thermocald.errors import (
     WrongDevice,
 )
 from thermocald.hal import Camera, Frame, Thermometer
-from thermocald_drivers import android_temperatures, photograph, pixel_formats, support
+from thermocald_drivers import (
+    android_temperatures,
+    android_zones,
+    photograph,
+    pixel_formats,
+    support,
+)
 from thermocald_drivers.android_phone import AdbPhone
 
 if TYPE_CHECKING:
@@ -60,6 +67,13 @@ STATE = (
     "dumpsys window | grep -m1 mCurrentFocus="
 )
 ZONES = 'for z in /sys/class/thermal/thermal_zone*; do echo "$(cat $z/type) $(cat $z/temp)"; done'
+DUMPS = {"battery": "dumpsys battery", "thermal": "dumpsys thermalservice", "zone": ZONES}
+PHONE_RANGE_C = (-30.0, 125.0)
+NO_BATTERY = (
+    "no battery temperature: not fitted, frozen (`dumpsys battery reset` ends that), or in an "
+    "unknown unit (write units: {{{channel}: degC}}, tenths or thousandths)"
+)
+STATE_UNIT = "write units: {{{channel}: degC}}, tenths or thousandths"
 POLL_S = 0.1
 CLOCKS_DIFFER_S = 5.0
 
@@ -270,6 +284,7 @@ class AndroidThermometer(Thermometer):
         clock: Clock,
         serial: str,
         sensors: Mapping[str, str] | None = None,
+        units: Mapping[str, str] | None = None,
         timeout_s: float = 5.0,
         host: str = "127.0.0.1",
         port: int = 5037,
@@ -284,7 +299,15 @@ class AndroidThermometer(Thermometer):
                 raise ConfigurationError(
                     f"sensors.{channel}: {source!r} is neither battery, thermal:NAME nor zone:TYPE"
                 )
-        self._scales: dict[str, float] = {}
+        self.units = dict(units or {})
+        for channel, unit in self.units.items():
+            kind = str(self.sensors.get(channel, "")).partition(":")[0]
+            if kind not in ("battery", "zone"):
+                raise ConfigurationError(
+                    f"units.{channel}: there is no battery or zone of that name in sensors"
+                )
+            support.choice(f"units.{channel}", unit, list(android_zones.UNITS))
+        self._scales = self._stated()
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[dict[str, Any]]:  # noqa: ARG003
@@ -296,22 +319,23 @@ class AndroidThermometer(Thermometer):
 
     def close(self) -> None:
         self.phone.disconnect()
-        self._scales.clear()
+        self._scales = self._stated()
 
     def identity(self) -> Mapping[str, str]:
         return {"serial": self.phone.serial}
 
     def read(self) -> Reading:
         begin = self.clock.monotonic()
-        available = self._available({source.partition(":")[0] for source in self.sensors.values()})
+        kinds = {source.partition(":")[0] for source in self.sensors.values()}
+        texts = {kind: self.phone.shell(DUMPS[kind]) for kind in sorted(kinds)}
+        found = self._battery_and_service(texts) | self._zones(texts)
         values, missing = {}, {}
         for channel, source in self.sensors.items():
-            value = available.get(source)
-            if value is None:
-                missing[channel] = f"{source}: not told by the phone"
-                continue
+            value = found.get(source, "the phone does not report it")
             try:
-                values[channel] = support.believable(value, -30.0, 120.0, source)
+                if isinstance(value, str):
+                    raise BadReading(f"{source}: {value.format(channel=channel)}")
+                values[channel] = support.believable(value, *PHONE_RANGE_C, source)
             except BadReading as error:
                 missing[channel] = str(error)
         if not values:
@@ -319,17 +343,37 @@ class AndroidThermometer(Thermometer):
         about = {"missing": missing} if missing else {}
         return support.middle_reading(self.clock, values, begin, about)
 
-    def _available(self, kinds: set[str]) -> dict[str, float | None]:
-        """{source as configured: °C}."""
-        found: dict[str, float | None] = {}
-        if "battery" in kinds:
-            found["battery"] = android_temperatures.battery(self.phone.shell("dumpsys battery"))
-        if "thermal" in kinds:
-            text = self.phone.shell("dumpsys thermalservice")
-            for name, value in android_temperatures.thermalservice(text).items():
-                found[f"thermal:{name}"] = value
-        if "zone" in kinds:
-            for name, raw in android_temperatures.thermal_zones(self.phone.shell(ZONES)).items():
-                scale = self._scales.setdefault(name, android_temperatures.zone_scale(raw))
-                found[f"zone:{name}"] = raw * scale
+    def _stated(self) -> dict[str, float]:
+        """{zone: factor to °C} of the units in the stanza."""
+        return {
+            self.sensors[channel].partition(":")[2]: android_zones.UNITS[unit]
+            for channel, unit in self.units.items()
+            if self.sensors[channel].startswith("zone:")
+        }
+
+    def _battery_and_service(self, texts: Mapping[str, str]) -> dict[str, float | str]:
+        """{source: °C, or why there is none}."""
+        found: dict[str, float | str] = {}
+        if "battery" in texts:
+            stated = [u for c, u in self.units.items() if self.sensors[c] == "battery"]
+            celsius = android_temperatures.battery(texts["battery"], *stated[:1])
+            found["battery"] = NO_BATTERY if celsius is None else celsius
+        for name, value in android_temperatures.thermalservice(texts.get("thermal", "")).items():
+            found[f"thermal:{name}"] = value
+        return found
+
+    def _zones(self, texts: Mapping[str, str]) -> dict[str, float | str]:
+        """{source: °C, or why there is none}; units that are certain are kept until `close`."""
+        raw = android_zones.raw_zones(texts.get("zone", ""))
+        self._scales |= android_zones.zone_scales(raw, self._scales)
+        found: dict[str, float | str] = {}
+        for name, value in raw.items():
+            if name in self._scales:
+                found[f"zone:{name}"] = round(value * self._scales[name], 6)
+            elif not android_zones.is_temperature(name):
+                found[f"zone:{name}"] = f"{value} is not a temperature; if it is, {STATE_UNIT}"
+            elif value == 0:
+                found[f"zone:{name}"] = f"0, as of a sensor not fitted; if not, {STATE_UNIT}"
+            else:
+                found[f"zone:{name}"] = f"the unit of {value} is not known; {STATE_UNIT}"
         return found

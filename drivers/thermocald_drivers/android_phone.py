@@ -19,6 +19,7 @@ from thermocald.errors import (
     DeviceGone,
     DeviceNotFound,
     DeviceTimeout,
+    WrongDevice,
 )
 from thermocald_drivers import support
 
@@ -73,16 +74,21 @@ class AdbPhone:
             return self._lines[-1]
 
         client.make_connection = remembering
-        states = dict(self._call(lambda: [(d.serial, d.state) for d in client.list()]))
-        state = states.get(self.serial)
-        if state is None:
-            others = ", ".join(f"{s} ({state})" for s, state in states.items()) or "none"
+        listed = self._call(lambda: [(d.serial, d.state) for d in client.list()])
+        states = [state for serial, state in listed if serial == self.serial]
+        if len(states) > 1:
+            raise WrongDevice(
+                f"{self.where}: {len(states)} devices have this serial number "
+                f"({', '.join(states)}); cheap phones share one: attach them to different machines"
+            )
+        if not states:
+            others = ", ".join(f"{serial} ({state})" for serial, state in listed) or "none"
             raise support.absent(
                 f"{self.where}: not attached; adb lists {others}; is USB debugging on, "
                 "the cable one that carries data?",
                 seen=self.seen,
             )
-        self._require(state)
+        self._require(states[0])
         self._device = client.device(serial=self.serial)
         self.seen = True
 
@@ -93,10 +99,10 @@ class AdbPhone:
             raise support.denied(f"{self.where}: {DENIED}", seen=self.seen)
         if state == "offline":
             raise DeviceGone(f"{self.where}: {OFFLINE}")
-        if state.startswith("no"):  # "no permissions (…); see http…"
+        if state == "no" or state.startswith("no perm"):  # "no permissions (…)", cut at blanks
             message = f"{self.where}: no permissions; see the udev rules in systemd/"
             raise support.denied(message, seen=self.seen)
-        raise DeviceGone(f"{self.where}: is in the state {state!r}; let it boot")
+        raise DeviceGone(f"{self.where}: its state is {state!r}; let it boot into Android")
 
     def _server_is_there(self) -> None:
         try:
@@ -154,7 +160,7 @@ class AdbPhone:
         text = line.read_until_close().split()
         end = time.time()
         try:
-            phone = float(text[0])
+            phone = support.parse_number(text[0])
         except (ValueError, IndexError) as error:
             raise BadReading(f"{self.where}: `date` says {' '.join(text)!r}") from error
         return phone - (begin + end) / 2.0, "".join(text[1:2]), (end - begin) / 2.0

@@ -111,7 +111,7 @@ class Bme280Thermometer(I2cThermometer):
         if temperature == 0x80000:
             raise BadReading(f"{self.where}: 0x80000, the temperature was not measured")
         if data == b"\xff" * 8:
-            raise BadReading(f"{self.where}: reads 0xFFFF, nobody drives the bus")
+            raise BadReading(f"{self.where}: reads 0xFFFF, nothing drives the bus")
         fine = self._compensation.fine(temperature)
         about: dict[str, Any] = {}
         pascal = self._compensation.pressure(pressure, fine)

@@ -1,12 +1,16 @@
-"""What the I2C thermometers share: the bus, the identity register, errno, refusal of 0xFFFF.
+"""What the I2C thermometers share: the bus, the identity register, errno, refusal of 0xFFFF and 0.
 
     thermometers:
       - {name: lens, driver: tmp117, bus: 1, address: 0x48}
 
 smbus2 opens /dev/i2c-N (Raspberry Pi: `dtparam=i2c_arm=on`, user in the group `i2c`). Where the
 kernel has a driver for the chip, prefer it (`hwmon`, `iio`): an address that a kernel driver holds
-is refused here with EBUSY. Word registers go over the wire high byte first, SMBus words low byte
-first: `_word` swaps them.
+is refused here with EBUSY. Word registers are sent high byte first, SMBus words low byte first:
+`_word` swaps them.
+
+0xFFFF is a bus that nothing drives. Chips without a data-ready flag hold a fixed value from
+power-up to the end of their first conversion, mostly 0 °C: it is read again after one conversion,
+and then accepted only if a recent reading lay within 5 K.
 """
 
 from __future__ import annotations
@@ -19,7 +23,7 @@ from thermocald.hal import Thermometer
 from thermocald_drivers import support
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from thermocald.hal import Clock, Reading
 
@@ -48,12 +52,13 @@ class I2cThermometer(Thermometer):
             known = ", ".join(f"0x{a:02x}" for a in self.addresses)
             shown = f"0x{chosen:02x}" if isinstance(chosen, int) else repr(chosen)
             raise ConfigurationError(
-                f"address: {shown} is none that a {self.chip} can have ({known})"
+                f"address: {shown} is not an address of a {self.chip} ({known})"
             )
         self.address = chosen
         self.channel = support.text("channel", channel)
         self._smbus: Any = None
         self._seen = False
+        self._neighbour = support.Neighbour(clock)
 
     @property
     def where(self) -> str:
@@ -62,7 +67,7 @@ class I2cThermometer(Thermometer):
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[dict[str, Any]]:
-        """Buses a chip could be on; addresses are not scanned, which could upset other chips."""
+        """Buses a chip could be on; scanning addresses could upset other chips."""
         buses = sorted(Path(sysfs).glob("class/i2c-dev/i2c-*"))
         return [
             {
@@ -105,11 +110,30 @@ class I2cThermometer(Thermometer):
         return support.middle_reading(self.clock, {self.channel: value}, begin, about)
 
     def _identify(self) -> Mapping[str, str]:
-        """Check that it is this chip and make it convert; WrongDevice where it is another."""
+        """Check that it is this chip and make it convert; WrongDevice if it is another."""
         raise NotImplementedError
 
     def _measure(self) -> tuple[float, Mapping[str, Any]]:
-        """One fresh value in °C and what else the chip says."""
+        """One fresh value in °C and what else the chip reports."""
+        raise NotImplementedError
+
+    def _converted(self, read: Callable[[], int], power_up: int, conversion_s: float) -> int:
+        """A temperature word of a chip that has no data-ready flag; BadReading at power-up."""
+        raw = read()
+        if raw != power_up:
+            self._neighbour.measured(self._celsius(raw))
+            return raw
+        self._wait(conversion_s)
+        raw = read()
+        if raw == power_up and not self._neighbour.supports(self._celsius(raw)):
+            raise BadReading(
+                f"{self.where}: {self._celsius(raw):g} °C is its power-up value and no recent "
+                "reading was near it; the chip lost its supply, or does not convert"
+            )
+        return raw
+
+    def _celsius(self, raw: int) -> float:
+        """°C of a temperature word, for chips that use `_converted`."""
         raise NotImplementedError
 
     def _word(self, register: int) -> int:
@@ -122,10 +146,10 @@ class I2cThermometer(Thermometer):
         self._smbus.write_word_data(self.address, register, swapped)
 
     def _data_word(self, register: int) -> int:
-        """A measurement register; 0xFFFF is a line that nobody drives, and is refused."""
+        """A measurement register; 0xFFFF is a bus that nothing drives, and is refused."""
         value = self._word(register)
         if value == 0xFFFF:
-            raise BadReading(f"{self.where}: reads 0xFFFF, nobody drives the bus")
+            raise BadReading(f"{self.where}: reads 0xFFFF, nothing drives the bus")
         return value
 
     def _expect(self, what: str, found: int, wanted: int) -> None:

@@ -6,11 +6,12 @@
       - {name: sensor, driver: iio, chip: tmp117}
       - {name: soc, driver: thermal_zone, zone: cpu-thermal}
 
-`channels` maps our channel names to the kernel's input (`temp1`, `in_temp_ambient`) or its label;
-without it every temperature input is read, a single one as `temperature`. `minimum_c`/`maximum_c`
-bound what is believed (a broken diode reads 127 °C); `sysfs` (/sys) is where the files are. The
-kernel numbers its devices anew at every plug: they are looked up by name at each open, and the name
-is checked again at each read.
+`channels` maps channel names to the kernel's input (`temp1`, `in_temp_ambient`) or its label;
+without it every temperature input is read, a single one as `temperature`. `minimum_c` and
+`maximum_c` bound what is accepted (a broken diode reads 127 °C); `sysfs` (/sys) is where the files
+are. The kernel renumbers its devices at every plug: they are looked up by name at each open, and
+the name is checked at each read. A zone of −40 °C is one that is not fitted, and the hwmon entry of
+a 1-wire sensor is refused at its power-on value: use the driver ds18b20, which sees the CRC.
 Source: Documentation/hwmon/sysfs-interface, ABI/testing/sysfs-bus-iio, driver-api/thermal.
 """
 
@@ -30,6 +31,9 @@ if TYPE_CHECKING:
     from thermocald.hal import Clock, Reading
 
 __all__ = ["HwmonThermometer", "IioThermometer", "ThermalZoneThermometer"]
+
+ONE_WIRE_POWER_ON_C = 85.0
+NOT_FITTED_C = -40.0
 
 
 class _KernelThermometer(Thermometer):
@@ -62,6 +66,7 @@ class _KernelThermometer(Thermometer):
         self._seen = False
         self._device: Path | None = None
         self._channels: dict[str, str] = {}
+        self._name = ""
 
     @classmethod
     def devices(cls, sysfs: Path) -> Iterator[tuple[Path, str, str]]:
@@ -173,7 +178,7 @@ class _KernelThermometer(Thermometer):
 
 
 def _number(path: Path) -> float:
-    return float(path.read_text().strip())
+    return support.parse_number(path.read_text())
 
 
 def _label(folder: Path, key: str) -> str:
@@ -198,7 +203,10 @@ class HwmonThermometer(_KernelThermometer):
         fault = folder / f"{key}_fault"
         if fault.exists() and _number(fault) != 0:
             raise BadReading(f"{folder.name} {key}: the chip reports a broken sensor (fault flag)")
-        return _number(folder / f"{key}_input") / 1000.0
+        value = _number(folder / f"{key}_input") / 1000.0
+        if value == ONE_WIRE_POWER_ON_C and self._name.startswith("w1_"):
+            raise BadReading(f"{folder.name} {key}: {value:g} °C is the 1-wire power-on value")
+        return value
 
 
 class IioThermometer(_KernelThermometer):
@@ -275,8 +283,11 @@ class ThermalZoneThermometer(_KernelThermometer):
 
     def _convert(self, folder: Path, key: str) -> float:
         try:
-            return _number(folder / key) / 1000.0
+            value = _number(folder / key) / 1000.0
         except OSError as error:
             if error.errno in (errno.EAGAIN, errno.ENODATA, errno.EINVAL):
                 raise BadReading(f"{folder.name}: the zone is disabled or asleep") from error
             raise
+        if value == NOT_FITTED_C:
+            raise BadReading(f"{folder.name}: {value:g} °C, as of a sensor that is not fitted")
+        return value

@@ -4,8 +4,8 @@
       - {name: lens, driver: mcp9808, bus: 1, address: 0x18, channel: lens}
 
 Manufacturer 0x0054 and device 0x04 are checked. Bits 15–13 of the temperature register are alert
-flags and bit 12 the sign: they are taken off before the value is computed. A chip in shut-down
-would repeat its last value for ever: it is woken, and one conversion awaited (0.25 s).
+flags and bit 12 the sign. A chip in shut-down would repeat its last value for ever: it is woken and
+one conversion awaited (0.25 s). The register is 0 at power-up; see `i2c`.
 Source: data sheet DS25095A, 5.1.3 and 5.2.
 """
 
@@ -52,5 +52,16 @@ class Mcp9808Thermometer(I2cThermometer):
 
     def _measure(self) -> tuple[float, Mapping[str, Any]]:
         self._wake()
-        raw = self._data_word(AMBIENT)
-        return signed(raw, 13) / 16.0, {"alert_flags": raw >> 13}
+        flags = 0
+
+        def read() -> int:
+            nonlocal flags
+            raw = self._data_word(AMBIENT)
+            flags = raw >> 13
+            return raw & 0x1FFF
+
+        raw = self._converted(read, 0, CONVERSION_S)
+        return self._celsius(raw), {"alert_flags": flags}
+
+    def _celsius(self, raw: int) -> float:
+        return signed(raw, 13) / 16.0

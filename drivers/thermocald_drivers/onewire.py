@@ -4,22 +4,27 @@
       - name: field
         driver: ds18b20
         sensors: {camera: 28-000000bfe244, air: 28-00000a1b2c3d}   # {channel: ROM id}
-        timeout_s: 3                    # for each sensor; one conversion takes 0.75 s
-        attempts: 2                     # a reading that is not believed is made once more
+        timeout_s: 3                    # per sensor; one conversion takes 0.75 s
+        attempts: 2                     # a refused reading is repeated once
         sysfs: /sys
 
-What this driver does not believe: a CRC that fails (computed here too, over the printed bytes), all
-zeros (a shorted or unplugged line: the CRC of zeros is zero), a `t=` that does not fit its bytes,
-values outside −55 … 125 °C, and 85 °C with the power-on scratchpad unless a neighbouring reading
-makes it likely: that value is what the chip holds before its first conversion, but a probe also
-passes through it on a ramp. Every sensor is asked at once, in its own thread; the kernel (seen with
-6.1) nevertheless keeps the bus to itself during a conversion, so that n sensors of one bus take
-n · 0.8 s, and the reading's time is the middle of them all.
-Source: Maxim DS18B20 data sheet (19-7487), Linux w1_therm.c.
+Refused are: a wrong CRC (computed here too, over the printed bytes), all zeros (a shorted or
+unplugged line: the CRC of zeros is zero), a `t=` that does not follow from its bytes, values
+outside −55 … 125 °C (127.94 °C is a failed conversion), a MAX31850 that reports a fault of its
+thermocouple, and the value that the chip holds before its first conversion. That power-on value is
+85 °C in every family and at every resolution (DS18S20: 0x00AA), and 25 °C in the counterfeits of
+family D, whose last scratchpad byte is not 0x10. It is accepted only if a recent reading lay within
+5 K: a probe also passes through it on a ramp.
+
+All sensors are read at once, each in its own thread. The kernel (as of 6.1) still holds the bus
+during a conversion, so n sensors on one bus take n · 0.8 s; the reading's time is the middle.
+Source: Maxim DS18B20 data sheet (19-7487), DS18S20 (19-5474), MAX31850 (19-6171), Linux
+w1_therm.c, C. Petrich's survey of counterfeit DS18B20.
 """
 
 from __future__ import annotations
 
+import re
 import threading
 from concurrent.futures import Future
 from pathlib import Path
@@ -34,13 +39,15 @@ if TYPE_CHECKING:
 
     from thermocald.hal import Clock, Reading
 
-__all__ = ["Ds18b20Thermometer", "crc8", "decode"]
+__all__ = ["Ds18b20Thermometer", "crc8", "decode", "power_on_value"]
 
-POWER_ON = bytes.fromhex("50054b467fff0c10")
-"""The scratchpad after power-on but for TH/TL, which are kept in EEPROM (bytes 2 and 3)."""
+POWER_ON_C = 85.0
+COUNTERFEIT_POWER_ON_C = 25.0
+_FILE = re.compile(
+    r"(?P<pad>[0-9a-f]{2}(?: [0-9a-f]{2}){8}) : crc=[0-9a-f]{2} (?P<verdict>YES|NO)\s*\n"
+    r"[0-9a-f ]*t=(?P<milli>-?[0-9]{1,7})"
+)
 FAMILIES = {"10": "DS18S20", "22": "DS1822", "28": "DS18B20", "3b": "DS1825", "42": "DS28EA00"}
-NEIGHBOUR_AGE_S = 60.0
-NEIGHBOUR_STEP_K = 5.0
 
 
 def crc8(data: bytes) -> int:
@@ -54,33 +61,50 @@ def crc8(data: bytes) -> int:
 
 
 def decode(content: str, where: str, family: str = "28") -> tuple[float, bytes]:
-    """(°C, scratchpad) of a `w1_slave` file; BadReading says what does not fit."""
-    lines = content.split("\n")
+    """(°C, scratchpad) of a `w1_slave` file; BadReading says what is wrong with it."""
     if not content.strip():
         raise BadReading(f"{where}: empty: no answer, or one whose CRC the kernel refused")
-    try:
-        left, right = lines[0].split(" : crc=", 1)
-        pad = bytes.fromhex(left)
-        milli = int(lines[1].rsplit("t=", 1)[1])
-    except (ValueError, IndexError) as error:
-        raise BadReading(f"{where}: {content!r} is no w1_slave content") from error
-    if len(pad) != 9 or not right.rstrip().endswith("YES") or crc8(pad[:8]) != pad[8]:
-        raise BadReading(f"{where}: CRC error in {left!r}; check the wiring and the pull-up")
+    match = _FILE.fullmatch(content.strip())
+    if match is None:
+        raise BadReading(f"{where}: {content!r} is not a w1_slave file")
+    pad, milli = bytes.fromhex(match["pad"]), int(match["milli"])
+    if match["verdict"] != "YES" or crc8(pad[:8]) != pad[8]:
+        raise BadReading(f"{where}: CRC error in {match['pad']!r}; check the wiring and pull-up")
     if not any(pad):
         raise BadReading(f"{where}: all zeros; the data line is shorted or the sensor unplugged")
-    if milli != _kernel_millikelvin(pad, family):
-        raise BadReading(f"{where}: t={milli} does not fit the bytes {left!r}")
-    return support.believable(milli / 1000.0, -55.0, 125.0, where), pad
+    if family == "3b" and pad[4] & 0x80 and pad[0] & 1:
+        raise BadReading(f"{where}: the MAX31850 reports a fault; check the thermocouple")
+    if family == "10" and pad[7] == 0:
+        raise BadReading(f"{where}: COUNT_PER_C is 0 in {match['pad']!r}; no DS18S20 sends that")
+    computed = _kernel_millidegrees(pad, family)
+    # kernels before 5.10 do not know the further bits of GX20MH01 and MAX31850
+    if milli not in (computed, int(int.from_bytes(pad[:2], "little", signed=True) * 1000 / 16)):
+        raise BadReading(f"{where}: t={milli} does not follow from the bytes {match['pad']!r}")
+    return support.believable(computed / 1000.0, -55.0, 125.0, where), pad
 
 
-def _kernel_millikelvin(pad: bytes, family: str) -> int:
+def power_on_value(pad: bytes, family: str) -> float | None:
+    """°C that this scratchpad holds if the chip has not converted yet; None if it has."""
+    raw = int.from_bytes(pad[:2], "little")
+    if raw == (0x00AA if family == "10" else 0x0550):
+        return POWER_ON_C
+    counterfeit = pad[5] != 0xFF or pad[7] != 0x10
+    if family == "28" and raw == 0x0190 and counterfeit:
+        return COUNTERFEIT_POWER_ON_C
+    return None
+
+
+def _kernel_millidegrees(pad: bytes, family: str) -> int:
     """What w1_therm.c computes from the scratchpad, in 1/1000 °C, rounded towards zero."""
     raw = int.from_bytes(pad[:2], "little", signed=True)
-    if family != "10":
-        return int(raw * 1000 / 16)
-    if pad[7] == 0:
-        return 0
-    return (raw >> 1) * 1000 - 250 + int(1000 * (pad[7] - pad[6]) / pad[7])
+    if family == "10":
+        return (raw >> 1) * 1000 - 250 + int(1000 * (pad[7] - pad[6]) / pad[7])
+    if family == "3b" and pad[4] & 0x80:  # MAX31850: fault and reserved bit are masked
+        return int((raw & ~3) * 1000 / 16)
+    if family in ("22", "28", "42") and pad[4] & 0x80:  # GX20MH01: two more bits
+        bits = (raw << 2 | pad[4] & 3) & 0xFFFF
+        return int((bits - (bits >> 15 << 16)) * 1000 / 64)
+    return int(raw * 1000 / 16)
 
 
 class Ds18b20Thermometer(Thermometer):
@@ -107,7 +131,7 @@ class Ds18b20Thermometer(Thermometer):
         self._seen = False
         self._open = False
         self._pending: dict[str, Future[float]] = {}
-        self._neighbour: dict[str, tuple[float, float]] = {}
+        self._neighbours: dict[str, support.Neighbour] = {}
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[dict[str, Any]]:
@@ -136,7 +160,7 @@ class Ds18b20Thermometer(Thermometer):
 
     def close(self) -> None:
         self._open = False
-        self._neighbour.clear()
+        self._neighbours.clear()
 
     def identity(self) -> Mapping[str, str]:
         return {"sensors": ", ".join(self.sensors.values())}
@@ -166,7 +190,7 @@ class Ds18b20Thermometer(Thermometer):
         return support.middle_reading(self.clock, values, begin, about)
 
     def _start(self, channel: str) -> None:
-        """Begin to read a sensor; one that still hangs from the last time is not asked twice."""
+        """Start reading a sensor; one that still hangs from the last time is not read twice."""
         late = self._pending.get(channel)
         if late is not None and not late.done():
             return
@@ -198,19 +222,15 @@ class Ds18b20Thermometer(Thermometer):
                 if isinstance(problem, DeviceGone):
                     raise DeviceGone(f"1-wire {rom}: vanished from the bus") from error
                 continue
-            if pad[:2] + pad[4:8] != POWER_ON[:2] + POWER_ON[4:8]:
-                self._neighbour[channel] = (self.clock.monotonic(), value)
+            neighbour = self._neighbours.setdefault(channel, support.Neighbour(self.clock))
+            untouched = power_on_value(pad, rom[:2])
+            if untouched is None:
+                neighbour.measured(value)
                 return value
-            if self._near_85(channel):
+            if neighbour.supports(value):
                 return value
             problem = BadReading(
-                f"1-wire {rom}: 85 °C is the power-on value and no reading before it was near; "
-                "the sensor lost its supply during the conversion"
+                f"1-wire {rom}: {untouched:g} °C is the power-on value and no recent reading was "
+                "near it; the sensor lost its supply, or has not converted yet"
             )
         raise problem
-
-    def _near_85(self, channel: str) -> bool:
-        """Whether a recent reading that is not the power-on pattern itself lay beside 85 °C."""
-        at, value = self._neighbour.get(channel, (float("-inf"), 0.0))
-        recent = self.clock.monotonic() - at <= NEIGHBOUR_AGE_S
-        return recent and abs(value - 85.0) <= NEIGHBOUR_STEP_K

@@ -58,9 +58,9 @@ CLOSE_S = 3.0
 
 
 def sensor_temperature(metadata: Mapping[str, Any]) -> float | None:
-    """°C of the sensor, None where it is absent or one of the values that stand for "unknown"."""
+    """°C of the sensor; None where it is absent or a value that means "unknown"."""
     value = metadata.get("SensorTemperature")
-    if not isinstance(value, int | float) or value == 0.0:
+    if isinstance(value, bool) or not isinstance(value, int | float) or value == 0.0:
         return None
     return float(value) if CLAMP_LOW_C < value < CLAMP_HIGH_C else None
 

@@ -7,26 +7,33 @@ r"""Thermometers on a serial line that speak in lines of text.
         port: /dev/serial/by-id/usb-FTDI_FT232R_A50285BI-if00-port0   # lasts over re-plugs
         baud: 9600
         framing: 8N1                            # data bits, parity (N, E, O), stop bits
-        command: "T?\\r\\n"                      # sent for each reading; empty: it speaks by itself
+        command: "T?\\r\\n"                      # sent for each reading; empty: it sends by itself
         pattern: 'T=(?P<temperature>[-+]?\\d+\\.\\d+)F\\*(?P<checksum>[0-9A-F]{2})'
         unit: F                                 # C (default), F, K
         scale: 1.0                              # times the number, then
         offset: 0.0                             # added
         timeout_s: 2
-        minimum_c: -100                         # and maximum_c: what is believed
-        checksum: xor                                    # of the text before it: xor, sum8, nmea
+        minimum_c: -60                          # and maximum_c: 125; instruments: -100 … 300
+        refuse_c: [-127, -50, -46.85, -45, -40, 85, 125]   # values that mean "no sensor"
+        checksum: xor                           # of the text before it: xor, sum8, nmea
 
-Each named group of `pattern` is a channel, scaled and offset, then brought to °C by `unit`. The
-pattern must match the **whole** line: the rest of a line whose head was lost (`3.5C` of `+023.5C`)
-is no reading. Instruments by name: see INSTRUMENTS.
+Each named group of `pattern` is a channel, scaled and offset, then converted to °C by `unit`. The
+pattern must match the **whole** line: the rest of a line whose start was lost (`3.5C` of `+023.5C`)
+is not a reading. A decimal comma is read as a point. A `°` in the pattern matches the degree signs
+of UTF-8, Latin-1, code page 437 and LCD fonts. Instruments by name: see INSTRUMENTS.
 
-A line that was in the queue before the reading was asked for is never used: with `command` the
+Firmware prints a fixed number where its sensor does not answer: −127 and 85 (DS18B20), −45 and
+−46.85 (SHT), −50 (an input at 0 V), −40 and 125 (ends of a scale). With `pattern` these are refused
+(`refuse_c`; [] accepts all), with `instrument` the instrument's own error texts are known.
+
+A line that was in the queue before the reading was requested is never used: with `command` the
 queue is emptied first, without it the next line that *ends* after the call counts. Echo and
-garbage are skipped until `timeout_s`; the error then quotes what came.
+garbage are skipped until `timeout_s`; the error then quotes what was received.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import operator
 import re
@@ -40,7 +47,7 @@ from thermocald.hal import Reading, Thermometer
 from thermocald_drivers import support
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from thermocald.hal import Clock
 
@@ -48,6 +55,10 @@ __all__ = ["INSTRUMENTS", "Instrument", "SerialThermometer"]
 
 NUMBER = r"[-+]?\d+(?:\.\d+)?"
 LONGEST_LINE = 512
+NO_SENSOR_C = (-127.0, -50.0, -46.85, -45.0, -40.0, 85.0, 125.0)
+NO_SENSOR_STEP_K = 0.006
+DEGREES = str.maketrans("ºø˚∘ß℃", "°°°°°°")
+"""What a degree sign of another encoding becomes in Latin-1: masculine ordinal, 0xF8, 0xDF."""
 POLL_S = 0.05  # changing pyserial's time-out later would set up the whole port anew
 QUEUE = 4000
 """Bytes that may have waited before the kernel's buffer (4096) could have lost some."""
@@ -66,10 +77,12 @@ class Instrument:
     offset: float = 0.0
     checksum: str = "none"
     timeout_s: float = 2.0
+    range_c: tuple[float, float] = (-100.0, 300.0)
+    refuse_c: tuple[float, ...] = ()
 
 
 INSTRUMENTS = {
-    # Papouch TM, TMU: speaks by itself every 10 s, ends with CR alone.
+    # Papouch TM, TMU: sends by itself every 10 s, ends with CR alone.
     "papouch-tm": Instrument(r"(?P<temperature>[-+]\d{3}\.\d)C", timeout_s=22.0),
     # Vaisala HMP230/240/260 series, user's guides, appendix "Serial commands".
     "vaisala-hmp": Instrument(
@@ -130,8 +143,9 @@ class SerialThermometer(Thermometer):
         offset: float | None = None,
         checksum: str | None = None,
         timeout_s: float | None = None,
-        minimum_c: float = -100.0,
-        maximum_c: float = 300.0,
+        minimum_c: float | None = None,
+        maximum_c: float | None = None,
+        refuse_c: Sequence[float] | None = None,
     ) -> None:
         self.clock = clock
         self.port = support.text("port", port)
@@ -142,7 +156,9 @@ class SerialThermometer(Thermometer):
         if instrument is not None:
             base = INSTRUMENTS[support.choice("instrument", instrument, list(INSTRUMENTS))]
         else:
-            base = Instrument(support.text("pattern", pattern))
+            base = Instrument(
+                support.text("pattern", pattern), range_c=(-60.0, 125.0), refuse_c=NO_SENSOR_C
+            )
         self.name = instrument or "serial line"
         self.command = (base.command if command is None else command).encode("ascii")
         self.baud = int(support.number("baud", baud or base.baud, 50, 4_000_000, "Bd", whole=True))
@@ -155,10 +171,14 @@ class SerialThermometer(Thermometer):
         self.checksum = support.choice("checksum", checksum or base.checksum, list(CHECKSUMS))
         wait = base.timeout_s if timeout_s is None else timeout_s
         self.timeout_s = support.number("timeout_s", wait, 0.01, 600, "s")
-        self.minimum_c = support.number("minimum_c", minimum_c, -273.15, 3000, "°C")
-        self.maximum_c = support.number("maximum_c", maximum_c, -273.15, 3000, "°C")
+        low = base.range_c[0] if minimum_c is None else minimum_c
+        high = base.range_c[1] if maximum_c is None else maximum_c
+        self.minimum_c = support.number("minimum_c", low, -273.15, 3000, "°C")
+        self.maximum_c = support.number("maximum_c", high, -273.15, 3000, "°C")
+        refused = base.refuse_c if refuse_c is None else refuse_c
+        self.refuse_c = [support.number("refuse_c", v, -273.15, 3000, "°C") for v in refused]
         try:
-            self.pattern = re.compile(base.pattern)
+            self.pattern = re.compile(base.pattern, re.ASCII)  # other scripts have digits too
         except re.error as error:
             raise ConfigurationError(f"pattern: {base.pattern!r}: {error}") from error
         self.channels = [name for name in self.pattern.groupindex if name != "checksum"]
@@ -260,8 +280,13 @@ class SerialThermometer(Thermometer):
             self._synchronous = True
         self._line = tail if mark else head + tail
 
+    def _match(self, line: bytes) -> re.Match[str] | None:
+        """The line against the pattern, in each encoding that it may have."""
+        matches = (self.pattern.fullmatch(text) for text in _decodings(line))
+        return next((match for match in matches if match is not None), None)
+
     def _next_values(self) -> tuple[dict[str, float], float, str]:
-        """Channels, the machine's monotonic instant, and the text of the next matching line."""
+        """Channels, the machine's monotonic time, and the text of the next matching line."""
         deadline = time.monotonic() + self.timeout_s
         skipped: list[str] = []
         problem = ""
@@ -269,17 +294,17 @@ class SerialThermometer(Thermometer):
             while b"\n" in self._line:
                 line, self._line = self._line.split(b"\n", 1)
                 whole, self._synchronous = self._synchronous, True
-                text = line.strip(b"\0").decode("ascii", "backslashreplace")
-                if not text or not whole or text.strip() == self.command.decode().strip():
+                line = line.strip(b"\0")
+                if not line or not whole or line.strip() == self.command.strip():
                     continue
-                match = self.pattern.fullmatch(text)
+                match = self._match(line)
                 if match is None:
-                    skipped.append(text)
+                    skipped.append(line.decode("ascii", "backslashreplace"))
                     continue
-                problem = self._checksum_problem(match, text)
+                problem = self._checksum_problem(match, line)
                 if not problem:
-                    return self._values(match), time.monotonic(), text
-                skipped.append(text)
+                    return self._values(match), time.monotonic(), match.string
+                skipped.append(match.string)
             if len(self._line) > LONGEST_LINE:
                 skipped.append(self._line[:40].decode("ascii", "backslashreplace"))
                 self._line, self._synchronous = b"", False
@@ -301,26 +326,52 @@ class SerialThermometer(Thermometer):
             )
         return DeviceTimeout(f"{self.where}: silent for {self.timeout_s:g} s")
 
-    def _checksum_problem(self, match: re.Match[str], text: str) -> str:
+    def _checksum_problem(self, match: re.Match[str], line: bytes) -> str:
         if self.checksum == "none":
             return ""
-        given = int(match["checksum"], 16)
-        computed = CHECKSUMS[self.checksum](text[: match.start("checksum")].encode("ascii"))
-        if given == computed:
+        given = match["checksum"] or ""
+        if not re.fullmatch(r"[0-9A-Fa-f]{1,4}", given):
+            return f"checksum {given!r} in {match.string!r} is not hexadecimal"
+        # the checksum is of bytes: those before it are the line without what follows
+        after = len(match.string[match.start("checksum") :].encode("latin-1", "replace"))
+        computed = CHECKSUMS[self.checksum](line[: len(line) - after])
+        if int(given, 16) == computed:
             return ""
-        return f"checksum {given:02X} in {text!r}, computed {computed:02X}"
+        return f"checksum {given} in {match.string!r}, computed {computed:02X}"
 
     def _values(self, match: re.Match[str]) -> dict[str, float]:
-        values = {}
+        """{channel: °C} of a line; a channel without a usable number is absent."""
+        values, problems = {}, []
         for channel in self.channels:
             if match[channel] is None:
                 continue
             try:
-                value = float(match[channel])
+                values[channel] = self._celsius(channel, match[channel])
             except ValueError as error:
-                raise BadReading(f"{self.where}: {match[channel]!r} is not a number") from error
-            celsius = UNITS[self.unit](value * self.scale + self.offset)
-            values[channel] = support.believable(
-                celsius, self.minimum_c, self.maximum_c, f"{self.where}, {channel}"
-            )
+                problems.append(f"{self.where}, {channel}: {error}")
+            except BadReading as error:
+                problems.append(str(error))
+        if not values:
+            raise BadReading("; ".join(problems) or f"{self.where}: {match.string!r} has no value")
         return values
+
+    def _celsius(self, channel: str, text: str) -> float:
+        value = support.parse_number(text, comma=True) * self.scale + self.offset
+        where = f"{self.where}, {channel}"
+        celsius = support.believable(UNITS[self.unit](value), self.minimum_c, self.maximum_c, where)
+        if any(abs(celsius - refused) < NO_SENSOR_STEP_K for refused in self.refuse_c):
+            raise BadReading(
+                f"{where}: {celsius:g} °C is what firmware prints without a sensor; if it is a "
+                "temperature, write refuse_c: []"
+            )
+        return celsius
+
+
+def _decodings(line: bytes) -> Iterator[str]:
+    """The line as text: UTF-8 if it is, Latin-1, and Latin-1 with every degree sign as °."""
+    with contextlib.suppress(UnicodeDecodeError):
+        text = line.decode("utf-8")
+        yield text
+        yield text.translate(DEGREES)
+    yield line.decode("latin-1")
+    yield line.decode("latin-1").translate(DEGREES)

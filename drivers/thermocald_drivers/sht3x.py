@@ -55,7 +55,7 @@ class Sht3xThermometer(I2cThermometer):
         self._wait(CONVERSION_S)
         temperature, humidity = self._words(2)
         if temperature == 0xFFFF and humidity == 0xFFFF:
-            raise BadReading(f"{self.where}: reads 0xFFFF, nobody drives the bus")
+            raise BadReading(f"{self.where}: reads 0xFFFF, nothing drives the bus")
         value = -45.0 + 175.0 * temperature / 65535.0
         return value, {"humidity_percent": 100.0 * humidity / 65535.0}
 

@@ -1,10 +1,11 @@
-"""What the drivers share: lazy libraries, bounded options, and errno translated into our errors."""
+"""What the drivers share: lazy imports, bounded options, errno as our errors, strict numbers."""
 
 from __future__ import annotations
 
 import errno
 import importlib
 import math
+import re
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from thermocald.hal import Clock
 
 __all__ = [
+    "Neighbour",
     "absent",
     "believable",
     "choice",
@@ -40,17 +42,22 @@ __all__ = [
     "middle_reading",
     "number",
     "on_clock",
+    "parse_number",
     "programme",
     "text",
 ]
 
 CLOCK_TRIES = 10
 CLOCK_SPREAD_S = 1e-4
+NEIGHBOUR_AGE_S = 60.0
+NEIGHBOUR_STEP_K = 5.0
+LOWEST_C, HIGHEST_C = -273.15, 2000.0
+_NUMBER = re.compile(r"[-+]?(?:[0-9]+(?:[.,][0-9]*)?|[.,][0-9]+)(?:[eE][-+]?[0-9]{1,2})?")
 _GONE = {errno.ENOENT, errno.ENXIO, errno.ENODEV, errno.EREMOTEIO, errno.ENOTCONN, errno.ESHUTDOWN}
 
 
 def library(module: str, extra: str = "") -> Any:
-    """Import a device's library when the device is opened; DriverMissing says how to install it."""
+    """Import a device's library when the device is opened; DriverMissing says what to install."""
     try:
         return importlib.import_module(module)
     except ImportError as error:
@@ -75,29 +82,29 @@ def number(
 
 
 def choice(name: str, value: object, allowed: Sequence[str]) -> str:
-    """An option out of a list of words; ConfigurationError shows the list."""
+    """An option from a list of words; ConfigurationError shows the list."""
     if not isinstance(value, str) or value not in allowed:
-        raise ConfigurationError(f"{name}: {value!r} is none of {', '.join(allowed)}")
+        raise ConfigurationError(f"{name}: {value!r} is not one of {', '.join(allowed)}")
     return value
 
 
 def text(name: str, value: object) -> str:
-    """An option that must be a non-empty string; numbers of a YAML file are taken as written."""
+    """An option that must be a non-empty string; whole numbers are taken as written."""
     if isinstance(value, bool) or not isinstance(value, str | int) or str(value) == "":
-        raise ConfigurationError(f"{name}: {value!r} is not a text; put it in quotes")
+        raise ConfigurationError(f"{name}: {value!r} is not text; put it in quotes")
     return str(value)
 
 
 def absent(message: str, *, seen: bool) -> DeviceError:
-    """What is not there: gone (retried) if it was opened once before, else not found (reported)."""
+    """A missing device: gone (retried) if it was open before, otherwise not found (reported)."""
     return DeviceGone(message) if seen else DeviceNotFound(message)
 
 
 def denied(message: str, *, seen: bool) -> DeviceError:
-    """What may not be used: for good, unless it was open before.
+    """A device that may not be used: permanent, unless it was open before.
 
-    A device that has just been plugged in again belongs to nobody until udev has seen it, and other
-    programs look into it; a phone is unauthorized until it has found its key.
+    A device that has just been plugged in again belongs to root until udev has seen it, and other
+    programs probe it; a phone is unauthorized until it has recognised the host's key.
     """
     return TransientDeviceError(message) if seen else DeviceDenied(message)
 
@@ -105,8 +112,9 @@ def denied(message: str, *, seen: bool) -> DeviceError:
 def fault(error: OSError, where: str, *, seen: bool, hint: str = "") -> DeviceError:
     """The device error that a system call's errno stands for.
 
-    where: the device as the user knows it; seen: whether it was opened once before; hint: what to
-    do where it is missing or denied.
+    where: the device as the user knows it.
+    seen: whether it was open before.
+    hint: what to do if it is missing or access is denied.
     """
     if isinstance(error, DeviceError):
         return error
@@ -125,10 +133,10 @@ def fault(error: OSError, where: str, *, seen: bool, hint: str = "") -> DeviceEr
 
 
 def on_clock(clock: Clock, monotonic: float) -> tuple[float, float]:
-    """An instant of the machine's CLOCK_MONOTONIC, s, on the clock's (monotonic, utc) scales.
+    """A time of the machine's CLOCK_MONOTONIC (s) on the clock's (monotonic, utc) scales.
 
-    The three clocks are read one after the other: a thread that is preempted in between would be
-    off by that pause (76 ms were seen on a busy machine). The closest of some tries counts.
+    The three clocks are read one after another; a thread that is preempted in between would be
+    off by that pause (76 ms on a busy machine), so the closest of several attempts counts.
     """
     tries = []
     for _ in range(CLOCK_TRIES):
@@ -148,7 +156,7 @@ def middle_reading(
     begin: float,
     metadata: Mapping[str, Any] | None = None,
 ) -> Reading:
-    """A reading stamped half-way between `begin` (clock's monotonic, s) and now."""
+    """A reading timed half-way between `begin` (clock's monotonic, s) and now."""
     now = time.monotonic()
     half = (clock.monotonic() - begin) / 2.0
     monotonic, utc = on_clock(clock, now)
@@ -161,7 +169,7 @@ def middle_reading(
 
 
 def believable(value_c: float, low_c: float, high_c: float, where: str) -> float:
-    """The temperature, if it is finite and within the sensor's range; BadReading otherwise."""
+    """The temperature if it is finite and within the sensor's range; otherwise BadReading."""
     if not math.isfinite(value_c) or not low_c <= value_c <= high_c:
         raise BadReading(
             f"{where}: {value_c:g} °C is outside the sensor's range {low_c:g} … {high_c:g} °C"
@@ -169,17 +177,57 @@ def believable(value_c: float, low_c: float, high_c: float, where: str) -> float
     return value_c
 
 
-def programme(points: object) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A course of [seconds, °C] points as times (n,) s and temperatures (n,) °C.
+def parse_number(text: str, *, comma: bool = False) -> float:
+    """The number in a text from a device: ASCII digits, one decimal point, nothing else.
 
-    ConfigurationError where it is none, or its times do not increase.
+    float() also takes `2_5.0`, `nan`, `infinity` and digits of any script, which a damaged line
+    may hold. comma: whether a decimal comma is accepted. Raises ValueError.
+    """
+    plain = text.strip(" \t\r\n")
+    if not _NUMBER.fullmatch(plain) or ("," in plain and not comma):
+        raise ValueError(f"{text!r} is not a plain decimal number")
+    return float(plain.replace(",", "."))
+
+
+class Neighbour:
+    """The last reading of a channel that was certainly measured.
+
+    A chip that has just been powered holds a fixed value (85 °C, 25 °C, 0 °C) that is also a
+    temperature. Such a value is accepted only where a reading less than NEIGHBOUR_AGE_S old and
+    within NEIGHBOUR_STEP_K makes it likely; it never supports itself.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._last: tuple[float, float] | None = None
+
+    def measured(self, value_c: float) -> None:
+        """Remember a reading that cannot be a power-on value."""
+        self._last = (self._clock.monotonic(), value_c)
+
+    def supports(self, value_c: float) -> bool:
+        """Whether a recent reading lay near enough."""
+        if self._last is None:
+            return False
+        at, last_c = self._last
+        recent = self._clock.monotonic() - at <= NEIGHBOUR_AGE_S
+        return recent and abs(last_c - value_c) <= NEIGHBOUR_STEP_K
+
+
+def programme(points: object) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A list of [seconds, °C] points as times (n,) s and temperatures (n,) °C.
+
+    Raises ConfigurationError for anything else, for times that do not increase, and for
+    temperatures that do not exist.
     """
     try:
-        course = np.array(points, dtype=float)
+        pairs = np.array(points, dtype=float)
     except (TypeError, ValueError):
-        course = np.empty(0)
-    if course.ndim != 2 or course.shape[1] != 2 or not np.isfinite(course).all():
+        pairs = np.empty(0)
+    if pairs.ndim != 2 or pairs.shape[1] != 2 or not np.isfinite(pairs).all():
         raise ConfigurationError("programme: must be a list of [seconds, °C]")
-    if np.any(np.diff(course[:, 0]) <= 0):
+    if np.any(np.diff(pairs[:, 0]) <= 0):
         raise ConfigurationError("programme: its times must increase")
-    return course[:, 0], course[:, 1]
+    for value in pairs[:, 1]:
+        number("programme: temperature", float(value), LOWEST_C, HIGHEST_C, "°C")
+    return pairs[:, 0], pairs[:, 1]

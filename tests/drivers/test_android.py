@@ -349,7 +349,7 @@ def test_temperatures(server, phone, shared):
     with thermometer(server, sensors=sensors) as device:
         reading = device.read()
     assert reading.values == {"temperature": 28.7, "ap": 25.6, "soc": 37.0}
-    assert reading.metadata["missing"] == {"usb": "thermal:USB: not told by the phone"}
+    assert reading.metadata["missing"] == {"usb": "thermal:USB: the phone does not report it"}
 
 
 def test_a_zones_unit_is_kept(server, phone):
@@ -360,9 +360,43 @@ def test_a_zones_unit_is_kept(server, phone):
         assert device.read().values == {"cpu": pytest.approx(0.9)}
 
 
+def test_a_zone_of_unknown_unit_asks_for_the_option(server, phone):
+    phone.zones = "tsens_tz_sensor5 45\n"
+    sensors = {"soc": "zone:tsens_tz_sensor5"}
+    with (
+        thermometer(server, sensors=sensors) as device,
+        pytest.raises(BadReading, match=r"unit of 45 is not known; write units: \{soc: degC\}"),
+    ):
+        device.read()
+    with thermometer(server, sensors=sensors, units={"soc": "tenths"}) as device:
+        assert device.read().values == {"soc": 4.5}
+
+
+def test_a_unit_that_was_certain_once_is_kept(server, phone):
+    phone.zones = "tsens_tz_sensor5 309\n"
+    with thermometer(server, sensors={"soc": "zone:tsens_tz_sensor5"}) as device:
+        assert device.read().values == {"soc": 30.9}
+        phone.zones = "tsens_tz_sensor5 45\n"
+        assert device.read().values == {"soc": 4.5}
+        phone.zones = "tsens_tz_sensor5 0\n"
+        assert device.read().values == {"soc": 0.0}
+
+
+@pytest.mark.parametrize("units", [{"soc": "kelvin"}, {"air": "degC"}, {"skin": "degC"}])
+def test_a_wrong_unit(server, units):
+    with pytest.raises(ConfigurationError, match="units"):
+        thermometer(server, sensors={"soc": "zone:x", "skin": "thermal:y"}, units=units)
+
+
+def test_two_phones_with_one_serial_number(server):
+    server.listing = f"{SERIAL}\toffline\n{SERIAL}\tdevice\n"
+    with pytest.raises(WrongDevice, match="2 devices have this serial number"):
+        thermometer(server).open()
+
+
 def test_a_phone_without_a_battery_sensor(server, phone):
     phone.battery = "  voltage: 0\n  temperature: 0\n"
-    with thermometer(server) as device, pytest.raises(BadReading, match="not told"):
+    with thermometer(server) as device, pytest.raises(BadReading, match="no battery temperature"):
         device.read()
 
 

@@ -233,6 +233,56 @@ def test_lm75_with_limits_of_another_chip(bus):
         thermometer("lm75").open()
 
 
+@pytest.mark.parametrize(
+    ("chip", "raw", "value"), [("lm75", 0x1920, 25.125), ("lm75", 0x1960, 25.375)]
+)
+def test_lm75a_and_b_under_lm75(bus, chip, raw, value):
+    bus.chips[0x48] = lm75(raw)
+    with thermometer("lm75", chip=chip) as device:
+        assert device.read().values == {"temperature": value}
+
+
+POWER_UP = [
+    ("mcp9808", {}, 0x18, mcp9808, 5, 0x0000, 0x0010),
+    ("mcp9808", {}, 0x18, mcp9808, 5, 0xC000, 0xC010),
+    *(
+        ("lm75", {"chip": name}, 0x48, lm75, 0, 0x0000, 0x0100)
+        for name in ("lm75", "lm75b", "tmp75", "tmp102")
+    ),
+]
+
+
+@pytest.mark.parametrize("case", POWER_UP)
+def test_the_power_up_register_is_not_zero_degrees(bus, case):
+    name, options, address, chip, register, zero, one = case
+    bus.chips[address] = chip(zero)
+    with thermometer(name, **options) as device:
+        with pytest.raises(BadReading, match="0 °C is its power-up value"):
+            device.read()
+        bus.chips[address].word(register, one)  # 1 °C, then 0 °C: a cold night
+        assert device.read().values == {"temperature": 1.0}
+        bus.chips[address].word(register, zero)
+        assert device.read().values == {"temperature": 0.0}
+        device.clock.advance(61.0)
+        with pytest.raises(BadReading, match="power-up"):
+            device.read()
+
+
+def test_a_chip_that_has_just_been_powered_is_read_again(bus):
+    bus.chips[0x18] = chip = mcp9808(0x0000)
+    reads = []
+
+    def convert(self, register):
+        reads.append(register)
+        if reads.count(5) == 2:
+            self.word(5, 0xC190)
+
+    chip.on_read = convert
+    with thermometer("mcp9808") as device:
+        assert device.read().values == {"temperature": 25.0}
+        assert device.clock.monotonic() >= 0.25
+
+
 def test_sht3x_crc_of_the_data_sheet():
     assert crc8(b"\xbe\xef") == 0x92
 

@@ -78,7 +78,9 @@ def test_an_input_of_a_sleeping_device_is_absent(sysfs):
         assert device.read().values == {"temp1": 28.0}
 
 
-@pytest.mark.parametrize("content", ["", "hot", "28000 mC", "nan"])
+@pytest.mark.parametrize(
+    "content", ["", "hot", "28000 mC", "nan", "inf", "28_000", "1e300", "٢٨٠٠٠", "28,5"]
+)
 def test_garbage_is_no_value(sysfs, content):
     sysfs.hwmon(0, "lm75", temp1_input=content)
     with thermometer("hwmon", sysfs, chip="lm75") as device, pytest.raises(BadReading):
@@ -151,6 +153,27 @@ def test_iio_processed_wins(sysfs):
 def test_iio_raw_without_scale_is_refused(sysfs):
     sysfs.iio(0, "adc", in_temp_raw="731")
     with thermometer("iio", sysfs, chip="adc") as device, pytest.raises(BadReading, match="scale"):
+        device.read()
+
+
+def test_the_power_on_value_of_a_1_wire_sensor_under_hwmon(sysfs):
+    sysfs.hwmon(0, "w1_slave_temp", temp1_input="85000")
+    sysfs.hwmon(1, "it87", temp1_input="85000")
+    with (
+        thermometer("hwmon", sysfs, chip="w1_slave_temp") as device,
+        pytest.raises(BadReading, match="power-on"),
+    ):
+        device.read()
+    with thermometer("hwmon", sysfs, chip="it87") as device:
+        assert device.read().values == {"temperature": 85.0}
+
+
+def test_a_zone_that_is_not_fitted(sysfs):
+    sysfs.zone(0, "camera-therm-usr", "-40000")
+    with (
+        thermometer("thermal_zone", sysfs, zone="camera-therm-usr") as device,
+        pytest.raises(BadReading, match="not fitted"),
+    ):
         device.read()
 
 

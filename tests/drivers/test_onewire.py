@@ -11,7 +11,7 @@ import time
 import pytest
 from thermocald_drivers.onewire import crc8, decode
 
-from tests.drivers.fakes.sysfs import Sysfs, w1_slave
+from tests.drivers.fakes.sysfs import Sysfs, w1_crc, w1_slave
 from thermocald.errors import BadReading, DeviceGone, DeviceNotFound, DeviceTimeout
 from thermocald.hal import SystemClock, VirtualClock, open_device
 
@@ -62,12 +62,12 @@ def test_crc_of_the_application_note():
     ("content", "why"),
     [
         ("", "empty: no answer"),
-        ("garbage", "no w1_slave"),
+        ("garbage", "not a w1_slave"),
         (CRC_NO, "CRC error"),
         (ZEROS, "all zeros"),
-        (w1_slave(21.0).replace("t=21000", "t=21500"), "does not fit"),
+        (w1_slave(21.0).replace("t=21000", "t=21500"), "does not follow"),
         (w1_slave(21.0).replace("YES", "NO"), "CRC error"),
-        (w1_slave(21.0).splitlines()[0], "no w1_slave"),
+        (w1_slave(21.0).splitlines()[0], "not a w1_slave"),
         (w1_slave(125.5), "outside"),
     ],
 )
@@ -116,6 +116,98 @@ def test_85_does_not_vouch_for_itself(sysfs):
         clock.advance(40.0)
         with pytest.raises(BadReading, match="power-on value"):
             device.read()
+
+
+def scratchpad(pad, milli):
+    """A w1_slave file around 8 bytes; the CRC by the fake's own code."""
+    data = bytes.fromhex(pad)
+    text = f"{data.hex(' ')} {w1_crc(data):02x}"
+    return f"{text} : crc={w1_crc(data):02x} YES\n{text} t={milli}"
+
+
+# C. Petrich's survey of counterfeits, with the resolutions of 9 to 12 bits
+POWER_ON_PADS = [
+    *(("28", f"50 05 4b 46 {c} ff 0c 10", 85000) for c in ("1f", "3f", "5f", "7f")),
+    ("28", "50 05 00 00 1f ff 0c 10", 85000),
+    ("28", "50 05 4b 46 7f ff 10 10", 85000),
+    ("28", "50 05 4b 46 1f ff 1f 10", 85000),
+    ("28", "50 05 7f 80 7f ff 0c 10", 85000),
+    ("28", "50 05 55 aa 7f ff 0c 10", 85000),
+    ("28", "50 05 55 00 7f ff 0c 10", 85000),
+    ("28", "50 05 ff ff 7f ff ff ff", 85000),
+    ("28", "90 01 55 05 7f 7e 81 66", 25000),  # family D2
+    ("28", "90 01 55 05 7f 3a 52 66", 25000),  # family D1
+    ("28", "50 05 4b 46 ff ff 0c 10", 85046),  # GX20MH01, 14 bits
+    ("22", "50 05 4b 46 7f ff 0c 10", 85000),
+    ("42", "50 05 4b 46 7f ff 0c 10", 85000),
+    ("3b", "50 05 4b 46 7f ff 0c 10", 85000),
+    ("10", "aa 00 4b 46 ff ff 0c 10", 85000),
+]
+
+
+@pytest.mark.parametrize(("family", "pad", "milli"), POWER_ON_PADS)
+def test_the_power_on_value_of_every_family(sysfs, family, pad, milli):
+    rom = f"{family}-000000bfe244"
+    sysfs.w1(rom, scratchpad(pad, milli))
+    sensors = {"temperature": rom}
+    with thermometer(sysfs, sensors=sensors) as device:
+        with pytest.raises(BadReading, match="power-on value"):
+            device.read()
+        near = (
+            w1_slave(milli / 1000 - 1.0)
+            if family != "10"
+            else scratchpad("a8 00 4b 46 ff ff 0c 10", 84000)
+        )
+        sysfs.w1(rom, near)
+        device.read()
+        sysfs.w1(rom, scratchpad(pad, milli))
+        assert device.read().values["temperature"] == pytest.approx(milli / 1000)
+
+
+@pytest.mark.parametrize(
+    ("family", "pad", "milli", "celsius"),
+    [
+        ("28", "90 01 4b 46 7f ff 10 10", 25000, 25.0),  # 25 °C of a chip that is not of family D
+        ("28", "93 01 7f 80 7f ff 0d 10", 25187, 25.187),
+        ("28", "90 01 4b 46 e3 ff 0c 10", 25046, 25.046),  # GX20MH01
+        ("28", "90 01 4b 46 e3 ff 0c 10", 25000, 25.046),  # by a kernel that does not know it
+        ("28", "70 fe 4b 46 e2 ff 0c 10", -24968, -24.968),
+        ("3b", "94 01 98 19 f0 ff ff ff", 25250, 25.25),  # MAX31850
+        ("10", "2a 00 4b 46 ff ff 0e 10", 20875, 20.875),
+        ("10", "e6 ff 4b 46 ff ff 08 10", -12750, -12.75),
+    ],
+)
+def test_readings_of_the_family(sysfs, family, pad, milli, celsius):
+    rom = f"{family}-000000bfe244"
+    sysfs.w1(rom, scratchpad(pad, milli))
+    with thermometer(sysfs, sensors={"temperature": rom}) as device:
+        assert device.read().values == {"temperature": celsius}
+
+
+@pytest.mark.parametrize(
+    ("family", "pad", "milli", "why"),
+    [
+        ("3b", "95 01 98 19 f0 ff ff ff", 25250, "reports a fault"),
+        ("10", "2a 00 4b 46 ff ff 0e 00", 0, "COUNT_PER_C"),
+        ("28", "ff 07 4b 46 7f ff 0c 10", 127937, "outside"),  # a failed conversion
+        ("28", "6a fe 4b 46 7f ff 0c 10", -5625, "does not follow"),
+    ],
+)
+def test_faults_of_the_family(sysfs, family, pad, milli, why):
+    rom = f"{family}-000000bfe244"
+    sysfs.w1(rom, scratchpad(pad, milli))
+    with (
+        thermometer(sysfs, sensors={"temperature": rom}) as device,
+        pytest.raises(BadReading, match=why),
+    ):
+        device.read()
+
+
+@pytest.mark.parametrize("milli", ["2_1000", "٢١٠٠٠", "21000.0", "+21000", "nan"])
+def test_numbers_that_the_kernel_does_not_print(sysfs, milli):
+    sysfs.w1(ROM, w1_slave(21.0).replace("t=21000", f"t={milli}"))
+    with thermometer(sysfs) as device, pytest.raises(BadReading, match="not a w1_slave"):
+        device.read()
 
 
 def test_a_crc_error_is_read_once_more(sysfs, monkeypatch):

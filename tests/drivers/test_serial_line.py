@@ -194,6 +194,73 @@ def test_checksums(instrument, kind):
             device.read()
 
 
+def answer(instrument, line, **options):
+    """What the driver makes of one line: °C, or None where it refuses."""
+    far = instrument({b"T?\r\n": line + b"\r\n"})
+    with asked(far, timeout_s=0.15, **options) as device:
+        try:
+            return device.read().values["temperature"]
+        except BadReading:
+            return None
+
+
+DEGREES = r"(?P<temperature>[-+]?\d+\.\d+) ?°C"
+ANY = r"T=(?P<temperature>\S+)"
+
+
+@pytest.mark.parametrize("sign", ["°".encode(), b"\xb0", b"\xf8", b"\xdf", "º".encode()])
+def test_degree_signs_of_other_encodings(instrument, sign):
+    assert answer(instrument, b"27.0" + sign + b"C", pattern=DEGREES) == 27.0
+
+
+@pytest.mark.parametrize(
+    ("text", "celsius"),
+    [("24,5", 24.5), ("+24.5", 24.5), ("-0.5", -0.5), ("2.45e1", 24.5), ("nan", None),
+     ("inf", None), ("1e300", None), ("2_5.0", None), ("٢٥.٠", None), ("1.024,5", None),
+     ("24.5.1", None), ("0x1A", None), ("", None), ("--5", None)],
+)  # fmt: skip
+def test_what_counts_as_a_number(instrument, text, celsius):
+    assert answer(instrument, f"T={text}".encode(), pattern=ANY) == celsius
+
+
+@pytest.mark.parametrize(
+    "celsius", ["-127.00", "85.00", "-45.00", "-46.85", "-50.0", "-40.0", "125.0", "130.0",
+                "-145.75", "998.8", "-242.02", "1037.55", "-999"],
+)  # fmt: skip
+def test_what_firmware_prints_without_a_sensor(instrument, celsius):
+    assert answer(instrument, f"T={celsius}".encode(), pattern=ANY) is None
+
+
+def test_the_user_decides_what_means_no_sensor(instrument):
+    assert answer(instrument, b"T=85.00", pattern=ANY, refuse_c=[]) == 85.0
+    assert answer(instrument, b"T=21.00", pattern=ANY, refuse_c=[21]) is None
+    assert answer(instrument, b"T=185.0", pattern=ANY, unit="F") is None  # 85 °C
+    assert answer(instrument, b"T=240.0", pattern=ANY, maximum_c=300) == 240.0
+
+
+@pytest.mark.parametrize("given", ["ZZ", "1_", "  ", "+1", "٢٥"])
+def test_a_checksum_that_is_not_hexadecimal(instrument, given):
+    pattern = PATTERN + r"\*(?P<checksum>..)"
+    far = instrument({b"T?\r\n": f"T=20.50*{given}\r\n".encode()})
+    with asked(far, pattern=pattern, checksum="xor") as device, pytest.raises(BadReading):
+        device.read()
+
+
+def test_the_checksum_is_of_the_bytes(instrument):
+    line = "T=20.50°C*".encode()
+    total = sum(line) % 256
+    pattern = r"T=(?P<temperature>[\d.]+)°C\*(?P<checksum>..)"
+    for text in (line + b"%02X", line + b"%02x"):
+        assert answer(instrument, text % total, pattern=pattern, checksum="sum8") == 20.5
+
+
+def test_one_channel_without_a_sensor_does_not_take_the_others_along(instrument):
+    far = instrument({b"T?\r\n": b"20.5;-127.0;nan\r\n"})
+    pattern = r"(?P<a>\S+);(?P<b>\S+);(?P<c>\S+)"
+    with asked(far, pattern=pattern) as device:
+        assert device.read().values == {"a": 20.5}
+
+
 def test_unplugged_and_plugged_again(instrument, tmp_path):
     """A by-id link comes back with another tty behind it."""
     link = tmp_path / "usb-thermometer"
@@ -250,10 +317,10 @@ def test_permission_denied(instrument, monkeypatch):
         ({"pattern": "("}, "pattern"),
         ({"pattern": r"\d+"}, "name the value"),
         ({"pattern": PATTERN, "checksum": "xor"}, "needs a group"),
-        ({"pattern": PATTERN, "unit": "R"}, "none of C, F, K"),
+        ({"pattern": PATTERN, "unit": "R"}, "not one of C, F, K"),
         ({"pattern": PATTERN, "framing": "9N1"}, "8N1"),
         ({"pattern": PATTERN, "baud": 3}, "not within"),
-        ({"instrument": "acme"}, "none of papouch-tm"),
+        ({"instrument": "acme"}, "not one of papouch-tm"),
     ],
 )
 def test_a_wrong_configuration(options, message):

@@ -124,10 +124,11 @@ class FakePhone:
 
 
 class AdbServer:
-    """`phones` by serial number."""
+    """`phones` by serial number; `listing` in place of theirs, as `adb devices` prints it."""
 
     def __init__(self) -> None:
         self.phones: dict[str, FakePhone] = {}
+        self.listing: str | None = None
         self._server = socket.create_server(("127.0.0.1", 0))
         self.port = self._server.getsockname()[1]
         self._lines: list[socket.socket] = []
@@ -166,7 +167,8 @@ class AdbServer:
         if request == "host:version":
             _block(line, "0029")
         elif request == "host:devices":
-            _block(line, "".join(f"{s}\t{p.state}\n" for s, p in self.phones.items()))
+            mine = "".join(f"{s}\t{p.state}\n" for s, p in self.phones.items())
+            _block(line, mine if self.listing is None else self.listing)
         elif match := re.fullmatch(r"host-serial:(.*):features", request):
             if self._phone(line, match[1]):
                 _block(line, "shell_v2,cmd,stat_v2")

@@ -9,7 +9,9 @@
      │    ├── ImageError                      an image cannot be read or used
      │    ├── StoreError                      a store is broken, foreign, or cannot be written
      │    │    ├── StoreFullError             the disk has no room for it
-     │    │    └── StoreVersionError          a store of a newer program
+     │    │    ├── StoreVersionError          a store of a newer program
+     │    │    └── ServerError                a server's store refused: a person must act
+     │    │         └── ServerGone (ConnectionError)  out of reach; may pass
      │    └── GeometryError                   too little geometry for what was asked
      └── DeviceError (OSError)                exit 3: a device failed
           ├── TransientDeviceError            may pass: the daemon retries with back-off
@@ -41,6 +43,8 @@ __all__ = [
     "ImageError",
     "PermanentDeviceError",
     "RecordingError",
+    "ServerError",
+    "ServerGone",
     "StoreError",
     "StoreFullError",
     "StoreVersionError",
@@ -96,6 +100,19 @@ class StoreFullError(StoreError):
 
 class StoreVersionError(StoreError):
     """A store was written by a newer program."""
+
+
+class ServerError(StoreError):
+    """A server's store refused what was asked; a person must act.
+
+    about_values: it is what a row holds that was refused, and not the connection or the role.
+    """
+
+    about_values = False
+
+
+class ServerGone(ServerError, ConnectionError):
+    """A server's store is out of reach, full or restarting: it may pass by itself."""
 
 
 class GeometryError(DataError):

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["StoredEpoch", "insert_epoch", "select_covariance", "select_epochs"]
+__all__ = ["StoredEpoch", "insert_epoch", "select_covariance", "select_details", "select_epochs"]
 
 _PARTS = 1024  # detail.id = epoch.id * _PARTS + part; part 0 is the covariance
 _PART_BYTES = 1100  # seven to a page
@@ -157,6 +157,11 @@ def select_covariance(connection: sqlite3.Connection, series: int, number: int) 
     ).fetchone()
     data = b"" if row is None else _detail(connection, row[0], 0, 1)
     return unpack_covariance(data) if data else None
+
+
+def select_details(connection: sqlite3.Connection, id_: int) -> tuple[bytes, bytes]:
+    """The covariance and the observations of the row `id_`, packed; empty where it has none."""
+    return _detail(connection, id_, 0, 1), _detail(connection, id_, 1, _PARTS)
 
 
 def _epoch(

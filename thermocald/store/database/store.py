@@ -16,6 +16,7 @@ import numpy as np
 
 from thermocald.errors import StoreError, StoreFullError
 from thermocald.store.database import columns as column_chunks
+from thermocald.store.database.changes import rows_after
 from thermocald.store.database.connection import Mode, connect, in_words
 from thermocald.store.database.epoch_columns import FIXED, status_codes
 from thermocald.store.database.epoch_table import (
@@ -299,6 +300,11 @@ class Store:
             )
             for name in series.head.channels
         }
+
+    def rows_after(self, table: str, after: int, limit: int) -> list[dict[str, Any]]:
+        """Rows of a growing table as they were kept, see `changes`: for a forwarder."""
+        with self._lock, in_words(self.path, f"{table}s cannot be read", reading=True):
+            return list(rows_after(self._db, table, after, limit))
 
     def events(self, series: StoredSeries | None = None, since_utc: float = 0.0) -> list[Event]:
         """What happened, oldest first; of one series, or all."""

@@ -1,0 +1,86 @@
+"""A real PostgreSQL of its own on loopback, for the tests that need one."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import subprocess
+from pathlib import Path
+
+import pytest
+
+
+def _programs() -> Path | None:
+    on_path = shutil.which("initdb")
+    found = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"))
+    return Path(on_path).parent if on_path else found[-1].parent if found else None
+
+
+class Server:
+    """A cluster in a folder; `stop` and `start` as often as a test likes."""
+
+    def __init__(self, programs: Path, folder: Path) -> None:
+        self.programs, self.folder = programs, folder
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.port = probe.getsockname()[1]
+        # PostgreSQL refuses to run as root
+        self.user = ["runuser", "-u", "postgres", "--"] if os.geteuid() == 0 else []
+        if self.user:
+            shutil.chown(folder, "postgres")
+        password = folder / "password"
+        password.write_text("secret\n")
+        self.run("initdb", "-D", str(folder / "data"), "-A", "scram-sha-256", "-U", "owner",
+                 f"--pwfile={password}", "--no-sync")  # fmt: skip
+
+    def run(self, program: str, *arguments: str) -> None:
+        subprocess.run(
+            [*self.user, str(self.programs / program), *arguments],
+            check=True, stdout=subprocess.DEVNULL, cwd="/", timeout=60,
+        )  # fmt: skip
+
+    def start(self) -> None:
+        options = (
+            f"-p {self.port} -c listen_addresses=127.0.0.1 -c fsync=off "
+            f"-c unix_socket_directories={self.folder}"
+        )
+        self.run("pg_ctl", "-D", str(self.folder / "data"), "-w", "-o", options,
+                 "-l", str(self.folder / "log"), "start")  # fmt: skip
+
+    def stop(self, mode: str = "immediate") -> None:
+        self.run("pg_ctl", "-D", str(self.folder / "data"), "-w", "-m", mode, "stop")
+
+    def address(self, query="", *, user="owner:secret", name="postgres") -> str:
+        return f"postgresql://{user}@127.0.0.1:{self.port}/{name}{query}"
+
+
+@pytest.fixture(scope="session")
+def cluster(tmp_path_factory):
+    programs = _programs()
+    if programs is None:
+        pytest.skip("PostgreSQL is not installed (apt install postgresql)")
+    pytest.importorskip("sqlalchemy", reason="pip install thermocald[server]")
+    folder = tmp_path_factory.mktemp("postgres")
+    for parent in (folder, *folder.parents[:3]):
+        if parent.stat().st_uid == os.geteuid():
+            parent.chmod(parent.stat().st_mode | 0o011)
+    server = Server(programs, folder)
+    server.start()
+    yield server
+    server.stop()
+
+
+@pytest.fixture
+def server(cluster):
+    """The cluster with an empty, initialised database `thermocald`."""
+    import psycopg
+
+    from thermocald.store.server.address import ServerAddress
+    from thermocald.store.server.schema import create_tables
+
+    with psycopg.connect(cluster.address(), autocommit=True) as connection:
+        connection.execute("DROP DATABASE IF EXISTS thermocald WITH (FORCE)")
+        connection.execute("CREATE DATABASE thermocald")
+    create_tables(ServerAddress.parse(cluster.address(name="thermocald")))
+    return cluster

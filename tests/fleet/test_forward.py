@@ -1,0 +1,227 @@
+"""Forwarding: everything arrives once, whatever breaks on the way, and reads as it did at home."""
+
+from __future__ import annotations
+
+import importlib.util
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thermocald.errors import ServerError, ServerGone, StoreVersionError, UsageError
+from thermocald.fleet.forward import Forwarder, forward_forever
+from thermocald.store.database.row import Event, LoggedReading
+from thermocald.store.database.store import Store
+
+_spec = importlib.util.spec_from_file_location(
+    "store_fixtures", Path(__file__).parents[1] / "store" / "conftest.py"
+)
+_fixtures = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(_fixtures)
+field, head, make_epoch, make_result, store_path, filled = (
+    getattr(_fixtures, name)
+    for name in ("field", "head", "make_epoch", "make_result", "store_path", "filled")
+)
+
+psycopg = pytest.importorskip("psycopg", reason="pip install thermocald[server]")
+from thermocald.store.server.address import ServerAddress, is_server  # noqa: E402
+from thermocald.store.server.reader import ServerStore  # noqa: E402
+from thermocald.store.server.schema import grant  # noqa: E402
+
+
+def address(server, query="", **given):
+    return ServerAddress.parse(server.address(query, name="thermocald", **given))
+
+
+def count(server, table):
+    with psycopg.connect(server.address(name="thermocald")) as connection:
+        return connection.execute(f"SELECT count(*) FROM {table}").fetchone()[0]
+
+
+def test_server_and_store_give_the_same(filled, server, make_result):
+    store, series = filled
+    store.amend(series, 5, make_result(105, "ok"))
+    store.add_event(Event(1.6e9, "knock", "a \0 knock", series.id, 3, {"px": 0.4}))
+    store.add_readings([LoggedReading("logger", 1.6e9 + i, {"t": 20.0 + i}) for i in range(3)])
+    done = Forwarder(store.path, address(server), "bank").send_waiting()
+    assert dict(done.sent) == {"epoch": 21, "event": 1, "reading": 3}
+    with ServerStore(address(server, "?station=bank&camera=rpi")) as there:
+        (found,) = there.all_series()
+        assert (found.head, found.start, found.settings) == (
+            series.head, series.start, series.settings
+        )
+        assert np.array_equal(found.testfield.points, series.testfield.points)
+        names = [*store.column_names(series), "blur"]
+        mine, theirs = store.series_columns(series, names), there.series_columns(found, names)
+        for name in names:
+            assert np.array_equal(mine[name], theirs[name], equal_nan=name != "status"), name
+        assert np.array_equal(store.covariances(series, [3, 5]), there.covariances(found, [3, 5]))
+        for a, b in zip(store.epochs(series), there.epochs(found), strict=True):
+            assert (a.epoch.number, a.revision, a.extra) == (b.epoch.number, b.revision, b.extra)
+            assert np.array_equal(a.epoch.observations.points, b.epoch.observations.points)
+            assert np.array_equal(a.result.covariance, b.result.covariance)
+            assert a.result.rejected == b.result.rejected
+        (event,) = there.events(found)
+        assert (event.text, event.epoch, event.data) == ("a \ufffd knock", 3, {"px": 0.4})
+        assert [r.values for r in there.readings("logger")] == [
+            r.values for r in store.readings("logger")
+        ]
+        assert there.last_epoch(found) == store.last_epoch(series)
+
+
+def test_what_is_sent_again_is_there_once(filled, server, tmp_path):
+    store, _ = filled
+    for _ in range(2):
+        Forwarder(store.path, address(server), "bank", tmp_path / "cursor", batch=3).send_waiting()
+        (tmp_path / "cursor").unlink()
+    assert count(server, "epoch") == 20
+    Forwarder(store.path, address(server), "hill", tmp_path / "other").send_waiting()
+    assert count(server, "epoch") == 40
+
+
+def test_a_role_that_may_only_insert_is_enough(filled, server):
+    store, _ = filled
+    with psycopg.connect(server.address(), autocommit=True) as connection:
+        connection.execute("DROP ROLE IF EXISTS pi")
+        connection.execute("CREATE ROLE pi LOGIN PASSWORD 'berry'")
+    try:
+        pi = address(server, user="pi:berry")
+        with pytest.raises(ServerError, match="grant it"):
+            Forwarder(store.path, pi, "bank").send_waiting()
+        grant(address(server), "pi", writes=True)
+        assert Forwarder(store.path, pi, "bank").send_waiting().rows == 20
+        with ServerStore(pi) as there, pytest.raises(ServerError, match="may not"):
+            there.all_series()
+        with psycopg.connect(server.address(user="pi:berry", name="thermocald")) as connection:
+            for statement in ("DELETE FROM epoch", "UPDATE epoch SET number = 0"):
+                with pytest.raises(psycopg.errors.InsufficientPrivilege):
+                    connection.execute(statement)
+                connection.rollback()
+    finally:
+        with psycopg.connect(server.address(name="thermocald"), autocommit=True) as connection:
+            connection.execute("DROP OWNED BY pi")
+            connection.execute("DROP ROLE pi")
+
+
+def test_months_become_partitions_and_wrong_clocks_do_not_matter(server, filled, make_epoch):
+    from dataclasses import replace
+
+    store, series = filled
+    for number, time in ((100, 1.7e9), (101, 3.0), (102, 1.7e9 + 40 * 86400), (103, 9e12)):
+        store.append(series, replace(make_epoch(number), frame_time=time), clock_trusted=False)
+    Forwarder(store.path, address(server), "bank").send_waiting()
+    with psycopg.connect(server.address(name="thermocald")) as connection:
+        parts = dict(
+            connection.execute("SELECT tableoid::regclass::text, count(*) FROM epoch GROUP BY 1")
+        )
+    assert parts == {"epoch_2020_09": 20, "epoch_2023_11": 1, "epoch_2023_12": 1, "epoch_other": 2}
+
+
+@pytest.mark.parametrize(
+    ("user", "name", "words"),
+    [
+        ("owner:wrong", "thermocald", "password"),
+        ("owner:secret", "nowhere", "no such database"),
+        ("owner:secret", "postgres", "server init"),
+    ],
+)
+def test_what_a_person_must_mend_is_said(filled, server, user, name, words):
+    store, _ = filled
+    wrong = ServerAddress.parse(server.address(user=user, name=name))
+    with pytest.raises(ServerError, match=words) as told:
+        Forwarder(store.path, wrong, "bank").send_waiting()
+    assert not isinstance(told.value, ServerGone)
+    assert "secret" not in str(told.value)
+    assert "wrong" not in str(told.value).split("(")[0]
+
+
+def test_a_server_of_another_version_is_refused(filled, server):
+    store, _ = filled
+    with psycopg.connect(server.address(name="thermocald")) as connection:
+        connection.execute("UPDATE alembic_version SET version_num = '0000'")
+    with pytest.raises(StoreVersionError, match="server init"):
+        Forwarder(store.path, address(server), "bank").send_waiting()
+
+
+def test_a_row_that_the_server_refuses_stops_no_other(filled, server):
+    store, _ = filled
+    with psycopg.connect(server.address(name="thermocald")) as connection:
+        connection.execute("ALTER TABLE epoch ADD CHECK (number <> 7)")
+    forwarder = Forwarder(store.path, address(server), "bank", batch=8)
+    done = forwarder.send_waiting()
+    assert (done.sent["epoch"], done.refused) == (19, 1)
+    assert count(server, "epoch") == 19
+    assert forwarder.send_waiting().rows == 0
+
+
+def test_a_server_that_dies_and_comes_back_gets_everything_once(filled, server, make_epoch):
+    store, series = filled
+    troubles, sent, rounds = [], [], []
+
+    def report(progress, trouble):
+        troubles.append(trouble)
+        if progress:
+            sent.append(progress.rows)
+
+    def wait(_seconds):
+        rounds.append(len(rounds))
+        if len(rounds) == 1:
+            server.stop()
+        for n in range(3):
+            store.append(series, make_epoch(100 * len(rounds) + n))
+        if len(rounds) == 3:
+            server.start()
+        return len(rounds) == 6
+
+    forward_forever(Forwarder(store.path, address(server), "bank", batch=4), wait, report)
+    assert [bool(t) for t in troubles[:4]] == [False, True, True, False]
+    assert "cannot be reached" in troubles[1]
+    assert sum(sent) == count(server, "epoch") == 20 + 5 * 3
+
+
+def test_two_forwarders_at_once_do_no_harm(filled, server, tmp_path):
+    store, _ = filled
+    errors = []
+
+    def send(name):
+        try:
+            Forwarder(store.path, address(server), "bank", tmp_path / name, batch=2).send_waiting()
+        except Exception as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=send, args=(f"c{i}",)) for i in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert errors == []
+    assert count(server, "epoch") == 20
+
+
+def test_a_hostile_name_is_a_name(server, tmp_path, head, field, make_epoch):
+    from dataclasses import replace
+
+    evil = "x'); DROP TABLE epoch; --"
+    with Store.open(tmp_path / "k.db", "append") as store:
+        series = store.create_series(
+            replace(head, series=evil, camera=replace(head.camera, name=evil)), field
+        )
+        store.append(series, make_epoch(1))
+        Forwarder(store.path, address(server), evil).send_waiting()
+    with ServerStore(address(server)) as there:
+        found = there.find_series(evil, evil)
+        assert there.series_columns(found, ["epoch", evil])["epoch"].tolist() == [1]
+
+
+def test_addresses():
+    path = Path("postgresql://u:p@h:5433/db?camera=a%20b&series=M1&sslmode=verify-full")
+    parsed = ServerAddress.parse(path)
+    assert is_server(path)
+    assert not is_server(Path("postgresql.db"))
+    assert (parsed.camera, parsed.series, parsed.station) == ("a b", "M1", None)
+    assert parsed.url == "postgresql+psycopg://u:p@h:5433/db?sslmode=verify-full"
+    assert str(parsed) == "postgresql://u@h:5433/db"
+    for wrong in ("postgresql://h:port/db", "sqlite:///x"):
+        with pytest.raises(UsageError):
+            ServerAddress.parse(wrong)

@@ -1,0 +1,55 @@
+"""`thermocald server`: the tables of a PostgreSQL server, and who may use them."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from thermocald.cli.common import say
+
+__all__ = ["register"]
+
+_Address = Annotated[
+    str, typer.Argument(metavar="ADDRESS", help="postgresql://OWNER@HOST/DATABASE, an owner's.")
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    group = typer.Typer(no_args_is_help=True, help="The database of a fleet.")
+    group.command("init")(init)
+    group.command("grant")(grant)
+    app.add_typer(group, name="server")
+
+
+def init(address: _Address) -> None:
+    """Make the tables, or bring older ones up to date.
+
+    Example: thermocald server init postgresql://owner@db.example/thermocald
+    """
+    from thermocald.store.server.address import ServerAddress
+    from thermocald.store.server.schema import create_tables
+
+    parsed = ServerAddress.parse(address)
+    create_tables(parsed)
+    say(f"{parsed}: the tables are as this program needs them")
+
+
+def grant(
+    address: _Address,
+    role: Annotated[str, typer.Argument(help="A role that exists.")],
+    forward: Annotated[
+        bool, typer.Option("--forward/--read", help="It may only insert; or only read.")
+    ] = False,
+) -> None:
+    """Let a role forward (insert and nothing else) or read.
+
+    Example: thermocald server grant postgresql://owner@db.example/thermocald gauge7 --forward
+    """
+    from thermocald.store.server.address import ServerAddress
+    from thermocald.store.server.schema import grant as give
+
+    parsed = ServerAddress.parse(address)
+    give(parsed, role, writes=forward)
+    say(f"{parsed}: {role} may {'insert' if forward else 'read'}")

@@ -1,0 +1,40 @@
+"""What a store has kept since, row by row in the order in which it was kept: to send elsewhere.
+
+Rows are never changed or deleted, so the last id that was sent is all a sender has to remember.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from thermocald.store.database.epoch_table import select_details
+
+if TYPE_CHECKING:
+    import sqlite3
+    from collections.abc import Iterator
+
+__all__ = ["KEPT", "rows_after"]
+
+KEPT = ("epoch", "event", "reading")
+"""The tables that grow while a daemon runs."""
+
+
+def rows_after(
+    connection: sqlite3.Connection, table: str, after: int, limit: int
+) -> Iterator[dict[str, Any]]:
+    """Up to `limit` rows of one of KEPT with an id above `after`, as {column: value}.
+
+    An epoch also has `covariance` and `observations`, bytes as `blob` packs them, or None.
+    """
+    if table not in KEPT:
+        raise ValueError(f"{table!r} is not one of {', '.join(KEPT)}")
+    cursor = connection.execute(
+        f"SELECT * FROM {table} WHERE id > ? ORDER BY id LIMIT ?", (after, limit)
+    )
+    names = [column[0] for column in cursor.description]
+    for values in cursor:
+        row = dict(zip(names, values, strict=True))
+        if table == "epoch":
+            covariance, observations = select_details(connection, row["id"])
+            row |= {"covariance": covariance or None, "observations": observations or None}
+        yield row

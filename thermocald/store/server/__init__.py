@@ -1,0 +1,1 @@
+"""The store of many stations: one PostgreSQL database, forwarded to and read by every analysis."""

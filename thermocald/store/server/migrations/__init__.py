@@ -1,0 +1,1 @@
+"""The server's tables, version by version, as Alembic runs them."""

@@ -1,0 +1,342 @@
+"""Reading a server's store with the methods of `store.database.store.Store` that read.
+
+Columns come as whole arrays: PostgreSQL's binary COPY of double precision values has records of a
+fixed length, which NumPy reads as they stand.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from thermocald.epoch import Epoch
+from thermocald.errors import StoreError
+from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
+from thermocald.store.database.blob import unpack_covariance, unpack_observations
+from thermocald.store.database.epoch_columns import FIXED
+from thermocald.store.database.epoch_table import StoredEpoch
+from thermocald.store.database.row import EpochResult, Event, LoggedReading, StoredSeries
+from thermocald.store.database.schema import sql_name
+from thermocald.store.recording.head import parse_head
+from thermocald.store.recording.readings import interpolate_readings
+from thermocald.store.recording.testfield_file import parse_testfield
+from thermocald.store.server.address import ServerAddress
+from thermocald.store.server.connection import connect, in_words, require_revision
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+    from types import TracebackType
+    from uuid import UUID
+
+    from numpy.typing import NDArray
+
+    from thermocald.photogrammetry.field.testfield import Observations
+
+    Array = NDArray[np.float64]
+
+__all__ = ["ServerStore"]
+
+_COPY_HEADER = 19  # bytes: signature 11, flags 4, length of the extension 4
+_BLOCK = 500  # epochs fetched at a time by a server-side cursor
+_LATEST = (
+    "FROM epoch e WHERE series = %s AND NOT EXISTS (SELECT 1 FROM epoch later "
+    "WHERE later.series = e.series AND later.number = e.number AND later.revision > e.revision "
+    "AND later.revision > 0)"
+)
+
+
+class ServerStore:
+    """An open store on a server, narrowed to what its address selects; use it in a `with` block."""
+
+    def __init__(self, address: ServerAddress) -> None:
+        self.address = address
+        self.path = Path(str(address))
+        self._keys: list[UUID] = []
+        self._engine = connect(address)
+        try:
+            require_revision(self._engine, address)
+        except BaseException:
+            self._engine.dispose()
+            raise
+
+    @classmethod
+    def open(cls, source: Path | str) -> Self:
+        """Open by address. Raises UsageError, ServerGone, ServerError, StoreVersionError."""
+        return cls(ServerAddress.parse(source))
+
+    def close(self) -> None:
+        """Close all connections; may be called twice."""
+        self._engine.dispose()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def all_series(self) -> list[StoredSeries]:
+        """All series that the address selects, in the order in which they were begun."""
+        wanted = self.address
+        rows = self._query(
+            "SELECT s.key, station, head, csv, start, identity, settings, created_utc "
+            "FROM series s JOIN testfield USING (digest) "
+            "WHERE station = coalesce(%s, station) AND camera = coalesce(%s, camera) "
+            "AND name = coalesce(%s, name) ORDER BY created_utc, s.key",
+            (wanted.station, wanted.camera, wanted.series),
+        )
+        return [
+            StoredSeries(
+                self._number(key),
+                parse_head(json.loads(head), self.path),
+                parse_testfield(csv, self.path),
+                start,
+                {"station": station, **json.loads(identity)},
+                json.loads(settings),
+                created,
+            )
+            for key, station, head, csv, start, identity, settings, created in rows
+        ]
+
+    def find_series(self, camera: str | None = None, name: str | None = None) -> StoredSeries:
+        """The one series of a camera and a name, either of which may be left open.
+
+        Raises StoreError, listing what there is, if none or several fit.
+        """
+        every = self.all_series()
+        found = [s for s in every if camera in (None, s.camera) and name in (None, s.name)]
+        if len(found) != 1:
+            there = ", ".join(
+                f"{s.identity['station']}: {s.camera}/{s.name}" for s in every[:20]
+            ) or "none"
+            raise StoreError(
+                f"{self.path}: {'several series fit' if found else 'there is no such series'}; "
+                f"station: camera/series there: {there}; "
+                "select with ?station=…&camera=…&series=… in the address"
+            )
+        return found[0]
+
+    def last_epoch(self, series: StoredSeries) -> int | None:
+        """The number of the last epoch, None if there is none."""
+        key = self._keys[series.id]
+        ((last,),) = self._query("SELECT max(number) FROM epoch WHERE series = %s", (key,))
+        return None if last is None else int(last)
+
+    def column_names(self, series: StoredSeries) -> list[str]:
+        """What `series_columns` can give, but extra columns."""
+        return ["epoch", *FIXED[1:], "status", *series.head.channels]
+
+    def series_columns(self, series: StoredSeries, names: Sequence[str]) -> dict[str, NDArray[Any]]:
+        """Columns (E,) over all epochs by name, as `Store.series_columns`."""
+        key = self._keys[series.id]
+        numeric = [name for name in dict.fromkeys(names) if name != "status"]
+        columns: dict[str, NDArray[Any]] = {}
+        if numeric:
+            columns |= self._copy(key, series, numeric)
+        if "status" in names:
+            rows = self._query(f"SELECT status {_LATEST} ORDER BY number", (key,))
+            columns["status"] = np.array([status for (status,) in rows], dtype=np.str_)
+        return {name: columns[name] for name in names}
+
+    def temperatures_at_frame(self, series: StoredSeries) -> dict[str, Array]:
+        """Every channel at the times of the frames, {name: (E,) °C}."""
+        names = ["frame_time", "temperature_time", *series.head.channels]
+        columns = self.series_columns(series, names)
+        return {
+            name: interpolate_readings(
+                columns["frame_time"], columns["temperature_time"], columns[name]
+            )
+            for name in series.head.channels
+        }
+
+    def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
+        """(E, 16, 16) covariances of some epochs, NaN for those without a result."""
+        rows = self._query(
+            f"SELECT number, covariance {_LATEST} AND number = ANY(%s)",
+            (self._keys[series.id], [int(n) for n in numbers]),
+        )
+        found = {number: unpack_covariance(bytes(data)) for number, data in rows if data}
+        missing = np.full((16, 16), np.nan)
+        return np.array([found.get(int(n), missing) for n in numbers]).reshape(-1, 16, 16)
+
+    def epochs(
+        self,
+        series: StoredSeries,
+        first: int = 0,
+        last: int | None = None,
+        *,
+        details: bool = True,
+    ) -> Iterator[StoredEpoch]:
+        """The epochs numbered `first` to `last`, one after the other, in constant memory."""
+        blobs = ["covariance", "observations"] if details else []
+        fields = [*_EPOCH, *(f'"{sql_name(n)}"' for n in PARAMETER_NAMES), *blobs]
+        statement = (
+            f"SELECT {', '.join(fields)} FROM epoch WHERE series = %s AND number >= %s "
+            "AND number <= coalesce(%s, number) ORDER BY number, revision"
+        )
+        values = (self._keys[series.id], first, last)
+        latest: StoredEpoch | None = None
+        for row in self._stream(statement, values):
+            stored = _epoch(row, details)
+            if latest is not None and latest.epoch.number == stored.epoch.number:
+                # a later calibration of observations that stay the same does not hold them again
+                if stored.epoch.observations is None:
+                    seen = latest.epoch.observations
+                    stored = replace(stored, epoch=replace(stored.epoch, observations=seen))
+            elif latest is not None:
+                yield latest
+            latest = stored
+        if latest is not None:
+            yield latest
+
+    def observations(
+        self, series: StoredSeries, numbers: Iterable[int]
+    ) -> Iterator[Observations | None]:
+        """The observations of some epochs; StoreError for a number that is not there."""
+        for number in numbers:
+            stored = next(self.epochs(series, number, number), None)
+            if stored is None:
+                raise StoreError(f"{self.path}: series {series.name!r} has no epoch {number}")
+            yield stored.epoch.observations
+
+    def events(self, series: StoredSeries | None = None, since_utc: float = 0.0) -> list[Event]:
+        """What happened, oldest first; of one series, or of all that the address selects."""
+        keys = [self._keys[s.id] for s in ([series] if series else self.all_series())]
+        rows = self._query(
+            "SELECT utc, kind, text, series, epoch, data FROM event "
+            "WHERE utc >= %s AND series = ANY(%s) ORDER BY utc, id",
+            (since_utc, keys),
+        )
+        return [
+            Event(utc, kind, text, self._number(key), epoch, json.loads(data))
+            for utc, kind, text, key, epoch, data in rows
+        ]
+
+    def readings(
+        self, thermometer: str | None = None, since_utc: float = 0.0
+    ) -> Iterator[LoggedReading]:
+        """Readings apart from epochs of the address's station, in the order they were kept."""
+        for name, utc, trusted, values in self._stream(
+            "SELECT thermometer, utc, clock_trusted, temperatures FROM reading WHERE utc >= %s "
+            "AND thermometer = coalesce(%s, thermometer) AND station = coalesce(%s, station) "
+            "ORDER BY station, id",
+            (since_utc, thermometer, self.address.station),
+        ):
+            yield LoggedReading(name, utc, json.loads(values), trusted)
+
+    def _number(self, key: UUID) -> int:
+        """The handle of a series in this process; `StoredSeries.id` is a number."""
+        if key not in self._keys:
+            self._keys.append(key)
+        return self._keys.index(key)
+
+    def _query(self, statement: str, values: Sequence[Any]) -> list[tuple[Any, ...]]:
+        with in_words(self.address, "it cannot be read"), self._engine.connect() as connection:
+            cursor = connection.connection.cursor()
+            cursor.execute(statement, values)
+            return list(cursor.fetchall())
+
+    def _stream(self, statement: str, values: Sequence[Any]) -> Iterator[tuple[Any, ...]]:
+        """Rows by a server-side cursor: a year of epochs in constant memory."""
+        with in_words(self.address, "it cannot be read"), self._engine.connect() as connection:
+            raw: Any = connection.connection.driver_connection
+            with raw.cursor(name="thermocald") as cursor:
+                cursor.itersize = _BLOCK
+                cursor.execute(statement, values)
+                yield from cursor
+
+    def _copy(self, key: UUID, series: StoredSeries, names: Sequence[str]) -> dict[str, Array]:
+        """Numeric columns (E,), ordered by number."""
+        from psycopg import sql
+
+        chosen = sql.SQL(", ").join(_expression(name, series) for name in names)
+        where = sql.SQL(_LATEST.replace("%s", "{}")).format(sql.Literal(key))
+        statement = sql.SQL(
+            "COPY (SELECT {} {} ORDER BY number) TO STDOUT (FORMAT BINARY)"
+        ).format(chosen, where)
+        data = bytearray()
+        reading = in_words(self.address, "columns cannot be read")
+        with reading, self._engine.connect() as connection:
+            raw: Any = connection.connection.driver_connection
+            with raw.cursor() as cursor, cursor.copy(statement) as copy:
+                for block in copy:
+                    data += block
+        return _fixed_records(data, names)
+
+
+_EPOCH = (
+    "number", "revision", "frame_time", "temperature_time", "clock_trusted", "status", "reason",
+    "sigma0", "redundancy", "n_observations", "rejected", "temperatures", "extra", "frame", "note",
+)  # fmt: skip
+
+
+def _epoch(row: tuple[Any, ...], details: bool) -> StoredEpoch:
+    field = dict(zip(_EPOCH, row, strict=False))
+    values = np.array(row[len(_EPOCH) : len(_EPOCH) + 16], dtype=float)
+    covariance, observations = row[-2:] if details else (None, None)
+    epoch = Epoch(
+        number=field["number"],
+        frame_time=field["frame_time"],
+        temperature_time=_nan(field["temperature_time"]),
+        temperatures=_mapping(field["temperatures"]),
+        frame=Path(field["frame"]) if field["frame"] else None,
+        observations=unpack_observations(bytes(observations)) if observations else None,
+        note=field["note"],
+    )
+    result = EpochResult(
+        field["status"],
+        field["reason"],
+        values,
+        unpack_covariance(bytes(covariance)) if covariance else None,
+        _nan(field["sigma0"]),
+        field["redundancy"],
+        field["n_observations"],
+        tuple(json.loads(field["rejected"])),
+    )
+    extra = _mapping(field["extra"])
+    return StoredEpoch(epoch, result, extra, field["clock_trusted"], field["revision"])
+
+
+def _expression(name: str, series: StoredSeries) -> Any:
+    """A column as double precision, NaN for NULL: every record has the same length."""
+    from psycopg import sql
+
+    if name == "epoch":
+        return sql.SQL("number::float8")
+    if name == "clock_trusted":
+        return sql.SQL("clock_trusted::int::float8")
+    if name in FIXED:
+        return sql.SQL("coalesce({}::float8, 'NaN')").format(sql.Identifier(sql_name(name)))
+    column = "temperatures" if name in series.head.channels else "extra"
+    return sql.SQL("coalesce(({}::json->>{})::float8, 'NaN')").format(
+        sql.Identifier(column), sql.Literal(name)
+    )
+
+
+def _fixed_records(data: bytearray, names: Sequence[str]) -> dict[str, Array]:
+    """Binary COPY of float8 columns → arrays. Source: PostgreSQL manual, COPY, "Binary Format"."""
+    kind = np.dtype(
+        [("count", ">i2"), *((f"{part}{i}", t) for i in range(len(names))
+                             for part, t in (("size", ">i4"), ("value", ">f8")))]
+    )  # fmt: skip
+    body = len(data) - _COPY_HEADER - 2  # a trailer of -1 ends it
+    if body < 0 or body % kind.itemsize:
+        raise StoreError(f"the server sent {len(data)} bytes that are not the columns asked for")
+    records = np.frombuffer(data, kind, body // kind.itemsize, _COPY_HEADER)
+    return {name: records[f"value{i}"].astype(np.float64) for i, name in enumerate(names)}
+
+
+def _mapping(text: str) -> dict[str, float]:
+    return {name: _nan(value) for name, value in json.loads(text).items()}
+
+
+def _nan(value: float | None) -> float:
+    return float("nan") if value is None else value

@@ -1,0 +1,167 @@
+"""Writing a station's rows to the server: batches, each whole or not at all, nothing twice.
+
+Keys are made here and not there, from what never changes: the same row sent again is the same key
+and is passed over. So a role that may only insert is enough, and sending again is always safe.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import TYPE_CHECKING, Any
+from uuid import UUID, uuid5
+
+from thermocald.errors import StoreVersionError
+from thermocald.store.recording.head import head_document
+from thermocald.store.recording.testfield_file import testfield_csv
+from thermocald.store.server.connection import connect, in_words, require_revision
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from types import TracebackType
+    from typing import Self
+
+    from sqlalchemy import Table
+
+    from thermocald.store.database.row import StoredSeries
+    from thermocald.store.server.address import ServerAddress
+
+__all__ = ["ServerWriter", "series_key"]
+
+_NAMESPACE = UUID("c1b7b0de-6c1e-5f0e-9d0d-7468656d6f63")
+# Columns of a store's row that the server does not keep: they have a meaning in that file alone.
+_LOCAL = {"epoch": {"id", "series_id"}, "event": {"series_id"}, "reading": set[str]()}
+
+
+def series_key(station: str, series: StoredSeries) -> UUID:
+    """The key of a series at the server: station, camera, name, and when it was begun."""
+    text = json.dumps([station, series.camera, series.name, series.created_utc])
+    return uuid5(_NAMESPACE, text)
+
+
+class ServerWriter:
+    """An open connection that inserts for one station; use it in a `with` block.
+
+    Raises ServerGone (try again later), ServerError, StoreVersionError.
+    """
+
+    def __init__(self, address: ServerAddress, station: str) -> None:
+        from sqlalchemy import MetaData, Table
+
+        self.address = address
+        self.station = station
+        self._engine = connect(address)
+        self._sent: set[UUID] = set()
+        self._months: set[int] = set()
+        try:
+            require_revision(self._engine, address)
+            with in_words(address, "its tables cannot be read"):
+                data = MetaData()
+                self._tables: dict[str, Table] = {
+                    name: Table(name, data, autoload_with=self._engine)
+                    for name in ("testfield", "series", "epoch", "event", "reading", "frame")
+                }
+        except BaseException:
+            self._engine.dispose()
+            raise
+
+    def close(self) -> None:
+        self._engine.dispose()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def write(
+        self, table: str, rows: Sequence[Mapping[str, Any]], series: Mapping[int, StoredSeries]
+    ) -> None:
+        """Insert rows of a store's table in one transaction; what is there already stays as it is.
+
+        series: the store's series by their ids; those of the rows are inserted with them.
+        """
+        if not rows:
+            return
+        keys = {id_: series_key(self.station, one) for id_, one in series.items()}
+        ready = [self._row(table, row, keys) for row in rows]
+        needed = {row["series_id"] for row in rows if row.get("series_id") is not None}
+        with in_words(self.address, f"{len(rows)} {table}s were not sent"):
+            with self._engine.begin() as connection:
+                for id_ in sorted(needed):
+                    if keys[id_] not in self._sent:
+                        self._insert_series(connection, keys[id_], series[id_])
+                if table == "epoch":
+                    self._make_months(connection, [float(row["frame_time"]) for row in rows])
+                connection.execute(_insert(self._tables[table]), ready)
+            self._sent.update(keys[id_] for id_ in needed)
+
+    def write_frame(self, series: StoredSeries, number: int, name: str, data: bytes) -> None:
+        """Insert the file of one frame."""
+        row = {
+            "series": series_key(self.station, series), "number": number, "name": name, "data": data
+        }  # fmt: skip
+        sending = in_words(self.address, f"frame {name} was not sent")
+        with sending, self._engine.begin() as connection:
+            connection.execute(_insert(self._tables["frame"]), [row])
+
+    def _row(
+        self, table: str, row: Mapping[str, Any], keys: Mapping[int, UUID]
+    ) -> dict[str, Any]:
+        columns = self._tables[table].columns
+        ready: dict[str, Any] = {}
+        if table == "epoch" or "series" in columns:
+            ready["series"] = keys.get(row["series_id"]) if row["series_id"] is not None else None
+        if "station" in columns:
+            ready["station"] = self.station
+        for name, value in row.items():
+            if name in _LOCAL[table]:
+                continue
+            if name not in columns:
+                raise StoreVersionError(
+                    f"{self.address}: the store's {table}s have a column {name!r} that the server "
+                    "does not know; run `thermocald server init` there with this program's version"
+                )
+            if name == "clock_trusted":
+                value = bool(value)
+            # PostgreSQL's text knows no NUL; a note may hold what a broken device sent
+            ready[name] = value.replace("\0", "\ufffd") if isinstance(value, str) else value
+        return ready
+
+    def _insert_series(self, connection: Any, key: UUID, series: StoredSeries) -> None:
+        csv = testfield_csv(series.testfield)
+        digest = hashlib.sha256(csv.encode()).hexdigest()
+        connection.execute(_insert(self._tables["testfield"]), [{"digest": digest, "csv": csv}])
+        row = {
+            "key": key,
+            "station": self.station,
+            "camera": series.camera,
+            "name": series.name,
+            "start": series.start,
+            "created_utc": series.created_utc,
+            "digest": digest,
+            "head": json.dumps(head_document(series.head), default=str),
+            "identity": json.dumps(dict(series.identity), default=str),
+            "settings": json.dumps(dict(series.settings), default=str),
+        }
+        connection.execute(_insert(self._tables["series"]), [row])
+
+    def _make_months(self, connection: Any, times: Sequence[float]) -> None:
+        """Partitions for the months of these times; a month has at most 31 days of 86400 s."""
+        from sqlalchemy import text
+
+        for day in sorted({int(t // 86400) for t in times} - self._months):
+            connection.execute(text("SELECT thermocald_month(:at)"), {"at": day * 86400.0})
+            self._months.add(day)
+
+
+def _insert(table: Table) -> Any:
+    # no conflict target: naming one would ask for the right to read
+    from sqlalchemy.dialects.postgresql import insert
+
+    return insert(table).on_conflict_do_nothing()

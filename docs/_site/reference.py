@@ -228,7 +228,7 @@ def _schema(part: dict[str, Any], definitions: dict[str, Any]) -> str:
 
 def _effect_page() -> str:
     from thermocald.simulation import effects
-    from thermocald.simulation.effects.base import EXPERIMENTS
+    from thermocald.simulation.effects.parameter import EXPERIMENTS
 
     parts = []
     for name in effects.names():

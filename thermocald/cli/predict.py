@@ -177,7 +177,7 @@ def _state_document(
     import numpy as np
 
     from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
-    from thermocald.simulation.effects.base import PARAMETER_UNITS
+    from thermocald.simulation.effects.parameter import PARAMETER_UNITS
 
     error = state.object_error(distance * 1000.0)
     reference = thermal.at(thermal.model.T0, extrapolate=True)

@@ -26,7 +26,7 @@ from dataclasses import astuple, dataclass, field
 from typing import TYPE_CHECKING
 
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES, ExteriorOrientation, Sensor
-from thermocald.simulation.effects.base import PARAMETER_UNITS
+from thermocald.simulation.effects.parameter import PARAMETER_UNITS
 from thermocald.simulation.heat import HeatNetwork, Link, read_network
 from thermocald.simulation.model_file import read_sensor
 from thermocald.simulation.quantities import QuantityReader

@@ -22,7 +22,8 @@ from thermocald.photogrammetry.camera.camera_model import (
     Sensor,
 )
 from thermocald.simulation import effects
-from thermocald.simulation.effects.base import Displacement, Influence
+from thermocald.simulation.drive import drive
+from thermocald.simulation.effects.influence import Displacement, Influence
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -132,18 +133,14 @@ class ThermalModel:
         """The rates (10,) per K in the order of IOP_NAMES."""
         return np.array([self.rates.get(name, 0.0) for name in IOP_NAMES])
 
+    @property
+    def drives(self) -> list[tuple[str, Mapping[str, Any]]]:
+        """The effects that replace T, in their order, with their values."""
+        return [(e.name, e.values) for e in self.effects if effects.get(e.name).is_drive]
+
     def drive(self, history: History) -> Array:
         """The temperature (E,) °C behind the linear terms: T through all drives of the model."""
-        drives = [e for e in self.effects if effects.get(e.name).kind == "drive"]
-        for effect in drives[:-1]:
-            # a drive's course, at the readings' own instants, is what the next one is given
-            course = effects.get(effect.name).drive(
-                history.at(history.reading_times), **effect.values
-            )
-            history = history.with_reference(course)
-        if drives:
-            return effects.get(drives[-1].name).drive(history, **drives[-1].values)
-        return history.temperature()
+        return drive(history, self.drives)
 
     def predict(self, history: History, test_field: TestField | None = None) -> Prediction:
         """Everything the model says of the history's instants.

@@ -34,7 +34,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     Sensor,
 )
 from thermocald.simulation import effects
-from thermocald.simulation.effects.base import PARAMETER_UNITS
+from thermocald.simulation.effects.parameter import PARAMETER_UNITS
 from thermocald.simulation.model import RATED, ModelEffect, ThermalModel
 from thermocald.simulation.quantities import QuantityReader, written
 from thermocald.yaml_file import dump_yaml, read_yaml

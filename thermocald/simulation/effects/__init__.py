@@ -1,43 +1,66 @@
 """The catalogue of effects: one physical cause, one class, one file.
 
-The registry is this folder: every module but `base` holds one `Effect` whose name is the module's.
-Adding an effect is one file here and one test.
+The registry is the entry point `thermocald.effects`, for the built-in effects of this folder (in
+`pyproject.toml`) and for those of other distributions alike; an entry's name is the effect's.
 """
 
 from __future__ import annotations
 
+from difflib import get_close_matches
 from functools import cache
-from importlib import import_module
-from pkgutil import iter_modules
+from importlib.metadata import entry_points
 
 from thermocald.errors import ConfigurationError
-from thermocald.simulation.effects.base import Effect
+from thermocald.simulation.effects.base import Effect, Proportional
 
-__all__ = ["get", "names"]
+__all__ = ["Effect", "carrier", "get", "names", "seen_in"]
+
+_GROUP = "thermocald.effects"
 
 
 @cache
 def names() -> tuple[str, ...]:
-    """The effects of the catalogue, sorted."""
-    return tuple(sorted(m.name for m in iter_modules(__path__) if m.name != "base"))
+    """The effects of the catalogue, sorted.
+
+    ConfigurationError where there is none: the installation is older than the program.
+    """
+    found = tuple(sorted({point.name for point in entry_points(group=_GROUP)}))
+    if not found:
+        raise ConfigurationError(
+            "no effect is installed: thermocald's entry points are older than the program; "
+            "install it again (python -m pip install -e .)"
+        )
+    return found
 
 
 @cache
 def get(name: str) -> Effect:
-    """An effect by its name; ConfigurationError where there is none."""
+    """An effect by its name; ConfigurationError where there is none, or where it is not one."""
     if name not in names():
-        from difflib import get_close_matches
-
         near = get_close_matches(name, names(), 1)
         hint = f"did you mean {near[0]!r}?" if near else f"known are: {', '.join(names())}"
         raise ConfigurationError(f"unknown effect {name!r}; {hint}")
-    module = import_module(f"{__name__}.{name}")
-    classes = [
-        member
-        for member in vars(module).values()
-        if isinstance(member, type)
-        and issubclass(member, Effect)
-        and member.__module__ == module.__name__
-    ]
-    effect: Effect = classes[0]()
-    return effect
+    (point,) = entry_points(group=_GROUP, name=name)
+    try:
+        loaded = point.load()
+    except (ImportError, AttributeError) as error:
+        raise ConfigurationError(f"effect {name!r} cannot be imported: {error}") from error
+    if not (isinstance(loaded, type) and issubclass(loaded, Effect) and loaded.name == name):
+        raise ConfigurationError(
+            f"the entry point {name!r} of {_GROUP} is {point.value}, which is not an Effect with "
+            "this name"
+        )
+    return loaded()
+
+
+def seen_in(place: str) -> Effect:
+    """The effect that is seen in the measuring noise ("noise") or in single targets ("targets")."""
+    return next(get(name) for name in names() if get(name).seen_in == place)
+
+
+def carrier(parameter: str) -> Effect:
+    """The effect by which a parameter follows the temperature beyond the base model's rates."""
+    return next(
+        get(name) for name in names()
+        if isinstance(get(name), Proportional) and parameter in get(name).linear
+    )  # fmt: skip

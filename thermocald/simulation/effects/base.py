@@ -2,7 +2,8 @@
 
 One class is used three times: forward in the simulation (`influence`), as columns in a fit
 (`drive`, `signal`, with `sensitivity` to carry the thermometer's error through them), and as words
-in a report (`sentence`, `experiment_against`).
+in a report (`sentence`, `experiment_against`). Everything in which effects differ is stated here
+as a property or a method: no other module asks for an effect by its name.
 
 Three kinds:
 
@@ -17,13 +18,14 @@ are linear: for a `signal` they bear the names of the parameters they act on.
 from __future__ import annotations
 
 from abc import ABC
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 
-from thermocald.errors import ConfigurationError
-from thermocald.photogrammetry.camera.camera_model import EOP_NAMES, IOP_NAMES, PARAMETER_NAMES
+from thermocald.errors import ConfigurationError, DataError
+from thermocald.simulation.effects.influence import Influence
+from thermocald.simulation.effects.parameter import EXPERIMENTS, Parameter, spoken
 from thermocald.simulation.history import History
 
 if TYPE_CHECKING:
@@ -36,104 +38,23 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = [
-    "EXPERIMENTS",
-    "PARAMETER_UNITS",
-    "Displacement",
-    "Effect",
-    "History",
-    "Influence",
-    "Parameter",
-    "Proportional",
-]
+__all__ = ["Effect", "OfTime", "Proportional", "Steady"]
 
 Kind = Literal["drive", "signal", "image"]
-
-# Units of IOP and EOP as the files write them (CONVENTIONS §2).
-PARAMETER_UNITS: dict[str, str] = {
-    "c": "mm", "x0": "mm", "y0": "mm", "A1": "mm-2", "A2": "mm-4", "A3": "mm-6",
-    "B1": "mm-1", "B2": "mm-1", "C1": "1", "C2": "1",
-    "omega": "rad", "phi": "rad", "kappa": "rad", "X0": "mm", "Y0": "mm", "Z0": "mm",
-}  # fmt: skip
-
-# What one can do to tell two effects apart; each effect says how it answers to some of these.
-EXPERIMENTS: dict[str, str] = {
-    "hold": "hold the lamp at 45 °C for 20 minutes",
-    "cycle": "heat and cool twice between the same two temperatures",
-    "rate": "heat over the same range once slowly and once fast",
-    "hotter": "heat 10 K further than before",
-    "idle": "leave the lamp off and let the device run for an hour",
-    "restart": "switch the device off for an hour and record again",
-    "shade": "shade the test field and heat the camera alone",
-    "turn": "turn the camera by 180° about its optical axis and heat it again",
-    "disconnect": "disconnect fan, heater and charger",
-    "load": "load the processor without heating from outside",
-}
+SeenIn = Literal["trajectory", "noise", "targets"]
 
 
 @dataclass(frozen=True, slots=True)
-class Parameter:
-    """A non-linear parameter: unit, range to search, usual value, searched by its logarithm?"""
+class Steady:
+    """An effect's signal at a temperature T at which the camera has long been.
 
-    unit: str
-    low: float
-    high: float
-    default: float
-    log: bool = False
-    text: bool = False  # a name (a channel), not a number
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Displacement:
-    """Some targets have moved: rows (k,) of the test field, vector (3,) mm, active (E,) when."""
-
-    rows: NDArray[np.int64]
-    vector: Array
-    active: NDArray[np.bool_]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Influence:
-    """What an effect changes at E instants.
-
-    iop (E, 10), eop (E, 6): added, in the order of IOP_NAMES and EOP_NAMES; scale (E, 3): factors
-    of the object coordinates; displacements: of single targets; noise_factor, blur_factor (E,).
+    powers: factors of (T - T₀)⁰, (T - T₀)¹, (T - T₀)²; knee: °C above which T - knee is added,
+    and the name of the parameter that it is; nothing of all this by default.
     """
 
-    iop: Array
-    eop: Array
-    scale: Array
-    noise_factor: Array
-    blur_factor: Array
-    displacements: tuple[Displacement, ...] = field(default=())
-
-    @classmethod
-    def none(cls, epochs: int) -> Self:
-        """Nothing changes."""
-        one = np.ones(epochs)
-        return cls(np.zeros((epochs, 10)), np.zeros((epochs, 6)), np.ones((epochs, 3)), one, one)
-
-    @classmethod
-    def of_parameters(cls, changes: Mapping[str, Array], epochs: int) -> Self:
-        """From changes (E,) of IOP and EOP by name."""
-        result = cls.none(epochs)
-        for name, change in changes.items():
-            if name in IOP_NAMES:
-                result.iop[:, IOP_NAMES.index(name)] += change
-            else:
-                result.eop[:, EOP_NAMES.index(name)] += change
-        return result
-
-    def __add__(self, other: Influence) -> Influence:
-        """Both together."""
-        return Influence(
-            self.iop + other.iop,
-            self.eop + other.eop,
-            self.scale * other.scale,
-            self.noise_factor * other.noise_factor,
-            self.blur_factor * other.blur_factor,
-            self.displacements + other.displacements,
-        )
+    powers: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    knee: float | None = None
+    knee_name: str = ""
 
 
 class Effect(ABC):
@@ -143,6 +64,11 @@ class Effect(ABC):
     {coefficient: unit}; usual: the coefficients that act unless told otherwise; fresh: non-linear
     parameters that belong to one series and do not carry over to another; behaviour: answers to
     EXPERIMENTS.
+
+    For a search: seen_in: the trajectories of the camera's parameters, the measuring noise, or
+    single targets; parameter_sets: the sets of coefficients that it may act on, by default the
+    usual ones; moves_mount: it may act on the orientation of the camera instead; columns:
+    {coefficient: column of the reduced series}, where the names differ. steady_signal: for `steady`.
     """
 
     name: ClassVar[str]
@@ -153,6 +79,38 @@ class Effect(ABC):
     usual: ClassVar[tuple[str, ...]] = ()
     fresh: ClassVar[tuple[str, ...]] = ()
     behaviour: ClassVar[Mapping[str, str]] = {}
+    seen_in: ClassVar[SeenIn] = "trajectory"
+    parameter_sets: ClassVar[tuple[tuple[str, ...], ...]] = ()
+    moves_mount: ClassVar[bool] = False
+    columns: ClassVar[Mapping[str, str]] = {}
+    steady_signal: ClassVar[Steady | None] = None
+
+    @property
+    def is_drive(self) -> bool:
+        """Whether it replaces the temperature behind the linear terms."""
+        return self.kind == "drive"
+
+    @property
+    def is_event(self) -> bool:
+        """Whether it happens at one time of a series or not at all; its size is the series' own."""
+        return any(self.nonlinear[name].role == "event" for name in self.fresh)
+
+    @property
+    def is_periodic(self) -> bool:
+        """Whether it cycles: two signals, whose weights are amplitude and phase of the series."""
+        return any(self.nonlinear[name].role == "phase" for name in self.fresh)
+
+    @property
+    def delay(self) -> str:
+        """The parameter that to first order delays the temperature, s; "" where there is none."""
+        if not self.is_drive:
+            return ""
+        roles = ("delay", "time_constant")
+        return next((n for n, p in self.nonlinear.items() if p.role in roles), "")
+
+    def column(self, coefficient: str) -> str:
+        """The column of a reduced series that a coefficient acts on."""
+        return self.columns.get(coefficient, coefficient)
 
     def drive(self, history: History, **nonlinear: Any) -> Array:
         """The temperature (E,) °C that drives the linear terms in place of T."""
@@ -198,20 +156,45 @@ class Effect(ABC):
         result: Array = self.sensitivity(history, **nonlinear) @ np.nan_to_num(errors)
         return result
 
-    def unresolved(self, history: History, **nonlinear: Any) -> Array:  # noqa: ARG002
-        """Standard deviation (E,) of drive or first signal that the readings' instants leave open.
+    def unresolved(
+        self,
+        history: History,
+        rate_jump: Array | None = None,  # noqa: ARG002
+        **nonlinear: Any,  # noqa: ARG002
+    ) -> Array:
+        """Standard deviation (E,) of drive or first signal that the times of the readings leave.
 
         What happens between two readings, or after the last, no reading tells; their noise is not
-        meant. Most effects need the temperature alone, which straight lines between readings tell.
+        meant. rate_jump (E,) K/s: how uncertain the rate of the temperature is at the frames,
+        because it jumps beside them. Most effects need the temperature alone, which straight lines
+        between readings tell.
         """
         return np.zeros(len(history.times))
 
     def turns(self, history: History, **nonlinear: Any) -> NDArray[np.bool_]:  # noqa: ARG002
-        """Epochs (E,) in which the course hangs on which reading was an extreme.
+        """Epochs (E,) in which the drive depends on which reading was an extreme.
 
-        What `sensitivity` says is not sure there.
+        What `sensitivity` says is uncertain there.
         """
         return np.zeros(len(history.times), dtype=bool)
+
+    def steady(
+        self,
+        values: Mapping[str, Any],  # noqa: ARG002
+        T0: float,  # noqa: ARG002
+        channels: Mapping[str, float] | None,  # noqa: ARG002
+    ) -> Steady:
+        """The signal of a camera that has long been at one temperature, and never hotter.
+
+        T0: the model's reference temperature °C; channels: °C of other thermometers. A drive has
+        settled. DataError where the effect does not say: such a model needs a temperature log.
+        """
+        if self.steady_signal is None and self.kind == "signal":
+            raise DataError(
+                f"effect {self.name} does not say what it is at a steady temperature; "
+                "give a temperature log instead"
+            )
+        return self.steady_signal or Steady()
 
     def _course(self, history: History, **nonlinear: Any) -> Array:
         if self.kind == "drive":
@@ -298,32 +281,21 @@ class Effect(ABC):
         return f"record longer and under another programme than now ({self.noun}, {other.noun})"
 
 
-def spoken(estimate: Mapping[str, Any]) -> str:
-    """An estimate as people write it: 84.1 ± 1.9 s, two digits of the standard deviation."""
-    value, sd, unit = estimate.get("value"), estimate.get("sd"), estimate.get("unit", "")
-    unit = "" if unit == "1" else f" {unit}"
-    if isinstance(value, str) or value is None:
-        return f"{value}{unit}"
-    if not sd or not np.isfinite(sd):
-        return f"{value:.4g}{unit}"
-    digits = 1 - int(np.floor(np.log10(sd)))
-    if -2 <= digits <= 5:
-        d = max(digits, 0)
-        return f"{round(value, digits):.{d}f} ± {round(sd, digits):.{d}f}{unit}"
-    exponent = int(np.floor(np.log10(max(abs(value), sd))))
-    d = max(digits + exponent, 0)
-    return f"({value / 10.0**exponent:.{d}f} ± {sd / 10.0**exponent:.{d}f})e{exponent}{unit}"
+class OfTime(Effect):
+    """An effect that knows the time alone: the thermometer's error does not reach it."""
 
+    steady_signal = Steady()
 
-def coefficient_units(per: str, parameters: tuple[str, ...] = PARAMETER_NAMES) -> dict[str, str]:
-    """Units of coefficients that act on parameters: mm/K, rad/K, …; `per`: "K", "K2", "s", "1"."""
-    if per == "1":
-        return {name: PARAMETER_UNITS[name] for name in parameters}
-    return {name: f"{PARAMETER_UNITS[name]}/{per}" for name in parameters}
+    def sensitivity(self, history: History, **_: Any) -> csr_array:
+        from scipy.sparse import csr_array
+
+        return csr_array((len(history.times), len(history.reading_times)))
 
 
 class Proportional(Effect):
     """An effect whose signal is T - T₀, at once."""
+
+    steady_signal = Steady((0.0, 1.0, 0.0))
 
     def signal(self, history: History, **_: Any) -> Array:
         return (history.temperature() - history.T0)[:, None]

@@ -6,20 +6,20 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from thermocald.simulation.effects.base import Effect, Parameter, coefficient_units, spoken
+from thermocald.simulation.effects.base import OfTime
+from thermocald.simulation.effects.parameter import Parameter, coefficient_units, spoken
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from numpy.typing import NDArray
-    from scipy.sparse import csr_array
 
     from thermocald.simulation.history import History
 
 __all__ = ["CyclicInterference"]
 
 
-class CyclicInterference(Effect):
+class CyclicInterference(OfTime):
     """Adds a sin(2πt/P + φ), t from the begin of the series.
 
     Its signals are sin(2πt/P) and cos(2πt/P): the phase φ is linear in a fit, is shared by all
@@ -30,12 +30,13 @@ class CyclicInterference(Effect):
     noun = "a cyclic interference"
     kind = "signal"
     nonlinear: ClassVar[Mapping[str, Parameter]] = {
-        "P": Parameter("s", 20.0, 5000.0, 120.0, log=True),
-        "phase": Parameter("rad", -np.pi, np.pi, 0.0),
+        "P": Parameter("s", 20.0, 5000.0, 120.0, log=True, role="period"),
+        "phase": Parameter("rad", -np.pi, np.pi, 0.0, role="phase"),
     }
     linear: ClassVar[Mapping[str, str]] = coefficient_units("1")
     usual = ("c", "x0", "y0")
     fresh = ("phase",)
+    moves_mount = True
     behaviour: ClassVar[Mapping[str, str]] = {
         "disconnect": "stops",
         "idle": "goes on at the same period",
@@ -49,12 +50,6 @@ class CyclicInterference(Effect):
     def weights(self, values: Mapping[str, Any], name: str) -> NDArray[np.float64]:
         a, phase = float(values[name]), float(values["phase"])
         return a * np.array([np.cos(phase), np.sin(phase)])
-
-    def sensitivity(self, history: History, **_: Any) -> csr_array:
-        from scipy.sparse import csr_array
-
-        # it knows the time alone: the thermometer's error does not reach it
-        return csr_array((len(history.times), len(history.reading_times)))
 
     def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
         return f"something cycles with a period of {spoken(estimates['P'])}"

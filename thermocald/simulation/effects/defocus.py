@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from thermocald.simulation.effects.base import Influence, Proportional, spoken
+from thermocald.simulation.effects.base import Proportional
+from thermocald.simulation.effects.influence import Influence
+from thermocald.simulation.effects.parameter import spoken
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -31,6 +33,7 @@ class Defocus(Proportional):
     kind = "image"
     linear: ClassVar[Mapping[str, str]] = {"factor": "1/K"}
     usual = ("factor",)
+    seen_in = "noise"
     behaviour: ClassVar[Mapping[str, str]] = {
         "hold": "leaves positions alone; noise stays as large as it is",
         "cycle": "makes noise come and go with the temperature",

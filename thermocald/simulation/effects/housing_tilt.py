@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-from thermocald.simulation.effects.base import Proportional, coefficient_units
+from thermocald.simulation.effects.base import Proportional
+from thermocald.simulation.effects.parameter import coefficient_units
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from thermocald.simulation.effects.base import Effect, Parameter, spoken
-from thermocald.simulation.history import play, play_matrix, play_turns
+from thermocald.simulation.effects.base import Effect
+from thermocald.simulation.effects.parameter import Parameter, spoken
+from thermocald.simulation.operators import play, play_matrix, play_turns
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -30,7 +31,7 @@ class Hysteresis(Effect):
     noun = "hysteresis"
     kind = "drive"
     nonlinear: ClassVar[Mapping[str, Parameter]] = {
-        "half_width": Parameter("K", 0.05, 20.0, 1.0, log=True)
+        "half_width": Parameter("K", 0.05, 20.0, 1.0, log=True, role="width")
     }
     behaviour: ClassVar[Mapping[str, str]] = {
         "hold": "does not settle: it stays where it is",

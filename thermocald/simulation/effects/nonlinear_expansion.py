@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from thermocald.simulation.effects.base import Effect, coefficient_units
+from thermocald.simulation.effects.base import Effect, Steady
+from thermocald.simulation.effects.parameter import coefficient_units
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -30,6 +31,7 @@ class NonlinearExpansion(Effect):
     kind = "signal"
     linear: ClassVar[Mapping[str, str]] = coefficient_units("K2")
     usual = ("c", "x0", "y0")
+    steady_signal = Steady((0.0, 0.0, 1.0))
     behaviour: ClassVar[Mapping[str, str]] = {
         "hold": "does not move while the temperature stands",
         "cycle": "runs along the same curve up and down",

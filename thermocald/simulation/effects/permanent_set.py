@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from thermocald.simulation.effects.base import Effect, coefficient_units
-from thermocald.simulation.history import running_maximum, running_maximum_matrix
+from thermocald.simulation.effects.base import Effect, Steady
+from thermocald.simulation.effects.parameter import coefficient_units
+from thermocald.simulation.operators import running_maximum, running_maximum_matrix
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -31,6 +32,7 @@ class PermanentSet(Effect):
     kind = "signal"
     linear: ClassVar[Mapping[str, str]] = coefficient_units("K")
     usual = ("c", "x0", "y0")
+    steady_signal = Steady((0.0, 1.0, 0.0))
     behaviour: ClassVar[Mapping[str, str]] = {
         "hold": "stays where it is",
         "cycle": "appears the first time only: the second loop does not widen it",

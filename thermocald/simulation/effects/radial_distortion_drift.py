@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-from thermocald.simulation.effects.base import Proportional, coefficient_units
+from thermocald.simulation.effects.base import Proportional
+from thermocald.simulation.effects.parameter import coefficient_units
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -20,6 +21,7 @@ class RadialDistortionDrift(Proportional):
     kind = "signal"
     linear: ClassVar[Mapping[str, str]] = coefficient_units("K", ("A1", "A2", "A3"))
     usual = ("A1",)
+    parameter_sets = (("A1",), ("A1", "A2"), ("A1", "A2", "A3"))
     behaviour: ClassVar[Mapping[str, str]] = {
         "turn": "stays radial about the principal point",
         "hold": "does not move while the temperature stands",

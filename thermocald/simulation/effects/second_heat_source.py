@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from thermocald.simulation.effects.base import Effect, Parameter, coefficient_units
+from thermocald.errors import DataError
+from thermocald.simulation.effects.base import Effect, Steady
+from thermocald.simulation.effects.parameter import Parameter, coefficient_units
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -43,6 +45,17 @@ class SecondHeatSource(Effect):
 
     def sensitivity(self, history: History, channel: str = "", **_: Any) -> csr_array:
         return history.temperature_matrix(self.channel(history, channel))
+
+    def steady(
+        self, values: Mapping[str, Any], T0: float, channels: Mapping[str, float] | None
+    ) -> Steady:
+        channel = str(values["channel"])
+        if channels is None or channel not in channels:
+            raise DataError(
+                f"the model also depends on {channel!r}: give its temperature, channels="
+                f"{{{channel!r}: …}}"
+            )
+        return Steady((float(channels[channel]) - T0, 0.0, 0.0))
 
     def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
         return f"{estimates['channel']['value']} heats the camera too"

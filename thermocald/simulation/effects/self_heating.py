@@ -6,20 +6,20 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from thermocald.simulation.effects.base import Effect, Parameter, coefficient_units, spoken
+from thermocald.simulation.effects.base import OfTime, Steady
+from thermocald.simulation.effects.parameter import Parameter, coefficient_units, spoken
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from numpy.typing import NDArray
-    from scipy.sparse import csr_array
 
     from thermocald.simulation.history import History
 
 __all__ = ["SelfHeating"]
 
 
-class SelfHeating(Effect):
+class SelfHeating(OfTime):
     """Adds a (1 - exp(-t/τ)), t from the begin of the series.
 
     The step response of one body with capacity C and conductance G to its own power: τ = C/G.
@@ -30,10 +30,11 @@ class SelfHeating(Effect):
     noun = "self-heating"
     kind = "signal"
     nonlinear: ClassVar[Mapping[str, Parameter]] = {
-        "tau": Parameter("s", 10.0, 10000.0, 300.0, log=True)
+        "tau": Parameter("s", 10.0, 10000.0, 300.0, log=True, role="time_constant")
     }
     linear: ClassVar[Mapping[str, str]] = coefficient_units("1")
     usual = ("c", "x0", "y0")
+    steady_signal = Steady((1.0, 0.0, 0.0))
     behaviour: ClassVar[Mapping[str, str]] = {
         "idle": "rises and settles although the thermometer stands",
         "restart": "comes again after each power-on",
@@ -43,12 +44,6 @@ class SelfHeating(Effect):
 
     def signal(self, history: History, tau: float = 300.0, **_: Any) -> NDArray[np.float64]:
         return -np.expm1(-history.times / tau)[:, None]
-
-    def sensitivity(self, history: History, **_: Any) -> csr_array:
-        from scipy.sparse import csr_array
-
-        # it knows the time alone: the thermometer's error does not reach it
-        return csr_array((len(history.times), len(history.reading_times)))
 
     def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
         return (

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from thermocald.simulation.effects.base import Effect, Parameter, coefficient_units, spoken
+from thermocald.simulation.effects.base import OfTime
+from thermocald.simulation.effects.parameter import Parameter, coefficient_units, spoken
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     import numpy as np
     from numpy.typing import NDArray
-    from scipy.sparse import csr_array
 
     from thermocald.simulation.history import History
 
 __all__ = ["Slip"]
 
 
-class Slip(Effect):
+class Slip(OfTime):
     """Adds a from one instant on: a step at `time` (s from the begin of the series).
 
     Each series has its own slip: the time does not carry over, nor does the height.
@@ -27,10 +27,13 @@ class Slip(Effect):
     name = "slip"
     noun = "a slip"
     kind = "signal"
-    nonlinear: ClassVar[Mapping[str, Parameter]] = {"time": Parameter("s", 0.0, 1e9, 600.0)}
+    nonlinear: ClassVar[Mapping[str, Parameter]] = {
+        "time": Parameter("s", 0.0, 1e9, 600.0, role="event")
+    }
     linear: ClassVar[Mapping[str, str]] = coefficient_units("1")
     usual = ("c", "x0", "y0")
     fresh = ("time",)
+    moves_mount = True
     behaviour: ClassVar[Mapping[str, str]] = {
         "hold": "does not come again",
         "cycle": "does not come again at the same temperature",
@@ -39,12 +42,6 @@ class Slip(Effect):
 
     def signal(self, history: History, time: float = 600.0, **_: Any) -> NDArray[np.float64]:
         return (history.times >= time).astype(float)[:, None]
-
-    def sensitivity(self, history: History, **_: Any) -> csr_array:
-        from scipy.sparse import csr_array
-
-        # it knows the time alone: the thermometer's error does not reach it
-        return csr_array((len(history.times), len(history.reading_times)))
 
     def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
         return f"a part slipped at {spoken(estimates['time'])} after the begin"

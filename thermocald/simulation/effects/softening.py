@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from thermocald.simulation.effects.base import Effect, Parameter, coefficient_units, spoken
+from thermocald.simulation.effects.base import Effect, Steady
+from thermocald.simulation.effects.parameter import Parameter, coefficient_units, spoken
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -29,7 +30,9 @@ class Softening(Effect):
     name = "softening"
     noun = "softening"
     kind = "signal"
-    nonlinear: ClassVar[Mapping[str, Parameter]] = {"T_k": Parameter("degC", -40.0, 150.0, 40.0)}
+    nonlinear: ClassVar[Mapping[str, Parameter]] = {
+        "T_k": Parameter("degC", -40.0, 150.0, 40.0, role="threshold")
+    }
     linear: ClassVar[Mapping[str, str]] = coefficient_units("K")
     usual = ("c", "x0", "y0")
     behaviour: ClassVar[Mapping[str, str]] = {
@@ -46,6 +49,14 @@ class Softening(Effect):
     def sensitivity(self, history: History, T_k: float = 40.0, **_: Any) -> csr_array:
         above = (history.temperature() > T_k).astype(float)
         return history.temperature_matrix().multiply(above[:, None]).tocsr()
+
+    def steady(
+        self,
+        values: Mapping[str, Any],
+        T0: float,  # noqa: ARG002
+        channels: Mapping[str, float] | None,  # noqa: ARG002
+    ) -> Steady:
+        return Steady(knee=float(values["T_k"]), knee_name="T_k")
 
     def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
         return f"something gives way above {spoken(estimates['T_k'])}"

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from thermocald.errors import ConfigurationError
-from thermocald.simulation.effects.base import Displacement, Effect, Influence, Parameter, spoken
+from thermocald.simulation.effects.base import OfTime
+from thermocald.simulation.effects.influence import Displacement, Influence
+from thermocald.simulation.effects.parameter import Parameter, spoken
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from numpy.typing import NDArray
-    from scipy.sparse import csr_array
 
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.simulation.history import History
@@ -22,19 +23,20 @@ if TYPE_CHECKING:
 __all__ = ["TargetDisplacement"]
 
 
-class TargetDisplacement(Effect):
+class TargetDisplacement(OfTime):
     """The named targets are (dX, dY, dZ) mm off from `time` (s from the begin) on."""
 
     name = "target_displacement"
     noun = "displaced targets"
     kind = "image"
     nonlinear: ClassVar[Mapping[str, Parameter]] = {
-        "time": Parameter("s", 0.0, 1e9, 600.0),
+        "time": Parameter("s", 0.0, 1e9, 600.0, role="event"),
         "targets": Parameter("names", 0.0, 0.0, 0.0, text=True),
     }
     linear: ClassVar[Mapping[str, str]] = {"dX": "mm", "dY": "mm", "dZ": "mm"}
     usual = ("dX", "dY", "dZ")
     fresh = ("time", "targets")
+    seen_in = "targets"
     behaviour: ClassVar[Mapping[str, str]] = {
         "turn": "concerns the same targets, wherever the camera looks",
         "cycle": "does not come again",
@@ -43,12 +45,6 @@ class TargetDisplacement(Effect):
 
     def signal(self, history: History, time: float = 600.0, **_: Any) -> NDArray[np.float64]:
         return (history.times >= time).astype(float)[:, None]
-
-    def sensitivity(self, history: History, **_: Any) -> csr_array:
-        from scipy.sparse import csr_array
-
-        # it knows the time alone: the thermometer's error does not reach it
-        return csr_array((len(history.times), len(history.reading_times)))
 
     def influence(
         self, history: History, values: Mapping[str, Any], field: TestField | None = None

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from thermocald.simulation.effects.base import Influence, Proportional
+from thermocald.simulation.effects.base import Proportional
+from thermocald.simulation.effects.influence import Influence
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -29,6 +30,7 @@ class TestFieldExpansion(Proportional):
     kind = "image"
     linear: ClassVar[Mapping[str, str]] = {"X": "1/K", "Y": "1/K", "Z": "1/K"}
     usual = ("X", "Y", "Z")
+    columns: ClassVar[Mapping[str, str]] = {"X": "scale_X", "Y": "scale_Y", "Z": "scale_Z"}
     behaviour: ClassVar[Mapping[str, str]] = {
         "shade": "stops",
         "hold": "does not move while the temperature stands",

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from thermocald.simulation.effects.base import Effect, coefficient_units
-from thermocald.simulation.history import slope_matrix
+from thermocald.simulation.effects.base import Effect, Steady
+from thermocald.simulation.effects.parameter import coefficient_units
+from thermocald.simulation.operators import slope_matrix
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -34,6 +35,8 @@ class ThermalGradient(Effect):
     kind = "signal"
     linear: ClassVar[Mapping[str, str]] = coefficient_units("(K/s)")
     usual = ("c", "x0", "y0")
+    moves_mount = True
+    steady_signal = Steady()
     behaviour: ClassVar[Mapping[str, str]] = {
         "hold": "vanishes as soon as the temperature stands",
         "rate": "grows in proportion to the rate",
@@ -46,11 +49,15 @@ class ThermalGradient(Effect):
         rate: NDArray[np.float64] = slope_matrix(p.times, history.times) @ p.values
         return rate[:, None]
 
-    def unresolved(self, history: History, **_: Any) -> NDArray[np.float64]:
-        """A lamp that is switched between two readings: the rate jumps, nobody knows when.
-
-        Half the jump between two edges, as far as it is beyond the noise of such differences.
-        """
+    def unresolved(
+        self,
+        history: History,
+        rate_jump: NDArray[np.float64] | None = None,
+        **_: Any,
+    ) -> NDArray[np.float64]:
+        """A lamp that is switched between two readings: the rate jumps, nobody knows when."""
+        if rate_jump is not None:
+            return rate_jump
         p = history.polygon()
         if len(p.times) < 5:
             return np.zeros(len(history.times))

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from thermocald.simulation.effects.base import Effect, Parameter, spoken
-from thermocald.simulation.history import lag, lag_matrix
+from thermocald.simulation.effects.base import Effect
+from thermocald.simulation.effects.parameter import Parameter, spoken
+from thermocald.simulation.operators import lag, lag_matrix
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -30,7 +31,7 @@ class ThermalLag(Effect):
     noun = "a thermal lag"
     kind = "drive"
     nonlinear: ClassVar[Mapping[str, Parameter]] = {
-        "tau": Parameter("s", 2.0, 3000.0, 60.0, log=True)
+        "tau": Parameter("s", 2.0, 3000.0, 60.0, log=True, role="time_constant")
     }
     behaviour: ClassVar[Mapping[str, str]] = {
         "hold": "settles",

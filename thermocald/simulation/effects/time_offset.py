@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from thermocald.simulation.effects.base import Effect, Parameter, spoken
-from thermocald.simulation.history import interpolation_matrix
+from thermocald.simulation.effects.base import Effect
+from thermocald.simulation.effects.parameter import Parameter, spoken
+from thermocald.simulation.operators import interpolation_matrix
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -29,7 +30,9 @@ class TimeOffset(Effect):
     name = "time_offset"
     noun = "a time offset"
     kind = "drive"
-    nonlinear: ClassVar[Mapping[str, Parameter]] = {"d": Parameter("s", -300.0, 300.0, 10.0)}
+    nonlinear: ClassVar[Mapping[str, Parameter]] = {
+        "d": Parameter("s", -300.0, 300.0, 10.0, role="delay")
+    }
     behaviour: ClassVar[Mapping[str, str]] = {
         "hold": "stops at once after the delay",
         "rate": "shifts the whole curve by the same time, its tips stay sharp",
@@ -40,7 +43,13 @@ class TimeOffset(Effect):
     def drive(self, history: History, d: float = 0.0, **_: Any) -> NDArray[np.float64]:
         return history.polygon().at(history.times - d)
 
-    def unresolved(self, history: History, d: float = 0.0, **_: Any) -> NDArray[np.float64]:
+    def unresolved(
+        self,
+        history: History,
+        rate_jump: NDArray[np.float64] | None = None,  # noqa: ARG002
+        d: float = 0.0,
+        **_: Any,
+    ) -> NDArray[np.float64]:
         """A thermometer that is ahead is needed after the last reading: nobody knows it there.
 
         As much as the temperature usually changes over the time that is missing.

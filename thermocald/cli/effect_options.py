@@ -48,12 +48,13 @@ def parse_effect(text: str) -> ModelEffect:
         if not equals:
             continue
         if key in kind.nonlinear and kind.nonlinear[key].text:
-            values[key] = tuple(value.split("+")) if key == "targets" else value
+            names = kind.nonlinear[key].unit == "names"
+            values[key] = tuple(value.split("+")) if names else value
         else:
             values[key] = _number(text, key, value)
     for key, parameter in kind.nonlinear.items():
         if parameter.text and not values.get(key):
-            example = "x33+y52" if key == "targets" else "board_temperature"
+            example = "x33+y52" if parameter.unit == "names" else "board_temperature"
             raise UsageError(f"--effect {text}: say which: --effect {name}:{key}={example}")
     coefficients = dict.fromkeys(chosen or kind.usual, 0.0)
     try:

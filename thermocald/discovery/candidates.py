@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.discovery.evidence import Evidence
-    from thermocald.simulation.effects.base import Parameter
+    from thermocald.simulation.effects.parameter import Parameter
 
     Array = NDArray[np.float64]
 

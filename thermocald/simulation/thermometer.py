@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.simulation.history import lag
+from thermocald.simulation.operators import lag
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -136,7 +136,7 @@ class ModelFit:
         """The state with the noise's law as the epochs' misfits tell it."""
         models = [state.of_series(k) for k in range(len(self.series))]
         found, self.noise[:] = defocus_law(self.series, models, self.noise, self.variance)
-        listed = tuple(found if e.name == "defocus" else e for e in state.model.effects)
+        listed = tuple(found if e.name == found.name else e for e in state.model.effects)
         return replace(state, model=replace(state.model, effects=listed))
 
 

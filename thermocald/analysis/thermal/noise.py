@@ -131,6 +131,8 @@ def defocus_law(
     cofactor = np.linalg.inv(A.T @ (w[:, None] * A))
     lever = np.array([-slope / level**2, 1.0 / level])
     sd = float(np.sqrt(lever @ cofactor @ lever))
-    found = ModelEffect("defocus", {"factor": float(slope / level)}, {"factor": sd})
+    kind = effects.seen_in("noise")
+    (key,) = kind.linear
+    found = ModelEffect(kind.name, {key: float(slope / level)}, {key: sd})
     ends = np.cumsum([len(s) for s in series])
     return found, list(np.split(factor, ends[:-1]))

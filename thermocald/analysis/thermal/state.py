@@ -31,13 +31,13 @@ FREE_INTERIOR = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2")
 
 def is_event(effect: ModelEffect) -> bool:
     """Whether it happens at one instant of a series, or not at all."""
-    return "time" in effects.get(effect.name).fresh
+    return effects.get(effect.name).is_event
 
 
 def unknowns_of(effect: ModelEffect) -> tuple[str, ...]:
     """The parameters of an effect that Gauss-Newton estimates and that all series share."""
-    if effect.name == "defocus" or is_event(effect):
-        return ()  # defocus is in the noise, not in the positions
+    if effects.get(effect.name).seen_in == "noise" or is_event(effect):
+        return ()  # the noise has no normal equations
     return tuple(
         key
         for key, value in effect.values.items()
@@ -169,9 +169,6 @@ class FitState:
 
 def _moved(effect: ModelEffect, key: str, old: float, change: float) -> float:
     kind = effects.get(effect.name)
-    if key not in kind.nonlinear or key == "phase":
+    if key not in kind.nonlinear or kind.nonlinear[key].role == "phase":
         return old + change
-    p = kind.nonlinear[key]
-    # a step across the range is a step too far
-    low, high = (max(p.low, old / 2), min(p.high, old * 2)) if p.log else (p.low, p.high)
-    return float(np.clip(old + change, low, high))
+    return kind.nonlinear[key].bounded(old, old + change)

@@ -19,6 +19,7 @@ from thermocald.analysis.thermal.series import N_PARAMETERS, ModelSeries
 from thermocald.analysis.thermal.state import own_of, unknowns_of
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES, IOP_NAMES, PARAMETER_NAMES
 from thermocald.simulation import effects
+from thermocald.simulation.drive import drive_matrix
 from thermocald.simulation.model import RATED, ThermalModel
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
-    from thermocald.simulation.effects.base import Influence
+    from thermocald.simulation.effects.influence import Influence
     from thermocald.simulation.history import History
 
     Array = NDArray[np.float64]
@@ -178,7 +179,7 @@ def error_operators(
     for effect in model.effects:
         kind = effects.get(effect.name)
         nonlinear, coefficients = kind.split(effect.values)
-        if kind.kind == "drive" or effect.name == "defocus" or not any(coefficients.values()):
+        if kind.is_drive or kind.seen_in == "noise" or not any(coefficients.values()):
             continue
         S = kind.sensitivity(history, **nonlinear)
         if S.nnz == 0:
@@ -208,18 +209,10 @@ def weights_of(coefficients: Mapping[str, float]) -> Array:
 
 def _drive_operator(history: History, model: ThermalModel) -> csr_array:
     """∂ drive / ∂ readings (E, R), through all drives of the model one after the other."""
-    drives = [e for e in model.effects if effects.get(e.name).kind == "drive"]
-    if not drives:
-        return history.temperature_matrix()
-    chain = None
-    for effect in drives[:-1]:
-        kind = effects.get(effect.name)
-        inner = history.at(history.reading_times)
-        S = kind.sensitivity(inner, **effect.values)
-        chain = S if chain is None else S @ chain
-        history = history.with_reference(kind.drive(inner, **effect.values))
-    last = effects.get(drives[-1].name).sensitivity(history, **drives[-1].values)
-    whole = last if chain is None else last @ chain
+    whole = drive_matrix(history, model.drives)
+    assert whole is not None
+    if not model.drives:
+        return whole
     # a thousandth of a reading's error is nobody's business, and the far past costs time
     whole.data[np.abs(whole.data) < _NEGLIGIBLE] = 0.0
     whole.eliminate_zeros()

@@ -20,12 +20,12 @@ import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
 from thermocald.analysis.camera.state import CameraState
-from thermocald.errors import ConfigurationError, DataError, UsageError
+from thermocald.errors import ConfigurationError, UsageError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.simulation import effects
 from thermocald.simulation.history import History
@@ -36,7 +36,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
-    from thermocald.simulation.model import ThermalModel
+    from thermocald.simulation.effects.base import Steady
+    from thermocald.simulation.model import ModelEffect, ThermalModel
 
     Array = NDArray[np.float64]
 
@@ -275,7 +276,7 @@ class ThermalCamera:
 
     @cached_property
     def _uses_channels(self) -> bool:
-        return any(e.name == "second_heat_source" for e in self.model.effects)
+        return any("channel" in effects.get(e.name).nonlinear for e in self.model.effects)
 
     def _beyond(self, T: float, extrapolate: bool) -> float:
         """How many kelvin a temperature lies outside; warns or refuses."""
@@ -344,49 +345,31 @@ class ThermalCamera:
                 add(f"rates.{n}", self.model.rates[n], row, 1)
         for effect in self.model.effects:
             kind = effects.get(effect.name)
-            terms = _steady_terms(effect.name, effect.values, channels, self.model.T0)
+            steady = kind.steady(effect.values, self.model.T0, channels)
             own = [
                 (k, IOP_NAMES.index(k))
                 for k in kind.linear
                 if k in effect.values and k in IOP_NAMES
             ]
-            if effect.name == "softening":
-                knees.append(_knee(effect, own, names))
-            for power, factor in terms:
+            if steady.knee is not None:
+                knees.append(_knee(effect, steady, own, names))
+            for power, factor in enumerate(steady.powers):
+                if not factor:
+                    continue
                 for key, row in own:
                     add(f"{effect.name}.{key}", float(effect.values[key]), row, power, factor)
         return _Steady(tuple(p), tuple(J), tuple(knees), self.covariance)  # type: ignore[arg-type]
 
 
-def _steady_terms(
-    name: str, values: Mapping[str, Any], channels: Mapping[str, float] | None, T0: float
-) -> list[tuple[int, float]]:
-    """What an effect's signal is at a steady temperature: (power of T - T₀, factor)."""
-    if name in ("radial_distortion_drift", "decentering_drift", "affinity_drift", "permanent_set"):
-        return [(1, 1.0)]
-    if name == "nonlinear_expansion":
-        return [(2, 1.0)]
-    if name == "self_heating":
-        return [(0, 1.0)]
-    if name == "second_heat_source":
-        channel = str(values["channel"])
-        if channels is None or channel not in channels:
-            raise DataError(
-                f"the model also hangs on {channel!r}: give its temperature, channels="
-                f"{{{channel!r}: …}}"
-            )
-        return [(0, float(channels[channel]) - T0)]
-    return []
-
-
 def _knee(
-    effect: Any, own: list[tuple[str, int]], names: tuple[str, ...]
+    effect: ModelEffect, steady: Steady, own: list[tuple[str, int]], names: tuple[str, ...]
 ) -> tuple[float, Array, Array, Array]:
     rate, by_rate, by_knee = np.zeros(10), np.zeros((10, len(names))), np.zeros((10, len(names)))
     for key, row in own:
         rate[row] = float(effect.values[key])
-        if f"softening.{key}" in names:
-            by_rate[row, names.index(f"softening.{key}")] = 1.0
-        if "softening.T_k" in names:
-            by_knee[row, names.index("softening.T_k")] = -rate[row]
-    return float(effect.values["T_k"]), rate, by_rate, by_knee
+        if f"{effect.name}.{key}" in names:
+            by_rate[row, names.index(f"{effect.name}.{key}")] = 1.0
+        if f"{effect.name}.{steady.knee_name}" in names:
+            by_knee[row, names.index(f"{effect.name}.{steady.knee_name}")] = -rate[row]
+    assert steady.knee is not None
+    return steady.knee, rate, by_rate, by_knee

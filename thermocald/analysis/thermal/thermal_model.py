@@ -105,14 +105,14 @@ def fit_thermal_model(
     for effect in listed:
         begun = replace(state.model, effects=(*state.model.effects, _started(effect)))
         state = replace(state, model=begun)
-        if effect.name != "defocus":
+        if effects.get(effect.name).seen_in != "noise":
             state = search_effect(checked, state, search)
     if listed:
         state = fit.solve(state)
     fit.take_off_offsets(state)
     fit.components = fit.correcting = True
     state = fit.solve(state)
-    if any(e.name == "defocus" for e in listed):
+    if any(effects.get(e.name).seen_in == "noise" for e in listed):
         for _ in range(3):
             state = fit.defocus(state)
             fit.take_off_offsets(state)
@@ -157,13 +157,13 @@ def _checked(series: Sequence[ModelSeries], listed: Sequence[ModelEffect]) -> li
             f"the temperature changes by {span:.2f} K only: heat the camera by several kelvin"
         )
     moved = targets_of(listed)
-    if any(e.name == "target_displacement" for e in listed) and not any(
-        t in first.field.index for t in moved
-    ):
-        raise DataError(
-            f"target_displacement: none of the targets {', '.join(moved) or '(none)'} is "
-            "in the test field"
-        )
+    for e in listed:
+        if effects.get(e.name).seen_in == "targets" and not any(
+            t in first.field.index for t in moved
+        ):
+            raise DataError(
+                f"{e.name}: none of the targets {', '.join(moved) or '(none)'} is in the test field"
+            )
     return [s.displacing(moved) if moved else s for s in series]
 
 
@@ -264,13 +264,15 @@ def _rms(series: ModelSeries, model: ThermalModel) -> float:
 
 
 def _with_sds(effect: ModelEffect, sd: dict[str, float], series: list[ModelSeries]) -> ModelEffect:
-    if effect.name == "defocus":
+    kind = effects.get(effect.name)
+    if kind.seen_in == "noise":
         return effect
     found = {k: sd[f"{effect.name}.{k}"] for k in effect.values if f"{effect.name}.{k}" in sd}
     values = dict(effect.values)
-    if "phase" in values:
-        values["phase"] = float(np.angle(np.exp(1j * values["phase"])))
-    if "time" in values:
-        # an instant between two frames: uniform over the interval
-        found["time"] = frame_interval(series[0].history.times) / np.sqrt(12.0)
+    for key, parameter in kind.nonlinear.items():
+        if parameter.role == "phase":
+            values[key] = float(np.angle(np.exp(1j * values[key])))
+        if parameter.role == "event":
+            # a time between two frames: uniform over the interval
+            found[key] = frame_interval(series[0].history.times) / np.sqrt(12.0)
     return ModelEffect(effect.name, values, found)

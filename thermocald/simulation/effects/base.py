@@ -68,7 +68,7 @@ class Effect(ABC):
     For a search: seen_in: the trajectories of the camera's parameters, the measuring noise, or
     single targets; parameter_sets: the sets of coefficients that it may act on, by default the
     usual ones; moves_mount: it may act on the orientation of the camera instead; columns:
-    {coefficient: column of the reduced series}, where the names differ. steady_signal: for `steady`.
+    {coefficient: column of the reduced series} where names differ; steady_signal: see `steady`.
     """
 
     name: ClassVar[str]

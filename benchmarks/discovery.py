@@ -3,9 +3,9 @@
     python benchmarks/discovery.py [--seeds 1] [--px 0.1] [--long]
 
 Peers get generous help: the free camera of each epoch whitened by its normal equations, the
-smoothed temperature, and a library of every catalogue course (non-linear parameters at the truth's
-order of magnitude on a grid). They need `pip install pysindy scikit-learn`; a peer that is not
-installed is left out and said so.
+smoothed temperature, and a library of every catalogue trajectory (non-linear parameters at the
+truth's order of magnitude on a grid). They need `pip install pysindy scikit-learn`; a peer that is
+not installed is left out and said so.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ import numpy as np
 from tests.blind.bridge import series_input
 from tests.blind.case import SINGLE, Case
 from tests.blind.generator import generate
-from thermocald.discovery.candidates import candidates
-from thermocald.discovery.evidence import COLUMNS
-from thermocald.discovery.laboratory import Laboratory
-from thermocald.discovery.reduction import gather
-from thermocald.discovery.result import discover_series
+from thermocald.discovery.search.candidates import candidates
+from thermocald.discovery.verdict.result import discover_series
+from thermocald.reduction.fit import HypothesisFitter
+from thermocald.reduction.reduce import reduce_series
+from thermocald.reduction.series import COLUMNS
 
-# what a course in the parameter series can show: image space is not offered to the peers
+# what a trajectory in the parameter series can show: image space is not offered to the peers
 COURSES = [e for e in SINGLE if e not in ("defocus", "target_displacement")]
 
 
@@ -46,29 +46,28 @@ class Score:
         self.closed, self.seconds = [], []
 
 
-def library(laboratory: Laboratory, series: int) -> tuple[list[str], np.ndarray]:
-    """Named, normalised columns (E · D, K): each catalogue course on each parameter it acts on."""
-    e = laboratory.series[series]
+def library(fitter: HypothesisFitter, series: int) -> tuple[list[str], np.ndarray]:
+    """Named, normalised columns (E · D, K): each effect on each parameter it acts on."""
+    e = fitter.series[series]
     names, columns = [], []
-    base = laboratory.drive_course([], series)
+    base = fitter.drive_trajectory([], series)
     T = base - base.mean()
-    for candidate in candidates(laboratory.series):
+    for candidate in candidates(fitter.series):
         grid = (
             candidate.grid[:: max(len(candidate.grid) // 8, 1)] if len(candidate.grid) else [None]
         )
         for value in grid:
             if candidate.is_event:
-                course = (e.times >= value).astype(float)
+                trajectory = (e.times >= value).astype(float)
             elif candidate.is_drive:
-                course = laboratory.drive_course([candidate.term(value, 1)], series) - base
+                trajectory = fitter.drive_trajectory([candidate.term(value, 1)], series) - base
             else:
-                course = laboratory.courses(candidate.term(value, 1), series, operators=False)[0][
-                    :, 0
-                ]
-            course = course - course.mean()
+                term = candidate.term(value, 1)
+                trajectory = fitter.trajectories(term, series, operators=False)[0][:, 0]
+            trajectory = trajectory - trajectory.mean()
             for parameter in candidate.parameters:
                 names.append(candidate.effect)
-                columns.append((course, parameter))
+                columns.append((trajectory, parameter))
     for parameter in ("c", "x0", "y0"):
         names.append("base")
         columns.append((T, parameter))
@@ -79,8 +78,8 @@ def library(laboratory: Laboratory, series: int) -> tuple[list[str], np.ndarray]
     return names, X
 
 
-def whitened(laboratory: Laboratory, series: int) -> np.ndarray:
-    e = laboratory.series[series]
+def whitened(fitter: HypothesisFitter, series: int) -> np.ndarray:
+    e = fitter.series[series]
     size, U = np.linalg.eigh(e.N.mean(axis=0))
     keep = size > 1e-4 * np.median(size)
     z = (e.values - e.values.mean(axis=0)) @ (U[:, keep] * np.sqrt(size[keep]))
@@ -123,15 +122,15 @@ def names_said(
     return {e for e, p in power.items() if p > floor}
 
 
-def gaussian_process(laboratory: Laboratory) -> float:
+def gaussian_process(fitter: HypothesisFitter) -> float:
     """Share of M2's misfit that a discrepancy in (T, dT/dt) learnt on M1 explains."""
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, WhiteKernel
 
     data = []
     for s in (0, 1):
-        e = laboratory.series[s]
-        T = laboratory.drive_course([], s)
+        e = fitter.series[s]
+        T = fitter.drive_trajectory([], s)
         size, U = np.linalg.eigh(e.N.mean(axis=0))
         z = (e.values - e.values.mean(axis=0)) @ (U[:, -6:] * np.sqrt(size[-6:]))
         t = T - T.mean()
@@ -152,7 +151,7 @@ def long_series() -> float:
     series, _ = generate(Case(("thermal_lag",), 0.1, 77, epochs=8640, with_m2=False))
     source = series_input(series[0])
     begin = time.process_time()
-    found = discover_series([gather(source)])
+    found = discover_series([reduce_series(source)])
     assert [e.effect for e in found.effects] == ["thermal_lag"]
     return time.process_time() - begin
 
@@ -183,8 +182,8 @@ def main() -> None:
     for case in cases:
         series, _ = generate(case)
         begin = time.process_time()
-        first = gather(series_input(series[0]))
-        second = gather(series_input(series[1]), first.T0, first.scale)
+        first = reduce_series(series_input(series[0]))
+        second = reduce_series(series_input(series[1]), first.T0, first.scale)
         found = discover_series([first, second])
         own = scores["thermocald discover"]
         own.seconds.append(time.process_time() - begin)
@@ -192,8 +191,8 @@ def main() -> None:
         closed = found.excess_closed()
         if closed is not None:
             own.closed.append(closed)
-        laboratory = Laboratory([first, second])
-        prepared = [(library(laboratory, s), whitened(laboratory, s)) for s in (0, 1)]
+        fitter = HypothesisFitter([first, second])
+        prepared = [(library(fitter, s), whitened(fitter, s)) for s in (0, 1)]
         (names, X), y = prepared[0]
         for name, peer in peers.items():
             begin = time.process_time()
@@ -204,7 +203,7 @@ def main() -> None:
             if case.effects:
                 scores[name].closed.append(_closed(prepared[1], coefficients, names))
         if case.effects and "LassoLarsIC" in peers:
-            gp.append(gaussian_process(laboratory))
+            gp.append(gaussian_process(fitter))
     print("| method | names right | false alarms | gap on M2 closed (median) | median CPU s |")
     print("|---|---|---|---|---|")
     for name, s in scores.items():

@@ -6,10 +6,10 @@ import numpy as np
 
 from tests.blind.case import CAMERAS
 from tests.blind.generator import Series
-from thermocald.discovery.evidence import SeriesInput
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.series.normals import ObservationGrid
+from thermocald.reduction.series import SeriesInput
 
 
 def series_input(series: Series) -> SeriesInput:

@@ -26,8 +26,8 @@ from tests.blind.case import OUTSIDE, SINGLE, Case
 from tests.blind.generator import generate
 from tests.blind.outcome import Outcome
 from tests.blind.tables import row, write
-from thermocald.discovery.reduction import gather
-from thermocald.discovery.result import Discovery, discover_series
+from thermocald.discovery.verdict.result import Discovery, discover_series
+from thermocald.reduction.reduce import reduce_series
 
 NUMBERS = {
     "thermal_lag": ("tau",), "time_offset": ("d",), "hysteresis": ("half_width",),
@@ -39,8 +39,8 @@ NUMBERS = {
 def examine_case(case: Case) -> tuple[Discovery, dict, float]:
     series, truth = generate(case)
     begin = time.process_time()
-    first = gather(series_input(series[0]))
-    rest = [gather(series_input(s), first.T0, first.scale) for s in series[1:]]
+    first = reduce_series(series_input(series[0]))
+    rest = [reduce_series(series_input(s), first.T0, first.scale) for s in series[1:]]
     discovery = discover_series([first, *rest])
     return discovery, truth, time.process_time() - begin
 

@@ -74,7 +74,7 @@ def test_with_the_model_found_nothing_is_missing(recordings, tmp_path):
 
 
 def test_simulate_runs_the_new_model(recordings, tmp_path):
-    from thermocald.discovery.source import series_input
+    from thermocald.reduction.source import series_input
     from thermocald.simulation.history import History
     from thermocald.simulation.model_file import read_model
     from thermocald.store.recording.reader import read_recording

@@ -10,11 +10,11 @@ import pytest
 from tests.blind.bridge import series_input
 from tests.blind.case import Case
 from tests.blind.generator import generate
-from thermocald.discovery.condensing import condensed
-from thermocald.discovery.hypothesis import Term
-from thermocald.discovery.laboratory import Laboratory
-from thermocald.discovery.reduction import gather
 from thermocald.errors import DataError
+from thermocald.reduction.blocks import in_blocks
+from thermocald.reduction.fit import HypothesisFitter
+from thermocald.reduction.hypothesis import Term
+from thermocald.reduction.reduce import reduce_series
 
 
 @pytest.fixture
@@ -23,14 +23,14 @@ def source():
 
 
 def test_noise_is_found(source):
-    e = gather(source)
+    e = reduce_series(source)
 
     assert np.sqrt(e.variance) * 0.04 == pytest.approx(0.04, rel=0.02)
     assert np.median(e.sigma0) == pytest.approx(1.0, abs=0.02)
 
 
 def test_gross_errors_are_taken_out(source):
-    e = gather(source)
+    e = reduce_series(source)
 
     share = e.gross / source.grid.observed.sum()
     assert 0.001 < share < 0.004  # 0.2 % were put in, some below what can be seen
@@ -39,12 +39,12 @@ def test_gross_errors_are_taken_out(source):
 
 
 def test_wrong_field_coordinates_do_not_matter(source):
-    """A constant error of each target's coordinates leaves the courses as they were."""
+    """A constant error of each target's coordinates leaves the trajectories as they were."""
     rng = np.random.default_rng(0)
     moved = source.field.points + rng.normal(0, 0.1, source.field.points.shape)
     other = replace(source, field=replace(source.field, points=moved))
 
-    fits = [Laboratory([gather(x)]).fit((Term("creep"),)) for x in (source, other)]
+    fits = [HypothesisFitter([reduce_series(x)]).fit((Term("creep"),)) for x in (source, other)]
 
     creep = [f.coefficients[3:] for f in fits]
     # 0.1 mm of 1 m turn the partial derivatives by 1e-4 and the linearisation by a little more
@@ -77,13 +77,13 @@ def test_weak_input_is_refused(source):
     }
     for words, weak in cases.items():
         with pytest.raises(DataError, match=words):
-            gather(weak)
+            reduce_series(weak)
 
 
 def test_blocks_keep_the_slow_courses(source):
-    e = gather(source)
+    e = reduce_series(source)
 
-    short = condensed(e, rows=60)
+    short = in_blocks(e, rows=60)
 
     assert len(short.times) == 60
     assert short.N.sum(axis=0) == pytest.approx(e.N.sum(axis=0))
@@ -95,7 +95,7 @@ def test_the_place_of_linearisation_has_all_parameters():
     """Where C1 of 4e-3 is held at 0, y0 and B2 make up for it, and the drifts come out biased."""
     series, _ = generate(Case(("affinity_drift",), 0.3, 210, with_m2=False))
 
-    at = gather(series_input(series[0])).at
+    at = reduce_series(series_input(series[0])).at
 
     assert at.iop[8] == pytest.approx(1.6e-3, abs=4e-4)  # C1 of the base and of the mean T
     assert abs(at.iop[7]) < 2e-4  # B2, drawn with 1e-4

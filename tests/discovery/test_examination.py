@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermocald.discovery.result import discover_series
+from thermocald.discovery.verdict.result import discover_series
 
 KEYS = {
     "effect",

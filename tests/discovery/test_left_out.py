@@ -8,27 +8,27 @@ import pytest
 from tests.blind.bridge import series_input
 from tests.blind.case import Case
 from tests.blind.generator import generate
-from thermocald.discovery.hypothesis import Term
-from thermocald.discovery.laboratory import Laboratory
-from thermocald.discovery.left_out import confirmed, gains, left_out
-from thermocald.discovery.reduction import gather
+from thermocald.discovery.search.cross_validation import confirmed, cross_validation, gains
+from thermocald.reduction.fit import HypothesisFitter
+from thermocald.reduction.hypothesis import Term
+from thermocald.reduction.reduce import reduce_series
 
 
-def laboratory(effect, seed=91):
+def fitter(effect, seed=91):
     series, truth = generate(Case((effect,), 0.2, seed, epochs=90))
-    first = gather(series_input(series[0]))
-    second = gather(series_input(series[1]), first.T0, first.scale)
-    return Laboratory([first, second]), truth
+    first = reduce_series(series_input(series[0]))
+    second = reduce_series(series_input(series[1]), first.T0, first.scale)
+    return HypothesisFitter([first, second]), truth
 
 
 def test_the_cause_predicts_every_block():
-    lab, _ = laboratory("nonlinear_expansion")
+    lab, _ = fitter("nonlinear_expansion")
     fit = lab.refine(lab.fit([Term("nonlinear_expansion")]))
 
     (gain,) = gains(lab, fit)
 
     assert confirmed(gain)
-    outside, inside = left_out(lab, fit)
+    outside, inside = cross_validation(lab, fit)
     assert 0.95 * inside < outside < 1.1 * inside
 
 
@@ -48,7 +48,7 @@ def test_what_confirms(gain, is_confirmed):
 def test_a_course_that_follows_the_noise_predicts_nothing():
     """A cycle fitted to a recording without effects, at the period that suits it best."""
     series, _ = generate(Case((), 0.2, 92, epochs=90, with_m2=False))
-    lab = Laboratory([gather(series_input(series[0]))])
+    lab = HypothesisFitter([reduce_series(series_input(series[0]))])
     trials = [
         lab.fit([Term("cyclic_interference", nonlinear=(("P", p),))])
         for p in np.geomspace(40, 400, 60)
@@ -61,7 +61,7 @@ def test_a_course_that_follows_the_noise_predicts_nothing():
 
 def test_a_step_within_the_block_left_out_is_no_fault():
     """Where a slip comes early in M2, the block with it leaves its height undetermined."""
-    lab, truth = laboratory("slip")
+    lab, truth = fitter("slip")
     times = [s["time"] for (s,) in truth["effects"] if s["happens"]]
     own = [
         (("time", float(e.times[np.searchsorted(e.times, t)])),)

@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermocald.discovery.evidence import COLUMNS
-from thermocald.discovery.hypothesis import Term
-from thermocald.discovery.laboratory import Laboratory
+from thermocald.reduction.fit import HypothesisFitter
+from thermocald.reduction.hypothesis import Term
+from thermocald.reduction.series import COLUMNS
 
 
 @pytest.fixture
 def dense(evidence_of):
-    """A short series, a fit with two carried courses, and S built entry by entry."""
+    """A short series, a fit with two carried trajectories, and S built entry by entry."""
     evidence, _ = evidence_of("nonlinear_expansion", seed=5, epochs=30, with_m2=False)
-    laboratory = Laboratory(evidence)
-    fit = laboratory.fit((Term("nonlinear_expansion"),))
+    fitter = HypothesisFitter(evidence)
+    fit = fitter.fit((Term("nonlinear_expansion"),))
     e = evidence[0]
     E, _P = len(e.times), len(COLUMNS)
     # the least determined combinations are left out so that N can be inverted
@@ -30,7 +30,7 @@ def dense(evidence_of):
     for block in fit.blocks:
         d = keep.T @ fit.direction(block)[0]
         operator = (
-            laboratory.drive((), 0)[1] if block.term < 0 else laboratory.courses(fit.terms[0], 0)[1]
+            fitter.drive((), 0)[1] if block.term < 0 else fitter.trajectories(fit.terms[0], 0)[1]
         )
         for i in range(E):
             J[i * k : (i + 1) * k] += np.outer(d, operator[i])
@@ -85,10 +85,10 @@ def test_scan_agrees_with_reduce(dense):
 def test_effect_free_recordings_are_at_the_floor(evidence_of):
     """Reduced χ² of the parameters is 1 with the thermometer's error in it, and far off without."""
     evidence, _ = evidence_of(seed=8)
-    laboratory = Laboratory(evidence)
-    fit = laboratory.fit(())
+    fitter = HypothesisFitter(evidence)
+    fit = fitter.fit(())
     rank = 18.0
     free = sum(rank * (len(e.times) - 1) - 3 for e in evidence)
     assert fit.chi2 / free == pytest.approx(1.0, abs=0.05)
-    laboratory.thermometer_factor = 1e-3
-    assert laboratory.fit(()).chi2 / free > 2.0
+    fitter.thermometer_factor = 1e-3
+    assert fitter.fit(()).chi2 / free > 2.0

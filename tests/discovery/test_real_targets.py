@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermocald.discovery.reduction import gather
-from thermocald.discovery.result import discover_series
-from thermocald.discovery.source import series_input
+from thermocald.discovery.verdict.result import discover_series
 from thermocald.errors import DataError
+from thermocald.reduction.reduce import reduce_series
+from thermocald.reduction.source import series_input
 from thermocald.store.recording.reader import read_recording
 
 CAMERAS = ("aviary-cam0", "aviary-cam1", "aviary-cam2", "aviary-cam6")
@@ -50,7 +50,7 @@ def with_temperature(shared, camera, kind, stretched=1.0):
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_fifty_seconds_are_too_short(shared, camera):
     with pytest.raises(DataError, match="lasts 50 s"):
-        gather(with_temperature(shared, camera, "ramp"))
+        reduce_series(with_temperature(shared, camera, "ramp"))
 
 
 @pytest.mark.slow
@@ -58,14 +58,14 @@ def test_fifty_seconds_are_too_short(shared, camera):
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_an_invented_temperature_names_no_effect(shared, camera, kind):
     """Tag 22 of cam2 and camera 6 as a whole really move a little: that may be `unnamed`."""
-    found = discover_series([gather(with_temperature(shared, camera, kind, 20.0))])
+    found = discover_series([reduce_series(with_temperature(shared, camera, kind, 20.0))])
 
     assert {e.effect for e in found.effects} <= {"unnamed"}
 
 
 def test_a_hidden_board_does_not_pull_at_the_cameras(shared):
     """Offsets and cameras are solved together: each target's residuals have no mean."""
-    e = gather(with_temperature(shared, "aviary-cam2", "ramp", 20.0))
+    e = reduce_series(with_temperature(shared, "aviary-cam2", "ramp", 20.0))
     seen = e.weights[..., 0] > 0
     often = seen.sum(axis=0) > 50
 

@@ -1,14 +1,14 @@
-"""The thermometer's noise from its readings, and its smooth course."""
+"""The thermometer's noise from its readings, and its smooth trajectory."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from thermocald.discovery.thermometer import latent_times, reading_noise, smooth_channel
+from thermocald.reduction.thermometer import latent_times, reading_noise, smooth_channel
 
 
-def course(t):
+def trajectory(t):
     """Two lamps, as a body with a time constant of 250 s follows them."""
     up = 20 * (1 - np.exp(-np.maximum(t - 200, 0) / 250))
     down = 20 * (1 - np.exp(-np.maximum(t - 805, 0) / 250))
@@ -19,7 +19,7 @@ def course(t):
 def readings():
     rng = np.random.default_rng(1)
     t = 10.0 * np.arange(180) + rng.uniform(-1, 1, 180)
-    raw = course(t) + rng.normal(0, 0.04, 180)
+    raw = trajectory(t) + rng.normal(0, 0.04, 180)
     return t, np.round(raw / 0.0625) * 0.0625
 
 
@@ -29,7 +29,7 @@ def test_noise_with_quantisation(readings):
     for seed in range(40):
         rng = np.random.default_rng(seed)
         t = 10.0 * np.arange(180) + rng.uniform(-1, 1, 180)
-        y = np.round((course(t) + rng.normal(0, 0.04, 180)) / 0.0625) * 0.0625
+        y = np.round((trajectory(t) + rng.normal(0, 0.04, 180)) / 0.0625) * 0.0625
         noises.append(reading_noise(t, y, 0.0625))
     # 177 third differences, correlated: 12 % each, so 2 % for the mean; kinks raise it a little
     assert np.mean(noises) == pytest.approx(true, rel=0.08)
@@ -50,8 +50,8 @@ def test_kinks_get_a_latent_instant(readings):
 def test_course_is_closer_than_readings(readings):
     t, y = readings
     c = smooth_channel(t, y, np.zeros(len(t), dtype=bool), 0.0625)
-    assert np.std(c.course - course(t)) < 0.7 * np.std(y - course(t))
-    assert c.course + c.deviation == pytest.approx(y)
+    assert np.std(c.trajectory - trajectory(t)) < 0.7 * np.std(y - trajectory(t))
+    assert c.trajectory + c.deviation == pytest.approx(y)
 
 
 def test_a_missing_reading_is_uncertain(readings):
@@ -64,7 +64,7 @@ def test_a_missing_reading_is_uncertain(readings):
 
 
 def test_thermometers_are_not_read_at_even_intervals():
-    """On a steep course jittered readings differ without any noise."""
+    """On a steep trajectory jittered readings differ without any noise."""
     rng = np.random.default_rng(3)
     t = 10.0 * np.arange(200) + rng.uniform(-1, 1, 200)
 

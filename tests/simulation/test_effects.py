@@ -15,8 +15,8 @@ from thermocald.photogrammetry.camera.camera_model import (
 from thermocald.simulation import effects
 from thermocald.simulation.effects.base import Effect
 from thermocald.simulation.history import History
-from thermocald.simulation.operators import play, play_turns
 from thermocald.simulation.model import ModelEffect, ThermalModel
+from thermocald.simulation.operators import play, play_turns
 from thermocald.simulation.testfields import corner_field
 
 T0 = 25.0

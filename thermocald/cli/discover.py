@@ -11,7 +11,7 @@ from thermocald.cli.common import say, write_json, write_text
 from thermocald.errors import UsageError
 
 if TYPE_CHECKING:
-    from thermocald.discovery.result import Discovery
+    from thermocald.discovery.verdict.result import Discovery
 
 __all__ = ["register"]
 
@@ -73,13 +73,13 @@ def discover(
     found = _examined(recording, verify, model)
     written: str | None = None
     if model_out is not None:
-        from thermocald.discovery.new_model import model_of
+        from thermocald.discovery.verdict.model import model_of
         from thermocald.simulation.model_file import read_model, write_model
 
         write_model(model_out, model_of(found, read_model(model) if model else None))
         written = str(model_out)
     if report is not None:
-        from thermocald.discovery.report import report_html
+        from thermocald.output.discovery.report import report_html
 
         write_text(report_html(found, recording.name), report)
     if json is not None:
@@ -90,15 +90,16 @@ def discover(
 
 
 def _examined(recording: Path, verify: Path | None, model: Path | None) -> Discovery:
-    from thermocald.discovery.new_model import terms_of
-    from thermocald.discovery.result import discover_series
-    from thermocald.discovery.source import gather_pair, load_pair
+    from thermocald.discovery.evidence.pair import load_pair
+    from thermocald.discovery.verdict.model import terms_of
+    from thermocald.discovery.verdict.result import discover_series
+    from thermocald.reduction.reduce import reduce_together
     from thermocald.simulation.model_file import read_model
 
     old = read_model(model) if model is not None else None
     inputs = load_pair(recording, verify, say)
     say("reducing the epochs to normal equations")
-    evidence = gather_pair(inputs, old.T0 if old else None)
+    evidence = reduce_together(inputs, old.T0 if old else None)
     return discover_series(evidence, say, terms_of(old) if old else ())
 
 

@@ -14,15 +14,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.discovery.candidates import Candidate, candidates
-from thermocald.discovery.evidence import COLUMNS, Evidence, SeriesInput
-from thermocald.discovery.examination import examine_series
-from thermocald.discovery.hypothesis import Term
-from thermocald.discovery.laboratory import Laboratory
-from thermocald.discovery.new_model import terms_of
-from thermocald.discovery.reduction import gather
-from thermocald.discovery.source import series_input
+from thermocald.discovery.search.candidates import Candidate, candidates
+from thermocald.discovery.search.examination import examine_series
+from thermocald.discovery.verdict.model import terms_of
 from thermocald.errors import UsageError
+from thermocald.reduction.fit import HypothesisFitter
+from thermocald.reduction.hypothesis import Term
+from thermocald.reduction.reduce import reduce_series
+from thermocald.reduction.series import COLUMNS, ReducedSeries, SeriesInput
+from thermocald.reduction.source import series_input
 from thermocald.simulation import effects as catalogue
 from thermocald.simulation.history import History
 from thermocald.simulation.model import ModelEffect
@@ -176,17 +176,17 @@ def plan_power(inputs: Sequence[SetUp], strength_px: float, advance: Callable[[]
     found: dict[str, dict[str, int]] = {}
     rng = np.random.default_rng(0)
     for set_up in inputs:
-        evidence = gather(set_up.source)
-        laboratory = Laboratory([evidence])
+        evidence = reduce_series(set_up.source)
+        fitter = HypothesisFitter([evidence])
         done: set[str] = set()
         for candidate in candidates([evidence]):
             if candidate.effect in done:
                 continue
             done.add(candidate.effect)
             if candidate.is_drive:
-                changed = _with_drive(set_up, laboratory, candidate, strength_px)
+                changed = _with_drive(set_up, fitter, candidate, strength_px)
             else:
-                changed = _with_effect(laboratory, candidate, strength_px, rng)
+                changed = _with_effect(fitter, candidate, strength_px, rng)
             said = _said(changed, set_up.given)
             row = found.setdefault(candidate.effect, {})
             row[said] = row.get(said, 0) + 1
@@ -194,7 +194,7 @@ def plan_power(inputs: Sequence[SetUp], strength_px: float, advance: Callable[[]
     return Plan(found, len(inputs), strength_px)
 
 
-def _said(evidence: Evidence, given: Sequence[tuple[str, dict[str, Any]]]) -> str:
+def _said(evidence: ReducedSeries, given: Sequence[tuple[str, dict[str, Any]]]) -> str:
     """What an examination says beyond the effects that the model has."""
     x = examine_series([evidence], given=given)
     if not x.adequate:
@@ -205,59 +205,59 @@ def _said(evidence: Evidence, given: Sequence[tuple[str, dict[str, Any]]]) -> st
 
 
 def _with_effect(
-    laboratory: Laboratory, candidate: Candidate, strength_px: float, rng: np.random.Generator
-) -> Evidence:
+    fitter: HypothesisFitter, candidate: Candidate, strength_px: float, rng: np.random.Generator
+) -> ReducedSeries:
     """The series with one effect in its normal equations, scaled to what the base leaves over."""
-    e = laboratory.series[0]
-    seen = Laboratory([replace(e, history=_as_read(e))])
+    e = fitter.series[0]
+    seen = HypothesisFitter([replace(e, history=_as_read(e))])
     value = _place(candidate, e, rng)
     term = candidate.term(value, 1)
     if candidate.is_event:
         term = Term(term.effect, term.parameters, (), (((candidate.name, value or 0.0),),))
-    course = seen.courses(term, 0, operators=False)[0][:, 0]
+    trajectory = seen.trajectories(term, 0, operators=False)[0][:, 0]
     direction = np.zeros(len(COLUMNS))
     direction[[COLUMNS.index(p) for p in term.parameters]] = rng.normal(size=len(term.parameters))
-    moved = course[:, None] * direction[None]
-    return _moved(e, moved * (strength_px / max(_left_over(laboratory, moved), 1e-12)))
+    moved = trajectory[:, None] * direction[None]
+    return _moved(e, moved * (strength_px / max(_left_over(fitter, moved), 1e-12)))
 
 
-def _moved(e: Evidence, moved: Array) -> Evidence:
+def _moved(e: ReducedSeries, moved: Array) -> ReducedSeries:
     """The series with its parameters moved (E, P), px-scaled."""
     b = e.b + np.einsum("epq,eq->ep", e.N, moved)
     values = e.values + moved
     return replace(e, b=b, values=values, yy=np.einsum("ep,ep->e", values, b))
 
 
-def _as_read(evidence: Evidence) -> History:
+def _as_read(evidence: ReducedSeries) -> History:
     """The readings themselves, where the evidence has them smoothed: a camera feels every kink."""
     h = evidence.history
-    readings = {n: h.readings[n] + c.deviation for n, c in evidence.channels.items()}
+    readings = {n: h.readings[n] + c.deviation for n, c in evidence.thermometers.items()}
     return History(h.times, h.reading_times, readings, h.reference, h.T0)
 
 
 def _with_drive(
-    set_up: SetUp, laboratory: Laboratory, candidate: Candidate, strength_px: float
-) -> Evidence:
+    set_up: SetUp, fitter: HypothesisFitter, candidate: Candidate, strength_px: float
+) -> ReducedSeries:
     """The series when the camera follows a drive, at the value that leaves the strength.
 
     Simulated anew where that can be: the truth behind the readings is not in them.
     """
-    base = laboratory.fit(())
+    base = fitter.fit(())
     rates = base.direction(base.blocks[0])[0]
-    follows = laboratory.drive_course([], 0)
+    follows = fitter.drive_trajectory([], 0)
     sizes = np.abs(candidate.grid)
     trials: list[tuple[float, Term, Array]] = []
     for value in np.geomspace(max(float(sizes.min()), 0.01), float(sizes.max()), 60):
         term = candidate.term(float(value), 1)
-        moved = (laboratory.drive_course([term], 0) - follows)[:, None] * rates[None]
-        off = abs(float(np.log(max(_left_over(laboratory, moved), 1e-9) / strength_px)))
+        moved = (fitter.drive_trajectory([term], 0) - follows)[:, None] * rates[None]
+        off = abs(float(np.log(max(_left_over(fitter, moved), 1e-9) / strength_px)))
         trials.append((off, term, moved))
     _, term, moved = min(trials, key=lambda t: t[0])
     source = set_up.following(term)
-    return _moved(laboratory.series[0], moved) if source is None else gather(source)
+    return _moved(fitter.series[0], moved) if source is None else reduce_series(source)
 
 
-def _place(candidate: Candidate, e: Evidence, rng: np.random.Generator) -> float | None:
+def _place(candidate: Candidate, e: ReducedSeries, rng: np.random.Generator) -> float | None:
     """A non-linear parameter where the effect is well seen, None where there is none."""
     if not len(candidate.grid):
         return None
@@ -266,10 +266,10 @@ def _place(candidate: Candidate, e: Evidence, rng: np.random.Generator) -> float
     return float(candidate.grid[int(len(candidate.grid) * rng.uniform(0.4, 0.6))])
 
 
-def _left_over(laboratory: Laboratory, moved: Array) -> float:
+def _left_over(fitter: HypothesisFitter, moved: Array) -> float:
     """RMS px that the base model, fitted, leaves of a movement (E, P) of the parameters."""
-    e = laboratory.series[0]
-    T = laboratory.drive_course([], 0)
+    e = fitter.series[0]
+    T = fitter.drive_trajectory([], 0)
     T = T - T.mean()
     r = moved - moved.mean(axis=0)
     N = e.N.mean(axis=0)

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.acquisition.calibrator import Calibrator
 from thermocald.analysis.thermal.series import ModelSeries
 from thermocald.errors import DataError
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
@@ -18,6 +17,7 @@ from thermocald.photogrammetry.series.normals import (
     normal_matrices,
     right_hand_sides,
 )
+from thermocald.reduction.source import measured_epochs
 from thermocald.simulation.history import History
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["load_model_series", "measured_epochs", "model_series", "reduce_series"]
+__all__ = ["load_model_series", "model_series", "reduce_series"]
 
 _ENOUGH = 20  # image points without which an epoch says too little
 _GROSS = 4.5  # standard deviations
@@ -83,27 +83,6 @@ def load_model_series(
     if not found:
         raise DataError(f"{path}: the store holds no series")
     return found
-
-
-def measured_epochs(
-    recording: Recording, advance: Callable[[int], None] | None = None
-) -> list[Epoch]:
-    """A recording's epochs with their observations; frames are measured where they are not."""
-    if recording.has_observations:
-        return list(recording.epochs)
-    camera = recording.camera
-    calibrator = Calibrator(
-        camera.sensor,
-        recording.testfield,
-        nominal_c=camera.principal_distance,
-        interior=camera.interior,
-    )
-    epochs = []
-    for epoch in recording.iter_epochs():
-        epochs.append(calibrator.calibrate(epoch).epoch)
-        if advance is not None:
-            advance(1)
-    return epochs
 
 
 def model_series(recording: Recording, keep_targets: tuple[str, ...] = ()) -> ModelSeries:

@@ -1,10 +1,10 @@
 """The likelihood of a hypothesis about one series, with the thermometer's error in it.
 
 Per epoch the evidence is a small normal matrix N_e over camera parameters. A hypothesis moves the
-parameters along directions v (P,) with courses c (E,): Σ v c(t). Courses that are made from
-temperatures carry the thermometer's error δ (R,) through their own operator O (E, R): what is
-observed is d·O δ beside the image noise. δ is integrated out exactly (Woodbury), so neither
-white nor lagged thermometer noise passes for an effect:
+parameters along directions v (P,) with trajectories c (E,): Σ v c(t). Trajectories that are made
+from temperatures carry the thermometer's error δ (R,) through their own operator O (E, R): what is
+observed is d·O δ beside the image noise. δ is integrated out exactly (Woodbury), so neither white
+nor lagged thermometer noise passes for an effect:
 
     S = N⁻¹ + J C Jᵀ,  J = Σ_k d_k ⊗ O_k,   S⁻¹ = N - N J (C⁻¹ + JᵀN J)⁻¹ JᵀN
 
@@ -24,20 +24,20 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from thermocald.discovery.evidence import Evidence
+    from thermocald.reduction.series import ReducedSeries
 
     Array = NDArray[np.float64]
 
-__all__ = ["Carried", "Reduced", "Weighting", "prepare"]
+__all__ = ["NormalEquations", "ReadingErrorTerm", "Weighting", "prepare"]
 
 
 @dataclass(frozen=True, eq=False)
-class Carried:
+class ReadingErrorTerm:
     """How a thermometer's error reaches the camera: d (P,) px per K·operator, O (E, R) from the
-    column's independent errors (`Evidence.states`), channel.
+    column's independent errors (`ReducedSeries.states`), channel.
 
-    unresolved (E,): standard deviation of the course itself where the temperature bends within
-    one interval, in the course's unit; None where the operator resolves it.
+    unresolved (E,): standard deviation of the trajectory itself where the temperature bends within
+    one interval, in the trajectory's unit; None where the operator resolves it.
     """
 
     direction: Array
@@ -67,56 +67,56 @@ class Weighting:
     level_b: Array
     level_factor: Array
 
-    def _carried(self, courses: Array, directions: Array) -> Array:
-        """L⁻¹ Jᵀ of regressors: courses (E, R), directions (P, R) → (states, R)."""
+    def _carried(self, trajectories: Array, directions: Array) -> Array:
+        """L⁻¹ Jᵀ of regressors: trajectories (E, R), directions (P, R) → (states, R)."""
         from scipy.linalg import solve_triangular
 
         assert self.factor is not None
         total: Array | float = 0.0
         for operator, dN in zip(self.operators, self.dN, strict=True):
-            total = total + operator.T @ ((dN @ directions) * courses)
+            total = total + operator.T @ ((dN @ directions) * trajectories)
         out: Array = solve_triangular(
             self.factor, np.asarray(total), lower=True, check_finite=False
         )
         return out
 
-    def reduce(self, courses: Array, directions: Array) -> Reduced:
-        """Normal equations of regressors after the levels: courses (E, R), directions (P, R)."""
+    def reduce(self, trajectories: Array, directions: Array) -> NormalEquations:
+        """Normal equations after the levels: trajectories (E, R), directions (P, R)."""
         VNV = np.einsum("pi,epq,qj->eij", directions, self.N, directions, optimize=True)
-        A = np.einsum("ei,ej,eij->ij", courses, courses, VNV, optimize=True)
-        c = np.einsum("ei,ei->i", courses, self.b @ directions)
-        K = np.einsum("epq,qi,ei->pi", self.N, directions, courses, optimize=True)
+        A = np.einsum("ei,ej,eij->ij", trajectories, trajectories, VNV, optimize=True)
+        c = np.einsum("ei,ei->i", trajectories, self.b @ directions)
+        K = np.einsum("epq,qi,ei->pi", self.N, directions, trajectories, optimize=True)
         if self.factor is not None:
-            U = self._carried(courses, directions)
+            U = self._carried(trajectories, directions)
             A = A - U.T @ U
             c = c - U.T @ self.data
             K = K - self.level.T @ U
         return self._without_level(A, c, K)
 
-    def _without_level(self, A: Array, c: Array, K: Array) -> Reduced:
+    def _without_level(self, A: Array, c: Array, K: Array) -> NormalEquations:
         from scipy.linalg import solve_triangular
 
         Q = solve_triangular(self.level_factor, np.column_stack([K, self.level_b]), lower=True)
         q = Q[:, -1]
         Q = Q[:, :-1]
-        return Reduced(A - Q.T @ Q, c - Q.T @ q, self.yy - float(q @ q), self.logdet)
+        return NormalEquations(A - Q.T @ Q, c - Q.T @ q, self.yy - float(q @ q), self.logdet)
 
     def scan(
-        self, courses: Array, directions: Array, base: tuple[Array, Array]
+        self, trajectories: Array, directions: Array, base: tuple[Array, Array]
     ) -> tuple[Array, Array, Array]:
-        """Many candidates at once: courses (G, E, m), directions (P, k), each with m·k columns.
+        """Many candidates at once: trajectories (G, E, m), directions (P, k); m·k columns each.
 
-        base: courses (E, R), directions (P, R) of what the model holds already.
+        base: trajectories (E, R), directions (P, R) of what the model holds already.
         Returns, after the levels: A (G, mk, mk), c (G, mk), cross with the base (G, mk, R).
         """
         from scipy.linalg import solve_triangular
 
-        G, E, m = courses.shape
+        G, E, m = trajectories.shape
         P, k = directions.shape
-        s = np.moveaxis(courses, 0, 1).reshape(E, G * m)  # columns by candidate, then course
+        s = np.moveaxis(trajectories, 0, 1).reshape(E, G * m)  # candidate by candidate
         NV = self.N @ directions  # (E, P, k)
         VNV = np.einsum("pa,epb->eab", directions, NV)
-        pairs = np.einsum("gem,gen->egmn", courses, courses).reshape(E, -1)
+        pairs = np.einsum("gem,gen->egmn", trajectories, trajectories).reshape(E, -1)
         A = (pairs.T @ VNV.reshape(E, -1)).reshape(G, m, m, k, k)
         A = A.transpose(0, 1, 3, 2, 4).reshape(G, m * k, m * k)
         c = (s.T @ (self.b @ directions)).reshape(G, m * k)
@@ -154,7 +154,7 @@ class Weighting:
 
 
 @dataclass(frozen=True, eq=False)
-class Reduced:
+class NormalEquations:
     """Normal equations after the levels: A (R, R), c (R,), yy, logdet."""
 
     A: Array
@@ -164,7 +164,7 @@ class Reduced:
 
 
 def prepare(
-    evidence: Evidence, carried: list[Carried], thermometer_factor: float = 1.0
+    evidence: ReducedSeries, carried: list[ReadingErrorTerm], thermometer_factor: float = 1.0
 ) -> Weighting:
     """Fix the covariance of a series: image noise, and the thermometers' carried by `carried`.
 
@@ -193,7 +193,7 @@ def prepare(
     N, b, yy, logdet = _blurred(N, b, yy, carried)
     N0 = N.sum(axis=0)
     dN = [np.einsum("p,epq->eq", item.direction, N) for item in carried]
-    # the readings' own deviation from the smooth course, carried to the camera
+    # the readings' own deviation from the smooth trajectory, carried to the camera
     shift = np.zeros((len(N), P))
     for item, operator in zip(carried, operators, strict=True):
         shift += np.outer(operator @ deviation, item.direction)
@@ -227,9 +227,9 @@ def prepare(
 
 
 def _blurred(
-    N: Array, b: Array, yy: float, carried: list[Carried]
+    N: Array, b: Array, yy: float, carried: list[ReadingErrorTerm]
 ) -> tuple[Array, Array, float, float]:
-    """Per epoch, the variance of unresolved courses along their directions (Sherman-Morrison)."""
+    """Per epoch, the variance of unresolved trajectories is added (Sherman-Morrison)."""
     logdet = 0.0
     for item in carried:
         if item.unresolved is None or not item.unresolved.any():

@@ -7,19 +7,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.discovery.adequacy import names_of
-from thermocald.discovery.candidates import richer_way
-from thermocald.discovery.estimates import (
+from thermocald.discovery.search.candidates import richer_set
+from thermocald.discovery.search.cross_validation import cross_validation
+from thermocald.discovery.search.examination import Examination, examine_series
+from thermocald.discovery.verdict.estimates import (
     acts_on,
-    displacement_estimates,
-    growth_estimates,
     term_estimates,
 )
-from thermocald.discovery.examination import Examination, examine_series
-from thermocald.discovery.gap import Gap, fit_first, gap_of
-from thermocald.discovery.left_out import left_out
-from thermocald.discovery.misfit import resolve
-from thermocald.discovery.unnamed import describe_unnamed
+from thermocald.discovery.verdict.found import EffectFound
+from thermocald.discovery.verdict.gap import Gap, fit_first, gap_of
+from thermocald.discovery.verdict.image_effects import image_effects, image_places
+from thermocald.discovery.verdict.misfit import resolve
+from thermocald.discovery.verdict.unnamed import describe_unnamed
 from thermocald.simulation import effects as catalogue
 
 if TYPE_CHECKING:
@@ -27,46 +26,13 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from thermocald.discovery.evidence import Evidence
-    from thermocald.discovery.hypothesis import Fit, Term
-    from thermocald.discovery.search import Solution
+    from thermocald.discovery.search.search import Solution
+    from thermocald.reduction.hypothesis import Fit, Term
+    from thermocald.reduction.series import ReducedSeries
 
     Array = NDArray[np.float64]
 
-__all__ = ["Discovery", "EffectFound", "Stage", "discover_series"]
-
-
-@dataclass(frozen=True, eq=False)
-class EffectFound:
-    """One entry of `effects` in CONVENTIONS §4."""
-
-    effect: str
-    statement: str
-    where: dict[str, Any]
-    estimates: dict[str, dict[str, Any]]
-    evidence: dict[str, Any]
-    alternatives: list[dict[str, Any]]
-    gap_before: Gap
-    gap_after: Gap
-    term: Term | None = None
-
-    @property
-    def alternative_names(self) -> list[str]:
-        """Effects that the data cannot exclude."""
-        return [a["effect"] for a in self.alternatives if not a.get("resembles")]
-
-    def as_json(self) -> dict[str, Any]:
-        """As the document has it."""
-        return {
-            "effect": self.effect,
-            "statement": self.statement,
-            "where": self.where,
-            "estimates": self.estimates,
-            "evidence": self.evidence,
-            "alternatives": self.alternatives,
-            "gap_before": self.gap_before.as_json(),
-            "gap_after": self.gap_after.as_json(),
-        }
+__all__ = ["Discovery", "Stage", "discover_series"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +54,7 @@ class Discovery:
     examination: Examination
     base_fit: Fit
     final_fit: Fit
-    left_out: tuple[float, float]
+    cross_validation: tuple[float, float]
 
     def excess_closed(self) -> float | None:
         """Share of the excess of reduced χ² over the floor that is closed on M2."""
@@ -105,7 +71,7 @@ class Discovery:
             verify = {"before": first.verify.as_json(), "after": last.verify.as_json()}
         effects = [e.as_json() for e in self.effects]
         if effects:  # where the base model is wrong, told with the first of its causes
-            misfit = resolve(self).as_json()
+            misfit = resolve(self.examination).as_json()
             effects[0]["evidence"] = {**effects[0]["evidence"], "base_misfit": misfit}
         return {
             "format": "thermocald-discovery/1",
@@ -120,7 +86,7 @@ class Discovery:
 
 
 def discover_series(
-    series: Sequence[Evidence],
+    series: Sequence[ReducedSeries],
     progress: Callable[[str], None] | None = None,
     given: Sequence[tuple[str, dict[str, Any]]] = (),
 ) -> Discovery:
@@ -133,8 +99,8 @@ def conclude(x: Examination) -> Discovery:
     """Words and numbers for an examination."""
     terms = x.best.terms if x.adequate else x.base.terms
     known = len(x.base.terms)
-    fits = [fit_first(x.laboratory, terms[:k]) for k in range(known, len(terms) + 1)]
-    found = _image_space(x, fits[0])
+    fits = [fit_first(x.fitter, terms[:k]) for k in range(known, len(terms) + 1)]
+    found = image_effects(x, _gap(x, fits[0], 0, 0))
     stages = [Stage("", _gap(x, fits[0], 0, 0), _verify(x, fits[0], 0))]
     for k, entry in enumerate(found):
         stages.append(Stage(entry.effect, _gap(x, fits[0], 0, k + 1), _verify(x, fits[0], k + 1)))
@@ -147,98 +113,28 @@ def conclude(x: Examination) -> Discovery:
         fit = fits[k + 1 - known]
         stages.append(Stage(terms[k].effect, _gap(x, fit, 0, n), _verify(x, fit, n)))
         found.append(_entry(x, fits[-1], k, stages[-2].fit, stages[-1].fit, len(found) == n))
-    blocks = left_out(x.laboratory, fits[-1]) if found else (float("nan"), float("nan"))
+    blocks = cross_validation(x.fitter, fits[-1]) if found else (float("nan"), float("nan"))
     verdict = "effects_found" if found else "adequate"
     return Discovery(verdict, tuple(found), tuple(stages), x, fits[0], fits[-1], blocks)
 
 
 def _verify(x: Examination, fit: Fit, known: int) -> Gap | None:
-    return _gap(x, fit, 1, known) if len(x.laboratory.series) > 1 else None
+    return _gap(x, fit, 1, known) if len(x.fitter.series) > 1 else None
 
 
 def _gap(x: Examination, fit: Fit, series: int, known: int, explained: float = 0.0) -> Gap:
     """The gap when the first `known` effects of image space are in the model."""
-    order = _image_names(x)[:known]
+    order = image_places(x)[:known]
     noise = x.defocus.noise[series] if x.defocus else None
     return gap_of(
-        x.laboratory, fit, series,
-        x.displaced[series], "target_displacement" in order,
-        noise, "defocus" in order, explained,
+        x.fitter, fit, series,
+        x.displaced[series], "targets" in order, noise, "noise" in order, explained,
     )  # fmt: skip
-
-
-def _image_names(x: Examination) -> list[str]:
-    names = ["target_displacement"] if x.displaced[0] else []
-    return [*names, "defocus"] if x.defocus else names
-
-
-def _image_space(x: Examination, fit: Fit) -> list[EffectFound]:
-    e = x.laboratory.series[0]
-    names = e.source.field.names
-    zero = _gap(x, fit, 0, 0)
-    out = []
-    if x.displaced[0]:
-        group = max(x.displaced[0], key=lambda g: g.gain)
-        estimates = displacement_estimates(group, names)
-        points = e.at.predicted[group.rows]
-        first = int(np.searchsorted(e.times, group.time))
-        out.append(
-            EffectFound(
-                "target_displacement",
-                catalogue.get("target_displacement").sentence(estimates),
-                {
-                    "parameters": [],
-                    "targets": [names[r] for r in group.rows],
-                    "epochs": [int(e.source.numbers[first]), int(e.source.numbers[-1])],
-                    "image_region": [
-                        *(float(v) for v in points.min(axis=0)),
-                        *(float(v) for v in points.max(axis=0)),
-                    ],
-                },
-                estimates,
-                {
-                    "chi2_gain": float(group.gain),
-                    "steps_px": group.steps.tolist(),
-                    "others": [
-                        {"targets": [names[r] for r in g.rows], "time": g.time}
-                        for g in x.displaced[0]
-                        if g is not group
-                    ],
-                    "note": "displacements are across the rays; along them one camera sees nothing",
-                },
-                [],
-                zero,
-                zero,
-            )
-        )
-    if x.defocus:
-        estimates = growth_estimates(x.defocus)
-        out.append(
-            EffectFound(
-                "defocus",
-                catalogue.get("defocus").sentence(estimates),
-                {
-                    "parameters": ["sigma0"],
-                    "epochs": [int(e.source.numbers[0]), int(e.source.numbers[-1])],
-                    "image_region": None,
-                },
-                estimates,
-                {
-                    "log_likelihood_gain": x.defocus.gain,
-                    "next_best_course": x.defocus.other,
-                    "next_best_gain": x.defocus.other_gain,
-                },
-                [],
-                zero,
-                zero,
-            )
-        )
-    return out
 
 
 def _entry(x: Examination, fit: Fit, k: int, before: Gap, after: Gap, first: bool) -> EffectFound:
     term = fit.terms[k]
-    e = x.laboratory.series[0]
+    e = x.fitter.series[0]
     effect = catalogue.get(term.effect)
     estimates = _undecided(x, fit, k, term_estimates(fit, k, e))
     without = _score_without(x, k)
@@ -248,7 +144,7 @@ def _entry(x: Examination, fit: Fit, k: int, before: Gap, after: Gap, first: boo
         "absolute_test": [
             {"sigmas": float(a.significance), "misfit_px": float(a.misfit_px)} for a in x.adequacy
         ],
-        "left_out_blocks_gain": [float(g) for g in x.left_out[k - len(x.base.terms)]],
+        "left_out_blocks_gain": [float(g) for g in x.cross_validation[k - len(x.base.terms)]],
         "inflation_for_correlated_noise": e.correlation,
     }
     if len(x.adequacy) < 2:
@@ -273,11 +169,11 @@ def _undecided(
     That a lens's A2 drifts by less than the data show does not make A1 as sure as if A2 stood
     still.
     """
-    richer = richer_way(fit.terms[k])
+    richer = richer_set(fit.terms[k])
     if richer is None:
         return estimates
     terms = (*fit.terms[:k], richer, *fit.terms[k + 1 :])
-    other = term_estimates(fit_first(x.laboratory, terms), k, x.laboratory.series[0])
+    other = term_estimates(fit_first(x.fitter, terms), k, x.fitter.series[0])
     return {
         name: {**e, "sd": max(e["sd"], other[name]["sd"])} if e["sd"] is not None else e
         for name, e in estimates.items()
@@ -287,24 +183,24 @@ def _undecided(
 def _score_without(x: Examination, k: int) -> float:
     """By how much the score worsens without one effect, the others fitted again."""
     terms = tuple(t for i, t in enumerate(x.best.terms) if i != k)
-    fit = x.laboratory.refine(x.laboratory.fit(terms))
+    fit = x.fitter.refine(x.fitter.fit(terms))
     score = fit.objective + sum(p for i, p in enumerate(x.best.penalties) if i != k)
     return float(score - x.best.score)
 
 
 def _when(x: Examination, fit: Fit, k: int) -> list[int]:
     """First and last epoch in which the effect moves the image by a quarter of its most."""
-    e = x.laboratory.series[0]
+    e = x.fitter.series[0]
     C, V, index = fit.designs[0]
     model = (C * fit.coefficients[index]) @ V.T
     fewer = tuple(t for i, t in enumerate(fit.terms) if i != k)
-    other = x.laboratory.fit(fewer, only=[0])
+    other = x.fitter.fit(fewer, only=[0])
     C, V, index = other.designs[0]
     r = model - (C * other.coefficients[index]) @ V.T
     level = np.linalg.lstsq(e.N.sum(axis=0), np.einsum("epq,eq->p", e.N, r), rcond=1e-12)[0]
     size = np.sqrt(np.maximum(np.einsum("ep,epq,eq->e", r - level, e.N, r - level), 0))
     large = np.flatnonzero(size > 0.25 * size.max())
-    return [int(e.source.numbers[large[0]]), int(e.source.numbers[large[-1]])]
+    return [int(e.numbers[large[0]]), int(e.numbers[large[-1]])]
 
 
 def _alternatives(x: Examination, term: Term, first: bool) -> list[dict[str, Any]]:
@@ -358,16 +254,10 @@ def _unexplained(x: Examination, base: Fit, stages: list[Stage], known: int) -> 
                 "sigmas": [float(a.significance) for a in x.adequacy],
                 "misfit_px": [float(a.misfit_px) for a in x.adequacy],
             },
-            "image_space": [e.effect for e in _image_space(x, base)],
+            "image_space": [e.effect for e in image_effects(x, before)],
         },
         resembling, before, after,
     )  # fmt: skip
     return Discovery(
         "unexplained", (entry,), tuple(stages), x, base, base, (float("nan"), float("nan"))
     )
-
-
-def leading_parameters(x: Examination, series: int = 0) -> list[tuple[str, float]]:
-    """Parameters in which the base model's rest is seen, with shares."""
-    a = x.base_adequacy[series]
-    return names_of(a.directions, a.scores)

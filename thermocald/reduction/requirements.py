@@ -10,8 +10,8 @@ from thermocald.errors import DataError
 from thermocald.photogrammetry.orientation.approximate import plane_fit
 
 if TYPE_CHECKING:
-    from thermocald.discovery.evidence import SeriesInput
-    from thermocald.discovery.thermometer import Channel
+    from thermocald.reduction.series import SeriesInput
+    from thermocald.reduction.thermometer import Thermometer
 
 __all__ = ["MIN_EPOCHS", "MIN_TARGETS", "no_temperature", "require", "require_change"]
 
@@ -62,10 +62,10 @@ def require(source: SeriesInput) -> None:
         )
 
 
-def require_change(source: SeriesInput, reference: str, channel: Channel) -> None:
+def require_change(source: SeriesInput, reference: str, channel: Thermometer) -> None:
     """Raises DataError where the reference temperature does not change."""
-    course = channel.course[np.isfinite(channel.course)]
-    change = float(np.ptp(course))
+    trajectory = channel.trajectory[np.isfinite(channel.trajectory)]
+    change = float(np.ptp(trajectory))
     if change < max(1.0, 8.0 * channel.noise):
         raise DataError(
             f"{source.name}: the temperature {reference!r} is constant within "

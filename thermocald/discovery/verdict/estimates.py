@@ -6,16 +6,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.discovery.evidence import COLUMNS, FIELD_SCALES
-from thermocald.discovery.hypothesis import EVENTS, OSCILLATIONS
+from thermocald.reduction.series import COLUMNS, FIELD_SCALES
 from thermocald.simulation import effects as catalogue
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from thermocald.discovery.evidence import Evidence
-    from thermocald.discovery.hypothesis import Block, Fit
-    from thermocald.discovery.image_space import Displaced, NoiseGrowth
+    from thermocald.discovery.evidence.image_space import Displaced, NoiseGrowth
+    from thermocald.reduction.hypothesis import Block, Fit
+    from thermocald.reduction.series import ReducedSeries
 
     Array = NDArray[np.float64]
 
@@ -28,7 +27,7 @@ def _number(value: float, sd: float, unit: str) -> Estimate:
     return {"value": float(value), "sd": float(sd), "unit": unit}
 
 
-def term_estimates(fit: Fit, number: int, evidence: Evidence) -> dict[str, Estimate]:
+def term_estimates(fit: Fit, number: int, evidence: ReducedSeries) -> dict[str, Estimate]:
     """All parameters of one term: searched ones by name, coefficients as `a_<parameter>`."""
     term = fit.terms[number]
     effect = catalogue.get(term.effect)
@@ -40,7 +39,7 @@ def term_estimates(fit: Fit, number: int, evidence: Evidence) -> dict[str, Estim
         if not isinstance(value, float):
             out[name] = {"value": value, "sd": None, "unit": units.get(name, "")}
             continue
-        if term.effect in EVENTS and name == "time":
+        if effect.nonlinear[name].role == "event":
             first = int(np.searchsorted(evidence.times, value - 1e-6))
             before = float(evidence.times[max(first - 1, 0)])
             out[name] = _number(
@@ -59,14 +58,14 @@ def term_estimates(fit: Fit, number: int, evidence: Evidence) -> dict[str, Estim
 
 
 def _coefficients(
-    fit: Fit, block: Block, evidence: Evidence, units: dict[str, str]
+    fit: Fit, block: Block, evidence: ReducedSeries, units: dict[str, str]
 ) -> dict[str, Estimate]:
     places = np.arange(block.start, block.stop)
-    x = fit.coefficients[places].reshape(block.courses, -1)
+    x = fit.coefficients[places].reshape(block.trajectories, -1)
     C = fit.covariance[np.ix_(places, places)]
     scale = np.array([evidence.scale[COLUMNS.index(p)] for p in block.parameters])
     out: dict[str, Estimate] = {}
-    if fit.terms[block.term].effect in OSCILLATIONS:
+    if fit.terms[block.term].kind.is_periodic:
         u, s, v = np.linalg.svd(x, full_matrices=False)
         a, side = s[0] * v[0], u[:, 0]
         if side[0] < 0:
@@ -100,7 +99,7 @@ def model_values(
 
 
 def displacement_estimates(group: Displaced, names: tuple[str, ...]) -> dict[str, Estimate]:
-    """Targets, instant, and displacement across the rays: the mean of the targets' lengths."""
+    """Targets, time, and displacement across the rays: the mean of the targets' lengths."""
     lengths = np.linalg.norm(group.vectors, axis=1)
     sd = np.sqrt(np.mean(group.sd_vectors**2)) / np.sqrt(len(lengths))
     mean = group.vectors.mean(axis=0)

@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from thermocald.discovery.search.candidates import MOUNT
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    from thermocald.discovery.hypothesis import Fit
-    from thermocald.discovery.result import Discovery
+    from thermocald.discovery.verdict.result import Discovery
+    from thermocald.reduction.hypothesis import Fit
 
     Array = NDArray[np.float64]
 
@@ -44,7 +46,7 @@ def _svg(figure: Figure) -> str:
 
 def _rest(discovery: Discovery, fit: Fit, series: int) -> Array:
     """What a fit leaves of the epochs' parameters (E, P), px-scaled, level taken out."""
-    e = discovery.examination.laboratory.series[series]
+    e = discovery.examination.fitter.series[series]
     C, V, index = fit.designs[series]
     r = e.values - (C * fit.coefficients[index]) @ V.T
     level = np.linalg.lstsq(e.N.sum(axis=0), np.einsum("epq,eq->p", e.N, r), rcond=1e-12)[0]
@@ -52,8 +54,8 @@ def _rest(discovery: Discovery, fit: Fit, series: int) -> Array:
 
 
 def misfit_map(discovery: Discovery) -> str:
-    """Per target, the RMS misfit over the series and its strongest course, before and after."""
-    e = discovery.examination.laboratory.series[0]
+    """Per target, the RMS misfit over the series and its strongest trajectory, before and after."""
+    e = discovery.examination.fitter.series[0]
     seen = e.weights[..., 0].any(axis=0)
     places = e.at.predicted[seen]
     figure, axes = _figure(9.0, 3.9, 2)
@@ -93,8 +95,8 @@ def misfit_map(discovery: Discovery) -> str:
 
 
 def signature(discovery: Discovery) -> str:
-    """What is measured of the effect beyond the base model, and the effect's own course."""
-    e = discovery.examination.laboratory.series[0]
+    """What is measured of the effect beyond the base model, and the effect's own trajectory."""
+    e = discovery.examination.fitter.series[0]
     before = _rest(discovery, discovery.base_fit, 0)
     after = _rest(discovery, discovery.final_fit, 0)
     model = before - after
@@ -134,7 +136,7 @@ def ranking(discovery: Discovery) -> str:
     rows: dict[str, float] = {}
     for s in x.ranking:
         name = s.names[-1]
-        if s.terms[-1].parameters[0] == "omega" and name != "housing_tilt":
+        if s.terms[-1].parameters == MOUNT != s.terms[-1].kind.usual:
             name += " (mount)"
         rows[name] = max(rows.get(name, 0.0), x.base.score - s.score)
     figure, axes = _figure(6.5, 0.6 + 0.3 * max(len(rows), 1))
@@ -150,7 +152,7 @@ def ranking(discovery: Discovery) -> str:
 
 
 def staircase(discovery: Discovery) -> str:
-    """Reduced χ² and px RMS after each step, on M1 and on M2, and the floor."""
+    """NormalEquations χ² and px RMS after each step, on M1 and on M2, and the floor."""
     stages = discovery.stages
     labels = ["before", *(f"+ {s.added}" for s in stages[1:])]
     figure, axes = _figure(9.0, 3.0, 2)
@@ -176,7 +178,7 @@ def staircase(discovery: Discovery) -> str:
 
 
 def misfit_matrix(discovery: Discovery) -> str:
-    """Where the base model fails: slow courses by parameter combination, in sigma."""
+    """Where the base model fails: slow trajectories by parameter combination, in sigma."""
     a = discovery.examination.base_adequacy[0]
     figure, axes = _figure(9.0, 3.0)
     image = axes[0].imshow(

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.discovery.adequacy import names_of
-from thermocald.discovery.evidence import COLUMNS
+from thermocald.reduction.adequacy import names_of
+from thermocald.reduction.series import COLUMNS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from thermocald.discovery.adequacy import Adequacy
-    from thermocald.discovery.evidence import Evidence
-    from thermocald.discovery.examination import Examination
+    from thermocald.discovery.search.examination import Examination
+    from thermocald.reduction.adequacy import Adequacy
+    from thermocald.reduction.series import ReducedSeries
 
     Array = NDArray[np.float64]
 
@@ -24,7 +24,7 @@ __all__ = ["Description", "describe_unnamed"]
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """Statement, where, estimates and evidence of an unnamed influence; course (E,) px RMS, its
+    """Statement, where, estimates and evidence of an unnamed influence; trajectory (E,) px RMS, its
     direction (P,) in px-scaled columns.
     """
 
@@ -32,30 +32,30 @@ class Description:
     where: dict[str, Any]
     estimates: dict[str, dict[str, Any]]
     evidence: dict[str, Any]
-    course: Array
+    trajectory: Array
     direction: Array
 
 
 def describe_unnamed(x: Examination) -> Description:
-    """Channel, time course, spatial pattern, correlations of what the base model leaves in M1."""
-    a, e = x.base_adequacy[0], x.laboratory.series[0]
+    """Time series, spatial pattern and correlations of what the base model leaves in M1."""
+    a, e = x.base_adequacy[0], x.fitter.series[0]
     u, s, v = np.linalg.svd(a.scores, full_matrices=False)
-    norms = np.linalg.norm(a.courses, axis=1)
-    course = (u[:, 0] * s[0] / norms) @ a.courses
+    norms = np.linalg.norm(a.trajectories, axis=1)
+    trajectory = (u[:, 0] * s[0] / norms) @ a.trajectories
     direction = a.directions @ v[0]
     image = np.einsum("tij,j->ti", e.columns, direction)
     pattern = float(np.sqrt(np.mean(image[e.weights[..., 0].any(axis=0)] ** 2)))
-    course_px = course * pattern
-    T = e.history.temperature()
+    course_px = trajectory * pattern
+    T = e.history.temperature()  # on all epochs; the rows may be blocks of them
     recorded: dict[str, Array] = {
-        "temperature": T,
-        "rate of temperature": np.gradient(T, e.times),
+        "temperature": e.averaged(T),
+        "rate of temperature": e.averaged(np.gradient(T, e.history.times)),
         "time": e.times,
         "sigma0": e.sigma0,
     }
     for name in e.history.readings:
         if name != e.history.reference:
-            recorded[name] = e.history.temperature(name)
+            recorded[name] = e.averaged(e.history.temperature(name))
     correlation = {
         name: float(np.corrcoef(course_px, values)[0, 1])
         for name, values in recorded.items()
@@ -79,7 +79,7 @@ def describe_unnamed(x: Examination) -> Description:
         statement,
         {
             "parameters": parameters,
-            "epochs": [int(e.source.numbers[large[0]]), int(e.source.numbers[large[-1]])],
+            "epochs": [int(e.numbers[large[0]]), int(e.numbers[large[-1]])],
             "image_region": None,
         },
         {
@@ -97,7 +97,7 @@ def describe_unnamed(x: Examination) -> Description:
     )
 
 
-def _bridge(a: Adequacy, e: Evidence) -> dict[str, Any]:
+def _bridge(a: Adequacy, e: ReducedSeries) -> dict[str, Any]:
     """What takes the rest up in this series alone: amplitudes of cos(k π t / duration), k = 1, 2, …
     with t from the first frame, in each parameter's own unit.
     """

@@ -12,21 +12,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.discovery.hypothesis import OSCILLATIONS
-
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from thermocald.discovery.evidence import Evidence
-    from thermocald.discovery.hypothesis import Fit, Term
-    from thermocald.discovery.image_space import Displaced
-    from thermocald.discovery.laboratory import Laboratory
+    from thermocald.discovery.evidence.image_space import Displaced
+    from thermocald.reduction.fit import HypothesisFitter
+    from thermocald.reduction.hypothesis import Fit, Term
+    from thermocald.reduction.series import ReducedSeries
 
     Array = NDArray[np.float64]
 
-__all__ = ["Gap", "carried_over", "fit_first", "gap_of", "rank"]
+__all__ = ["Gap", "carried_over", "fit_first", "gap_of"]
 
 _DISTANCE_MM = 10_000.0
 
@@ -48,16 +46,16 @@ class Gap:
         }
 
 
-def fit_first(laboratory: Laboratory, terms: Sequence[Term]) -> Fit:
+def fit_first(fitter: HypothesisFitter, terms: Sequence[Term]) -> Fit:
     """Fit a hypothesis to the first series alone and carry its constants to the others."""
-    fit = laboratory.refine(laboratory.fit(terms, only=[0]), only=[0])
+    fit = fitter.refine(fitter.fit(terms, only=[0]), only=[0])
     return carried_over(fit)
 
 
 def carried_over(fit: Fit) -> Fit:
     """Constants as the first series gave them; what a series has of its own is estimated anew.
 
-    Of an oscillation that is the phase, of a slip its instant and height.
+    Of an oscillation that is the phase, of a slip its time and height.
     """
     x = fit.coefficients.copy()
     for block in fit.blocks:
@@ -70,12 +68,11 @@ def carried_over(fit: Fit) -> Fit:
         A = reduced.A[np.ix_(inside, inside)]
         right = reduced.c[inside] - reduced.A[np.ix_(inside, ~inside)] @ x[index[~inside]]
         own = index[inside]
-        if block.term >= 0 and fit.terms[block.term].effect in OSCILLATIONS:
+        if block.term >= 0 and fit.terms[block.term].kind.is_periodic:
             model = next(b for b in fit.blocks if b.term == block.term and b.series == 0)
             pair = x[model.start : model.stop].reshape(2, -1)
-            u, s, v = np.linalg.svd(pair, full_matrices=False)
+            _, s, v = np.linalg.svd(pair, full_matrices=False)
             amplitude = s[0] * v[0]
-            del u
             angles = np.linspace(0, 2 * np.pi, 720, endpoint=False)
             trial = np.stack(
                 [np.outer(np.cos(angles), amplitude), np.outer(np.sin(angles), amplitude)], axis=1
@@ -89,7 +86,7 @@ def carried_over(fit: Fit) -> Fit:
 
 
 def image_chi2(
-    evidence: Evidence, fit: Fit, series: int, epochs: NDArray[np.bool_] | None = None
+    evidence: ReducedSeries, fit: Fit, series: int, epochs: NDArray[np.bool_] | None = None
 ) -> float:
     """Σ of squared parameter misfits in the metric of the image points, levels estimated anew."""
     C, V, index = fit.designs[series]
@@ -103,7 +100,7 @@ def image_chi2(
 
 
 def gap_of(
-    laboratory: Laboratory,
+    fitter: HypothesisFitter,
     fit: Fit,
     series: int,
     displaced: Sequence[Displaced] = (),
@@ -118,15 +115,16 @@ def gap_of(
     noise factor the evidence is weighted by, and whether the model knows it; explained: χ² that
     a bridge takes up beside the model.
     """
-    e = laboratory.series[series]
+    e = fitter.series[series]
     residuals = np.nan_to_num(e.residuals)
     within = float(np.sum(e.weights[..., :2] * residuals**2))
     coordinates = 2.0 * float(e.n.sum())
     targets = float((e.n.sum() > 0) * np.sum(e.weights[..., 0].any(axis=0)))
     # what a camera does within one block of a long series is no part of the comparison
     unused = e.blocks.within_free if e.blocks is not None else 0.0
-    free = max(coordinates - 2.0 * targets - rank(e) - unused, 1.0)
-    # `slowed` has put correlated noise into the weights; the floor is that of single epochs
+    free = max(coordinates - 2.0 * targets - e.rank - unused, 1.0)
+    # `with_correlated_noise` has put correlated noise into the weights; the floor is that of single
+    # epochs
     k = e.correlation
     total = within + k * max(fit.chi2_of(series) - explained, 0.0)
     image = within + k * max(image_chi2(e, fit, series) - explained, 0.0)
@@ -137,25 +135,20 @@ def gap_of(
     chi2 = total / free
     if noise is not None:
         power = float(np.mean(noise**2))
-        sigma2 = sigma2 * 1.0
         if not noise_known:
             chi2 *= power / float(np.min(noise) ** 2)
     rms = float(np.sqrt(sigma2 * image / free))
     return Gap(rms, chi2, _object_mm(e, rms))
 
 
-def rank(evidence: Evidence) -> float:
-    """Levels that the series determines."""
-    size = np.linalg.eigvalsh(evidence.N.sum(axis=0))
-    return float(np.sum(size > 1e-9 * size[-1]))
-
-
-def _object_mm(evidence: Evidence, rms: float) -> float:
+def _object_mm(evidence: ReducedSeries, rms: float) -> float:
     c = float(evidence.at.iop[0])
     return rms * evidence.source.sensor.pixel_pitch / c * _DISTANCE_MM
 
 
-def _moved(evidence: Evidence, displaced: Sequence[Displaced], known: bool) -> tuple[float, float]:
+def _moved(
+    evidence: ReducedSeries, displaced: Sequence[Displaced], known: bool
+) -> tuple[float, float]:
     """χ² of the displaced targets about the camera of the others, and its degrees of freedom."""
     total = count = 0.0
     w = evidence.weights[..., 0]

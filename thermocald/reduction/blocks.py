@@ -7,19 +7,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.discovery.evidence import Blocks, solve
+from thermocald.reduction.series import Blocks, solve
 
 if TYPE_CHECKING:
-    from thermocald.discovery.evidence import Evidence
+    from thermocald.reduction.series import ReducedSeries
 
-__all__ = ["condensed"]
+__all__ = ["in_blocks"]
 
 
-def condensed(evidence: Evidence, rows: int = 720) -> Evidence:
+def in_blocks(evidence: ReducedSeries, rows: int = 720) -> ReducedSeries:
     """A long series on at most `rows` blocks of neighbouring epochs; a short one as it is.
 
-    Heat is slow: over twelve epochs of 10 s a course of parameters loses what is faster than some
-    minutes, and nothing else. Courses are computed on all epochs and then averaged.
+    Heat is slow: over twelve epochs of 10 s a trajectory of parameters loses what is faster than
+    some minutes, and nothing else. Trajectories are computed on all epochs and then averaged.
     """
     from scipy.sparse import csr_array
 
@@ -38,7 +38,7 @@ def condensed(evidence: Evidence, rows: int = 720) -> Evidence:
     values = solve(N, b)
     yy = np.einsum("ek,ek->e", values, b)
     rank = float(np.sum(np.linalg.eigvalsh(N.sum(axis=0)) > 1e-9 * np.trace(N.sum(axis=0))))
-    knots = next(iter(evidence.channels.values())).times
+    knots = next(iter(evidence.thermometers.values())).times
     inside = (knots >= evidence.history.times[0] - 30.0) & (
         knots <= evidence.history.times[-1] + 30.0
     )
@@ -65,5 +65,6 @@ def condensed(evidence: Evidence, rows: int = 720) -> Evidence:
             average,
             pool,
             rank * float((evidence.n > 0).sum() - (total > 0).sum()),
+            first,
         ),
     )

@@ -1,4 +1,4 @@
-"""The laboratory: the series under examination, in which hypotheses are fitted.
+"""The fit of hypotheses to series: generalised least squares and Gauss-Newton.
 
 Linear coefficients come from generalised least squares under the likelihood of `likelihood`,
 non-linear ones by Gauss-Newton on the same normal equations.
@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.discovery.evidence import COLUMNS
-from thermocald.discovery.hypothesis import BASE, EVENTS, OSCILLATIONS, Block, Fit, Term
-from thermocald.discovery.likelihood import Carried, Reduced, Weighting, prepare
+from thermocald.reduction.hypothesis import BASE, Block, Fit, Term
+from thermocald.reduction.likelihood import NormalEquations, ReadingErrorTerm, Weighting, prepare
+from thermocald.reduction.series import COLUMNS
 from thermocald.simulation import effects as catalogue
+from thermocald.simulation.drive import drive, drive_matrix, driven_history
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,87 +23,57 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
-    from thermocald.discovery.evidence import Evidence
-    from thermocald.simulation.history import History
+    from thermocald.reduction.series import ReducedSeries
 
     Array = NDArray[np.float64]
 
-__all__ = ["Laboratory"]
+__all__ = ["HypothesisFitter"]
 
 # relative standard deviation with which the readings themselves tell their noise
 _NOISE_KNOWN = 0.05
 
 
-class Laboratory:
+class HypothesisFitter:
     """The series under examination, and everything that is computed once for all hypotheses."""
 
-    def __init__(self, series: Sequence[Evidence]) -> None:
+    def __init__(self, series: Sequence[ReducedSeries]) -> None:
         self.series = tuple(series)
         self.thermometer_factor = 1.0
-        self._courses: dict[Any, tuple[Array, Array | None, str]] = {}
+        self._trajectories: dict[Any, tuple[Array, Array | None, str]] = {}
         self._drives: dict[Any, tuple[Array, Array]] = {}
 
-    def share_courses(self, other: Laboratory) -> None:
-        """Use the courses that a laboratory of the same histories has computed."""
-        self._courses, self._drives = other._courses, other._drives
+    def share_trajectories(self, other: HypothesisFitter) -> None:
+        """Use the trajectories that a fitter of the same histories has computed."""
+        self._trajectories, self._drives = other._trajectories, other._drives
 
-    # -- courses ---------------------------------------------------------------------------
+    # -- trajectories ---------------------------------------------------------------------------
 
     def drive(self, terms: Sequence[Term], series: int) -> tuple[Array, Array]:
-        """The course (E,) that drives the linear terms, and its operator (E, states)."""
-        key = (series, tuple((t.effect, t.nonlinear) for t in terms if t.is_drive))
+        """The trajectory (E,) that drives the linear terms, and its operator (E, states)."""
+        drives = _drives(terms, series)
+        key = (series, tuple((name, tuple(values.items())) for name, values in drives))
         if key not in self._drives:
-            evidence = self.series[series]
-            history, operator = self._through(terms, series, last=False)
-            drives = [t for t in terms if t.is_drive]
-            if drives:
-                effect, values = catalogue.get(drives[-1].effect), drives[-1].values(series) or {}
-                course = effect.drive(history, **values)
-                own = effect.sensitivity(history, **values)
-            else:
-                course, own = history.temperature(), history.temperature_matrix()
-            whole = own if operator is None else own @ operator
+            reduced = self.series[series]
+            history = reduced.history
+            operator = drive_matrix(history, drives)
+            assert operator is not None
             if len(self._drives) > 60:
                 self._drives.clear()
             self._drives[key] = (
-                evidence.averaged(course),
-                evidence.states(history.reference, whole),
+                reduced.averaged(drive(history, drives)),
+                reduced.states(history.reference, operator),
             )
         return self._drives[key]
 
-    def drive_course(self, terms: Sequence[Term], series: int) -> Array:
-        """The course (E,) alone: for scanning, where no operator is needed."""
-        history, _ = self._through(terms, series, last=False, operators=False)
-        drives = [t for t in terms if t.is_drive]
-        course = history.temperature()
-        if drives:
-            course = catalogue.get(drives[-1].effect).drive(
-                history, **(drives[-1].values(series) or {})
-            )
-        return self.series[series].averaged(course)
+    def drive_trajectory(self, terms: Sequence[Term], series: int) -> Array:
+        """The trajectory (E,) alone: for scanning, where no operator is needed."""
+        reduced = self.series[series]
+        return reduced.averaged(drive(reduced.history, _drives(terms, series)))
 
-    def _through(
-        self, terms: Sequence[Term], series: int, last: bool, operators: bool = True
-    ) -> tuple[History, csr_array | None]:
-        """The history with its reference sent through the drives (but for the last, unless asked),
-        and the matrix from the knots' errors to what they are then.
-        """
-        history = self.series[series].history
-        drives = [t for t in terms if t.is_drive]
-        operator: csr_array | None = None
-        for term in drives if last else drives[:-1]:
-            effect, values = catalogue.get(term.effect), term.values(series) or {}
-            at_knots = history.at(history.reading_times)
-            if operators:
-                own = effect.sensitivity(at_knots, **values)
-                operator = own if operator is None else own @ operator
-            history = history.with_reference(effect.drive(at_knots, **values))
-        return history, operator
-
-    def courses(
+    def trajectories(
         self, term: Term, series: int, terms: Sequence[Term] = (), operators: bool = True
     ) -> tuple[Array, Array | None, str]:
-        """Courses (E, m) of a signal, operator (E, states) of the first or None, channel."""
+        """Trajectories (E, m) of a signal, operator (E, states) of the first or None, channel."""
         effect = catalogue.get(term.effect)
         values = term.values(series)
         evidence = self.series[series]
@@ -114,23 +85,25 @@ class Laboratory:
             series, term.effect, tuple(sorted(values.items())), drives if through else None,
             operators,
         )  # fmt: skip
-        if key not in self._courses:
+        if key not in self._trajectories:
             history = evidence.history
             before: csr_array | None = None
             if through:
-                history, before = self._through(terms, series, last=True)
-            course = evidence.averaged(effect.signal(history, **values))
+                chain = _drives(terms, series)
+                before = drive_matrix(history, chain, at_readings=True)
+                history = driven_history(history, chain)
+            trajectory = evidence.averaged(effect.signal(history, **values))
             operator = None
             channel = effect.channel(history, **values)
-            if operators and course.shape[1] == 1:
+            if operators and trajectory.shape[1] == 1:
                 sparse = effect.sensitivity(history, **values)
                 if sparse.nnz:
                     whole = sparse if before is None else sparse @ before
                     operator = evidence.states(channel, whole)
-            if len(self._courses) > 600:
-                self._courses.clear()
-            self._courses[key] = (course, operator, channel)
-        return self._courses[key]
+            if len(self._trajectories) > 600:
+                self._trajectories.clear()
+            self._trajectories[key] = (trajectory, operator, channel)
+        return self._trajectories[key]
 
     # -- fitting ---------------------------------------------------------------------------
 
@@ -140,9 +113,8 @@ class Laboratory:
         for i, term in enumerate(terms):
             if term.is_drive:
                 continue
-            separate = term.effect in EVENTS + OSCILLATIONS
-            m = 2 if term.effect in OSCILLATIONS else 1
-            for s in range(len(self.series)) if separate else (None,):
+            m = 2 if term.kind.is_periodic else 1
+            for s in range(len(self.series)) if term.is_separate else (None,):
                 if s is not None and term.values(s) is None:
                     continue
                 blocks.append(Block(i, s, start, m, term.parameters))
@@ -152,7 +124,7 @@ class Laboratory:
     def design(
         self, terms: Sequence[Term], blocks: Sequence[Block], series: int
     ) -> tuple[Array, Array, NDArray[np.int64]]:
-        """Courses (E, K), directions (P, K) and places in the unknowns (K,) of one series."""
+        """Trajectories (E, K), directions (P, K) and places in the unknowns (K,) of one series."""
         columns: list[Array] = []
         directions: list[Array] = []
         index: list[int] = []
@@ -160,15 +132,15 @@ class Laboratory:
             if block.series not in (None, series):
                 continue
             if block.term < 0:
-                course = self.drive(terms, series)[0][:, None]
+                trajectory = self.drive(terms, series)[0][:, None]
             else:
-                course = self.courses(terms[block.term], series, terms, operators=False)[0]
-            course = course - course.mean(axis=0)  # conditioning; the level is eliminated anyway
-            for m in range(block.courses):
+                trajectory = self.trajectories(terms[block.term], series, terms, operators=False)[0]
+            trajectory = trajectory - trajectory.mean(axis=0)  # for conditioning
+            for m in range(block.trajectories):
                 for j, name in enumerate(block.parameters):
                     unit = np.zeros(len(COLUMNS))
                     unit[COLUMNS.index(name)] = 1.0
-                    columns.append(course[:, m])
+                    columns.append(trajectory[:, m])
                     directions.append(unit)
                     index.append(block.start + m * len(block.parameters) + j)
         return np.stack(columns, axis=1), np.stack(directions, axis=1), np.array(index)
@@ -179,7 +151,7 @@ class Laboratory:
         """The covariance of a series at some coefficients."""
         carried = []
         for block in blocks:
-            if block.series not in (None, series) or block.courses > 1:
+            if block.series not in (None, series) or block.trajectories > 1:
                 continue
             d = np.zeros(len(COLUMNS))
             d[[COLUMNS.index(p) for p in block.parameters]] = x[block.start : block.stop]
@@ -187,30 +159,33 @@ class Laboratory:
                 operator: Array | None = self.drive(terms, series)[1]
                 channel = self.series[series].history.reference
             else:
-                _, operator, channel = self.courses(terms[block.term], series, terms)
+                _, operator, channel = self.trajectories(terms[block.term], series, terms)
             if operator is not None and d.any():
                 unresolved = self._unresolved(terms, block, series)
-                carried.append(Carried(d, operator, channel, unresolved))
+                carried.append(ReadingErrorTerm(d, operator, channel, unresolved))
         return prepare(self.series[series], carried, self.thermometer_factor)
 
     def _unresolved(self, terms: Sequence[Term], block: Block, series: int) -> Array | None:
-        """What a course leaves open at single epochs (E,), beside the readings' errors; or None.
+        """Uncertainty of a trajectory at single epochs (E,) beyond the readings' errors; or None.
 
         The rate beside a switched lamp; where a play turns, which reading was the extreme.
         """
         evidence = self.series[series]
         history = evidence.history
-        instrument = evidence.channels[history.reference]
+        instrument = evidence.thermometers[history.reference]
         if block.term >= 0:
-            if terms[block.term].effect != "thermal_gradient":
-                return None
-            return instrument.slope_jump(evidence.times)
-        drives = [t for t in terms if t.is_drive]
+            term = terms[block.term]
+            values = term.values(series) or {}
+            # averaged times stand for the frames of long series
+            here = history.at(evidence.times)
+            left = term.kind.unresolved(here, instrument.slope_jump(evidence.times), **values)
+            return left if left.any() else None
+        drives = _drives(terms, series)
         if not drives:
             return None
-        before, _ = self._through(terms, series, last=False, operators=False)
-        last = catalogue.get(drives[-1].effect)
-        turns = last.turns(before, **(drives[-1].values(series) or {}))
+        before = driven_history(history, drives[:-1])
+        name, values = drives[-1]
+        turns = catalogue.get(name).turns(before, **values)
         if not turns.any():
             return None
         step = float(np.median(np.diff(history.reading_times[instrument.real])))
@@ -223,7 +198,7 @@ class Laboratory:
         self,
         terms: Sequence[Term],
         start: Array | None = None,
-        turns: int = 3,
+        max_iterations: int = 3,
         only: Sequence[int] | None = None,
     ) -> Fit:
         """Linear coefficients of a hypothesis; the covariance follows them, `turns` times.
@@ -236,9 +211,9 @@ class Laboratory:
         designs = [self.design(terms, blocks, s) for s in which]
         x = np.zeros(K) if start is None or len(start) != K else start
         weightings: list[Weighting] = []
-        reduced: list[Reduced] = []
+        reduced: list[NormalEquations] = []
         A, c = np.zeros((K, K)), np.zeros(K)
-        for turn in range(turns + (0 if x.any() else 1)):
+        for turn in range(max_iterations + (0 if x.any() else 1)):
             weightings = [self.weighting(terms, blocks, x, s) for s in which]
             reduced = [w.reduce(d[0], d[1]) for w, d in zip(weightings, designs, strict=True)]
             A, c = np.zeros((K, K)), np.zeros(K)
@@ -298,13 +273,13 @@ class Laboratory:
     def _derivatives(
         self, fit: Fit, searched: Sequence[tuple[int, str]], series: int
     ) -> tuple[Array, Array, Array]:
-        """Columns of ∂(prediction)/∂(non-linear): courses (E, D), directions (P, D), map (D, L)."""
-        courses: list[Array] = []
+        """∂(prediction)/∂(non-linear): trajectories (E, D), directions (P, D), map (D, L)."""
+        trajectories: list[Array] = []
         directions: list[Array] = []
         owner: list[int] = []
         for position, (i, name) in enumerate(searched):
             value = dict(fit.terms[i].nonlinear)[name]
-            step = _step(fit.terms[i].effect, name, value)
+            step = fit.terms[i].kind.nonlinear[name].difference_step(value)
             sides = []
             for sign in (1.0, -1.0):
                 terms = list(fit.terms)
@@ -313,15 +288,15 @@ class Laboratory:
             slope = (sides[0] - sides[1]) / (2 * step)
             _, V, index = fit.designs[series]
             for k in np.flatnonzero(np.abs(slope).max(axis=0) > 0):
-                courses.append(slope[:, k])
+                trajectories.append(slope[:, k])
                 directions.append(V[:, k] * fit.coefficients[index[k]])
                 owner.append(position)
-        if not courses:
+        if not trajectories:
             E, P = fit.designs[series][0].shape[0], len(COLUMNS)
             return np.zeros((E, 0)), np.zeros((P, 0)), np.zeros((0, len(searched)))
         mapping = np.zeros((len(owner), len(searched)))
         mapping[np.arange(len(owner)), owner] = 1.0
-        return np.stack(courses, axis=1), np.stack(directions, axis=1), mapping
+        return np.stack(trajectories, axis=1), np.stack(directions, axis=1), mapping
 
     def normal_equations(
         self, fit: Fit, only: Sequence[int] | None = None
@@ -343,11 +318,11 @@ class Laboratory:
             g += T.T @ (joint.c - joint.A @ at)
         return A, g, searched
 
-    def refine(self, fit: Fit, turns: int = 6, only: Sequence[int] | None = None) -> Fit:
+    def refine(self, fit: Fit, max_iterations: int = 6, only: Sequence[int] | None = None) -> Fit:
         """Gauss-Newton on the non-linear parameters; never makes the objective worse."""
         searched = self.searched(fit.terms)
         if searched:
-            for _ in range(turns):
+            for _ in range(max_iterations):
                 A, g, _ = self.normal_equations(fit, only)
                 step = _solve(A, g)[len(fit.coefficients) :]
                 improved = False
@@ -356,7 +331,8 @@ class Laboratory:
                     for (i, name), d in zip(searched, damping * step, strict=True):
                         old = dict(terms[i].nonlinear)[name]
                         terms[i] = terms[i].with_value(
-                            name, _bounded(terms[i].effect, name, old, old + float(d))
+                            name,
+                            terms[i].kind.nonlinear[name].bounded(old, old + float(d), slack=0.1),
                         )
                     trial = self.fit(terms, fit.coefficients, 2, only)
                     if trial.objective < fit.objective:
@@ -368,21 +344,9 @@ class Laboratory:
         return replace(fit, covariance=_inverse(A), searched=tuple(searched))
 
 
-def _step(effect: str, name: str, value: float) -> float:
-    """A step for differences, small against the parameter's effect and large against rounding."""
-    if catalogue.get(effect).nonlinear[name].log:
-        return 1e-3 * max(abs(value), 1e-6)
-    return {"T_k": 0.02, "d": 0.05}.get(name, 1e-3)
-
-
-def _bounded(effect: str, name: str, old: float, new: float) -> float:
-    parameter = catalogue.get(effect).nonlinear[name]
-    if parameter.log:
-        # the bounds are of what a simulation makes sense of; data may ask for less
-        return float(
-            np.clip(np.clip(new, old / 2.0, old * 2.0), 0.1 * parameter.low, parameter.high)
-        )
-    return float(np.clip(new, parameter.low, parameter.high))
+def _drives(terms: Sequence[Term], series: int) -> list[tuple[str, dict[str, Any]]]:
+    """The drives among some terms, as `simulation.drive` takes them."""
+    return [(t.effect, t.values(series) or {}) for t in terms if t.is_drive]
 
 
 def _solve(A: Array, c: Array) -> Array:

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.discovery.candidates import Candidate, candidates
-from thermocald.discovery.evidence import COLUMNS, FIELD_SCALES
-from thermocald.discovery.hypothesis import BASE, EVENTS, OSCILLATIONS, Fit, Term
+from thermocald.discovery.search.candidates import Candidate, candidates
+from thermocald.reduction.hypothesis import BASE, Fit, Term
+from thermocald.reduction.series import COLUMNS
 from thermocald.simulation import effects as catalogue
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from thermocald.discovery.laboratory import Laboratory
+    from thermocald.reduction.fit import HypothesisFitter
 
     Array = NDArray[np.float64]
 
@@ -36,8 +36,8 @@ __all__ = ["MARGIN", "Scanned", "Search", "Solution"]
 
 # beyond the penalty for the search: what errors of the noise model itself may feign
 MARGIN = 16.0
-# of an effect's best way that another of its ways has to promise
-_WAY_SHARE = 0.95
+# of an effect's best parameter set that another of its sets has to promise
+_SET_FRACTION = 0.95
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,60 +75,58 @@ class Solution:
 
 
 class Search:
-    """One examination of a laboratory's series."""
+    """One examination of a fitter's series."""
 
     def __init__(
-        self, laboratory: Laboratory, progress: Callable[[str], None] | None = None
+        self, fitter: HypothesisFitter, progress: Callable[[str], None] | None = None
     ) -> None:
-        self.laboratory = laboratory
-        self.candidates = candidates(laboratory.series)
-        self.epochs = sum(int((e.n > 0).sum()) for e in laboratory.series)
+        self.fitter = fitter
+        self.candidates = candidates(fitter.series)
+        self.epochs = sum(int((e.n > 0).sum()) for e in fitter.series)
         # the more noise is correlated, the less is known of it
-        self.margin = MARGIN * max(e.correlation for e in laboratory.series)
+        self.margin = MARGIN * max(e.correlation for e in fitter.series)
         self.progress = progress or (lambda _: None)
         self._trials: dict[tuple[str, tuple[str, ...]], float] = {}
-        self._courses: dict[tuple[int, int], Array] = {}
-        self._refined: dict[tuple[object, ...], Solution] = {}
+        self._trajectories: dict[tuple[int, int], Array] = {}
+        self._refined: dict[tuple[Term, ...], Fit] = {}
 
     def base(self, given: Sequence[tuple[str, dict[str, Any]]] = ()) -> Solution:
         """The base model, with the effects that a model has already, fitted."""
         if not given:
-            return Solution(self.laboratory.fit(()), ())
-        terms = tuple(
-            _given_term(name, values, len(self.laboratory.series)) for name, values in given
-        )
-        return Solution(self.laboratory.refine(self.laboratory.fit(terms)), (0.0,) * len(terms))
+            return Solution(self.fitter.fit(()), ())
+        terms = tuple(_given_term(name, values, len(self.fitter.series)) for name, values in given)
+        return Solution(self.fitter.refine(self.fitter.fit(terms)), (0.0,) * len(terms))
 
     # -- scanning --------------------------------------------------------------------------
 
     def _stack(self, number: int, series: int, fit: Fit) -> Array:
-        """Courses (G, E, m) of a candidate over its grid in one series."""
+        """Trajectories (G, E, m) of a candidate over its grid in one series."""
         candidate = self.candidates[number]
-        laboratory = self.laboratory
+        fitter = self.fitter
         drives = [t for t in fit.terms if t.is_drive]
         key = (number, series)
-        if key in self._courses and not (candidate.is_drive and drives):
-            return self._courses[key]
+        if key in self._trajectories and not (candidate.is_drive and drives):
+            return self._trajectories[key]
         rows = []
         if candidate.is_event:
-            times = laboratory.series[series].times
+            times = fitter.series[series].times
             return (times[None, :, None] >= times[1:, None, None]).astype(float)
         for value in candidate.grid if len(candidate.grid) else [None]:
-            term = candidate.term(value, len(laboratory.series))
+            term = candidate.term(value, len(fitter.series))
             if candidate.is_drive:
-                rows.append(laboratory.drive_course([*drives, term], series)[:, None])
+                rows.append(fitter.drive_trajectory([*drives, term], series)[:, None])
             else:
-                rows.append(laboratory.courses(term, series, operators=False)[0])
+                rows.append(fitter.trajectories(term, series, operators=False)[0])
         stack: Array = np.stack(rows)
         stack -= stack.mean(axis=1, keepdims=True)
         if not (candidate.is_drive and drives):
-            self._courses[key] = stack
+            self._trajectories[key] = stack
         return stack
 
     def scan(self, number: int, solution: Solution) -> Scanned | None:
         """The best place of one candidate added to a solution."""
         candidate, fit = self.candidates[number], solution.fit
-        series = range(len(self.laboratory.series))
+        series = range(len(self.fitter.series))
         directions = np.zeros((len(COLUMNS), len(candidate.parameters)))
         for j, name in enumerate(candidate.parameters):
             directions[COLUMNS.index(name), j] = 1.0
@@ -155,12 +153,12 @@ class Search:
         rest = float(base_c @ _solve(base_A, base_c[:, None])[:, 0]) if len(base_c) else 0.0
         if candidate.is_event:
             return self._event(candidate, parts, base_A, base_c, count)
-        if candidate.effect in OSCILLATIONS and len(parts) > 1:
+        if candidate.is_periodic and len(parts) > 1:
             gains = sum(_gain([p], base_A, base_c) for p in parts)
             count *= 2 * len(parts)
         else:
             gains = _gain(parts, base_A, base_c)
-            count *= 2 if candidate.effect in OSCILLATIONS else 1
+            count *= 2 if candidate.is_periodic else 1
         gains = np.asarray(gains) + rest - reference
         best = int(np.argmax(gains))
         value = float(candidate.grid[best]) if len(candidate.grid) else None
@@ -180,7 +178,7 @@ class Search:
             gains = np.where(np.isfinite(gains), gains, 0.0)
             best = int(np.argmax(gains))
             if gains[best] > single + self.margin or s == 0:
-                fresh.append(((candidate.name, float(self.laboratory.series[s].times[best + 1])),))
+                fresh.append(((candidate.name, float(self.fitter.series[s].times[best + 1])),))
                 total += float(gains[best])
                 penalty += single
             else:
@@ -195,7 +193,7 @@ class Search:
         key = (candidate.effect, candidate.parameters)
         if key not in self._trials:
             number = self.candidates.index(candidate)
-            stack = self._courses.get((number, 0))
+            stack = self._trajectories.get((number, 0))
             trials = float(len(candidate.grid)) if len(candidate.grid) else 1.0
             if stack is not None and len(stack) > 1:
                 trials = _independent(stack)
@@ -210,14 +208,12 @@ class Search:
 
     # -- growing and shrinking ----------------------------------------------------------------
 
-    def refine(self, terms: Sequence[Term], penalties: Sequence[float], start: Fit) -> Solution:
-        """Fit a hypothesis in full."""
-        key = (tuple(terms),)
+    def refine(self, terms: Sequence[Term], penalties: Sequence[float]) -> Solution:
+        """Fit a hypothesis in full, once; its penalties depend on how it was found."""
+        key = tuple(terms)
         if key not in self._refined:
-            fit = self.laboratory.refine(self.laboratory.fit(terms), turns=5)
-            self._refined[key] = Solution(fit, tuple(penalties))
-        del start
-        return self._refined[key]
+            self._refined[key] = self.fitter.refine(self.fitter.fit(terms), max_iterations=5)
+        return Solution(self._refined[key], tuple(penalties))
 
     def expand(self, solution: Solution, width: int = 6) -> list[Solution]:
         """The best solutions with one effect more, best first."""
@@ -230,11 +226,7 @@ class Search:
             if found is not None and np.isfinite(found.gain):
                 promises.append(found)
         grown = [
-            self.refine(
-                (*solution.terms, promise.term),
-                (*solution.penalties, promise.penalty),
-                solution.fit,
-            )
+            self.refine((*solution.terms, promise.term), (*solution.penalties, promise.penalty))
             for promise in _worth_fitting(promises, width)
         ]
         grown.sort(key=lambda s: s.score)
@@ -247,7 +239,7 @@ class Search:
             for i in range(kept, len(solution.terms)):
                 terms = tuple(t for j, t in enumerate(solution.terms) if j != i)
                 penalties = tuple(p for j, p in enumerate(solution.penalties) if j != i)
-                fewer.append(self.refine(terms, penalties, solution.fit))
+                fewer.append(self.refine(terms, penalties))
             best = min(fewer, key=lambda s: s.score)
             if best.score > solution.score:
                 break
@@ -256,7 +248,7 @@ class Search:
 
 
 def _worth_fitting(promises: Sequence[Scanned], width: int) -> list[Scanned]:
-    """The `width` most promising effects, each in the ways that promise nearly as much as its best.
+    """The `width` most promising effects, each with the sets that promise as much as its best.
 
     A scan is right to some percent, with a drive to half: what promises a tenth cannot win.
     """
@@ -266,7 +258,7 @@ def _worth_fitting(promises: Sequence[Scanned], width: int) -> list[Scanned]:
     for p in ordered:
         name = p.candidate.effect
         if name in best:
-            if p.net > _WAY_SHARE * best[name]:
+            if p.net > _SET_FRACTION * best[name]:
                 out.append(p)
         elif len(best) < width and (len(best) < 3 or p.net >= 0.1 * ordered[0].net):
             best[name] = p.net
@@ -277,16 +269,14 @@ def _worth_fitting(promises: Sequence[Scanned], width: int) -> list[Scanned]:
 def _given_term(name: str, values: dict[str, Any], series: int) -> Term:
     """A term of an effect that a model holds: its non-linear values as a start."""
     effect = catalogue.get(name)
-    parameters = tuple(p for p in effect.linear if p in values)
-    if name == "test_field_expansion":
-        parameters = FIELD_SCALES
+    parameters = tuple(effect.column(p) for p in effect.linear if p in values)
     shared = tuple(
         (k, v if isinstance(v, str) else float(v))
         for k, v in values.items()
         if k in effect.nonlinear and k not in effect.fresh
     )
     fresh: tuple[tuple[tuple[str, Any], ...] | None, ...] = ()
-    if name in EVENTS:
+    if effect.is_event:
         own = tuple((k, float(values[k])) for k in effect.fresh if k in values)
         fresh = (own, *(None,) * (series - 1))
     return Term(name, parameters or BASE, shared, fresh)
@@ -326,7 +316,7 @@ def _solve(A: Array, right: Array) -> Array:
 
 
 def _independent(stack: Array) -> float:
-    """How many independent courses a grid (G, E, m) holds: its length in angles over 90°."""
+    """How many independent trajectories a grid (G, E, m) holds: its length in angles over 90°."""
     s = stack[..., 0]
     s = s - s.mean(axis=1, keepdims=True)
     norm = np.linalg.norm(s, axis=1)

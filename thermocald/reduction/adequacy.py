@@ -1,4 +1,4 @@
-"""The absolute test: does a model leave smooth courses in any parameter, or in the noise level?
+"""The absolute test: does a model leave smooth trajectories in any parameter?
 
 An improvement is not honesty: a flexible surrogate improves M1 and even M2. What tells it from the
 cause is what it leaves. Cosines of growing order are offered to every independent combination of
@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.discovery.evidence import COLUMNS
+from thermocald.reduction.series import COLUMNS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from thermocald.discovery.hypothesis import Fit
-    from thermocald.discovery.laboratory import Laboratory
+    from thermocald.reduction.fit import HypothesisFitter
+    from thermocald.reduction.hypothesis import Fit
 
     Array = NDArray[np.float64]
 
@@ -36,8 +36,8 @@ NEGLIGIBLE_PX = 0.004
 class Adequacy:
     """What a model leaves in one series.
 
-    scores (ORDERS, D): unit normal where nothing is left; amplitudes (ORDERS, P): of the courses
-    in px-scaled columns, which take the rest up; directions (P, D): combinations of
+    scores (ORDERS, D): unit normal where nothing is left; amplitudes (ORDERS, P): of the
+    trajectories in px-scaled columns, which take the rest up; directions (P, D): combinations of
     px-scaled columns; excess: χ² beyond its expectation; significance: in standard deviations;
     misfit_px: RMS over image coordinates of the smooth rest.
     """
@@ -45,7 +45,7 @@ class Adequacy:
     scores: Array
     amplitudes: Array
     directions: Array
-    courses: Array
+    trajectories: Array
     excess: float
     significance: float
     misfit_px: float
@@ -57,23 +57,23 @@ class Adequacy:
 
 
 def cosines(times: Array, orders: int) -> Array:
-    """Smooth courses (orders, E) over a series, order 1 being half a wave."""
+    """Smooth trajectories (orders, E) over a series, order 1 being half a wave."""
     u = (times - times[0]) / max(float(times[-1] - times[0]), 1e-9)
     rows: Array = np.cos(np.pi * np.arange(1, orders + 1)[:, None] * u[None])
     rows -= rows.mean(axis=1, keepdims=True)
     return rows
 
 
-def examine(laboratory: Laboratory, fit: Fit, series: int) -> Adequacy:
+def examine(fitter: HypothesisFitter, fit: Fit, series: int) -> Adequacy:
     """Test one series."""
-    evidence, weighting = laboratory.series[series], fit.weightings[series]
+    evidence, weighting = fitter.series[series], fit.weightings[series]
     C, V, index = fit.designs[series]
     x = fit.coefficients[index]
     size, U = np.linalg.eigh(evidence.N.mean(axis=0))
     keep = size > 1e-4 * np.median(size)
     directions = U[:, keep] / np.sqrt(size[keep])
-    courses = cosines(evidence.times, ORDERS)
-    A, c, B = weighting.scan(courses[:, :, None], directions, (C, V))
+    trajectories = cosines(evidence.times, ORDERS)
+    A, c, B = weighting.scan(trajectories[:, :, None], directions, (C, V))
     rest = c - B @ x
     scores = np.zeros(rest.shape)
     amplitudes = np.zeros((ORDERS, len(directions)))
@@ -86,22 +86,15 @@ def examine(laboratory: Laboratory, fit: Fit, series: int) -> Adequacy:
     free = scores.size
     excess = max(total - free, 0.0)
     coordinates = 2.0 * float(evidence.n.sum())
-    sigma = _mean_sigma(evidence)
     return Adequacy(
         scores,
         amplitudes,
         directions,
-        courses,
+        trajectories,
         excess,
         (total - free) / np.sqrt(2.0 * free),
-        sigma * float(np.sqrt(excess * evidence.correlation / coordinates)),
+        evidence.sigma_px * float(np.sqrt(excess * evidence.correlation / coordinates)),
     )
-
-
-def _mean_sigma(evidence: object) -> float:
-    """The noise of an image coordinate in px as the evidence weighs it."""
-    weights = getattr(evidence, "weights")[..., :2]  # noqa: B009
-    return float(1.0 / np.sqrt(np.mean(weights[weights > 0])))
 
 
 def names_of(directions: Array, scores: Array) -> list[tuple[str, float]]:

@@ -1,8 +1,8 @@
-"""Blocks of time left out: does what was fitted to the rest predict them?
+"""Cross-validation in blocks of time: does what was fitted to the rest predict them?
 
 Each series is cut into blocks; a block of every series is left out, the coefficients are fitted to
 the others, and the likelihood of the block is taken at them, with a level of its own. An effect
-that only follows the noise, or bends to a course that is not its own, predicts nothing.
+that only follows the noise, or bends to a trajectory that is not its own, predicts nothing.
 
 Source: cross-validation in blocks as Burman, Chow, Nolan (1994), Biometrika 81, 351-358.
 """
@@ -14,20 +14,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.discovery.gap import rank
-from thermocald.discovery.laboratory import Laboratory
+from thermocald.reduction.fit import HypothesisFitter
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from thermocald.discovery.evidence import Evidence
-    from thermocald.discovery.hypothesis import Fit
+    from thermocald.reduction.hypothesis import Fit
+    from thermocald.reduction.series import ReducedSeries
 
     Array = NDArray[np.float64]
 
-__all__ = ["confirmed", "gains", "left_out", "predictive"]
+__all__ = ["confirmed", "cross_validation", "gains", "predictive"]
 
 BLOCKS = 6
 # -2 log L by which a block may be worse off for a cause that is one: of chance, and of what the
@@ -37,7 +36,7 @@ _PRIOR = 1e-6  # of a coefficient's whole information, where the other blocks ho
 
 
 def predictive(
-    laboratory: Laboratory, fit: Fit, series: Sequence[int], blocks: int = BLOCKS
+    fitter: HypothesisFitter, fit: Fit, series: Sequence[int], blocks: int = BLOCKS
 ) -> tuple[Array, Array]:
     """χ² and -2 log likelihood (blocks,) of the blocks as predicted without them.
 
@@ -47,9 +46,9 @@ def predictive(
     """
     chi2, objective = np.zeros(blocks), np.zeros(blocks)
     for k in range(blocks):
-        masks = [_block(e, k, blocks) for e in laboratory.series]
-        trained = _part(laboratory, [~m for m in masks]).fit(fit.terms, fit.coefficients, 1, series)
-        tested = _part(laboratory, masks).fit(fit.terms, fit.coefficients, 1, series)
+        masks = [_block(e, k, blocks) for e in fitter.series]
+        trained = _part(fitter, [~m for m in masks]).fit(fit.terms, fit.coefficients, 1, series)
+        tested = _part(fitter, masks).fit(fit.terms, fit.coefficients, 1, series)
         whole = np.diag(_normal(fit, series)[0])
         own = np.where(whole > 0, _PRIOR * whole, 1.0)  # 1: of a series that takes no part
         known = _normal(trained, series)[0] + np.diag(own)
@@ -75,17 +74,17 @@ def _normal(fit: Fit, series: Sequence[int]) -> tuple[Array, Array]:
     return A, c
 
 
-def gains(laboratory: Laboratory, fit: Fit, kept: int = 0) -> list[Array]:
+def gains(fitter: HypothesisFitter, fit: Fit, kept: int = 0) -> list[Array]:
     """By how much each effect beyond the first `kept` improves the prediction of blocks (blocks,).
 
     The others are fitted again without it; in -2 log likelihood, all series together.
     """
-    every = range(len(laboratory.series))
-    whole = predictive(laboratory, fit, every)[1]
+    every = range(len(fitter.series))
+    whole = predictive(fitter, fit, every)[1]
     out = []
     for i in range(kept, len(fit.terms)):
-        fewer = laboratory.fit([t for j, t in enumerate(fit.terms) if j != i])
-        out.append(predictive(laboratory, laboratory.refine(fewer), every)[1] - whole)
+        fewer = fitter.fit([t for j, t in enumerate(fit.terms) if j != i])
+        out.append(predictive(fitter, fitter.refine(fewer), every)[1] - whole)
     return out
 
 
@@ -95,30 +94,30 @@ def confirmed(gain: Array) -> bool:
     return total > 0 and float(gain.min()) > -(_WORSE + _WORSE_SHARE * total)
 
 
-def left_out(laboratory: Laboratory, fit: Fit) -> tuple[float, float]:
+def cross_validation(fitter: HypothesisFitter, fit: Fit) -> tuple[float, float]:
     """Parameter χ² per degree of freedom on blocks of M1 that the fit did not see, and on M1."""
-    e = laboratory.series[0]
-    outside = float(predictive(laboratory, fit, [0])[0].sum())
-    free = rank(e) * float((e.n > 0).sum())
-    return outside / max(free - BLOCKS * rank(e), 1.0), fit.chi2_of(0) / max(free - rank(e), 1.0)
+    e = fitter.series[0]
+    outside = float(predictive(fitter, fit, [0])[0].sum())
+    free = e.rank * float((e.n > 0).sum())
+    return outside / max(free - BLOCKS * e.rank, 1.0), fit.chi2_of(0) / max(free - e.rank, 1.0)
 
 
-def _block(evidence: Evidence, number: int, blocks: int) -> NDArray[np.bool_]:
+def _block(evidence: ReducedSeries, number: int, blocks: int) -> NDArray[np.bool_]:
     edges = np.linspace(0, len(evidence.times), blocks + 1).astype(int)
     inside = np.zeros(len(evidence.times), dtype=bool)
     inside[edges[number] : edges[number + 1]] = True
     return inside
 
 
-def _part(laboratory: Laboratory, masks: Sequence[NDArray[np.bool_]]) -> Laboratory:
-    """The laboratory with the weight of some epochs alone; courses are the same."""
-    part = Laboratory([_only(e, m) for e, m in zip(laboratory.series, masks, strict=True)])
-    part.thermometer_factor = laboratory.thermometer_factor
-    part.share_courses(laboratory)
+def _part(fitter: HypothesisFitter, masks: Sequence[NDArray[np.bool_]]) -> HypothesisFitter:
+    """The fitter with the weight of some epochs alone; trajectories are the same."""
+    part = HypothesisFitter([_only(e, m) for e, m in zip(fitter.series, masks, strict=True)])
+    part.thermometer_factor = fitter.thermometer_factor
+    part.share_trajectories(fitter)
     return part
 
 
-def _only(evidence: Evidence, epochs: NDArray[np.bool_]) -> Evidence:
+def _only(evidence: ReducedSeries, epochs: NDArray[np.bool_]) -> ReducedSeries:
     w = epochs.astype(float)
     return replace(
         evidence,

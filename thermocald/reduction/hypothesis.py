@@ -1,6 +1,6 @@
 """A hypothesis: the base model with some effects added, and its fit to series together.
 
-Physical constants are shared by the series; levels belong to each series, and so do the instants
+Physical constants are shared by the series; levels belong to each series, and so do the times
 and phases that an effect calls fresh.
 """
 
@@ -11,22 +11,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.discovery.evidence import COLUMNS
+from thermocald.reduction.series import COLUMNS
 from thermocald.simulation import effects as catalogue
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from thermocald.discovery.likelihood import Reduced, Weighting
+    from thermocald.reduction.likelihood import NormalEquations, Weighting
+    from thermocald.simulation.effects import Effect
 
     Array = NDArray[np.float64]
 
-__all__ = ["BASE", "EVENTS", "OSCILLATIONS", "Block", "Fit", "Term"]
+__all__ = ["BASE", "Block", "Fit", "Term"]
 
 BASE = ("c", "x0", "y0")
-# effects whose whole size may differ between series: an event, not a constant of the camera
-EVENTS = ("slip",)
-OSCILLATIONS = ("cyclic_interference",)
 
 
 @dataclass(frozen=True)
@@ -34,7 +32,7 @@ class Term:
     """One effect of a hypothesis.
 
     parameters: the columns it acts on; nonlinear: shared values; fresh: per series, None where
-    the effect does not occur; through_drive: a course of T that follows the drive instead of T.
+    the effect does not occur; through_drive: a trajectory of T that follows the drive instead of T.
     """
 
     effect: str
@@ -44,12 +42,19 @@ class Term:
     through_drive: bool = False
 
     @property
-    def kind(self) -> str:
-        return catalogue.get(self.effect).kind
+    def kind(self) -> Effect:
+        """The effect itself."""
+        return catalogue.get(self.effect)
 
     @property
     def is_drive(self) -> bool:
-        return self.kind == "drive"
+        """Whether it replaces the temperature behind the linear terms."""
+        return self.kind.is_drive
+
+    @property
+    def is_separate(self) -> bool:
+        """Whether each series has coefficients of its own: a height, or amplitude and phase."""
+        return self.kind.is_event or self.kind.is_periodic
 
     def values(self, series: int) -> dict[str, Any] | None:
         """Non-linear values in one series; None where the effect does not occur there."""
@@ -67,17 +72,17 @@ class Term:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Where the coefficients of one term stand: columns of courses and of the unknowns."""
+    """Where the coefficients of one term stand: columns of trajectories and of the unknowns."""
 
     term: int  # -1: the base's rates
     series: int | None  # None: shared
     start: int
-    courses: int
+    trajectories: int
     parameters: tuple[str, ...]
 
     @property
     def stop(self) -> int:
-        return self.start + self.courses * len(self.parameters)
+        return self.start + self.trajectories * len(self.parameters)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +102,7 @@ class Fit:
     logdet: float
     weightings: tuple[Weighting, ...]
     designs: tuple[tuple[Array, Array, NDArray[np.int64]], ...]
-    reduced: tuple[Reduced, ...]
+    reduced: tuple[NormalEquations, ...]
     searched: tuple[tuple[int, str], ...] = field(default=())
 
     @property
@@ -105,9 +110,9 @@ class Fit:
         return self.chi2 + self.logdet
 
     def direction(self, block: Block) -> Array:
-        """Coefficients of one block as (courses, P) in px-scaled columns."""
-        out = np.zeros((block.courses, len(COLUMNS)))
-        part = self.coefficients[block.start : block.stop].reshape(block.courses, -1)
+        """Coefficients of one block as (trajectories, P) in px-scaled columns."""
+        out = np.zeros((block.trajectories, len(COLUMNS)))
+        part = self.coefficients[block.start : block.stop].reshape(block.trajectories, -1)
         out[:, [COLUMNS.index(p) for p in block.parameters]] = part
         return out
 

@@ -7,27 +7,28 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.discovery.adequacy import Adequacy, examine
-from thermocald.discovery.condensing import condensed
-from thermocald.discovery.curvature import relinearised
-from thermocald.discovery.image_space import (
+from thermocald.discovery.evidence.image_space import (
     Displaced,
     NoiseGrowth,
     displaced_targets,
     noise_growth,
 )
-from thermocald.discovery.laboratory import Laboratory
-from thermocald.discovery.left_out import confirmed, gains
-from thermocald.discovery.noise import jumps, slowed, with_jumps
-from thermocald.discovery.reduction import reweighted
-from thermocald.discovery.search import Search, Solution
+from thermocald.discovery.search.cross_validation import confirmed, gains
+from thermocald.discovery.search.search import Search, Solution
+from thermocald.reduction.adequacy import Adequacy, examine
+from thermocald.reduction.blocks import in_blocks
+from thermocald.reduction.calibrated import calibrated_thermometers
+from thermocald.reduction.curvature import relinearised
+from thermocald.reduction.fit import HypothesisFitter
+from thermocald.reduction.noise import jumps, with_correlated_noise, with_jumps
+from thermocald.reduction.reduce import reweighted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
-    from thermocald.discovery.evidence import Evidence
+    from thermocald.reduction.series import ReducedSeries
 
     Array = NDArray[np.float64]
 
@@ -38,7 +39,6 @@ MAX_EFFECTS = 2
 BAND = 14.0
 # a model that leaves less than this share of what the base left has the cause
 _LEFT = 0.03
-_LAG_OR_DELAY = ("thermal_lag", "time_offset")
 # by how much worse (χ²) another way of following the temperature may fit and not be excluded
 _SWAP_BAND = 120.0
 # slow variances over those of white noise: beyond, what one series shows has to be seen in another
@@ -52,13 +52,12 @@ _LEFT_PX, _LEFT_SHARE = 0.005, 0.15
 class Examination:
     """What the search found.
 
-    laboratory: the series as examined, displaced targets out and noise weighted; base, best:
-    solutions; ranking: singles by score; rivals: solutions that cannot be excluded;
-    adequacy: of best, per series; left_out: gains (blocks,) of its effects on blocks of time left
-    out.
+    fitter: the series as examined, displaced targets out and noise weighted; base, best: solutions;
+    ranking: singles by score; rivals: solutions that cannot be excluded; adequacy: of best, per
+    series; cross_validation: gains (blocks,) of its effects on blocks of time left out.
     """
 
-    laboratory: Laboratory
+    fitter: HypothesisFitter
     base: Solution
     best: Solution
     ranking: tuple[Solution, ...]
@@ -66,14 +65,14 @@ class Examination:
     base_adequacy: tuple[Adequacy, ...]
     adequacy: tuple[Adequacy, ...]
     adequate: bool
-    left_out: tuple[Array, ...] = ()
+    cross_validation: tuple[Array, ...] = ()
     displaced: tuple[tuple[Displaced, ...], ...] = ()
     defocus: NoiseGrowth | None = None
-    original: tuple[Evidence, ...] = ()
+    original: tuple[ReducedSeries, ...] = ()
 
 
 def examine_series(
-    series: Sequence[Evidence],
+    series: Sequence[ReducedSeries],
     progress: Callable[[str], None] | None = None,
     given: Sequence[tuple[str, dict[str, Any]]] = (),
 ) -> Examination:
@@ -92,50 +91,50 @@ def examine_series(
     growth = noise_growth(cleaned)
     if growth is not None:
         cleaned = [reweighted(e, n) for e, n in zip(cleaned, growth.noise, strict=True)]
-    ready = [condensed(slowed(e)) for e in calibrated_thermometers(cleaned)]
-    found = _searched(Laboratory(ready), say, given)
+    ready = [in_blocks(with_correlated_noise(e)) for e in calibrated_thermometers(cleaned)]
+    found = _searched(HypothesisFitter(ready), say, given)
     curved = _curved(found)
     if curved is not None:
         say("curvature of the projection: once more")
-        found = _searched(Laboratory(curved), say, given)
+        found = _searched(HypothesisFitter(curved), say, given)
     noisy = _noisier(found)
     if noisy is not None:
         say("noise that targets share: once more")
-        found = _searched(Laboratory(noisy), say, given)
+        found = _searched(HypothesisFitter(noisy), say, given)
     return replace(found, displaced=tuple(displaced), defocus=growth, original=tuple(series))
 
 
-def _curved(found: Examination) -> list[Evidence] | None:
+def _curved(found: Examination) -> list[ReducedSeries] | None:
     """The series with the projection's curvature taken off; None where it does not matter."""
-    laboratory = found.laboratory
-    out = [relinearised(laboratory, found.best.fit, s) for s in range(len(laboratory.series))]
+    fitter = found.fitter
+    out = [relinearised(fitter, found.best.fit, s) for s in range(len(fitter.series))]
     if all(e is None for e in out):
         return None
-    return [e or old for e, old in zip(out, laboratory.series, strict=True)]
+    return [e or old for e, old in zip(out, fitter.series, strict=True)]
 
 
-def _noisier(found: Examination) -> list[Evidence] | None:
+def _noisier(found: Examination) -> list[ReducedSeries] | None:
     """The series with what still jumps from epoch to epoch as noise; None where nothing does."""
-    laboratory, out = found.laboratory, []
-    for s, e in enumerate(laboratory.series):
+    fitter, out = found.fitter, []
+    for s, e in enumerate(fitter.series):
         if len(e.times) < 60:
             return None
-        out.append(with_jumps(e, *jumps(laboratory, found.best.fit, s)))
+        out.append(with_jumps(e, *jumps(fitter, found.best.fit, s)))
     if all(e is None for e in out):
         return None
-    return [e or old for e, old in zip(out, laboratory.series, strict=True)]
+    return [e or old for e, old in zip(out, fitter.series, strict=True)]
 
 
 def _searched(
-    laboratory: Laboratory,
+    fitter: HypothesisFitter,
     say: Callable[[str], None],
     given: Sequence[tuple[str, dict[str, Any]]],
 ) -> Examination:
-    """The search itself, in the courses of the parameters."""
+    """The search itself, in the trajectories of the parameters."""
     say("base model")
-    search = Search(laboratory, say)
+    search = Search(fitter, say)
     base = search.base(given)
-    base_adequacy = _adequacies(laboratory, base)
+    base_adequacy = _adequacies(fitter, base)
     best, ranking = base, []
     frontier = [base]
     seen: list[Solution] = []
@@ -156,11 +155,11 @@ def _searched(
         if champion.score >= best.score:
             break
         if level > 1 and adequate:
-            least = max(_LEFT_PX, _LEFT_SHARE * _size_px(laboratory, base, best))
-            if _size_px(laboratory, best, champion) < least:
+            least = max(_LEFT_PX, _LEFT_SHARE * _size_px(fitter, base, best))
+            if _size_px(fitter, best, champion) < least:
                 break
         best = champion
-        adequate = _adequate(_adequacies(laboratory, best), base_adequacy)
+        adequate = _adequate(_adequacies(fitter, best), base_adequacy)
         # what is adequate may still lack something too fast for the absolute test
         frontier = [best] if adequate else _frontier(grown)
     # larger combinations that were not accepted are no rivals
@@ -169,9 +168,9 @@ def _searched(
         best, seen = _contest(search, best, seen)
         best, seen = _lag_or_delay(search, best, seen)
     best, blocks = _confirmed(search, base, best)
-    adequacy = _adequacies(laboratory, best)
+    adequacy = _adequacies(fitter, best)
     adequate = _adequate(adequacy, base_adequacy)
-    if len(best.terms) > len(base.terms) and _unverified(laboratory.series):
+    if len(best.terms) > len(base.terms) and _unverified(fitter.series):
         adequate = False
     rivals: list[Solution] = []
     for s in sorted(seen, key=lambda s: s.score):
@@ -182,7 +181,7 @@ def _searched(
         if different and close and s.names not in [r.names for r in rivals]:
             rivals.append(s)
     return Examination(
-        laboratory, base, best, tuple(ranking), tuple(rivals), base_adequacy, adequacy, adequate,
+        fitter, base, best, tuple(ranking), tuple(rivals), base_adequacy, adequacy, adequate,
         tuple(blocks),
     )  # fmt: skip
 
@@ -192,7 +191,7 @@ def _lag_or_delay(
 ) -> tuple[Solution, list[Solution]]:
     """Of a lag and a delay the one that fits better, and both among the solutions seen.
 
-    The likelihood holds every course of the temperature for equally probable. A lag smooths the
+    The likelihood holds every trajectory of the temperature for equally probable. A lag smooths the
     thermometer's noise, a delay does not; so a smooth image, which all temperatures give, would
     speak for a lag whatever the cause. Between these two the fit alone decides.
     """
@@ -205,18 +204,21 @@ def _lag_or_delay(
 
 
 def _with_the_other(search: Search, solution: Solution) -> Solution | None:
-    """The solution with a delay in place of its lag, or a lag in place of its delay."""
+    """The solution with another effect that delays the temperature in place of the one it has."""
+    delays = [c for c in search.candidates if c.kind.delay]
     for i, term in enumerate(solution.terms):
-        if term.effect not in _LAG_OR_DELAY:
+        if not term.kind.delay:
             continue
-        name = _LAG_OR_DELAY[1 - _LAG_OR_DELAY.index(term.effect)]
-        seconds = float(term.nonlinear[0][1])
-        if seconds <= 0 or name in solution.names:
+        seconds = float(dict(term.nonlinear)[term.kind.delay])
+        others = [c for c in delays if c.effect not in solution.names]
+        if seconds <= 0 or not others:
             return None
-        candidate = next(c for c in search.candidates if c.effect == name)
-        swapped = candidate.term(seconds, len(search.laboratory.series))
-        terms = (*solution.terms[:i], swapped, *solution.terms[i + 1 :])
-        return search.refine(terms, solution.penalties, solution.fit)
+        found = []
+        for candidate in others:
+            swapped = candidate.term(seconds, len(search.fitter.series))
+            terms = (*solution.terms[:i], swapped, *solution.terms[i + 1 :])
+            found.append(search.refine(terms, solution.penalties))
+        return min(found, key=lambda s: s.fit.chi2)
     return None
 
 
@@ -227,7 +229,7 @@ def _swapped(one: Solution, other: Solution) -> bool:
     return len(mine) == len(theirs) == 1 and mine[0].is_drive and theirs[0].is_drive
 
 
-def _unverified(series: Sequence[Evidence]) -> bool:
+def _unverified(series: Sequence[ReducedSeries]) -> bool:
     """Single targets wander so much that one series alone carries no name."""
     return len(series) < 2 and max(e.correlation for e in series) > _WANDERING
 
@@ -238,7 +240,7 @@ def _confirmed(search: Search, base: Solution, best: Solution) -> tuple[Solution
     """
     kept = len(base.terms)
     while len(best.terms) > kept:
-        blocks = gains(search.laboratory, best.fit, kept)
+        blocks = gains(search.fitter, best.fit, kept)
         bad = [i for i, g in enumerate(blocks) if not confirmed(g)]
         if not bad:
             return best, blocks
@@ -246,58 +248,8 @@ def _confirmed(search: Search, base: Solution, best: Solution) -> tuple[Solution
         search.progress(f"{best.names[worst]} does not predict the blocks left out")
         terms = [t for i, t in enumerate(best.terms) if i != worst]
         penalties = [p for i, p in enumerate(best.penalties) if i != worst]
-        best = search.refine(terms, penalties, best.fit) if terms else base
+        best = search.refine(terms, penalties) if terms else base
     return best, []
-
-
-def calibrated_thermometers(series: Sequence[Evidence]) -> list[Evidence]:
-    """The series with the noise of the reference thermometer as the images confirm it.
-
-    The images tell the temperature too, through the linear terms: with an unknown slow error, but
-    sharper than most thermometers. Where a fast effect spoils that, the readings alone count. One
-    thermometer has one noise.
-    """
-    laboratory = Laboratory([condensed(e) for e in series])
-    fit = laboratory.fit(())
-    laboratory = Laboratory(series)
-    d = fit.direction(fit.blocks[0])[0]
-    variances, weights = [], []
-    for s, e in enumerate(series):
-        instrument = e.channels[e.history.reference]
-        precision = np.einsum("p,epq,q->e", d, e.N, d)
-        ok = precision > 0
-        own = instrument.noise**2
-        if ok.sum() > 20:
-            course = laboratory.drive_course((), s)
-            matrix = e.history.temperature_matrix() @ instrument.mixing
-            shown = course + matrix @ instrument.deviation
-            # what the image says of T beyond its level, in K
-            rest = (e.b @ d)[ok] / precision[ok] - shown[ok]
-            second = np.diff(rest, 2)
-            image = 6.0 * float(np.mean(1.0 / precision[ok]))
-            shown_by_image = (_clipped(second) ** 2 - image) / 6.0
-            if shown_by_image < 1.5 * own:
-                own = max(0.5 * (own + shown_by_image), 0.25 * own)
-        variances.append(own)
-        weights.append(float(ok.sum()))
-    noise = float(np.sqrt(np.average(variances, weights=weights)))
-    out = []
-    for e in series:
-        name = e.history.reference
-        old = e.channels[name]
-        ratio = noise / old.noise
-        channels = {**e.channels, name: replace(old, sd=old.sd * ratio, noise=noise)}
-        out.append(replace(e, channels=channels))
-    return out
-
-
-def _clipped(values: Array) -> float:
-    """Standard deviation of a normal distribution whose tails are spoiled."""
-    scale = float(np.sqrt(np.mean(values**2)))
-    for _ in range(20):
-        kept = values[np.abs(values) <= 2.2 * scale]
-        scale = float(np.sqrt(np.mean(kept**2))) / 0.9162 if len(kept) > 5 else scale
-    return scale
 
 
 def _contest(
@@ -307,21 +259,21 @@ def _contest(
     close = {s.terms: s for s in seen if s.score < best.score + 60.0}
     if len({s.names for s in close.values()}) < 2:
         return best, seen
-    laboratory = search.laboratory
+    fitter = search.fitter
     again: list[Solution] = []
     for s in sorted(close.values(), key=lambda s: s.score)[:6]:
-        _, objective = laboratory.thermometer_scale(s.fit)
+        _, objective = fitter.thermometer_scale(s.fit)
         again.append(replace(s, fit=replace(s.fit, logdet=objective - s.fit.chi2)))
     again.sort(key=lambda s: s.score)
     others = [s for s in seen if s.terms not in close]
     return again[0], [*again, *others]
 
 
-def _size_px(laboratory: Laboratory, without: Solution, with_it: Solution) -> float:
+def _size_px(fitter: HypothesisFitter, without: Solution, with_it: Solution) -> float:
     """RMS px that one more effect explains."""
     gain = max(without.score - with_it.score, 0.0)
-    coordinates = 2.0 * sum(float(e.n.sum()) for e in laboratory.series)
-    weights = np.concatenate([e.weights[..., 0].ravel() for e in laboratory.series])
+    coordinates = 2.0 * sum(float(e.n.sum()) for e in fitter.series)
+    weights = np.concatenate([e.weights[..., 0].ravel() for e in fitter.series])
     return float(np.sqrt(gain / coordinates / np.mean(weights[weights > 0])))
 
 
@@ -334,8 +286,8 @@ def _frontier(grown: list[Solution], width: int = 4) -> list[Solution]:
     return out[:width]
 
 
-def _adequacies(laboratory: Laboratory, solution: Solution) -> tuple[Adequacy, ...]:
-    return tuple(examine(laboratory, solution.fit, s) for s in range(len(laboratory.series)))
+def _adequacies(fitter: HypothesisFitter, solution: Solution) -> tuple[Adequacy, ...]:
+    return tuple(examine(fitter, solution.fit, s) for s in range(len(fitter.series)))
 
 
 def _adequate(now: Sequence[Adequacy], base: Sequence[Adequacy]) -> bool:

@@ -1,10 +1,10 @@
 """Noise that the images' own sigmas do not know: correlated in time, or shared by neighbours.
 
-Correlation in time is seen in the residuals of single targets and makes slow courses less certain
-than their number of epochs says; corners of a marker, or of a board, err slowly together, and pull
-at some combinations of the parameters more than at others. Noise that neighbours share from epoch
-to epoch goes into the camera's parameters; it is seen in their jumps, once the courses have been
-explained.
+Correlation in time is seen in the residuals of single targets and makes slow trajectories less
+certain than their number of epochs says; corners of a marker, or of a board, err slowly together,
+and pull at some combinations of the parameters more than at others. Noise that neighbours share
+from epoch to epoch goes into the camera's parameters; it is seen in their jumps, once the
+trajectories have been explained.
 
 Source: Liang, Zeger (1986), Biometrika 73, 13-22, for covariances from clusters that err together;
 Bell, McCaffrey (2002), Survey Methodology 28, 169-181, for what the fit takes off their residuals.
@@ -17,24 +17,24 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.discovery.adequacy import ORDERS, cosines
+from thermocald.reduction.adequacy import ORDERS, cosines
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from thermocald.discovery.evidence import Evidence
-    from thermocald.discovery.hypothesis import Fit
-    from thermocald.discovery.laboratory import Laboratory
+    from thermocald.reduction.fit import HypothesisFitter
+    from thermocald.reduction.hypothesis import Fit
+    from thermocald.reduction.series import ReducedSeries
 
     Array = NDArray[np.float64]
 
-__all__ = ["jumps", "slow_together", "slowed", "with_jumps"]
+__all__ = ["jumps", "slow_together", "with_correlated_noise", "with_jumps"]
 
 _UNUSUAL = 1.7  # a variance from 170 second differences has 13 % of standard deviation
 
 
-def slowed(evidence: Evidence) -> Evidence:
-    """The series with weights as its slow courses deserve them."""
+def with_correlated_noise(evidence: ReducedSeries) -> ReducedSeries:
+    """The series with weights as its slow trajectories deserve them."""
     k = evidence.correlation
     if k <= 1.0:
         return evidence
@@ -43,19 +43,20 @@ def slowed(evidence: Evidence) -> Evidence:
     return with_jumps(e, factors / k, W) or e
 
 
-def slow_together(evidence: Evidence) -> tuple[Array, Array]:
-    """Variance of slow courses over that of white noise (P,), and the combinations W (P, P) it is
-    of, orthonormal under the mean normal matrix.
+def slow_together(evidence: ReducedSeries) -> tuple[Array, Array]:
+    """Variance of slow trajectories over that of white noise (P,), by combinations W (P, P).
 
-    From what clusters of neighbouring targets leave over together in slow courses; what the fit
-    has taken off a cluster's residuals is put back, so that white noise gives 1.
+    The combinations are orthonormal under the mean normal matrix.
+
+    From what clusters of neighbouring targets leave over together in slow trajectories; what the
+    fit has taken off a cluster's residuals is put back, so that white noise gives 1.
     """
     M = evidence.N.mean(axis=0)
     size, U = np.linalg.eigh(M)
     good = size > 1e-6 * np.median(size)
     W = U / np.sqrt(np.where(good, size, 1.0))
-    courses = cosines(evidence.history.times, ORDERS)
-    courses /= np.linalg.norm(courses, axis=1, keepdims=True)
+    trajectories = cosines(evidence.history.times, ORDERS)
+    trajectories /= np.linalg.norm(trajectories, axis=1, keepdims=True)
     weights = evidence.weights[..., :2]
     v = np.nan_to_num(evidence.residuals) * weights
     mean = weights.mean(axis=0)
@@ -63,17 +64,17 @@ def slow_together(evidence: Evidence) -> tuple[Array, Array]:
     for rows in _clusters(evidence):
         A = (evidence.columns[rows] @ W).reshape(-1, len(M))
         left, V = np.linalg.eigh(np.eye(len(M)) - A.T @ (A * mean[rows].reshape(-1, 1)))
-        pull = (courses @ v[:, rows].reshape(len(v), -1)) @ A
+        pull = (trajectories @ v[:, rows].reshape(len(v), -1)) @ A
         # what a cluster determines alone cannot be told from its residuals at all
         pull = pull @ (V / np.sqrt(np.maximum(left, 0.05))) @ V.T
-        total += pull.T @ pull / len(courses)
+        total += pull.T @ pull / len(trajectories)
     total[~good] = 0.0
     total[:, ~good] = 0.0
     factors, turn = np.linalg.eigh(total)
     return factors, W @ turn
 
 
-def _clusters(evidence: Evidence) -> list[NDArray[np.int64]]:
+def _clusters(evidence: ReducedSeries) -> list[NDArray[np.int64]]:
     """Neighbouring targets of the field together, markers whole: some thirty clusters."""
     from scipy.cluster.hierarchy import fcluster, linkage
 
@@ -89,13 +90,13 @@ def _clusters(evidence: Evidence) -> list[NDArray[np.int64]]:
     return [used[label[member] == g] for g in np.unique(label)]
 
 
-def jumps(laboratory: Laboratory, fit: Fit, series: int) -> tuple[Array, Array]:
+def jumps(fitter: HypothesisFitter, fit: Fit, series: int) -> tuple[Array, Array]:
     """Variance of the jumps over its expectation (P,) and the combinations W (P, P) it is of.
 
     The columns of W are orthonormal under the mean normal matrix; the thermometer's noise, which
     jumps too, is in the expectation.
     """
-    e = laboratory.series[series]
+    e = fitter.series[series]
     C, V, index = fit.designs[series]
     rest = e.b - np.einsum("epq,eq->ep", e.N, (C * fit.coefficients[index]) @ V.T)
     level = np.linalg.lstsq(e.N.sum(axis=0), rest.sum(axis=0), rcond=1e-12)[0]
@@ -110,22 +111,22 @@ def jumps(laboratory: Laboratory, fit: Fit, series: int) -> tuple[Array, Array]:
         [np.mean(x[np.abs(x) <= 4 * s] ** 2) for x, s in zip(d.T, spread, strict=True)]
     )
     expected = np.full(len(size), 6.0 / e.correlation)
-    expected = expected + _thermometer_jumps(laboratory, fit, series, W)
+    expected = expected + _thermometer_jumps(fitter, fit, series, W)
     return np.where(good, observed / expected, 1.0), W
 
 
-def _thermometer_jumps(laboratory: Laboratory, fit: Fit, series: int, W: Array) -> Array:
+def _thermometer_jumps(fitter: HypothesisFitter, fit: Fit, series: int, W: Array) -> Array:
     """Mean square of the second differences that the thermometers' noise makes in each z."""
-    e = laboratory.series[series]
+    e = fitter.series[series]
     second = np.diff(np.eye(len(e.times)), 2, axis=0)
     total = np.zeros(W.shape[1])
     for block in fit.blocks:
-        if block.courses > 1 or block.series not in (None, series):
+        if block.trajectories > 1 or block.series not in (None, series):
             continue
         if block.term < 0:
-            operator, channel = laboratory.drive(fit.terms, series)[1], e.history.reference
+            operator, channel = fitter.drive(fit.terms, series)[1], e.history.reference
         else:
-            _, found, channel = laboratory.courses(fit.terms[block.term], series, fit.terms)
+            _, found, channel = fitter.trajectories(fit.terms[block.term], series, fit.terms)
             if found is None:
                 continue
             operator = found
@@ -135,7 +136,7 @@ def _thermometer_jumps(laboratory: Laboratory, fit: Fit, series: int, W: Array) 
     return total
 
 
-def with_jumps(evidence: Evidence, factors: Array, W: Array) -> Evidence | None:
+def with_jumps(evidence: ReducedSeries, factors: Array, W: Array) -> ReducedSeries | None:
     """The series with unusual jumps as part of its noise; None where there are none."""
     factors = np.where(factors > _UNUSUAL, factors, 1.0)
     if np.all(factors == 1.0):

@@ -1,7 +1,8 @@
-"""The second linearisation: what the image does beyond first order, once the courses are known.
+"""The second linearisation: what the image does beyond first order.
 
 A drift of several pixels leaves some thousandths of a pixel to the curvature of the projection,
-which is more than a discovery has to see. The courses found so far say how much, epoch by epoch.
+which is more than a discovery has to see. The trajectories found so far say how much, epoch by
+epoch.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ from thermocald.photogrammetry.camera.camera_model import project
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from thermocald.discovery.evidence import Evidence
-    from thermocald.discovery.hypothesis import Fit
-    from thermocald.discovery.laboratory import Laboratory
+    from thermocald.reduction.fit import HypothesisFitter
+    from thermocald.reduction.hypothesis import Fit
+    from thermocald.reduction.series import ReducedSeries
 
     Array = NDArray[np.float64]
 
@@ -27,9 +28,9 @@ __all__ = ["relinearised"]
 _WORTH_PX = 0.0005
 
 
-def relinearised(laboratory: Laboratory, fit: Fit, series: int) -> Evidence | None:
+def relinearised(fitter: HypothesisFitter, fit: Fit, series: int) -> ReducedSeries | None:
     """One series with the curvature taken off its observations; None where it does not matter."""
-    e = laboratory.series[series]
+    e = fitter.series[series]
     if e.blocks is not None:
         return None
     C, V, index = fit.designs[series]

@@ -1,7 +1,7 @@
-"""The thermometer as an instrument: its noise, and the smooth course behind its readings.
+"""The thermometer as an instrument: its noise, and the smooth trajectory behind its readings.
 
-The smooth course is only where non-linear operators are linearised; the readings themselves stay
-the data and their error is carried through each operator (`likelihood`). So a kink that the
+The smooth trajectory is only where non-linear operators are linearised; the readings themselves
+stay the data and their error is carried through each operator (`likelihood`). So a kink that the
 smoothing rounds off does not pass for an effect.
 
 Source: Eilers (2003), A perfect smoother, Analytical Chemistry 75, 3631-3636; generalised
@@ -24,30 +24,30 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
 
 __all__ = [
-    "Channel",
+    "Thermometer",
     "extend",
-    "instruments",
     "latent_times",
     "reading_noise",
     "smooth_channel",
+    "thermometers",
 ]
 
 _SMOOTHING = np.logspace(-1, 5, 19)
 
 
 @dataclass(frozen=True, eq=False)
-class Channel:
-    """A temperature column as an instrument, on knots: its readings and latent instants between.
+class Thermometer:
+    """A temperature column as an instrument, on knots: its readings and latent times between.
 
-    times (K,) s; course (K,) °C: smoothed, filled in, the point of linearisation; NaN at knots of
-    other columns; deviation (K,) K: reading minus course; sd (K,) K of the independent errors;
-    mixing (K, K), sparse: errors of the knots = mixing @ independent errors: a latent instant
-    carries the errors of the readings beside it and its own; real (K,): where a knot is an instant
-    of reading; noise: K of one reading.
+    times (K,) s; trajectory (K,) °C: smoothed, filled in, the point of linearisation; NaN at knots
+    of other columns; deviation (K,) K: reading minus trajectory; sd (K,) K of the independent
+    errors; mixing (K, K), sparse: errors of the knots = mixing @ independent errors: a latent time
+    carries the errors of the readings beside it and its own; real (K,): where a knot is an time of
+    reading; noise: K of one reading.
     """
 
     times: Array
-    course: Array
+    trajectory: Array
     deviation: Array
     sd: Array
     mixing: csr_array
@@ -55,8 +55,8 @@ class Channel:
     noise: float
 
     def slope_jump(self, times: Array) -> Array:
-        """How uncertain the rate (E,) K/s is at some instants because it jumps beside them."""
-        t, y = self.times[self.real], (self.course + self.deviation)[self.real]
+        """How uncertain the rate (E,) K/s is at some times because it jumps beside them."""
+        t, y = self.times[self.real], (self.trajectory + self.deviation)[self.real]
         bend, limit = _bends(t, y, self.noise)
         width = np.diff(t)
         size = np.sqrt(np.maximum(bend**2 - (limit / 3.0) ** 2, 0.0)) / width
@@ -104,15 +104,15 @@ def _third_differences(t: Array, y: Array) -> Array:
 def latent_times(times: Array, readings: Array, resolution: float | None) -> Array:
     """Instants between two readings at which the temperature may leave the straight line.
 
-    Where a lamp was switched the course bends within one interval, by up to a quarter of the bend;
-    a maximum that lies between two readings is seen by no reading.
+    Where a lamp was switched the trajectory bends within one interval, by up to a quarter of the
+    bend; a maximum that lies between two readings is seen by no reading.
     """
     valid = np.isfinite(readings)
     t, y = times[valid], readings[valid]
     bend, limit = _bends(t, y, reading_noise(t, y, resolution))
     sharp = np.abs(bend) > limit
     if sharp.mean() > 0.2 if len(sharp) else True:
-        return np.zeros(0)  # not a course with a few kinks: nothing is sharper than the rest
+        return np.zeros(0)  # not a trajectory with a few kinks: nothing is sharper than the rest
     return 0.5 * (t[:-1] + t[1:])[sharp]
 
 
@@ -130,11 +130,11 @@ def _bends(t: Array, y: Array, noise: float) -> tuple[Array, float]:
 
 def smooth_channel(
     times: Array, readings: Array, latent: NDArray[np.bool_], resolution: float | None
-) -> Channel:
-    """One temperature column on knots: its instants, those of others (NaN), and its latent ones.
+) -> Thermometer:
+    """One temperature column on knots: its times, those of others (NaN), and its latent ones.
 
     times (K,) s ascending, readings (K,) °C with NaN where missing; latent (K,): True where a knot
-    is a latent instant of this column, or of another.
+    is a latent time of this column, or of another.
     """
     noise = reading_noise(times, readings, resolution)
     valid = np.isfinite(readings)
@@ -144,8 +144,8 @@ def smooth_channel(
     smooth = filled
     if valid.sum() >= 8 and float(np.ptp(readings[valid])) > 3 * noise:
         smooth = _whittaker(filled, np.isfinite(y).astype(float), noise)
-    course = np.full(len(times), np.nan)
-    course[own] = smooth
+    trajectory = np.full(len(times), np.nan)
+    trajectory[own] = smooth
     sd = np.full(len(times), noise)
     if not np.isfinite(y).all():
         # what may happen between two readings: a share of the step across the gap
@@ -168,29 +168,29 @@ def smooth_channel(
             # a kink at a random place bulges by 1/8 of the bend in the middle, ± 0.07; its
             # neighbours bend too and do not bulge
             top = size > 0 and size >= np.max(np.abs(bend[max(i - 1, 0) : i + 2]))
-            course[row] = (1 - share) * smooth[i] + share * smooth[i + 1]
-            course[row] -= bend[i] / 8 * top
+            trajectory[row] = (1 - share) * smooth[i] + share * smooth[i + 1]
+            trajectory[row] -= bend[i] / 8 * top
             sd[row] = 0.12 * size + 0.25 * noise
-    deviation = np.nan_to_num(readings - course)
-    return Channel(times, course, deviation, sd, csr_array(mixing), own, noise)
+    deviation = np.nan_to_num(readings - trajectory)
+    return Thermometer(times, trajectory, deviation, sd, csr_array(mixing), own, noise)
 
 
-def extend(channel: Channel) -> Channel:
+def extend(channel: Thermometer) -> Thermometer:
     """The same column with knots before its begin and after its end, as uncertain as they are.
 
     Before the begin the temperature is taken as it was at the begin (EFFECTS: the past begins
     with the series), after the end it goes on along its slope; both within half of what the slope
-    makes of the time elapsed. A delay asks for such instants, and so does the state at the begin.
+    makes of the time elapsed. A delay asks for such times, and so does the state at the begin.
     """
     t = channel.times
-    k = np.flatnonzero(np.isfinite(channel.course))
+    k = np.flatnonzero(np.isfinite(channel.trajectory))
     step = float(np.median(np.diff(t[k])))
     before = -step * np.array([12.0, 6.0, 3.0, 0.5]) + t[0]
     after = step * np.array([0.5, 1.5, 3.0, 6.0, 12.0]) + t[-1]
-    first = np.polyfit(t[k[:4]], channel.course[k[:4]], 1)[0]
-    last = np.polyfit(t[k[-4:]], channel.course[k[-4:]], 1)[0]
-    held = np.full(len(before), channel.course[k[0]])
-    carried = channel.course[k[-1]] + last * (after - t[-1]) * 0.7
+    first = np.polyfit(t[k[:4]], channel.trajectory[k[:4]], 1)[0]
+    last = np.polyfit(t[k[-4:]], channel.trajectory[k[-4:]], 1)[0]
+    held = np.full(len(before), channel.trajectory[k[0]])
+    carried = channel.trajectory[k[-1]] + last * (after - t[-1]) * 0.7
     K, n, m = len(t), len(before), len(after)
     from scipy.sparse import block_diag, csr_array
 
@@ -199,10 +199,10 @@ def extend(channel: Channel) -> Channel:
     ends = csr_array((np.ones(n + m), (edge, at)), shape=(n + K + m, n + K + m))
     ones = [csr_array(np.eye(size)) for size in (n, m)]
     mixing = csr_array(block_diag([ones[0], channel.mixing, ones[1]]) + ends)
-    rate = float(np.sqrt(np.mean(np.gradient(channel.course[k], t[k]) ** 2)))
-    return Channel(
+    rate = float(np.sqrt(np.mean(np.gradient(channel.trajectory[k], t[k]) ** 2)))
+    return Thermometer(
         np.concatenate([before, t, after]),
-        np.concatenate([held, channel.course, carried]),
+        np.concatenate([held, channel.trajectory, carried]),
         np.concatenate([np.zeros(n), channel.deviation, np.zeros(m)]),
         np.concatenate(
             [
@@ -244,10 +244,10 @@ def _whittaker(values: Array, weights: Array, noise: float) -> Array:
     return np.asarray(chosen, dtype=float)
 
 
-def instruments(
+def thermometers(
     times: Array, readings: Mapping[str, Array], resolutions: Mapping[str, float | None]
-) -> tuple[Array, dict[str, Channel]]:
-    """All columns on common knots: the readings' instants and the latent ones of each column."""
+) -> tuple[Array, dict[str, Thermometer]]:
+    """All columns on common knots: the readings' times and the latent ones of each column."""
     latent = {name: latent_times(times, r, resolutions.get(name)) for name, r in readings.items()}
     knots, first = np.unique(np.concatenate([times, *latent.values()]), return_index=True)
     from_reading = first < len(times)
@@ -262,14 +262,14 @@ def instruments(
     return next(iter(channels.values())).times, channels
 
 
-def _spread(channel: Channel, knots: Array, here: NDArray[np.bool_]) -> Channel:
+def _spread(channel: Thermometer, knots: Array, here: NDArray[np.bool_]) -> Thermometer:
     """A column's instrument on all knots; those of other columns are NaN and carry nothing."""
     from scipy.sparse import csr_array
 
     K, rows = len(knots), np.flatnonzero(here)
-    course, deviation, sd = np.full(K, np.nan), np.zeros(K), np.full(K, 1e-6)
+    trajectory, deviation, sd = np.full(K, np.nan), np.zeros(K), np.full(K, 1e-6)
     real = np.zeros(K, dtype=bool)
-    course[here], deviation[here], sd[here] = channel.course, channel.deviation, channel.sd
+    trajectory[here], deviation[here], sd[here] = channel.trajectory, channel.deviation, channel.sd
     real[here] = channel.real
     part = channel.mixing.tocoo()
     others = np.flatnonzero(~here)
@@ -283,4 +283,4 @@ def _spread(channel: Channel, knots: Array, here: NDArray[np.bool_]) -> Channel:
         ),
         shape=(K, K),
     )
-    return Channel(knots, course, deviation, sd, mixing, real, channel.noise)
+    return Thermometer(knots, trajectory, deviation, sd, mixing, real, channel.noise)

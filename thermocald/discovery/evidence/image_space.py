@@ -1,7 +1,7 @@
 """Effects in image space: single targets that moved, and a measuring noise that grows.
 
 They are looked for in what a free camera per epoch leaves, so that nothing the camera itself does
-can pass for them, and taken out before the courses of parameters are examined.
+can pass for them, and taken out before the trajectories of parameters are examined.
 
 Source: a step at an unknown time as Page (1955), Biometrika 42, 523-527; variances as a
 generalised linear model, McCullagh and Nelder (1989), Generalized Linear Models, chapter 10.
@@ -14,21 +14,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.discovery.adequacy import cosines
-from thermocald.discovery.reduction import without_targets
+from thermocald.reduction.adequacy import cosines
+from thermocald.reduction.reduce import without_targets
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
-    from thermocald.discovery.evidence import Evidence
+    from thermocald.reduction.series import ReducedSeries
 
     Array = NDArray[np.float64]
 
 __all__ = ["Displaced", "NoiseGrowth", "displaced_targets", "noise_growth"]
 
-_GAIN = 60.0  # χ² of a step, for 147 targets × 180 instants a chance of 1e-8
+_GAIN = 60.0  # χ² of a step, for 147 targets × 180 times a chance of 1e-8
 _STEP_PX = 0.02
 _LEAST = 0.005  # share of the noise at T0 that is left where it is coldest
 _SHARE = 0.6  # of a target's slow movement that the step has to explain
@@ -36,7 +36,7 @@ _SHARE = 0.6  # of a target's slow movement that the step has to explain
 
 @dataclass(frozen=True, eq=False)
 class Displaced:
-    """Targets that moved together: rows of the field, instant s ± s from the series' begin,
+    """Targets that moved together: rows of the field, time s ± s from the series' begin,
     displacement (k, 3) mm as far as an image shows it (across the ray), sd (k, 3), step (k, 2) px.
     """
 
@@ -53,7 +53,8 @@ class Displaced:
 class NoiseGrowth:
     """Noise 1 + factor (T - T0): factor per K and its sd; gain in -2 log L; noise (E,) per series.
 
-    other_gain: of the best course that is not the reference temperature (time, another channel).
+    other_gain: of the best trajectory that is not the reference temperature (time, another
+    channel).
     """
 
     factor: float
@@ -64,7 +65,7 @@ class NoiseGrowth:
     noise: tuple[Array, ...]
 
 
-def _steps(evidence: Evidence) -> tuple[Array, NDArray[np.int64], Array]:
+def _steps(evidence: ReducedSeries) -> tuple[Array, NDArray[np.int64], Array]:
     """Best step of each target: gain (T,), index of the first epoch after it, share of movement."""
     w = np.sqrt(evidence.weights[..., :2])
     r = evidence.residuals * w
@@ -98,7 +99,7 @@ def _steps(evidence: Evidence) -> tuple[Array, NDArray[np.int64], Array]:
     return top, best + 1, top / np.maximum(top + rest, 1e-9)
 
 
-def displaced_targets(evidence: Evidence) -> tuple[list[Displaced], Evidence]:
+def displaced_targets(evidence: ReducedSeries) -> tuple[list[Displaced], ReducedSeries]:
     """Targets that jumped, and the series without them.
 
     A marker jumps as a whole: where a few of its corners jump, it was badly seen, and is left out.
@@ -132,13 +133,13 @@ def displaced_targets(evidence: Evidence) -> tuple[list[Displaced], Evidence]:
     return _grouped(cleaned, whole) if whole else [], cleaned
 
 
-def _with_their_markers(evidence: Evidence, found: Iterable[int]) -> NDArray[np.int64]:
+def _with_their_markers(evidence: ReducedSeries, found: Iterable[int]) -> NDArray[np.int64]:
     groups = evidence.source.field.groups
     return np.flatnonzero(np.isin(groups, groups[sorted(found)]))
 
 
 def _whole_markers(
-    evidence: Evidence, found: dict[int, tuple[int, float]]
+    evidence: ReducedSeries, found: dict[int, tuple[int, float]]
 ) -> dict[int, tuple[int, float]]:
     """The jumps without those that other corners of their marker did not make with them."""
     groups = evidence.source.field.groups
@@ -152,8 +153,8 @@ def _whole_markers(
     return out
 
 
-def _grouped(cleaned: Evidence, found: dict[int, tuple[int, float]]) -> list[Displaced]:
-    """Measure the steps against the camera that the other targets give; one group per instant."""
+def _grouped(cleaned: ReducedSeries, found: dict[int, tuple[int, float]]) -> list[Displaced]:
+    """Measure the steps against the camera that the other targets give; one group per time."""
     rows = np.array(sorted(found))
     A = cleaned.columns[rows]
     misclosure = cleaned.source.grid.points[:, rows] - cleaned.at.predicted[rows]
@@ -213,7 +214,7 @@ def _best_step(v: Array) -> int:
     return int(np.argmax(gain)) + 1
 
 
-def noise_growth(series: Sequence[Evidence]) -> NoiseGrowth | None:
+def noise_growth(series: Sequence[ReducedSeries]) -> NoiseGrowth | None:
     """Does the measuring noise follow the reference temperature? None where it does not change.
 
     The variances of the epochs' adjustments are χ² distributed about (1 + k (T - T0))².
@@ -228,8 +229,8 @@ def noise_growth(series: Sequence[Evidence]) -> NoiseGrowth | None:
     others: list[tuple[float, str]] = []
     for name in series[0].history.readings:
         if name != series[0].history.reference and all(name in e.history.readings for e in series):
-            course = [e.history.temperature(name) for e in series]
-            others.append((_slope([c - c.mean() for c in course], data)[1], name))
+            trajectory = [e.history.temperature(name) for e in series]
+            others.append((_slope([c - c.mean() for c in trajectory], data)[1], name))
     time = [(e.times - e.times.mean()) / max(float(np.ptp(e.times)), 1.0) for e in series]
     others.append((_slope(time, data)[1], "time"))
     other_gain, other = max(others)
@@ -244,13 +245,13 @@ def noise_growth(series: Sequence[Evidence]) -> NoiseGrowth | None:
 
 
 def _roughness(
-    courses: Sequence[Array], data: Sequence[tuple[NDArray[np.bool_], Array, Array]], k: float
+    trajectories: Sequence[Array], data: Sequence[tuple[NDArray[np.bool_], Array, Array]], k: float
 ) -> float:
     """By how much the variances scatter more, and slower, than χ² lets them; at least 1."""
     total = []
-    for course, (ok, free, v) in zip(courses, data, strict=True):
+    for trajectory, (ok, free, v) in zip(trajectories, data, strict=True):
         f = free[ok]
-        ratio = v[ok] / np.maximum(1.0 + k * course[ok], _LEAST) ** 2
+        ratio = v[ok] / np.maximum(1.0 + k * trajectory[ok], _LEAST) ** 2
         z = (ratio / (np.sum(f * ratio) / np.sum(f)) - 1.0) * np.sqrt(f / 2.0)
         power = float(np.mean(z**2))
         slow = 1.0 + 2.0 * sum(
@@ -261,24 +262,24 @@ def _roughness(
 
 
 def _slope(
-    courses: Sequence[Array],
+    trajectories: Sequence[Array],
     data: Sequence[tuple[NDArray[np.bool_], Array, Array]],
 ) -> tuple[float, float, float]:
-    """k, gain in -2 log L, and sd of k for the noise 1 + k course, with a level per series."""
+    """k, gain in -2 log L, and sd of k for the noise 1 + k trajectory, with a level per series."""
     from scipy.optimize import minimize_scalar
 
     def objective(k: float) -> float:
         total = 0.0
-        for course, (ok, free, v) in zip(courses, data, strict=True):
-            s2 = np.maximum(1.0 + k * course[ok], _LEAST) ** 2
+        for trajectory, (ok, free, v) in zip(trajectories, data, strict=True):
+            s2 = np.maximum(1.0 + k * trajectory[ok], _LEAST) ** 2
             f = free[ok]
             level = np.sum(f * v[ok] / s2) / np.sum(f)
             total += float(np.sum(f * (np.log(s2) + np.log(level))))
         return total
 
-    reach = max(float(np.max(np.abs(c))) for c in courses)
-    low = min(float(np.min(c)) for c in courses)
-    high = max(float(np.max(c)) for c in courses)
+    reach = max(float(np.max(np.abs(c))) for c in trajectories)
+    low = min(float(np.min(c)) for c in trajectories)
+    high = max(float(np.max(c)) for c in trajectories)
     bounds = (-0.995 / max(high, 1e-9), 0.995 / max(-low, 1e-9))
     start = minimize_scalar(objective, bounds=bounds, method="bounded", options={"xatol": 1e-7})
     k = float(start.x)

@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.discovery.estimates import model_values
-from thermocald.discovery.evidence import COLUMNS
-from thermocald.discovery.hypothesis import BASE
+from thermocald.discovery.verdict.estimates import model_values
 from thermocald.photogrammetry.camera.camera_model import (
     EOP_NAMES,
     IOP_NAMES,
@@ -17,13 +15,15 @@ from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     InteriorOrientation,
 )
+from thermocald.reduction.hypothesis import BASE
+from thermocald.reduction.series import COLUMNS
 from thermocald.simulation import effects as catalogue
 from thermocald.simulation.model import ModelEffect, ThermalModel
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from thermocald.discovery.result import Discovery
+    from thermocald.discovery.verdict.result import Discovery
 
     Array = NDArray[np.float64]
 
@@ -33,10 +33,10 @@ __all__ = ["model_of", "terms_of"]
 def model_of(discovery: Discovery, old: ThermalModel | None = None) -> ThermalModel:
     """The model with what was found; constants as M1 alone gave them.
 
-    An effect keeps what it is fresh in (an instant, a phase) as M1 had it.
+    An effect keeps what it is fresh in (an time, a phase) as M1 had it.
     """
     x, fit = discovery.examination, discovery.final_fit
-    e = x.laboratory.series[0]
+    e = x.fitter.series[0]
     level, sd = _level(discovery)
     scale = e.scale[: len(PARAMETER_NAMES)]
     start = np.concatenate([e.at.iop, e.at.eop])
@@ -79,7 +79,7 @@ def model_of(discovery: Discovery, old: ThermalModel | None = None) -> ThermalMo
         },
         validity={e.history.reference: (float(T.min()), float(T.max()))},
         fitted_on=[{"recording": s.source.name, "epochs": int((s.n > 0).sum())}
-                   for s in x.laboratory.series[:1]],
+                   for s in x.fitter.series[:1]],
         evidence=_evidence(discovery),
         name=old.name if old else e.source.camera,
         version=old.version + 1 if old else 1,
@@ -116,8 +116,8 @@ def _plain(value: Any) -> Any:
 def _level(discovery: Discovery) -> tuple[Array, Array]:
     """Level of the 16 parameters at T0 with all effects at zero, px-scaled, and its sd."""
     fit = discovery.final_fit
-    laboratory = discovery.examination.laboratory
-    e = laboratory.series[0]
+    fitter = discovery.examination.fitter
+    e = fitter.series[0]
     C, V, index = fit.designs[0]
     x = fit.coefficients[index]
     rest = (e.b - np.einsum("epq,eq->ep", e.N, (C * x) @ V.T)).sum(axis=0)[:16]
@@ -131,18 +131,18 @@ def _level(discovery: Discovery) -> tuple[Array, Array]:
         if block.series not in (None, 0):
             continue
         if block.term < 0:
-            course = laboratory.drive(fit.terms, 0)[0][:, None] - e.T0
+            trajectory = fitter.drive(fit.terms, 0)[0][:, None] - e.T0
         else:
-            course = laboratory.courses(fit.terms[block.term], 0, fit.terms)[0]
-        means += [m for m in course.mean(axis=0) for _ in block.parameters]
+            trajectory = fitter.trajectories(fit.terms[block.term], 0, fit.terms)[0]
+        means += [m for m in trajectory.mean(axis=0) for _ in block.parameters]
     level = level - (V @ (np.array(means) * x))[:16]
     return level, np.sqrt(np.diag(inverse))
 
 
 def terms_of(model: ThermalModel) -> list[tuple[str, dict[str, Any]]]:
-    """The effects of a model that act on courses of parameters, with their values."""
+    """The effects of a model that act on trajectories of parameters, with their values."""
     return [
         (e.name, dict(e.values))
         for e in model.effects
-        if catalogue.get(e.name).kind != "image" or e.name == "test_field_expansion"
+        if catalogue.get(e.name).seen_in == "trajectory"
     ]

@@ -5,12 +5,13 @@ from __future__ import annotations
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from thermocald.discovery import figures
-from thermocald.discovery.misfit import resolve
+from thermocald.discovery.verdict.misfit import resolve
+from thermocald.output.discovery import figures
 
 if TYPE_CHECKING:
-    from thermocald.discovery.gap import Gap
-    from thermocald.discovery.result import Discovery, EffectFound
+    from thermocald.discovery.verdict.found import EffectFound
+    from thermocald.discovery.verdict.gap import Gap
+    from thermocald.discovery.verdict.result import Discovery
 
 __all__ = ["report_html"]
 
@@ -87,7 +88,7 @@ def _gaps(discovery: Discovery) -> str:
         + "".join(rows)
         + "</table>"
     )
-    outside, inside = discovery.left_out
+    outside, inside = discovery.cross_validation
     if outside == outside:  # a number
         text += (
             "<p>On blocks of M1 left out of the fit, χ² of the parameters per degree of freedom "
@@ -132,7 +133,7 @@ def _effect(effect: EffectFound) -> str:
 
 def _where(discovery: Discovery) -> str:
     rows = []
-    for name, value, sigmas in resolve(discovery).rows:
+    for name, value, sigmas in resolve(discovery.examination).rows:
         rows.append(
             f"<tr><td>{escape(name)}</td><td class='n'>{_text(value)}</td>"
             f"<td class='n'>{sigmas:.1f}</td></tr>"

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.discovery.evidence import COLUMNS
+from thermocald.reduction.series import COLUMNS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from thermocald.discovery.result import Discovery
+    from thermocald.discovery.search.examination import Examination
+    from thermocald.reduction.series import ReducedSeries
 
     Array = NDArray[np.float64]
 
@@ -28,7 +29,7 @@ class Misfit:
     """A misfit resolved.
 
     rows: (against what, size in px RMS, significance in sigma); targets: those that jumped;
-    regions {(row, column) of a 3 × 3 raster of the image: what a free camera leaves, in units of
+    regions {(row, column) of a 3 × 3 grid over the image: what a free camera leaves, in units of
     the noise}.
     """
 
@@ -51,20 +52,18 @@ class Misfit:
         }
 
 
-def resolve(discovery: Discovery, series: int = 0) -> Misfit:
+def resolve(x: Examination, series: int = 0) -> Misfit:
     """The base model's misfit in one series."""
-    x = discovery.examination
-    e = x.laboratory.series[series]
+    e = x.fitter.series[series]
     fit = x.base.fit
     weighting = fit.weightings[series]
     C, V, index = fit.designs[series]
     coefficients = fit.coefficients[index]
-    weights = e.weights[..., :2]
-    sigma = float(1.0 / np.sqrt(np.mean(weights[weights > 0])))
+    sigma = e.sigma_px
     coordinates = 2.0 * float(e.n.sum())
 
-    def against(courses: Array, directions: Array) -> tuple[float, float]:
-        A, c, B = weighting.scan(courses[None], directions, (C, V))
+    def against(trajectories: Array, directions: Array) -> tuple[float, float]:
+        A, c, B = weighting.scan(trajectories[None], directions, (C, V))
         rest = c[0] - B[0] @ coefficients
         scale = np.sqrt(np.maximum(np.diag(A[0]), 1e-300))
         own = A[0] / np.outer(scale, scale) + 1e-9 * np.eye(len(scale))
@@ -74,28 +73,28 @@ def resolve(discovery: Discovery, series: int = 0) -> Misfit:
         return sigma * float(np.sqrt(excess / coordinates)), (gain - free) / np.sqrt(2.0 * free)
 
     every = x.base_adequacy[series].directions
-    T = e.history.temperature()
-    courses: dict[str, Array] = {
+    T = e.history.temperature()  # on all epochs; the rows may be blocks of them
+    trajectories: dict[str, Array] = {
         "time": e.times - e.times.mean(),
-        "temperature, bent": (T - T.mean()) ** 2,
-        "rate of temperature": np.gradient(T, e.times),
+        "temperature, bent": e.averaged((T - T.mean()) ** 2),
+        "rate of temperature": e.averaged(np.gradient(T, e.history.times)),
     }
     for name in e.history.readings:
         if name != e.history.reference:
-            courses[f"channel {name}"] = e.history.temperature(name)
+            trajectories[f"channel {name}"] = e.averaged(e.history.temperature(name))
     rows: list[tuple[str, float, float]] = []
-    for name, course in courses.items():
-        rows.append((name, *against((course - course.mean())[:, None], every)))
-    smooth = x.base_adequacy[series].courses.T
+    for name, trajectory in trajectories.items():
+        rows.append((name, *against((trajectory - trajectory.mean())[:, None], every)))
+    smooth = x.base_adequacy[series].trajectories.T
     for j, column in enumerate(COLUMNS):
         one = np.zeros((len(COLUMNS), 1))
         one[j] = 1.0
-        rows.append((f"{column}, slow courses", *against(smooth, one)))
+        rows.append((f"{column}, slow trajectories", *against(smooth, one)))
     total = x.base_adequacy[series]
-    rows.insert(0, ("all slow courses in all parameters", total.misfit_px, total.significance))
+    rows.insert(0, ("all slow trajectories in all parameters", total.misfit_px, total.significance))
     rows.append(("noise level (sigma0)", *_noise(e.sigma0, e.n.astype(float), e.N.shape[1])))
     rows = [(what, float(size), float(sigmas)) for what, size, sigmas in rows]
-    return Misfit(tuple(rows), tuple(_targets(discovery, series)), _regions(e, sigma))
+    return Misfit(tuple(rows), tuple(_targets(x, series)), _regions(e, sigma))
 
 
 def _noise(sigma0: Array, n: Array, columns: int) -> tuple[float, float]:
@@ -107,13 +106,13 @@ def _noise(sigma0: Array, n: Array, columns: int) -> tuple[float, float]:
     return float(np.std(sigma0[ok])), (z - count) / np.sqrt(2 * count)
 
 
-def _targets(discovery: Discovery, series: int) -> list[str]:
-    names = discovery.examination.laboratory.series[series].source.field.names
-    return [names[r] for g in discovery.examination.displaced[series] for r in g.rows]
+def _targets(x: Examination, series: int) -> list[str]:
+    names = x.fitter.series[series].source.field.names
+    return [names[r] for g in x.displaced[series] for r in g.rows]
 
 
-def _regions(e: Any, sigma: float) -> dict[tuple[int, int], float]:
-    """RMS of what a free camera leaves, on a raster of 3 × 3, in units of the noise."""
+def _regions(e: ReducedSeries, sigma: float) -> dict[tuple[int, int], float]:
+    """RMS of what a free camera leaves, on a grid of 3 × 3, in units of the noise."""
     place = e.at.predicted
     row = np.clip((3 * place[:, 1] / e.source.sensor.height).astype(float), 0, 2.99)
     column = np.clip((3 * place[:, 0] / e.source.sensor.width).astype(float), 0, 2.99)

@@ -20,15 +20,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
-    from thermocald.discovery.thermometer import Channel
     from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.series.normals import ObservationGrid, Partials
+    from thermocald.reduction.thermometer import Thermometer
     from thermocald.simulation.history import History
 
     Array = NDArray[np.float64]
 
-__all__ = ["COLUMNS", "FIELD_SCALES", "Blocks", "Evidence", "SeriesInput", "solve"]
+__all__ = ["COLUMNS", "FIELD_SCALES", "Blocks", "ReducedSeries", "SeriesInput", "solve"]
 
 FIELD_SCALES = ("scale_X", "scale_Y", "scale_Z")
 COLUMNS = PARAMETER_NAMES + FIELD_SCALES
@@ -61,12 +61,14 @@ class Blocks:
     """Neighbouring epochs of a long series as one row.
 
     average (B, E): weights of the epochs in each block; pool (K, S): knots to states, the readings
-    of a block being one; within_free: degrees of freedom of the epochs about their blocks.
+    of a block being one; within_free: degrees of freedom of the epochs about their blocks; first
+    (B,): index of each block's first epoch.
     """
 
     average: csr_array
     pool: csr_array
     within_free: float
+    first: NDArray[np.int64]
 
     def pooled_mean(self, values: Array) -> Array:
         """Mean over the knots of each state."""
@@ -78,23 +80,30 @@ class Blocks:
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class ReducedSeries:
     """One series, reduced.
 
-    times (E,) s from its begin; history: smoothed readings; channels: as instruments;
-    at: linearisation; scale (19,): px per unit of each column, N (E, 19, 19) and b (E, 19) are in
-    px-scaled columns and weighted by the noise found; yy (E,): bᵀN⁻¹b; values (E, 19): the free
-    camera of each epoch, scaled; residuals (E, T, 2) px: what the free camera leaves, offsets taken
-    out, NaN where unseen or gross; n (E,) image points; sigma0 (E,); variance: factor by which the
-    given variances were too small.
+    source: what was recorded; times (E,) s from its start; history: smoothed readings;
+    thermometers: the columns as instruments; at: linearisation; scale (19,): px per unit of each
+    column; columns (T, 2, 19): ∂ image points / ∂ scaled columns.
+
+    N (E, 19, 19), b (E, 19): normal equations in px-scaled columns, weighted by the noise found; yy
+    (E,): bᵀN⁻¹b; values (E, 19): the free camera of each epoch, scaled; residuals (E, T, 2) px:
+    what the free camera leaves, offsets (T, 2) px taken out, NaN where unseen or gross; weights (E,
+    T, 3) px⁻²; n (E,) image points; sigma0 (E,).
+
+    variance: factor by which the given variances were too small; correlation: how much larger the
+    variance of slow trajectories is than that of white noise; gross: rejected points; excluded:
+    rows of targets left out; blocks: the epochs behind each row of a long series, or None.
     """
 
     source: SeriesInput
     times: Array
     history: History
-    channels: Mapping[str, Channel]
+    thermometers: Mapping[str, Thermometer]
     at: Partials
     scale: Array
+    columns: Array
     N: Array
     b: Array
     yy: Array
@@ -108,33 +117,51 @@ class Evidence:
     correlation: float
     gross: int
     excluded: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    columns: Array = field(default_factory=lambda: np.zeros(0))
     blocks: Blocks | None = None
 
+    @property
+    def numbers(self) -> NDArray[np.int64]:
+        """The number of the epoch of each row; of a block, of its first epoch."""
+        every = self.source.numbers
+        return every if self.blocks is None else every[self.blocks.first]
+
     def states(self, channel: str, operator: csr_array) -> Array:
-        """∂ course / ∂ knots (epochs, K), sparse → ∂ course / ∂ independent errors, dense."""
-        result = operator @ self.channels[channel].mixing
+        """∂ trajectory / ∂ independent errors, dense, from ∂ trajectory / ∂ knots (epochs, K)."""
+        result = operator @ self.thermometers[channel].mixing
         if self.blocks is not None:
             result = self.blocks.average @ result @ self.blocks.pool
         return np.asarray(result.toarray())
 
     def state_sd(self, channel: str) -> Array:
         """Standard deviations of the independent errors, K."""
-        sd = self.channels[channel].sd
+        sd = self.thermometers[channel].sd
         return sd if self.blocks is None else self.blocks.pooled_sd(sd)
 
     def state_deviation(self, channel: str) -> Array:
-        """Readings minus smooth course as far as the independent errors hold it, K."""
-        deviation = self.channels[channel].deviation
+        """Readings minus smooth trajectory as far as the independent errors hold it, K."""
+        deviation = self.thermometers[channel].deviation
         return deviation if self.blocks is None else self.blocks.pooled_mean(deviation)
 
-    def averaged(self, course: Array) -> Array:
-        """A course (epochs, …) on the rows of the normal equations."""
-        return course if self.blocks is None else np.asarray(self.blocks.average @ course)
+    def averaged(self, trajectory: Array) -> Array:
+        """A trajectory (epochs, …) on the rows of the normal equations."""
+        return trajectory if self.blocks is None else np.asarray(self.blocks.average @ trajectory)
 
     @property
     def T0(self) -> float:
+        """The reference temperature, °C."""
         return self.history.T0
+
+    @property
+    def rank(self) -> float:
+        """How many levels of the parameters the series determines."""
+        size = np.linalg.eigvalsh(self.N.sum(axis=0))
+        return float(np.sum(size > 1e-9 * size[-1]))
+
+    @property
+    def sigma_px(self) -> float:
+        """The noise of an image coordinate, px, as the weights have it."""
+        weights = self.weights[..., :2]
+        return float(1.0 / np.sqrt(np.mean(weights[weights > 0])))
 
     @property
     def dof(self) -> float:

@@ -13,15 +13,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.discovery.evidence import Evidence, SeriesInput, solve
-from thermocald.discovery.requirements import (
-    MIN_EPOCHS,
-    MIN_TARGETS,
-    no_temperature,
-    require,
-    require_change,
-)
-from thermocald.discovery.thermometer import Channel, instruments
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
@@ -34,10 +25,19 @@ from thermocald.photogrammetry.series.normals import (
     right_hand_sides,
     sums_of_squares,
 )
+from thermocald.reduction.requirements import (
+    MIN_EPOCHS,
+    MIN_TARGETS,
+    no_temperature,
+    require,
+    require_change,
+)
+from thermocald.reduction.series import ReducedSeries, SeriesInput, solve
+from thermocald.reduction.thermometer import Thermometer, thermometers
 from thermocald.simulation.history import History
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -45,13 +45,15 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["gather", "reweighted", "without_targets"]
+__all__ = ["reduce_series", "reduce_together", "reweighted", "without_targets"]
 
 _GROSS = 4.5  # standard deviations beyond which a point is a gross error
 _ANY_GEOMETRY = GeometryBounds(0, 2.0, 1e9, 1e9, 0.0, 0.0)
 
 
-def gather(source: SeriesInput, T0: float | None = None, scale: Array | None = None) -> Evidence:
+def reduce_series(
+    source: SeriesInput, T0: float | None = None, scale: Array | None = None
+) -> ReducedSeries:
     """Check a series and reduce it; `T0` and `scale` are M1's for M2.
 
     Raises DataError where the data cannot carry a discovery: it says what is missing.
@@ -69,18 +71,32 @@ def gather(source: SeriesInput, T0: float | None = None, scale: Array | None = N
     reference = next(iter(source.readings))
     if reference not in present:
         raise DataError(no_temperature(source, reference))
-    knots, channels = instruments(reading_times, present, source.resolutions)
-    course = channels[reference].course
-    course = course[np.isfinite(course)]
+    knots, instruments = thermometers(reading_times, present, source.resolutions)
+    trajectory = instruments[reference].trajectory
+    trajectory = trajectory[np.isfinite(trajectory)]
     history = History(
         times,
         knots,
-        {name: c.course for name, c in channels.items()},
+        {name: c.trajectory for name, c in instruments.items()},
         reference,
-        float(np.mean(course)) if T0 is None else T0,
+        float(np.mean(trajectory)) if T0 is None else T0,
     )
-    require_change(source, reference, channels[reference])
-    return _reduce(source, times, history, channels, scale)
+    require_change(source, reference, instruments[reference])
+    return _reduce(source, times, history, instruments, scale)
+
+
+def reduce_together(inputs: Sequence[SeriesInput], T0: float | None = None) -> list[ReducedSeries]:
+    """Reduce series in common units; T0 is the mean of the first unless a model has one."""
+    first = reduce_series(inputs[0], T0)
+    out = [first, *(reduce_series(i, first.T0, first.scale) for i in inputs[1:])]
+    for e in out[1:]:
+        low = float(np.min(e.at.iop[0] / first.at.iop[0]))
+        if not 0.9 < low < 1.1:
+            raise DataError(
+                f"{e.source.name}: the principal distance is {e.at.iop[0]:.3f} mm, in "
+                f"{first.source.name} {first.at.iop[0]:.3f} mm: another camera, or refocused"
+            )
+    return out
 
 
 def _running_median(values: Array, width: int = 5) -> Array:
@@ -144,9 +160,9 @@ def _reduce(
     source: SeriesInput,
     times: Array,
     history: History,
-    channels: Mapping[str, Channel],
+    instruments: Mapping[str, Thermometer],
     scale: Array | None,
-) -> Evidence:
+) -> ReducedSeries:
     at = _linearised(source)
     X = source.field.points
     A = np.concatenate([at.A, at.B * X[:, None, :]], axis=-1)
@@ -191,11 +207,27 @@ def _reduce(
     v = np.where((seen & ~bad)[..., None], v, np.nan)
     weak = ~enough
     N[weak], b[weak], yy[weak], count[weak] = 0.0, 0.0, 0.0, 0
-    return Evidence(
-        source, times, history, channels, at, scale,
-        N / variance, b / variance, yy / variance, values, v, w / variance, offsets,
-        count, sigma0 / np.sqrt(variance), variance, _slowness(v), int(bad.sum()), columns=A,
-    )  # fmt: skip
+    return ReducedSeries(
+        source=source,
+        times=times,
+        history=history,
+        thermometers=instruments,
+        at=at,
+        scale=scale,
+        columns=A,
+        N=N / variance,
+        b=b / variance,
+        yy=yy / variance,
+        values=values,
+        residuals=v,
+        weights=w / variance,
+        offsets=offsets,
+        n=count,
+        sigma0=sigma0 / np.sqrt(variance),
+        variance=variance,
+        correlation=_slowness(v),
+        gross=int(bad.sum()),
+    )
 
 
 def _offsets_and_cameras(
@@ -216,7 +248,7 @@ def _offsets_and_cameras(
     return (offsets, *cameras(offsets))
 
 
-def _offset_change(weights: Array, v: Array, N: Array, A: Array, turns: int = 60) -> Array:
+def _offset_change(weights: Array, v: Array, N: Array, A: Array, max_iterations: int = 60) -> Array:
     """One offset per target (T, 2) that residuals v (E, T, 2) of free cameras ask for.
 
     Targets hidden for long pull at the cameras of the other epochs: offsets and cameras are solved
@@ -235,7 +267,7 @@ def _offset_change(weights: Array, v: Array, N: Array, A: Array, turns: int = 60
     r = np.sum(weights * v, axis=0)
     z = inverse * r
     p, rz = z, float(np.sum(r * z))
-    for _ in range(turns):
+    for _ in range(max_iterations):
         if np.max(np.abs(z)) < 1e-5:
             break
         q = normal(p)
@@ -269,7 +301,7 @@ def _slowness(v: Array, lags: int = 20) -> float:
     return max(total, 1.0) if total > 1.08 else 1.0
 
 
-def reweighted(evidence: Evidence, noise: Array) -> Evidence:
+def reweighted(evidence: ReducedSeries, noise: Array) -> ReducedSeries:
     """The same series when the measuring noise of each epoch is `noise` (E,) times the usual."""
     free = np.maximum(2.0 * evidence.n - evidence.N.shape[1], 0.0)
     level = np.sum(free * (evidence.sigma0 / noise) ** 2) / max(float(free.sum()), 1.0)
@@ -285,7 +317,7 @@ def reweighted(evidence: Evidence, noise: Array) -> Evidence:
     )
 
 
-def without_targets(evidence: Evidence, rows: NDArray[np.int64]) -> Evidence:
+def without_targets(evidence: ReducedSeries, rows: NDArray[np.int64]) -> ReducedSeries:
     """The same series as if some targets of the field had never been observed."""
     source = evidence.source
     mask = np.zeros(source.grid.observed.shape, dtype=bool)
@@ -294,7 +326,7 @@ def without_targets(evidence: Evidence, rows: NDArray[np.int64]) -> Evidence:
         replace(source, grid=source.grid.reject(mask)),
         evidence.times,
         evidence.history,
-        evidence.channels,
+        evidence.thermometers,
         evidence.scale,
     )
     return replace(reduced, source=source, excluded=np.union1d(evidence.excluded, rows))

@@ -1,0 +1,1 @@
+"""What a recording shows before any search: targets that moved, noise that grows."""

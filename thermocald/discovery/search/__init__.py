@@ -1,0 +1,1 @@
+"""The search: candidates, their combinations, and what excludes them."""

@@ -1,0 +1,1 @@
+"""The verdict: names, numbers with standard deviations, gaps, the new model."""

@@ -1,0 +1,1 @@
+"""A discovery for people: figures and the report."""

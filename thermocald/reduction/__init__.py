@@ -1,0 +1,1 @@
+"""A series reduced to small normal equations, and the hypotheses that are fitted to it."""

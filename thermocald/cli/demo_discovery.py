@@ -21,16 +21,19 @@ def discover_hidden_effect(out: Path, seed: int, quiet: bool) -> dict[str, Any]:
     from thermocald.discovery.verdict.model import model_of
     from thermocald.discovery.verdict.result import discover_series
     from thermocald.reduction.reduce import reduce_together
+    from thermocald.simulation import effects
     from thermocald.simulation.model import ModelEffect
     from thermocald.simulation.model_file import write_model
     from thermocald.simulation.presets import preset_simulation
 
+    lag = effects.find(lambda e: any(p.role == "time_constant" for p in e.nonlinear.values())
+                       and e.is_drive)  # fmt: skip
     say(f"hiding an effect: the camera follows the thermometer with a lag of {_TAU_S:.0f} s")
     folder = out / "discovery"
     folder.mkdir(parents=True)
     for number, name in enumerate(("M1", "M2")):
         simulation = preset_simulation("rpi-v2.1-heating", seed + number, name, None)
-        hidden = (ModelEffect("thermal_lag", {"tau": _TAU_S}),)
+        hidden = (ModelEffect(lag.name, {lag.delay: _TAU_S}),)
         model = replace(simulation.model, effects=hidden)
         replace(simulation, model=model).write(folder / name)
     say("discovering: where do model and measurement disagree, and why?")
@@ -39,7 +42,7 @@ def discover_hidden_effect(out: Path, seed: int, quiet: bool) -> dict[str, Any]:
     path = folder / "camera.thermal.yaml"
     write_model(path, model_of(found, None))
     document: dict[str, Any] = dict(found.as_json(str(path)))
-    document["hidden"] = {"effect": "thermal_lag", "tau_s": _TAU_S}
+    document["hidden"] = {"effect": lag.name, "tau_s": _TAU_S}
     if not quiet:
         _tell(document)
     return document
@@ -49,9 +52,8 @@ def _tell(document: dict[str, Any]) -> None:
     from rich.console import Console
 
     console = Console()
-    console.print(
-        f"\nhidden:    thermal_lag, tau {document['hidden']['tau_s']:.0f} s", highlight=False
-    )
+    hidden = document["hidden"]
+    console.print(f"\nhidden:    {hidden['effect']}, tau {hidden['tau_s']:.0f} s", highlight=False)
     for effect in document["effects"]:
         console.print(f"found:     {effect['effect']}: {effect['statement']}", highlight=False)
     for label, key in (("on M1", "fit"), ("on M2", "verify")):

@@ -27,6 +27,7 @@ import numpy as np
 
 from thermocald.errors import ConfigurationError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
+from thermocald.simulation import effects
 from thermocald.simulation.course import Course
 from thermocald.simulation.device import CameraDevice, Measuring
 from thermocald.simulation.heat import HeatNetwork, Link
@@ -215,12 +216,17 @@ def _effects(preset: Preset, way: Any, warming: float) -> list[ModelEffect]:
     found = []
     if preset.set_share:
         x0, y0 = (float(v) for v in way * preset.set_share / warming)
-        found.append(ModelEffect("permanent_set", {"x0": x0, "y0": y0}))
+        stays = effects.find(lambda e: e.irreversible)
+        found.append(ModelEffect(stays.name, {"x0": x0, "y0": y0}))
     a1, b1, b2 = preset.distortion_drift
     if a1:
-        found.append(ModelEffect("radial_distortion_drift", {"A1": a1 / warming}))
+        radial = effects.find(lambda e: e.usual == ("A1",))
+        found.append(ModelEffect(radial.name, {"A1": a1 / warming}))
     if b1 or b2:
-        found.append(ModelEffect("decentering_drift", {"B1": b1 / warming, "B2": b2 / warming}))
+        decentering = effects.find(lambda e: e.usual == ("B1", "B2"))
+        found.append(ModelEffect(decentering.name, {"B1": b1 / warming, "B2": b2 / warming}))
     if preset.noise_ratio != 1.0:
-        found.append(ModelEffect("defocus", {"factor": (preset.noise_ratio - 1.0) / warming}))
+        noise = effects.seen_in("noise")
+        rise = (preset.noise_ratio - 1.0) / warming
+        found.append(ModelEffect(noise.name, dict.fromkeys(noise.linear, rise)))
     return found

@@ -67,7 +67,7 @@ class Examination:
     adequate: bool
     cross_validation: tuple[Array, ...] = ()
     displaced: tuple[tuple[Displaced, ...], ...] = ()
-    defocus: NoiseGrowth | None = None
+    noise_growth: NoiseGrowth | None = None
     original: tuple[ReducedSeries, ...] = ()
 
 
@@ -101,7 +101,7 @@ def examine_series(
     if noisy is not None:
         say("noise that targets share: once more")
         found = _searched(HypothesisFitter(noisy), say, given)
-    return replace(found, displaced=tuple(displaced), defocus=growth, original=tuple(series))
+    return replace(found, displaced=tuple(displaced), noise_growth=growth, original=tuple(series))
 
 
 def _curved(found: Examination) -> list[ReducedSeries] | None:

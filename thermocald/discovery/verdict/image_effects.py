@@ -22,7 +22,7 @@ __all__ = ["image_effects", "image_places"]
 def image_places(x: Examination) -> list[str]:
     """Where such effects were seen ("targets", "noise"), in the order of the document."""
     places = ["targets"] if x.displaced[0] else []
-    return [*places, "noise"] if x.defocus else places
+    return [*places, "noise"] if x.noise_growth else places
 
 
 def image_effects(x: Examination, gap: Gap) -> list[EffectFound]:
@@ -30,8 +30,8 @@ def image_effects(x: Examination, gap: Gap) -> list[EffectFound]:
     out = []
     if x.displaced[0]:
         out.append(_moved_targets(x, gap))
-    if x.defocus:
-        out.append(_noise_growth(x.fitter.series[0], x.defocus, gap))
+    if x.noise_growth:
+        out.append(_noise_growth(x.fitter.series[0], x.noise_growth, gap))
     return out
 
 

@@ -125,7 +125,7 @@ def _verify(x: Examination, fit: Fit, known: int) -> Gap | None:
 def _gap(x: Examination, fit: Fit, series: int, known: int, explained: float = 0.0) -> Gap:
     """The gap when the first `known` effects of image space are in the model."""
     order = image_places(x)[:known]
-    noise = x.defocus.noise[series] if x.defocus else None
+    noise = x.noise_growth.noise[series] if x.noise_growth else None
     return gap_of(
         x.fitter, fit, series,
         x.displaced[series], "targets" in order, noise, "noise" in order, explained,

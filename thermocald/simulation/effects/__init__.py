@@ -9,11 +9,15 @@ from __future__ import annotations
 from difflib import get_close_matches
 from functools import cache
 from importlib.metadata import entry_points
+from typing import TYPE_CHECKING
 
 from thermocald.errors import ConfigurationError
-from thermocald.simulation.effects.base import Effect, Proportional
+from thermocald.simulation.effects.base import Effect
 
-__all__ = ["Effect", "carrier", "get", "names", "seen_in"]
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+__all__ = ["Effect", "find", "get", "names", "seen_in"]
 
 _GROUP = "thermocald.effects"
 
@@ -53,14 +57,14 @@ def get(name: str) -> Effect:
     return loaded()
 
 
+def find(wanted: Callable[[Effect], bool]) -> Effect:
+    """The first effect with some property; ConfigurationError where none has it."""
+    for name in names():
+        if wanted(get(name)):
+            return get(name)
+    raise ConfigurationError("no installed effect has the property that was asked for")
+
+
 def seen_in(place: str) -> Effect:
     """The effect that is seen in the measuring noise ("noise") or in single targets ("targets")."""
-    return next(get(name) for name in names() if get(name).seen_in == place)
-
-
-def carrier(parameter: str) -> Effect:
-    """The effect by which a parameter follows the temperature beyond the base model's rates."""
-    return next(
-        get(name) for name in names()
-        if isinstance(get(name), Proportional) and parameter in get(name).linear
-    )  # fmt: skip
+    return find(lambda effect: effect.seen_in == place)

@@ -67,7 +67,8 @@ class Effect(ABC):
 
     For a search: seen_in: the trajectories of the camera's parameters, the measuring noise, or
     single targets; parameter_sets: the sets of coefficients that it may act on, by default the
-    usual ones; moves_mount: it may act on the orientation of the camera instead; columns:
+    usual ones; moves_mount: it may act on the orientation of the camera instead;
+    irreversible: it stays after cooling; columns:
     {coefficient: column of the reduced series} where names differ; steady_signal: see `steady`.
     """
 
@@ -82,6 +83,7 @@ class Effect(ABC):
     seen_in: ClassVar[SeenIn] = "trajectory"
     parameter_sets: ClassVar[tuple[tuple[str, ...], ...]] = ()
     moves_mount: ClassVar[bool] = False
+    irreversible: ClassVar[bool] = False
     columns: ClassVar[Mapping[str, str]] = {}
     steady_signal: ClassVar[Steady | None] = None
 

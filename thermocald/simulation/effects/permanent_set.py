@@ -32,6 +32,7 @@ class PermanentSet(Effect):
     kind = "signal"
     linear: ClassVar[Mapping[str, str]] = coefficient_units("K")
     usual = ("c", "x0", "y0")
+    irreversible = True
     steady_signal = Steady((0.0, 1.0, 0.0))
     behaviour: ClassVar[Mapping[str, str]] = {
         "hold": "stays where it is",

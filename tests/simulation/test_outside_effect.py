@@ -1,0 +1,133 @@
+"""An effect is one file: one from outside is simulated, fitted, discovered and documented."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import thermocald
+from thermocald.simulation import effects
+
+OUTSIDE = '''
+"""Saturation: a spring that gives less and less."""
+
+import numpy as np
+
+from thermocald.simulation.effects.base import Effect, Steady
+from thermocald.simulation.effects.parameter import Parameter, coefficient_units
+
+
+class Saturation(Effect):
+    """Adds a tanh((T - T_s) / 4 K)."""
+
+    name = "saturation"
+    noun = "a spring that saturates"
+    kind = "signal"
+    nonlinear = {"T_s": Parameter("degC", -40.0, 150.0, 40.0, role="threshold")}
+    linear = coefficient_units("1")
+    usual = ("c", "x0", "y0")
+    behaviour = {"cycle": "runs along the same bent line up and down"}
+
+    def signal(self, history, T_s=40.0, **_):
+        return np.tanh((history.temperature() - T_s) / 4.0)[:, None]
+
+    def sensitivity(self, history, T_s=40.0, **_):
+        slope = 0.25 / np.cosh((history.temperature() - T_s) / 4.0) ** 2
+        return history.temperature_matrix().multiply(slope[:, None]).tocsr()
+'''
+PROGRAM = """
+import os
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
+from dataclasses import replace
+from thermocald.analysis.thermal.thermal_model import fit_thermal_model
+from thermocald.cli.effect_options import parse_effect
+from thermocald.discovery.verdict.result import discover_series
+from thermocald.reduction.reduce import reduce_together
+from thermocald.reduction.source import series_input
+from thermocald.simulation.course import Course
+from thermocald.simulation.model import ModelEffect
+from thermocald.simulation.presets import preset_simulation
+from thermocald.store.recording.reader import read_recording
+from tests.analysis.test_thermal_model import reduced
+
+hidden = ModelEffect("saturation", {"T_s": 38.0, "c": 1e-3, "x0": 2e-3, "y0": -1e-3})
+s = preset_simulation("rpi-v2.1-heating", seed=3)
+lamp = Course.steps([0, 80.0, 700.0, 1e5], [0.0, 9.0, 0.0])
+programme = replace(s.programme, epochs=120, sources={"housing": lamp})
+s = replace(s, model=replace(s.model, effects=(hidden,)), programme=programme)
+found = fit_thermal_model([reduced(s)], [parse_effect("saturation")]).model.effects[0]
+assert abs(found.values["T_s"] - 38.0) < 4 * found.sds["T_s"], found
+assert abs(found.values["x0"] - 2e-3) < 4 * found.sds["x0"], found
+s.write(Path := __import__("pathlib").Path("M1"))
+d = discover_series(reduce_together([series_input(read_recording(Path))]))
+print("discovered", *(e.effect for e in d.effects))
+"""
+
+
+def outside(folder: Path) -> None:
+    """A small distribution on a path: one module, one entry point."""
+    (folder / "saturation.py").write_text(OUTSIDE)
+    info = folder / "saturation-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: saturation\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(
+        "[thermocald.effects]\nsaturation = saturation:Saturation\n"
+    )
+
+
+def python(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    root = Path(__file__).parents[2]
+    path = f"{folder}:{root}:{root / 'tests/photogrammetry'}"
+    return subprocess.run(
+        [sys.executable, *arguments], cwd=folder, capture_output=True, text=True, check=False,
+        env={"PYTHONPATH": path, "PATH": "/usr/bin:/bin"},
+    )  # fmt: skip
+
+
+def test_an_effect_from_outside(tmp_path):
+    outside(tmp_path)
+
+    ran = python(tmp_path, "-c", PROGRAM)
+    listed = python(tmp_path, "-m", "thermocald", "simulate", "--list")
+    page = python(
+        tmp_path, "-c",
+        "import sys; sys.path.insert(0, 'ROOT'); import reference; print(reference._effect_page())"
+        .replace("ROOT", str(Path(__file__).parents[2] / "docs/_site")),
+    )  # fmt: skip
+
+    assert ran.stdout.split() == ["discovered", "saturation"], ran.stderr
+    assert "saturation" in listed.stdout, listed.stderr
+    assert "Adds a tanh" in page.stdout, page.stderr
+
+
+def test_a_class_that_is_no_effect_is_refused(tmp_path):
+    outside(tmp_path)
+    (tmp_path / "saturation.py").write_text("class Saturation:\n    pass\n")
+    ran = python(
+        tmp_path, "-c", "from thermocald.simulation import effects; effects.get('saturation')"
+    )
+    assert "ConfigurationError" in ran.stderr
+    assert "saturation:Saturation, which is not an Effect" in ran.stderr
+
+
+def test_no_module_outside_the_catalogue_names_an_effect():
+    """Neither as a string nor as a class; modules that cannot reach the catalogue may use words."""
+    root = Path(thermocald.__file__).parent
+    names = set(effects.names())
+    classes = {type(effects.get(name)).__name__ for name in names}
+    found = []
+    for path in sorted(root.rglob("*.py")):
+        source = path.read_text(encoding="utf-8")
+        if root / "simulation" / "effects" in path.parents or not re.search(
+            r"thermocald\.(simulation|reduction|discovery|analysis\.thermal)", source
+        ):
+            continue
+        for node in ast.walk(ast.parse(source)):
+            text = node.value if isinstance(node, ast.Constant) else getattr(node, "id", "")
+            if isinstance(text, str) and (text in names or text in classes):
+                found.append(f"{path.relative_to(root)}:{node.lineno} {text}")
+    assert found == []
+    assert len(names) >= 19

@@ -36,7 +36,7 @@ def run():
 
 
 def test_print_writes_files_and_says_what_to_measure(run, tmp_path):
-    result = run("testfield", "print", "--paper", "A4", "--corner", "--out", tmp_path / "field")
+    result = run("testfield", "print", "--paper", "A4", "--out", tmp_path / "field")
     assert result.exit_code == 0, result.output
     assert sorted(p.name for p in (tmp_path / "field").iterdir()) == [
         "testfield-1.svg", "testfield-2.svg", "testfield-3.svg", "testfield.csv", "testfield.pdf",
@@ -44,6 +44,30 @@ def test_print_writes_files_and_says_what_to_measure(run, tmp_path):
     assert result.stdout.count("for --scale R") == 3
     field = read_testfield(tmp_path / "field" / "testfield.csv")
     assert f"{sum(bool(c) for c in field.codes)} coded" in result.stdout
+
+
+def test_a_printed_field_is_not_overwritten(run, tmp_path):
+    folder = tmp_path / "not" / "there" / "yet"
+    run("testfield", "print", "--paper", "A4", "--out", folder)
+    before = (folder / "testfield.csv").read_bytes()
+    with pytest.raises(UsageError, match="--force"):
+        run("testfield", "print", "--paper", "A4", "--first-code", 9, "--out", folder)
+    assert (folder / "testfield.csv").read_bytes() == before
+    run("testfield", "print", "--paper", "A4", "--first-code", 9, "--out", folder, "--force")
+    assert (folder / "testfield.csv").read_bytes() != before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "calibrates"), [((), True), (("--paper", "A4"), True), (("--flat",), False)]
+)
+def test_check_says_before_printing_whether_a_series_gets_a_result(run, arguments, calibrates):
+    """The same bounds as the adjustment's, on what `print` would draw."""
+    result = run("testfield", "check", *arguments)
+    assert ("NOT ENOUGH" in result.stdout) is not calibrates
+    document = json.loads(run("testfield", "check", *arguments, "--json", "-").stdout)
+    assert document["calibrates"] is calibrates
+    if not calibrates:
+        assert any("correlate at" in reason for reason in document["weak"])
 
 
 def test_print_json_is_the_only_thing_on_standard_output(run, tmp_path):
@@ -69,7 +93,18 @@ def test_print_that_cannot_be_is_refused(run, tmp_path):
 def photographs(run, tmp_path_factory):
     """A printed A3 sheet, a little bent, as JPEG photographs in a folder."""
     folder = tmp_path_factory.mktemp("survey")
-    run("testfield", "print", "--paper", "A3", "--landscape", "--diameter", 12, "--out", folder)
+    run(
+        "testfield",
+        "print",
+        "--paper",
+        "A3",
+        "--flat",
+        "--landscape",
+        "--diameter",
+        12,
+        "--out",
+        folder,
+    )
     nominal = read_testfield(folder / "testfield.csv")
     points = nominal.points.copy()
     points[:, 2] = 3e-5 * (points[:, 0] - 200) ** 2
@@ -151,7 +186,7 @@ def test_survey_with_a_known_camera_held(run, photographs, tmp_path):
         (["NOWHERE", "--scale", "R65", "R71", "100"], UsageError, "no such file"),
         (["PHOTOS", "--scale", "R65", "X", "100"], GeometryError, "X"),
         (["PHOTOS", "--scale", "R65", "R71", "100", "--hold-camera"], UsageError, "needs --camera"),
-        (["CSV", "--scale", "R65", "R71", "100"], ThermocaldError, "no picture"),
+        (["CSV", "--scale", "R65", "R71", "100"], ThermocaldError, "no image"),
     ],
 )
 def test_wrong_surveys_are_refused_and_write_nothing(

@@ -15,10 +15,11 @@ from typer.testing import CliRunner
 
 from tests.docs.blocks import ROOT, blocks
 from tests.photogrammetry import network_cases
+from tests.photogrammetry.printed_sheets import photograph, put_up
 from thermocald.cli import application
+from thermocald.output.testfield.layout import TRIM, paper_size
 from thermocald.photogrammetry.camera.camera_model import (
     CameraModel,
-    ExteriorOrientation,
     InteriorOrientation,
     Sensor,
 )
@@ -27,7 +28,6 @@ from thermocald.simulation.demonstration import demonstration_field, demonstrati
 from thermocald.simulation.model import ModelEffect
 from thermocald.simulation.model_file import write_model
 from thermocald.simulation.presets import preset_simulation
-from thermocald.simulation.scene import Scene
 from thermocald.simulation.testfields import corner_field
 from thermocald.store.recording.testfield_file import read_testfield
 
@@ -118,33 +118,20 @@ def put_config(folder: Path, name: str, store: str = "thermocald.db") -> None:
 
 
 def put_photographs(folder: Path) -> None:
-    """Eight photographs of the field that was printed into `field/`."""
-    nominal = read_testfield(folder / "field" / "testfield.csv")
-    corner = bool(np.ptp(nominal.points, axis=0).min() > 0)
-    sensor = Sensor(3280, 2464, 0.00112) if corner else Sensor(1640, 1232, 0.00224)
-    camera = CameraModel(sensor, InteriorOrientation(3.05, 0.02, -0.01, -2e-3))
-    scene = Scene(sensor, nominal)
+    """Eight photographs of the corner whose PDF was printed into `field/`."""
+    page = paper_size("A3", landscape=True)
+    sheets = put_up(folder / "field" / "testfield.pdf", page, TRIM)
+    middle = read_testfield(folder / "field" / "testfield.csv").points.mean(axis=0)
+    camera = CameraModel(Sensor(1640, 1232, 0.00224), InteriorOrientation(3.05, 0.02, -0.01, -2e-3))
     (folder / "photos").mkdir(exist_ok=True)
-    if corner:
-        stations = _before_the_corner(nominal.points)
-    else:
-        distance = 1.44 * float(np.ptp(nominal.points, axis=0).max())
-        stations = network_cases.convergent_stations(nominal.points, 8, distance=distance)
-    for i, station in enumerate(stations):
-        frame = scene.render(camera.interior.as_array(), station.as_array(), seed=i)
+    rng = np.random.default_rng(0)
+    for i in range(8):  # stations that see all three sheets, every second one turned by 90°
+        direction = np.ones(3) + rng.uniform(-0.45, 0.45, 3)
+        where = middle + 680.0 * direction / np.linalg.norm(direction)
+        station = network_cases.looking_at(where, middle, (i % 4) * np.pi / 2)
+        frame = photograph(sheets, camera, station, seed=i)
         path = str(folder / "photos" / f"{i}.jpg")
         cv2.imwrite(path, frame, [cv2.IMWRITE_JPEG_QUALITY, 95])
-
-
-def _before_the_corner(points: np.ndarray) -> list[ExteriorOrientation]:
-    """Eight stations that see all three sheets, every second one turned by 90°."""
-    rng = np.random.default_rng(0)
-    middle, stations = points.mean(axis=0), []
-    for i in range(8):
-        direction = np.ones(3) + rng.uniform(-0.45, 0.45, 3)
-        where = middle + 750.0 * direction / np.linalg.norm(direction)
-        stations.append(network_cases.looking_at(where, middle, (i % 4) * np.pi / 2))
-    return stations
 
 
 def how_to_daemon(shelf: Path, folder: Path) -> None:

@@ -6,9 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
+from thermocald.analysis.field.check import usual_station
 from thermocald.errors import UsageError
 from thermocald.output.testfield.layout import TRIM, Design, field_of, lay_out, paper_size
 from thermocald.output.testfield.print import default_diameter, print_testfield
+from thermocald.photogrammetry.camera.camera_model import (
+    CameraModel,
+    InteriorOrientation,
+    Sensor,
+)
 from thermocald.photogrammetry.targets import ring_code
 from thermocald.store.recording.testfield_file import read_testfield
 
@@ -167,19 +173,58 @@ def test_corner_is_three_perpendicular_sheets_with_distinct_codes(tmp_path):
         "testfield.pdf", "testfield-1.svg", "testfield-2.svg", "testfield-3.svg", "testfield.csv",
     ]  # fmt: skip
     field = printed.field
-    planes = [np.flatnonzero(np.abs(field.points[:, axis]) < 1e-9) for axis in (2, 0, 1)]
+    planes = [np.flatnonzero(np.abs(field.points[:, axis]) < 1e-9) for axis in (2, 1, 0)]
     assert [len(p) for p in planes] == [len(s.targets) for s in printed.sheets]
     assert field.points.min() >= 0
     codes = [c for c in field.codes if c]
     assert len(set(codes)) == len(codes)
     # seen from outside, on each sheet the order right, up, towards the viewer is right-handed:
     # otherwise the ring codes of that sheet would be mirrored
-    for rows, sheet, normal in zip(planes, printed.sheets, np.eye(3)[[2, 0, 1]], strict=True):
+    for rows, sheet, normal in zip(planes, printed.sheets, np.eye(3)[[2, 1, 0]], strict=True):
         local = np.array([[t.x, t.y] for t in sheet.targets])
         axes = np.linalg.lstsq(
             np.column_stack([local, np.ones(len(local))]), field.points[rows], rcond=None
         )[0][:2]
         assert np.cross(axes[0], axes[1]) == pytest.approx(normal, abs=1e-9)
+
+
+def test_the_plan_and_the_coordinates_agree_on_left_and_right(tmp_path):
+    """Who looks into the corner sees sheet 2 on the left; letters are on edges that coincide."""
+    sheets = print_testfield(Design(paper_size("A3"), 9.0, sheets=3), tmp_path).sheets
+    field = field_of(sheets)
+    camera = CameraModel(Sensor(3280, 2464, 0.00112), InteriorOrientation(3.04))
+    image = camera.project(usual_station(camera, field), field.points)
+    rows = {s.title: [field.index[t.name] for t in s.targets] for s in sheets}
+    floor, left, right = (image[r].mean(axis=0) for r in rows.values())
+    assert left[0] < floor[0] < right[0]
+    assert floor[1] > max(left[1], right[1])
+    ends = {"left": ((0, 0), (0, 1)), "right": ((1, 0), (1, 1)), "lower": ((0, 0), (1, 0))}
+    edges: dict[str, list[set[int]]] = {}
+    for sheet, (_, r) in zip(sheets, rows.items(), strict=True):
+        local = np.array([[t.x, t.y, 1.0] for t in sheet.targets])
+        placing = np.linalg.lstsq(local, field.points[r], rcond=None)[0]
+        for side, letter in sheet.edges.items():
+            line = np.array([[*np.array(end) * sheet.size, 1.0] for end in ends[side]]) @ placing
+            on = {axis for axis in range(3) if np.abs(line[:, axis]).max() < 1e-6}
+            edges.setdefault(letter, []).append(on)
+    # both sheets with a letter have that edge on the same axis, where the two others are 0
+    assert sorted(edges) == ["A", "B", "C"]
+    for first, second in edges.values():
+        assert first == second
+        assert len(first) == 2
+
+
+def test_a_corner_comes_with_the_plan_to_put_it_up(tmp_path):
+    pdfium = pytest.importorskip("pypdfium2")
+    print_testfield(Design(paper_size("A4"), 7.0, sheets=3), tmp_path)
+    document = pdfium.PdfDocument(tmp_path / "testfield.pdf")
+    try:
+        assert len(document) == 4
+        words = " ".join(document[3].get_textpage().get_text_bounded().split())
+    finally:
+        document.close()
+    for said in ("Glue", "brackets", "0.4°", "survey", "edges with the same letter meet"):
+        assert said in words
 
 
 def test_sigmas_are_those_of_an_unsurveyed_print():

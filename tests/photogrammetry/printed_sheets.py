@@ -116,16 +116,20 @@ def put_up(pdf: Path, page_mm: tuple[float, float], trim: float, dpi: float = 15
     pages = [rasterised(pdf, i, dpi) for i in range(min(page_count(pdf), 3))]
     if len(pages) < 3:
         return [Sheet(pages[0], page_mm, np.array([-trim, -trim, 0.0]), np.eye(3)[:2])]
-    px = [image.shape[1] / page_mm[0] * trim for image in pages]
-    size = (page_mm[0] - 2 * trim, page_mm[1] - 2 * trim)
-    cut = [_cut(image, round(p)) for image, p in zip(pages, px, strict=True)]
+    w, h = (side - 2 * trim for side in page_mm)
+    sizes = [(w, min(w, h)), (w, h), (w, h)]
+    mm = [image.shape[1] / page_mm[0] for image in pages]
+    cut = []
+    for image, px, (wide, high) in zip(pages, mm, sizes, strict=True):
+        low, top, right = (round(length * px) for length in (trim, trim + high, trim + wide))
+        cut.append(image[-top - 1 : -low, low : right + 1])
     e = np.eye(3)
-    return [
-        Sheet(cut[0], size, np.zeros(3), e[:2]),
-        Sheet(cut[1], size, np.zeros(3), e[1:]),
-        Sheet(cut[2], size, np.array([size[0], 0.0, 0.0]), np.stack([-e[0], e[2]])),
+    places = [
+        (np.zeros(3), e[:2]),
+        (np.array([w, 0.0, 0.0]), np.stack([-e[0], e[2]])),
+        (np.zeros(3), e[1:]),
     ]
-
-
-def _cut(image: np.ndarray, margin: int) -> np.ndarray:
-    return np.ascontiguousarray(image[margin:-margin, margin:-margin])
+    return [
+        Sheet(np.ascontiguousarray(image), (image.shape[1] / px, image.shape[0] / px), *place)
+        for image, px, place in zip(cut, mm, places, strict=True)
+    ]

@@ -10,8 +10,13 @@ import typer
 from thermocald.cli.common import say
 from thermocald.cli.testfield_options import (
     CameraFile,
+    Diameter,
+    Flat,
     Json,
+    Landscape,
+    Paper,
     PixelPitch,
+    design_of,
 )
 
 if TYPE_CHECKING:
@@ -27,7 +32,16 @@ _EOP = ("omega", "phi", "kappa", "X0", "Y0", "Z0")
 
 
 def check(
-    field: Annotated[Path, typer.Argument(metavar="FIELD", help="A testfield.csv.")],
+    field: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[FIELD]", help="A testfield.csv; without it what `print` would draw."
+        ),
+    ] = None,
+    paper: Paper = "A3",
+    flat: Flat = False,
+    landscape: Landscape = None,
+    diameter: Diameter = None,
     camera: CameraFile = None,
     pixel_pitch: PixelPitch = None,
     place: Annotated[
@@ -44,20 +58,26 @@ def check(
     ] = 0.03,
     json: Json = None,
 ) -> None:
-    """Judge a test field: what a camera sees of it, how well it would be calibrated, what to add.
+    """Assess a test field: what a camera sees of it, how well it would be calibrated, what to add.
 
-    Without --from the camera stands where the field just fills its image; without --camera it is a
-    Raspberry Pi camera v2.1.
+    Without FIELD it is the field that `testfield print` would draw with the same --paper, --flat,
+    --landscape and --diameter, so that you know before you print. Without --from the camera stands
+    where the field just fills its image; without --camera it is a Raspberry Pi camera v2.1.
 
+    Example: thermocald testfield check --paper A4
     Example: thermocald testfield check field/testfield.csv --from 900 900 700
     """
     import numpy as np
 
     from thermocald.analysis.field.check import check_field, station_at, usual_station
     from thermocald.cli.common import write_json
+    from thermocald.output.testfield.layout import field_of, lay_out
     from thermocald.store.recording.testfield_file import read_testfield
 
-    targets = read_testfield(field)
+    if field is None:
+        targets = field_of(lay_out(design_of(paper, flat, landscape, diameter)))
+    else:
+        targets = read_testfield(field)
     model = _camera(camera, pixel_pitch)
     middle = (targets.points.min(axis=0) + targets.points.max(axis=0)) / 2
     look_at = middle if at is None else np.array(at)
@@ -68,10 +88,11 @@ def check(
     else:
         stand = station_at(np.array(place), look_at, np.radians(roll))
     result = check_field(model, targets, stand, sigma)
+    document = _check_document(result, targets, model, sigma)
     if json is not None:
-        write_json(_check_document(result, targets, model, sigma), json)
+        write_json(document, json)
     if json != "-":
-        _show_check(result, targets, model)
+        _show_check(result, targets, model, document["advice"])
 
 
 def _camera(file: Path | None, pixel_pitch: float | None) -> CameraModel:
@@ -92,6 +113,7 @@ def _camera(file: Path | None, pixel_pitch: float | None) -> CameraModel:
 def _check_document(
     result: FieldCheck, field: TestField, model: CameraModel, sigma: float
 ) -> dict[str, Any]:
+    from thermocald.analysis.field.advice import advise
     from thermocald.analysis.field.check import FREE
 
     def finite(value: float) -> float | None:
@@ -117,11 +139,21 @@ def _check_document(
         "sigma_px": sigma,
         "pixel_pitch": model.sensor.pixel_pitch,
         **sds,
-        "advice": list(result.advice),
+        "calibrates": not result.weak,
+        "weak": list(result.weak),
+        "advice": advise(model, field, result, sigma),
     }
 
 
-def _show_check(result: FieldCheck, field: TestField, model: CameraModel) -> None:
+def _show_check(
+    result: FieldCheck, field: TestField, model: CameraModel, advice: list[str]
+) -> None:
+    if result.weak:
+        typer.echo("NOT ENOUGH: a series of a fixed camera gets no result from there")
+        for reason in result.weak:
+            typer.echo(f"  because: {reason}")
+    else:
+        typer.echo("good: every image from there can be calibrated by itself")
     X, Y, Z = result.station.centre
     typer.echo(
         f"{len(result.visible)} of {len(field)} targets visible from ({X:.0f}, {Y:.0f}, {Z:.0f}) "
@@ -135,5 +167,5 @@ def _show_check(result: FieldCheck, field: TestField, model: CameraModel) -> Non
     for name, row in result.precision.pixels(model.sensor.pixel_pitch).items():
         cells = [f"{v:.3g}" if v < 1e300 else "none" for v in row]
         typer.echo(f"    {name:<24} {cells[0]:>12} {cells[1]:>14} {cells[2]:>20}")
-    for note in result.advice:
+    for note in advice:
         typer.echo(f"  better: {note}")

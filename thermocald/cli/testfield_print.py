@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from thermocald.cli.testfield_options import Json
+from thermocald.cli.common import say
+from thermocald.cli.testfield_options import Diameter, Flat, Json, Landscape, Paper, design_of
 
 if TYPE_CHECKING:
     from thermocald.output.testfield.print import Printed
@@ -17,16 +19,10 @@ __all__ = ["print_"]
 
 def print_(
     out: Annotated[Path, typer.Option("--out", "-o", help="The folder to write into.")],
-    paper: Annotated[
-        str, typer.Option("--paper", help="A4, A3, A2, A1, A0, or WIDTHxHEIGHT in mm.")
-    ] = "A3",
-    landscape: Annotated[bool, typer.Option("--landscape", help="Turn the paper.")] = False,
-    corner: Annotated[
-        bool, typer.Option("--corner", help="Three sheets for three planes of a corner.")
-    ] = False,
-    diameter: Annotated[
-        float | None, typer.Option("--diameter", help="Of the discs, mm; default by paper size.")
-    ] = None,
+    paper: Paper = "A3",
+    flat: Flat = False,
+    landscape: Landscape = None,
+    diameter: Diameter = None,
     bits: Annotated[
         int | None, typer.Option("--bits", help="Of the ring codes: 12, 14, or 0 for none.")
     ] = None,
@@ -38,7 +34,7 @@ def print_(
         typer.Option("--markers", help="Markers too, of a dictionary: DICT_APRILTAG_36h11."),
     ] = None,
     marker_every: Annotated[
-        int, typer.Option("--marker-every", help="Every how many-th place is a marker.")
+        int, typer.Option("--marker-every", help="Every N-th place is a marker.")
     ] = 5,
     light: Annotated[bool, typer.Option("--light", help="White targets on black.")] = False,
     first_code: Annotated[
@@ -47,47 +43,49 @@ def print_(
     pitch: Annotated[
         float | None, typer.Option("--pitch", help="Distance of the coded targets, mm.")
     ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace a test field that was printed before.")
+    ] = False,
     json: Json = None,
 ) -> None:
-    """Draw a test field: a PDF, an SVG per sheet, and the matching testfield.csv.
+    """Draw a test field: a PDF, an SVG per sheet, and the testfield.csv that belongs to it.
 
+    By default it is a corner of three sheets; the last page of the PDF shows how to put it up.
     Print without scaling ("actual size"), measure the rulers, then survey what you have built.
 
-    Example: thermocald testfield print --paper A3 --corner --out field
+    Example: thermocald testfield print --paper A3 --out field
     """
     from thermocald.cli.common import write_json
-    from thermocald.output.testfield.layout import Design, paper_size
-    from thermocald.output.testfield.print import default_diameter, print_testfield
+    from thermocald.output.testfield.print import print_testfield
 
-    page = paper_size(paper, landscape=landscape)
-    design = Design(
-        page=page,
-        diameter=diameter if diameter is not None else default_diameter(page),
-        bits=bits,
-        plain=plain,
-        dictionary=markers,
-        marker_every=marker_every,
-        light=light,
-        sheets=3 if corner else 1,
-        first_code=first_code,
-        pitch=pitch,
-    )
-    printed = print_testfield(design, out)
+    design = replace(
+        design_of(paper, flat, landscape, diameter),
+        bits=bits, plain=plain, dictionary=markers, marker_every=marker_every, light=light,
+        first_code=first_code, pitch=pitch,
+    )  # fmt: skip
+    printed = print_testfield(design, out, replace_printed=force)
     document = _print_document(printed)
     if json is not None:
         write_json(document, json)
-    if json != "-":
-        sheet = printed.sheets[0]
+    if json == "-":
+        return
+    sheets = "1 sheet" if flat else "3 sheets of a corner and how to put it up, "
+    typer.echo(
+        f"{out}: {sheets} of {design.page[0]:g} × {design.page[1]:g} mm, {document['coded']} coded "
+        f"and {document['plain']} plain circles of {design.diameter:g} mm, {document['markers']} "
+        "markers"
+    )
+    for bar in document["scale_bars"]:
         typer.echo(
-            f"{out}: {len(printed.sheets)} sheet{'s' if corner else ''} of "
-            f"{page[0]:g} × {page[1]:g} mm, {document['coded']} coded and {document['plain']} "
-            f"plain circles of {sheet.design.diameter:g} mm, {document['markers']} markers"
+            f"  {bar['sheet']}: measure {bar['a']} to {bar['b']} (nominal "
+            f"{bar['nominal']:.2f} mm) for --scale {bar['a']} {bar['b']} MM"
         )
-        for bar in document["scale_bars"]:
-            typer.echo(
-                f"  {bar['sheet']}: measure {bar['a']} to {bar['b']} (nominal "
-                f"{bar['nominal']:.2f} mm) for --scale {bar['a']} {bar['b']} MM"
-            )
+    if flat:
+        say(
+            "one flat sheet calibrates a camera from photographs in several poses (thermocald "
+            "calibrate, testfield survey); a camera that stands still before it gets no result: "
+            "print the corner for series, and ask `thermocald testfield check` before you glue"
+        )
 
 
 def _print_document(printed: Printed) -> dict[str, Any]:

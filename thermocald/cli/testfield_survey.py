@@ -119,25 +119,10 @@ def _photos(paths: list[Path]) -> list[Path]:
 
 def _picture(path: Path) -> Any:
     """A picture that is read when it is needed, as the sensor saw it."""
-    from thermocald.errors import ImageError
     from thermocald.photogrammetry.survey.survey import Picture
+    from thermocald.photogrammetry.targets.image_file import decode_grey
 
-    def load() -> Any:
-        import cv2
-        import numpy as np
-
-        try:
-            data = np.fromfile(path, dtype=np.uint8)
-        except OSError as cause:
-            raise ImageError(f"{path}: cannot be read: {cause.strerror}") from cause
-        # the camera was turned, not its sensor: what the file says of turning is ignored
-        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-        image = cv2.imdecode(data, flags) if data.size else None
-        if image is None:
-            raise ImageError(f"{path}: is no picture that can be read")
-        return image
-
-    return Picture(str(path), load)
+    return Picture(str(path), lambda: decode_grey(path))
 
 
 def _distances(

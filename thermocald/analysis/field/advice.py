@@ -25,7 +25,9 @@ _FEW = 40
 _FLAT = 0.02  # depth of a field over its distance below which it is a plane
 
 
-def advise(camera: CameraModel, field: TestField, check: FieldCheck, sigma_px: float) -> list[str]:
+def advise(
+    camera: CameraModel, field: TestField, check: FieldCheck, sigma_px: float = 0.03
+) -> list[str]:
     """Sentences, the most helpful first; none if nothing would help by a seventh."""
     points, sigmas = field.points[check.visible], field.sigmas[check.visible]
     typical = np.broadcast_to(np.median(sigmas, axis=0), (1, 3))
@@ -80,8 +82,9 @@ def _remarks(check: FieldCheck) -> list[str]:
     notes = []
     if check.flatness < _FLAT:
         notes.append(
-            "the field is one plane: no single image of it tells c, x0, and y0 from where the "
-            "camera stands, from wherever it is taken; only changes within a series can be seen"
+            "the field is one plane: no single image separates c, x0 and y0 from where the camera "
+            "stands; print the corner (thermocald testfield print), or photograph the sheet from "
+            "several sides and use `thermocald calibrate`"
         )
     too_small = sum("smaller" in reason for reason in check.hidden.values())
     if too_small:

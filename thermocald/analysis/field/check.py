@@ -3,12 +3,12 @@
 Which targets it sees and how large, how the image is filled, how deep the field is, and the
 standard deviations of the interior orientation that one image and a series would reach: the inverse
 of the normal equations of a planned network (Grafarend's first-order design), no image needed.
-Then what would help most, each proposal computed and not guessed.
+What would help most is for `advice` to say.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,7 +21,11 @@ from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     partials,
 )
-from thermocald.photogrammetry.epoch.geometry import image_coverage
+from thermocald.photogrammetry.epoch.geometry import (
+    GeometryBounds,
+    image_coverage,
+    weaknesses,
+)
 from thermocald.photogrammetry.field.planes import field_normals
 from thermocald.photogrammetry.targets.outline import local_maps
 
@@ -75,7 +79,8 @@ class FieldCheck:
     sizes: smaller diameter in px of each visible circle; cells: targets per part of the image
     (rows, columns); coverage: share of the image inside the targets' hull; depth_relief: range of
     depth over mean depth; distance: mean depth mm; flatness: how far the targets lie off their best
-    plane, over that distance; advice: sentences, the most helpful first.
+    plane, over that distance; weak: why the program would call an image of it too weak for a
+    result, empty if it would not.
     """
 
     station: ExteriorOrientation
@@ -88,7 +93,7 @@ class FieldCheck:
     distance: float
     flatness: float
     precision: Precision
-    advice: tuple[str, ...]
+    weak: tuple[str, ...]
 
 
 def usual_station(camera: CameraModel, field: TestField) -> ExteriorOrientation:
@@ -178,7 +183,7 @@ def check_field(
     image = camera.project(station, points)
     depth = -((points - station.centre) @ station.rotation)[:, 2]
     reached = precision(camera, station, points, sigmas, sigma_px)
-    partial = FieldCheck(
+    return FieldCheck(
         station=station,
         visible=rows,
         hidden=hidden,
@@ -189,11 +194,8 @@ def check_field(
         distance=float(depth.mean()),
         flatness=_off_plane(points) / float(depth.mean()),
         precision=reached,
-        advice=(),
+        weak=tuple(_weak(camera, station, points, image, sigma_px)),
     )
-    from thermocald.analysis.field.advice import advise
-
-    return replace(partial, advice=tuple(advise(camera, field, partial, sigma_px)))
 
 
 def _off_plane(points: Array) -> float:
@@ -201,6 +203,23 @@ def _off_plane(points: Array) -> float:
     centred = points - points.mean(axis=0)
     normal = np.linalg.svd(centred, full_matrices=False)[2][2]
     return float(np.ptp(centred @ normal))
+
+
+def _weak(
+    camera: CameraModel, station: ExteriorOrientation, points: Array, image: Array, sigma_px: float
+) -> list[str]:
+    """The reasons for which `adjust` would give an image of these points no result."""
+    values = np.concatenate([camera.interior.as_array(), station.as_array()])
+    _, A, _ = partials(camera.sensor, values[:10], values[10:], points)
+    use = [PARAMETER_NAMES.index(name) for name in (*FREE, *EOP_NAMES)]
+    noise = np.broadcast_to(np.eye(2) * sigma_px**2, (len(points), 2, 2))
+    N = _normal_matrix(A[:, :, use], noise)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(N), 1e-300))
+    covariance = np.zeros((len(PARAMETER_NAMES),) * 2)
+    # what nothing determines gets a variance that is large, and correlations that are 1
+    inverse = np.linalg.inv(N * scale * scale[:, None] + 1e-13 * np.eye(len(use)))
+    covariance[np.ix_(use, use)] = inverse * scale * scale[:, None]
+    return weaknesses(camera.sensor, points, image, values, covariance, FREE, GeometryBounds())
 
 
 def _visible(

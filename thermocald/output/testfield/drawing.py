@@ -14,6 +14,7 @@ import numpy as np
 
 from thermocald.errors import DriverMissing, UsageError
 from thermocald.output.testfield.layout import STRIP, TRIM
+from thermocald.output.testfield.plan import draw_plan
 from thermocald.photogrammetry.targets import ring_code
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ class _Pen:
         self.transform = (
             Affine2D().translate(TRIM, TRIM).scale(1 / _MM_PER_INCH) + self.figure.dpi_scale_trans
         )
-        self.ink, self.ground = ("white", "black") if light else ("black", "white")
+        self.colour = "white" if light else "black"
 
     @staticmethod
     def stretch(width: float, height: float) -> Any:
@@ -72,7 +73,7 @@ class _Pen:
         )  # fmt: skip
 
     def text(self, x: float, y: float, words: str, height: float, **style: Any) -> None:
-        style = {"color": self.ink, "ha": "left", "va": "baseline", **style}
+        style = {"color": self.colour, "ha": "left", "va": "baseline", **style}
         self.figure.text(
             x, y, words, transform=self.transform, fontsize=height * _POINTS_PER_MM, **style
         )
@@ -87,9 +88,9 @@ def draw(sheet: Sheet) -> Any:
         pen.fill(Curve.unit_rectangle().transformed(pen.stretch(*sheet.size)), "black")
     r = sheet.design.diameter / 2
     for target in sheet.targets:
-        pen.fill(_circle(target.x, target.y, r), pen.ink)
+        pen.fill(_circle(target.x, target.y, r), pen.colour)
         for begin, end in _arcs(target):
-            pen.fill(_ring_segment(target, r, begin, end), pen.ink)
+            pen.fill(_ring_segment(target, r, begin, end), pen.colour)
         below = (ring_code.RING_OUTER if target.code else 1.0) * r
         _label(pen, target.x, target.y - below, target.name, r)
     for marker in sheet.markers:
@@ -103,7 +104,20 @@ def draw(sheet: Sheet) -> Any:
     _crop_marks(pen, sheet)
     _rulers(pen, sheet)
     _legend(pen, sheet)
+    _edge_letters(pen, sheet)
     return pen.figure
+
+
+def _edge_letters(pen: _Pen, sheet: Sheet) -> None:
+    """At each edge that meets another sheet's the letter that both have."""
+    (w, h), size = sheet.size, 3.0
+    places = {
+        "left": (1.5, 0.75 * h),
+        "right": (w - 1.5 - size, 0.75 * h),
+        "lower": (0.75 * w, 1.5),
+    }
+    for side, letter in sheet.edges.items():
+        pen.text(*places[side], letter, size, color=_GREY)
 
 
 def _label(pen: _Pen, x: float, below: float, name: str, r: float) -> None:
@@ -201,10 +215,10 @@ def _rulers(pen: _Pen, sheet: Sheet) -> None:
         def at(s: float, t: float, along: int = along) -> tuple[float, float]:
             return (STRIP + s, t) if along == 0 else (t, STRIP + s)
 
-        pen.line([at(0, 4), at(total, 4)], pen.ink, 0.1)
+        pen.line([at(0, 4), at(total, 4)], pen.colour, 0.1)
         for mm in range(int(total) + 1):
             tick = 3.0 if mm % 10 == 0 else 2.0 if mm % 5 == 0 else 1.2
-            pen.line([at(mm, 4), at(mm, 4 + tick)], pen.ink, 0.1)
+            pen.line([at(mm, 4), at(mm, 4 + tick)], pen.colour, 0.1)
         words = f"0 to {total:g} mm: measure it; if it is not {total:g}.0 mm, the printer scaled"
         x, y = at(0, 1.2)
         if along == 0:
@@ -223,13 +237,13 @@ def _legend(pen: _Pen, sheet: Sheet) -> None:
         if a.y == b.y:
             y = STRIP - 1.0
             for x in (a.x, b.x):
-                pen.line([(x, y - 1.2), (x, y + 1.2)], pen.ink, 0.1)
+                pen.line([(x, y - 1.2), (x, y + 1.2)], pen.colour, 0.1)
             pen.line([(a.x, y), (b.x, y)], _GREY, 0.1)
     pen.text(STRIP, STRIP - 4.6, words, 2.1)
 
 
 def write_pdf(sheets: Sequence[Sheet], path: Path) -> None:
-    """All sheets as the pages of one PDF."""
+    """All sheets as the pages of one PDF; a corner's have the plan to put it up as the last one."""
     _require_matplotlib()
     from matplotlib import rc_context
     from matplotlib.backends.backend_pdf import PdfPages
@@ -239,6 +253,8 @@ def write_pdf(sheets: Sequence[Sheet], path: Path) -> None:
         with rc_context({"pdf.fonttype": 42}), PdfPages(path, metadata=about) as pages:
             for sheet in sheets:
                 pages.savefig(draw(sheet))
+            if len(sheets) == 3:
+                pages.savefig(draw_plan(sheets))
     except OSError as cause:
         raise UsageError(f"{path}: cannot be written: {cause.strerror}") from cause
 

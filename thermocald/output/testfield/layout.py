@@ -4,13 +4,16 @@ A sheet is a square grid of coded targets with a plain circle in the middle of e
 OpenCV's dictionaries may take some of the grid's places. Sheet coordinates are mm from the lower
 left corner of the trimmed sheet, x right, y up, as a viewer sees it.
 
-Three sheets form a corner: the floor (XY, seen from +Z), the left wall (YZ, seen from +X) and the
-right wall (XZ, seen from +Y), trimmed edges meeting at the axes.
+Three sheets form a corner: the floor (XY, seen from +Z), the left wall (XZ, seen from +Y) and the
+right wall (YZ, seen from +X), left and right as somebody sees them who looks into the corner with Z
+up. Trimmed edges meet at the axes; the floor is cut to a square where it would stand out from under
+the walls.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import count
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -60,18 +63,26 @@ _MARKER_SIDE = 6.0
 _SIGMA_PRINT, _SIGMA_SCALE, _SIGMA_FLAT, _SIGMA_MOUNT = 0.1, 0.003, 1.0, 3.0
 
 
+_TITLES = ("1 floor (XY)", "2 left wall (XZ)", "3 right wall (YZ)")
+_EDGES = {
+    _TITLES[0]: {"left": "A", "lower": "B"},
+    _TITLES[1]: {"lower": "B", "right": "C"},
+    _TITLES[2]: {"lower": "A", "left": "C"},
+}
+
+
 class _OutOfCodes(UsageError):
     """There are fewer codes than places on the sheets."""
 
 
 @dataclass(frozen=True, slots=True)
 class Design:
-    """What is wanted of a print.
+    """What is asked of a print.
 
     page: size (width, height) mm; diameter of the discs mm; bits of the ring codes (12 or 14, 0 for
     none, None for the fewest that suffice), from the `first_code`-th on; whether plain circles
-    stand in between; a marker dictionary, and every how many-th place of the grid is a marker;
-    light targets on black; 1 sheet or the 3 of a corner; pitch of the grid mm, None for the least.
+    stand in between; a dictionary of markers, each `marker_every`-th place being one of them; light
+    targets on black; 1 sheet or the 3 of a corner; pitch of the grid mm, None for the least.
     """
 
     page: tuple[float, float]
@@ -125,8 +136,13 @@ class Sheet:
     markers: tuple[Marker, ...]
 
     @property
+    def edges(self) -> dict[str, str]:
+        """The letters of the edges that meet other sheets', by side: left, right, lower."""
+        return _EDGES.get(self.title, {})
+
+    @property
     def scale_bar(self) -> tuple[Target, Target] | None:
-        """The two targets whose distance is to be measured: the longest level one between codes."""
+        """The two coded targets to measure between: the ends of the lowest row."""
         coded = [t for t in self.targets if t.code] or list(self.targets)
         if len(coded) < 2:
             return None
@@ -164,52 +180,69 @@ def lay_out(design: Design) -> tuple[Sheet, ...]:
             return lay_out(replace(design, bits=14))
     _check(design)
     width, height = (side - 2 * TRIM for side in design.page)
+    sizes = [(width, height)]
+    titles: tuple[str, ...] = ("sheet",)
+    if design.sheets == 3:
+        titles = _TITLES
+        sizes = [(width, min(width, height)), (width, height), (width, height)]
+    numbering = _Numbering(design)
+    return tuple(
+        _sheet(design, title, size, numbering) for title, size in zip(titles, sizes, strict=True)
+    )
+
+
+class _Numbering:
+    """The codes, markers and plain names that are still free."""
+
+    def __init__(self, design: Design) -> None:
+        self.codes = _codes(design)
+        self.markers = _marker_ids(design)
+        self.plain = count(1)
+
+
+def _sheet(design: Design, title: str, size: tuple[float, float], numbering: _Numbering) -> Sheet:
+    """One sheet filled with a grid of targets."""
+    x, y = _grid(design, size)
+    pitch = float(x[1] - x[0])
+    r = design.diameter / 2
+    targets, markers = [], []
+    for j in range(len(y)):
+        for i in range(len(x)):
+            place = float(x[i]), float(y[j])
+            if design.dictionary and (i + 2 * j) % design.marker_every == design.marker_every // 2:
+                code = next(numbering.markers)
+                name = "M" + code.rpartition(":")[2]
+                markers.append(Marker(name, *place, _MARKER_SIDE * r, code))
+            elif design.bits:
+                code = next(numbering.codes)
+                targets.append(Target(f"R{code.rpartition(':')[2]}", *place, code))
+            else:
+                targets.append(Target(f"P{next(numbering.plain)}", *place, ""))
+    if design.plain and design.bits:
+        for j in range(len(y) - 1):
+            for i in range(len(x) - 1):
+                middle = float(x[i]) + pitch / 2, float(y[j]) + pitch / 2
+                targets.append(Target(f"P{next(numbering.plain)}", *middle, ""))
+    return Sheet(title, design, size, tuple(targets), tuple(markers))
+
+
+def _grid(design: Design, size: tuple[float, float]) -> tuple[Array, Array]:
+    """The coordinates of columns and rows on a sheet, mm."""
     r = design.diameter / 2
     pitch = design.pitch if design.pitch is not None else _PITCH * r
     reach = 4 * r if design.bits or design.dictionary else 2 * r
     low = STRIP + reach
-    nx = int((width - low - reach) / pitch) + 1 if width > low + reach else 0
-    ny = int((height - low - reach) / pitch) + 1 if height > low + reach else 0
-    if nx < 2 or ny < 2:
+    counts = [int((side - low - reach) / pitch) + 1 if side > low + reach else 0 for side in size]
+    if min(counts) < 2:
         raise UsageError(
             f"discs of {design.diameter:g} mm on {design.page[0]:g} × {design.page[1]:g} mm paper "
-            f"leave room for {nx} × {ny} targets: take smaller discs or larger paper"
+            f"leave room for {counts[0]} × {counts[1]} targets: take smaller discs or larger paper"
         )
-    x = low + (width - low - reach - (nx - 1) * pitch) / 2 + pitch * np.arange(nx)
-    y = low + (height - low - reach - (ny - 1) * pitch) / 2 + pitch * np.arange(ny)
-    codes = _codes(design)
-    marker_ids = _marker_ids(design)
-    plain_number = 0
-    titles = (
-        ["sheet"] if design.sheets == 1 else ["floor (XY)", "left wall (YZ)", "right wall (XZ)"]
+    x, y = (
+        np.asarray(low + (side - low - reach - (n - 1) * pitch) / 2 + pitch * np.arange(n), float)
+        for side, n in zip(size, counts, strict=True)
     )
-    sheets = []
-    for title in titles:
-        targets, markers = [], []
-        for j in range(ny):
-            for i in range(nx):
-                if (
-                    design.dictionary
-                    and (i + 2 * j) % design.marker_every == design.marker_every // 2
-                ):
-                    code = next(marker_ids)
-                    name = "M" + code.rpartition(":")[2]
-                    markers.append(Marker(name, x[i], y[j], _MARKER_SIDE * r, code))
-                elif design.bits:
-                    code = next(codes)
-                    name = f"R{code.rpartition(':')[2]}"
-                    targets.append(Target(name, float(x[i]), float(y[j]), code))
-                else:
-                    plain_number += 1
-                    targets.append(Target(f"P{plain_number}", float(x[i]), float(y[j]), ""))
-        if design.plain and design.bits:
-            for j in range(ny - 1):
-                for i in range(nx - 1):
-                    plain_number += 1
-                    middle = float(x[i] + pitch / 2), float(y[j] + pitch / 2)
-                    targets.append(Target(f"P{plain_number}", *middle, ""))
-        sheets.append(Sheet(title, design, (width, height), tuple(targets), tuple(markers)))
-    return tuple(sheets)
+    return x, y
 
 
 def _check(design: Design) -> None:
@@ -255,12 +288,12 @@ def _marker_ids(design: Design) -> Iterator[str]:
     if number is None or not design.dictionary.startswith("DICT_"):
         known = [n for n in dir(cv2.aruco) if n.startswith("DICT_")]
         raise UsageError(f"no marker dictionary {design.dictionary!r}: {', '.join(sorted(known))}")
-    count = len(cv2.aruco.getPredefinedDictionary(number).bytesList)
-    for i in range(count):
+    available = len(cv2.aruco.getPredefinedDictionary(number).bytesList)
+    for i in range(available):
         code = f"{design.dictionary}:{i}"
         parse_marker(code)
         yield code
-    raise UsageError(f"the field needs more than the {count} markers of {design.dictionary}")
+    raise UsageError(f"the field needs more than the {available} markers of {design.dictionary}")
 
 
 def _placement(sheets: Sequence[Sheet], k: int) -> tuple[Array, Array]:
@@ -268,8 +301,8 @@ def _placement(sheets: Sequence[Sheet], k: int) -> tuple[Array, Array]:
     if len(sheets) == 1 or k == 0:
         return np.zeros(3), np.eye(3)[:2]
     if k == 1:
-        return np.zeros(3), np.eye(3)[1:]
-    return np.array([sheets[k].size[0], 0.0, 0.0]), np.array([[-1.0, 0, 0], [0, 0, 1.0]])
+        return np.array([sheets[k].size[0], 0.0, 0.0]), np.array([[-1.0, 0, 0], [0, 0, 1.0]])
+    return np.zeros(3), np.eye(3)[1:]
 
 
 def field_of(sheets: Sequence[Sheet]) -> TestField:

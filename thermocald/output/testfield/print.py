@@ -35,11 +35,17 @@ def default_diameter(page: tuple[float, float]) -> float:
     return max(3.0, round(min(page) / 34))
 
 
-def print_testfield(design: Design, folder: Path) -> Printed:
+def print_testfield(design: Design, folder: Path, *, replace_printed: bool = False) -> Printed:
     """Write `testfield.pdf`, one SVG per sheet, and `testfield.csv` into a folder.
 
-    All files appear, or none; files of these names are replaced, others stay.
+    All files appear, or none. UsageError where the folder holds a `testfield.csv` already: what
+    hangs on a wall would no longer have its coordinates; `replace_printed` replaces it.
     """
+    if not replace_printed and (folder / "testfield.csv").exists():
+        raise UsageError(
+            f"{folder}: holds a printed test field already, whose coordinates would be lost: give "
+            "another folder with --out, or --force to replace it"
+        )
     sheets = lay_out(design)
     field = field_of(sheets)
     try:

@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermocald.analysis.online.equilibrium import EquilibriumWatch, fit_approach, slope
+from thermocald.analysis.online.equilibrium import (
+    EquilibriumWatch,
+    GivenInterior,
+    fit_approach,
+    slope,
+)
 
 
 def test_a_slope_scatters_as_its_sd_says():
@@ -48,23 +53,24 @@ def watch(values_of, epochs: int = 60, noise: float = 0.02) -> EquilibriumWatch:
     made = EquilibriumWatch()
     for k in range(epochs):
         values = values_of(10.0 * k) + rng.normal(0, noise, 3)
-        made.add(10.0 * k, values, np.full(3, noise))
+        made.add(GivenInterior(10.0 * k, values, np.zeros((3, 6)), np.full(3, noise)))
     return made
 
 
 def test_warm_is_ready_and_warming_is_not():
-    steady = watch(lambda t: np.zeros(3)).judge()
+    steady = watch(lambda t: np.zeros(3)).assess()
     assert steady.state == "ready"
-    warming = watch(lambda t: np.array([1.0, 2.0, -2.0]) * np.exp(-t / 400.0)).judge()
+    warming = watch(lambda t: np.array([1.0, 2.0, -2.0]) * np.exp(-t / 400.0)).assess()
     assert warming.state == "drifting"
     truth = 60.0 * 3.0 / 400.0 * np.exp(-500.0 / 400.0)  # at the middle of the last 3 min
     assert warming.drift == pytest.approx(truth, rel=0.15)
     assert "ready in about" in warming.sentence
-    assert watch(lambda t: np.zeros(3), epochs=4).judge().state == "unknown"
+    assert watch(lambda t: np.zeros(3), epochs=4).assess().state == "unknown"
 
 
 def test_a_held_parameter_is_not_asked():
     made = EquilibriumWatch()
     for k in range(30):
-        made.add(10.0 * k, np.array([np.nan, 0.0, 0.0]), np.array([np.nan, 0.01, 0.01]))
-    assert made.judge().state == "ready"
+        values, sds = np.array([np.nan, 0.0, 0.0]), np.array([np.nan, 0.01, 0.01])
+        made.add(GivenInterior(10.0 * k, values, np.zeros((3, 6)), sds))
+    assert made.assess().state == "ready"

@@ -5,15 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from thermocald.acquisition.calibrator import CalibratedEpoch
+from thermocald.analysis.online.field_errors import FieldErrors
 from thermocald.analysis.online.filter import FilterSettings, OnlineFilter, chi2_quantile
-from thermocald.analysis.online.observer import given_exterior
+from thermocald.analysis.online.observer import OnlineObserver, given_exterior
+from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     InteriorOrientation,
     project,
 )
 from thermocald.photogrammetry.epoch.adjustment import adjust
-from thermocald.photogrammetry.field.testfield import Observations
+from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.simulation.demonstration import demonstration_model
 from thermocald.simulation.testfields import corner_field
 
@@ -68,8 +71,8 @@ def test_the_scatter_of_estimate_and_rates_is_what_its_covariance_says(camera):
     for seed in range(40):
         found = run(camera, seed)
         sd = np.sqrt(np.diag(found.covariance()))[:3]
-        # the estimate stands at the last temperature read, which has noise of its own
-        at = found._temperature
+        # the estimate is that at the last temperature read, which has noise of its own
+        at = found.last_temperature
         sd_rate = np.sqrt(np.diag(found.rates_covariance))
         deviations.append([*((found.values()[:3] - camera.truth(at)) / sd),
                            *((found.rates - RATES) / sd_rate)])  # fmt: skip
@@ -118,9 +121,9 @@ def test_one_bad_epoch_is_an_outlier_and_leaves_the_estimate_alone(camera):
 
 def test_with_the_exterior_known_an_epoch_tells_the_interior_ten_times_better(camera):
     result = camera(3)(25.0)
-    given, sds = given_exterior(result.values, result.covariance, camera.eop)
-    assert np.all(sds[1:] < 0.1 * result.sd[1:3])
-    assert np.all(np.abs(given - camera.truth(25.0)) < 4 * sds)
+    one = given_exterior(0.0, result.values, result.covariance, 1.0)
+    assert np.all(one.sds[1:] < 0.1 * result.sd[1:3])
+    assert np.all(np.abs(one.at(camera.eop) - camera.truth(25.0)) < 4 * one.sds)
 
 
 def test_chi2_quantiles():
@@ -137,3 +140,116 @@ def test_an_epoch_without_a_result_changes_nothing(camera):
     found = OnlineFilter(camera.sensor, FilterSettings())
     assert found.update(failed("bad_frame", ""), 25.0) is None
     assert found.epochs == 0
+
+
+class Surveyed:
+    """A camera before a field whose coordinates err as its sigmas state: series of epochs."""
+
+    def __init__(self, sigma_mm: float, seed: int, missing: float = 0.0) -> None:
+        plain = corner_field("plain", per_side=4, pitch_mm=150.0)
+        self.model = demonstration_model(plain)
+        self.rng = np.random.default_rng([seed, round(1e3 * sigma_mm)])
+        self.field = TestField.build(plain.names, plain.points, sigma_mm)
+        self.true_points = plain.points + sigma_mm * self.rng.standard_normal(plain.points.shape)
+        self.iop, self.eop = self.model.interior.as_array(), self.model.exterior.as_array()
+        self.missing = missing
+
+    def epoch(self, rise: float = 0.0, change=0.0):
+        values = np.concatenate([self.iop, self.eop]) + change
+        values[:3] += RATES * rise
+        points = project(self.model.sensor, values[:10], values[10:], self.true_points)
+        points = points + self.rng.normal(0, 0.04, points.shape)
+        rows = np.flatnonzero(self.rng.random(len(points)) >= self.missing)
+        seen = Observations(rows, points[rows], np.full((len(rows), 2), 0.04))
+        result = adjust(
+            self.model.sensor, self.field, seen, InteriorOrientation.from_array(self.iop),
+            ExteriorOrientation.from_array(self.eop),
+        )  # fmt: skip
+        assert result.ok
+        return seen, result
+
+    def filter(self):
+        """The filter, and a function that gives it an epoch."""
+        errors = FieldErrors(self.model.sensor, self.field)
+        found = OnlineFilter(self.model.sensor, common_variances=errors.variances)
+
+        def take(rise: float = 0.0, change=0.0):
+            seen, result = self.epoch(rise, change)
+            reading = 25.0 + rise + self.rng.normal(0, 0.05)
+            return found.update(result, reading, errors.split(result, seen))
+
+        return found, take
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.1])
+@pytest.mark.parametrize("sigma_mm", [0.0, 0.01, 0.05])
+def test_innovations_are_as_large_as_their_covariance_whatever_the_field(sigma_mm, missing):
+    """With the field's errors as noise of each epoch chi-square per degree of freedom was 0.09."""
+    ratios = []
+    for seed in range(6):
+        _, take = Surveyed(sigma_mm, seed, missing).filter()
+        found = [take() for _ in range(40)]
+        assert all(one.change == "" for one in found)
+        ratios += [one.chi2 / one.dof for one in found[1:]]
+    # 234 epochs of 14 degrees of freedom: sd of the mean 0.025.
+    assert 0.9 < np.mean(ratios) < 1.1
+
+
+@pytest.mark.parametrize("sigma_mm", [0.01, 0.05])
+def test_the_sds_of_the_estimate_hold_the_field_whatever_the_number_of_epochs(sigma_mm):
+    deviations, sds = [], []
+    for seed in range(200):
+        camera = Surveyed(sigma_mm, seed)
+        found, take = camera.filter()
+        for _ in range(4):
+            take()
+        sd = np.sqrt(np.diag(found.covariance()))[:3]
+        deviations.append((found.values()[:3] - camera.iop[:3]) / sd)
+        sds.append(sd)
+    rms = np.sqrt(np.mean(np.square(deviations), axis=0))
+    # 200 draws: a ratio scatters by 5 %.
+    assert np.all((rms > 0.9) & (rms < 1.1)), rms
+    pitch = camera.model.sensor.pixel_pitch
+    assert np.all(np.mean(sds, axis=0)[1:] / pitch > 0.4)  # px, where 0.1 used to be stated
+
+
+@pytest.mark.parametrize("sigma_mm", [0.0, 0.01, 0.05])
+def test_a_knock_of_a_tenth_of_a_pixel_is_noticed(sigma_mm):
+    noticed = 0
+    for seed in range(20):
+        camera = Surveyed(sigma_mm, seed)
+        _, take = camera.filter()
+        assert all(take().change == "" for _ in range(20))
+        change = np.zeros(16)
+        change[11] = 0.1 * camera.model.sensor.pixel_pitch / camera.iop[0]  # of phi, rad
+        noticed += any(take(change=change).change not in ("", "outlier") for _ in range(4))
+    assert noticed >= 18
+
+
+@pytest.mark.parametrize("sigma_mm", [0.0, 0.05])
+def test_a_steady_camera_is_ready_in_time_before_a_field_that_errs(sigma_mm):
+    camera = Surveyed(sigma_mm, 1)
+    events, states = [], []
+    observer = OnlineObserver(camera.model.sensor, camera.field, lambda *a: events.append(a))
+    for k in range(80):
+        seen, result = camera.epoch()
+        epoch = Epoch(k, 10.0 * k, 10.0 * k, {"temperature": 25.0}, None, seen)
+        observer.observe(CalibratedEpoch(epoch, result, {}))
+        states.append(observer.report()["state"])
+    assert "ready" in states[:50]
+    assert states[60:].count("ready") >= 16
+    assert states.count("drifting") <= 4  # 2 sd in up to three components
+    assert not events
+
+
+def test_the_noise_is_measured_apart_from_the_field():
+    """A field stated far better or worse than it is leaves the level of the noise alone."""
+    for sigma_mm, stated in ((0.05, 0.001), (0.0, 0.05)):
+        camera = Surveyed(sigma_mm, 3)
+        camera.field = TestField.build(camera.field.names, camera.field.points, stated)
+        errors = FieldErrors(camera.model.sensor, camera.field)
+        for _ in range(30):
+            seen, result = camera.epoch()
+            errors.split(result, seen)
+        # 30 differences of 96 coordinates: 3 %.
+        assert errors.level == pytest.approx(1.0, abs=0.1)

@@ -18,21 +18,22 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["Approach", "Equilibrium", "EquilibriumWatch", "fit_approach", "slope"]
+__all__ = ["Approach", "Equilibrium", "EquilibriumWatch", "GivenInterior", "fit_approach", "slope"]
 
 State = Literal["unknown", "drifting", "ready"]
 
 _FEWEST = 8
 _TAUS = 60
 _NARROWINGS = 6
-_WEIGHTY = 9  # points of the grid that share the weight
+_WEIGHTY = 9  # points of the grid that carry the weight
 _SETTLED_SD = 2.0
+_CURVED_SD = 3.0
 _WORST_MISFIT = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class Approach:
-    """An exponential approach: tau s, and s from the last instant until it is steady, with sds;
+    """An exponential approach: tau s, and s from the last epoch until it is steady, with sds;
     misfit: reduced chi-square.
     """
 
@@ -41,6 +42,24 @@ class Approach:
     ready_in: float
     sd_ready_in: float
     misfit: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GivenInterior:
+    """(c, x0, y0) of one epoch as a function of the exterior orientation that one assumes.
+
+    time s; values (3,) px at the exterior orientation 0; gain (3, 6): px per unit of the exterior
+    orientation; sds (3,) px of the epoch's noise, NaN for what is not estimated.
+    """
+
+    time: float
+    values: Array
+    gain: Array
+    sds: Array
+
+    def at(self, exterior: Array | None) -> Array:
+        """(3,) px, given the exterior orientation (6,)."""
+        return self.values if exterior is None else self.values + self.gain @ exterior
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,40 +152,41 @@ def _profile(
 class EquilibriumWatch:
     """Watches (c, x0, y0) in px over a sliding window.
 
-    window_s: how much of the past counts for the drift; the approach is fitted to four times as
-    much. bound: px/min below which the camera counts as steady.
+    window_s: the least past that the drift is taken from; up to four times as much where a straight
+    line describes it. bound: px/min below which the camera counts as steady.
     """
 
     def __init__(self, window_s: float = 180.0, bound: float = 0.05) -> None:
         self.window_s = window_s
         self.bound = bound
-        self._past: deque[tuple[float, Array, Array]] = deque()
+        self._past: deque[GivenInterior] = deque()
 
     def clear(self) -> None:
-        """Begin anew, after a knock."""
+        """Start again, after a knock."""
         self._past.clear()
 
-    def add(self, time: float, values: Array, sds: Array) -> None:
-        """Add an epoch: values (3,) and sds (3,) px; NaN where one is not estimated."""
-        self._past.append((time, values, sds))
-        while self._past and time - self._past[0][0] > 4.0 * self.window_s:
+    def add(self, one: GivenInterior) -> None:
+        """Add an epoch; the sds of what is not estimated are NaN."""
+        self._past.append(one)
+        while self._past and one.time - self._past[0].time > 4.0 * self.window_s:
             self._past.popleft()
 
-    def judge(self) -> Equilibrium:
-        """Where the camera stands now."""
+    def assess(self, exterior: Array | None = None) -> Equilibrium:
+        """How steady the camera is, given its exterior orientation (6,) as it is known now.
+
+        All of the past is seen from the same exterior orientation: what was known of it at each
+        epoch improves with time, and would look like drift.
+        """
         if len(self._past) < _FEWEST:
             return Equilibrium("unknown", float("nan"), float("nan"))
-        times = np.array([t for t, _, _ in self._past])
-        values = np.array([v for _, v, _ in self._past])
-        sds = np.array([s for _, _, s in self._past])
+        times = np.array([one.time for one in self._past])
+        values = np.array([one.at(exterior) for one in self._past])
+        sds = np.array([one.sds for one in self._past])
         good = np.isfinite(values).all(axis=0) & np.isfinite(sds).all(axis=0)
         if not good.any():
             return Equilibrium("unknown", float("nan"), float("nan"))
         values, sds = values[:, good], sds[:, good]
-        recent = times >= times[-1] - self.window_s
-        if recent.sum() < _FEWEST:
-            recent[-_FEWEST:] = True
-        rate, sd_rate = slope(times[recent], values[recent], sds[recent])
+        rate, sd_rate = self._rate(times, values, sds)
         speed = 60.0 * float(np.linalg.norm(rate))
         direction = rate / max(float(np.linalg.norm(rate)), 1e-300)
         sd_speed = 60.0 * float(np.sqrt(np.sum((direction * sd_rate) ** 2)))
@@ -181,13 +201,36 @@ class EquilibriumWatch:
             return Equilibrium("drifting", speed, sd_speed)
         return Equilibrium("drifting", speed, sd_speed, approach.ready_in, approach.sd_ready_in)
 
+    def _rate(self, times: Array, values: Array, sds: Array) -> tuple[Array, Array]:
+        """Slope from the longest past that straight lines describe, else from the window."""
+        for multiple in (4.0, 2.0, 1.0):
+            recent = times >= times[-1] - multiple * self.window_s
+            if recent.sum() < _FEWEST:
+                recent[-_FEWEST:] = True
+            if multiple == 1.0 or _straight(times[recent], values[recent], sds[recent]):
+                break
+        return slope(times[recent], values[recent], sds[recent])
+
     def _approach(self, times: Array, values: Array, sds: Array) -> Approach | None:
         """From the longest past that one exponential describes: heating may just have begun."""
-        for share in (1.0, 0.5, 0.25):
-            recent = times >= times[-1] - 4.0 * share * self.window_s
+        for fraction in (1.0, 0.5, 0.25):
+            recent = times >= times[-1] - 4.0 * fraction * self.window_s
             if recent.sum() < _FEWEST:
                 return None
             found = fit_approach(times[recent], values[recent], sds[recent], self.bound / 60.0)
             if found is None or found.misfit < _WORST_MISFIT:
                 return found
         return None
+
+
+def _straight(times: Array, values: Array, sds: Array) -> bool:
+    """Whether a parabola finds no curvature, of any of the columns (n, k), beyond 2 sd."""
+    t = (times - times.mean()) / max(float(np.ptp(times)), 1e-9)
+    design = np.stack([np.ones_like(t), t, t * t], axis=1)
+    for column, sd in zip(values.T, sds.T, strict=True):
+        A = design / sd[:, None]
+        cofactor = np.linalg.inv(A.T @ A)
+        curvature = float((cofactor @ A.T @ (column / sd))[2])
+        if abs(curvature) > _CURVED_SD * np.sqrt(cofactor[2, 2]):
+            return False
+    return True

@@ -1,4 +1,4 @@
-"""What is said about a camera while it runs: filter, innovation test and equilibrium together."""
+"""What is reported about a camera while it runs: filter, innovation test, equilibrium."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.analysis.online.equilibrium import Equilibrium, EquilibriumWatch
+from thermocald.analysis.online.equilibrium import Equilibrium, EquilibriumWatch, GivenInterior
+from thermocald.analysis.online.field_errors import FieldErrors
 from thermocald.analysis.online.filter import OnlineFilter
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 
@@ -35,10 +36,11 @@ _SENTENCES = {
 }
 
 
-def given_exterior(values: Array, covariance: Array, exterior: Array) -> tuple[Array, Array]:
-    """(c, x0, y0) and their sds mm, given that the exterior orientation is `exterior` (6,).
+def given_exterior(time: float, values: Array, covariance: Array, unit: float) -> GivenInterior:
+    """(c, x0, y0) of an epoch, to be seen from any exterior orientation.
 
-    values (16,), covariance (16, 16) of one epoch; NaN for what was held.
+    time s; values (16,), covariance (16, 16) of the epoch's noise; unit: mm that count as one, the
+    pixel pitch. Errors of the test field are in both orientations alike and cancel.
     """
     block = covariance[10:, 10:]
     cross = covariance[_IOP, 10:]
@@ -47,16 +49,15 @@ def given_exterior(values: Array, covariance: Array, exterior: Array) -> tuple[A
     else:
         s = np.sqrt(np.diag(block))
         gain = np.linalg.solve(block / np.outer(s, s), (cross / s).T).T / s
-    given = values[_IOP] - gain @ (values[10:] - exterior)
     variance = np.diag(covariance[_IOP, _IOP] - gain @ cross.T)
     sds = np.sqrt(np.where(variance > 0, variance, np.nan))
-    return given, sds
+    return GivenInterior(time, (values[_IOP] - gain @ values[10:]) / unit, gain / unit, sds / unit)
 
 
 class OnlineObserver:
-    """Told every calibrated epoch, in order.
+    """Receives every calibrated epoch, in order.
 
-    tell(kind, text, utc, epoch): told of a knock, a slip, another lens, a moved target.
+    tell(kind, text, utc, epoch): called on a knock, a slip, another lens, a moved target.
     """
 
     def __init__(
@@ -65,20 +66,24 @@ class OnlineObserver:
         testfield: TestField,
         tell: Callable[[str, str, float, int], None],
     ) -> None:
-        self.filter = OnlineFilter(sensor)
+        self._errors = FieldErrors(sensor, testfield)
+        self.filter = OnlineFilter(sensor, common_variances=self._errors.variances)
         self.watch = EquilibriumWatch()
         self._pitch = sensor.pixel_pitch
         self._field = testfield
         self._tell = tell
         self._rejected: Counter[int] = Counter()
-        self._told: set[int] = set()
+        self._reported: set[int] = set()
         self._equilibrium = Equilibrium("unknown", float("nan"), float("nan"))
 
     def observe(self, calibrated: CalibratedEpoch) -> dict[str, float]:
         """Take an epoch in; returns columns for the store."""
         epoch, adjustment = calibrated.epoch, calibrated.adjustment
         temperature = next(iter(epoch.temperatures.values()), math.nan)
-        innovation = self.filter.update(adjustment, temperature)
+        if not adjustment.ok or epoch.observations is None:
+            return {}
+        errors = self._errors.split(adjustment, epoch.observations)
+        innovation = self.filter.update(adjustment, temperature, errors)
         if innovation is None:
             return {}
         self._watch_targets(calibrated)
@@ -87,10 +92,10 @@ class OnlineObserver:
             self._tell(event, _SENTENCES[event], epoch.frame_time, epoch.number)
             self.watch.clear()
         if innovation.change != "outlier":
-            exterior = self.filter.values()[10:]
-            given, sds = given_exterior(adjustment.values, adjustment.covariance, exterior)
-            self.watch.add(epoch.frame_time, given / self._pitch, sds / self._pitch)
-        self._equilibrium = self.watch.judge()
+            self.watch.add(
+                given_exterior(epoch.frame_time, adjustment.values, errors.noise, self._pitch)
+            )
+        self._equilibrium = self.watch.assess(self.filter.values()[10:])
         columns = {
             "innovation_chi2": innovation.chi2,
             "innovation_bound": innovation.bound,
@@ -136,12 +141,12 @@ class OnlineObserver:
         for row in list(self._rejected):
             if row in measured and row not in rejected:
                 del self._rejected[row]
-                self._told.discard(row)
+                self._reported.discard(row)
         self._rejected.update(rejected)
         epoch = calibrated.epoch
-        for row in sorted(rejected - self._told):
+        for row in sorted(rejected - self._reported):
             if self._rejected[row] >= _MOVED_AFTER:
-                self._told.add(row)
+                self._reported.add(row)
                 name = self._field.names[row]
                 text = f"target {name} contradicts the others for {_MOVED_AFTER} epochs: it moved"
                 self._tell("target_moved", text, epoch.frame_time, epoch.number)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from thermocald import config as module
 from thermocald.config import Config, load_config, parse_config
 from thermocald.errors import ConfigurationError
-from thermocald.hal import option_names
+from thermocald.hal import driver_names, option_names
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, PARAMETER_NAMES
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
 from thermocald.yaml_file import dump_yaml
@@ -190,3 +190,17 @@ def test_any_damage_to_the_text(tmp_path, at, put):
     else:
         return
     assert message.startswith(str(path))
+
+
+def test_the_comments_of_config_yaml_name_drivers_that_exist():
+    """In the file that every user starts from: after `driver: mock   #`, until a colon or dots."""
+    text = (Path(__file__).parents[1] / "config.yaml").read_text()
+    sections = re.split(r"^(cameras|thermometers|outputs):", text, flags=re.M)
+    seen = 0
+    for kind, section in zip(sections[1::2], sections[2::2], strict=True):
+        named = re.findall(r"driver: *(\w+)(?: *# ([^\n:…]*))?", section)
+        for driver, others in named:
+            words = {driver, *re.findall(r"\w+", others)}
+            assert words <= set(driver_names(kind.removesuffix("s")))
+            seen += len(words)
+    assert seen >= 8

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import inspect
+import re
 import threading
 import time
 from importlib.metadata import EntryPoint
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -85,6 +87,29 @@ def test_options_of_a_driver():
 def test_options_that_do_not_fit():
     with pytest.raises(ConfigurationError, match=r"thermometer driver 'mock'.*'sed'"):
         open_device("thermometer", "mock", {"sed": 1}, VirtualClock())
+
+
+@pytest.mark.parametrize(
+    ("kind", "driver", "options", "message"),
+    [
+        ("output", "mqtt", {}, "output driver 'mqtt': host is missing"),
+        ("camera", "android", {"serial": "X"}, "width, height are missing"),
+        ("thermometer", "ds18b20", {}, "sensors is missing"),
+    ],
+)
+def test_a_missing_option_is_named(kind, driver, options, message):
+    with pytest.raises(ConfigurationError, match=message):
+        open_device(kind, driver, options, VirtualClock())
+
+
+def test_nothing_is_inferred_from_names_or_attributes():
+    """What the program needs to know of a driver or an error is a member of its class."""
+    root = Path(hal.__file__).parent
+    folders = [root / "acquisition", root / "daemon", root / "cli"]
+    sources = [root / "hal.py", *(path for folder in folders for path in folder.rglob("*.py"))]
+    sources += Path(inspect.getfile(load_driver("camera", "mock"))).parent.glob("*.py")
+    guess = re.compile(r"type\(\w+\)\.__name__\s*(==|in)|hasattr\(|in option_names\(")
+    assert [p.name for p in sources if guess.search(p.read_text())] == []
 
 
 def test_a_driver_that_cannot_be_imported(monkeypatch):

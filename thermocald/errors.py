@@ -22,7 +22,8 @@
                ├── DeviceNotFound                   no such device
                ├── DeviceDenied (PermissionError)   permission, unauthorized, busy for good
                ├── WrongDevice                      identity, size or capability does not fit
-               └── DriverMissing                    an optional library is not installed
+               ├── DriverMissing                    an optional library is not installed
+               └── DeviceFinished                   nothing more will come, and that is no fault
 
 Leaves also are the built-in exception that they mean.
 """
@@ -35,6 +36,7 @@ __all__ = [
     "DataError",
     "DeviceDenied",
     "DeviceError",
+    "DeviceFinished",
     "DeviceGone",
     "DeviceNotFound",
     "DeviceTimeout",
@@ -159,3 +161,7 @@ class WrongDevice(PermanentDeviceError):
 
 class DriverMissing(PermanentDeviceError):
     """An optional library that the driver needs is not installed."""
+
+
+class DeviceFinished(PermanentDeviceError):
+    """The device has delivered everything it had, such as a recording played to its end."""

@@ -1,13 +1,17 @@
-"""The hardware abstraction: what a camera, a thermometer, an output and a clock promise.
+"""The hardware abstraction: the contracts of cameras, thermometers, outputs and clocks.
 
 The daemon, the demo, a replay and a test differ only in which of these they are given. Drivers are
-found by entry point and by nothing else; the groups are `thermocald.cameras`,
-`thermocald.thermometers`, `thermocald.outputs`. An entry point names a class with one constructor
-argument per configuration key. A driver's module imports no device library at its top: the library
-is imported in `open()`.
+found by entry point and in no other way; the groups are `thermocald.cameras`,
+`thermocald.thermometers` and `thermocald.outputs`. An entry point names a class whose constructor
+has one keyword argument per configuration key. A driver module imports no device library at its
+top: the library is imported in `open()`.
+
+Nothing is inferred from a driver's name or attributes: what the program needs to know of a driver
+is a member of its class here, with a default.
 
 Errors are those of `thermocald.errors`: a `TransientDeviceError` is retried with back-off (the
-caller closes and re-opens the device), a `PermanentDeviceError` is reported and not retried.
+caller closes and re-opens the device), a `PermanentDeviceError` is reported and not retried, a
+`DeviceFinished` ends the device without being a fault.
 """
 
 from __future__ import annotations
@@ -17,12 +21,12 @@ import threading
 import time
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
-from typing import TYPE_CHECKING, Any, Literal, Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self, runtime_checkable
 
 from thermocald.errors import ConfigurationError, DriverMissing
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
     from types import TracebackType
 
     import numpy as np
@@ -32,7 +36,9 @@ __all__ = [
     "Camera",
     "Clock",
     "Device",
+    "Found",
     "Frame",
+    "KnownScene",
     "Output",
     "Reading",
     "SystemClock",
@@ -49,13 +55,18 @@ Kind = Literal["camera", "thermometer", "output"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """One image as a camera gave it.
+    """One image as a camera delivered it.
 
-    image: (H, W) uint8 or uint16 grey values, not writeable; None where `encoded` holds a JPEG, or
-    where it was measured before and `metadata["observations"]` says what it showed.
-    monotonic, utc: s, the middle of the exposure as well as the device tells it, on the clock's
-    two scales; exposure: s or None; sequence: the device's own frame number or None.
-    metadata: what else the device said, JSON-able.
+    image: (H, W) uint8 or uint16 grey values, read-only; None where `encoded` holds a JPEG, or
+    where the frame was measured before and `metadata["observations"]` holds its image points.
+    monotonic, utc: s, the middle of the exposure as well as the device reports it, on the clock's
+    two scales.
+    exposure: s, or None.
+    sequence: the device's own frame number, or None.
+    settings: what moves the image, as read back with this frame, by name: focus, exposure, gain,
+    white balance in the device's own units; 1.0 and 0.0 for automatic modes. Stored with the epoch
+    as the columns `camera_<name>`.
+    metadata: what else the device reported, JSON-able; not stored.
     """
 
     image: NDArray[np.uint8] | NDArray[np.uint16] | None
@@ -65,6 +76,7 @@ class Frame:
     sequence: int | None = None
     encoded: bytes | None = None
     metadata: Mapping[str, Any] = field(default_factory=dict)
+    settings: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.image is None and self.encoded is None and "observations" not in self.metadata:
@@ -77,16 +89,38 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What a thermometer said: {channel: °C}, and when.
+    """What a thermometer reported, and when.
 
-    A channel that could not be read is absent, never repeated, never filled in.
-    monotonic, utc: s, the instant of the conversion as well as the device tells it.
+    values: {channel: °C}; a channel that could not be read is absent, never repeated or filled in.
+    monotonic, utc: s, the time of the conversion as well as the device reports it.
     """
 
     values: Mapping[str, float]
     monotonic: float
     utc: float
     metadata: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """An attached device, as `thermocald devices` lists it.
+
+    options: its stanza without name and driver.
+    about: one line for the user.
+    certain: False if nobody can know what is there (a serial port, an I2C bus).
+    """
+
+    options: Mapping[str, Any]
+    about: str
+    certain: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class KnownScene:
+    """What a simulated camera looks at: its sensor and test field."""
+
+    sensor: Any
+    testfield: Any
 
 
 @runtime_checkable
@@ -100,7 +134,7 @@ class Clock(Protocol):
         """Seconds since 1970-01-01 UTC; may step."""
 
     def sleep_until(self, monotonic: float, wake: threading.Event | None = None) -> bool:
-        """Wait for an instant; False if `wake` was set first."""
+        """Wait until a time of the monotonic scale; False if `wake` was set first."""
 
 
 class Device:
@@ -109,7 +143,15 @@ class Device:
     `open` raises a DeviceError; `close` never raises and may be called twice.
     """
 
+    device_classes: ClassVar[tuple[str, ...]] = ()
+    """The nodes in /dev that it opens, as systemd's DeviceAllow= names them: `char-i2c`."""
+
     clock: Clock
+
+    @classmethod
+    def attached(cls, sysfs: str = "/sys") -> Sequence[Found]:  # noqa: ARG003
+        """The devices of this driver that are attached; a DeviceError if it cannot look."""
+        return []
 
     def open(self) -> None:
         """Claim the device; drivers that need a library import it here."""
@@ -118,8 +160,12 @@ class Device:
         """Release the device."""
 
     def identity(self) -> Mapping[str, str]:
-        """Name, serial number, versions: what tells this device from another."""
+        """Name, serial number, versions: what distinguishes this device from others."""
         return {}
+
+    def warnings(self) -> Sequence[str]:
+        """One sentence for each setting that harms the results; shown in the status."""
+        return []
 
     def __enter__(self) -> Self:
         self.open()
@@ -141,20 +187,33 @@ class Camera(Device):
         """Take a frame; raises a DeviceError, never returns an old or a broken one."""
         raise NotImplementedError
 
+    def frame_size(self) -> tuple[int, int] | None:
+        """(width, height) in px of the frames, where the configuration states it."""
+        return None
+
+    def known_scene(self) -> KnownScene | None:
+        """What it looks at, where the driver knows; it then needs no test field in the stanza."""
+        return None
+
 
 class Thermometer(Device):
-    """`read()` returns what the device says now."""
+    """`read()` returns what the device reports now."""
 
     def read(self) -> Reading:
-        """Read all channels; raises a DeviceError where none could be read."""
+        """Read all channels; raises a DeviceError if none could be read."""
         raise NotImplementedError
 
 
 class Output(Device):
-    """`emit()` tells the world; it must not block longer than its `timeout_s`."""
+    """`emit()` passes a result on; it must not block longer than its `timeout_s`."""
+
+    heats: ClassVar[bool] = False
+    """Whether it heats the camera by a `programme`, which a session may replace."""
+
+    timeout_s: float = 5.0
 
     def emit(self, result: Mapping[str, Any]) -> None:
-        """Hand over one epoch's result: the keys of the CSV export, and `device`, `state`."""
+        """Pass on one epoch's result: the columns of the CSV export, and `device`, `state`."""
         raise NotImplementedError
 
 
@@ -177,9 +236,9 @@ class SystemClock:
 
 
 class VirtualClock:
-    """A clock that jumps to where it is asked to wait: 25 minutes pass in no time.
+    """A clock that jumps to the end of each wait, so that 25 minutes take no time.
 
-    utc: the UTC instant at monotonic 0; `step_utc` plays an NTP step.
+    utc: UTC at monotonic 0; `step_utc` imitates an NTP step.
     """
 
     def __init__(self, utc: float = 1_600_000_000.0, monotonic: float = 0.0) -> None:
@@ -194,12 +253,12 @@ class VirtualClock:
         return self._now + self._offset
 
     def advance(self, seconds: float) -> None:
-        """Let time pass, as a device does that takes its time."""
+        """Let time pass, as a slow device does."""
         with self._lock:
             self._now += seconds
 
     def step_utc(self, seconds: float) -> None:
-        """Set the UTC clock forth or back; the monotonic clock does not notice."""
+        """Set the UTC clock forward or back; the monotonic clock is not affected."""
         self._offset += seconds
 
     def sleep_until(self, monotonic: float, wake: threading.Event | None = None) -> bool:
@@ -238,19 +297,33 @@ def load_driver(kind: Kind, name: str) -> type[Any]:
 
 
 def option_names(kind: Kind, name: str) -> list[str]:
-    """The options that a driver's constructor takes; errors as `load_driver`."""
-    parameters = inspect.signature(load_driver(kind, name)).parameters
-    return [parameter for parameter in parameters if parameter != "clock"]
+    """The options of a driver's constructor; errors as `load_driver`."""
+    return list(_options(load_driver(kind, name)))
 
 
 def open_device(kind: Kind, name: str, options: Mapping[str, Any], clock: Clock) -> Any:
     """Construct a driver from its configuration; the caller opens it.
 
-    Raises ConfigurationError where the options do not fit the constructor.
+    Raises ConfigurationError, which names a missing or unknown option.
     """
     driver = load_driver(kind, name)
+    known = _options(driver)
+    where = f"{kind} driver {name!r}"
+    missing = [option for option, required in known.items() if required and option not in options]
+    if missing:
+        verb = "is" if len(missing) == 1 else "are"
+        raise ConfigurationError(f"{where}: {', '.join(missing)} {verb} missing")
+    if unknown := set(options) - set(known):
+        raise ConfigurationError(
+            f"{where}: it has no option {min(unknown)!r}; it has {', '.join(known) or 'none'}"
+        )
     try:
-        device = driver(clock=clock, **options)
-    except TypeError as error:
-        raise ConfigurationError(f"{kind} driver {name!r}: {error}") from error
-    return device
+        return driver(clock=clock, **options)
+    except TypeError as error:  # an option of a type that the driver did not expect
+        raise ConfigurationError(f"{where}: {error}") from error
+
+
+def _options(driver: type[Any]) -> dict[str, bool]:
+    """{option: whether it is required} of a driver's constructor."""
+    parameters = inspect.signature(driver).parameters.values()
+    return {p.name: p.default is p.empty for p in parameters if p.name != "clock"}

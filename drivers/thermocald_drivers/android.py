@@ -41,7 +41,7 @@ from thermocald.errors import (
     PermanentDeviceError,
     WrongDevice,
 )
-from thermocald.hal import Camera, Frame, Thermometer
+from thermocald.hal import Camera, Found, Frame, Thermometer
 from thermocald_drivers import (
     android_temperatures,
     android_zones,
@@ -74,6 +74,8 @@ NO_BATTERY = (
     "unknown unit (write units: {{{channel}: degC}}, tenths or thousandths)"
 )
 STATE_UNIT = "write units: {{{channel}: degC}}, tenths or thousandths"
+ADB_CLASSES = ("char-usb_device",)
+"""Opened by the adb server where this driver starts it."""
 POLL_S = 0.1
 CLOCKS_DIFFER_S = 5.0
 
@@ -103,6 +105,8 @@ def _attached() -> list[str]:
 
 class AndroidCamera(Camera):
     """A phone's camera app, triggered from here."""
+
+    device_classes = ADB_CLASSES
 
     def __init__(
         self,
@@ -141,10 +145,10 @@ class AndroidCamera(Camera):
         self._offset, self._zone, self._offset_half = 0.0, "", 0.0
 
     @classmethod
-    def attached(cls, sysfs: str = "/sys") -> list[dict[str, Any]]:  # noqa: ARG003
+    def attached(cls, sysfs: str = "/sys") -> list[Found]:  # noqa: ARG003
         """Phones that the adb server lists, whatever their state."""
         return [
-            {"options": {"serial": line.split()[0], "width": 4032, "height": 3024}, "about": line}
+            Found({"serial": line.split()[0], "width": 4032, "height": 3024}, line)
             for line in _attached()
         ]
 
@@ -160,6 +164,9 @@ class AndroidCamera(Camera):
 
     def identity(self) -> Mapping[str, str]:
         return {"serial": self.phone.serial}
+
+    def frame_size(self) -> tuple[int, int]:
+        return self.width, self.height
 
     def capture(self) -> Frame:
         if "Awake" not in self.phone.shell(STATE):
@@ -278,6 +285,8 @@ class AndroidCamera(Camera):
 class AndroidThermometer(Thermometer):
     """Battery, thermal service and thermal zones of a phone, in one shell call each."""
 
+    device_classes = ADB_CLASSES
+
     def __init__(
         self,
         *,
@@ -310,9 +319,9 @@ class AndroidThermometer(Thermometer):
         self._scales = self._stated()
 
     @classmethod
-    def attached(cls, sysfs: str = "/sys") -> list[dict[str, Any]]:  # noqa: ARG003
+    def attached(cls, sysfs: str = "/sys") -> list[Found]:  # noqa: ARG003
         """Phones that the adb server lists."""
-        return [{"options": {"serial": line.split()[0]}, "about": line} for line in _attached()]
+        return [Found({"serial": line.split()[0]}, line) for line in _attached()]
 
     def open(self) -> None:
         self.phone.connect()

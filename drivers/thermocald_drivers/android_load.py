@@ -43,6 +43,9 @@ MARK = "thermocald_load"
 class AndroidLoadOutput(Output):
     """Busy loops on the phone while the programme wants heat."""
 
+    device_classes = ("char-usb_device",)
+    heats = True
+
     def __init__(
         self,
         *,

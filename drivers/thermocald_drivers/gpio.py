@@ -39,6 +39,9 @@ if TYPE_CHECKING:
 
 __all__ = ["LedOutput", "RelayOutput"]
 
+GPIO_CLASSES = ("char-gpiochip",)
+"""/dev/gpiochipN, which gpiozero opens through lgpio."""
+
 log = logging.getLogger(__name__)
 
 
@@ -60,6 +63,8 @@ def _pin(kind: str, pin: int, active_high: bool) -> Any:
 
 class LedOutput(Output):
     """Steady while epochs have results, blinking while they have none, dark while closed."""
+
+    device_classes = GPIO_CLASSES
 
     def __init__(
         self, *, clock: Clock, pin: int, active_high: bool = True, blink_s: float = 0.25
@@ -95,6 +100,9 @@ class LedOutput(Output):
 
 class RelayOutput(Output):
     """A heating lamp under a programme; see the module's docstring for when it is off."""
+
+    device_classes = GPIO_CLASSES
+    heats = True
 
     def __init__(
         self,

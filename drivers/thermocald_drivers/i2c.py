@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from thermocald.errors import BadReading, ConfigurationError, DeviceGone, WrongDevice
-from thermocald.hal import Thermometer
+from thermocald.hal import Found, Thermometer
 from thermocald_drivers import support
 
 if TYPE_CHECKING:
@@ -33,6 +33,7 @@ __all__ = ["I2cThermometer", "signed"]
 class I2cThermometer(Thermometer):
     """A thermometer at one address of one bus; a chip gives `_identify` and `_measure`."""
 
+    device_classes = ("char-i2c",)
     chip: ClassVar[str]
     addresses: ClassVar[range | tuple[int, ...]]
     range_c: ClassVar[tuple[float, float]]
@@ -66,15 +67,15 @@ class I2cThermometer(Thermometer):
         return f"{self.chip} at 0x{self.address:02x} on /dev/i2c-{self.bus}"
 
     @classmethod
-    def attached(cls, sysfs: str = "/sys") -> list[dict[str, Any]]:
+    def attached(cls, sysfs: str = "/sys") -> list[Found]:
         """Buses a chip could be on; scanning addresses could upset other chips."""
         buses = sorted(Path(sysfs).glob("class/i2c-dev/i2c-*"))
         return [
-            {
-                "options": {"bus": int(path.name.split("-")[1]), "address": cls.addresses[0]},
-                "about": f"/dev/{path.name}: if a {cls.chip} is wired to it",
-                "certain": False,
-            }
+            Found(
+                {"bus": int(path.name.split("-")[1]), "address": cls.addresses[0]},
+                f"/dev/{path.name}: if a {cls.chip} is wired to it",
+                certain=False,
+            )
             for path in buses
         ]
 

@@ -22,6 +22,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from thermocald.errors import DeviceGone, DeviceTimeout, TransientDeviceError
 from thermocald.hal import Output
 from thermocald_drivers import support
@@ -40,7 +42,7 @@ def encode(result: Mapping[str, Any]) -> bytes:
 
 
 def _plain(value: Any) -> Any:
-    if hasattr(value, "tolist"):
+    if isinstance(value, np.generic | np.ndarray):
         value = value.tolist()
     if isinstance(value, float):
         return value if math.isfinite(value) else None

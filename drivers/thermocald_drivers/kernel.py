@@ -19,10 +19,10 @@ from __future__ import annotations
 
 import errno
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from thermocald.errors import BadReading, ConfigurationError, DeviceGone, WrongDevice
-from thermocald.hal import Thermometer
+from thermocald.hal import Found, Thermometer
 from thermocald_drivers import support
 
 if TYPE_CHECKING:
@@ -80,12 +80,12 @@ class _KernelThermometer(Thermometer):
             yield folder, name, device.resolve().name if device.exists() else folder.name
 
     @classmethod
-    def attached(cls, sysfs: str = "/sys") -> list[dict[str, Any]]:
+    def attached(cls, sysfs: str = "/sys") -> list[Found]:
         """Configuration stanzas of what is there, for `thermocald devices`."""
         found = list(cls.devices(Path(sysfs)))
         names = [name for _, name, _ in found]
         return [
-            {"options": {"chip": name if names.count(name) == 1 else address}, "about": str(folder)}
+            Found({"chip": name if names.count(name) == 1 else address}, str(folder))
             for folder, name, address in found
             if cls._inputs(folder)
         ]
@@ -270,10 +270,10 @@ class ThermalZoneThermometer(_KernelThermometer):
         )
 
     @classmethod
-    def attached(cls, sysfs: str = "/sys") -> list[dict[str, Any]]:
+    def attached(cls, sysfs: str = "/sys") -> list[Found]:
         """Configuration stanzas of what is there, for `thermocald devices`."""
         return [
-            {"options": {"zone": name if name else folder.name}, "about": str(folder)}
+            Found({"zone": name if name else folder.name}, str(folder))
             for folder, name, _ in cls.devices(Path(sysfs))
         ]
 

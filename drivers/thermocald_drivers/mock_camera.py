@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.errors import ConfigurationError, DeviceGone
-from thermocald.hal import Camera, Frame
+from thermocald.hal import Camera, Frame, KnownScene
 from thermocald_drivers import support
 from thermocald_drivers.faults import Faults
 
@@ -106,6 +106,9 @@ class MockCamera(Camera):
                 )
             self._scene = Scene(self._model.sensor, field)
         return self._scene
+
+    def known_scene(self) -> KnownScene:
+        return KnownScene(self.model.sensor, self.field)
 
     @property
     def field(self) -> TestField:

@@ -28,10 +28,10 @@ import re
 import threading
 from concurrent.futures import Future
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from thermocald.errors import BadReading, ConfigurationError, DeviceError, DeviceGone, DeviceTimeout
-from thermocald.hal import Thermometer
+from thermocald.hal import Found, Thermometer
 from thermocald_drivers import support
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ class Ds18b20Thermometer(Thermometer):
         self._neighbours: dict[str, support.Neighbour] = {}
 
     @classmethod
-    def attached(cls, sysfs: str = "/sys") -> list[dict[str, Any]]:
+    def attached(cls, sysfs: str = "/sys") -> list[Found]:
         """Configuration stanzas of what is there, for `thermocald devices`."""
         ids = sorted(
             path.name
@@ -145,7 +145,7 @@ class Ds18b20Thermometer(Thermometer):
             return []
         channels = ["temperature"] if len(ids) == 1 else [f"probe{k + 1}" for k in range(len(ids))]
         about = ", ".join(f"{FAMILIES[i[:2]]} {i}" for i in ids)
-        return [{"options": {"sensors": dict(zip(channels, ids, strict=True))}, "about": about}]
+        return [Found({"sensors": dict(zip(channels, ids, strict=True))}, about)]
 
     def open(self) -> None:
         missing = [rom for rom in self.sensors.values() if not (self.root / rom).is_dir()]

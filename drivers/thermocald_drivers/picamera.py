@@ -41,7 +41,7 @@ from thermocald.errors import (
     DeviceTimeout,
     WrongDevice,
 )
-from thermocald.hal import Camera, Frame
+from thermocald.hal import Camera, Found, Frame
 from thermocald_drivers import support
 
 if TYPE_CHECKING:
@@ -76,6 +76,8 @@ def _jsonable(value: Any) -> Any:
 
 class Picamera2Camera(Camera):
     """One libcamera camera, configured for stills and kept running."""
+
+    device_classes = ("char-video4linux", "char-media", "char-dma_heap")
 
     def __init__(
         self,
@@ -114,14 +116,11 @@ class Picamera2Camera(Camera):
         return f"libcamera camera {self.number}"
 
     @classmethod
-    def attached(cls, sysfs: str = "/sys") -> list[dict[str, Any]]:  # noqa: ARG003
+    def attached(cls, sysfs: str = "/sys") -> list[Found]:  # noqa: ARG003
         """Cameras that libcamera lists."""
         library = support.library("picamera2")
         return [
-            {
-                "options": {"camera": k, "model": str(info.get("Model", ""))},
-                "about": str(info.get("Id", "")),
-            }
+            Found({"camera": k, "model": str(info.get("Model", ""))}, str(info.get("Id", "")))
             for k, info in enumerate(library.Picamera2.global_camera_info())
         ]
 
@@ -192,6 +191,9 @@ class Picamera2Camera(Camera):
 
     def identity(self) -> Mapping[str, str]:
         return {"camera": str(self.number), "model": str(self.model or "")}
+
+    def frame_size(self) -> tuple[int, int]:
+        return self.width, self.height
 
     def capture(self) -> Frame:
         camera = self._camera

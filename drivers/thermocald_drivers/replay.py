@@ -5,12 +5,12 @@
     thermometers:
       - {name: replayed, driver: replay, recording: ../recordings/M1}
 
-`loop: true` starts over at the end, with instants that go on. Otherwise the end is a
-RecordingEndedError, which no retry mends; what could not be taken then is a BadReading now.
+`loop: true` starts again at the end, with times that continue. Otherwise the end is a
+DeviceFinished. An epoch that has no frame, or no temperature, is a BadReading.
 
-Frames keep the instants at which they were taken: `utc` is the recorded one, `monotonic` the same
-on the clock's monotonic scale. A JPEG comes as it was recorded, in `encoded`. A recording of
-measurements gives frames without a picture, whose `metadata["observations"]` hold what
+Frames keep their recorded time: `utc` is as recorded, `monotonic` the same on the clock's monotonic
+scale. A JPEG is delivered as recorded, in `encoded`. A recording of measurements gives frames
+without an image, whose `metadata["observations"]` hold what
 `thermocald.photogrammetry.field.exchange` reads. `metadata["epoch"]` is the epoch's number.
 """
 
@@ -19,7 +19,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from thermocald.errors import BadReading, DeviceGone, DeviceNotFound, PermanentDeviceError
+from thermocald.errors import BadReading, DeviceFinished, DeviceGone, DeviceNotFound
 from thermocald.hal import Camera, Device, Frame, Reading, Thermometer
 from thermocald_drivers import support
 
@@ -30,11 +30,7 @@ if TYPE_CHECKING:
     from thermocald.hal import Clock
     from thermocald.store.recording.reader import Recording
 
-__all__ = ["RecordingEndedError", "ReplayCamera", "ReplayThermometer"]
-
-
-class RecordingEndedError(PermanentDeviceError):
-    """All epochs of the recording have been played."""
+__all__ = ["ReplayCamera", "ReplayThermometer"]
 
 
 class _Replay(Device):
@@ -82,7 +78,7 @@ class _Replay(Device):
             self._epochs = self._recording.iter_epochs()
             epoch = next(self._epochs)
         if epoch is None:
-            raise RecordingEndedError(f"{self._path}: the recording has ended")
+            raise DeviceFinished(f"{self._path}: the recording has ended")
         return epoch
 
     def _instants(self, recorded: float) -> tuple[float, float]:

@@ -43,7 +43,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from thermocald.errors import BadReading, ConfigurationError, DeviceGone, DeviceTimeout
-from thermocald.hal import Reading, Thermometer
+from thermocald.hal import Found, Reading, Thermometer
 from thermocald_drivers import support
 
 if TYPE_CHECKING:
@@ -128,6 +128,8 @@ UNITS: Mapping[str, Callable[[float], float]] = {
 class SerialThermometer(Thermometer):
     """A line protocol by a pattern, or an instrument by its name."""
 
+    device_classes = ("char-ttyUSB", "char-ttyACM", "char-ttyAMA", "char-ttyS")
+
     def __init__(
         self,
         *,
@@ -197,16 +199,16 @@ class SerialThermometer(Thermometer):
         return f"{self.name} on {self.port}"
 
     @classmethod
-    def attached(cls, sysfs: str = "/sys") -> list[dict[str, Any]]:  # noqa: ARG003
+    def attached(cls, sysfs: str = "/sys") -> list[Found]:  # noqa: ARG003
         """Serial ports with their lasting names; what is on them cannot be known."""
         ports = support.library("serial.tools.list_ports").comports(include_links=True)
         links = [p for p in ports if "/by-id/" in p.device]
         return [
-            {
-                "options": {"port": p.device, "instrument": "papouch-tm"},
-                "about": f"{p.description}; write the instrument that is on it",
-                "certain": False,
-            }
+            Found(
+                {"port": p.device, "instrument": "papouch-tm"},
+                f"{p.description}; write the instrument that is on it",
+                certain=False,
+            )
             for p in (links or [p for p in ports if p.hwid != "n/a"])
         ]
 
@@ -265,7 +267,7 @@ class SerialThermometer(Thermometer):
 
     def _lost(self, error: Exception) -> Exception:
         """Pyserial reports an unplug without an errno, or with EIO."""
-        if isinstance(error, OSError) and type(error).__name__ == "SerialTimeoutException":
+        if isinstance(error, support.library("serial").SerialTimeoutException):
             return DeviceTimeout(f"{self.where}: cannot send, the line is held")
         return DeviceGone(f"{self.where}: unplugged ({error})")
 

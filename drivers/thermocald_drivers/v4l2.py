@@ -39,7 +39,7 @@ from thermocald.errors import (
     TransientDeviceError,
     WrongDevice,
 )
-from thermocald.hal import Camera, Frame
+from thermocald.hal import Camera, Found, Frame
 from thermocald_drivers import pixel_formats, support
 from thermocald_drivers.v4l2_stream import (
     BUFFERS,
@@ -69,6 +69,8 @@ FUTURE_S = 1.0
 
 class V4l2Camera(Camera):
     """One capture device, streaming while it is open."""
+
+    device_classes = ("char-video4linux",)
 
     def __init__(
         self,
@@ -123,7 +125,7 @@ class V4l2Camera(Camera):
         return f"camera {self.device or self.serial}"
 
     @classmethod
-    def attached(cls, sysfs: str = "/sys", dev: str = "/dev") -> list[dict[str, Any]]:
+    def attached(cls, sysfs: str = "/sys", dev: str = "/dev") -> list[Found]:
         """Capture nodes by their lasting names (by-id, by-path), else /dev/videoN."""
         found = []
         for node in sorted(Path(sysfs).glob("class/video4linux/video*")):
@@ -143,7 +145,7 @@ class V4l2Camera(Camera):
             lasting = str(links[0] if links else path)
             options = {"device": lasting, "width": 1920, "height": 1080, "pixel_format": "MJPG"}
             about = f"{name} ({path}); sizes: v4l2-ctl -d {path} --list-formats-ext"
-            found.append({"options": options, "about": about})
+            found.append(Found(options, about))
         return found
 
     def open(self) -> None:
@@ -173,6 +175,9 @@ class V4l2Camera(Camera):
     def identity(self) -> Mapping[str, str]:
         card = self._stream.card if self._stream else ""
         return {"device": str(self.device or self.serial), "card": card}
+
+    def frame_size(self) -> tuple[int, int]:
+        return self.width, self.height
 
     def capture(self) -> Frame:
         if self._stream is None:

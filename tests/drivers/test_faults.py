@@ -122,7 +122,7 @@ def test_injected_while_it_runs(clock):
 @pytest.mark.parametrize(
     ("plan", "message"),
     [
-        ([{"kind": "explode"}], "is none of timeout, unplugged"),
+        ([{"kind": "explode"}], "is not one of timeout, unplugged"),
         ([{"kind": "timeout", "att": 3}], "a fault has no 'att'"),
         ([{"kind": "timeout", "at": 0}], "is not within 1"),
         ([{"kind": "timeout", "at": 1.5}], "not a whole number"),

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from thermocald_drivers.replay import RecordingEndedError
 
 from thermocald.epoch import Epoch
-from thermocald.errors import BadReading, ConfigurationError, DeviceNotFound, PermanentDeviceError
+from thermocald.errors import (
+    BadReading,
+    ConfigurationError,
+    DeviceFinished,
+    DeviceNotFound,
+    PermanentDeviceError,
+)
 from thermocald.hal import VirtualClock, open_device
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.exchange import observations_from_lists
@@ -84,9 +89,9 @@ def test_the_end_is_permanent(write):
     path = write((epoch(1), IMAGE))
     with open_device("camera", "replay", {"recording": path}, VirtualClock()) as camera:
         camera.capture()
-        with pytest.raises(RecordingEndedError, match="has ended"):
+        with pytest.raises(DeviceFinished, match="has ended"):
             camera.capture()
-    assert issubclass(RecordingEndedError, PermanentDeviceError)
+    assert issubclass(DeviceFinished, PermanentDeviceError)
 
 
 def test_loop_goes_on_in_time(write):

@@ -11,7 +11,12 @@ import logging
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
-from thermocald.errors import DeviceNotFound, PermanentDeviceError, TransientDeviceError
+from thermocald.errors import (
+    DeviceFinished,
+    DeviceNotFound,
+    PermanentDeviceError,
+    TransientDeviceError,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -121,6 +126,14 @@ class Link:
             log.exception("%s %s: does not say what it is", self.kind, self.name)
             return {}
 
+    def warnings(self) -> list[str]:
+        """Settings of the device that harm the results, in one sentence each."""
+        try:
+            return list(self.device.warnings())
+        except Exception:
+            log.exception("%s %s: its warnings cannot be read", self.kind, self.name)
+            return []
+
     def _back(self) -> None:
         if self.state == "out":
             away_s = self._clock.monotonic() - self.out_since
@@ -154,7 +167,7 @@ class Link:
         self.error = error
         self.why = str(error)
         # a recording that has been played to its end is no failure
-        finished = type(error).__name__ == "RecordingEndedError"
+        finished = isinstance(error, DeviceFinished)
         self.state = "finished" if finished else "failed"
         level = logging.INFO if finished else logging.ERROR
         kind = f"device_{self.state}"

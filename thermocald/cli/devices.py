@@ -1,7 +1,7 @@
 """`thermocald devices`: what is attached, as configuration; and the probe of `thermocald check`.
 
-A driver class may have a class method `attached() -> list[{options, about, certain?}]`. An entry
-that is not certain (a serial port, an I2C bus: nobody knows what is on it) is shown as a comment.
+A device that is not certain (a serial port, an I2C bus: nobody knows what is on it) is shown as a
+comment.
 """
 
 from __future__ import annotations
@@ -57,12 +57,10 @@ def attached() -> tuple[list[Attached], list[str]]:
     for kind in KINDS:
         for name in driver_names(kind):
             try:
-                look = getattr(load_driver(kind, name), "attached", None)
-                for entry in look() if look is not None else ():
-                    certain = bool(entry.get("certain", True))
-                    found.append(
-                        Attached(kind, name, entry["options"], str(entry["about"]), certain)
-                    )
+                found += [
+                    Attached(kind, name, one.options, one.about, one.certain)
+                    for one in load_driver(kind, name).attached()
+                ]
             except DeviceError as error:
                 notes.append(f"{kind} driver {name}: {error}")
     return found, notes

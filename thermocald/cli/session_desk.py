@@ -73,9 +73,9 @@ def _prepare(config: Config, session: Session, done: int) -> Config:
 
 
 def _use_programme(outputs: list[dict[str, Any]], steps: list[dict[str, Any]]) -> None:
-    from thermocald.hal import option_names
+    from thermocald.hal import load_driver
 
-    takers = [o for o in outputs if "programme" in option_names("output", o["driver"])]
+    takers = [o for o in outputs if load_driver("output", o["driver"]).heats]
     if not takers:
         raise ConfigurationError("--programme: no output of the configuration heats")
     for taker in takers:

@@ -191,6 +191,9 @@ def _warnings(document: dict[str, Any]) -> list[str]:
         found.append(document["frames"]["paused"])
     if not document["clock"]["trusted"]:
         found.append("the clock is not synchronised: times may be wrong")
+    for kind in ("camera", "thermometer", "output"):
+        for name, device in document[f"{kind}s"].items():
+            found += [f"{kind} {name}: {text}" for text in device.get("warnings", ())]
     for name, camera in document["cameras"].items():
         if camera["why"]:
             found.append(f"camera {name}: {camera['why']}")

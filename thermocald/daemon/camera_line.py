@@ -269,5 +269,6 @@ def link_status(link: Link, busy_s: float, hang_after_s: float) -> dict[str, Any
     return {
         "device": "hung" if busy_s > hang_after_s else link.state,
         "why": link.why,
+        "warnings": link.warnings(),
         "faults": link.faults,
     }

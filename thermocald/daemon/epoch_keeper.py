@@ -107,14 +107,15 @@ class EpochKeeper:
         eventful = calibrated is not None and (
             not calibrated.adjustment.ok or "event" in calibrated.extra
         )
-        result, extra = None, {}
+        result = None
+        extra = {f"camera_{name}": value for name, value in acquired.frame.settings.items()}
         path = None
         if self._frames.wanted(epoch.number, eventful) or put_off:
             path = self._frames.keep(self.plan.name, self.plan.series, epoch.number, acquired.frame)
             self.kept_frames += path is not None
         if calibrated is not None:
             result = EpochResult.from_adjustment(calibrated.adjustment)
-            extra = calibrated.extra
+            extra |= calibrated.extra
         elif put_off and path is None:
             result = EpochResult("frame_not_kept", "calibration was put off and the frame not kept")
         epoch = replace(epoch, frame=path)

@@ -63,7 +63,7 @@ def plan_cameras(config: Config, clock: Clock) -> list[CameraPlan]:
 
 
 def _plan(config: Config, one: CameraConfig, clock: Clock) -> CameraPlan:
-    camera = open_device("camera", one.driver, one.options, clock)
+    camera: Camera = open_device("camera", one.driver, one.options, clock)
     calibration = config.calibration_of(one)
     sensor, field = _sensor(one), None
     if one.testfield is not None:
@@ -73,9 +73,9 @@ def _plan(config: Config, one: CameraConfig, clock: Clock) -> CameraPlan:
                 f"camera {one.name!r}: a test field needs `sensor: {{width_px: …, height_px: …, "
                 "pixel_pitch_mm: …}}` too"
             )
-    elif hasattr(camera, "field") and hasattr(camera, "model"):
-        # a rendered camera knows what it looks at
-        field, sensor = camera.field, sensor or camera.model.sensor
+    elif (scene := camera.known_scene()) is not None:
+        field, sensor = scene.testfield, sensor or scene.sensor
+    _check_size(one, camera, sensor)
     calibrator = None
     if field is not None and sensor is not None:
         calibrator = Calibrator(
@@ -87,6 +87,16 @@ def _plan(config: Config, one: CameraConfig, clock: Clock) -> CameraPlan:
             sigma_floor_px=calibration.sigma_floor_px,
         )
     return CameraPlan(one, calibration, camera, sensor, field, calibrator, one.series or "")
+
+
+def _check_size(one: CameraConfig, camera: Camera, sensor: Sensor | None) -> None:
+    """Raise ConfigurationError if the sensor's size is not that of the driver's frames."""
+    size = camera.frame_size()
+    if sensor is not None and size is not None and size != (sensor.width, sensor.height):
+        raise ConfigurationError(
+            f"camera {one.name!r}: sensor says {sensor.width}×{sensor.height} px and the driver's "
+            f"frames have {size[0]}×{size[1]} px (its width and height); both must be the same"
+        )
 
 
 def _sensor(one: CameraConfig) -> Sensor | None:

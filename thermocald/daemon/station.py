@@ -22,7 +22,7 @@ from thermocald.daemon.camera_line import CameraLine, link_status
 from thermocald.daemon.output_loop import OutputLoop
 from thermocald.daemon.plan import plan_cameras
 from thermocald.errors import ConfigurationError
-from thermocald.hal import open_device, option_names
+from thermocald.hal import load_driver, open_device
 from thermocald.store.database.row import Event, LoggedReading
 
 if TYPE_CHECKING:
@@ -192,7 +192,7 @@ class Station:
         found = {
             i: self._output(one, {**one.options, "programme": list(programme)})
             for i, one in enumerate(self.config.outputs)
-            if "programme" in option_names("output", one.driver)
+            if load_driver("output", one.driver).heats
         }
         if not found:
             raise ConfigurationError("programme: no output of the configuration heats")

@@ -189,7 +189,7 @@ class Store:
         observations: Observations | None = None,
         extra: Mapping[str, float] | None = None,
     ) -> None:
-        """Keep a later calibration of an epoch; `observations`, `extra` None: as they were."""
+        """Keep a later calibration of an epoch; observations None: as before; extra: added."""
         with self._transaction(f"the calibration of epoch {number} was not kept"):
             then = next(select_epochs(self._db, series.id, number, number, details=False), None)
             if then is None:
@@ -197,7 +197,7 @@ class Store:
             stored = StoredEpoch(
                 replace(then.epoch, observations=observations),
                 result,
-                then.extra if extra is None else extra,
+                {**then.extra, **(extra or {})},
                 then.clock_trusted,
                 then.revision + 1,
             )

@@ -1,0 +1,70 @@
+"""What a camera's frames report of focus and exposure reaches the store and the status."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from thermocald.acquisition.link import Link
+from thermocald.acquisition.live_pipeline import AcquiredEpoch
+from thermocald.cli.status import _warnings
+from thermocald.config import parse_config
+from thermocald.daemon.camera_line import link_status
+from thermocald.daemon.epoch_keeper import EpochKeeper
+from thermocald.daemon.plan import plan_cameras
+from thermocald.epoch import Epoch
+from thermocald.errors import ConfigurationError
+from thermocald.hal import Camera, Frame, VirtualClock
+from thermocald.store.database.row import EpochResult
+from thermocald.store.database.store import Store
+
+CAMERA = {"name": "river", "driver": "v4l2", "device": "/dev/video0", "width": 64, "height": 48}
+
+
+def plan_of(**changes):
+    document = {"cameras": [{**CAMERA, "series": "M1", **changes}]}
+    (plan,) = plan_cameras(parse_config(document, Path("/etc/config.yaml")), VirtualClock())
+    return plan
+
+
+def test_every_epoch_keeps_its_settings_also_when_it_is_calibrated_later(tmp_path):
+    with Store.open(tmp_path / "k.db", "append") as store:
+        guard = SimpleNamespace(store=store, event=lambda event: None, thin=False, away=False)
+        guard.append = lambda row: store.append(row.series, row.epoch, row.result, extra=row.extra)
+        frames = SimpleNamespace(wanted=lambda number, eventful: False)
+        keeper = EpochKeeper(plan_of(), guard, frames, lambda acquired, row: None)
+        frame = Frame(np.zeros((48, 64), np.uint8), 1.0, 1e9, settings={"focus": 30.0, "gain": 4.0})
+        for number in (1, 2):
+            epoch = Epoch(number, 1e9 + number, 1e9 + number, {"air": 20.0})
+            keeper.keep(AcquiredEpoch(number, replace(frame, utc=1e9 + number), True, epoch))
+        store.amend(keeper.series, 1, EpochResult("ok"), extra={"blur": 0.7})
+        columns = store.series_columns(keeper.series, ["camera_focus", "camera_gain", "blur"])
+    assert columns["camera_focus"].tolist() == [30.0, 30.0]
+    assert columns["camera_gain"].tolist() == [4.0, 4.0]
+    assert columns["blur"][0] == 0.7
+
+
+def test_a_setting_that_harms_is_in_the_status():
+    class Focusing(Camera):
+        def warnings(self):
+            return ["focus: auto lets the camera focus by itself"]
+
+    link = Link("camera", "river", Focusing(), VirtualClock())
+    status = link_status(link, 0.0, 60.0)
+    document = {
+        "stalled": [], "store": {"state": "ok"}, "frames": {"paused": ""},
+        "clock": {"trusted": True}, "thermometers": {}, "outputs": {},
+        "cameras": {"river": {**status, "put_off": 0, "caught_up": 0}},
+    }  # fmt: skip
+    assert _warnings(document) == ["camera river: focus: auto lets the camera focus by itself"]
+
+
+def test_a_sensor_of_another_size_than_the_driver_is_refused():
+    sensor = {"width_px": 64, "height_px": 48, "pixel_pitch_mm": 0.003}
+    assert plan_of(sensor=sensor).sensor.width == 64
+    with pytest.raises(ConfigurationError, match=r"sensor says 1920×1080 px .* have 64×48 px"):
+        plan_of(sensor={**sensor, "width_px": 1920, "height_px": 1080})

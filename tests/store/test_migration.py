@@ -3,31 +3,36 @@
 from __future__ import annotations
 
 import sqlite3
+import zlib
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from thermocald.errors import StoreError
-from thermocald.store.database import columns, schema
+from thermocald.store.database import columns, connection, migrations
 from thermocald.store.database.store import Store
+
+KEPT = ("testfield", "series", "epoch", "detail", "event")
 
 
 @pytest.fixture
-def version_1(store_path, field, head, make_epoch, make_result, monkeypatch):
-    """A file as version 1 wrote it: no column chunks, no codes of the statuses, no readings."""
+def version_1(store_path, tmp_path, field, head, make_epoch, make_result, monkeypatch):
+    """A file as version 1 wrote it: no column chunks, no readings, no checksums."""
     monkeypatch.setattr(columns, "CHUNK", 8)
-    with Store.open(store_path, "append", durable=False) as store:
+    new = tmp_path / "new.db"
+    with Store.open(new, "append", durable=False) as store:
         series = store.create_series(head, field)
         for i in range(1, 21):
             status = "ok" if i % 3 else "weak"
             store.append(series, make_epoch(i), replace(make_result(i), status=status))
-    with sqlite3.connect(store_path) as database:
-        database.execute("DROP TABLE column_chunk")
-        database.execute("DROP TABLE status_code")
-        database.execute("DROP TABLE late_epoch")
-        database.execute("DROP TABLE reading")
-        database.execute("PRAGMA user_version = 1")
+    database = sqlite3.connect(store_path, isolation_level=None)
+    migrations.migrate(database, 0, 1)
+    database.execute("ATTACH ? AS new", (str(new),))
+    for table in KEPT:
+        names = [row[1] for row in database.execute(f"PRAGMA main.table_info({table})")]
+        listed = ", ".join(names)
+        database.execute(f"INSERT INTO main.{table} ({listed}) SELECT {listed} FROM new.{table}")
     database.close()
     return store_path
 
@@ -39,19 +44,11 @@ def version(path) -> int:
     return number
 
 
-def test_version_1_is_what_its_step_made(version_1, tmp_path):
-    """The fixture's file has the tables that step 1 makes, and no others."""
-
-    def tables(database) -> list:
-        query = "SELECT type, name, sql FROM sqlite_master WHERE sql NOT NULL ORDER BY name"
-        return database.execute(query).fetchall()
-
-    database = sqlite3.connect(tmp_path / "one.db", isolation_level=None)
-    schema.migrate(database, 0, 1)
-    old = sqlite3.connect(version_1)
-    assert tables(old) == tables(database)
-    database.close()
-    old.close()
+def test_the_steps_are_text_and_make_what_they_made_when_they_were_released():
+    """Frozen: a released step never changes, since stores in the field were made by it."""
+    text = "\n".join(" ".join(line.split()) for step in migrations.STEPS for line in step)
+    assert all(isinstance(line, str) for step in migrations.STEPS for line in step)
+    assert (len(migrations.STEPS), zlib.crc32(text.encode())) == (4, 3778381292)
 
 
 @pytest.mark.parametrize("mode", ["read", "append"])
@@ -68,17 +65,14 @@ def test_version_1_is_brought_up_to_date(version_1, make_epoch, make_result, mod
         assert found["status"].tolist() == ["ok" if i % 3 else "weak" for i in range(1, 21)]
         (stored,) = store.epochs(series, 9, 9)
         assert np.array_equal(stored.epoch.observations.points, make_epoch(9).observations.points)
-    assert version(version_1) == schema.VERSION
+    assert version(version_1) == migrations.VERSION
 
 
 def test_a_migration_that_fails_changes_nothing(version_1, monkeypatch):
-    def fails(connection):
-        connection.execute("CREATE TABLE half_done (id)")
-        raise sqlite3.OperationalError("something is wrong")
-
     before = version_1.read_bytes()
-    monkeypatch.setattr(schema, "STEPS", (schema.STEPS[0], fails))
-    with pytest.raises(StoreError, match="something is wrong"):
+    fails = ("CREATE TABLE half_done (id)", "INSERT INTO nowhere VALUES (1)")
+    monkeypatch.setattr(migrations, "STEPS", (migrations.STEPS[0], fails))
+    with pytest.raises(StoreError, match="nowhere"):
         Store.open(version_1, "append")
     assert version(version_1) == 1
     database = sqlite3.connect(version_1)
@@ -94,3 +88,26 @@ def test_an_up_to_date_store_is_not_touched(version_1):
     with Store.open(version_1):
         pass
     assert version_1.read_bytes() == before
+
+
+@pytest.mark.parametrize("mode", ["read", "append"])
+def test_before_it_is_changed_an_older_store_is_copied(version_1, mode):
+    before = version_1.read_bytes()
+    with Store.open(version_1, mode):
+        pass
+    copy = version_1.with_name("small.db.version-1")
+    assert version(copy) == 1
+    assert version(version_1) == migrations.VERSION
+    rows = [list(sqlite3.connect(p).iterdump()) for p in (copy,)]
+    version_1.write_bytes(before)
+    assert rows == [list(sqlite3.connect(version_1).iterdump())]
+
+
+def test_without_room_for_the_copy_nothing_is_changed(version_1, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(connection, "copy_database", full)
+    with pytest.raises(StoreError, match="nothing was changed"):
+        Store.open(version_1, "append")
+    assert version(version_1) == 1

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import csv
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermocald.errors import DataError
+from thermocald.store.recording.paths import FileFolder
 from thermocald.store.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from numpy.typing import NDArray
 
     from thermocald.epoch import Epoch
@@ -62,9 +62,10 @@ def archive_series(
         ]
         head = replace(head, extra={**head.extra, "clock_set_back": steps})
     by_number = dict(zip(columns["epoch"].tolist(), corrections.tolist(), strict=True))
+    kept = FileFolder(frames or Path())
     with RecordingWriter(path, head, series.testfield) as writer:
         for stored in store.epochs(series):
-            epoch = _with_frame(stored.epoch, frames)
+            epoch = _with_frame(stored.epoch, kept)
             shift = by_number[epoch.number]
             if shift:
                 epoch = replace(
@@ -101,8 +102,7 @@ def archive_readings(store: Store, folder: Path) -> dict[str, Path]:
     return written
 
 
-def _with_frame(epoch: Epoch, frames: Path | None) -> Epoch:
+def _with_frame(epoch: Epoch, frames: FileFolder) -> Epoch:
     if epoch.frame is None:
         return epoch
-    path = epoch.frame if frames is None else frames / epoch.frame
-    return replace(epoch, frame=path if path.is_file() else None)
+    return replace(epoch, frame=frames.find(epoch.frame))

@@ -18,6 +18,8 @@ __all__ = ["KEPT", "rows_after"]
 KEPT = ("epoch", "event", "reading")
 """The tables that grow while a daemon runs."""
 
+_CHECKSUMS = ("checksum", "detail_checksum")
+
 
 def rows_after(
     connection: sqlite3.Connection, table: str, after: int, limit: int
@@ -34,6 +36,8 @@ def rows_after(
     names = [column[0] for column in cursor.description]
     for values in cursor:
         row = dict(zip(names, values, strict=True))
+        for name in _CHECKSUMS:  # of this file's rows, as SQLite gives them back
+            row.pop(name, None)
         if table == "epoch":
             covariance, observations = select_details(connection, row["id"])
             row |= {"covariance": covariance or None, "observations": observations or None}

@@ -10,16 +10,18 @@ derived and can be rebuilt.
 
 from __future__ import annotations
 
+import logging
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermocald.errors import StoreError
-from thermocald.store.database.epoch_columns import FIELDS, late_columns, latest_columns
+from thermocald.store.database.checksum import row_checksum
+from thermocald.store.database.epoch_columns import CHUNKED, late_columns, latest_columns
 
 if TYPE_CHECKING:
     import sqlite3
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -28,12 +30,16 @@ if TYPE_CHECKING:
 __all__ = [
     "CHUNK",
     "MERGED",
+    "build_all_chunks",
     "build_missing_chunks",
+    "checked_chunks",
     "loose_rows",
     "note_amended",
     "read_columns",
     "rebuild_chunks",
 ]
+
+log = logging.getLogger(__name__)
 
 CHUNK = 1024
 MERGED = 16
@@ -44,9 +50,22 @@ def read_columns(
 ) -> dict[str, Array]:
     """Columns by their source names (see `epoch_columns`), (E,) each, NaN where there is none.
 
-    They share one piece of memory, which lives as long as any of them. Raises StoreError if a chunk
-    does not fit the others.
+    They share one piece of memory, which lives as long as any of them. Where a chunk is damaged the
+    rows are read instead; raises StoreError where these are damaged too.
     """
+    try:
+        return _read_columns(connection, series, names)
+    except _ChunkError as error:
+        log.warning("%s; its epochs are read one by one instead", error)
+    fields = [name.split(".")[0] for name in names]
+    columns = latest_columns(connection, series, fields, -1)
+    absent = np.full(columns["number"].size, np.nan)
+    return {name: columns.get(name, absent) for name in names}
+
+
+def _read_columns(
+    connection: sqlite3.Connection, series: int, names: Sequence[str]
+) -> dict[str, Array]:
     fields = [name.split(".")[0] for name in names]
     chunks = _Chunks(connection, series)
     tail = latest_columns(connection, series, fields, chunks.last_number)
@@ -63,6 +82,17 @@ def read_columns(
         column[chunks.rows :] = tail.get(name, np.nan)
         column[rows] = late.get(name, np.nan)
     return dict(zip(names, columns, strict=True))
+
+
+def checked_chunks(connection: sqlite3.Connection) -> Iterator[str]:
+    """A sentence for every chunk that is damaged."""
+    for row in connection.execute(
+        "SELECT checksum, series_id, name, first_row, last_number, data FROM column_chunk"
+    ):
+        try:
+            _require(*row)
+        except (_ChunkError, TypeError, ValueError):
+            yield f"a chunk of column {row[2]} (its epochs are read one by one instead)"
 
 
 def loose_rows(connection: sqlite3.Connection, series: int) -> int:
@@ -91,11 +121,24 @@ def build_missing_chunks(connection: sqlite3.Connection, series: int) -> None:
         "ORDER BY number LIMIT 1 OFFSET ?",
         (series, last, CHUNK - 1),
     ).fetchone():
-        columns = latest_columns(connection, series, FIELDS, last, end[0])
+        columns = latest_columns(connection, series, CHUNKED, last, end[0])
         last = end[0]
         _insert(connection, series, first_row, last, columns)
         first_row += CHUNK
         _merge(connection, series)
+
+
+def build_all_chunks(connection: sqlite3.Connection) -> None:
+    """Write all chunks that the rows allow, after a migration; damage leaves a series without."""
+    for (series,) in connection.execute("SELECT id FROM series").fetchall():
+        connection.execute("BEGIN IMMEDIATE")
+        try:
+            build_missing_chunks(connection, series)
+        except StoreError as error:
+            connection.execute("ROLLBACK")
+            log.warning("%s", error)
+        else:
+            connection.execute("COMMIT")
 
 
 def rebuild_chunks(connection: sqlite3.Connection, series: int) -> None:
@@ -115,10 +158,12 @@ def _merge(connection: sqlite3.Connection, series: int) -> None:
         "SELECT max(last_number) FROM column_chunk WHERE series_id = ? AND first_row >= ?", where
     ).fetchone()
     columns: dict[str, Array] = {}
-    for name, first, data in connection.execute(
-        "SELECT name, first_row, data FROM column_chunk WHERE series_id = ? AND first_row >= ?",
+    for name, first, end, data, kept in connection.execute(
+        "SELECT name, first_row, last_number, data, checksum FROM column_chunk "
+        "WHERE series_id = ? AND first_row >= ?",
         where,
     ):
+        _require(kept, series, name, first, end, data)
         column = columns.setdefault(name, np.full(MERGED * CHUNK, np.nan))
         column[first - first_rows[0] :][:CHUNK] = np.frombuffer(data)
     connection.execute("DELETE FROM column_chunk WHERE series_id = ? AND first_row >= ?", where)
@@ -133,10 +178,28 @@ def _insert(
     columns: dict[str, Array],
 ) -> None:
     connection.executemany(
-        "INSERT INTO column_chunk (series_id, name, first_row, last_number, data) "
-        "VALUES (?, ?, ?, ?, ?)",
-        [(series, name, first_row, last, v.tobytes()) for name, v in columns.items()],
+        "INSERT INTO column_chunk (series_id, name, first_row, last_number, data, checksum) "
+        "VALUES (?, ?, ?, ?, ?, ?)",
+        [
+            (series, name, first_row, last, data, _checksum(series, name, first_row, last, data))
+            for name, data in ((name, values.tobytes()) for name, values in columns.items())
+        ],
     )
+
+
+def _checksum(series: int, name: str, first_row: int, last: int, data: bytes) -> int:
+    return row_checksum((series, first_row, last), (name,), data)
+
+
+def _require(
+    kept: int | None, series: int, name: str, first_row: int, last: int, data: bytes
+) -> None:
+    if kept is not None and kept != _checksum(series, name, first_row, last, data):
+        raise _ChunkError(f"a chunk of column {name} is damaged")
+
+
+class _ChunkError(StoreError):
+    """A chunk is damaged: what it holds is in the rows too."""
 
 
 class _Chunks:
@@ -157,7 +220,7 @@ class _Chunks:
         self.rows = 0
         for first, size in self._sizes.items():
             if first != self.rows or size % 8:
-                raise StoreError(f"the column chunks of series {series} are broken; rebuild them")
+                raise _ChunkError(f"the column chunks of series {series} are broken")
             self.rows += size // 8
         self.last_number = int(found[-1][2]) if found else -1
 
@@ -171,13 +234,14 @@ class _Chunks:
         """Copy a column's chunks into (rows,); NaN where it did not exist yet, or any more."""
         target = column.data.cast("B")  # copies faster than NumPy assigns
         done = 0
-        for first, data in self._connection.execute(
-            "SELECT first_row, data FROM column_chunk WHERE series_id = ? AND name = ? "
-            "ORDER BY first_row",
+        for first, last, data, kept in self._connection.execute(
+            "SELECT first_row, last_number, data, checksum FROM column_chunk "
+            "WHERE series_id = ? AND name = ? ORDER BY first_row",
             (self._series, name),
         ):
             if self._sizes.get(first) != len(data):
-                raise StoreError(f"a chunk of column {name} is broken; rebuild the columns")
+                raise _ChunkError(f"a chunk of column {name} is broken")
+            _require(kept, self._series, name, first, last, data)
             column[done:first] = np.nan
             target[8 * first : 8 * first + len(data)] = data
             done = first + len(data) // 8

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import logging
+import os
 import sqlite3
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Literal
 
 from thermocald.errors import StoreError, StoreFullError, StoreVersionError, ThermocaldError
-from thermocald.store.database.schema import APPLICATION_ID, PAGE_SIZE, VERSION, migrate
+from thermocald.store.database.checksum import DamageError
+from thermocald.store.database.columns import build_all_chunks
+from thermocald.store.database.copies import copy_database, open_copy
+from thermocald.store.database.migrations import APPLICATION_ID, PAGE_SIZE, VERSION, migrate
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
 __all__ = ["Mode", "connect", "in_words"]
+
+log = logging.getLogger(__name__)
 
 Mode = Literal["read", "append"]
 
@@ -33,6 +40,10 @@ def in_words(path: Path, doing: str, *, reading: bool = False) -> Iterator[None]
     """
     try:
         yield
+    except DamageError as error:
+        if str(error).startswith(str(path)):
+            raise
+        raise DamageError(f"{path}: {error}") from error
     except ThermocaldError:
         raise
     except sqlite3.Error as cause:
@@ -82,7 +93,7 @@ def connect(path: Path, mode: Mode, *, durable: bool) -> sqlite3.Connection:
             if version == 0 and mode == "read":
                 raise StoreError(f"{path}: is empty, nothing was stored yet")
             if version < VERSION:
-                _bring_up_to_date(connection, path, version, mode)
+                connection = _bring_up_to_date(connection, path, version, mode)
             if mode == "append":
                 # with FULL, what is committed survives a power cut; with NORMAL, a killed process
                 connection.execute(f"PRAGMA synchronous = {'FULL' if durable else 'NORMAL'}")
@@ -106,10 +117,10 @@ def _open(path: Path, mode: Mode) -> sqlite3.Connection:
         connection.execute("SELECT 1 FROM sqlite_master").fetchone()
     except sqlite3.OperationalError as cause:
         connection.close()
-        # On a read-only medium WAL's helper files cannot be made; nobody can write there either.
+        # where its folder cannot be written, WAL's helper files cannot be made
         if not _name(cause).startswith(("SQLITE_CANTOPEN", "SQLITE_READONLY")):
             raise
-        return _connect(path, "ro&immutable=1")
+        return open_copy(path)
     except BaseException:
         connection.close()
         raise
@@ -117,13 +128,20 @@ def _open(path: Path, mode: Mode) -> sqlite3.Connection:
 
 
 def _connect(path: Path, mode: str) -> sqlite3.Connection:
-    return sqlite3.connect(
+    connection = sqlite3.connect(
         f"{path.absolute().as_uri()}?mode={mode}",
         uri=True,
         timeout=_BUSY_S,
         isolation_level=None,  # transactions are begun and ended by hand
         check_same_thread=False,
     )
+    # a damaged text must show as a wrong checksum of its row, not as an error of the whole query
+    connection.text_factory = _text
+    return connection
+
+
+def _text(data: bytes) -> str:
+    return data.decode(errors="surrogateescape")
 
 
 def _version(connection: sqlite3.Connection, path: Path) -> int:
@@ -140,15 +158,47 @@ def _version(connection: sqlite3.Connection, path: Path) -> int:
     return int(version)
 
 
-def _bring_up_to_date(connection: sqlite3.Connection, path: Path, version: int, mode: Mode) -> None:
+def _bring_up_to_date(
+    connection: sqlite3.Connection, path: Path, version: int, mode: Mode
+) -> sqlite3.Connection:
+    """Migrate; returns the connection to use, another one where the file cannot be written."""
     if mode == "read":
+        if not os.access(path, os.W_OK) or not os.access(path.absolute().parent, os.W_OK):
+            connection.close()
+            return open_copy(path, _migrate)
         writing = _connect(path, "rw")
         try:
-            migrate(writing, version)
+            _backup_version(writing, path, version)
+            _migrate(writing)
         finally:
             writing.close()
-        return
+        return connection
     if version == 0:
         connection.execute(f"PRAGMA page_size = {PAGE_SIZE}")
+    else:
+        _backup_version(connection, path, version)
     connection.execute("PRAGMA journal_mode = WAL")
+    _migrate(connection)
+    return connection
+
+
+def _migrate(connection: sqlite3.Connection) -> None:
+    (version,) = connection.execute("PRAGMA user_version").fetchone()
     migrate(connection, version)
+    if version:
+        build_all_chunks(connection)
+
+
+def _backup_version(connection: sqlite3.Connection, path: Path, version: int) -> None:
+    """Copy an older file before it is changed: `<name>.version-<version>`, made once."""
+    copy = path.with_name(f"{path.name}.version-{version}")
+    if copy.exists():
+        return
+    try:
+        copy_database(connection, copy)
+    except (OSError, sqlite3.Error) as error:
+        raise StoreError(
+            f"{path}: is of version {version}; a backup of it must be made before it is brought "
+            f"up to date, and {copy} cannot be written ({error}); nothing was changed"
+        ) from error
+    log.warning("%s: brought from version %d to %d; backup: %s", path, version, VERSION, copy)

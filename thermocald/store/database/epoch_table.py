@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,8 +18,10 @@ from thermocald.store.database.blob import (
     unpack_covariance,
     unpack_observations,
 )
+from thermocald.store.database.checksum import require_checksum, row_checksum
+from thermocald.store.database.epoch_columns import insert_row, rows_of
 from thermocald.store.database.row import EpochResult
-from thermocald.store.database.schema import sql_name
+from thermocald.store.recording.paths import relative_path
 
 if TYPE_CHECKING:
     import sqlite3
@@ -32,39 +33,17 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["StoredEpoch", "insert_epoch", "select_covariance", "select_details", "select_epochs"]
+__all__ = [
+    "StoredEpoch",
+    "check_details",
+    "insert_epoch",
+    "select_covariance",
+    "select_details",
+    "select_epochs",
+]
 
 _PARTS = 1024  # detail.id = epoch.id * _PARTS + part; part 0 is the covariance
 _PART_BYTES = 1100  # seven to a page
-
-_FIELDS = (
-    "number",
-    "revision",
-    "frame_time",
-    "temperature_time",
-    "clock_trusted",
-    "status",
-    "sigma0",
-    "redundancy",
-    "n_observations",
-    "measured",
-    "temperatures",
-    "extra",
-    "rejected",
-    "frame",
-    "note",
-    "reason",
-    *PARAMETER_NAMES,
-)
-_WRITTEN = (*_FIELDS, *(f"sd_{name}" for name in PARAMETER_NAMES), "n_rejected", "series_id")
-_INSERT = (
-    f"INSERT INTO epoch ({', '.join(map(sql_name, _WRITTEN))}) "
-    f"VALUES ({', '.join('?' * len(_WRITTEN))})"
-)
-_SELECT = (
-    f"SELECT id, {', '.join(map(sql_name, _FIELDS))} FROM epoch WHERE series_id = ? "
-    "AND number >= ? AND number <= ifnull(?, number) ORDER BY number, revision"
-)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,44 +64,53 @@ def insert_epoch(connection: sqlite3.Connection, series: int, stored: StoredEpoc
     """Insert one epoch with its details and return its id; within the caller's transaction."""
     epoch, result, seen = stored.epoch, stored.result, stored.epoch.observations
     connection.execute("INSERT OR IGNORE INTO status_code (status) VALUES (?)", (result.status,))
-    cursor = connection.execute(
-        _INSERT,
-        (
-            epoch.number,
-            stored.revision,
-            epoch.frame_time,
-            epoch.temperature_time,
-            stored.clock_trusted,
-            result.status,
-            result.sigma0,
-            result.redundancy,
-            result.n_observations,
-            None if seen is None else len(seen),
-            _numbers_json(epoch.temperatures),
-            _numbers_json(stored.extra),
-            json.dumps(result.rejected),
-            "" if epoch.frame is None else str(epoch.frame),
-            epoch.note,
-            result.reason,
-            *result.values.tolist(),
-            *result.sd.tolist(),
-            len(result.rejected),
-            series,
-        ),
-    )
-    assert cursor.lastrowid is not None
-    first = cursor.lastrowid * _PARTS
+    # not left to SQLite: the id is covered by the checksum, since the details depend on it
+    (id_,) = connection.execute("SELECT ifnull(max(id), 0) + 1 FROM epoch").fetchone()
+    parts = _parts(epoch.number, id_, result.covariance, seen)
+    row: dict[str, Any] = {
+        "id": id_,
+        "series_id": series,
+        "number": epoch.number,
+        "revision": stored.revision,
+        "frame_time": epoch.frame_time,
+        "temperature_time": epoch.temperature_time,
+        "clock_trusted": int(stored.clock_trusted),
+        "status": result.status,
+        "sigma0": result.sigma0,
+        "redundancy": result.redundancy,
+        "n_observations": result.n_observations,
+        "n_rejected": len(result.rejected),
+        "measured": None if seen is None else len(seen),
+        "temperatures": _numbers_json(epoch.temperatures),
+        "extra": _numbers_json(stored.extra),
+        "rejected": json.dumps(result.rejected),
+        "frame": "" if epoch.frame is None else str(epoch.frame),
+        "note": epoch.note,
+        "reason": result.reason,
+        **dict(zip(PARAMETER_NAMES, result.values.tolist(), strict=True)),
+        **dict(zip((f"sd_{n}" for n in PARAMETER_NAMES), result.sd.tolist(), strict=True)),
+        "detail_checksum": row_checksum((), data=b"".join(data for _, data in parts)),
+    }
+    insert_row(connection, row)
+    connection.executemany("INSERT INTO detail (id, data) VALUES (?, ?)", parts)
+    return int(id_)
+
+
+def _parts(
+    number: int, id_: int, covariance: Array | None, seen: Observations | None
+) -> list[tuple[int, bytes]]:
+    """Covariance and observations as rows of the table `detail`."""
+    first = id_ * _PARTS
     parts: list[tuple[int, bytes]] = []
-    if result.covariance is not None:
-        parts.append((first, pack_covariance(result.covariance)))
+    if covariance is not None:
+        parts.append((first, pack_covariance(covariance)))
     if seen is not None:
         data = pack_observations(seen)
         cuts = range(0, len(data), _PART_BYTES)
         if len(cuts) >= _PARTS:
-            raise StoreError(f"epoch {epoch.number}: {len(seen)} observations are too many to keep")
+            raise StoreError(f"epoch {number}: {len(seen)} observations are too many to keep")
         parts += [(first + 1 + i, data[c : c + _PART_BYTES]) for i, c in enumerate(cuts)]
-    connection.executemany("INSERT INTO detail (id, data) VALUES (?, ?)", parts)
-    return cursor.lastrowid
+    return parts
 
 
 def select_epochs(
@@ -135,78 +123,92 @@ def select_epochs(
 ) -> Iterator[StoredEpoch]:
     """The epochs numbered `first` to `last` in their latest revision, one after the other.
 
-    details: False leaves out observations and covariances.
+    details: False leaves out observations and covariances. Raises StoreError for damage.
     """
-    rows = connection.execute(_SELECT, (series, first, last))
+    rows = rows_of(connection, series, first, last)
     row = next(rows, None)
     while row is not None:
-        latest, measured = row, row[0]
+        latest = measured = row
         # a later calibration of observations that stay the same does not keep them again
-        while (row := next(rows, None)) is not None and row[1] == latest[1]:
+        while (row := next(rows, None)) is not None and row["number"] == latest["number"]:
             latest = row
-            if row[10] is not None:
-                measured = row[0]
+            if row["measured"] is not None:
+                measured = row
         yield _epoch(connection, latest, measured, details)
 
 
 def select_covariance(connection: sqlite3.Connection, series: int, number: int) -> Array | None:
     """The (16, 16) covariance of an epoch's latest calibration, None if there is none."""
-    row = connection.execute(
-        "SELECT id FROM epoch WHERE series_id = ? AND number = ? ORDER BY revision DESC LIMIT 1",
-        (series, number),
-    ).fetchone()
-    data = b"" if row is None else _detail(connection, row[0], 0, 1)
-    return unpack_covariance(data) if data else None
+    rows = list(rows_of(connection, series, number, number))
+    return _details(connection, rows[-1])[0] if rows else None
+
+
+def check_details(connection: sqlite3.Connection, row: dict[str, Any]) -> None:
+    """Raise StoreError where the covariance or the observations of a row are damaged."""
+    _details(connection, row)
 
 
 def select_details(connection: sqlite3.Connection, id_: int) -> tuple[bytes, bytes]:
     """The covariance and the observations of the row `id_`, packed; empty where it has none."""
-    return _detail(connection, id_, 0, 1), _detail(connection, id_, 1, _PARTS)
+    parts = _parts_of(connection, id_)
+    covariance = b"".join(data for part, data in parts if part == 0)
+    return covariance, b"".join(data for part, data in parts if part)
+
+
+def _parts_of(connection: sqlite3.Connection, id_: int) -> list[tuple[int, bytes]]:
+    return connection.execute(
+        "SELECT id - ?1, data FROM detail WHERE id >= ?1 AND id < ?1 + ?2 ORDER BY id",
+        (id_ * _PARTS, _PARTS),
+    ).fetchall()
 
 
 def _epoch(
-    connection: sqlite3.Connection, row: tuple[Any, ...], measured: int, details: bool
+    connection: sqlite3.Connection, row: dict[str, Any], measured: dict[str, Any], details: bool
 ) -> StoredEpoch:
-    id_, *values = row
-    field = dict(zip(_FIELDS, values, strict=True))
     epoch = Epoch(
-        number=field["number"],
-        frame_time=field["frame_time"],
-        temperature_time=_nan(field["temperature_time"]),
-        temperatures=_mapping(field["temperatures"]),
-        frame=Path(field["frame"]) if field["frame"] else None,
-        note=field["note"],
+        number=row["number"],
+        frame_time=row["frame_time"],
+        temperature_time=_nan(row["temperature_time"]),
+        temperatures=_mapping(row["temperatures"]),
+        frame=relative_path(row["frame"], f"epoch {row['number']}: frame", StoreError)
+        if row["frame"]
+        else None,
+        note=row["note"],
     )
     result = EpochResult(
-        status=field["status"],
-        reason=field["reason"],
-        values=np.array([field[name] for name in PARAMETER_NAMES], dtype=float),
-        sigma0=_nan(field["sigma0"]),
-        redundancy=field["redundancy"],
-        n_observations=field["n_observations"],
-        rejected=tuple(json.loads(field["rejected"])),
+        status=row["status"],
+        reason=row["reason"],
+        values=np.array([row[name] for name in PARAMETER_NAMES], dtype=float),
+        sigma0=_nan(row["sigma0"]),
+        redundancy=row["redundancy"],
+        n_observations=row["n_observations"],
+        rejected=tuple(json.loads(row["rejected"])),
     )
     if details:
-        covariance = _detail(connection, id_, 0, 1)
-        if covariance:
-            result = replace(result, covariance=unpack_covariance(covariance))
-        epoch = replace(epoch, observations=_observations(connection, measured))
+        covariance, seen = _details(connection, row)
+        if measured is not row:
+            _, seen = _details(connection, measured)
+        result = replace(result, covariance=covariance)
+        epoch = replace(epoch, observations=seen)
     return StoredEpoch(
-        epoch, result, _mapping(field["extra"]), bool(field["clock_trusted"]), field["revision"]
+        epoch, result, _mapping(row["extra"]), bool(row["clock_trusted"]), row["revision"]
     )
 
 
-def _observations(connection: sqlite3.Connection, id_: int) -> Observations | None:
-    data = _detail(connection, id_, 1, _PARTS)
-    return unpack_observations(data) if data else None
-
-
-def _detail(connection: sqlite3.Connection, id_: int, first: int, stop: int) -> bytes:
-    rows = connection.execute(
-        "SELECT data FROM detail WHERE id >= ? AND id < ? ORDER BY id",
-        (id_ * _PARTS + first, id_ * _PARTS + stop),
-    )
-    return b"".join(data for (data,) in rows)
+def _details(
+    connection: sqlite3.Connection, row: dict[str, Any]
+) -> tuple[Array | None, Observations | None]:
+    """(covariance, observations) of one row; StoreError where they are not as they were written."""
+    parts = _parts_of(connection, row["id"])
+    data = b"".join(bytes(part) for _, part in parts)
+    what = f"epoch {row['number']}: its covariance or its observations"
+    require_checksum(row["detail_checksum"], what, (), data=data)
+    covariance = seen = None
+    if parts and parts[0][0] == 0:
+        covariance, parts = unpack_covariance(parts[0][1]), parts[1:]
+    if parts:
+        seen = unpack_observations(b"".join(part for _, part in parts))
+    return covariance, seen
 
 
 def _numbers_json(values: Mapping[str, float]) -> str:

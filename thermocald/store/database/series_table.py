@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 from typing import TYPE_CHECKING
 
+from thermocald.errors import StoreError
+from thermocald.store.database.checksum import require_checksum, row_checksum
 from thermocald.store.database.row import Event, LoggedReading, StoredSeries
 from thermocald.store.recording.head import Head, head_document, parse_head
+from thermocald.store.recording.paths import file_name
 from thermocald.store.recording.testfield_file import parse_testfield, testfield_csv
 
 if TYPE_CHECKING:
     import sqlite3
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
     from typing import Any
 
@@ -28,6 +32,9 @@ __all__ = [
 ]
 
 
+log = logging.getLogger(__name__)
+
+
 def insert_series(
     connection: sqlite3.Connection,
     head: Head,
@@ -41,19 +48,18 @@ def insert_series(
     csv = testfield_csv(testfield)
     digest = hashlib.sha256(csv.encode()).hexdigest()
     connection.execute("INSERT OR IGNORE INTO testfield (digest, csv) VALUES (?, ?)", (digest, csv))
+    texts = (
+        head.camera.name,
+        head.series,
+        start,
+        _json(head_document(head)),
+        _json(identity),
+        _json(settings),
+    )
     connection.execute(
-        "INSERT INTO series (camera, name, start, created_utc, head, identity, settings, "
-        "testfield_id) SELECT ?, ?, ?, ?, ?, ?, ?, id FROM testfield WHERE digest = ?",
-        (
-            head.camera.name,
-            head.series,
-            start,
-            created_utc,
-            _json(head_document(head)),
-            _json(identity),
-            _json(settings),
-            digest,
-        ),
+        "INSERT INTO series (camera, name, start, head, identity, settings, created_utc, checksum, "
+        "testfield_id) SELECT ?, ?, ?, ?, ?, ?, ?, ?, id FROM testfield WHERE digest = ?",
+        (*texts, created_utc, row_checksum((created_utc,), (*texts, digest)), digest),
     )
 
 
@@ -62,66 +68,110 @@ def select_series(
 ) -> list[StoredSeries]:
     """The series of a camera and a name, None for any; `path` is for the messages."""
     rows = connection.execute(
-        "SELECT s.id, head, csv, start, identity, settings, created_utc FROM series s "
+        "SELECT s.id, created_utc, s.checksum, csv, camera, name, start, head, identity, settings, "
+        "digest FROM series s "
         "JOIN testfield t ON t.id = testfield_id "
         "WHERE camera = ifnull(?, camera) AND name = ifnull(?, name) ORDER BY s.id",
         (camera, name),
     ).fetchall()
-    return [
-        StoredSeries(
-            number,
-            parse_head(json.loads(head), path),
-            parse_testfield(csv, path),
-            start,
-            json.loads(identity),
-            json.loads(settings),
-            created,
-        )
-        for number, head, csv, start, identity, settings, created in rows
-    ]
+    return [_series(path, *row) for row in rows]
+
+
+def _series(
+    path: Path, number: int, created: float, kept: int | None, csv: str, *texts: str
+) -> StoredSeries:
+    camera, name, start, head, identity, settings, digest = texts
+    what = f"{path}: series {camera}/{name}"
+    require_checksum(kept, what, (created,), texts)
+    if hashlib.sha256(csv.encode(errors="surrogateescape")).hexdigest() != digest:
+        raise StoreError(f"{what}: its test field is damaged: it is not what its digest says")
+    file_name(camera, f"{what}: camera", StoreError)
+    file_name(name, f"{what}: series", StoreError)
+    parsed = parse_head(json.loads(head), path)
+    if (parsed.camera.name, parsed.series) != (camera, name):
+        raise StoreError(f"{what}: its head is of {parsed.camera.name!r}/{parsed.series!r}")
+    return StoredSeries(
+        number,
+        parsed,
+        parse_testfield(csv, path),
+        start,
+        json.loads(identity),
+        json.loads(settings),
+        created,
+    )
 
 
 def insert_events(connection: sqlite3.Connection, events: Iterable[Event]) -> None:
     """Insert events; within the caller's transaction."""
+    rows = []
+    for event in events:
+        numbers = (event.utc, event.series, event.epoch)
+        texts = (event.kind, event.text, _json(event.data))
+        rows.append((*numbers, *texts, row_checksum(numbers, texts)))
     connection.executemany(
-        "INSERT INTO event (utc, kind, text, series_id, epoch, data) VALUES (?, ?, ?, ?, ?, ?)",
-        [(e.utc, e.kind, e.text, e.series, e.epoch, _json(e.data)) for e in events],
+        "INSERT INTO event (utc, series_id, epoch, kind, text, data, checksum) "
+        "VALUES (?, ?, ?, ?, ?, ?, ?)",
+        rows,
     )
 
 
 def select_events(
     connection: sqlite3.Connection, series: int | None, since_utc: float
 ) -> list[Event]:
-    """Events of a series, None for all, from an instant on, in the order they were kept."""
+    """Events of a series, None for all, from a time on, in the order they were kept.
+
+    One that is damaged is left out, with a warning: what is computed does not depend on it.
+    """
     rows = connection.execute(
-        "SELECT utc, kind, text, series_id, epoch, data FROM event WHERE utc >= ? "
+        "SELECT checksum, id, utc, series_id, epoch, kind, text, data FROM event WHERE utc >= ? "
         "AND series_id IS ifnull(?, series_id) ORDER BY id",
         (since_utc, series),
     ).fetchall()
-    return [
-        Event(utc, kind, text, series_id, epoch, json.loads(data))
-        for utc, kind, text, series_id, epoch, data in rows
-    ]
+    events = []
+    for kept, id_, utc, series_id, epoch, kind, text, data in rows:
+        if _sound(kept, f"event {id_}", (utc, series_id, epoch), (kind, text, data)):
+            events.append(Event(utc, kind, text, series_id, epoch, json.loads(data)))
+    return events
 
 
 def insert_readings(connection: sqlite3.Connection, readings: Iterable[LoggedReading]) -> None:
     """Insert readings; within the caller's transaction."""
+    rows = []
+    for reading in readings:
+        numbers = (reading.utc, int(reading.clock_trusted))
+        texts = (reading.thermometer, _json(reading.values))
+        rows.append((*numbers, *texts, row_checksum(numbers, texts)))
     connection.executemany(
-        "INSERT INTO reading (thermometer, utc, clock_trusted, temperatures) VALUES (?, ?, ?, ?)",
-        [(r.thermometer, r.utc, int(r.clock_trusted), _json(r.values)) for r in readings],
+        "INSERT INTO reading (utc, clock_trusted, thermometer, temperatures, checksum) "
+        "VALUES (?, ?, ?, ?, ?)",
+        rows,
     )
 
 
 def select_readings(
     connection: sqlite3.Connection, thermometer: str | None, since_utc: float
 ) -> Iterator[LoggedReading]:
-    """Readings of a thermometer, None for all, from an instant on, in the order they were kept."""
-    for name, utc, trusted, values in connection.execute(
-        "SELECT thermometer, utc, clock_trusted, temperatures FROM reading WHERE utc >= ? "
-        "AND thermometer = ifnull(?, thermometer) ORDER BY id",
+    """Readings of a thermometer, None for all, from a time on, in the order they were kept.
+
+    One that is damaged is left out, with a warning.
+    """
+    for kept, id_, utc, trusted, name, values in connection.execute(
+        "SELECT checksum, id, utc, clock_trusted, thermometer, temperatures FROM reading "
+        "WHERE utc >= ? AND thermometer = ifnull(?, thermometer) ORDER BY id",
         (since_utc, thermometer),
     ):
-        yield LoggedReading(name, utc, json.loads(values), bool(trusted))
+        if _sound(kept, f"reading {id_}", (utc, trusted), (name, values)):
+            file_name(name, "thermometer", StoreError)
+            yield LoggedReading(name, utc, json.loads(values), bool(trusted))
+
+
+def _sound(kept: int | None, what: str, numbers: Sequence[Any], texts: Sequence[str]) -> bool:
+    try:
+        require_checksum(kept, what, numbers, texts)
+    except StoreError as error:
+        log.warning("%s; it is left out", error)
+        return False
+    return True
 
 
 def _json(mapping: Mapping[str, Any]) -> str:

@@ -7,6 +7,7 @@ revision, and triggers in the file refuse everything else.
 
 from __future__ import annotations
 
+import logging
 import threading
 from contextlib import contextmanager
 from dataclasses import replace
@@ -18,13 +19,15 @@ from thermocald.errors import StoreError, StoreFullError
 from thermocald.store.database import columns as column_chunks
 from thermocald.store.database.changes import rows_after
 from thermocald.store.database.connection import Mode, connect, in_words
-from thermocald.store.database.epoch_columns import FIXED, status_codes
+from thermocald.store.database.copies import copy_database
+from thermocald.store.database.epoch_columns import COLUMN_NAMES, status_codes
 from thermocald.store.database.epoch_table import (
     StoredEpoch,
     insert_epoch,
     select_covariance,
     select_epochs,
 )
+from thermocald.store.database.examination import Examination, examine
 from thermocald.store.database.row import (
     NOT_CALIBRATED,
     EpochResult,
@@ -40,6 +43,7 @@ from thermocald.store.database.series_table import (
     select_readings,
     select_series,
 )
+from thermocald.store.recording.paths import file_name
 from thermocald.store.recording.readings import interpolate_readings
 
 if TYPE_CHECKING:
@@ -58,6 +62,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Store"]
 
+log = logging.getLogger(__name__)
+
 
 class Store:
     """An open store; use `Store.open` and a `with` block. Threads may share it."""
@@ -66,6 +72,7 @@ class Store:
         self.path = path
         self._db = connection
         self._lock = threading.RLock()
+        self._unchunked: set[int] = set()  # series whose chunks cannot be built
         self._ends: dict[int, tuple[int, int]] = {}  # series → last number, rows in no chunk
 
     @classmethod
@@ -104,8 +111,10 @@ class Store:
         created_utc: float = 0.0,
     ) -> StoredSeries:
         """Begin a series; StoreError if the camera has one of this name already."""
-        if taken := {*FIXED, *_DERIVED} & set(head.channels):
+        if taken := {*COLUMN_NAMES, *_DERIVED} & set(head.channels):
             raise StoreError(f"a temperature channel cannot be called {min(taken)!r}")
+        file_name(head.camera.name, "camera", StoreError)
+        file_name(head.series, "series", StoreError)
         with self._transaction(f"series {head.series!r} was not begun"):
             if self._select_series(head.camera.name, head.series):
                 raise StoreError(
@@ -151,7 +160,7 @@ class Store:
         blur. Keeps nothing of the epoch and raises StoreError if its number does not come after the
         last one, StoreFullError if the disk is full: an epoch without observations is smaller.
         """
-        if taken := {*FIXED, *_DERIVED, *series.head.channels} & set(extra or ()):
+        if taken := {*COLUMN_NAMES, *_DERIVED, *series.head.channels} & set(extra or ()):
             raise StoreError(f"an extra column cannot be called {min(taken)!r}")
         stored = StoredEpoch(
             epoch, result or EpochResult(NOT_CALIBRATED), extra or {}, clock_trusted, 0
@@ -176,9 +185,20 @@ class Store:
             insert_epoch(self._db, series.id, stored)
             insert_events(self._db, events)
             full = loose + 1 >= column_chunks.CHUNK
-            if full:
-                column_chunks.build_missing_chunks(self._db, series.id)
+            if full and series.id not in self._unchunked:
+                self._build_chunks(series)
         self._ends[series.id] = (epoch.number, 0 if full else loose + 1)
+
+    def _build_chunks(self, series: StoredSeries) -> None:
+        """Damage in an old row must not stop new ones: then columns are read from the rows."""
+        self._db.execute("SAVEPOINT chunks")
+        try:
+            column_chunks.build_missing_chunks(self._db, series.id)
+        except StoreError as error:
+            self._db.execute("ROLLBACK TO chunks")
+            self._unchunked.add(series.id)
+            log.warning("%s: %s", self.path, error)
+        self._db.execute("RELEASE chunks")
 
     def amend(
         self,
@@ -243,8 +263,19 @@ class Store:
 
         details: False leaves out observations and covariances, and is faster.
         """
+        missing, before = 0, first or 1
         with in_words(self.path, "epochs cannot be read", reading=True):
-            yield from select_epochs(self._db, series.id, first, last, details=details)
+            for stored in select_epochs(self._db, series.id, first, last, details=details):
+                missing += max(0, stored.epoch.number - before)
+                before = stored.epoch.number + 1
+                yield stored
+        if not first and last is None:
+            missing += max(0, (self.last_epoch(series) or 0) + 1 - before)
+            if missing:
+                log.warning(
+                    "%s: %d epochs of series %s are missing; `thermocald check` says which",
+                    self.path, missing, series.name,
+                )  # fmt: skip
 
     def observations(
         self, series: StoredSeries, numbers: Iterable[int]
@@ -268,7 +299,7 @@ class Store:
 
     def column_names(self, series: StoredSeries) -> list[str]:
         """What `series_columns` can give, but extra columns."""
-        return ["epoch", *FIXED[1:], "status", *series.head.channels]
+        return ["epoch", *COLUMN_NAMES[1:], "status", *series.head.channels]
 
     def series_columns(self, series: StoredSeries, names: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Columns over all epochs by name, (E,) each: a million epochs in a fraction of a second.
@@ -320,10 +351,32 @@ class Store:
         return not busy
 
     def check(self) -> None:
-        """Read the whole file; StoreError if it is damaged."""
-        ((verdict,), *_) = self._query("PRAGMA integrity_check", ())
-        if verdict != "ok":
-            raise StoreError(f"{self.path}: is damaged: {verdict}")
+        """Read the whole file; StoreError if anything in it is damaged."""
+        if damaged := self.examine().damaged:
+            more = f" and {len(damaged) - 1} more" if len(damaged) > 1 else ""
+            raise StoreError(f"{self.path}: is damaged: {damaged[0]}{more}")
+
+    def examine(self) -> Examination:
+        """Read the whole file: what is damaged, and which epochs are missing.
+
+        Raises StoreError where it cannot be read as a store at all.
+        """
+        for series in self.all_series():
+            self.series_columns(series, self.column_names(series))
+        self.events()
+        with self._lock, in_words(self.path, "the store cannot be read", reading=True):
+            return examine(self._db)
+
+    def copy_to(self, target: Path) -> None:
+        """Copy the store to another file, whole or not at all, while it may be written.
+
+        Raises StoreError where that cannot be written.
+        """
+        with in_words(self.path, f"the copy {target} cannot be made"):
+            try:
+                copy_database(self._db, target)
+            except OSError as error:
+                raise StoreError(f"{target}: cannot be written: {error.strerror}") from error
 
     def _select_series(
         self, camera: str | None = None, name: str | None = None
@@ -365,6 +418,6 @@ def _source(name: str, series: StoredSeries) -> str:
     """The name in the chunks of a column by its public name."""
     if name == "epoch":
         return "number"
-    if name in FIXED or name == "status":
+    if name in COLUMN_NAMES or name == "status":
         return name
     return f"temperatures.{name}" if name in series.head.channels else f"extra.{name}"

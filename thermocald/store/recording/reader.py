@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,6 +13,7 @@ from thermocald.epoch import Epoch
 from thermocald.errors import RecordingError
 from thermocald.store.recording.head import CameraSpec, Channel, Head, read_head
 from thermocald.store.recording.observation_file import ObservationFile, ObservationTable
+from thermocald.store.recording.paths import FileFolder
 from thermocald.store.recording.readings import (
     interpolate_readings,
     temperature_at_frame,
@@ -217,6 +217,7 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
     times: dict[str, list[Array]] = {"frame_time": [], "temperature_time": []}
     temperatures: dict[str, list[Array]] = {name: [] for name in channels}
     frames: list[str] = []
+    files = FileFolder(folder)
     extra: dict[str, list[str]] = {name: [] for name in extra_names}
     previous = {"epoch": -1.0, "frame_time": -np.inf, "temperature_time": -np.inf}
     for chunk in table.chunks():
@@ -245,8 +246,13 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
             chunk.check(name, readings[-1] < -273.15, "is below absolute zero")
         for row, text in enumerate(chunk.text("frame")):
             frame = text.strip()
-            if frame and not os.path.isfile(os.path.join(folder, frame)):
-                chunk.fail(row, "frame", f"{frame!r} is missing; leave it empty if it was not kept")
+            if frame and files.find(frame) is None:
+                chunk.fail(
+                    row,
+                    "frame",
+                    f"{frame!r} is missing, or leads out of the recording; leave it empty if it "
+                    "was not kept",
+                )
             frames.append(frame)
         for name in extra_names:
             extra[name].extend(chunk.text(name))

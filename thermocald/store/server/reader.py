@@ -17,10 +17,9 @@ from thermocald.epoch import Epoch
 from thermocald.errors import StoreError
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.store.database.blob import unpack_covariance, unpack_observations
-from thermocald.store.database.epoch_columns import FIXED
+from thermocald.store.database.epoch_columns import COLUMN_NAMES, sql_name
 from thermocald.store.database.epoch_table import StoredEpoch
 from thermocald.store.database.row import EpochResult, Event, LoggedReading, StoredSeries
-from thermocald.store.database.schema import sql_name
 from thermocald.store.recording.head import parse_head
 from thermocald.store.recording.readings import interpolate_readings
 from thermocald.store.recording.testfield_file import parse_testfield
@@ -132,7 +131,7 @@ class ServerStore:
 
     def column_names(self, series: StoredSeries) -> list[str]:
         """What `series_columns` can give, but extra columns."""
-        return ["epoch", *FIXED[1:], "status", *series.head.channels]
+        return ["epoch", *COLUMN_NAMES[1:], "status", *series.head.channels]
 
     def series_columns(self, series: StoredSeries, names: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Columns (E,) over all epochs by name, as `Store.series_columns`."""
@@ -313,7 +312,7 @@ def _expression(name: str, series: StoredSeries) -> Any:
         return sql.SQL("number::float8")
     if name == "clock_trusted":
         return sql.SQL("clock_trusted::int::float8")
-    if name in FIXED:
+    if name in COLUMN_NAMES:
         return sql.SQL("coalesce({}::float8, 'NaN')").format(sql.Identifier(sql_name(name)))
     column = "temperatures" if name in series.head.channels else "extra"
     return sql.SQL("coalesce(({}::json->>{})::float8, 'NaN')").format(

@@ -1,0 +1,112 @@
+"""Bits that flip on a card: a value that changed is never given out as if it were right."""
+
+from __future__ import annotations
+
+import sqlite3
+
+import numpy as np
+import pytest
+
+from thermocald.errors import ThermocaldError
+from thermocald.store.database import columns
+from thermocald.store.database.row import Event
+from thermocald.store.database.store import Store
+
+EPOCHS = 40
+NAMES = ["epoch", "frame_time", "c", "sd_x0", "status", "temperature", "blur"]
+
+
+@pytest.fixture
+def whole(store_path, head, field, make_epoch, make_result, monkeypatch) -> bytes:
+    """A store with chunks, a later calibration and events, as bytes."""
+    monkeypatch.setattr(columns, "CHUNK", 16)
+    with Store.open(store_path, "append", durable=False) as store:
+        series = store.create_series(head, field, identity={"serial": "x1"})
+        for i in range(1, EPOCHS + 1):
+            store.append(series, make_epoch(i), make_result(i), extra={"blur": 0.5 * i})
+        store.amend(series, 7, make_result(70))
+        store.add_event(Event(1.6e9, "knock", "somebody came"))
+    return store_path.read_bytes()
+
+
+def content(path) -> tuple[dict, list, list]:
+    """Everything that a reader gets: columns, epochs, events."""
+    with Store.open(path) as store:
+        (series,) = store.all_series()
+        read = store.series_columns(series, NAMES)
+        epochs = [
+            (s.epoch.number, s.epoch.frame_time, s.result.values.tolist(), s.revision,
+             s.result.covariance.tolist(), s.epoch.observations.points.tolist(), s.result.status)
+            for s in store.epochs(series)
+        ]  # fmt: skip
+        events = [e.text for e in store.events()]
+        about = (series.head, series.identity, series.testfield.points.tolist())
+    return {name: list(map(str, v)) for name, v in read.items()}, epochs, [events, about]
+
+
+def test_a_flipped_bit_is_never_given_out(whole, store_path, caplog):
+    truth = content(store_path)
+    rng = np.random.default_rng(17)
+    silent, unseen = [], []
+    for _ in range(120):
+        at, bit = int(rng.integers(len(whole))), int(rng.integers(8))
+        data = bytearray(whole)
+        data[at] ^= 1 << bit
+        store_path.write_bytes(data)
+        caplog.clear()
+        try:
+            found = content(store_path)
+        except ThermocaldError:
+            found = None
+        if found is not None and found != truth and not caplog.messages:
+            silent.append(at)
+        try:
+            with Store.open(store_path) as store:
+                store.check()
+                missing = store.examine().gaps
+        except ThermocaldError:
+            continue
+        if found != truth and not missing:
+            unseen.append((at, bit, found is None))
+    assert (silent, unseen) == ([], [])
+
+
+def test_a_damaged_chunk_is_read_from_its_rows(whole, store_path, caplog):
+    truth = content(store_path)
+    database = sqlite3.connect(store_path)
+    database.execute("UPDATE column_chunk SET data = zeroblob(length(data)) WHERE name = 'c'")
+    database.commit()
+    database.close()
+    assert content(store_path) == truth
+    assert "chunk of column c is damaged" in caplog.text
+
+
+def test_a_damaged_row_does_not_stop_new_ones(whole, store_path, make_epoch, make_result):
+    database = sqlite3.connect(store_path)
+    database.execute("DROP TRIGGER epoch_update")
+    database.execute("UPDATE epoch SET x0 = x0 + 1e-9 WHERE number = 36")
+    database.commit()
+    database.close()
+    with Store.open(store_path, "append", durable=False) as store:
+        (series,) = store.all_series()
+        for i in range(EPOCHS + 1, EPOCHS + 20):
+            store.append(series, make_epoch(i), make_result(i))
+        assert store.last_epoch(series) == EPOCHS + 19
+        found = store.examine()
+    assert found.damaged == ("rpi/M1, epoch 36",)
+
+
+def test_missing_epochs_are_named(whole, store_path):
+    database = sqlite3.connect(store_path)
+    database.execute("DROP TRIGGER epoch_delete")
+    database.execute("DROP TRIGGER detail_delete")
+    database.execute("DELETE FROM epoch WHERE number IN (3, 10, 11, 12)")
+    database.execute("DELETE FROM detail WHERE id / 1024 NOT IN (SELECT id FROM epoch)")
+    database.commit()
+    database.close()
+    with Store.open(store_path) as store:
+        found = store.examine()
+    assert [gap.text for gap in found.gaps] == [
+        "rpi/M1: epoch 3 is missing", "rpi/M1: epochs 10 to 12 are missing (3)"
+    ]  # fmt: skip
+    assert found.damaged == ()

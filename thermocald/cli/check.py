@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     from thermocald.hal import Kind
 
 __all__ = ["register"]
+
+_SHOWN = 20  # lines of a kind
 
 
 def register(app: typer.Typer) -> None:
@@ -53,6 +56,11 @@ def check(
     if json != "-":
         for line in document.pop("lines"):
             typer.echo(line)
+    if damaged := document.get("damaged"):
+        raise DataError(
+            f"{source}: {len(damaged)} places are damaged, the first: {damaged[0]}; restore a "
+            "backup, or read what is sound"
+        )
     probes = document.get("probes", [])
     failed = [probe["name"] for probe in probes if probe["error"]]
     if failed:
@@ -148,17 +156,31 @@ def _store(path: Path) -> dict[str, Any]:
 
     with Store.open(path) as store:
         say(f"{path}: reading the whole file")
-        store.check()
+        found = store.examine()
         series = [
             {"camera": s.camera, "series": s.name, "last_epoch": store.last_epoch(s)}
             for s in store.all_series()
         ]
-    lines = [f"{path}: a sound store of {len(series)} series"]
+    sound = "a damaged store" if found.damaged else "a sound store"
+    lines = [f"{path}: {sound} of {len(series)} series, {found.epochs} epochs"]
     lines += [f"  {s['camera']}/{s['series']}: up to epoch {s['last_epoch']}" for s in series]
+    lines += [f"  {gap.text}" for gap in found.gaps[:_SHOWN]]
+    if len(found.gaps) > _SHOWN:
+        lines.append(f"  and {len(found.gaps) - _SHOWN} more gaps")
+    lines += [f"  damaged: {text}" for text in found.damaged[:_SHOWN]]
+    if found.unchecked:
+        lines.append(
+            f"  {found.unchecked} epochs are of an older version and have no checksum: they were "
+            "not verified"
+        )
     return {
         "format": "thermocald-check/1",
         "kind": "store",
         "path": path,
         "series": series,
+        "epochs": found.epochs,
+        "damaged": list(found.damaged),
+        "gaps": [asdict(gap) for gap in found.gaps],
+        "unchecked": found.unchecked,
         "lines": lines,
     }

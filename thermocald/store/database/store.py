@@ -361,11 +361,13 @@ class Store:
 
         Raises StoreError where it cannot be read as a store at all.
         """
-        for series in self.all_series():
-            self.series_columns(series, self.column_names(series))
-        self.events()
         with self._lock, in_words(self.path, "the store cannot be read", reading=True):
-            return examine(self._db)
+            found = examine(self._db)
+        if not found.damaged:
+            for series in self.all_series():
+                self.series_columns(series, self.column_names(series))
+            self.events()
+        return found
 
     def copy_to(self, target: Path) -> None:
         """Copy the store to another file, whole or not at all, while it may be written.

@@ -1,0 +1,120 @@
+"""Stores and recordings made by somebody else: they name nothing outside their own folders."""
+
+from __future__ import annotations
+
+import json
+import os
+import sqlite3
+
+import pytest
+
+from thermocald.errors import RecordingError, StoreError
+from thermocald.store.database.archive import archive_readings, archive_series
+from thermocald.store.database.row import LoggedReading
+from thermocald.store.database.store import Store
+from thermocald.store.recording.reader import read_recording
+
+
+def change(path, statement: str, *values) -> None:
+    database = sqlite3.connect(path)
+    for name in ("series_update", "epoch_update", "reading_update"):
+        database.execute(f"DROP TRIGGER {name}")
+    database.execute(statement, values)
+    for table in ("series", "epoch", "reading"):  # as a file of an older version, or a clever hand
+        database.execute(f"UPDATE {table} SET checksum = NULL")
+    database.commit()
+    database.close()
+
+
+@pytest.fixture
+def crafted(filled):
+    store, _ = filled
+    store.add_readings([LoggedReading("air", 1.6e9, {"temperature": 20.0})])
+    store.close()
+    return store.path
+
+
+@pytest.mark.parametrize("name", ["../../x", "/etc/x", "..", ".hidden", "a/b", "a\x1b[2Jb", " "])
+@pytest.mark.parametrize("column", ["camera", "name"])
+def test_a_name_that_leads_out_is_refused_when_it_is_read(crafted, name, column):
+    change(crafted, f"UPDATE series SET {column} = ?", name)
+    with Store.open(crafted) as store, pytest.raises(StoreError, match="part of a file's name"):
+        store.all_series()
+
+
+def test_a_head_of_another_name_is_refused(crafted):
+    database = sqlite3.connect(crafted)
+    (head,) = database.execute("SELECT head FROM series").fetchone()
+    database.close()
+    document = json.loads(head)
+    document["camera"]["name"] = "../../x"
+    change(crafted, "UPDATE series SET head = ?", json.dumps(document))
+    with Store.open(crafted) as store, pytest.raises(StoreError, match="its head is of"):
+        store.all_series()
+
+
+def test_a_thermometers_name_that_leads_out_is_refused(crafted, tmp_path):
+    change(crafted, "UPDATE reading SET thermometer = '../../air'")
+    (tmp_path / "out").mkdir()
+    with Store.open(crafted) as store, pytest.raises(StoreError, match="thermometer"):
+        archive_readings(store, tmp_path / "out")
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+@pytest.mark.parametrize("frame", ["/etc/passwd", "../secret.jpg", "a/../../secret.jpg"])
+def test_a_frame_that_leads_out_is_refused(crafted, tmp_path, frame):
+    (tmp_path / "secret.jpg").write_bytes(b"secret")
+    (tmp_path / "frames").mkdir()
+    change(crafted, "UPDATE epoch SET frame = ? WHERE number = 3", frame)
+    with Store.open(crafted) as store, pytest.raises(StoreError, match="leads out"):
+        archive_series(store, store.find_series(), tmp_path / "out", tmp_path / "frames")
+    assert not (tmp_path / "out").exists()
+    assert not list(tmp_path.glob(".*partial"))
+
+
+def test_a_link_among_the_frames_is_not_followed_out(crafted, tmp_path):
+    (tmp_path / "secret.jpg").write_bytes(b"secret")
+    (tmp_path / "frames").mkdir()
+    (tmp_path / "frames/link.jpg").symlink_to(tmp_path / "secret.jpg")
+    (tmp_path / "frames/away").symlink_to(tmp_path)
+    (tmp_path / "frames/kept.jpg").write_bytes(b"kept")
+    for number, frame in ((3, "link.jpg"), (4, "away/secret.jpg"), (5, "kept.jpg")):
+        database = sqlite3.connect(crafted)
+        database.execute("DROP TRIGGER IF EXISTS epoch_update")
+        query = "UPDATE epoch SET frame = ?, checksum = NULL WHERE number = ?"
+        database.execute(query, (frame, number))
+        database.commit()
+        database.close()
+    with Store.open(crafted) as store:
+        archive_series(store, store.find_series(), tmp_path / "out", tmp_path / "frames")
+    kept = {p.name: p.read_bytes() for p in (tmp_path / "out/frames").iterdir()}
+    assert kept == {"000005.jpg": b"kept"}
+
+
+@pytest.mark.parametrize("kind", ["absolute", "up", "link", "folder link", "device", "pipe"])
+def test_a_recording_names_frames_of_its_own_only(recording_path, tmp_path, kind):
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (outside / "secret.jpg").write_bytes(b"secret")
+    frames = recording_path / "frames"
+    frames.mkdir()
+    frame = "frames/1.jpg"
+    if kind == "absolute":
+        frame = str(outside / "secret.jpg")
+    elif kind == "up":
+        frame = "../outside/secret.jpg"
+    elif kind == "link":
+        (frames / "1.jpg").symlink_to(outside / "secret.jpg")
+    elif kind == "folder link":
+        (recording_path / "linked").symlink_to(outside)
+        frame = "linked/secret.jpg"
+    elif kind == "device":
+        (frames / "1.jpg").symlink_to("/dev/zero")
+    else:
+        os.mkfifo(frames / "1.jpg")
+    table = recording_path / "epochs.csv"
+    lines = table.read_text().splitlines()
+    lines[1] = lines[1].rsplit(",", 1)[0] + f",{frame}"
+    table.write_text("\n".join(lines) + "\n")
+    with pytest.raises(RecordingError, match="leads out of the recording"):
+        read_recording(recording_path)

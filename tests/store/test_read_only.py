@@ -1,0 +1,87 @@
+"""A store whose folder cannot be written: its -wal file is read too, and nothing is left behind."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from thermocald.errors import StoreError
+from thermocald.store.database import copies
+from thermocald.store.database.store import Store
+
+
+@pytest.fixture
+def with_wal(store_path, field, head, make_epoch, make_result, tmp_path):
+    """A killed daemon's folder: five epochs in the store, nine more in its -wal file."""
+    folder = tmp_path / "killed"
+    folder.mkdir()
+    store = Store.open(store_path, "append", durable=False)
+    series = store.create_series(head, field)
+    for i in range(1, 6):
+        store.append(series, make_epoch(i), make_result(i))
+    store.checkpoint()
+    for i in range(6, 15):
+        store.append(series, make_epoch(i), make_result(i))
+    for name in (store_path.name, f"{store_path.name}-wal"):
+        shutil.copy(store_path.with_name(name), folder / name)
+    store.close()
+    return folder / store_path.name
+
+
+@pytest.fixture
+def read_only(with_wal):
+    """The same on a medium that is mounted read-only."""
+    folder = with_wal.parent
+    tool = shutil.which("mount")
+    command = [tool or "mount", "--bind", folder, folder]
+    done = tool and subprocess.run(command, capture_output=True, check=False)
+    if not done or done.returncode:
+        pytest.skip("nothing can be mounted here: needs root")
+    subprocess.run([tool, "-o", "remount,ro,bind", folder], check=True)
+    yield with_wal
+    subprocess.run(["umount", "-l", folder], check=False)
+
+
+def numbers(path: Path) -> list[int]:
+    with Store.open(path) as store:
+        series = store.find_series()
+        store.check()
+        read = store.series_columns(series, ["epoch"])["epoch"].astype(int).tolist()
+        assert [s.epoch.number for s in store.epochs(series)] == read
+        return read
+
+
+def test_what_is_in_the_wal_is_read_where_nothing_can_be_written(read_only):
+    before = set(Path(tempfile.gettempdir()).glob("thermocald-*"))
+    assert numbers(read_only) == list(range(1, 15))
+    assert set(Path(tempfile.gettempdir()).glob("thermocald-*")) == before
+
+
+def test_through_a_link_too(read_only, tmp_path):
+    link = tmp_path / "link.db"
+    link.symlink_to(read_only)
+    assert numbers(link) == list(range(1, 15))
+
+
+def test_without_a_wal_it_is_read_in_place(with_wal, monkeypatch):
+    with Store.open(with_wal, "append"):
+        pass  # the -wal file is moved into the store
+    monkeypatch.setattr(copies.tempfile, "mkdtemp", None)
+    copies.open_copy(with_wal).close()
+
+
+def test_a_file_that_is_being_written_is_not_copied_torn(with_wal, monkeypatch):
+    copyfile = shutil.copyfile
+
+    def written_meanwhile(source, target):
+        copyfile(source, target)
+        with Path(source).open("ab") as file:
+            file.write(b"x")
+
+    monkeypatch.setattr(copies.shutil, "copyfile", written_meanwhile)
+    with pytest.raises(StoreError, match="being written"):
+        copies.open_copy(with_wal)

@@ -31,12 +31,3 @@ def test_long_series_pool_frequencies_without_changing_the_answer():
     found = noise_autocorrelation(series, np.cumsum(rng.standard_normal(200_000)))
     assert found.phi == pytest.approx(0.9, abs=0.06)
     assert found.n_effective == pytest.approx(200_000 / 19, rel=0.4)
-
-
-def test_surrogates_have_unit_variance_and_the_series_correlation():
-    rng = np.random.default_rng(4)
-    series = np.asarray(signal.lfilter([1], [1, -0.85], rng.standard_normal(3000)))
-    surrogates = noise_autocorrelation(series).surrogates(rng, 400, 300)
-    assert surrogates.var() == pytest.approx(1, abs=0.06)
-    lag_one = np.mean(surrogates[:, 1:] * surrogates[:, :-1])
-    assert lag_one == pytest.approx(0.85, abs=0.05)

@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.analysis.statistics.noise_models import grid, pooled, spectra
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -23,11 +25,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Autocorrelation", "noise_autocorrelation"]
 
-_PHI = np.array([0.2, 0.4, 0.6, 0.75, 0.85, 0.92, 0.96, 0.985, 0.995])
-_COLOURED = np.array([0.1, 0.2, 0.35, 0.5, 0.75, 1.0])
-# Beyond this many low frequencies, which carry the slow correlation, neighbours are pooled.
-_SINGLE_FREQUENCIES = 2000
-_POOLED_FREQUENCIES = 1000
+_PHI = (0.2, 0.4, 0.6, 0.75, 0.85, 0.92, 0.96, 0.985, 0.995)
+_COLOURED = (0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,43 +34,27 @@ class Autocorrelation:
     """Autocorrelation a·phi^k of a series' noise at lag k epochs.
 
     n: values; n_effective: independent values that determine a slope on `x` as well; phi, coloured:
-    the most likely phi and a (0 ≤ a ≤ 1, the rest is white); phis, coloureds, plausible (g,): the
-    grid of both and how plausible each pair is (sums to 1).
+    the most likely phi and a (0 ≤ a ≤ 1, the rest is white).
     """
 
     n: int
     n_effective: float
     phi: float
     coloured: float
-    phis: Array
-    coloureds: Array
-    plausible: Array
 
     @property
     def lag_one(self) -> float:
         """Correlation of neighbouring epochs."""
         return self.phi * self.coloured
 
-    def surrogates(self, rng: np.random.Generator, count: int, n: int) -> Array:
-        """Series of noise (count, n) of unit variance, autocorrelations drawn as plausible."""
-        series = rng.standard_normal((count, n))
-        model = rng.choice(len(self.plausible), size=count, p=self.plausible)
-        for g in np.unique(model):
-            phi, coloured = float(self.phis[g]), float(self.coloureds[g])
-            if phi and coloured:
-                rows = model == g
-                slow = _autoregressive(rng, int(rows.sum()), n, phi)
-                series[rows] = np.sqrt(coloured) * slow + np.sqrt(1 - coloured) * series[rows]
-        return series
-
 
 def noise_autocorrelation(
-    y: Array, x: Array | None = None, *, fitted: bool = False, variance: float | None = None
+    y: Array, x: Array | None = None, *, fitted: bool = False
 ) -> Autocorrelation:
     """Autocorrelation of y (n,) about its mean, or about its straight line on x (n,).
 
-    Finite values, evenly spaced; n ≥ 4; fitted: y is what an estimated line on x left already;
-    variance: of y, where it is known beforehand. Without x, `n_effective` is that of the mean. Gaps
+    Finite values, evenly spaced; n ≥ 4; fitted: y is what an estimated line on x left already.
+    Without x, `n_effective` is that of the mean. Gaps
     must be closed up by the caller: values on both sides of a gap then count as neighbours.
     """
     from scipy.fft import dct
@@ -80,8 +63,9 @@ def noise_autocorrelation(
     v = dct(y - y.mean(), norm="ortho")[1:]
     frequency = np.pi * np.arange(1, n) / n
     u = np.zeros_like(v) if x is None else dct(x - x.mean(), norm="ortho")[1:]
-    count, frequency, uu, uv, vv = _pool(frequency, u * u, u * v, v * v)
-    phi, coloured, spectrum = _spectra(frequency)
+    count, frequency, uu, uv, vv = pooled(frequency, u * u, u * v, v * v)
+    phi, coloured = grid(_PHI, _COLOURED)
+    spectrum = spectra(frequency, phi, coloured)
 
     weight = 1.0 / spectrum
     residual = weight @ vv
@@ -93,10 +77,7 @@ def noise_autocorrelation(
         restricted = restricted + np.log(information)
         if not fitted:
             residual = residual - (weight @ uv) ** 2 / information
-    if variance is None:
-        deviance = degrees * np.log(np.maximum(residual, np.finfo(float).tiny)) + restricted
-    else:
-        deviance = residual / variance + restricted
+    deviance = degrees * np.log(np.maximum(residual, np.finfo(float).tiny)) + restricted
     plausible = np.exp(-0.5 * (deviance - deviance.min()))
     plausible[0] *= len(plausible) - 1  # white noise is as likely beforehand as all others together
     plausible /= plausible.sum()
@@ -112,38 +93,4 @@ def noise_autocorrelation(
         n / max(1.0, float(np.exp(plausible @ np.log(inflation)))),
         float(phi[best]),
         float(coloured[best]),
-        phi,
-        coloured,
-        plausible,
     )
-
-
-def _pool(frequency: Array, *power: Array) -> tuple[Array, ...]:
-    """Sums of `power` over neighbouring high frequencies, with their count and mean frequency."""
-    m = len(frequency)
-    if m <= _SINGLE_FREQUENCIES + _POOLED_FREQUENCIES:
-        return (np.ones(m), frequency, *power)
-    edges = np.geomspace(_SINGLE_FREQUENCIES, m, _POOLED_FREQUENCIES + 1)[:-1].astype(int)
-    starts = np.concatenate([np.arange(_SINGLE_FREQUENCIES), np.unique(edges)])
-    count = np.diff(starts, append=m).astype(float)
-    pooled = [np.add.reduceat(p, starts) for p in (frequency, *power)]
-    return (count, pooled[0] / count, *pooled[1:])
-
-
-def _spectra(frequency: Array) -> tuple[Array, Array, Array]:
-    """The grid of phi (g,), a (g,), and its spectra (g, m) of unit variance; the first is white."""
-    phi, coloured = (grid.ravel() for grid in np.meshgrid(_PHI, _COLOURED))
-    phi, coloured = np.append(0.0, phi), np.append(0.0, coloured)
-    shape = (1 - phi**2)[:, None] / (
-        1 + (phi**2)[:, None] - 2 * phi[:, None] * np.cos(frequency)[None, :]
-    )
-    return phi, coloured, coloured[:, None] * shape + (1 - coloured)[:, None]
-
-
-def _autoregressive(rng: np.random.Generator, count: int, n: int, phi: float) -> Array:
-    """Stationary first-order autoregressive noise (count, n) of unit variance."""
-    from scipy.signal import lfilter
-
-    drive = rng.standard_normal((count, n)) * np.sqrt(1 - phi**2)
-    drive[:, 0] /= np.sqrt(1 - phi**2)
-    return np.asarray(lfilter([1.0], [1.0, -phi], drive, axis=1), dtype=float)

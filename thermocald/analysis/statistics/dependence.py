@@ -1,9 +1,9 @@
 """How a parameter depends on the temperature: correlation, its significance, and the slope.
 
 Pearson's r with the t-test as the reference has it (Elias et al. 2020, section 4.3), which counts
-every epoch as independent, and beside it with the effective number of values that the
-autocorrelation of the residuals leaves. The slope is fitted with the thermometer's noise counted.
-p-values are corrected for the number of parameters by Holm's method.
+every epoch as independent, and alongside it a test that holds for noise with a memory. The slope is
+fitted with the thermometer's noise counted. p-values are corrected for the number of parameters by
+Holm's method.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.analysis.statistics.autocorrelation import noise_autocorrelation
+from thermocald.analysis.statistics.noise_models import MODELS, largest_p_value, pooled, spectra
 from thermocald.analysis.statistics.straight_line import fit_straight_line
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ __all__ = [
     "dependence",
     "holm",
     "pearson_p_value",
+    "slope_p_value",
     "thermometer_noise",
 ]
 
@@ -41,9 +43,10 @@ _NOISY = 0.01
 class Dependence:
     """One parameter against one temperature; slope in parameter units per K.
 
-    p_naive counts all n epochs as independent; p_value counts `n_effective`, and is 1 where fewer
-    than three are left; sd_slope holds thermometer noise, the adjustments' sds, scatter beyond both
-    and autocorrelation; misfit: scatter over what the two noises explain.
+    p_naive counts all n epochs as independent; p_value holds whatever the autocorrelation of the
+    noise; n_effective: independent values that the epochs are worth; sd_slope holds thermometer
+    noise, the adjustments' sds, scatter beyond both and autocorrelation; misfit: scatter over what
+    the two noises explain.
     """
 
     n: int
@@ -66,6 +69,28 @@ def pearson_p_value(r: float, n: float) -> float:
     if abs(r) >= 1.0:
         return 0.0
     return float(2 * t.sf(abs(r) * np.sqrt((n - 2) / (1 - r * r)), n - 2))
+
+
+def slope_p_value(values: Array, temperature: Array) -> float:
+    """Two-sided p-value of no linear dependence, whatever the memory of the noise.
+
+    The t-test of the slope by generalised least squares, its largest p-value over the noise models.
+    """
+    from scipy.fft import dct
+    from scipy.stats import t
+
+    n = len(values)
+    v, u = (dct(one - one.mean(), norm="ortho")[1:] for one in (values, temperature))
+    frequency = np.pi * np.arange(1, n) / n
+    count, frequency, uu, uv, vv = pooled(frequency, u * u, u * v, v * v)
+    spectrum = spectra(frequency, *MODELS)
+    weight = 1.0 / spectrum
+    information, product = weight @ uu, weight @ uv
+    left = np.maximum(weight @ vv - product**2 / information, np.finfo(float).tiny)
+    degrees = n - 2
+    deviance = degrees * np.log(left) + np.log(spectrum) @ count + np.log(information)
+    p = 2 * t.sf(np.abs(product) / np.sqrt(information * left / degrees), degrees)
+    return largest_p_value(np.asarray(p), deviance)
 
 
 def dependence(values: Array, sds: Array, temperature: Array, temperature_sd: float) -> Dependence:
@@ -106,7 +131,7 @@ def dependence(values: Array, sds: Array, temperature: Array, temperature_sd: fl
         pearson_p_value(r, n),
         noise.n_effective,
         noise.lag_one,
-        pearson_p_value(r, noise.n_effective),
+        slope_p_value(values, temperature),
         line.slope,
         line.sd_slope * float(np.sqrt(n / noise.n_effective)),
         misfit,

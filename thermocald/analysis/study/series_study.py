@@ -5,7 +5,7 @@ Everything that cannot be computed is said in `notes`, in words, and is None in 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,12 +16,8 @@ from thermocald.analysis.statistics.dependence import (
     dependence,
     holm,
 )
-from thermocald.analysis.statistics.significance import (
-    DriftTest,
-    drift_test,
-    moving_f_test,
-    unbroken_windows,
-)
+from thermocald.analysis.statistics.drift_test import DriftTest, drift_test
+from thermocald.analysis.statistics.significance import moving_f_test, unbroken_windows
 from thermocald.analysis.study.depth_of_field import (
     DepthOfField,
     circle_of_confusion,
@@ -86,9 +82,10 @@ class StudySettings:
 class Significance:
     """The moving F-test of one parameter, summed up, and the test for the whole series.
 
-    success_ratio over `tests` instants, `left_out` had no window; degrees of freedom of the
+    success_ratio over `tests` epochs, `left_out` had no window; degrees of freedom of the
     variance and (median) of the mean squared sd; critical: median; course (k, 2): time s, ratio of
-    the variances, thinned for drawing; drift: None where there is none.
+    the variances, thinned for drawing; drift: None where there is none; p_holm, p_excess_holm: its
+    p-values corrected for the number of parameters.
     """
 
     success_ratio: float
@@ -100,6 +97,8 @@ class Significance:
     median_ratio: float
     course: Array
     drift: DriftTest | None
+    p_holm: float = float("nan")
+    p_excess_holm: float = float("nan")
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +133,8 @@ class SeriesStudy:
 
     deviations: by IOP, `sigma0`, and thermometer; raster, displacement (k, 2) px: image
     points of a still scene, first to last epoch, y down; columns, matrix (n, n): Pearson's r among
-    free IOP, sigma0 and thermometers.
+    free IOP, sigma0 and thermometers; noise_ratio: scatter between neighbouring epochs over the
+    stated standard deviations, NaN where it was not found.
     """
 
     series: MeasuredSeries
@@ -147,6 +147,7 @@ class SeriesStudy:
     columns: tuple[str, ...]
     matrix: Array
     notes: tuple[str, ...]
+    noise_ratio: float
 
 
 def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy:
@@ -182,6 +183,7 @@ def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy
         names,
         correlation_matrix(columns),
         tuple(notes),
+        _noise_ratio(significance),
     )
 
 
@@ -214,7 +216,7 @@ def _circumstances(series: MeasuredSeries) -> list[str]:
     if series.exterior == "per_epoch":
         notes.append(
             "Every epoch has an exterior orientation of its own: its movements and the principal "
-            "point's are told apart only weakly, and the standard deviations say so."
+            "point's are separated only weakly, and the standard deviations say so."
         )
     if not series.thermometers:
         notes.append("The series has no temperature: no dependence on it can be computed.")
@@ -251,7 +253,7 @@ def _significance(
         test = moving_f_test(
             values, sds, series.redundancy, series.time_s, settings.window, settings.alpha
         )
-        drift = drift_test(values, sds, series.redundancy, seed=settings.seed)
+        drift = drift_test(values, sds, series.redundancy, settings.window)
         course = np.column_stack([series.time_s[test.index], test.ratio])
         result[name] = Significance(
             test.success_ratio,
@@ -264,7 +266,23 @@ def _significance(
             course[:: max(1, -(-len(course) // _COURSE))].copy(),
             drift,
         )
+    return _corrected(result)
+
+
+def _corrected(result: dict[str, Significance]) -> dict[str, Significance]:
+    """The p-values of the drift tests corrected for the number of parameters."""
+    tested = {name: one.drift for name, one in result.items() if one.drift is not None}
+    drift = holm([test.p_value for test in tested.values()])
+    excess = holm([test.p_excess for test in tested.values()])
+    for name, p, p_excess in zip(tested, drift, excess, strict=True):
+        result[name] = replace(result[name], p_holm=p, p_excess_holm=p_excess)
     return result
+
+
+def _noise_ratio(significance: Mapping[str, Significance]) -> float:
+    """Scatter between neighbouring epochs over the stated sds: over all parameters, root mean."""
+    found = [one.drift.noise_ratio for one in significance.values() if one.drift is not None]
+    return float(np.sqrt(np.mean(np.square(found)))) if found else float("nan")
 
 
 def _channel(series: MeasuredSeries, thermometer: Thermometer) -> ChannelStudy:
@@ -282,7 +300,7 @@ def _channel(series: MeasuredSeries, thermometer: Thermometer) -> ChannelStudy:
     elif float(np.var(t, ddof=1)) < 2 * sd**2:
         reason = (
             f"{name} varied by {np.std(t, ddof=1):.3f} K, which its noise of {sd:.3f} K explains: "
-            "no dependence on it can be told."
+            "no dependence on it can be computed."
         )
     if reason:
         return ChannelStudy(thermometer, {}, {}, {}, reason)

@@ -73,6 +73,8 @@ def _series(study: SeriesStudy) -> dict[str, Any]:
         "source": s.source,
         "epochs": len(s),
         "without_result": dict(s.without_result),
+        "sigma0": float(np.sqrt(np.mean(np.square(s.sigma0)))),
+        "noise_ratio": study.noise_ratio,
         "exterior": s.exterior,
         "free": list(s.free),
         "deviations": {
@@ -121,9 +123,13 @@ def _significance(test: Significance) -> dict[str, Any]:
         "drift_test": None
         if test.drift is None
         else {
-            "variance_ratio": test.drift.statistic,
             "p": test.drift.p_value,
-            "surrogates": test.drift.surrogates,
+            "p_holm": test.p_holm,
+            "p_excess": test.drift.p_excess,
+            "p_excess_holm": test.p_excess_holm,
+            "variance_ratio": test.drift.variance_ratio,
+            "noise_ratio": test.drift.noise_ratio,
+            "sd_noise_ratio": test.drift.sd_noise_ratio,
             "epochs": test.drift.epochs,
         },
     }

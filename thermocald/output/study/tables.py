@@ -22,7 +22,12 @@ from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 
 if TYPE_CHECKING:
     from thermocald.analysis.study.deviations import Deviation
-    from thermocald.analysis.study.series_study import ChannelStudy, SeriesStudy, StudySettings
+    from thermocald.analysis.study.series_study import (
+        ChannelStudy,
+        SeriesStudy,
+        Significance,
+        StudySettings,
+    )
     from thermocald.analysis.study.study import CameraStudy
 
 __all__ = [
@@ -174,7 +179,7 @@ def significance_table(camera: CameraStudy, settings: StudySettings) -> Table | 
                         f"{test.critical:.3f}",
                         f"{test.degrees_variance}; {test.degrees_sd:.0f}",
                         f"{test.tests} ({test.left_out})",
-                        p_text(test.drift.p_value) if test.drift else "–",
+                        *_drift_cells(test),
                     )
                 )
     return Table(
@@ -186,18 +191,30 @@ def significance_table(camera: CameraStudy, settings: StudySettings) -> Table | 
             "median variance ratio",
             "limit",
             "degrees of freedom",
-            "instants tested (left out)",
-            "p, whole series",
+            "epochs tested (left out)",
+            "p, no drift",
+            "p, within sds",
+            "noise / stated",
         ),
         tuple(rows),
-        f"F-test at each instant: variance of {settings.window} consecutive epochs against the "
+        f"F-test at each epoch: variance of {settings.window} consecutive epochs against the "
         f"mean of their squared standard deviations, one-sided at α = {settings.alpha:g}. "
-        f"Neighbouring windows share {settings.window - 1} of {settings.window} epochs, so "
-        "their tests are not independent and the success ratio is no probability; of a parameter "
-        "that does not drift, about α of the instants succeed by chance. The last column is a "
-        "probability: it compares the variance of the whole series with those of simulated series "
-        "that do not drift but have the same standard deviations and autocorrelation.",
+        f"Neighbouring windows have {settings.window - 1} of {settings.window} epochs in common, "
+        "so the success ratio is no probability; of a parameter that does not drift, about α of "
+        "the epochs succeed by chance, and more where its noise exceeds the stated standard "
+        "deviations or has a memory. The p-values are for the whole series and corrected for the "
+        "number of parameters (Holm). No drift: the slow changes are noise, of whatever size and "
+        "memory. Within sds: all variation is noise of the stated standard deviations, whatever "
+        "its memory. Noise / stated: scatter between neighbouring epochs over the stated standard "
+        "deviation, 1 where they agree.",
     )
+
+
+def _drift_cells(test: Significance) -> tuple[str, str, str]:
+    if test.drift is None:
+        return ("–", "–", "–")
+    noise = with_sd(test.drift.noise_ratio, test.drift.sd_noise_ratio)
+    return (p_text(test.p_holm), p_text(test.p_excess_holm), noise)
 
 
 def dependence_tables(camera: CameraStudy) -> list[Table]:
@@ -244,10 +261,11 @@ def _dependence_table(study: SeriesStudy, channel: ChannelStudy) -> Table:
             "scatter / noise",
         ),
         tuple(rows),
-        f"r: Pearson's correlation. p naive counts every epoch as independent; p counts the "
-        "effective number that the autocorrelation of the residuals leaves; both are corrected for "
-        "the number of parameters (Holm). The slope counts the thermometer's noise of "
-        f"{plain(t.sd, 'K', 2)}. Scatter / noise above 1: the straight line does not explain all.",
+        f"r: Pearson's correlation. p naive counts every epoch as independent; p holds whatever "
+        "the memory of the noise; both are corrected for the number of parameters (Holm). n "
+        "effective: independent epochs that the series is worth. The slope counts the "
+        f"thermometer's noise of {plain(t.sd, 'K', 2)}. Scatter / noise above 1: the "
+        "straight line does not explain all.",
     )
 
 

@@ -1,7 +1,8 @@
 """A model of a camera type: the mean of several specimens, and how much they differ.
 
 The standard deviation of a type model is that of one more specimen: scatter between the cameras,
-and what each of their fits does not know. It is what a user has who did not calibrate.
+and how well their mean is known. It is what a user has who did not calibrate, and the prior of one
+who measured at a few temperatures.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.analysis.statistics.random_effects import population
 from thermocald.analysis.thermal.state import is_event
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, InteriorOrientation
@@ -45,12 +47,10 @@ def type_model(models: Sequence[ThermalModel], name: str) -> ThermalModel:
             )
     names = _names(first)
     values = np.array([[_value(m, n) for n in names] for m in models])
-    known = np.array([[_sd(m, n) for n in names] for m in models])
-    mean = values.mean(axis=0)
     n = len(models)
-    scatter = np.atleast_2d(np.cov(values, rowvar=False))
-    covariance = scatter * (1 + 1 / n) + np.diag((known**2).mean(axis=0) / n)
-    found = dict(zip(names, mean.tolist(), strict=True))
+    people = population(values, np.array([_covariance(m, names) for m in models]))
+    covariance = people.prior
+    found = dict(zip(names, people.mean.tolist(), strict=True))
     sd = dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
     listed = []
     for effect in first.effects:
@@ -92,6 +92,17 @@ def _value(model: ThermalModel, name: str) -> float:
     if group == "rates":
         return float(model.rates.get(key, 0.0))
     return float(next(e for e in model.effects if e.name == group).values[key])
+
+
+def _covariance(model: ThermalModel, names: tuple[str, ...]) -> Array:
+    """The covariance (k, k) of a model's numbers; else of its standard deviations."""
+    if model.covariance is None or not set(names) & set(model.covariance_names):
+        return np.diag([_sd(model, n) ** 2 for n in names])
+    place = {n: i for i, n in enumerate(model.covariance_names)}
+    full = np.array(model.covariance)
+    rows = [place.get(n, -1) for n in names]
+    known = np.array([r >= 0 for r in rows])
+    return np.where(np.outer(known, known), full[np.ix_(rows, rows)], 0.0)
 
 
 def _sd(model: ThermalModel, name: str) -> float:

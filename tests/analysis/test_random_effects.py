@@ -1,0 +1,96 @@
+"""A type of cameras: what is stated of a new specimen holds, and odd ones are seen."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermocald.analysis.statistics.random_effects import odd_specimens, population
+from thermocald.errors import DataError
+
+# rates of c, x0, y0 (µm/K) and the level of x0 (µm): scatter between specimens and their mean
+MEAN = np.array([1.2, -0.8, 0.5, 3.0])
+SD = np.array([0.30, 0.25, 0.20, 6.0])
+CORRELATION = 0.6
+
+
+def fleet(rng, count, noise):
+    """True values (count, k), estimates and their covariances."""
+    k = len(MEAN)
+    R = np.full((k, k), CORRELATION) + (1 - CORRELATION) * np.eye(k)
+    true = MEAN + rng.multivariate_normal(np.zeros(k), R * np.outer(SD, SD), count)
+    C = np.diag((noise * SD) ** 2)
+    return true, true + rng.multivariate_normal(np.zeros(k), C, count), np.array([C] * count)
+
+
+def coverage(noise, own, fleets):
+    """Fractions (5,) of 95 % intervals that hold: of each parameter, and of x0 at T0 + 20 K.
+
+    own: the new specimen's noise over the scatter of its type.
+    """
+    rng = np.random.default_rng([21, int(100 * noise), int(10 * own)])
+    inside = np.zeros(5)
+    for _ in range(fleets):
+        _, found, C = fleet(rng, 10, noise)
+        true, seen, C_new = fleet(rng, 1, own)
+        new = population(found, C).posterior(seen[0], np.linalg.inv(C_new[0]))
+        for i, direction in enumerate((*np.eye(4), np.array([0, 20.0, 0, 1.0]))):
+            _, low, high = new.interval(direction)
+            inside[i] += low <= direction @ true[0] <= high
+    return inside / fleets
+
+
+def test_the_intervals_of_a_new_specimen_hold():
+    found = coverage(0.1, 1.0, 120)
+    assert found.mean() == pytest.approx(0.95, abs=0.03)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("noise", "own"), [(0.05, 1.0), (0.3, 0.3), (0.1, 3.0)])
+def test_the_intervals_hold_over_a_thousand_fleets(noise, own):
+    found = coverage(noise, own, 1000)
+    assert found[:4].mean() == pytest.approx(0.95, abs=0.01)
+    assert (found > 0.92).all()
+
+
+def test_what_is_unknown_comes_from_the_type():
+    rng = np.random.default_rng(5)
+    _, found, C = fleet(rng, 10, 0.1)
+    people = population(found, C)
+    new = people.posterior(np.full(4, np.nan), np.zeros((4, 4)))
+    assert new.values == pytest.approx(people.mean)
+    assert new.covariance == pytest.approx(people.prior)
+    exact = people.posterior(MEAN, np.diag(1e12 / SD**2))
+    assert exact.values == pytest.approx(MEAN, abs=1e-6)
+
+
+def test_shrinking_is_better_than_either_alone():
+    rng = np.random.default_rng(6)
+    shrunk, own, kind = [], [], []
+    for _ in range(80):
+        _, found, C = fleet(rng, 10, 0.1)
+        people = population(found, C)
+        true, seen, C_new = fleet(rng, 1, 1.0)
+        new = people.posterior(seen[0], np.linalg.inv(C_new[0]))
+        shrunk.append(((new.values - true[0]) / SD) ** 2)
+        own.append(((seen[0] - true[0]) / SD) ** 2)
+        kind.append(((people.mean - true[0]) / SD) ** 2)
+    assert np.mean(shrunk) < 0.65 * np.mean(own)
+    assert np.mean(shrunk) < 0.65 * np.mean(kind)
+
+
+def test_odd_specimens_are_seen_and_others_are_not():
+    rng = np.random.default_rng(7)
+    false, seen = [], []
+    for _ in range(60):
+        _, found, C = fleet(rng, 10, 0.1)
+        false.append(odd_specimens(found, C) < 0.01)
+        found[3, 1] += 10 * SD[1]
+        seen.append(odd_specimens(found, C)[3] < 0.01)
+    assert np.mean(false) <= 0.02
+    assert np.mean(seen) >= 0.95
+
+
+def test_one_specimen_is_no_type():
+    with pytest.raises(DataError, match="at least 2"):
+        population(np.zeros((1, 3)), np.zeros((1, 3, 3)))

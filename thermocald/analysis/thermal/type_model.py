@@ -12,10 +12,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.statistics.random_effects import population
+from thermocald.analysis.statistics.random_effects import (
+    Population,
+    odd_specimens,
+    population,
+)
 from thermocald.analysis.thermal.state import is_event
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, InteriorOrientation
+from thermocald.photogrammetry.linalg import scaled_inverse
 from thermocald.simulation.model import RATED, ModelEffect, ThermalModel
 
 if TYPE_CHECKING:
@@ -25,7 +30,10 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["type_model"]
+__all__ = ["odd_cameras", "shrunk_to_type", "type_model"]
+
+_FEWEST_TO_COMPARE = 3
+_NORMAL_95 = 1.959964
 
 
 def type_model(models: Sequence[ThermalModel], name: str) -> ThermalModel:
@@ -49,35 +57,102 @@ def type_model(models: Sequence[ThermalModel], name: str) -> ThermalModel:
     values = np.array([[_value(m, n) for n in names] for m in models])
     n = len(models)
     people = population(values, np.array([_covariance(m, names) for m in models]))
-    covariance = people.prior
-    found = dict(zip(names, people.mean.tolist(), strict=True))
-    sd = dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
+    low = max(m.validity[c][0] for m in models for c in list(m.validity)[:1])
+    high = min(m.validity[c][1] for m in models for c in list(m.validity)[:1])
+    channel = next(iter(first.validity), "temperature")
+    mean = _with_values(first, names, people.mean, people.prior, name)
+    own = {k: v for k, v in mean.sds.items() if k.split(".")[0] in ("interior", "rates")}
+    return replace(
+        mean,
+        camera=name,
+        name=f"type {name}, {n} cameras",
+        exterior=None,
+        sds=own,
+        evidence={},
+        validity={channel: (low, high)} if low < high else first.validity,
+        fitted_on=tuple({"camera": m.camera, "version": m.version} for m in models),
+    )
+
+
+def odd_cameras(models: Sequence[ThermalModel]) -> dict[str, float]:
+    """{camera: probability that a camera of this type is as unlike the others as it is}.
+
+    Compared are the thermal parameters: rates and effects. DataError for fewer than three.
+    """
+    if len(models) < _FEWEST_TO_COMPARE:
+        raise DataError(f"odd cameras show among {_FEWEST_TO_COMPARE} or more")
+    names = tuple(n for n in _names(models[0]) if not n.startswith("interior."))
+    values = np.array([[_value(m, n) for n in names] for m in models])
+    covariances = np.array([_covariance(m, names) for m in models])
+    varied = (np.ptp(values, axis=0) > 0) | (np.einsum("ikk->ik", covariances) > 0).any(axis=0)
+    found = odd_specimens(values[:, varied], covariances[:, varied][:, :, varied])
+    return {m.camera: float(p) for m, p in zip(models, found, strict=True)}
+
+
+def shrunk_to_type(model: ThermalModel, kind: ThermalModel) -> ThermalModel:
+    """A camera that was measured at few temperatures, with what its type says of the rest.
+
+    model: its own fit; kind: of `type_model`, with the same T₀ and effects. The standard
+    deviations are such that 95 % lie within 1.96 of them, few specimens or not.
+    """
+    names = _names(kind)
+    if kind.covariance is None or not kind.fitted_on:
+        raise DataError(f"{kind.name or kind.camera} is not a type model (`fit --type` writes one)")
+    if model.sensor != kind.sensor or model.T0 != kind.T0 or _names(model) != names:
+        raise DataError(
+            f"the model of {model.camera} and the type {kind.camera} are not alike: sensor, "
+            "reference temperature and effects must be the same; fit with --t0 and --effect of "
+            "the type"
+        )
+    n = len(kind.fitted_on)
+    prior = np.array(kind.covariance)
+    own = _covariance(model, names)
+    people = Population(
+        np.array([_value(kind, name) for name in names]),
+        prior / (n + 1),
+        prior * n / (n + 1),
+        np.zeros_like(prior),
+        n - 1.0,
+        n,
+    )
+    free = (np.diag(own) > 0) & (np.diag(prior) > 0)
+    information = np.zeros_like(prior)
+    information[np.ix_(free, free)] = scaled_inverse(own[np.ix_(free, free)])
+    new = people.posterior(np.array([_value(model, name) for name in names]), information)
+    sd = np.sqrt(np.maximum(np.diag(new.covariance), 0.0))
+    wider = np.ones(len(names))
+    for i in np.flatnonzero(sd > 0):
+        value, low, _ = new.interval(np.eye(len(names))[i])
+        wider[i] = (value - low) / (_NORMAL_95 * sd[i])
+    return _with_values(
+        model, names, new.values, new.covariance * np.outer(wider, wider), str(kind.camera)
+    )
+
+
+def _with_values(
+    model: ThermalModel, names: tuple[str, ...], values: Array, covariance: Array, kind: str
+) -> ThermalModel:
+    found = dict(zip(names, values.tolist(), strict=True))
+    sd = dict(zip(names, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True))
     listed = []
-    for effect in first.effects:
+    for effect in model.effects:
         own = {k: f"{effect.name}.{k}" for k in effect.values if f"{effect.name}.{k}" in found}
         listed.append(
             ModelEffect(
                 effect.name,
                 {**effect.values, **{k: found[f] for k, f in own.items()}},
-                {k: sd[f] for k, f in own.items()},
+                {**effect.sds, **{k: sd[f] for k, f in own.items()}},
             )
         )
-    low = max(m.validity[c][0] for m in models for c in list(m.validity)[:1])
-    high = min(m.validity[c][1] for m in models for c in list(m.validity)[:1])
-    channel = next(iter(first.validity), "temperature")
     return replace(
-        first,
-        camera=name,
-        name=f"type {name}, {n} cameras",
+        model,
         interior=InteriorOrientation(**{p: found[f"interior.{p}"] for p in IOP_NAMES}),
         rates={p: found[f"rates.{p}"] for p in RATED},
         effects=tuple(listed),
-        exterior=None,
-        sds={k: v for k, v in sd.items() if k.split(".")[0] in ("interior", "rates")},
+        sds={**model.sds, **{k: v for k, v in sd.items() if k.startswith(("interior.", "rates."))}},
         covariance_names=names,
         covariance=tuple(tuple(row) for row in covariance.tolist()),
-        validity={channel: (low, high)} if low < high else first.validity,
-        fitted_on=tuple({"camera": m.camera, "version": m.version} for m in models),
+        evidence={**model.evidence, "shrunk_to_type": kind},
     )
 
 

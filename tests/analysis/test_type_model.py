@@ -1,0 +1,80 @@
+"""A type of cameras, and a camera of it that was measured at few temperatures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from thermocald.analysis.thermal.type_model import odd_cameras, shrunk_to_type, type_model
+from thermocald.errors import DataError
+from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
+from thermocald.simulation.model import ModelEffect, ThermalModel
+
+NAMES = ("interior.c", "rates.c", "rates.x0", "thermal_lag.tau")
+TYPE = np.array([3.04, 3.0e-4, -4.0e-4, 80.0])
+SCATTER = np.array([0.02, 5e-5, 8e-5, 10.0])
+
+
+def camera(name, values, sd):
+    found = dict(zip(NAMES, values, strict=True))
+    return ThermalModel(
+        name, Sensor(3280, 2464, 0.00112), 25.0,
+        InteriorOrientation(c=found["interior.c"]),
+        {"c": found["rates.c"], "x0": found["rates.x0"], "y0": 0.0},
+        (ModelEffect("thermal_lag", {"tau": found["thermal_lag.tau"]}, {"tau": sd[3]}),),
+        covariance_names=NAMES, covariance=tuple(map(tuple, np.diag(np.square(sd)))),
+        validity={"temperature": (10.0, 50.0)}, fitted_on=({"series": "M1"},),
+    )  # fmt: skip
+
+
+def cameras(rng, count, noise):
+    true = TYPE + SCATTER * rng.standard_normal((count, 4))
+    seen = true + noise * SCATTER * rng.standard_normal((count, 4))
+    return true, [camera(f"cam{i}", v, noise * SCATTER) for i, v in enumerate(seen)]
+
+
+def values_of(model):
+    tau = model.effects[0].values["tau"]
+    return np.array([model.interior.c, model.rates["c"], model.rates["x0"], tau])
+
+
+def test_few_temperatures_and_the_type_are_better_than_few_temperatures():
+    rng = np.random.default_rng(8)
+    pulls, own, shrunk = [], [], []
+    for _ in range(60):
+        _, fleet = cameras(rng, 10, 0.1)
+        kind = type_model(fleet, "rpi-v2.1")
+        true, (new,) = cameras(rng, 1, 1.0)
+        found = shrunk_to_type(new, kind)
+        sd = np.sqrt(np.diag(np.array(found.covariance)))
+        rows = [found.covariance_names.index(n) for n in NAMES]
+        pulls.append((values_of(found) - true[0]) / sd[rows])
+        own.append((values_of(new) - true[0]) / SCATTER)
+        shrunk.append((values_of(found) - true[0]) / SCATTER)
+    assert np.mean(np.abs(pulls) < 1.96) == pytest.approx(0.95, abs=0.04)
+    assert np.std(shrunk) < 0.8 * np.std(own)
+    assert found.evidence["shrunk_to_type"] == "rpi-v2.1"
+    assert found.camera == "cam0"
+    assert found.validity == new.validity
+
+
+def test_a_camera_unlike_its_type_is_named():
+    _, fleet = cameras(np.random.default_rng(9), 10, 0.1)
+    rates = {**fleet[4].rates, "x0": fleet[4].rates["x0"] + 10 * SCATTER[2]}
+    fleet[4] = replace(fleet[4], rates=rates)
+    found = odd_cameras(fleet)
+    assert found["cam4"] < 0.01
+    assert min(p for name, p in found.items() if name != "cam4") > 0.01
+
+
+def test_models_that_are_not_alike_are_refused():
+    _, fleet = cameras(np.random.default_rng(9), 4, 0.1)
+    kind = type_model(fleet, "rpi")
+    with pytest.raises(DataError, match="not a type model"):
+        shrunk_to_type(fleet[0], replace(kind, covariance=None))
+    with pytest.raises(DataError, match="not alike"):
+        shrunk_to_type(replace(fleet[0], T0=20.0), kind)
+    with pytest.raises(DataError, match="3 or more"):
+        odd_cameras(fleet[:2])

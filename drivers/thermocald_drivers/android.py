@@ -9,7 +9,7 @@
         width: 4032
         height: 3024
         delete: true                  # the photograph from the phone, after it is safely here
-        refuse_unlocked: false        # true: a frame whose focus or exposure moved is an error
+        refuse_unlocked: null         # null: focus, focal length, zoom; true: exposure too; false
         minimum_free_mb: 200          # less free storage is an error
         timeout_s: 15
         host: 127.0.0.1               # the adb server's, and its
@@ -20,11 +20,17 @@
          sensors: {temperature: battery, skin: "thermal:skin", soc: "zone:cpu-0-0"},
          units: {soc: thousandths}}    # of a battery or zone: degC, tenths, thousandths
 
-Before the first frame: set the camera app to its manual (pro) mode, fix focus, ISO and exposure
-time. The driver wakes and unlocks the phone (not through a PIN), opens the camera app once and
-keeps it open, since a restart would focus anew. A photograph is the one new file of the folder; it
-is taken when its size stands, its bytes are all there and the JPEG ends. Its time is EXIF's, with
-the phone's clock compared to this machine's at each open, or the trigger's where EXIF has none.
+Nothing of a phone's camera can be set through adb: set the camera app to its manual (pro) mode and
+fix focus, ISO and exposure time before the first frame. Each photograph is compared with the first
+one, by EXIF and the camera service, and what they report is stored with the epoch. A photograph
+whose focus, focal length or zoom changed is refused (`refuse_unlocked`); where a phone does not
+report its focus, the status says that it cannot be checked.
+
+The driver wakes and unlocks the phone (not through a PIN), opens the camera app once and keeps it
+open, since a restart would focus again. A photograph is the one new file of the folder; it is taken
+when its size no longer changes, all bytes were received and the JPEG is complete. Its time is that
+of EXIF, with the phone's clock compared to this machine's at each open, or the trigger's if EXIF
+has none.
 """
 
 from __future__ import annotations
@@ -119,7 +125,7 @@ class AndroidCamera(Camera):
         tap: Sequence[int] | None = None,
         folder: str = "/sdcard/DCIM/Camera",
         delete: bool = False,
-        refuse_unlocked: bool = False,
+        refuse_unlocked: bool | None = None,
         minimum_free_mb: float = 200.0,
         timeout_s: float = 15.0,
         host: str = "127.0.0.1",
@@ -139,7 +145,11 @@ class AndroidCamera(Camera):
         else:
             self.command = f"input keyevent {KEYS[trigger]}"
         self.folder = support.text("folder", folder).rstrip("/")
-        self.delete, self.refuse_unlocked = bool(delete), bool(refuse_unlocked)
+        self.delete = bool(delete)
+        if refuse_unlocked is not None and not isinstance(refuse_unlocked, bool):
+            raise ConfigurationError(f"refuse_unlocked: {refuse_unlocked!r} is not true or false")
+        self.refuse_unlocked = refuse_unlocked
+        self._unchecked = ""
         self.minimum_free_mb = support.number("minimum_free_mb", minimum_free_mb, 0, 1e6, "MB")
         self._first: dict[str, Any] | None = None
         self._offset, self._zone, self._offset_half = 0.0, "", 0.0
@@ -164,6 +174,14 @@ class AndroidCamera(Camera):
 
     def identity(self) -> Mapping[str, str]:
         return {"serial": self.phone.serial}
+
+    def warnings(self) -> list[str]:
+        found = []
+        if self.refuse_unlocked is False:
+            found.append("refuse_unlocked: false accepts a phone that focuses between frames")
+        if self._unchecked:
+            found.append(f"{self._unchecked}: whether they stay as they are cannot be checked")
+        return found
 
     def frame_size(self) -> tuple[int, int]:
         return self.width, self.height
@@ -201,6 +219,7 @@ class AndroidCamera(Camera):
             utc=utc,
             exposure=tags.get("exposure_s"),
             metadata=metadata,
+            settings=photograph.settings(tags),
         )
 
     def _wake(self) -> None:
@@ -265,8 +284,15 @@ class AndroidCamera(Camera):
         if self._first is None:
             self._first = dict(tags)
         locked, why = photograph.lock_verdict(self._first, tags)
-        if locked is False and self.refuse_unlocked:
-            raise BadReading(f"{self.phone.where}: focus or exposure moved, {why}")
+        self._unchecked = why if locked is None else ""
+        moved = photograph.image_moved(self._first, tags)
+        if "SCAN" in str(self._first.get("af_state", "")):
+            self._first = None  # nothing to compare with: it was still focusing
+        if (locked is False and self.refuse_unlocked) or (moved and self.refuse_unlocked is None):
+            raise BadReading(
+                f"{self.phone.where}: focus or exposure moved, {why}; set the camera app to manual "
+                "(refuse_unlocked: false accepts it)"
+            )
         return locked, why
 
     def _instant(self, tags: Mapping[str, Any], triggered: float) -> tuple[float, str]:

@@ -1,4 +1,4 @@
-"""What a photograph says about itself (EXIF), and whether focus and exposure stayed locked.
+"""What a photograph reports of itself (EXIF), and whether focus and exposure stayed locked.
 
 Source: CIPA DC-008 (Exif 2.32), Android's `dumpsys media.camera`.
 """
@@ -6,6 +6,7 @@ Source: CIPA DC-008 (Exif 2.32), Android's `dumpsys media.camera`.
 from __future__ import annotations
 
 import io
+import math
 import re
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, timezone
@@ -15,9 +16,17 @@ from thermocald.errors import BadReading
 from thermocald_drivers import support
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
-__all__ = ["Instant", "exif", "focus_state", "instant", "lock_verdict"]
+__all__ = [
+    "Instant",
+    "exif",
+    "focus_state",
+    "image_moved",
+    "instant",
+    "lock_verdict",
+    "settings",
+]
 
 EXIF_IFD = 0x8769
 TAGS = {
@@ -33,8 +42,11 @@ TAGS = {
     0xA403: "white_balance",
     0xA404: "digital_zoom",
 }
-LOCKED = ("exposure_s", "iso", "f_number", "focal_length_mm", "digital_zoom")
+EXPOSURE = ("exposure_s", "iso")
+LENS = ("f_number", "focal_length_mm", "digital_zoom")
 FOCUS = ("subject_distance_m", "focus_distance_dioptres")
+SETTINGS = (*EXPOSURE, *LENS, *FOCUS)
+"""What a photograph tells of its camera's settings, stored with its epoch."""
 
 
 def exif(jpeg: bytes) -> dict[str, Any]:
@@ -47,7 +59,7 @@ def exif(jpeg: bytes) -> dict[str, Any]:
             found |= {"make": _plain(base.get(0x010F)), "model": _plain(base.get(0x0110))}
             found |= {"width": image.width, "height": image.height}
     except (OSError, ValueError, SyntaxError) as error:
-        raise BadReading(f"no photograph: {error}") from error
+        raise BadReading(f"these {len(jpeg)} bytes are not a photograph") from error
     return {name: value for name, value in found.items() if value is not None}
 
 
@@ -66,7 +78,7 @@ def _plain(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class Instant:
-    """When the exposure began, s UTC by the phone's clock, and how finely it is told (s)."""
+    """When the exposure began, s UTC by the phone's clock, and the resolution of that (s)."""
 
     utc: float
     resolution_s: float
@@ -93,7 +105,7 @@ def instant(tags: Mapping[str, Any], zone: str) -> Instant | None:
 
 
 def focus_state(dump: str) -> dict[str, Any]:
-    """Lens position and autofocus state out of `dumpsys media.camera`, where they are told."""
+    """Lens position and autofocus state from `dumpsys media.camera`, where it reports them."""
     found: dict[str, Any] = {}
     distance = re.search(
         r"android\.lens\.focusDistance \([^)]*\):[^\n]*\n\s*\[\s*([-\d.eE]+)", dump
@@ -106,16 +118,37 @@ def focus_state(dump: str) -> dict[str, Any]:
     return found
 
 
-def lock_verdict(first: Mapping[str, Any], now: Mapping[str, Any]) -> tuple[bool | None, str]:
-    """(True, False or None for "cannot be told", why): this photograph beside the first one."""
-    for name in (*LOCKED, *FOCUS):
-        if name in first and now.get(name) != first[name]:
-            return False, f"{name} was {first[name]} and is {now.get(name)}"
+def image_moved(first: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """What moved the image since the first photograph: focus, focal length, zoom; "" if nothing."""
     if "SCAN" in str(now.get("af_state", "")):
-        return False, f"autofocus is at work ({now['af_state']})"
+        return f"autofocus is at work ({now['af_state']})"
+    return _changed((*LENS, *FOCUS), first, now)
+
+
+def settings(tags: Mapping[str, Any]) -> dict[str, float]:
+    """The numbers among SETTINGS that the photograph tells."""
+    found = {name: tags[name] for name in SETTINGS if name in tags}
+    return {
+        name: float(value)
+        for name, value in found.items()
+        if isinstance(value, int | float) and math.isfinite(value)
+    }
+
+
+def _changed(names: Iterable[str], first: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    for name in names:
+        if name in first and now.get(name) != first[name]:
+            return f"{name} was {first[name]} and is {now.get(name)}"
+    return ""
+
+
+def lock_verdict(first: Mapping[str, Any], now: Mapping[str, Any]) -> tuple[bool | None, str]:
+    """(True, False, or None if unknown; why) of this photograph against the first one."""
+    if why := image_moved(first, now) or _changed(EXPOSURE, first, now):
+        return False, why
     missing = [name for name in ("exposure_s", "iso") if name not in now]
     if missing:
-        return None, f"the photographs do not tell {', '.join(missing)}"
+        return None, f"the photographs do not report {', '.join(missing)}"
     if not any(name in now for name in FOCUS):
-        return None, "neither the photographs nor the camera service tell the focus"
+        return None, "neither the photographs nor the camera service report the focus"
     return True, ""

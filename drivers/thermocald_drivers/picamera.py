@@ -7,21 +7,27 @@
         model: imx219                 # refuses any other sensor
         width: 3280                   # the whole sensor, no scaling
         height: 2464
-        exposure_s: 0.02
-        gain: 1.0
-        focus_dioptres: null          # lens position in 1/m; null where there is none
+        exposure_s: 0.02              # or `auto`
+        gain: 1.0                     # analogue; or `auto`
+        focus_dioptres: 2.0           # lens position in 1/m, `auto`, or left out: locked as it is
+        colour_gains: [1.8, 1.5]      # red, blue; `auto`, or left out: locked as they are
+        tolerance: 0.05               # by which exposure, gain and focus may differ
         timeout_s: 10
 
 The frame is the luminance plane of the sensor's YUV output, without a JPEG in between. Automatic
-exposure, gain and white balance are off; what the sensor really did stands in the metadata and
-must agree with what was asked (to `tolerance`, 5 %: exposures are whole numbers of lines). A frame
-that began before the call is thrown away. A capture that hangs is given up after `timeout_s` and
-the camera closed, so that the next `open` begins anew. picamera2 comes from Raspberry Pi OS
-(`apt install python3-picamera2`; the environment needs `--system-site-packages`).
+exposure, gain, white balance and focus are off; lens position and colour gains are locked at the
+values of the first frame after opening, and at the same ones when the camera is opened again. What
+the sensor really did is read back with each frame, stored with the epoch, and must agree with what
+was set (`tolerance`: exposures are whole numbers of lines). `auto` is accepted only by name, with a
+warning in the status. A frame that began before the call is discarded. A capture that hangs is
+given up after `timeout_s` and the camera closed, so that the next `open` starts again. picamera2
+comes from Raspberry Pi OS (`apt install python3-picamera2`; the environment needs
+`--system-site-packages`).
 
 libcamera's SensorTimestamp is on CLOCK_BOOTTIME, when the first line began to be read out: half an
 exposure later than the middle of that line's exposure. SensorTemperature is kept only where it is
-believable: the IMX219 gives none; others give their lower clamp (−20) or 0.0 until it is measured.
+plausible: the IMX219 gives none; others give their lower limit (−20) or 0.0 until it is measured.
+Source: libcamera control_ids_core.yaml, Picamera2 manual (Raspberry Pi Ltd), appendix C.
 """
 
 from __future__ import annotations
@@ -36,6 +42,7 @@ import numpy as np
 
 from thermocald.errors import (
     BadReading,
+    ConfigurationError,
     DeviceDenied,
     DeviceGone,
     DeviceTimeout,
@@ -45,7 +52,7 @@ from thermocald.hal import Camera, Found, Frame
 from thermocald_drivers import support
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from thermocald.hal import Clock
 
@@ -55,6 +62,9 @@ log = logging.getLogger(__name__)
 
 CLAMP_LOW_C, CLAMP_HIGH_C = -20.0, 80.0
 CLOSE_S = 3.0
+AUTO = "auto"
+MANUAL_FOCUS, CONTINUOUS_FOCUS = 0, 2
+"""libcamera's AfModeManual and AfModeContinuous."""
 
 
 def sensor_temperature(metadata: Mapping[str, Any]) -> float | None:
@@ -74,6 +84,39 @@ def _jsonable(value: Any) -> Any:
     return value if isinstance(value, str | int | float | bool | None) else str(value)
 
 
+def _number_or_auto(
+    name: str, value: object, low: float, high: float, unit: str = ""
+) -> float | str:
+    return AUTO if value == AUTO else support.number(name, value, low, high, unit)
+
+
+def _colour_gains(value: object) -> tuple[float, float] | str | None:
+    """Red and blue gain, AUTO, or None; ConfigurationError for anything else."""
+    if value is None or value == AUTO:
+        return None if value is None else AUTO
+    if not isinstance(value, list | tuple) or len(value) != 2:
+        raise ConfigurationError(f"colour_gains: {value!r} is not [red, blue]")
+    red, blue = (support.number("colour_gains", gain, 0, 32) for gain in value)
+    return red, blue
+
+
+def _current_settings(library: Any, number: int) -> dict[str, Any]:
+    """Size and lens position of a camera that nobody uses; {} otherwise."""
+    try:
+        camera = library.Picamera2(number)
+    except RuntimeError:
+        return {}
+    try:
+        width, height = camera.sensor_resolution
+        found: dict[str, Any] = {"width": int(width), "height": int(height)}
+        limits = camera.camera_controls.get("LensPosition")
+        if isinstance(limits, tuple) and len(limits) == 3 and limits[2] is not None:
+            found["focus_dioptres"] = float(limits[2])
+        return found
+    finally:
+        camera.close()
+
+
 class Picamera2Camera(Camera):
     """One libcamera camera, configured for stills and kept running."""
 
@@ -87,9 +130,10 @@ class Picamera2Camera(Camera):
         model: str | None = None,
         width: int = 3280,
         height: int = 2464,
-        exposure_s: float = 0.02,
-        gain: float = 1.0,
-        focus_dioptres: float | None = None,
+        exposure_s: float | str = 0.02,
+        gain: float | str = 1.0,
+        focus_dioptres: float | str | None = None,
+        colour_gains: Sequence[float] | str | None = None,
         tolerance: float = 0.05,
         timeout_s: float = 10.0,
     ) -> None:
@@ -98,17 +142,19 @@ class Picamera2Camera(Camera):
         self.model = model
         self.width = int(support.number("width", width, 64, 20000, "px", whole=True))
         self.height = int(support.number("height", height, 64, 20000, "px", whole=True))
-        self.exposure_s = support.number("exposure_s", exposure_s, 1e-5, 200, "s")
-        self.gain = support.number("gain", gain, 1, 64)
+        self.exposure_s = _number_or_auto("exposure_s", exposure_s, 1e-5, 200, "s")
+        self.gain = _number_or_auto("gain", gain, 1, 64)
         self.focus_dioptres = (
             None
             if focus_dioptres is None
-            else support.number("focus_dioptres", focus_dioptres, 0, 32, "1/m")
+            else _number_or_auto("focus_dioptres", focus_dioptres, 0, 32, "1/m")
         )
+        self.colour_gains = _colour_gains(colour_gains)
         self.tolerance = support.number("tolerance", tolerance, 0, 1)
         self.timeout_s = support.number("timeout_s", timeout_s, 0.05, 600, "s")
         self._camera: Any = None
         self._seen = False
+        self._held: dict[str, Any] = {}
 
     @property
     def where(self) -> str:
@@ -119,10 +165,12 @@ class Picamera2Camera(Camera):
     def attached(cls, sysfs: str = "/sys") -> list[Found]:  # noqa: ARG003
         """Cameras that libcamera lists."""
         library = support.library("picamera2")
-        return [
-            Found({"camera": k, "model": str(info.get("Model", ""))}, str(info.get("Id", "")))
-            for k, info in enumerate(library.Picamera2.global_camera_info())
-        ]
+        found = []
+        for k, info in enumerate(library.Picamera2.global_camera_info()):
+            options = {"camera": k, "model": str(info.get("Model", ""))}
+            options |= _current_settings(library, k) | {"exposure_s": 0.02, "gain": 1.0}
+            found.append(Found(options, str(info.get("Id", ""))))
+        return found
 
     def open(self) -> None:
         self._in_time(self._open, "opening")
@@ -159,27 +207,49 @@ class Picamera2Camera(Camera):
                 f"{self.where}: the sensor has {have} px, not {self.width}×{self.height}; "
                 "a scaled image has another interior orientation"
             )
-        microseconds = round(self.exposure_s * 1e6)
-        controls: dict[str, Any] = {
-            "AeEnable": False,
-            "AwbEnable": False,
-            "ExposureTime": microseconds,
-            "AnalogueGain": self.gain,
-            "FrameDurationLimits": (max(microseconds, 100_000),) * 2,
-        }
-        if self.focus_dioptres is not None:
-            if "LensPosition" not in camera.camera_controls:
-                raise WrongDevice(
-                    f"{self.where}: this lens cannot be focused; focus_dioptres: null"
-                )
-            controls |= {"AfMode": 0, "LensPosition": self.focus_dioptres}
+        if self.focus_dioptres is not None and "LensPosition" not in camera.camera_controls:
+            raise WrongDevice(
+                f"{self.where}: this lens cannot be focused; leave focus_dioptres out"
+            )
         size = (self.width, self.height)
         camera.configure(
             camera.create_still_configuration(
-                main={"size": size, "format": "YUV420"}, controls=controls, buffer_count=2
+                main={"size": size, "format": "YUV420"},
+                controls=self._controls("LensPosition" in camera.camera_controls),
+                buffer_count=2,
             )
         )
         camera.start()
+        self._lock(camera)
+
+    def _controls(self, focuses: bool) -> dict[str, Any]:
+        """The controls of the configuration; what is left out is locked by `_lock`."""
+        automatic = AUTO in (self.exposure_s, self.gain)
+        controls: dict[str, Any] = {"AeEnable": automatic, "AwbEnable": self.colour_gains == AUTO}
+        if not isinstance(self.exposure_s, str):
+            microseconds = round(self.exposure_s * 1e6)
+            controls["ExposureTime"] = microseconds
+            controls["FrameDurationLimits"] = (max(microseconds, 100_000),) * 2
+        if not isinstance(self.gain, str):
+            controls["AnalogueGain"] = self.gain
+        if isinstance(self.colour_gains, tuple):
+            controls["ColourGains"] = self.colour_gains
+        if focuses:
+            controls["AfMode"] = CONTINUOUS_FOCUS if self.focus_dioptres == AUTO else MANUAL_FOCUS
+            if isinstance(self.focus_dioptres, int | float):
+                controls["LensPosition"] = self.focus_dioptres
+        return controls
+
+    def _lock(self, camera: Any) -> None:
+        """Hold lens position and colour gains where the stanza leaves them out."""
+        wanted = {"LensPosition": self.focus_dioptres, "ColourGains": self.colour_gains}
+        open_ones = [name for name, value in wanted.items() if value is None]
+        if any(name not in self._held for name in open_ones):
+            first = camera.capture_metadata()
+            self._held = {n: first[n] for n in open_ones if first.get(n) is not None} | self._held
+        held = {name: self._held[name] for name in open_ones if name in self._held}
+        if held:
+            camera.set_controls(held)
 
     def close(self) -> None:
         camera, self._camera = self._camera, None
@@ -188,6 +258,14 @@ class Picamera2Camera(Camera):
                 self._in_time(camera.close, "closing", CLOSE_S)
             except (DeviceTimeout, RuntimeError) as error:
                 log.warning("%s", error)
+
+    def warnings(self) -> list[str]:
+        options = ("exposure_s", "gain", "focus_dioptres", "colour_gains")
+        return [
+            f"{name}: auto lets the camera change it; every change is another camera"
+            for name in options
+            if getattr(self, name) == AUTO
+        ]
 
     def identity(self) -> Mapping[str, str]:
         return {"camera": str(self.number), "model": str(self.model or "")}
@@ -220,6 +298,7 @@ class Picamera2Camera(Camera):
             utc=utc,
             exposure=exposure,
             metadata=kept,
+            settings=self._settings(metadata),
         )
 
     def _fresh(self, camera: Any, called_ns: int) -> tuple[Any, Mapping[str, Any]]:
@@ -246,14 +325,50 @@ class Picamera2Camera(Camera):
         return np.array(array[: self.height, : self.width], np.uint8)
 
     def _verify(self, metadata: Mapping[str, Any]) -> None:
-        """The camera did what it was told; libcamera delivers what it can, not what was asked."""
-        asked = {"ExposureTime": self.exposure_s * 1e6, "AnalogueGain": self.gain}
-        if self.focus_dioptres is not None:
+        """Libcamera delivers what it can, not what was asked: BadReading where they differ."""
+        asked: dict[str, Any] = dict(self._held)
+        if not isinstance(self.exposure_s, str):
+            asked["ExposureTime"] = self.exposure_s * 1e6
+        if not isinstance(self.gain, str):
+            asked["AnalogueGain"] = self.gain
+        if isinstance(self.focus_dioptres, int | float):
             asked["LensPosition"] = self.focus_dioptres
+        if isinstance(self.colour_gains, tuple):
+            asked["ColourGains"] = self.colour_gains
         for name, value in asked.items():
             got = metadata.get(name)
-            if got is None or abs(got - value) > self.tolerance * max(value, 1e-9):
-                raise BadReading(f"{self.where}: {name} was set to {value:g} and is {got}")
+            if not self._agrees(value, got):
+                shown = f"{value:g}" if isinstance(value, int | float) else f"{value}"
+                raise BadReading(f"{self.where}: {name} was set to {shown} and is {got}")
+
+    def _agrees(self, asked: Any, got: Any) -> bool:
+        if isinstance(asked, tuple | list):
+            same = isinstance(got, tuple | list) and len(got) == len(asked)
+            return same and all(map(self._agrees, asked, got))
+        if isinstance(got, bool) or not isinstance(got, int | float):
+            return False
+        return bool(abs(got - asked) <= self.tolerance * max(abs(asked), 1e-9))
+
+    def _settings(self, metadata: Mapping[str, Any]) -> dict[str, float]:
+        """What moves the image, as the sensor reports it."""
+        found = {
+            "exposure_auto": float(AUTO in (self.exposure_s, self.gain)),
+            "white_balance_auto": float(self.colour_gains == AUTO),
+        }
+        for name, key, unit in (
+            ("exposure_s", "ExposureTime", 1e-6),
+            ("gain", "AnalogueGain", 1.0),
+            ("digital_gain", "DigitalGain", 1.0),
+            ("focus_dioptres", "LensPosition", 1.0),
+        ):
+            if isinstance(metadata.get(key), int | float):
+                found[name] = round(float(metadata[key]) * unit, 9)
+        if "LensPosition" in metadata:
+            found["focus_auto"] = float(self.focus_dioptres == AUTO)
+        gains = metadata.get("ColourGains")
+        if isinstance(gains, tuple | list) and len(gains) == 2:
+            found["colour_gain_red"], found["colour_gain_blue"] = map(float, gains)
+        return found
 
     def _in_time(self, work: Any, what: str, timeout_s: float | None = None) -> Any:
         """Run in a thread of its own, which is left behind if it hangs."""

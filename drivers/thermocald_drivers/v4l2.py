@@ -7,20 +7,25 @@
         width: 1920
         height: 1080
         pixel_format: MJPG            # GREY, Y16, YUYV, NV12, MJPG, Bayer (RG10, pRAA) …
-        exposure_s: 0.0156            # manual, read back at each frame
+        exposure_s: 0.0156            # these four: a value, `auto`, or left out: locked as it is
         gain: 0
-        focus: 0                      # manual focus position of the camera
+        focus: 0                      # focus position in the camera's own unit
         white_balance_k: 4600
         controls: {power_line_frequency: 1, sharpness: 0}     # any other, named as v4l2-ctl does
         card: C920                    # refuses a camera that does not call itself so
+        strict: true                  # false: a setting that does not hold is only stored
         timeout_s: 5
         backend: auto                 # linuxpy, opencv; auto: what is installed
         dev: /dev                     # where the nodes are
 
-Every control is set, read back, and read again with each frame: a camera that does not obey, or
-that falls back to automatic, is an error and not a frame (`strict: false` stores it in the frame's
-metadata instead). The frame's time is that of its buffer, brought to the middle of the exposure;
-frames that were exposed before `capture` was called are thrown away.
+A camera that focuses is another camera: what is left out is locked at the value that it has when it
+is opened, automatic modes are switched off, and `auto` is accepted only by name, with a warning in
+the status. Every setting is read back after it was set and with each frame, and stored with the
+epoch; a camera that does not obey, or that falls back to automatic, is an error and not a frame.
+`thermocald devices` writes the current values into the stanza.
+
+The frame's time is that of its buffer, moved to the middle of the exposure; frames that were
+exposed before `capture` was called are discarded.
 """
 
 from __future__ import annotations
@@ -41,6 +46,7 @@ from thermocald.errors import (
 )
 from thermocald.hal import Camera, Found, Frame
 from thermocald_drivers import pixel_formats, support
+from thermocald_drivers.v4l2_controls import AUTO, CameraControls
 from thermocald_drivers.v4l2_stream import (
     BUFFERS,
     OLDEST_S,
@@ -48,6 +54,7 @@ from thermocald_drivers.v4l2_stream import (
     LinuxpyStream,
     OpenCvStream,
     Stream,
+    current_settings,
 )
 
 if TYPE_CHECKING:
@@ -57,14 +64,8 @@ if TYPE_CHECKING:
 
 __all__ = ["V4l2Camera"]
 
-EXPOSURE_AUTO, EXPOSURE = 0x009A0901, 0x009A0902
-GAIN_AUTO, GAIN = 0x00980912, 0x00980913
-FOCUS_AUTO, FOCUS = 0x009A090C, 0x009A090A
-WHITE_AUTO, WHITE = 0x0098090C, 0x0098091A
-MANUAL_EXPOSURE = 1
-EXPOSURE_UNIT_S = 1e-4
 FUTURE_S = 1.0
-"""A stamp may lie this far ahead (vivid: up to a frame); beyond it is not CLOCK_MONOTONIC."""
+"""A time stamp may be this far ahead (vivid: up to a frame); beyond, it is another clock's."""
 
 
 class V4l2Camera(Camera):
@@ -82,10 +83,10 @@ class V4l2Camera(Camera):
         serial: str | None = None,
         card: str | None = None,
         pixel_format: str = "YUYV",
-        exposure_s: float | None = None,
-        gain: int | None = None,
-        focus: int | None = None,
-        white_balance_k: int | None = None,
+        exposure_s: float | str | None = None,
+        gain: int | str | None = None,
+        focus: int | str | None = None,
+        white_balance_k: int | str | None = None,
         controls: Mapping[str, int] | None = None,
         strict: bool = True,
         timeout_s: float = 5.0,
@@ -100,24 +101,23 @@ class V4l2Camera(Camera):
         self.device, self.serial, self.card = device, serial, card
         known = ["MJPG", *(name.strip() for name in pixel_formats.FORMATS)]
         self.pixel_format = support.choice("pixel_format", pixel_format, known).ljust(4)
-        self.exposure_s = (
-            None if exposure_s is None else support.number("exposure_s", exposure_s, 1e-5, 60, "s")
-        )
         wanted = {"gain": gain, "focus": focus, "white_balance_k": white_balance_k}
-        for name, value in wanted.items():
-            if value is not None:
+        for name, value in {"exposure_s": exposure_s, **wanted}.items():
+            if value is None or value == AUTO:
+                continue
+            if name == "exposure_s":
+                support.number(name, value, 1e-5, 60, "s")
+            else:
                 support.number(name, value, 0, 1e6, whole=True)
-        self.gain, self.focus, self.white_balance_k = gain, focus, white_balance_k
-        self.named = dict(controls or {})
+        self._controls = CameraControls(
+            f"camera {device or serial}", {"exposure_s": exposure_s, **wanted}, dict(controls or {})
+        )
         self.strict = bool(strict)
         self.timeout_s = support.number("timeout_s", timeout_s, 0.05, 600, "s")
         self.backend = support.choice("backend", backend, ["auto", "linuxpy", "opencv"])
         self.dev = Path(dev)
         self._stream: Stream | None = None
         self._seen = False
-        self._asked: dict[int, int] = {}
-        self._names: dict[int, str] = {}
-        self._limits: dict[int, str] = {}
 
     @property
     def where(self) -> str:
@@ -144,6 +144,7 @@ class V4l2Camera(Camera):
             ]
             lasting = str(links[0] if links else path)
             options = {"device": lasting, "width": 1920, "height": 1080, "pixel_format": "MJPG"}
+            options |= current_settings(str(path))
             about = f"{name} ({path}); sizes: v4l2-ctl -d {path} --list-formats-ext"
             found.append(Found(options, about))
         return found
@@ -153,7 +154,7 @@ class V4l2Camera(Camera):
         try:
             self._stream = self._open_stream(path)
             self._check_card(path)
-            self._set_controls()
+            self._controls.apply(self._stream, strict=self.strict)
             self._stream.start()
         except DeviceError as error:
             self.close()
@@ -172,6 +173,9 @@ class V4l2Camera(Camera):
         if stream is not None:
             stream.close()
 
+    def warnings(self) -> list[str]:
+        return self._controls.warnings()
+
     def identity(self) -> Mapping[str, str]:
         card = self._stream.card if self._stream else ""
         return {"device": str(self.device or self.serial), "card": card}
@@ -185,13 +189,14 @@ class V4l2Camera(Camera):
         called = time.monotonic()
         deadline = called + self.timeout_s
         try:
-            exposure = self._exposure(self._stream)
+            exposure = self._exposure(self._controls.values(self._stream))
             grab, stamp, dropped = self._fresh(self._stream, called, deadline, exposure)
-            disobeyed = self._disobeyed(self._stream)
+            values = self._controls.values(self._stream)
         except DeviceError:
             raise
         except OSError as error:
             raise support.fault(error, self.where, seen=True) from error
+        disobeyed = self._controls.deviations(values)
         if disobeyed and self.strict:
             raise BadReading(f"{self.where}: {'; '.join(disobeyed)}")
         middle = stamp + (0.5 if grab.start_of_exposure else -0.5) * (exposure or 0.0)
@@ -199,7 +204,7 @@ class V4l2Camera(Camera):
         metadata: dict[str, Any] = {
             "timestamp": "buffer" if stamp == grab.stamp else "arrival",
             "stale_frames_dropped": dropped,
-            "controls": {self._names[c]: value for c, value in self._asked.items()},
+            "controls": self._controls.by_name(values),
         }
         if disobeyed:
             metadata["disobeyed"] = disobeyed
@@ -211,12 +216,13 @@ class V4l2Camera(Camera):
             exposure=exposure,
             sequence=grab.sequence,
             metadata=metadata,
+            settings=self._controls.settings(values),
         )
 
     def _fresh(
         self, stream: Stream, called: float, deadline: float, exposure: float | None
     ) -> tuple[Grab, float, int]:
-        """(frame, its stamp in s, stale frames dropped): exposed after the call."""
+        """(frame, its time stamp in s, stale frames dropped): exposed after the call."""
         dropped = 0
         broken: BadReading | None = None
         arrived = 0.0
@@ -226,13 +232,11 @@ class V4l2Camera(Camera):
             arrived = time.monotonic()
             if stamp is not None and not arrived - OLDEST_S < stamp < arrived + FUTURE_S:
                 raise WrongDevice(
-                    f"{self.where}: the frame's stamp {stamp:.3f} s is not of this machine's "
+                    f"{self.where}: the frame's time stamp {stamp:.3f} s is not of this machine's "
                     f"monotonic clock ({arrived:.3f} s)"
                 )
             if stamp is None or stamp > arrived:
-                return (
-                    dropped >= BUFFERS
-                )  # it tells nothing: take the first that cannot have waited
+                return dropped >= BUFFERS  # it says nothing: take the first that cannot have waited
             return stamp - (0.0 if start_of_exposure else exposure or 0.0) >= called
 
         while True:
@@ -286,68 +290,7 @@ class V4l2Camera(Camera):
         if self.card is not None and self.card not in card:
             raise WrongDevice(f"{path}: this is {card!r}, not {self.card!r}")
 
-    def _wanted(self, stream: Stream) -> dict[int, int]:
-        """{control: value} in the order in which they must be set: manual mode first."""
-        available = stream.controls()
-        self._names = {number: control.name for number, control in available.items()}
-        self._limits = {
-            number: f"{c.minimum} … {c.maximum} in steps of {c.step}"
-            for number, c in available.items()
-        }
-        wanted: dict[int, int] = {}
-        for value, automatic, off, control, unit in (
-            (self.exposure_s, EXPOSURE_AUTO, MANUAL_EXPOSURE, EXPOSURE, EXPOSURE_UNIT_S),
-            (self.gain, GAIN_AUTO, 0, GAIN, 1),
-            (self.focus, FOCUS_AUTO, 0, FOCUS, 1),
-            (self.white_balance_k, WHITE_AUTO, 0, WHITE, 1),
-        ):
-            if value is None:
-                continue
-            if automatic in available:
-                wanted[automatic] = off
-            wanted[control] = round(value / unit)
-        by_name = {name: number for number, name in self._names.items()}
-        for name, number_value in self.named.items():
-            if name not in by_name:
-                known = ", ".join(sorted(by_name)) or "none"
-                raise WrongDevice(f"{self.where}: there is no control {name!r}; it has {known}")
-            wanted[by_name[name]] = int(support.number(name, number_value, -(2**31), 2**31 - 1))
-        for number in wanted:
-            if number not in available:
-                raise WrongDevice(f"{self.where}: no control 0x{number:08x} to set manually")
-        return wanted
-
-    def _set_controls(self) -> None:
-        stream = self._stream
-        if stream is None:
-            return
-        self._asked = self._wanted(stream)
-        for control, value in self._asked.items():
-            try:
-                stream.set(control, value)
-            except OSError as error:
-                raise WrongDevice(
-                    f"{self.where}: does not take {self._names[control]} = {value} "
-                    f"({error.strerror}); it takes {self._limits[control]}"
-                ) from error
-        disobeyed = self._disobeyed(stream)
-        if disobeyed and self.strict:
-            raise WrongDevice(f"{self.where}: {'; '.join(disobeyed)}")
-
-    def _disobeyed(self, stream: Stream) -> list[str]:
-        """Sentences on controls that do not read back as they were set."""
-        found = []
-        for control, value in self._asked.items():
-            now = stream.get(control)
-            if now != value:
-                limits = self._limits[control]
-                found.append(f"{self._names[control]} was set to {value} and is {now} ({limits})")
-        return found
-
-    def _exposure(self, stream: Stream) -> float | None:
-        """s, where the camera is in manual exposure and tells it."""
-        if EXPOSURE not in self._names or (
-            EXPOSURE_AUTO in self._names and stream.get(EXPOSURE_AUTO) != MANUAL_EXPOSURE
-        ):
-            return None
-        return stream.get(EXPOSURE) * EXPOSURE_UNIT_S
+    def _exposure(self, values: Mapping[int, int]) -> float | None:
+        """s, where the camera is in manual exposure and reports it."""
+        settings = self._controls.settings(values)
+        return None if settings.get("exposure_auto") else settings.get("exposure_s")

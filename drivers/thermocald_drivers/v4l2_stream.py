@@ -16,8 +16,9 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
-from thermocald.errors import BadReading, DeviceGone, DeviceTimeout, WrongDevice
+from thermocald.errors import BadReading, DeviceGone, DeviceTimeout, DriverMissing, WrongDevice
 from thermocald_drivers import pixel_formats, support
+from thermocald_drivers.v4l2_controls import Control, standing_values
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -26,7 +27,16 @@ if TYPE_CHECKING:
 
     Accept = Callable[[float | None, bool], bool]
 
-__all__ = ["BUFFERS", "OLDEST_S", "Control", "Grab", "LinuxpyStream", "OpenCvStream", "Stream"]
+__all__ = [
+    "BUFFERS",
+    "OLDEST_S",
+    "Control",
+    "Grab",
+    "LinuxpyStream",
+    "OpenCvStream",
+    "Stream",
+    "current_settings",
+]
 
 ERROR, TYPE_MASK, START_OF_EXPOSURE = 0x40, 0xE000, 0x10000
 OLDEST_S = 3600.0
@@ -40,18 +50,11 @@ OPENCV_PROPERTIES = {
     0x009A090A: "CAP_PROP_FOCUS",
     0x0098090C: "CAP_PROP_AUTO_WB",
     0x0098091A: "CAP_PROP_WB_TEMPERATURE",
+    0x009A0908: "CAP_PROP_PAN",
+    0x009A0909: "CAP_PROP_TILT",
+    0x009A090D: "CAP_PROP_ZOOM",
+    0x009A0911: "CAP_PROP_IRIS",
 }
-
-
-@dataclass(frozen=True)
-class Control:
-    """A setting of the camera; `name` is its name in lower case with underscores."""
-
-    id: int
-    name: str
-    minimum: int
-    maximum: int
-    step: int
 
 
 @dataclass(frozen=True)
@@ -90,7 +93,7 @@ class LinuxpyStream:
     def __init__(self, path: str, fourcc: str, width: int, height: int) -> None:
         self._path, self._fourcc = path, fourcc
         self._video = support.library("linuxpy.video.device", "v4l2")
-        logging.getLogger("linuxpy").setLevel(logging.WARNING)  # it tells each open and close
+        logging.getLogger("linuxpy").setLevel(logging.WARNING)  # it logs each open and close
         self._device = self._video.Device(path)
         self._capture: Any = None
         self._size, self._stride = (width, height), 0
@@ -107,7 +110,7 @@ class LinuxpyStream:
         capabilities = self._device.info.device_capabilities
         if self._video.Capability.VIDEO_CAPTURE not in capabilities:
             raise WrongDevice(
-                f"{path}: {self.card!r} is no capture device; try its first /dev/video"
+                f"{path}: {self.card!r} is not a capture device; try its first /dev/video"
             )
         kind = self._video.BufferType.VIDEO_CAPTURE
         self._video.set_format(self._device, kind, width, height, fourcc)
@@ -121,10 +124,7 @@ class LinuxpyStream:
         self._stride = int(pixels.bytesperline)
 
     def controls(self) -> dict[int, Control]:
-        return {
-            c.id: Control(c.id, _plain_name(c.name.decode()), c.minimum, c.maximum, c.step)
-            for c in self._video.iter_read_controls(self._device)
-        }
+        return _controls(self._video, self._device)
 
     def get(self, control: int) -> int:
         return int(self._video.get_control(self._device, control))
@@ -229,7 +229,7 @@ class OpenCvStream:
         self._capture.set(getattr(self._cv2, OPENCV_PROPERTIES[control]), value)
 
     def start(self) -> None:
-        """OpenCV streams from the first grab on."""
+        """OpenCV streams from the first grab."""
 
     def grab(self, deadline: float, accept: Accept) -> Grab | None:
         if self._pending is None or self._pending.done():
@@ -266,6 +266,26 @@ class OpenCvStream:
             self._pending.add_done_callback(lambda _: capture.release())
             return
         self._capture.release()
+
+
+def _controls(video: Any, device: Any) -> dict[int, Control]:
+    return {
+        c.id: Control(c.id, _plain_name(c.name.decode()), c.minimum, c.maximum, c.step)
+        for c in video.iter_read_controls(device)
+    }
+
+
+def current_settings(path: str) -> dict[str, float]:
+    """{option: value} of a camera as it is now, {} where it cannot be asked; sets nothing."""
+    try:
+        video = support.library("linuxpy.video.device", "v4l2")
+        logging.getLogger("linuxpy").setLevel(logging.WARNING)
+        with video.Device(path) as device:
+            return standing_values(
+                _controls(video, device), lambda number: int(video.get_control(device, number))
+            )
+    except (OSError, DriverMissing):
+        return {}
 
 
 def _plain_name(name: str) -> str:

@@ -223,6 +223,55 @@ def test_exposure_that_moved_is_flagged_or_refused(server, phone):
                 assert device.capture().metadata["locked"] is False
 
 
+FOCUS_MOVED = FOCUS.replace("0.25", "0.31")
+
+
+@pytest.mark.parametrize(
+    ("change", "tags", "why"),
+    [({"media_camera": FOCUS_MOVED}, {}, "focus_distance_dioptres was 0.25 and is 0.31"),
+     ({}, {"distance": 2.0}, "subject_distance_m was 1.5 and is 2.0"),
+     ({"media_camera": FOCUS + "android.control.afState (1): byte[1]\n [PASSIVE_SCAN ]\n"}, {},
+      "autofocus is at work")],
+)  # fmt: skip
+def test_a_phone_that_focuses_gives_no_frame(server, phone, change, tags, why):
+    phone.shoot = shoot(distance=1.5)
+    with camera(server) as device:
+        assert device.capture().settings["focus_distance_dioptres"] == 0.25
+        for name, value in change.items():
+            setattr(phone, name, value)
+        phone.shoot = shoot(**{"distance": 1.5, **tags})
+        with pytest.raises(BadReading, match=why):
+            device.capture()
+
+
+def test_a_phone_that_may_focus_is_in_the_warnings(server, phone):
+    with camera(server, refuse_unlocked=False) as device:
+        device.capture()
+        phone.media_camera = FOCUS_MOVED
+        frame = device.capture()
+        assert "refuse_unlocked: false" in device.warnings()[0]
+    assert frame.metadata["locked"] is False
+    assert frame.settings == {
+        "exposure_s": pytest.approx(1 / 60), "iso": 100.0, "focus_distance_dioptres": 0.31,
+    }  # fmt: skip
+
+
+def test_exposure_alone_is_stored_and_flagged(server, phone):
+    with camera(server) as device:
+        device.capture()
+        phone.shoot = shoot(iso=200)
+        frame = device.capture()
+    assert (frame.settings["iso"], frame.metadata["locked"]) == (200.0, False)
+
+
+def test_what_a_phone_does_not_report_is_in_the_warnings(server, phone):
+    phone.media_camera = ""
+    with camera(server) as device:
+        assert device.warnings() == []
+        device.capture()
+        assert "cannot be checked" in device.warnings()[0]
+
+
 def test_a_focus_that_nobody_tells_is_not_called_locked(server, phone):
     phone.media_camera = ""
     with camera(server) as device:

@@ -25,7 +25,7 @@ def test_tags():
 
 @pytest.mark.parametrize("data", [b"", b"\xff\xd8\xff\xd9", b"GIF89a"])
 def test_no_photograph(data):
-    with pytest.raises(BadReading, match="no photograph"):
+    with pytest.raises(BadReading, match="not a photograph"):
         exif(data)
 
 

@@ -9,11 +9,12 @@ import time
 
 import numpy as np
 import pytest
-from thermocald_drivers.picamera import sensor_temperature
+from thermocald_drivers.picamera import Picamera2Camera, sensor_temperature
 
 from tests.drivers.fakes import picamera2_stand_in
 from thermocald.errors import (
     BadReading,
+    ConfigurationError,
     DeviceDenied,
     DeviceGone,
     DeviceNotFound,
@@ -58,6 +59,79 @@ def test_manual_controls(pi):
     assert controls["AwbEnable"] is False
     assert (controls["ExposureTime"], controls["AnalogueGain"]) == (4000, 2.0)
     assert (controls["AfMode"], controls["LensPosition"]) == (0, 2.0)
+
+
+@pytest.fixture
+def focusing(pi):
+    """A camera with a lens that moves, such as the Camera Module 3."""
+    pi.camera_controls = {"LensPosition": (0.0, 32.0, 1.0)}
+    pi.standing = {"LensPosition": 1.5, "ColourGains": (1.75, 1.5)}
+    return pi
+
+
+def test_what_is_not_configured_is_locked_as_it_is(focusing):
+    with camera() as device:
+        frame = device.capture()
+        assert device.warnings() == []
+    controls = focusing.instances[0].configuration["controls"]
+    assert (controls["AfMode"], controls["LensPosition"]) == (0, 1.5)
+    assert (controls["AwbEnable"], controls["ColourGains"]) == (False, (1.75, 1.5))
+    assert frame.settings == {
+        "exposure_auto": 0.0, "white_balance_auto": 0.0, "exposure_s": 0.004, "gain": 1.0,
+        "focus_dioptres": 1.5, "focus_auto": 0.0, "colour_gain_red": 1.75, "colour_gain_blue": 1.5,
+    }  # fmt: skip
+
+
+def test_after_it_was_closed_the_same_values_are_set_again(focusing):
+    device = camera()
+    with device:
+        device.capture()
+    focusing.standing = {"LensPosition": 4.0, "ColourGains": (1.0, 1.0)}
+    with device:
+        assert device.capture().settings["focus_dioptres"] == 1.5
+
+
+@pytest.mark.parametrize(
+    "moved", [{"LensPosition": 2.0}, {"ColourGains": (1.0, 1.5)}, {"LensPosition": None}]
+)
+def test_a_lock_that_does_not_hold_gives_no_frame(focusing, moved):
+    with camera() as device:
+        device.capture()
+        focusing.extra = moved
+        with pytest.raises(BadReading, match=f"{next(iter(moved))} was set to"):
+            device.capture()
+
+
+def test_auto_only_by_name_and_with_a_warning(focusing):
+    with camera(focus_dioptres="auto", exposure_s="auto", colour_gains="auto") as device:
+        focusing.extra = {"LensPosition": 5.0}
+        frame = device.capture()
+        warned = [text.partition(":")[0] for text in device.warnings()]
+    assert warned == ["exposure_s", "focus_dioptres", "colour_gains"]
+    controls = focusing.instances[0].configuration["controls"]
+    assert (controls["AeEnable"], controls["AwbEnable"], controls["AfMode"]) == (True, True, 2)
+    assert "ExposureTime" not in controls
+    assert (frame.settings["focus_auto"], frame.settings["focus_dioptres"]) == (1.0, 5.0)
+
+
+@pytest.mark.parametrize(
+    "options", [{"colour_gains": [1.0]}, {"colour_gains": "warm"}, {"gain": "high"}]
+)
+def test_a_wrong_configuration(pi, options):
+    with pytest.raises(ConfigurationError):
+        camera(**options)
+
+
+def test_the_stanza_has_size_and_lens_position(focusing):
+    (found,) = Picamera2Camera.attached()
+    assert found.options == {
+        "camera": 0, "model": "imx219", "width": 96, "height": 64, "focus_dioptres": 1.0,
+        "exposure_s": 0.02, "gain": 1.0,
+    }  # fmt: skip
+    assert focusing.instances[0].closed
+    focusing.busy = True
+    (found,) = Picamera2Camera.attached()
+    assert found.options["model"] == "imx219"
 
 
 def test_the_time_is_the_middle_of_the_exposure(pi):

@@ -12,6 +12,7 @@ import cv2
 import linuxpy.ioctl
 import numpy as np
 import pytest
+from thermocald_drivers.v4l2 import V4l2Camera
 
 from tests.drivers.fakes.v4l2_kernel import FakeCamera
 from thermocald.errors import (
@@ -162,6 +163,115 @@ def test_a_control_that_it_does_not_have(kernel):
         camera(kernel, focus=0).open()
 
 
+AUTO_FOCUS, FOCUS, ZOOM, STABILISE = 0x9A090C, 0x9A090A, 0x9A090D, 0x9A0916
+AUTO_EXPOSURE, EXPOSURE, GAIN = 0x9A0901, 0x9A0902, 0x980913
+
+
+@pytest.fixture
+def focusing(kernel):
+    """A camera that focuses by itself: its position drifts while the automatic mode is on."""
+    kernel.controls |= {
+        AUTO_FOCUS: ["Focus, Automatic Continuous", 0, 1, 1, 1],
+        FOCUS: ["Focus, Absolute", 0, 255, 5, 35],
+        ZOOM: ["Zoom, Absolute", 100, 500, 1, 120],
+        STABILISE: ["Image Stabilization", 0, 1, 1, 1],
+    }
+    return kernel
+
+
+def test_what_is_not_configured_is_locked_as_it_is(focusing):
+    with camera(focusing) as device:
+        frame = device.capture()
+        assert device.warnings() == []
+    values = {number: control[4] for number, control in focusing.controls.items()}
+    assert (values[AUTO_FOCUS], values[FOCUS], values[ZOOM], values[STABILISE]) == (0, 35, 120, 0)
+    assert (values[AUTO_EXPOSURE], values[EXPOSURE], values[GAIN]) == (1, 250, 64)
+    assert frame.settings == {
+        "exposure_auto": 0.0, "exposure_s": 0.025, "gain": 64.0, "focus_auto": 0.0, "focus": 35.0,
+        "zoom_absolute": 120.0, "image_stabilization": 0.0,
+    }  # fmt: skip
+    assert frame.exposure == 0.025
+
+
+@pytest.mark.parametrize(
+    ("control", "value", "name"),
+    [(FOCUS, 40, "focus_absolute"), (ZOOM, 130, "zoom_absolute"), (AUTO_FOCUS, 1, "focus_auto"),
+     (EXPOSURE, 300, "exposure_time"), (GAIN, 65, "gain"), (STABILISE, 1, "image_stab")],
+)  # fmt: skip
+def test_a_lock_that_does_not_hold_gives_no_frame(focusing, control, value, name):
+    with camera(focusing) as device:
+        device.capture()
+        focusing.controls[control][4] = value
+        with pytest.raises(BadReading, match=f"{name}.* was set to .* and is {value}"):
+            device.capture()
+
+
+def test_after_a_plug_the_same_values_are_set_again(focusing):
+    device = camera(focusing)
+    with device:
+        device.capture()
+    for control, default in ((AUTO_FOCUS, 1), (FOCUS, 0), (AUTO_EXPOSURE, 3), (EXPOSURE, 156)):
+        focusing.controls[control][4] = default
+    with device:
+        settings = device.capture().settings
+    assert (settings["focus"], settings["exposure_s"]) == (35.0, 0.025)
+
+
+def test_an_automatic_mode_that_cannot_be_switched_off(focusing):
+    focusing.obeys = lambda control, value: 1 if control == AUTO_FOCUS else value
+    with pytest.raises(WrongDevice, match="to let it change, write focus: auto"):
+        camera(focusing).open()
+    with camera(focusing, focus="auto") as device:
+        focusing.controls[FOCUS][4] = 60
+        frame = device.capture()
+        assert device.warnings() == [
+            "focus: auto lets the camera change it; every change is another camera"
+        ]
+    assert (frame.settings["focus_auto"], frame.settings["focus"]) == (1.0, 60.0)
+
+
+def test_auto_by_name_switches_it_on(focusing):
+    with camera(focusing):
+        pass
+    assert focusing.controls[AUTO_FOCUS][4] == 0
+    with camera(focusing, focus="auto", exposure_s="auto") as device:
+        assert focusing.controls[AUTO_FOCUS][4] == 1
+        assert focusing.controls[AUTO_EXPOSURE][4] == 3
+        assert device.capture().exposure is None
+    with pytest.raises(WrongDevice, match="no automatic mode"):
+        camera(focusing, gain="auto").open()
+    with pytest.raises(ConfigurationError):
+        camera(focusing, focus="manual")
+
+
+def test_a_camera_that_rounds_its_own_value_is_locked_at_what_it_takes(focusing):
+    """It reports 37 while it focuses by itself, and can be set in steps of 5."""
+
+    def obeys(control, value):
+        if control == AUTO_FOCUS and value == 0:
+            focusing.controls[FOCUS][4] = 0  # forgets where it was
+        return value // 5 * 5 if control == FOCUS else value
+
+    focusing.controls[FOCUS][4], focusing.obeys = 37, obeys
+    with camera(focusing) as device:
+        assert device.capture().settings["focus"] == 35.0
+    with camera(focusing) as device:
+        assert device.capture().settings["focus"] == 35.0
+
+
+def test_the_stanza_has_the_current_values(focusing, tmp_path):
+    node = tmp_path / "sys/class/video4linux/video0"
+    node.mkdir(parents=True)
+    (node / "name").write_text("Fake Webcam\n")
+    (node / "index").write_text("0\n")
+    (found,) = V4l2Camera.attached(str(tmp_path / "sys"), str(tmp_path))
+    assert found.options == {
+        "device": str(focusing.path), "width": 1920, "height": 1080, "pixel_format": "MJPG",
+        "exposure_s": 0.025, "gain": 64, "focus": 35,
+    }  # fmt: skip
+    assert focusing.controls[AUTO_FOCUS][4] == 1  # nothing was set
+
+
 def test_a_size_that_it_does_not_have(kernel):
     with pytest.raises(WrongDevice, match="asked for 1920×1080 GREY, the camera gives 64×48 GREY"):
         camera(kernel, width=1920, height=1080).open()
@@ -174,7 +284,7 @@ def test_another_camera_at_the_node(kernel):
 
 def test_a_node_that_does_not_capture(kernel):
     kernel.capture_device = False
-    with pytest.raises(WrongDevice, match="no capture device"):
+    with pytest.raises(WrongDevice, match="not a capture device"):
         camera(kernel).open()
 
 
@@ -243,7 +353,7 @@ def test_another_device_at_its_number_is_not_the_end(kernel):
     device.open()
     device.close()
     kernel.capture_device = False
-    with pytest.raises(TransientDeviceError, match="no capture device"):
+    with pytest.raises(TransientDeviceError, match="not a capture device"):
         device.open()
     kernel.capture_device = True
     device.open()

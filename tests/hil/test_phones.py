@@ -87,8 +87,14 @@ def test_no_camera_app(phone):
 
 
 def test_focus_that_moved(phone, subject):
-    phone.load(subject[0][:2])
+    phone.load(subject[0][:4])
     with camera(phone) as device:
+        device.capture()
+        phone.focus(0.31)
+        with pytest.raises(BadReading, match=r"focus_distance_dioptres was 0\.25 and is 0\.31"):
+            device.capture()
+    with camera(phone, refuse_unlocked=False) as device:
+        phone.focus(0.25)
         device.capture()
         phone.focus(0.31)
         metadata = device.capture().metadata

@@ -35,6 +35,7 @@ class StandIn:
     sensor_resolution = (96, 64)
     camera_controls: ClassVar[dict] = {"ExposureTime": (), "AnalogueGain": ()}
     extra: ClassVar[dict] = {}
+    standing: ClassVar[dict] = {}
     stale = 0
     hang: threading.Event | None = None
     busy = False
@@ -62,11 +63,21 @@ class StandIn:
     def start(self) -> None:
         self.started = True
 
+    def capture_metadata(self) -> dict:
+        """Of the next frame, as libcamera's own state is now."""
+        return {**type(self).standing, **type(self).extra}
+
+    def set_controls(self, controls: dict) -> None:
+        unknown = set(controls) - {*type(self).camera_controls, "ColourGains", "AfMode"}
+        assert not unknown, f"libcamera has no control {unknown}"
+        self.configuration["controls"] |= controls
+
     def capture_request(self) -> Request:
         if type(self).hang is not None:
             type(self).hang.wait()
             raise RuntimeError("closed while waiting")
-        controls = self.configuration["controls"]
+        controls = {"ExposureTime": 8000, "AnalogueGain": 2.0, **type(self).standing}
+        controls |= self.configuration["controls"]
         exposure = controls["ExposureTime"]
         now = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
         if self._stale:
@@ -79,6 +90,7 @@ class StandIn:
             "SensorTimestamp": stamp,
             "ExposureTime": exposure,
             "AnalogueGain": controls["AnalogueGain"],
+            **{n: controls[n] for n in ("LensPosition", "ColourGains") if n in controls},
             "ScalerCrop": (0, 0, 96, 64),
             **type(self).extra,
         }

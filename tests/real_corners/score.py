@@ -1,0 +1,134 @@
+"""Scoring of the discovery on effects hidden in real corners.
+
+    python -m tests.real_corners.score --first 500 --seeds 2 [--part nine] [--camera aviary-cam1]
+
+Runs in memory through `discover_series`, the same function the command calls. Parts: `nine`, the
+nine effects of the target; `others`; `none`: no effect, 25 recordings of each camera and seed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+
+from tests.real_corners.generator import (
+    CAMERAS,
+    NINE,
+    OTHERS,
+    SHARED,
+    RealCase,
+    RealSeries,
+    generate,
+)
+from thermocald.discovery.evidence import SeriesInput
+from thermocald.discovery.reduction import gather
+from thermocald.discovery.result import Discovery, discover_series
+from thermocald.discovery.source import series_input
+from thermocald.store.recording import read_recording
+
+NONE_PER_SEED = 25
+
+
+@dataclass
+class RealOutcome:
+    """found: names said; listed: alternatives not excluded; gap_closed: share on M2."""
+
+    case: RealCase
+    found: tuple[str, ...]
+    verdict: str
+    listed: tuple[str, ...]
+    right: bool
+    right_or_listed: bool
+    gap_closed: float | None
+    seconds: float
+
+
+def input_of(series: RealSeries, source: str) -> SeriesInput:
+    """What the program reads, without files."""
+    recorded = series_input(read_recording(SHARED / source))
+    grid = recorded.grid
+    weights = np.zeros((len(series.times), len(recorded.field), 3))
+    weights[..., :2] = np.isfinite(series.points[..., :1]) / 0.1**2
+    return SeriesInput(
+        series.name, series.camera, recorded.sensor, recorded.field, recorded.principal_distance,
+        series.times, series.times, series.temperatures, dict.fromkeys(series.temperatures),
+        type(grid)(np.round(series.points, 4), weights), series.numbers,
+    )  # fmt: skip
+
+
+def discovered(case: RealCase) -> tuple[Discovery, dict, float]:
+    """The discovery of one case, its truth, CPU s."""
+    series, truth = generate(case)
+    inputs = [input_of(s, case.camera) for s in series]
+    begin = time.process_time()
+    first = gather(inputs[0])
+    rest = [gather(s, first.T0, first.scale) for s in inputs[1:]]
+    found = discover_series([first, *rest])
+    return found, truth, time.process_time() - begin
+
+
+def judge(case: RealCase) -> RealOutcome:
+    """One case, right or wrong."""
+    discovery, _, seconds = discovered(case)
+    found = tuple(sorted(e.effect for e in discovery.effects))
+    listed = tuple(a for e in discovery.effects for a in e.alternative_names)
+    hidden = tuple(sorted(case.effects))
+    right = found == hidden
+    if not hidden:  # what nobody recorded may be seen; it must not be named
+        right = found in ((), ("unnamed",))
+    close = right
+    if not right and len(found) == len(hidden):
+        wrong = [h for h in hidden if h not in found]
+        close = all(any(w in a.split("+") for a in listed) for w in wrong)
+    return RealOutcome(
+        case, found, discovery.verdict, listed, right, close, discovery.excess_closed(), seconds
+    )
+
+
+def cases(part: str, seeds: Iterable[int], cameras: Iterable[str] = CAMERAS) -> Iterator[RealCase]:
+    """The cases of a part."""
+    for camera in cameras:
+        for seed in seeds:
+            if part == "none":
+                for k in range(NONE_PER_SEED):
+                    yield RealCase(camera, (), seed * NONE_PER_SEED + k)
+            else:
+                for effect in NINE if part == "nine" else OTHERS:
+                    yield RealCase(camera, (effect,), seed)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--part", action="append")
+    parser.add_argument("--camera", action="append")
+    a = parser.parse_args()
+    for part in a.part or ("nine", "none"):
+        done = []
+        for case in cases(part, range(a.first, a.first + a.seeds), a.camera or CAMERAS):
+            o = judge(case)
+            done.append(o)
+            mark = "  " if o.right else "l " if o.right_or_listed else "X "
+            closed = "" if o.gap_closed is None else f"{o.gap_closed:.2f}"
+            print(
+                f"{mark}{case.camera} {'+'.join(case.effects) or 'none'} seed {case.seed}: "
+                f"{'+'.join(o.found) or 'none'} ({o.verdict}) listed {o.listed} gap {closed} "
+                f"{o.seconds:.1f} s", flush=True,
+            )  # fmt: skip
+        print(
+            f"{part}: exact {sum(o.right for o in done)} of {len(done)}, exact or listed "
+            f"{sum(o.right_or_listed for o in done)}, median "
+            f"{np.median([o.seconds for o in done]):.1f} s"
+        )
+
+
+if __name__ == "__main__":
+    main()

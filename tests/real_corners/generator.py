@@ -154,8 +154,8 @@ def generate(case: RealCase) -> tuple[list[RealSeries], dict]:
             RealSeries(
                 f"M{k + 1}", head["name"], np.arange(len(times)) + 1 + k * half,
                 times + 1.6e9 + 1e5 * k, read, corner + moved(own[k], k) - at_rest,
-            )  # fmt: skip
-        )
+            )
+        )  # fmt: skip
     truth = {
         "case": dict(case.__dict__.items()), "strength_px": strength, "programmes": programmes,
         "effects": [

@@ -27,11 +27,11 @@ from tests.real_corners.generator import (
     RealSeries,
     generate,
 )
-from thermocald.discovery.evidence import SeriesInput
-from thermocald.discovery.reduction import gather
-from thermocald.discovery.result import Discovery, discover_series
-from thermocald.discovery.source import series_input
-from thermocald.store.recording import read_recording
+from thermocald.discovery.verdict.result import Discovery, discover_series
+from thermocald.reduction.reduce import reduce_together
+from thermocald.reduction.series import SeriesInput
+from thermocald.reduction.source import series_input
+from thermocald.store.recording.reader import read_recording
 
 NONE_PER_SEED = 25
 
@@ -68,9 +68,7 @@ def discovered(case: RealCase) -> tuple[Discovery, dict, float]:
     series, truth = generate(case)
     inputs = [input_of(s, case.camera) for s in series]
     begin = time.process_time()
-    first = gather(inputs[0])
-    rest = [gather(s, first.T0, first.scale) for s in inputs[1:]]
-    found = discover_series([first, *rest])
+    found = discover_series(reduce_together(inputs))
     return found, truth, time.process_time() - begin
 
 

@@ -67,4 +67,5 @@ def in_blocks(evidence: ReducedSeries, rows: int = 720) -> ReducedSeries:
             rank * float((evidence.n > 0).sum() - (total > 0).sum()),
             first,
         ),
+        hidden=evidence.hidden.in_blocks(first) if evidence.hidden else None,
     )

@@ -54,4 +54,10 @@ def relinearised(fitter: HypothesisFitter, fit: Fit, series: int) -> ReducedSeri
     b = e.b - np.einsum("eti,tik->ek", weights[..., :2] * curved, e.columns)
     k = e.N.shape[-1]
     values = np.linalg.solve(e.N + 1e-6 * np.eye(k), b[..., None])[..., 0]
-    return replace(e, b=b, values=values, yy=np.einsum("ek,ek->e", values, b))
+    return replace(
+        e,
+        b=b,
+        values=values,
+        yy=np.einsum("ek,ek->e", values, b),
+        hidden=e.hidden.less(curved) if e.hidden else None,
+    )

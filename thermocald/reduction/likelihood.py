@@ -4,11 +4,12 @@ Per epoch the evidence is a small normal matrix N_e over camera parameters. A hy
 parameters along directions v (P,) with trajectories c (E,): Σ v c(t). Trajectories that are made
 from temperatures carry the thermometer's error δ (R,) through their own operator O (E, R): what is
 observed is d·O δ beside the image noise. δ is integrated out exactly (Woodbury), so neither white
-nor lagged thermometer noise passes for an effect:
+nor lagged thermometer noise is mistaken for an effect:
 
     S = N⁻¹ + J C Jᵀ,  J = Σ_k d_k ⊗ O_k,   S⁻¹ = N - N J (C⁻¹ + JᵀN J)⁻¹ JᵀN
 
-The level of every parameter belongs to the series and is eliminated here.
+The level of every parameter belongs to the series and is eliminated here; offsets of targets that
+are hidden for long, and the mount's movement, are integrated out with δ (`random_effects`).
 
 Source: Fuller (1987), Measurement Error Models, section 3.2; Rasmussen, Williams (2006), Gaussian
 Processes for Machine Learning, section 2.7 for marginalised linear terms.
@@ -59,7 +60,10 @@ class Weighting:
     logdet: float
     # (R, ·) blocks: L⁻¹ Oᵀ… ; empty lists where no thermometer matters
     operators: tuple[Array, ...]
+    places: tuple[slice, ...]  # of their states
     dN: tuple[Array, ...]  # d_kᵀN_e (E, P)
+    hidden: Array  # (S, E, P) of the hidden targets' offsets
+    hidden_at: slice
     factor: Array | None
     data: Array  # L⁻¹ Jᵀ b (R,)
     level: Array  # L⁻¹ Jᵀ constants (R, P)
@@ -72,12 +76,14 @@ class Weighting:
         from scipy.linalg import solve_triangular
 
         assert self.factor is not None
-        total: Array | float = 0.0
-        for operator, dN in zip(self.operators, self.dN, strict=True):
-            total = total + operator.T @ ((dN @ directions) * trajectories)
-        out: Array = solve_triangular(
-            self.factor, np.asarray(total), lower=True, check_finite=False
-        )
+        total = np.zeros((len(self.factor), trajectories.shape[1]))
+        for operator, at, dN in zip(self.operators, self.places, self.dN, strict=True):
+            total[at] += operator.T @ ((dN @ directions) * trajectories)
+        if len(self.hidden):
+            total[self.hidden_at] = np.einsum(
+                "sep,pr,er->sr", self.hidden, directions, trajectories, optimize=True
+            )
+        out: Array = solve_triangular(self.factor, total, lower=True, check_finite=False)
         return out
 
     def reduce(self, trajectories: Array, directions: Array) -> NormalEquations:
@@ -129,11 +135,14 @@ class Weighting:
         Kb = np.einsum("epq,qi,ei->pi", self.N, Vb, Cb, optimize=True)
         U = None
         if self.factor is not None:
-            total = np.zeros((self.operators[0].shape[1], G * m, k))
-            for operator, dN in zip(self.operators, self.dN, strict=True):
+            total = np.zeros((len(self.factor), G * m, k))
+            for operator, at, dN in zip(self.operators, self.places, self.dN, strict=True):
                 h = dN @ directions
                 for a in range(k):
-                    total[:, :, a] += operator.T @ (s * h[:, a : a + 1])
+                    total[at, :, a] += operator.T @ (s * h[:, a : a + 1])
+            if len(self.hidden):
+                seen = np.swapaxes(self.hidden, 1, 2) @ s  # (S, P, G m)
+                total[self.hidden_at] = np.swapaxes(seen, 1, 2) @ directions
             U = solve_triangular(
                 self.factor, total.reshape(len(total), -1), lower=True, check_finite=False
             )
@@ -166,83 +175,140 @@ class NormalEquations:
 def prepare(
     evidence: ReducedSeries, carried: list[ReadingErrorTerm], thermometer_factor: float = 1.0
 ) -> Weighting:
-    """Fix the covariance of a series: image noise, and the thermometers' carried by `carried`.
+    """Fix the covariance of a series: image noise, the movement of the epochs, and the
+    thermometers' noise carried by `carried`.
 
     thermometer_factor: multiplies the standard deviations of the readings.
     """
     from scipy.linalg import cholesky, solve_triangular
 
-    N, b = evidence.N, evidence.b
-    P = N.shape[1]
-    yy = float(evidence.yy.sum())
-    k0, N0 = b.sum(axis=0), N.sum(axis=0)
-    if not carried:
-        F = _level_factor(N0)
-        return Weighting(N, b, yy, 0.0, (), (), None, np.zeros(0), np.zeros((0, P)), N0, k0, F)
-    names = list(dict.fromkeys(c.channel for c in carried))
-    sizes = [len(evidence.state_sd(n)) for n in names]
-    starts = np.concatenate([[0], np.cumsum(sizes)])
-    sd = np.concatenate([evidence.state_sd(n) for n in names]) * thermometer_factor
-    deviation = np.concatenate([evidence.state_deviation(n) for n in names])
-    operators = []
-    for item in carried:
-        operator = np.zeros((len(N), starts[-1]))
-        i = names.index(item.channel)
-        operator[:, starts[i] : starts[i + 1]] = item.operator
-        operators.append(operator)
-    N, b, yy, logdet = _blurred(N, b, yy, carried)
-    N0 = N.sum(axis=0)
-    dN = [np.einsum("p,epq->eq", item.direction, N) for item in carried]
+    sums = _sums(evidence)
+    P = sums.N.shape[1]
+    movement = evidence.movement
+    if not carried and movement is None and not len(sums.right):
+        k0, N0 = sums.b.sum(axis=0), sums.N.sum(axis=0)
+        return Weighting(
+            sums.N, sums.b, sums.yy, 0.0, (), (), (), sums.cross, slice(0, 0), None, np.zeros(0),
+            np.zeros((0, P)), N0, k0, _level_factor(N0),
+        )  # fmt: skip
+    states: list[tuple[Array, Array, slice]] = []
+    sds: list[Array] = []
+    start = 0
+    if movement is not None:
+        m, K = movement.sd.shape
+        for j in range(m):
+            states.append(
+                (movement.directions[:, j], movement.operator(j), slice(start, start + K))
+            )
+            start += K
+        sds.append(np.ones(start))
+    moving = len(states)
+    own = slice(start, start + len(sums.right))
+    sds.append(np.ones(len(sums.right)))
+    start = own.stop
+    places: dict[str, slice] = {}
+    deviations: dict[str, Array] = {}
+    for name in dict.fromkeys(c.channel for c in carried):
+        sd_here = evidence.state_sd(name) * thermometer_factor
+        places[name] = slice(start, start + len(sd_here))
+        deviations[name] = evidence.state_deviation(name)
+        sds.append(sd_here)
+        start += len(sd_here)
+    states += [(c.direction, c.operator, places[c.channel]) for c in carried]
+    sd = np.concatenate(sds)
     # the readings' own deviation from the smooth trajectory, carried to the camera
-    shift = np.zeros((len(N), P))
-    for item, operator in zip(carried, operators, strict=True):
-        shift += np.outer(operator @ deviation, item.direction)
-    Nshift = np.einsum("epq,eq->ep", N, shift)
-    yy = yy - 2 * float(np.sum(shift * b)) + float(np.sum(shift * Nshift))
-    b = b - Nshift
+    shift = np.zeros((len(sums.N), P))
+    for item in carried:
+        shift += np.outer(item.operator @ deviations[item.channel], item.direction)
+        if item.unresolved is not None and item.unresolved.any():
+            sums = sums.blurred(item.direction, item.unresolved**2)
+    sums = sums.shifted(shift)
+    N, b, cross = sums.N, sums.b, sums.cross
+    N0 = N.sum(axis=0)
+    dN = [np.einsum("p,epq->eq", d, N) for d, _, _ in states]
     k0 = b.sum(axis=0)
     M = np.diag(1.0 / sd**2)
-    for i, (Oi, item) in enumerate(zip(operators, carried, strict=True)):
-        for j, Oj in enumerate(operators):
-            if j < i:
-                continue
-            weight = dN[i] @ carried[j].direction
+    if movement is not None:
+        Dn = np.einsum("epq,qj->epj", N, movement.directions)
+        G = np.einsum("pi,epj->eij", movement.directions, Dn)
+    for i, (_, Oi, at) in enumerate(states):
+        for j in range(i, len(states)):
+            dj, Oj, to = states[j]
+            weight = G[:, i, j] if j < moving else dN[i] @ dj
             part = Oi.T @ (weight[:, None] * Oj)
-            M += part if i == j else part + part.T
-        del item
+            M[at, to] += part
+            if i != j:
+                M[to, at] += part.T
+    M[own, own] = sums.normal
+    for d, operator, at in states:
+        part = operator.T @ (cross @ d).T
+        M[at, own] += part
+        M[own, at] += part.T
     factor = cholesky(M, lower=True, check_finite=False)
-    logdet += 2 * float(np.sum(np.log(np.diag(factor)))) + 2 * float(np.sum(np.log(sd)))
-    right = np.zeros((starts[-1], P + 1))
-    for operator, w, item in zip(operators, dN, carried, strict=True):
-        right[:, :P] += operator.T @ w
-        right[:, P] += operator.T @ (b @ item.direction)
+    logdet = sums.logdet + 2 * float(np.sum(np.log(np.diag(factor) * sd)))
+    right = np.zeros((start, P + 1))
+    for (d, operator, at), w in zip(states, dN, strict=True):
+        right[at, :P] += operator.T @ w
+        right[at, P] += operator.T @ (b @ d)
+    right[own, :P] = cross.sum(axis=1)
+    right[own, P] = sums.right
     right = solve_triangular(factor, right, lower=True, check_finite=False)
     level, data = right[:, :P], right[:, P]
     N0 = N0 - level.T @ level
     k0 = k0 - level.T @ data
+    held = _level_factor(N0)
+    if movement is not None:  # its size is estimated: the levels' share counts (restricted)
+        logdet += 2 * float(np.sum(np.log(np.diag(held))))
     return Weighting(
-        N, b, yy - float(data @ data), logdet, tuple(operators), tuple(dN), factor, data, level,
-        N0, k0, _level_factor(N0),
+        N, b, sums.yy - float(data @ data), logdet, tuple(o for _, o, _ in states),
+        tuple(at for _, _, at in states), tuple(dN), cross, own, factor, data, level, N0, k0, held,
     )  # fmt: skip
 
 
-def _blurred(
-    N: Array, b: Array, yy: float, carried: list[ReadingErrorTerm]
-) -> tuple[Array, Array, float, float]:
-    """Per epoch, the variance of unresolved trajectories is added (Sherman-Morrison)."""
-    logdet = 0.0
-    for item in carried:
-        if item.unresolved is None or not item.unresolved.any():
-            continue
-        d, variance = item.direction, item.unresolved**2
-        Nd = N @ d
+@dataclass(frozen=True, eq=False)
+class _Sums:
+    """The sums of a series before anything is integrated out, those of hidden targets included."""
+
+    N: Array  # (E, P, P)
+    b: Array  # (E, P)
+    yy: float
+    logdet: float
+    cross: Array  # (S, E, P)
+    normal: Array  # (S, S)
+    right: Array  # (S,)
+
+    def blurred(self, d: Array, variance: Array) -> _Sums:
+        """With a variance (E,) of the parameters along d, per epoch (Sherman-Morrison)."""
+        Nd = self.N @ d
         gain = variance / (1.0 + variance * (Nd @ d))
-        db = b @ d
-        logdet += float(np.sum(np.log1p(variance * (Nd @ d))))
-        yy -= float(np.sum(gain * db**2))
-        b = b - (gain * db)[:, None] * Nd
-        N = N - gain[:, None, None] * Nd[:, :, None] * Nd[:, None, :]
-    return N, b, yy, logdet
+        db = self.b @ d
+        dc = self.cross @ d
+        return _Sums(
+            self.N - gain[:, None, None] * Nd[:, :, None] * Nd[:, None, :],
+            self.b - (gain * db)[:, None] * Nd,
+            self.yy - float(np.sum(gain * db**2)),
+            self.logdet + float(np.sum(np.log1p(variance * (Nd @ d)))),
+            self.cross - (gain * dc)[:, :, None] * Nd,
+            self.normal - (gain * dc) @ dc.T,
+            self.right - dc @ (gain * db),
+        )
+
+    def shifted(self, shift: Array) -> _Sums:
+        """With shifts (E, P) of the parameters taken off the data."""
+        moved = np.einsum("epq,eq->ep", self.N, shift)
+        yy = self.yy - 2 * float(np.sum(shift * self.b)) + float(np.sum(shift * moved))
+        right = self.right - np.einsum("sep,ep->s", self.cross, shift)
+        return _Sums(self.N, self.b - moved, yy, self.logdet, self.cross, self.normal, right)
+
+
+def _sums(evidence: ReducedSeries) -> _Sums:
+    hidden = evidence.hidden
+    yy = float(evidence.yy.sum())
+    if hidden is None:
+        none = np.zeros((0, *evidence.b.shape))
+        return _Sums(evidence.N, evidence.b, yy, 0.0, none, np.zeros((0, 0)), np.zeros(0))
+    normal, right = np.diag(hidden.normal), hidden.right.sum(axis=1)
+    return _Sums(evidence.N, evidence.b, yy, 0.0, hidden.cross, normal, right)
 
 
 def _level_factor(N0: Array) -> Array:

@@ -39,7 +39,8 @@ def with_correlated_noise(evidence: ReducedSeries) -> ReducedSeries:
     if k <= 1.0:
         return evidence
     factors, W = slow_together(evidence)
-    e = replace(evidence, N=evidence.N / k, b=evidence.b / k, yy=evidence.yy / k)
+    hidden = evidence.hidden.scaled(1.0 / k) if evidence.hidden else None
+    e = replace(evidence, N=evidence.N / k, b=evidence.b / k, yy=evidence.yy / k, hidden=hidden)
     return with_jumps(e, factors / k, W) or e
 
 

@@ -25,6 +25,7 @@ from thermocald.photogrammetry.series.normals import (
     right_hand_sides,
     sums_of_squares,
 )
+from thermocald.reduction.random_effects import hidden_targets
 from thermocald.reduction.requirements import (
     MIN_EPOCHS,
     MIN_TARGETS,
@@ -227,6 +228,7 @@ def _reduce(
         variance=variance,
         correlation=_slowness(v),
         gross=int(bad.sum()),
+        hidden=hidden_targets(w / variance, misclosure - offsets, A),
     )
 
 
@@ -314,6 +316,7 @@ def reweighted(evidence: ReducedSeries, noise: Array) -> ReducedSeries:
         yy=evidence.yy * factor,
         weights=evidence.weights * factor[:, None, None],
         sigma0=evidence.sigma0 / noise,
+        hidden=evidence.hidden.scaled(factor) if evidence.hidden else None,
     )
 
 

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.series.normals import ObservationGrid, Partials
+    from thermocald.reduction.random_effects import HiddenTargets, Movement
     from thermocald.reduction.thermometer import Thermometer
     from thermocald.simulation.history import History
 
@@ -94,7 +95,8 @@ class ReducedSeries:
 
     variance: factor by which the given variances were too small; correlation: how much larger the
     variance of slow trajectories is than that of white noise; gross: rejected points; excluded:
-    rows of targets left out; blocks: the epochs behind each row of a long series, or None.
+    rows of targets left out; blocks: the epochs behind each row of a long series, or None; hidden,
+    movement: what the likelihood integrates out (`random_effects`), or None.
     """
 
     source: SeriesInput
@@ -118,6 +120,8 @@ class ReducedSeries:
     gross: int
     excluded: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     blocks: Blocks | None = None
+    hidden: HiddenTargets | None = None
+    movement: Movement | None = None
 
     @property
     def numbers(self) -> NDArray[np.int64]:

@@ -125,4 +125,5 @@ def _only(evidence: ReducedSeries, epochs: NDArray[np.bool_]) -> ReducedSeries:
         b=evidence.b * w[:, None],
         yy=evidence.yy * w,
         n=evidence.n * epochs,
+        hidden=evidence.hidden.scaled(w) if evidence.hidden else None,
     )

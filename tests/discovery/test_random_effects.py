@@ -1,0 +1,77 @@
+"""What is integrated out: offsets of hidden targets, the mount's movement."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.blind.bridge import series_input
+from tests.blind.case import Case
+from tests.blind.generator import generate
+from thermocald.reduction.fit import HypothesisFitter
+from thermocald.reduction.random_effects import Movement, waves
+from thermocald.reduction.reduce import reduce_together
+
+
+def hidden_but(epochs: slice, targets: list[int]):
+    """A camera with nothing but its rates, some targets of which are seen for a while only."""
+    series, _ = generate(Case((), 0.3, 7, epochs=40, with_m2=False))
+    source = series_input(series[0])
+    never = np.zeros(source.grid.observed.shape, dtype=bool)
+    never[:, targets] = True
+    seldom = never.copy()
+    seldom[epochs][:, targets] = False
+    return [
+        reduce_together([replace(source, grid=source.grid.reject(bad))]) for bad in (never, seldom)
+    ]
+
+
+def test_targets_seen_in_one_epoch_say_nothing():
+    """Whatever their offsets are: one epoch has nothing to hold them against."""
+    without, once = hidden_but(slice(11, 12), list(range(60)))
+
+    a, b = (HypothesisFitter(series).fit(()) for series in (without, once))
+
+    sd = np.sqrt(np.diag(a.covariance))
+    scale = once[0].scale[:3] / without[0].scale[:3]
+    assert np.max(np.abs(b.coefficients / scale - a.coefficients) / sd[:3]) < 0.3
+    assert np.sqrt(np.diag(b.covariance)) / scale == pytest.approx(sd, rel=0.03)
+
+
+def test_movement_is_the_dense_covariance():
+    """Inner products with a movement equal those of the covariance matrix written out."""
+    series, _ = generate(Case((), 0.3, 5, epochs=24, with_m2=False))
+    e = reduce_together([series_input(series[0])])[0]
+    size, U = np.linalg.eigh(e.N.mean(axis=0))
+    keep = U[:, size > 1e-3 * np.median(size)]
+    directions = keep[:, -2:]
+    movement = Movement(directions, waves(e.times, 4), np.full((2, 4), 0.05))
+    fit = HypothesisFitter([replace(e, movement=movement)]).fit(())
+
+    N = np.einsum("pi,epq,qj->eij", keep, e.N, keep)
+    E, k = len(N), keep.shape[1]
+    S = np.zeros((E * k, E * k))
+    for i in range(E):
+        S[i * k : (i + 1) * k, i * k : (i + 1) * k] = np.linalg.inv(N[i])
+    J = [
+        np.einsum("e,k->ek", movement.operator(j)[:, w], keep.T @ directions[:, j]).ravel()
+        for j in range(2)
+        for w in range(4)
+    ]
+    own = HypothesisFitter([e]).drive((), 0)[1] * e.state_sd("temperature")
+    d = keep.T @ fit.direction(fit.blocks[0])[0]
+    J += [np.einsum("e,k->ek", own[:, i], d).ravel() for i in range(own.shape[1])]
+    S += np.transpose(J) @ np.array(J)
+    C = np.random.default_rng(1).normal(size=(E, 2))
+    C -= C.mean(axis=0)
+    X = np.einsum("er,kr->ekr", C, keep.T @ keep[:, :2]).reshape(-1, 2)
+    level = np.tile(np.eye(k), (E, 1))
+    inverse = np.linalg.inv(S)
+    L = inverse @ level
+    expected = X.T @ (inverse - L @ np.linalg.solve(level.T @ L, L.T)) @ X
+
+    found = fit.weightings[0].reduce(C, keep[:, :2]).A
+
+    assert found == pytest.approx(expected, rel=2e-3, abs=2e-3 * np.abs(expected).max())

@@ -1,0 +1,38 @@
+"""Effects hidden in real image points (`python -m tests.real_corners.score`)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.real_corners import generator
+from tests.real_corners.generator import SHARED, RealCase
+
+pytestmark = pytest.mark.skipif(
+    not (SHARED / "aviary-cam0").exists(), reason="shared/data/aviary-* is not there"
+)
+
+
+@pytest.fixture
+def still(monkeypatch):
+    """The boards come and go as they did; the corners stand still but for white noise."""
+    real = generator.corners
+
+    def quiet(camera):
+        names, place, points = real(camera)
+        rng = np.random.default_rng(5)
+        seen = np.isfinite(points)
+        count = np.maximum(seen.sum(axis=0), 1)
+        mean = np.where(seen, points, 0.0).sum(axis=0) / count
+        return names, place, np.where(seen, mean + rng.normal(0, 0.05, points.shape), np.nan)
+
+    monkeypatch.setattr(generator, "corners", quiet)
+
+
+def test_boards_that_come_and_go_do_not_pull_at_the_camera(still):
+    from tests.real_corners.score import judge
+
+    found = judge(RealCase("aviary-cam1", ("creep",), 0))
+
+    assert found.right
+    assert found.gap_closed == pytest.approx(1.0, abs=0.05)

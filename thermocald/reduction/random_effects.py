@@ -1,0 +1,130 @@
+"""Unknowns of a series that are no part of a hypothesis and are integrated out of its likelihood.
+
+The offsets of targets that are hidden for long: where they are taken for known, a target that comes
+back pulls at the camera. The slow movement of the camera on its mount: a random walk, or a bounded
+one, in the well-determined combinations of the camera's parameters.
+
+Source: Patterson, Thompson (1971), Biometrika 58, 545-554 (variance components); Rasmussen,
+Williams (2006), Gaussian Processes for Machine Learning, section 2.7.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+__all__ = ["HiddenTargets", "Movement", "hidden_targets", "waves"]
+
+_OFTEN = 0.9  # share of the epochs that show a target whose offset needs no unknown of its own
+_LOOSE = 1e-4  # px⁻², of an offset a priori
+
+
+@dataclass(frozen=True, eq=False)
+class HiddenTargets:
+    """Offsets of hidden targets, S combinations that the camera's parameters could take up.
+
+    patterns (G, E) px⁻²: weights of the targets that are seen together; members: per pattern the
+    targets' rows (n,) and the combinations (2n, s) of their coordinates; group (S,): the pattern of
+    each combination; vectors (S, P): its products with scaled parameters; right (S, E): with the
+    misclosures.
+    """
+
+    patterns: Array
+    members: tuple[tuple[NDArray[np.int64], Array], ...]
+    group: NDArray[np.int64]
+    vectors: Array
+    right: Array
+
+    @property
+    def cross(self) -> Array:
+        """Their part of the normal equations beside the epochs' parameters, (S, E, P)."""
+        out: Array = self.patterns[self.group][:, :, None] * self.vectors[:, None, :]
+        return out
+
+    @property
+    def normal(self) -> Array:
+        """The diagonal (S,) of their own normal matrix."""
+        out: Array = self.patterns.sum(axis=1)[self.group] + _LOOSE
+        return out
+
+    def scaled(self, factor: Array | float) -> HiddenTargets:
+        """With all weights multiplied by a factor, or by one (E,) for each epoch."""
+        return replace(self, patterns=self.patterns * factor, right=self.right * factor)
+
+    def in_blocks(self, starts: NDArray[np.int64]) -> HiddenTargets:
+        """On blocks of neighbouring epochs that start at some rows."""
+        return replace(
+            self,
+            patterns=np.add.reduceat(self.patterns, starts, axis=1),
+            right=np.add.reduceat(self.right, starts, axis=1),
+        )
+
+    def less(self, change: Array) -> HiddenTargets:
+        """With changes (E, T, 2) px taken off the image points."""
+        parts = [
+            self.patterns[k] * (change[:, rows].reshape(len(change), -1) @ U).T
+            for k, (rows, U) in enumerate(self.members)
+        ]
+        return replace(self, right=self.right - np.concatenate(parts))
+
+
+def hidden_targets(w: Array, left: Array, A: Array) -> HiddenTargets | None:
+    """The targets that are hidden for long, grouped by when they are seen; None where none is.
+
+    w (E, T, 3) px⁻², left (E, T, 2) px: misclosures, A (T, 2, P): partials.
+    """
+    there = w[..., 0] > 0
+    epochs = there.any(axis=1)
+    rows = np.flatnonzero(there.any(axis=0) & (there[epochs].mean(axis=0) < _OFTEN))
+    if not len(rows):
+        return None
+    together: dict[bytes, list[int]] = {}
+    for row in rows.tolist():
+        together.setdefault(np.packbits(there[:, row]).tobytes(), []).append(row)
+    patterns, members, group, vectors = [], [], [], []
+    for number, targets in enumerate(together.values()):
+        U, s, V = np.linalg.svd(A[targets].reshape(2 * len(targets), -1), full_matrices=False)
+        kept = s > 1e-9 * s[0]
+        patterns.append(w[:, targets, :2].mean(axis=(1, 2)))
+        members.append((np.array(targets), U[:, kept]))
+        group.append(np.full(int(kept.sum()), number))
+        vectors.append(s[kept, None] * V[kept])
+    empty = HiddenTargets(
+        np.stack(patterns), tuple(members), np.concatenate(group), np.concatenate(vectors),
+        np.zeros((sum(U.shape[1] for _, U in members), len(w))),
+    )  # fmt: skip
+    return empty.less(-np.where(there[..., None], left, 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Movement:
+    """Slow movement of the epochs' parameters that no hypothesis explains.
+
+    directions (P, m) in px-scaled columns; trajectories (E, K): orthonormal cosines; sd (m, K): of
+    their amplitudes.
+    """
+
+    directions: Array
+    trajectories: Array
+    sd: Array
+
+    def operator(self, mode: int) -> Array:
+        """Trajectories (E, K) of one direction for amplitudes of unit variance."""
+        out: Array = self.trajectories * self.sd[mode]
+        return out
+
+
+def waves(times: Array, count: int) -> Array:
+    """Cosines (E, K) over a series, orthonormal where the epochs are at even intervals."""
+    E = len(times)
+    u = (times - times[0]) / max(float(times[-1] - times[0]), 1e-9)
+    u = (u * (E - 1) + 0.5) / E
+    out: Array = np.sqrt(2.0 / E) * np.cos(np.pi * np.arange(1, count + 1) * u[:, None])
+    return out

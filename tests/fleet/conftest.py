@@ -6,6 +6,7 @@ import os
 import shutil
 import socket
 import subprocess
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -56,19 +57,19 @@ class Server:
 
 
 @pytest.fixture(scope="session")
-def cluster(tmp_path_factory):
+def cluster():
     programs = _programs()
     if programs is None:
         pytest.skip("PostgreSQL is not installed (apt install postgresql)")
     pytest.importorskip("sqlalchemy", reason="pip install thermocald[server]")
-    folder = tmp_path_factory.mktemp("postgres")
-    for parent in (folder, *folder.parents[:3]):
-        if parent.stat().st_uid == os.geteuid():
-            parent.chmod(parent.stat().st_mode | 0o011)
+    # not among pytest's folders: another user must reach it through every folder above
+    folder = Path(tempfile.mkdtemp(prefix="thermocald-postgres-"))
+    folder.chmod(0o755)
     server = Server(programs, folder)
     server.start()
     yield server
     server.stop()
+    shutil.rmtree(folder)
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -40,6 +40,7 @@ __all__ = [
     "select_covariance",
     "select_details",
     "select_epochs",
+    "stored_epoch",
 ]
 
 _PARTS = 1024  # detail.id = epoch.id * _PARTS + part; part 0 is the covariance
@@ -165,6 +166,18 @@ def _parts_of(connection: sqlite3.Connection, id_: int) -> list[tuple[int, bytes
 def _epoch(
     connection: sqlite3.Connection, row: dict[str, Any], measured: dict[str, Any], details: bool
 ) -> StoredEpoch:
+    covariance = seen = None
+    if details:
+        covariance, seen = _details(connection, row)
+        if measured is not row:
+            _, seen = _details(connection, measured)
+    return stored_epoch(row, covariance, seen)
+
+
+def stored_epoch(
+    row: Mapping[str, Any], covariance: Array | None, seen: Observations | None
+) -> StoredEpoch:
+    """An epoch from a row by column names, of this file or of a server."""
     epoch = Epoch(
         number=row["number"],
         frame_time=row["frame_time"],
@@ -173,23 +186,19 @@ def _epoch(
         frame=relative_path(row["frame"], f"epoch {row['number']}: frame", StoreError)
         if row["frame"]
         else None,
+        observations=seen,
         note=row["note"],
     )
     result = EpochResult(
         status=row["status"],
         reason=row["reason"],
         values=np.array([row[name] for name in PARAMETER_NAMES], dtype=float),
+        covariance=covariance,
         sigma0=_nan(row["sigma0"]),
         redundancy=row["redundancy"],
         n_observations=row["n_observations"],
         rejected=tuple(json.loads(row["rejected"])),
     )
-    if details:
-        covariance, seen = _details(connection, row)
-        if measured is not row:
-            _, seen = _details(connection, measured)
-        result = replace(result, covariance=covariance)
-        epoch = replace(epoch, observations=seen)
     return StoredEpoch(
         epoch, result, _mapping(row["extra"]), bool(row["clock_trusted"]), row["revision"]
     )

@@ -13,13 +13,12 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from thermocald.epoch import Epoch
 from thermocald.errors import StoreError
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.store.database.blob import unpack_covariance, unpack_observations
 from thermocald.store.database.epoch_columns import COLUMN_NAMES, sql_name
-from thermocald.store.database.epoch_table import StoredEpoch
-from thermocald.store.database.row import EpochResult, Event, LoggedReading, StoredSeries
+from thermocald.store.database.epoch_table import StoredEpoch, stored_epoch
+from thermocald.store.database.row import Event, LoggedReading, StoredSeries
 from thermocald.store.recording.head import parse_head
 from thermocald.store.recording.readings import interpolate_readings
 from thermocald.store.recording.testfield_file import parse_testfield
@@ -278,30 +277,14 @@ _EPOCH = (
 
 
 def _epoch(row: tuple[Any, ...], details: bool) -> StoredEpoch:
-    field = dict(zip(_EPOCH, row, strict=False))
-    values = np.array(row[len(_EPOCH) : len(_EPOCH) + 16], dtype=float)
-    covariance, observations = row[-2:] if details else (None, None)
-    epoch = Epoch(
-        number=field["number"],
-        frame_time=field["frame_time"],
-        temperature_time=_nan(field["temperature_time"]),
-        temperatures=_mapping(field["temperatures"]),
-        frame=Path(field["frame"]) if field["frame"] else None,
-        observations=unpack_observations(bytes(observations)) if observations else None,
-        note=field["note"],
-    )
-    result = EpochResult(
-        field["status"],
-        field["reason"],
-        values,
+    names = (*_EPOCH, *PARAMETER_NAMES, *(("covariance", "observations") if details else ()))
+    field = dict(zip(names, row, strict=True))
+    covariance, seen = field.get("covariance"), field.get("observations")
+    return stored_epoch(
+        field,
         unpack_covariance(bytes(covariance)) if covariance else None,
-        _nan(field["sigma0"]),
-        field["redundancy"],
-        field["n_observations"],
-        tuple(json.loads(field["rejected"])),
+        unpack_observations(bytes(seen)) if seen else None,
     )
-    extra = _mapping(field["extra"])
-    return StoredEpoch(epoch, result, extra, field["clock_trusted"], field["revision"])
 
 
 def _expression(name: str, series: StoredSeries) -> Any:
@@ -331,11 +314,3 @@ def _fixed_records(data: bytearray, names: Sequence[str]) -> dict[str, Array]:
         raise StoreError(f"the server sent {len(data)} bytes that are not the columns asked for")
     records = np.frombuffer(data, kind, body // kind.itemsize, _COPY_HEADER)
     return {name: records[f"value{i}"].astype(np.float64) for i, name in enumerate(names)}
-
-
-def _mapping(text: str) -> dict[str, float]:
-    return {name: _nan(value) for name, value in json.loads(text).items()}
-
-
-def _nan(value: float | None) -> float:
-    return float("nan") if value is None else value

@@ -49,7 +49,9 @@ def test_server_and_store_give_the_same(filled, server, make_result):
     with ServerStore(address(server, "?station=bank&camera=rpi")) as there:
         (found,) = there.all_series()
         assert (found.head, found.start, found.settings) == (
-            series.head, series.start, series.settings
+            series.head,
+            series.start,
+            series.settings,
         )
         assert np.array_equal(found.testfield.points, series.testfield.points)
         names = [*store.column_names(series), "blur"]

@@ -112,9 +112,10 @@ class ServerStore:
         every = self.all_series()
         found = [s for s in every if camera in (None, s.camera) and name in (None, s.name)]
         if len(found) != 1:
-            there = ", ".join(
-                f"{s.identity['station']}: {s.camera}/{s.name}" for s in every[:20]
-            ) or "none"
+            there = (
+                ", ".join(f"{s.identity['station']}: {s.camera}/{s.name}" for s in every[:20])
+                or "none"
+            )
             raise StoreError(
                 f"{self.path}: {'several series fit' if found else 'there is no such series'}; "
                 f"station: camera/series there: {there}; "
@@ -257,9 +258,9 @@ class ServerStore:
 
         chosen = sql.SQL(", ").join(_expression(name, series) for name in names)
         where = sql.SQL(_LATEST.replace("%s", "{}")).format(sql.Literal(key))
-        statement = sql.SQL(
-            "COPY (SELECT {} {} ORDER BY number) TO STDOUT (FORMAT BINARY)"
-        ).format(chosen, where)
+        statement = sql.SQL("COPY (SELECT {} {} ORDER BY number) TO STDOUT (FORMAT BINARY)").format(
+            chosen, where
+        )
         data = bytearray()
         reading = in_words(self.address, "columns cannot be read")
         with reading, self._engine.connect() as connection:

@@ -110,9 +110,7 @@ class ServerWriter:
         with sending, self._engine.begin() as connection:
             connection.execute(_insert(self._tables["frame"]), [row])
 
-    def _row(
-        self, table: str, row: Mapping[str, Any], keys: Mapping[int, UUID]
-    ) -> dict[str, Any]:
+    def _row(self, table: str, row: Mapping[str, Any], keys: Mapping[int, UUID]) -> dict[str, Any]:
         columns = self._tables[table].columns
         ready: dict[str, Any] = {}
         if table == "epoch" or "series" in columns:

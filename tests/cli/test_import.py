@@ -1,0 +1,138 @@
+"""`thermocald import` as a user runs it: EXIF times, a German log, clocks that are wrong."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from thermocald.cli import application
+from thermocald.errors import ThermocaldError
+from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.store.recording.reader import read_recording
+from thermocald.store.recording.testfield_file import write_testfield
+
+Image = pytest.importorskip("PIL.Image")
+START = datetime(2026, 6, 14, 10, 0, tzinfo=UTC).timestamp()
+
+
+def run(*arguments):
+    result = CliRunner().invoke(application(), ["import", *(str(a) for a in arguments)])
+    if isinstance(result.exception, ThermocaldError):
+        raise result.exception
+    return result
+
+
+def photograph(path, local, subsec="", offset="", size=(64, 48), focal=(304, 100), f35=29):
+    exif = Image.Exif()
+    exif[0x010F], exif[0x0110] = "RaspberryPi", "imx219"
+    inner = exif.get_ifd(0x8769)
+    if local:
+        inner[0x9003] = local
+    if subsec:
+        inner[0x9291] = subsec
+    if offset:
+        inner[0x9011] = offset
+    inner[0x920A], inner[0xA405] = focal[0] / focal[1], f35
+    Image.fromarray(np.full(size[::-1], 90, np.uint8)).save(path, exif=exif)
+
+
+@pytest.fixture
+def place(tmp_path):
+    """Six photographs every 10 s from 12:00:00.25 in Berlin, a log every 15 s, a field."""
+    (tmp_path / "photos").mkdir()
+    for i in range(6):
+        photograph(tmp_path / "photos" / f"{i}.jpg", f"2026:06:14 12:00:{10 * i:02d}", "250")
+    rows = "14.06.2026;11:59:50;20,5\n"
+    for i in range(8):
+        value = f"{21 + 0.25 * i:.2f}".replace(".", ",")
+        rows += f"14.06.2026;12:0{i // 4}:{15 * (i % 4):02d};{value}\n"
+    (tmp_path / "log.csv").write_text("Datum;Uhrzeit;Temperatur °C\n" + rows, encoding="latin-1")
+    names = [f"T{i}" for i in range(4)]
+    points = [[0, 0, 0], [300, 0, 0], [0, 300, 0], [300, 300, 50]]
+    write_testfield(tmp_path / "field.csv", TestField.build(names, points, 0.02, 10.0))
+    return tmp_path
+
+
+def arguments(place, *more):
+    return (
+        place / "photos", "--log", place / "log.csv", "--testfield", place / "field.csv", "--out",
+        place / "M1", *more,
+    )  # fmt: skip
+
+
+def test_photographs_and_a_german_log_become_a_recording(place):
+    result = run(*arguments(place, "--timezone", "Europe/Berlin"))
+    assert result.exit_code == 0, result.output
+    assert "6 epochs" in result.stdout
+    assert "guessed" in result.stderr
+    recording = read_recording(place / "M1")
+    assert recording.columns.frame_time.tolist() == [START + 0.25 + 10 * i for i in range(6)]
+    at_frame = recording.columns.at_frame("Temperatur °C")
+    assert at_frame == pytest.approx([21 + (0.25 + 10 * i) / 60 for i in range(6)])
+    assert recording.camera.principal_distance == pytest.approx(3.04)
+    assert recording.camera.sensor.pixel_pitch == pytest.approx(43.2666 * 3.04 / 29 / 80)
+    assert all(e.frame.read_bytes() for e in recording.epochs)
+
+
+def test_a_dry_run_shows_all_and_writes_nothing(place):
+    before = sorted(place.iterdir())
+    result = run(place / "photos", "--log", place / "log.csv", "--timezone", "Europe/Berlin",
+                 "--dry-run", "--json", "-")  # fmt: skip
+    assert sorted(place.iterdir()) == before
+    document = json.loads(result.stdout)
+    assert document["with_temperature"] == 6
+    assert "2026-06-14T10:00:00.250Z" in result.stderr
+    assert "cp1252, columns separated by semicolon, decimals with a comma" in result.stderr
+
+
+def test_clock_errors_and_zones_of_each_device(place):
+    """A camera 3 min 12 s ahead that writes its zone, a logger on winter time."""
+    for i in range(6):
+        photograph(
+            place / "photos" / f"{i}.jpg", f"2026:06:14 13:03:{12 + 4 * i:02d}", "", "+03:00"
+        )
+    result = run(*arguments(place, "--log-timezone", "+02:00", "--camera-clock", "+00:03:12"))
+    assert result.exit_code == 0, result.output
+    recording = read_recording(place / "M1")
+    assert recording.columns.frame_time.tolist() == [START + 4 * i for i in range(6)]
+
+
+@pytest.mark.parametrize(
+    ("more", "reason"),
+    [
+        ((), "has no time zone: say which with --timezone"),
+        (("--timezone", "Europe/Berlin", "--camera-clock", "+05:00:00"), "5.0 h apart"),
+        (("--timezone", "Mars"), "time zone 'Mars'"),
+        (("--timezone", "UTC", "--pixel-pitch", 0.002, "--unit", "R"), "--unit R"),
+        (("--timezone", "UTC", "--temperature-column", "T"), "there is no column 'T'"),
+    ],
+)
+def test_what_is_not_certain_is_refused_and_nothing_is_written(place, more, reason):
+    before = sorted(place.iterdir())
+    with pytest.raises(ThermocaldError, match=reason):
+        run(*arguments(place, *more))
+    assert sorted(place.iterdir()) == before
+
+
+def test_photographs_that_do_not_belong_together_are_refused(place):
+    photograph(place / "photos" / "9.jpg", "2026:06:14 12:01:10", size=(48, 64))
+    with pytest.raises(ThermocaldError, match=r"9\.jpg: has 48 × 64 px"):
+        run(*arguments(place, "--timezone", "Europe/Berlin"))
+    (place / "photos" / "9.jpg").write_bytes(b"\xff\xd8no picture")
+    with pytest.raises(ThermocaldError, match=r"9\.jpg: is not a picture"):
+        run(*arguments(place, "--timezone", "Europe/Berlin"))
+    photograph(place / "photos" / "9.jpg", "")
+    with pytest.raises(ThermocaldError, match=r"9\.jpg: EXIF holds no time.*--times name"):
+        run(*arguments(place, "--timezone", "Europe/Berlin"))
+
+
+def test_times_from_names(place):
+    for i in range(6):
+        (place / "photos" / f"{i}.jpg").rename(place / "photos" / f"IMG_20260614_12000{i}.jpg")
+    run(*arguments(place, "--timezone", "Europe/Berlin", "--times", "name"))
+    recording = read_recording(place / "M1")
+    assert recording.columns.frame_time.tolist() == [START + i for i in range(6)]

@@ -1,0 +1,181 @@
+"""Clocks, dialects and units of loggers: right, or refused with the option that says it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+
+import numpy as np
+import pytest
+
+from thermocald.errors import DataError, UsageError
+from thermocald.store.logger.clock import DeviceClock, clock_error, time_zone
+from thermocald.store.logger.moments import MomentFormat, parse_moment
+from thermocald.store.logger.temperatures import LogOptions, read_log
+
+BERLIN = DeviceClock(time_zone("Europe/Berlin"))
+JUNE = datetime(2026, 6, 14, 10, 0, tzinfo=UTC).timestamp()  # 12:00 in Berlin
+
+
+def logged(tmp_path, data, **options):
+    path = tmp_path / "log.csv"
+    path.write_bytes(data if isinstance(data, bytes) else data.encode())
+    return read_log(path, LogOptions(**{"clock": BERLIN, **options}))
+
+
+GERMAN = """Datum;Uhrzeit;Temperatur °C;Feuchte %
+14.06.2026;12:00:00;21,5;40,1
+14.06.2026;12:01:00;21,75;40,0
+"""
+ENGLISH = """time,temperature,humidity
+2026-06-14 12:00:00,21.5,40
+2026-06-14 12:01:00,21.75,40
+"""
+PLAIN = ENGLISH.replace(",40", "").replace(",humidity", "")
+HOBO = """"Plot Title: x"
+"#","Date Time, GMT+02:00","Temp, °C (LGR S/N: 1)"
+1,06/14/26 12:00:00 PM,21.5
+2,06/14/26 12:01:00 PM,21.75
+"""
+DIALECTS = {
+    "German, Latin-1": GERMAN.encode("latin-1"),
+    "German, UTF-8 with BOM": GERMAN.encode("utf-8-sig"),
+    "German, UTF-16": GERMAN.encode("utf-16"),
+    "lines above, CR LF": ("Logger 4711\nSerie A\n\n" + GERMAN).replace("\n", "\r\n").encode(),
+    "English": ENGLISH.encode(),
+    "tabs": PLAIN.replace(",", "\t").replace(".", ",").encode(),
+    "UTC in the times": PLAIN.replace(" 12:", "T10:").replace(":00,", ":00Z,").encode(),
+    "offset in the times": PLAIN.replace(":00,", ":00+0200;").replace("e,t", "e;t").encode(),
+    "seconds since 1970": f"time,temp\n{JUNE:.0f},21.5\n{JUNE + 60:.0f},21.75\n".encode(),
+    "milliseconds": f"time,temp\n{JUNE:.0f}000,21.5\n{JUNE + 60:.0f}000,21.75\n".encode(),
+    "no header": PLAIN.partition("\n")[2].encode(),
+    "HOBO": HOBO.encode("utf-8-sig"),
+    "units in a second line": PLAIN.replace("ature\n", "ature\n,deg C\n").encode(),
+    "quoted decimal commas": PLAIN.replace(",21.5", ',"21,5"')
+    .replace(",21.75", ',"21,75"')
+    .encode(),
+}
+
+
+@pytest.mark.parametrize("name", DIALECTS)
+def test_a_log_is_the_same_in_every_dialect(tmp_path, name):
+    found = logged(tmp_path, DIALECTS[name])
+    assert found.times.tolist() == [JUNE, JUNE + 60]
+    (values,) = found.channels.values()
+    assert values == pytest.approx([21.5, 21.75])
+    assert any("guessed" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("data", "options", "reason"),
+    [
+        (GERMAN, {"clock": DeviceClock()}, "no time zone: say which with --timezone"),
+        (b"time,temp\n06/07/2026 12:00,21\n06/07/2026 12:01,21\n", {}, "--date-order dmy or mdy"),
+        (b"time,temp\n2026-06-14 12:00,294.5\n2026-06-14 12:01,294.6\n", {}, "--unit K"),
+        (b"time,temp K (Kelvin)\n2026-06-14 12:00,20\n2026-06-14 12:01,20\n", {}, "--unit K"),
+        ("time;T °F\n2026-06-14 12:00;70,1\n2026-06-14 12:01;70,1\n", {}, "--unit degF"),
+        (b"time,a,b\n2026-06-14 12:00,20,21\n2026-06-14 12:01,20,21\n", {}, "--temperature-column"),
+        (PLAIN.replace("21.75", "2_5.0"), {"temperatures": ("temperature",)}, "is not a number"),
+        (b"time,temp\n2026-06-14 12:00,20\n2026-06-14 12:01,1e300\n", {}, "Another unit"),
+        (b"a,b\n1,2\n3,4\n", {}, "no separator"),
+        (b"", {}, "is empty"),
+        (b"\x7fELF\0\0\0\0", {}, "is not text"),
+        (GERMAN, {"temperatures": ("Temp",)}, "there is no column 'Temp'"),
+    ],
+)  # fmt: skip
+def test_what_is_not_certain_is_refused_with_the_remedy(tmp_path, data, options, reason):
+    with pytest.raises((DataError, UsageError), match=reason):
+        logged(tmp_path, data, **options)
+
+
+def test_units_and_orders_that_are_said_are_used(tmp_path):
+    kelvin = logged(
+        tmp_path, b"time,temp\n2026-06-14 12:00,294.65\n2026-06-14 12:01,295.15\n", unit="K"
+    )
+    assert kelvin.channels["temp"] == pytest.approx([21.5, 22.0])
+    american = b"time,temp\n06/07/2026 12:00,21\n06/07/2026 12:01,21\n"
+    june = logged(tmp_path, american, date_order="mdy").times[0]
+    july = logged(tmp_path, american, date_order="dmy").times[0]
+    assert july - june == 29 * 86400
+    lost = logged(tmp_path, b"time,temp\n2026-06-14 12:00,-127\n2026-06-14 12:01,21\n")
+    assert np.isnan(lost.channels["temp"][0])
+
+
+def hour(*minutes):
+    """Rows of the morning on which clocks are put back, by (hour, minute)."""
+    rows = "".join(f"2026-10-25 {h:02d}:{m:02d};20,5\n" for h, m in minutes)
+    return f"time;temp\n{rows}".encode()
+
+
+TWICE = hour((1, 50), (2, 20), (2, 50), (2, 20), (2, 50), (3, 10))
+
+
+def test_the_hour_that_comes_twice(tmp_path):
+    with pytest.raises(DataError, match=r"line 3: 2026-10-25 02:20:00 exists twice .*--ambiguous"):
+        logged(tmp_path, TWICE)
+    found = logged(tmp_path, TWICE, clock=replace(BERLIN, ambiguous="order"))
+    start = datetime(2026, 10, 24, 23, 50, tzinfo=UTC).timestamp()
+    assert ((found.times - start) / 60).tolist() == [0, 30, 60, 90, 120, 140]
+    once = hour((1, 50), (2, 20), (2, 50), (3, 10))
+    with pytest.raises(DataError, match="order of the rows does not tell"):
+        logged(tmp_path, once, clock=replace(BERLIN, ambiguous="order"))
+    later = logged(tmp_path, once, clock=replace(BERLIN, ambiguous="later")).times
+    assert ((later - start) / 60).tolist() == [0, 90, 120, 140]
+
+
+def test_the_hour_that_does_not_exist_names_the_fixed_zone(tmp_path):
+    data = b"time;temp\n2026-03-29 01:50;20,5\n2026-03-29 02:20;20,5\n"
+    with pytest.raises(DataError, match=r"does not exist in Europe/Berlin.*\+01:00"):
+        logged(tmp_path, data)
+    winter = logged(tmp_path, data, clock=DeviceClock(time_zone("+01:00")))
+    assert np.diff(winter.times) == 1800
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [("+00:03:12", 192), ("-00:03:12", -192), ("12:30", 750), ("+4.5", 4.5), ("-2s", -2)],
+)
+def test_clock_errors(text, seconds):
+    assert clock_error(text) == seconds
+    assert DeviceClock(UTC, clock_error(text)).utc([datetime(1970, 1, 2)], str) == 86400 - seconds
+
+
+@pytest.mark.parametrize("text", ["three", "1:2:3:4", "+", "00:03:12 ahead"])
+def test_what_is_no_clock_error_is_refused(text):
+    with pytest.raises(UsageError, match=r"HH:MM:SS"):
+        clock_error(text)
+
+
+@pytest.mark.parametrize("text", ["Europe/Nowhere", "CEST!", "+99:00", "../../etc/passwd", ""])
+def test_unknown_zones_are_refused(text):
+    with pytest.raises(UsageError, match="time zone"):
+        time_zone(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("2026:06:14 12:00:01", datetime(2026, 6, 14, 12, 0, 1)),
+        ("14.06.26 12:00:03,5", datetime(2026, 6, 14, 12, 0, 3, 500000)),
+        ("20260614_120001", datetime(2026, 6, 14, 12, 0, 1)),
+        ("6/14/2026 12:02 AM", datetime(2026, 6, 14, 0, 2)),
+        ("2026-06-14 12:00 MESZ", datetime(2026, 6, 14, 10, tzinfo=UTC)),
+    ],
+)
+def test_moments(text, expected):
+    found = parse_moment(text, MomentFormat("mdy"))
+    assert found == expected
+    assert (found.utcoffset() is None) == (expected.utcoffset() is None)
+
+
+@pytest.mark.parametrize("text", ["2026-13-01 12:00", "25:00:00", "tomorrow", "", "2026-06-14 12"])
+def test_what_is_no_moment_is_refused(text):
+    with pytest.raises(ValueError, match=r"."):
+        parse_moment(text)
+
+
+def test_times_with_a_zone_keep_it_unless_the_zone_is_forced():
+    moment = datetime(2026, 6, 14, 12, tzinfo=time_zone("+02:00"))
+    assert DeviceClock(time_zone("UTC")).utc([moment], str) == JUNE
+    assert DeviceClock(time_zone("UTC"), forced=True).utc([moment], str) == JUNE + 7200
+    assert DeviceClock().utc([moment + timedelta(seconds=1)], str) == JUNE + 1

@@ -1,0 +1,154 @@
+"""Photographs with the times at which they were taken: from EXIF, the file's name, or its date.
+
+Only the head of a file is read; what EXIF says of the camera comes with it. Source: CIPA DC-008,
+Exif 2.32: DateTimeOriginal, SubSecTimeOriginal, OffsetTimeOriginal.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import struct
+import warnings
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import TYPE_CHECKING, Any
+
+from thermocald.errors import DataError, DriverMissing, ImageError
+from thermocald.store.logger.moments import parse_moment
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+__all__ = ["SOURCES", "Photograph", "find_photographs", "read_photograph"]
+
+SOURCES = ("exif", "name", "file")
+SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
+_IN_NAME = re.compile(r"(\d{8})[_T-]?(\d{6})(?:[_.-]?(\d{3}))?")
+_EXIF_IFD = 0x8769
+_TIME_TAGS = ((0x9003, 0x9291, 0x9011), (0x9004, 0x9292, 0x9012), (0x0132, 0x9290, 0x9010))
+"""Time, its fraction of a second, its zone: as taken, as digitised, as changed last."""
+_DIAGONAL_35MM = 43.2666  # mm, of 36 × 24
+
+
+@dataclass(frozen=True, slots=True)
+class Photograph:
+    """A file, when it was taken as the camera wrote it, its size px, and what EXIF says of the
+    camera: name, principal distance mm, pixel pitch mm; None where it does not.
+    """
+
+    path: Path
+    moment: datetime
+    width: int
+    height: int
+    camera: str = ""
+    focal_length: float | None = None
+    pixel_pitch: float | None = None
+
+
+def find_photographs(paths: list[Path]) -> list[Path]:
+    """The pictures among files and in folders, each once; DataError where there are none."""
+    found: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            found += sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES)
+        elif path.is_file():
+            found.append(path)
+        else:
+            raise DataError(f"{path}: there is no such file or folder")
+    if not found:
+        raise DataError(f"{paths[0]}: holds no photographs ({', '.join(sorted(SUFFIXES))})")
+    return list(dict.fromkeys(found))
+
+
+def read_photograph(path: Path, source: str = "exif") -> Photograph:
+    """One photograph; `source` of its time is one of SOURCES.
+
+    Raises ImageError for what is not a picture, DataError where it does not hold its time.
+    """
+    if importlib.util.find_spec("PIL") is None:
+        raise DriverMissing("reading photographs needs Pillow: pip install 'thermocald[report]'")
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            # a large sensor is no attack: nothing is decoded here
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path) as image:
+                width, height = image.size
+                exif = image.getexif()
+                details: dict[int, Any] = {**exif, **exif.get_ifd(_EXIF_IFD)}
+    except (OSError, ValueError, SyntaxError, KeyError, TypeError, Image.DecompressionBombError,
+            struct.error) as cause:  # fmt: skip
+        raise ImageError(f"{path}: is not a picture that can be read ({cause})") from cause
+    if source == "exif":
+        moment = _exif_moment(path, details)
+    elif source == "name":
+        moment = _name_moment(path)
+    else:
+        moment = datetime.fromtimestamp(path.stat().st_mtime, UTC)
+    focal = _positive(details.get(0x920A))
+    return Photograph(
+        path, moment, width, height, _camera(details), focal,
+        _pixel_pitch(details, focal, width, height),
+    )  # fmt: skip
+
+
+def _exif_moment(path: Path, details: dict[int, Any]) -> datetime:
+    for when, part, offset in _TIME_TAGS:
+        text = str(details.get(when) or "").strip("\0 ")
+        if not text or text.startswith("0000"):
+            continue
+        fraction = re.sub(r"\D", "", str(details.get(part) or ""))
+        zone = str(details.get(offset) or "").strip("\0 ")
+        try:
+            known = re.fullmatch(r"[+-]\d{2}:?\d{2}|Z", zone)
+            moment = parse_moment(text + (zone if known else ""))
+        except ValueError as cause:
+            raise DataError(f"{path}: EXIF: {cause}") from cause
+        if not isinstance(moment, datetime):
+            raise DataError(f"{path}: EXIF: {text!r} is not a date with a time")
+        return moment + timedelta(seconds=float(f"0.{fraction or 0}"))
+    raise DataError(
+        f"{path}: EXIF holds no time; take it from the name (--times name, as in "
+        "IMG_20260614_120301.jpg) or from the file's date (--times file)"
+    )
+
+
+def _name_moment(path: Path) -> datetime:
+    found = _IN_NAME.search(path.stem)
+    if found is None:
+        raise DataError(f"{path}: no time in the name; IMG_20260614_120301.jpg would hold one")
+    try:
+        moment = parse_moment(f"{found[1]}T{found[2]}" + (f".{found[3]}" if found[3] else ""))
+    except ValueError as cause:
+        raise DataError(f"{path}: the name: {cause}") from cause
+    assert isinstance(moment, datetime)
+    return moment
+
+
+def _camera(details: dict[int, Any]) -> str:
+    make, model = (str(details.get(tag) or "").strip("\0 ") for tag in (0x010F, 0x0110))
+    return model if model.startswith(make) else f"{make} {model}".strip()
+
+
+def _pixel_pitch(
+    details: dict[int, Any], focal: float | None, width: int, height: int
+) -> float | None:
+    """From the focal plane's resolution, else from the focal length of a 35 mm camera, mm."""
+    resolution, unit = _positive(details.get(0xA20E)), details.get(0xA210)
+    per_mm = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}.get(unit if isinstance(unit, int) else 2)
+    if resolution and per_mm and 5e-4 < per_mm / resolution < 0.02:
+        return per_mm / resolution
+    equivalent = _positive(details.get(0xA405))
+    if focal and equivalent:
+        return _DIAGONAL_35MM * focal / equivalent / float((width**2 + height**2) ** 0.5)
+    return None
+
+
+def _positive(value: Any) -> float | None:
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if 0 < number < 1e6 else None

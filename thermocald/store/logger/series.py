@@ -1,0 +1,151 @@
+"""Photographs and a log of temperatures put together as the epochs of a recording.
+
+Each photograph gets the reading next to it in time, with the reading's own time; the temperature
+at the photograph's instant is interpolated from them when the recording is read.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.epoch import Epoch
+from thermocald.errors import DataError
+from thermocald.store.recording.readings import interpolate_readings
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from thermocald.store.logger.clock import DeviceClock
+    from thermocald.store.logger.photographs import Photograph
+    from thermocald.store.logger.temperatures import LoggedTemperatures
+
+    Array = NDArray[np.float64]
+
+__all__ = ["PhotographSeries", "put_together"]
+
+_LARGEST_GAP_IN_INTERVALS = 10.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PhotographSeries:
+    """Photographs in the order of time, times (n,) s UTC, and the log they were paired with.
+
+    reading (n,): the row of the log next to each, -1 where there is none near; at_frame (n,) °C of
+    the first channel, NaN where the log does not say.
+    """
+
+    photographs: tuple[Photograph, ...]
+    times: Array
+    log: LoggedTemperatures
+    reading: NDArray[np.int64]
+    at_frame: Array
+
+    @property
+    def interval(self) -> float:
+        """The median time between photographs, s; 1 for a single one."""
+        return float(np.median(np.diff(self.times))) if len(self.times) > 1 else 1.0
+
+    def epochs(self) -> list[Epoch]:
+        """The epochs from 1 on, their frames the photographs."""
+        found = []
+        for i, (photograph, row) in enumerate(
+            zip(self.photographs, self.reading.tolist(), strict=True)
+        ):
+            temperatures = {
+                n: float(v[row]) if row >= 0 else np.nan for n, v in self.log.channels.items()
+            }
+            moment = float(self.log.times[row]) if row >= 0 else np.nan
+            found.append(Epoch(i + 1, float(self.times[i]), moment, temperatures, photograph.path))
+        return found
+
+    def preview(self) -> list[str]:
+        """Lines for a person: what would be written."""
+        first = next(iter(self.log.channels))
+        known = np.isfinite(self.at_frame)
+        head = self.photographs[0]
+        span = f"{iso(self.times[0])} to {iso(self.times[-1])}, every {self.interval:.4g} s"
+        step = float(np.median(np.diff(self.log.times)))
+        low, high = np.nanmin(self.at_frame), np.nanmax(self.at_frame)
+        lines = [f"photographs: {len(self.times)}, {head.width} × {head.height} px, {span}"]
+        lines += self.log.notes
+        lines.append(
+            f"log: {iso(self.log.times[0])} to {iso(self.log.times[-1])}, every {step:.4g} s"
+        )
+        lines.append(
+            f"temperature ({first}): known for {known.sum()} of {len(known)} photographs, "
+            f"{low:.2f} to {high:.2f} °C"
+        )
+        for i in sorted({0, len(self.times) // 2, len(self.times) - 1}):
+            reading = f"{self.at_frame[i]:.3f} °C" if known[i] else "no temperature"
+            lines.append(f"  {self.photographs[i].path.name}  {iso(self.times[i])}  {reading}")
+        return lines
+
+
+def iso(seconds: float) -> str:
+    """A time as ISO 8601 in UTC, to a millisecond."""
+    moment = datetime.fromtimestamp(float(seconds), UTC)
+    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def put_together(
+    photographs: Sequence[Photograph], camera_clock: DeviceClock, log: LoggedTemperatures
+) -> PhotographSeries:
+    """Photographs and log on one clock.
+
+    Raises DataError for photographs of different sizes, for times that do not say their zone, and
+    where log and photographs do not overlap.
+    """
+    sizes = {(p.width, p.height) for p in photographs}
+    if len(sizes) > 1:
+        other = next(p for p in photographs if (p.width, p.height) != _size(photographs[0]))
+        raise DataError(
+            f"{other.path}: has {other.width} × {other.height} px, {photographs[0].path.name} "
+            f"{photographs[0].width} × {photographs[0].height}: one recording is of one camera in "
+            "one position; import them apart"
+        )
+    # by name first: within a second it is the order in which they were taken
+    named = sorted(photographs, key=lambda p: p.path.name)
+    times = camera_clock.utc([p.moment for p in named], lambda i: str(named[i].path))
+    order = np.argsort(times, kind="stable")
+    times = times[order]
+    placed = tuple(named[i] for i in order.tolist())
+    _overlap(times, log.times)
+    reading = _next_to(times, log.times)
+    first = next(iter(log.channels.values()))
+    at_frame = interpolate_readings(times, log.times, first)
+    if not np.isfinite(at_frame).any():
+        raise DataError(
+            "no photograph has a temperature: the log has gaps wherever photographs were taken "
+            f"({iso(times[0])} to {iso(times[-1])})"
+        )
+    return PhotographSeries(placed, times, log, reading, at_frame)
+
+
+def _size(photograph: Photograph) -> tuple[int, int]:
+    return photograph.width, photograph.height
+
+
+def _overlap(frames: Array, log: Array) -> None:
+    if frames[0] <= log[-1] and frames[-1] >= log[0]:
+        return
+    apart = log[0] - frames[-1] if frames[-1] < log[0] else frames[0] - log[-1]
+    raise DataError(
+        f"photographs ({iso(frames[0])} to {iso(frames[-1])}) and log ({iso(log[0])} to "
+        f"{iso(log[-1])}) lie {apart / 3600:.1f} h apart: is a time zone wrong (--camera-timezone, "
+        "--log-timezone), or a clock (--camera-clock, --log-clock)?"
+    )
+
+
+def _next_to(frames: Array, log: Array) -> NDArray[np.int64]:
+    """The row of the log next in time to each frame, -1 beyond ten of its intervals."""
+    right = np.clip(np.searchsorted(log, frames), 1, len(log) - 1)
+    left = right - 1
+    row = np.where(frames - log[left] <= log[right] - frames, left, right)
+    far = np.abs(log[row] - frames) > _LARGEST_GAP_IN_INTERVALS * np.median(np.diff(log))
+    return np.where(far, -1, row).astype(np.int64)

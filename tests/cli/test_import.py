@@ -136,3 +136,37 @@ def test_times_from_names(place):
     run(*arguments(place, "--timezone", "Europe/Berlin", "--times", "name"))
     recording = read_recording(place / "M1")
     assert recording.columns.frame_time.tolist() == [START + i for i in range(6)]
+
+
+@pytest.mark.parametrize("zone", [None, "UTC", "Europe/Berlin"])
+def test_correct_and_predict_take_no_time_for_utc_that_does_not_say_so(tmp_path, zone):
+    """The readers that both commands use for their --log and for the points."""
+    from thermocald.analysis.thermal.correction import read_rows, read_temperature_log
+    from thermocald.cli.options import device_clock
+
+    ours, foreign = tmp_path / "ours.csv", tmp_path / "foreign.csv"
+    ours.write_text("time,housing\n2026-06-14 12:00:00,21.5\n2026-06-14 12:01:00,21.6\n")
+    foreign.write_text("Datum;Temp\n14.06.2026 12:00;21,5\n14.06.2026 12:01;21,6\n")
+    (tmp_path / "points.csv").write_text("time,x,y\n2026-06-14T12:00:30,5,6\n")
+    clock = device_clock(zone)
+    if zone is None:
+        for path in (ours, foreign):
+            with pytest.raises(ThermocaldError, match=r"has no time zone.*--timezone"):
+                read_temperature_log(path, clock=clock)
+        with pytest.raises(ThermocaldError, match=r"points\.csv, line 2.*--timezone"):
+            read_rows(tmp_path / "points.csv", ("time", "x", "y"), clock)
+        return
+    first = START + (7200 if zone == "UTC" else 0)
+    for path in (ours, foreign):
+        log = read_temperature_log(path, clock=clock)
+        assert log.times.tolist() == [first, first + 60]
+    _, _, numbers = read_rows(tmp_path / "points.csv", ("time", "x", "y"), clock)
+    assert numbers.tolist() == [[first + 30, 5, 6]]
+
+
+def test_kelvin_in_a_log_is_refused_with_the_remedy(tmp_path):
+    from thermocald.analysis.thermal.correction import read_temperature_log
+
+    (tmp_path / "log.csv").write_text("time,housing\n1,294.5\n2,294.6\n")
+    with pytest.raises(ThermocaldError, match=r"kelvin.*subtract 273\.15"):
+        read_temperature_log(tmp_path / "log.csv")

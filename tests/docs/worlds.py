@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import yaml
+from PIL import Image
 from typer.testing import CliRunner
 
 from tests.docs.blocks import ROOT, blocks
@@ -29,7 +30,7 @@ from thermocald.simulation.model import ModelEffect
 from thermocald.simulation.model_file import write_model
 from thermocald.simulation.presets import preset_simulation
 from thermocald.simulation.testfields import corner_field
-from thermocald.store.recording.testfield_file import read_testfield
+from thermocald.store.recording.testfield_file import read_testfield, write_testfield
 
 
 def run(*arguments: object) -> None:
@@ -134,6 +135,21 @@ def put_photographs(folder: Path) -> None:
         cv2.imwrite(path, frame, [cv2.IMWRITE_JPEG_QUALITY, 95])
 
 
+def photographs_with_times(shelf: Path, folder: Path) -> None:
+    """A few small photographs with EXIF times and a logger's file, and a field."""
+    del shelf
+    (folder / "photos").mkdir()
+    rows = []
+    for i in range(4):
+        exif = Image.Exif()
+        exif.get_ifd(0x8769)[0x9003] = f"2026:06:14 12:00:{10 * i:02d}"
+        picture = Image.fromarray(np.full((48, 64), 90, np.uint8))
+        picture.save(folder / "photos" / f"{i}.jpg", exif=exif)
+        rows.append(f"14.06.2026 12:00:{10 * i:02d};{20 + i},5")
+    (folder / "logger.csv").write_text("Zeit;Temperatur °C\n" + "\n".join(rows) + "\n", "latin-1")
+    write_testfield(folder / "surveyed.csv", corner_field("circles", 4, 150.0))
+
+
 def how_to_daemon(shelf: Path, folder: Path) -> None:
     put_config(folder, "demo")
     put_recordings(shelf, folder, "M1")
@@ -185,6 +201,7 @@ WORLDS: dict[str, World] = {
     "docs/explanation/simulation.md": simulation,
     "docs/how-to/daemon.md": how_to_daemon,
     "docs/how-to/dashboard.md": store,
+    "docs/how-to/make-a-recording.md": photographs_with_times,
     "docs/how-to/session.md": lambda _, f: put_config(f, "phone-1"),
     "docs/how-to/study.md": how_to_study,
     "docs/how-to/thermal-model.md": how_to_thermal_model,

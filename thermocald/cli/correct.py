@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from thermocald.cli.options import TimezoneOption, device_clock
 from thermocald.errors import DataError, ImageError, UsageError
 
 if TYPE_CHECKING:
@@ -41,6 +42,7 @@ def correct(
     column: Annotated[
         str | None, typer.Option("--column", help="Temperature column of the log.")
     ] = None,
+    timezone: TimezoneOption = None,
     temperature_sd: Annotated[
         float, typer.Option("--temperature-sd", min=0.0, help="Of a reading of the log, K.")
     ] = 0.05,
@@ -62,7 +64,7 @@ def correct(
     from thermocald.cli.predict import read_log, warnings_said
 
     thermal = ThermalCamera.load(model)
-    table = read_log(thermal, log, column)
+    table = read_log(thermal, log, column, timezone)
     if image_size is not None:
         thermal = thermal.for_images(*_size(image_size))
     try:
@@ -74,9 +76,9 @@ def correct(
         raise UsageError("--out is missing: the folder for the corrected images")
     with warnings_said():
         if "image" in header and out is not None:
-            _images(thermal, table, points, out, to, temperature_sd, extrapolate, json)
+            _images(thermal, table, points, out, to, temperature_sd, extrapolate, json, timezone)
         else:
-            _points(thermal, table, points, out, to, temperature_sd, extrapolate, json)
+            _points(thermal, table, points, out, to, temperature_sd, extrapolate, json, timezone)
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -95,6 +97,7 @@ def _points(
     temperature_sd: float,
     extrapolate: bool,
     json: str | None,
+    timezone: str | None,
 ) -> None:
     import csv
     import io
@@ -104,7 +107,7 @@ def _points(
     from thermocald.analysis.thermal.correction import correct_points, read_rows
     from thermocald.cli.common import write_json, write_text
 
-    header, rows, numbers = read_rows(path, ("time", "x", "y"))
+    header, rows, numbers = read_rows(path, ("time", "x", "y"), device_clock(timezone))
     inside = thermal.model.sensor.contains(numbers[:, 1:])
     if not inside.all():
         x, y = numbers[np.argmin(inside), 1:]
@@ -154,13 +157,14 @@ def _images(
     temperature_sd: float,
     extrapolate: bool,
     json: str | None,
+    timezone: str | None,
 ) -> None:
     import cv2
 
     from thermocald.analysis.thermal.correction import image_corrections, read_rows
     from thermocald.cli.common import progress, write_json
 
-    _, rows, numbers = read_rows(path, ("time",))
+    _, rows, numbers = read_rows(path, ("time",), device_clock(timezone))
     out.mkdir(parents=True, exist_ok=True)
     sensor = thermal.model.sensor
     done: list[dict[str, Any]] = []

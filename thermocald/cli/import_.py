@@ -138,7 +138,7 @@ def import_(
     )
     clock = _clock(timezone, camera_timezone, camera_clock, ambiguous, "--camera-timezone")
     placed = put_together(pictures, clock, logged)
-    spec, notes = _camera(pictures[0], camera, pixel_pitch, principal_distance)
+    spec, notes = _camera(pictures[0], camera, pixel_pitch, principal_distance, dry_run)
     for line in [*placed.preview(), *notes]:
         say(line)
     document = {
@@ -192,7 +192,11 @@ def _clock(
 
 
 def _camera(
-    photograph: Photograph, file: Path | None, pitch: float | None, distance: float | None
+    photograph: Photograph,
+    file: Path | None,
+    pitch: float | None,
+    distance: float | None,
+    dry_run: bool,
 ) -> tuple[CameraSpec, list[str]]:
     """The camera, and what of it was taken from EXIF."""
     from thermocald.cli.options import read_camera
@@ -213,11 +217,14 @@ def _camera(
         notes.append(f"camera: principal distance {distance:g} mm from EXIF (--principal-distance)")
     if pitch is None:
         pitch = photograph.pixel_pitch
-        if pitch is None:
-            raise UsageError(
-                "the size of a pixel is not known and EXIF does not say it: --pixel-pitch 0.00112 "
-                "(mm), or --camera FILE"
-            )
-        notes.append(f"camera: pixel pitch {pitch:.5f} mm from EXIF (--pixel-pitch)")
+        unknown = (
+            "the size of a pixel is not known and EXIF does not say it: --pixel-pitch 0.00112 "
+            "(mm), or --camera FILE"
+        )
+        if pitch is None and not dry_run:
+            raise UsageError(unknown)
+        known = f"pixel pitch {pitch:.5f} mm from EXIF (--pixel-pitch)" if pitch else unknown
+        notes.append(f"camera: {known}")
+        pitch = pitch or 0.001
     sensor = Sensor(photograph.width, photograph.height, pitch)
     return CameraSpec(photograph.camera or "camera", sensor, distance), notes

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,7 +13,19 @@ from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, InteriorOri
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
 from thermocald.yaml_file import read_yaml
 
-__all__ = ["CameraFile", "ExteriorOption", "FreeOption", "JsonOption", "free_names", "read_camera"]
+if TYPE_CHECKING:
+    from thermocald.store.logger.clock import DeviceClock
+
+__all__ = [
+    "CameraFile",
+    "ExteriorOption",
+    "FreeOption",
+    "JsonOption",
+    "TimezoneOption",
+    "device_clock",
+    "free_names",
+    "read_camera",
+]
 
 JsonOption = Annotated[
     str | None, typer.Option("--json", help="Write the result as JSON; - for standard output.")
@@ -31,6 +43,19 @@ ExteriorOption = Annotated[
         help="per_epoch: every epoch has its own orientation; series: the camera stood still.",
     ),
 ]
+
+
+TimezoneOption = Annotated[
+    str | None,
+    typer.Option("--timezone", help="Of times without a zone: Europe/Berlin, UTC, +02:00."),
+]
+
+
+def device_clock(timezone: str | None) -> DeviceClock:
+    """The clock that `--timezone` describes; without it times without a zone are refused."""
+    from thermocald.store.logger.clock import DeviceClock, time_zone
+
+    return DeviceClock(None if timezone is None else time_zone(timezone), ambiguous="order")
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from thermocald.cli.options import TimezoneOption, device_clock
 from thermocald.errors import UsageError
 
 if TYPE_CHECKING:
@@ -46,6 +47,7 @@ def predict(
     log: Annotated[
         Path | None, typer.Option("--log", help="CSV of times and temperatures, or an epochs.csv.")
     ] = None,
+    timezone: TimezoneOption = None,
     test: Annotated[
         Path | None,
         typer.Option("--test", help="Recording or store: how well the model predicts it."),
@@ -90,7 +92,7 @@ def predict(
             state = thermal.at(temperature, channels=others or None, extrapolate=extrapolate)
             document, lines = _state_document(thermal, state, distance)
         elif log is not None:
-            table = read_log(thermal, log)
+            table = read_log(thermal, log, timezone=timezone)
             along = thermal.along(table.times, dict(table.channels), extrapolate=extrapolate)
             document, lines = _along_document(thermal, along)
         elif test is not None:
@@ -140,10 +142,13 @@ def _tested(thermal: ThermalCamera, path: Path) -> tuple[dict[str, Any], list[st
     return document, lines
 
 
-def read_log(thermal: ThermalCamera, path: Path, column: str | None = None) -> TemperatureLog:
+def read_log(
+    thermal: ThermalCamera, path: Path, column: str | None = None, timezone: str | None = None
+) -> TemperatureLog:
     """A temperature log; T is the named column, else the model's own reference, else the first.
 
-    ConfigurationError where the log is of a recording of another camera.
+    timezone: of times without one. ConfigurationError where the log is of a recording of another
+    camera.
     """
     from thermocald.analysis.thermal.correction import read_temperature_log
     from thermocald.store.recording.head import read_head
@@ -151,10 +156,11 @@ def read_log(thermal: ThermalCamera, path: Path, column: str | None = None) -> T
     if path.name == "epochs.csv" and (path.parent / "recording.yaml").is_file():
         camera = read_head(path.parent).camera
         thermal.for_images(camera.sensor.width, camera.sensor.height, camera.name)
-    table = read_temperature_log(path, column)
+    clock = device_clock(timezone)
+    table = read_temperature_log(path, column, clock)
     reference = next(iter(thermal.model.validity), None)
     if column is None and reference in table.channels:
-        return read_temperature_log(path, reference)
+        return read_temperature_log(path, reference, clock)
     return table
 
 

@@ -223,8 +223,8 @@ def _camera(
         )
         if pitch is None and not dry_run:
             raise UsageError(unknown)
-        known = f"pixel pitch {pitch:.5f} mm from EXIF (--pixel-pitch)" if pitch else unknown
-        notes.append(f"camera: {known}")
+        said = f"pixel pitch {pitch:.5f} mm from EXIF (--pixel-pitch)" if pitch else unknown
+        notes.append(f"camera: {said}")
         pitch = pitch or 0.001
     sensor = Sensor(photograph.width, photograph.height, pitch)
     return CameraSpec(photograph.camera or "camera", sensor, distance), notes

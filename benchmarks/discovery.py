@@ -57,9 +57,9 @@ def library(fitter: HypothesisFitter, series: int) -> tuple[list[str], np.ndarra
             candidate.grid[:: max(len(candidate.grid) // 8, 1)] if len(candidate.grid) else [None]
         )
         for value in grid:
-            if candidate.is_event:
+            if candidate.kind.is_event:
                 trajectory = (e.times >= value).astype(float)
-            elif candidate.is_drive:
+            elif candidate.kind.is_drive:
                 trajectory = fitter.drive_trajectory([candidate.term(value, 1)], series) - base
             else:
                 term = candidate.term(value, 1)

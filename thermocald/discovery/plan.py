@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.discovery.search.candidates import Candidate, candidates
+from thermocald.discovery.search.candidates import candidates
 from thermocald.discovery.search.examination import examine_series
 from thermocald.discovery.verdict.model import terms_of
 from thermocald.errors import UsageError
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.reduction.candidate import Candidate
     from thermocald.simulation.observations import Simulation
 
     Array = NDArray[np.float64]
@@ -183,7 +184,7 @@ def plan_power(inputs: Sequence[SetUp], strength_px: float, advance: Callable[[]
             if candidate.effect in done:
                 continue
             done.add(candidate.effect)
-            if candidate.is_drive:
+            if candidate.kind.is_drive:
                 changed = _with_drive(set_up, fitter, candidate, strength_px)
             else:
                 changed = _with_effect(fitter, candidate, strength_px, rng)
@@ -212,7 +213,7 @@ def _with_effect(
     seen = HypothesisFitter([replace(e, history=_as_read(e))])
     value = _place(candidate, e, rng)
     term = candidate.term(value, 1)
-    if candidate.is_event:
+    if candidate.kind.is_event:
         term = Term(term.effect, term.parameters, (), (((candidate.name, value or 0.0),),))
     trajectory = seen.trajectories(term, 0, operators=False)[0][:, 0]
     direction = np.zeros(len(COLUMNS))
@@ -261,7 +262,7 @@ def _place(candidate: Candidate, e: ReducedSeries, rng: np.random.Generator) -> 
     """A non-linear parameter where the effect is well seen, None where there is none."""
     if not len(candidate.grid):
         return None
-    if candidate.name == "P":
+    if candidate.kind.nonlinear[candidate.name].role == "period":
         return float(e.times[-1] / rng.uniform(4, 20))
     return float(candidate.grid[int(len(candidate.grid) * rng.uniform(0.4, 0.6))])
 

@@ -39,6 +39,7 @@ class HypothesisFitter:
     def __init__(self, series: Sequence[ReducedSeries]) -> None:
         self.series = tuple(series)
         self.thermometer_factor = 1.0
+        self.held: frozenset[str] = frozenset()  # non-linear parameters, such as `effect.tau`
         self._trajectories: dict[Any, tuple[Array, Array | None, str]] = {}
         self._drives: dict[Any, tuple[Array, Array]] = {}
 
@@ -122,9 +123,13 @@ class HypothesisFitter:
         return blocks, start
 
     def design(
-        self, terms: Sequence[Term], blocks: Sequence[Block], series: int
+        self, terms: Sequence[Term], blocks: Sequence[Block], series: int, centred: bool = True
     ) -> tuple[Array, Array, NDArray[np.int64]]:
-        """Trajectories (E, K), directions (P, K) and places in the unknowns (K,) of one series."""
+        """Trajectories (E, K), directions (P, K) and places in the unknowns (K,) of one series.
+
+        centred: without their means, for conditioning, where the levels are eliminated anyway;
+        otherwise as the model has them, 0 at T0.
+        """
         columns: list[Array] = []
         directions: list[Array] = []
         index: list[int] = []
@@ -132,10 +137,11 @@ class HypothesisFitter:
             if block.series not in (None, series):
                 continue
             if block.term < 0:
-                trajectory = self.drive(terms, series)[0][:, None]
+                trajectory = self.drive(terms, series)[0][:, None] - self.series[series].T0
             else:
                 trajectory = self.trajectories(terms[block.term], series, terms, operators=False)[0]
-            trajectory = trajectory - trajectory.mean(axis=0)  # for conditioning
+            if centred:
+                trajectory = trajectory - trajectory.mean(axis=0)
             for m in range(block.trajectories):
                 for j, name in enumerate(block.parameters):
                     unit = np.zeros(len(COLUMNS))
@@ -267,11 +273,15 @@ class HypothesisFitter:
             (i, name)
             for i, term in enumerate(terms)
             for name, value in term.nonlinear
-            if isinstance(value, float)
+            if isinstance(value, float) and f"{term.effect}.{name}" not in self.held
         ]
 
-    def _derivatives(
-        self, fit: Fit, searched: Sequence[tuple[int, str]], series: int
+    def derivatives(
+        self,
+        fit: Fit,
+        searched: Sequence[tuple[int, str]],
+        series: int,
+        centred: bool = True,
     ) -> tuple[Array, Array, Array]:
         """∂(prediction)/∂(non-linear): trajectories (E, D), directions (P, D), map (D, L)."""
         trajectories: list[Array] = []
@@ -284,7 +294,7 @@ class HypothesisFitter:
             for sign in (1.0, -1.0):
                 terms = list(fit.terms)
                 terms[i] = terms[i].with_value(name, value + sign * step)
-                sides.append(self.design(terms, fit.blocks, series)[0])
+                sides.append(self.design(terms, fit.blocks, series, centred)[0])
             slope = (sides[0] - sides[1]) / (2 * step)
             _, V, index = fit.designs[series]
             for k in np.flatnonzero(np.abs(slope).max(axis=0) > 0):
@@ -307,7 +317,7 @@ class HypothesisFitter:
         A, g = np.zeros((K + L, K + L)), np.zeros(K + L)
         for s in range(len(self.series)) if only is None else only:
             C, V, index = fit.designs[s]
-            dC, dV, mapping = self._derivatives(fit, searched, s)
+            dC, dV, mapping = self.derivatives(fit, searched, s)
             joint = fit.weightings[s].reduce(np.hstack([C, dC]), np.hstack([V, dV]))
             T = np.zeros((C.shape[1] + dC.shape[1], K + L))
             T[np.arange(C.shape[1]), index] = 1.0

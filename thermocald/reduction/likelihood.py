@@ -86,8 +86,12 @@ class Weighting:
         out: Array = solve_triangular(self.factor, total, lower=True, check_finite=False)
         return out
 
-    def reduce(self, trajectories: Array, directions: Array) -> NormalEquations:
-        """Normal equations after the levels: trajectories (E, R), directions (P, R)."""
+    def joint(self, trajectories: Array, directions: Array) -> tuple[Array, Array, Array]:
+        """Normal equations beside the levels: A (R, R), c (R,), K (P, R).
+
+        trajectories (E, R), directions (P, R); K couples them with the levels, whose own normal
+        equations are `level_normal` and `level_b`.
+        """
         VNV = np.einsum("pi,epq,qj->eij", directions, self.N, directions, optimize=True)
         A = np.einsum("ei,ej,eij->ij", trajectories, trajectories, VNV, optimize=True)
         c = np.einsum("ei,ei->i", trajectories, self.b @ directions)
@@ -97,7 +101,11 @@ class Weighting:
             A = A - U.T @ U
             c = c - U.T @ self.data
             K = K - self.level.T @ U
-        return self._without_level(A, c, K)
+        return A, c, K
+
+    def reduce(self, trajectories: Array, directions: Array) -> NormalEquations:
+        """Normal equations after the levels: trajectories (E, R), directions (P, R)."""
+        return self._without_level(*self.joint(trajectories, directions))
 
     def _without_level(self, A: Array, c: Array, K: Array) -> NormalEquations:
         from scipy.linalg import solve_triangular

@@ -27,11 +27,13 @@ from thermocald.photogrammetry.series.normals import (
 )
 from thermocald.reduction.random_effects import hidden_targets
 from thermocald.reduction.requirements import (
+    LEAST_EPOCHS,
     MIN_EPOCHS,
     MIN_TARGETS,
     no_temperature,
     require,
     require_change,
+    require_for_fit,
 )
 from thermocald.reduction.series import ReducedSeries, SeriesInput, solve
 from thermocald.reduction.thermometer import Thermometer, thermometers
@@ -53,13 +55,26 @@ _ANY_GEOMETRY = GeometryBounds(0, 2.0, 1e9, 1e9, 0.0, 0.0)
 
 
 def reduce_series(
-    source: SeriesInput, T0: float | None = None, scale: Array | None = None
+    source: SeriesInput,
+    T0: float | None = None,
+    scale: Array | None = None,
+    *,
+    affinity: bool = True,
+    strict: bool = True,
 ) -> ReducedSeries:
-    """Check a series and reduce it; `T0` and `scale` are M1's for M2.
+    """Check a series and reduce it.
 
-    Raises DataError where the data cannot carry a discovery: it says what is missing.
+    T0 °C: the reference temperature, by default the mean of the series; scale (19,): px per unit of
+    the columns, of another series of the camera; affinity: whether C1 and C2 are free where the
+    projection is linearised; strict: whether the series must carry a discovery, else only a fit.
+
+    Raises DataError where the data cannot carry it: it says what is missing.
     """
-    require(source)
+    least = MIN_EPOCHS if strict else LEAST_EPOCHS
+    if strict:
+        require(source)
+    else:
+        require_for_fit(source)
     times = source.frame_times - source.frame_times[0]
     reading_times = source.reading_times - source.frame_times[0]
     usable = np.isfinite(reading_times)
@@ -67,7 +82,7 @@ def reduce_series(
     present = {
         name: np.asarray(r, dtype=float)[usable]
         for name, r in source.readings.items()
-        if np.isfinite(np.asarray(r, dtype=float)[usable]).sum() >= MIN_EPOCHS
+        if np.isfinite(np.asarray(r, dtype=float)[usable]).sum() >= least
     }
     reference = next(iter(source.readings))
     if reference not in present:
@@ -82,8 +97,9 @@ def reduce_series(
         reference,
         float(np.mean(trajectory)) if T0 is None else T0,
     )
-    require_change(source, reference, instruments[reference])
-    return _reduce(source, times, history, instruments, scale)
+    if strict:
+        require_change(source, reference, instruments[reference])
+    return _reduce(source, times, history, instruments, _linearised(source, affinity), scale)
 
 
 def reduce_together(inputs: Sequence[SeriesInput], T0: float | None = None) -> list[ReducedSeries]:
@@ -130,17 +146,18 @@ def _spikes(misclosure: Array, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return bad
 
 
-def _loose(source: SeriesInput) -> AdjustmentSettings:
-    """All ten parameters free: at a place with C1 or C2 held, the principal point makes up for
-    them, and the partials are those of another camera. Weak ones stay near zero.
+def _loose(source: SeriesInput, affinity: bool) -> AdjustmentSettings:
+    """All parameters free: where C1 or C2 is held, the principal point makes up for it, and the
+    partials are those of another camera. Weak ones stay near zero.
     """
     c = source.principal_distance or source.sensor.width * source.sensor.pixel_pitch
     spreads = (0.3 / c**2, 0.3 / c**4, 0.3 / c**6, 0.02 / c, 0.02 / c, 0.02, 0.02)
-    priors = {name: (0.0, sd) for name, sd in zip(IOP_NAMES[3:], spreads, strict=True)}
-    return AdjustmentSettings(IOP_NAMES, priors, max_rejected=0.9, bounds=_ANY_GEOMETRY)
+    free = IOP_NAMES if affinity else IOP_NAMES[:-2]
+    priors = {n: (0.0, sd) for n, sd in zip(IOP_NAMES[3:], spreads, strict=True) if n in free}
+    return AdjustmentSettings(free, priors, max_rejected=0.9, bounds=_ANY_GEOMETRY)
 
 
-def _linearised(source: SeriesInput) -> Partials:
+def _linearised(source: SeriesInput, affinity: bool) -> Partials:
     """The linearisation: one camera for the mean image of the series."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
@@ -149,7 +166,10 @@ def _linearised(source: SeriesInput) -> Partials:
     often = source.grid.observed.sum(axis=0) >= 0.5 * len(source.frame_times)
     rows = np.flatnonzero(np.isfinite(mean[:, 0]) & often)
     seen = Observations(rows, mean[rows], np.full((len(rows), 2), 0.1))
-    found = cold_start(source.sensor, source.field, seen, _loose(source), source.principal_distance)
+    found = cold_start(
+        source.sensor, source.field, seen, _loose(source, affinity), source.principal_distance,
+        None if affinity else source.interior,
+    )  # fmt: skip
     if found.interior is None or found.exterior is None:
         raise DataError(
             f"{source.name}: the camera cannot be oriented on its mean image: {found.reason}"
@@ -162,9 +182,9 @@ def _reduce(
     times: Array,
     history: History,
     instruments: Mapping[str, Thermometer],
+    at: Partials,
     scale: Array | None,
 ) -> ReducedSeries:
-    at = _linearised(source)
     X = source.field.points
     A = np.concatenate([at.A, at.B * X[:, None, :]], axis=-1)
     used = source.grid.observed.any(axis=0)
@@ -330,6 +350,7 @@ def without_targets(evidence: ReducedSeries, rows: NDArray[np.int64]) -> Reduced
         evidence.times,
         evidence.history,
         evidence.thermometers,
+        evidence.at,
         evidence.scale,
     )
     return replace(reduced, source=source, excluded=np.union1d(evidence.excluded, rows))

@@ -13,9 +13,19 @@ if TYPE_CHECKING:
     from thermocald.reduction.series import SeriesInput
     from thermocald.reduction.thermometer import Thermometer
 
-__all__ = ["MIN_EPOCHS", "MIN_TARGETS", "no_temperature", "require", "require_change"]
+__all__ = [
+    "LEAST_EPOCHS",
+    "MIN_EPOCHS",
+    "MIN_TARGETS",
+    "no_temperature",
+    "require",
+    "require_change",
+    "require_for_fit",
+]
 
 MIN_EPOCHS = 20
+LEAST_EPOCHS = 3
+_ENOUGH = 20  # targets without which an epoch says too little to a fit
 MIN_TARGETS = 12
 _MIN_DURATION = 120.0  # s
 
@@ -59,6 +69,17 @@ def require(source: SeriesInput) -> None:
         raise DataError(
             f"{source.name}: the {int(rows.sum())} targets seen lie in one plane; principal point "
             "and tilt cannot be told apart on it. Use a field with depth, such as a corner"
+        )
+
+
+def require_for_fit(source: SeriesInput) -> None:
+    """Raises DataError where temperature or epochs do not carry the fit of a thermal model."""
+    if not source.readings:
+        raise DataError(f"{source.name}: has no temperature column; a thermal model needs one")
+    enough = source.grid.observed.sum(axis=1) >= _ENOUGH
+    if enough.sum() < LEAST_EPOCHS:
+        raise DataError(
+            f"{source.name}: fewer than {LEAST_EPOCHS} epochs show {_ENOUGH} targets or more"
         )
 
 

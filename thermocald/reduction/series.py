@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
-    from thermocald.photogrammetry.camera.camera_model import Sensor
+    from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.series.normals import ObservationGrid, Partials
     from thermocald.reduction.random_effects import HiddenTargets, Movement
@@ -41,7 +41,7 @@ class SeriesInput:
 
     frame_times (E,) s; reading_times (R,) s; readings {channel: (R,)} °C, the first the reference;
     resolutions {channel: K or None}; grid: image points on epochs × targets; numbers (E,): the
-    epochs' own numbers.
+    epochs' own numbers; series: its name; interior: what is known of the camera, for a start.
     """
 
     name: str
@@ -55,6 +55,8 @@ class SeriesInput:
     resolutions: Mapping[str, float | None]
     grid: ObservationGrid
     numbers: NDArray[np.int64]
+    series: str = ""
+    interior: InteriorOrientation | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,17 +4,23 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from thermocald.acquisition.calibrator import Calibrator
+from thermocald.errors import DataError
 from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.reduction.series import SeriesInput
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
 
     from thermocald.epoch import Epoch
+    from thermocald.photogrammetry.field.testfield import TestField
+    from thermocald.store.recording.head import Head
     from thermocald.store.recording.reader import Recording
 
-__all__ = ["measured_epochs", "series_input"]
+__all__ = ["epochs_input", "load_series", "measured_epochs", "series_input"]
 
 
 def measured_epochs(
@@ -38,26 +44,57 @@ def measured_epochs(
     return epochs
 
 
-def series_input(recording: Recording, say: Callable[[str], None] | None = None) -> SeriesInput:
+def epochs_input(head: Head, field: TestField, epochs: Sequence[Epoch], name: str) -> SeriesInput:
+    """The arrays of some epochs; name: of their recording or store, for messages."""
+    camera = head.camera
+    readings = {
+        channel: np.array([e.temperatures.get(channel, np.nan) for e in epochs], dtype=float)
+        for channel in head.channels
+    }
+    return SeriesInput(
+        name=name,
+        camera=camera.name,
+        sensor=camera.sensor,
+        field=field,
+        principal_distance=camera.principal_distance,
+        frame_times=np.array([e.frame_time for e in epochs], dtype=float),
+        reading_times=np.array([e.temperature_time for e in epochs], dtype=float),
+        readings=readings,
+        resolutions={channel: c.resolution for channel, c in head.channels.items()},
+        grid=ObservationGrid.from_observations(field, [e.observations for e in epochs]),
+        numbers=np.array([e.number for e in epochs], dtype=np.int64),
+        series=head.series,
+        interior=camera.interior,
+    )
+
+
+def series_input(
+    recording: Recording,
+    say: Callable[[str], None] | None = None,
+    advance: Callable[[int], None] | None = None,
+) -> SeriesInput:
     """The arrays of one recording; its frames are measured where they have not been."""
     if not recording.has_observations and say is not None:
         say(f"measuring the {len(recording.columns)} frames of {recording.path}")
-    observations = [e.observations for e in measured_epochs(recording)]
-    columns = recording.columns
-    camera = recording.camera
-    readings = {
-        name: values for name, values in columns.temperatures.items() if name in recording.channels
-    }
-    return SeriesInput(
-        name=f"{recording.path}",
-        camera=camera.name,
-        sensor=camera.sensor,
-        field=recording.testfield,
-        principal_distance=camera.principal_distance,
-        frame_times=columns.frame_time,
-        reading_times=columns.temperature_time,
-        readings=readings,
-        resolutions={name: c.resolution for name, c in recording.channels.items()},
-        grid=ObservationGrid.from_observations(recording.testfield, observations),
-        numbers=columns.numbers,
-    )
+    epochs = measured_epochs(recording, advance)
+    return epochs_input(recording.head, recording.testfield, epochs, f"{recording.path}")
+
+
+def load_series(path: Path, advance: Callable[[int], None] | None = None) -> list[SeriesInput]:
+    """The series of a recording (a folder) or of a store (a file); advance: frames measured."""
+    if path.is_dir():
+        from thermocald.store.recording.reader import open_recording
+
+        return [series_input(open_recording(path), advance=advance)]
+    from thermocald.store.database.store import Store
+
+    with Store.open(path) as store:
+        found = [
+            epochs_input(
+                s.head, s.testfield, [e.epoch for e in store.epochs(s)], f"{path}: {s.name}"
+            )
+            for s in store.all_series()
+        ]
+    if not found:
+        raise DataError(f"{path}: the store holds no series")
+    return found

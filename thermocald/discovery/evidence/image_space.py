@@ -1,10 +1,9 @@
-"""Effects in image space: single targets that moved, and a measuring noise that grows.
+"""Single targets that moved.
 
 They are looked for in what a free camera per epoch leaves, so that nothing the camera itself does
-can pass for them, and taken out before the trajectories of parameters are examined.
+can be mistaken for them, and taken out before the trajectories of parameters are examined.
 
-Source: a step at an unknown time as Page (1955), Biometrika 42, 523-527; variances as a
-generalised linear model, McCullagh and Nelder (1989), Generalized Linear Models, chapter 10.
+Source: a step at an unknown time as Page (1955), Biometrika 42, 523-527.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from thermocald.reduction.adequacy import cosines
 from thermocald.reduction.reduce import without_targets
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable
 
     from numpy.typing import NDArray
 
@@ -26,11 +25,10 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["Displaced", "NoiseGrowth", "displaced_targets", "noise_growth"]
+__all__ = ["Displaced", "displaced_targets"]
 
 _GAIN = 60.0  # χ² of a step, for 147 targets × 180 times a chance of 1e-8
 _STEP_PX = 0.02
-_LEAST = 0.005  # share of the noise at T0 that is left where it is coldest
 _SHARE = 0.6  # of a target's slow movement that the step has to explain
 
 
@@ -47,22 +45,6 @@ class Displaced:
     sd_vectors: Array
     steps: Array
     gain: float
-
-
-@dataclass(frozen=True, eq=False)
-class NoiseGrowth:
-    """Noise 1 + factor (T - T0): factor per K and its sd; gain in -2 log L; noise (E,) per series.
-
-    other_gain: of the best trajectory that is not the reference temperature (time, another
-    channel).
-    """
-
-    factor: float
-    sd: float
-    gain: float
-    other_gain: float
-    other: str
-    noise: tuple[Array, ...]
 
 
 def _steps(evidence: ReducedSeries) -> tuple[Array, NDArray[np.int64], Array]:
@@ -212,80 +194,3 @@ def _best_step(v: Array) -> int:
         d = (s[-1] - s[:-1]) / n1[:, None] - s[:-1] / n0[:, None]
         gain = np.nan_to_num(np.sum(d**2, axis=1) * n0 * n1)
     return int(np.argmax(gain)) + 1
-
-
-def noise_growth(series: Sequence[ReducedSeries]) -> NoiseGrowth | None:
-    """Does the measuring noise follow the reference temperature? None where it does not change.
-
-    The variances of the epochs' adjustments are χ² distributed about (1 + k (T - T0))².
-    """
-    data = []
-    for e in series:
-        ok = e.n > 0
-        free = np.maximum(2.0 * e.n - e.N.shape[1], 1.0)
-        data.append((ok, free, e.sigma0**2))
-    temperature = [e.history.temperature() - e.T0 for e in series]
-    k, gain, sd = _slope(temperature, data)
-    others: list[tuple[float, str]] = []
-    for name in series[0].history.readings:
-        if name != series[0].history.reference and all(name in e.history.readings for e in series):
-            trajectory = [e.history.temperature(name) for e in series]
-            others.append((_slope([c - c.mean() for c in trajectory], data)[1], name))
-    time = [(e.times - e.times.mean()) / max(float(np.ptp(e.times)), 1.0) for e in series]
-    others.append((_slope(time, data)[1], "time"))
-    other_gain, other = max(others)
-    if gain < 40.0 or gain < other_gain + 10.0:
-        return None
-    rough = _roughness(temperature, data, k)
-    gain, other_gain, sd = gain / rough, other_gain / rough, sd * float(np.sqrt(rough))
-    if gain < 40.0:
-        return None
-    noise = tuple(np.maximum(1.0 + k * t, _LEAST) for t in temperature)
-    return NoiseGrowth(k, sd, gain, other_gain, other, noise)
-
-
-def _roughness(
-    trajectories: Sequence[Array], data: Sequence[tuple[NDArray[np.bool_], Array, Array]], k: float
-) -> float:
-    """By how much the variances scatter more, and slower, than χ² lets them; at least 1."""
-    total = []
-    for trajectory, (ok, free, v) in zip(trajectories, data, strict=True):
-        f = free[ok]
-        ratio = v[ok] / np.maximum(1.0 + k * trajectory[ok], _LEAST) ** 2
-        z = (ratio / (np.sum(f * ratio) / np.sum(f)) - 1.0) * np.sqrt(f / 2.0)
-        power = float(np.mean(z**2))
-        slow = 1.0 + 2.0 * sum(
-            float(np.mean(z[j:] * z[:-j])) / max(power, 1e-9) for j in range(1, min(11, len(z)))
-        )
-        total.append(power * max(slow, 1.0))
-    return max(1.0, float(np.mean(total)))
-
-
-def _slope(
-    trajectories: Sequence[Array],
-    data: Sequence[tuple[NDArray[np.bool_], Array, Array]],
-) -> tuple[float, float, float]:
-    """k, gain in -2 log L, and sd of k for the noise 1 + k trajectory, with a level per series."""
-    from scipy.optimize import minimize_scalar
-
-    def objective(k: float) -> float:
-        total = 0.0
-        for trajectory, (ok, free, v) in zip(trajectories, data, strict=True):
-            s2 = np.maximum(1.0 + k * trajectory[ok], _LEAST) ** 2
-            f = free[ok]
-            level = np.sum(f * v[ok] / s2) / np.sum(f)
-            total += float(np.sum(f * (np.log(s2) + np.log(level))))
-        return total
-
-    reach = max(float(np.max(np.abs(c))) for c in trajectories)
-    low = min(float(np.min(c)) for c in trajectories)
-    high = max(float(np.max(c)) for c in trajectories)
-    bounds = (-0.995 / max(high, 1e-9), 0.995 / max(-low, 1e-9))
-    start = minimize_scalar(objective, bounds=bounds, method="bounded", options={"xatol": 1e-7})
-    k = float(start.x)
-    gain = objective(0.0) - float(start.fun)
-    h = 0.01 / reach
-    curvature = (objective(k + h) - 2 * objective(k) + objective(k - h)) / h**2
-    # log variances scatter a little more than χ² does: gross errors near the limit
-    sd = float(np.sqrt(2.0 / curvature)) if curvature > 0 else float("inf")
-    return k, gain, sd

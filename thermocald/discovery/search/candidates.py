@@ -6,12 +6,12 @@ recording could show, and how many independent trials that makes is part of the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.reduction.grid import trial_values
+from thermocald.reduction.candidate import Candidate, candidate_of
 from thermocald.reduction.hypothesis import BASE, Term
 from thermocald.simulation import effects as catalogue
 
@@ -21,60 +21,18 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.reduction.series import ReducedSeries
-    from thermocald.simulation.effects import Effect
 
     Array = NDArray[np.float64]
 
-__all__ = ["MOUNT", "Candidate", "candidates", "richer_set"]
+__all__ = ["MOUNT", "candidates", "richer_set"]
 
 MOUNT = ("omega", "phi", "kappa")
-
-
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """One effect acting on one set of parameters.
-
-    name: of the searched non-linear parameter, "" where there is none; grid: its values.
-    """
-
-    effect: str
-    parameters: tuple[str, ...]
-    name: str
-    grid: Array
-    fixed: tuple[tuple[str, Any], ...] = ()
-
-    @property
-    def kind(self) -> Effect:
-        """The effect itself."""
-        return catalogue.get(self.effect)
-
-    @property
-    def is_drive(self) -> bool:
-        """Whether it replaces the temperature behind the linear terms."""
-        return self.kind.is_drive
-
-    @property
-    def is_event(self) -> bool:
-        """Whether it happens at one time of a series, or not at all."""
-        return self.kind.is_event
-
-    @property
-    def is_periodic(self) -> bool:
-        """Whether it cycles, with a phase of its own in each series."""
-        return self.kind.is_periodic
-
-    def term(self, value: float | None, series: int) -> Term:
-        """The term at one value of the grid; `series`: how many series there are."""
-        if self.is_event:
-            return Term(self.effect, self.parameters, self.fixed, ((),) * series)
-        own = () if value is None else ((self.name, float(value)),)
-        return Term(self.effect, self.parameters, self.fixed + own)
 
 
 def candidates(series: Sequence[ReducedSeries]) -> list[Candidate]:
     """All candidates that the recordings could show."""
     first = series[0]
-    out = []
+    out: list[Candidate] = []
     for name in catalogue.names():
         effect = catalogue.get(name)
         if effect.seen_in != "trajectory" or (effect.kind == "image" and not effect.columns):
@@ -84,11 +42,6 @@ def candidates(series: Sequence[ReducedSeries]) -> list[Candidate]:
             sets = (BASE,)
         if effect.moves_mount:
             sets = (*sets, MOUNT)
-        searched = {
-            k: p
-            for k, p in effect.nonlinear.items()
-            if not p.text and (k not in effect.fresh or p.role == "event")
-        }
         channels: Sequence[tuple[tuple[str, Any], ...]] = [()]
         if any(p.text for p in effect.nonlinear.values()):
             channels = [
@@ -96,15 +49,7 @@ def candidates(series: Sequence[ReducedSeries]) -> list[Candidate]:
                 for c in first.history.readings
                 if c != first.history.reference and all(_varies(e, c) for e in series)
             ]
-        for fixed in channels:
-            for parameters in sets:
-                columns = tuple(effect.column(p) for p in parameters)
-                if searched:
-                    key, parameter = next(iter(searched.items()))
-                    grid = trial_values(parameter, series)
-                    out.append(Candidate(name, columns, key, grid, fixed))
-                else:
-                    out.append(Candidate(name, columns, "", np.zeros(0), fixed))
+        out += [candidate_of(effect, p, series, fixed) for fixed in channels for p in sets]
     return out
 
 

@@ -7,12 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.discovery.evidence.image_space import (
-    Displaced,
-    NoiseGrowth,
-    displaced_targets,
-    noise_growth,
-)
+from thermocald.discovery.evidence.image_space import Displaced, displaced_targets
 from thermocald.discovery.search.cross_validation import confirmed, gains
 from thermocald.discovery.search.search import Search, Solution
 from thermocald.reduction.adequacy import Adequacy, examine
@@ -21,6 +16,7 @@ from thermocald.reduction.calibrated import calibrated_thermometers
 from thermocald.reduction.curvature import relinearised
 from thermocald.reduction.fit import HypothesisFitter
 from thermocald.reduction.noise import jumps, with_correlated_noise, with_jumps
+from thermocald.reduction.noise_growth import NoiseGrowth, noise_growth
 from thermocald.reduction.reduce import reweighted
 
 if TYPE_CHECKING:

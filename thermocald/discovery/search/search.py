@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.discovery.search.candidates import Candidate, candidates
-from thermocald.reduction.hypothesis import BASE, Fit, Term
-from thermocald.reduction.series import COLUMNS
+from thermocald.discovery.search.candidates import candidates
+from thermocald.reduction.hypothesis import BASE, Term
+from thermocald.reduction.scan import Scanner
 from thermocald.simulation import effects as catalogue
 
 if TYPE_CHECKING:
@@ -28,7 +28,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.reduction.candidate import Candidate
     from thermocald.reduction.fit import HypothesisFitter
+    from thermocald.reduction.hypothesis import Fit
+    from thermocald.reduction.scan import Scan
 
     Array = NDArray[np.float64]
 
@@ -82,12 +85,12 @@ class Search:
     ) -> None:
         self.fitter = fitter
         self.candidates = candidates(fitter.series)
+        self.scanner = Scanner(fitter)
         self.epochs = sum(int((e.n > 0).sum()) for e in fitter.series)
         # the more noise is correlated, the less is known of it
         self.margin = MARGIN * max(e.correlation for e in fitter.series)
         self.progress = progress or (lambda _: None)
         self._trials: dict[tuple[str, tuple[str, ...]], float] = {}
-        self._trajectories: dict[tuple[int, int], Array] = {}
         self._refined: dict[tuple[Term, ...], Fit] = {}
 
     def base(self, given: Sequence[tuple[str, dict[str, Any]]] = ()) -> Solution:
@@ -99,83 +102,22 @@ class Search:
 
     # -- scanning --------------------------------------------------------------------------
 
-    def _stack(self, number: int, series: int, fit: Fit) -> Array:
-        """Trajectories (G, E, m) of a candidate over its grid in one series."""
-        candidate = self.candidates[number]
-        fitter = self.fitter
-        drives = [t for t in fit.terms if t.is_drive]
-        key = (number, series)
-        if key in self._trajectories and not (candidate.is_drive and drives):
-            return self._trajectories[key]
-        rows = []
-        if candidate.is_event:
-            times = fitter.series[series].times
-            return (times[None, :, None] >= times[1:, None, None]).astype(float)
-        for value in candidate.grid if len(candidate.grid) else [None]:
-            term = candidate.term(value, len(fitter.series))
-            if candidate.is_drive:
-                rows.append(fitter.drive_trajectory([*drives, term], series)[:, None])
-            else:
-                rows.append(fitter.trajectories(term, series, operators=False)[0])
-        stack: Array = np.stack(rows)
-        stack -= stack.mean(axis=1, keepdims=True)
-        if not (candidate.is_drive and drives):
-            self._trajectories[key] = stack
-        return stack
-
-    def scan(self, number: int, solution: Solution) -> Scanned | None:
+    def scan(self, candidate: Candidate, solution: Solution) -> Scanned:
         """The best place of one candidate added to a solution."""
-        candidate, fit = self.candidates[number], solution.fit
-        series = range(len(self.fitter.series))
-        directions = np.zeros((len(COLUMNS), len(candidate.parameters)))
-        for j, name in enumerate(candidate.parameters):
-            directions[COLUMNS.index(name), j] = 1.0
-        K = len(fit.coefficients)
-        parts = []
-        base_A, base_c = np.zeros((K, K)), np.zeros(K)
-        for s in series:
-            C, V, index = fit.designs[s]
-            stack = self._stack(number, s, fit)
-            A, c, B = fit.weightings[s].scan(stack, directions, (C, V))
-            full = np.zeros((*c.shape, K))
-            full[..., index] = B
-            parts.append((A, c, full))
-            base_A[np.ix_(index, index)] += fit.reduced[s].A
-            base_c[index] += fit.reduced[s].c
-        count = len(candidate.parameters)
-        reference = float(base_c @ _solve(base_A, base_c[:, None])[:, 0])
-        if candidate.is_drive:
-            # the drive takes the place of T: the base's own rates leave
-            keep = np.arange(len(BASE), K)
-            base_A, base_c = base_A[np.ix_(keep, keep)], base_c[keep]
-            parts = [(A, c, B[..., keep]) for A, c, B in parts]
-            count = 0
-        rest = float(base_c @ _solve(base_A, base_c[:, None])[:, 0]) if len(base_c) else 0.0
-        if candidate.is_event:
-            return self._event(candidate, parts, base_A, base_c, count)
-        if candidate.is_periodic and len(parts) > 1:
-            gains = sum(_gain([p], base_A, base_c) for p in parts)
-            count *= 2 * len(parts)
-        else:
-            gains = _gain(parts, base_A, base_c)
-            count *= 2 if candidate.is_periodic else 1
-        gains = np.asarray(gains) + rest - reference
-        best = int(np.argmax(gains))
-        value = float(candidate.grid[best]) if len(candidate.grid) else None
-        term = candidate.term(value, len(parts))
-        return Scanned(candidate, term, float(gains[best]), self._penalty(candidate, count))
+        found = self.scanner.scan(candidate, solution.fit)
+        if candidate.kind.is_event:
+            return self._event(candidate, found)
+        value = float(candidate.grid[found.best]) if len(candidate.grid) else None
+        term = candidate.term(value, len(self.fitter.series))
+        penalty = self._penalty(candidate, found.coefficients)
+        return Scanned(candidate, term, float(found.gains[found.best]), penalty)
 
-    def _event(
-        self, candidate: Candidate, parts: list[tuple[Array, Array, Array]],
-        base_A: Array, base_c: Array, count: int,
-    ) -> Scanned:  # fmt: skip
+    def _event(self, candidate: Candidate, found: Scan) -> Scanned:
         """An event may have come in each series, at its own time, or not at all."""
         fresh: list[tuple[tuple[str, float], ...] | None] = []
         total, penalty = 0.0, 0.0
-        single = count * np.log(self.epochs) + 2 * np.log(self.epochs)
-        for s, part in enumerate(parts):
-            gains = _gain([part], base_A, base_c)
-            gains = np.where(np.isfinite(gains), gains, 0.0)
+        single = found.coefficients * np.log(self.epochs) + 2 * np.log(self.epochs)
+        for s, gains in enumerate(found.events):
             best = int(np.argmax(gains))
             if gains[best] > single + self.margin or s == 0:
                 fresh.append(((candidate.name, float(self.fitter.series[s].times[best + 1])),))
@@ -183,7 +125,7 @@ class Search:
                 penalty += single
             else:
                 fresh.append(None)
-        term = replace(candidate.term(None, len(parts)), fresh=tuple(fresh))
+        term = replace(candidate.term(None, len(found.events)), fresh=tuple(fresh))
         return Scanned(candidate, term, total, penalty + self._once())
 
     def _once(self) -> float:
@@ -192,12 +134,7 @@ class Search:
     def _penalty(self, candidate: Candidate, count: int) -> float:
         key = (candidate.effect, candidate.parameters)
         if key not in self._trials:
-            number = self.candidates.index(candidate)
-            stack = self._trajectories.get((number, 0))
-            trials = float(len(candidate.grid)) if len(candidate.grid) else 1.0
-            if stack is not None and len(stack) > 1:
-                trials = _independent(stack)
-            self._trials[key] = trials
+            self._trials[key] = self.scanner.trials(candidate)
         searched = np.log(self.epochs) if len(candidate.grid) else 0.0
         return float(
             count * np.log(self.epochs)
@@ -218,12 +155,11 @@ class Search:
     def expand(self, solution: Solution, width: int = 6) -> list[Solution]:
         """The best solutions with one effect more, best first."""
         promises = []
-        for number, candidate in enumerate(self.candidates):
-            taken = [t for t in solution.terms if t.effect == candidate.effect]
-            if taken:
+        for candidate in self.candidates:
+            if candidate.effect in solution.names:
                 continue
-            found = self.scan(number, solution)
-            if found is not None and np.isfinite(found.gain):
+            found = self.scan(candidate, solution)
+            if np.isfinite(found.gain):
                 promises.append(found)
         grown = [
             self.refine((*solution.terms, promise.term), (*solution.penalties, promise.penalty))
@@ -280,45 +216,3 @@ def _given_term(name: str, values: dict[str, Any], series: int) -> Term:
         own = tuple((k, float(values[k])) for k in effect.fresh if k in values)
         fresh = (own, *(None,) * (series - 1))
     return Term(name, parameters or BASE, shared, fresh)
-
-
-def _gain(parts: list[tuple[Array, Array, Array]], base_A: Array, base_c: Array) -> Array:
-    """χ² explained by candidates (G,) beyond the base."""
-    A = sum(p[0] for p in parts)
-    c = sum(p[1] for p in parts)
-    B = sum(p[2] for p in parts)
-    assert not isinstance(A, int)
-    assert not isinstance(c, int)
-    assert not isinstance(B, int)
-    if len(base_c):
-        X = _solve(base_A, np.column_stack([base_c, B.reshape(-1, len(base_c)).T]))
-        c = c - B @ X[:, 0]
-        BX = np.einsum("gir,rgj->gij", B, X[:, 1:].reshape(len(base_c), *c.shape))
-        A = A - BX
-    scale = np.sqrt(np.maximum(np.einsum("gii->gi", A), 1e-12))
-    own = A / scale[:, :, None] / scale[:, None, :]
-    own = own + 1e-9 * np.eye(A.shape[-1])
-    right = c / scale
-    weak = scale.min(axis=1) < 1e-3
-    out: Array = np.einsum("gi,gi->g", right, np.linalg.solve(own, right[..., None])[..., 0])
-    return np.where(weak, -np.inf, out)
-
-
-def _solve(A: Array, right: Array) -> Array:
-    if not len(A):
-        return np.zeros((0, right.shape[1]))
-    d = np.sqrt(np.maximum(np.diag(A), 1e-300))
-    x: Array = (
-        np.linalg.solve(A / np.outer(d, d) + 1e-12 * np.eye(len(A)), right / d[:, None])
-        / d[:, None]
-    )
-    return x
-
-
-def _independent(stack: Array) -> float:
-    """How many independent trajectories a grid (G, E, m) holds: its length in angles over 90°."""
-    s = stack[..., 0]
-    s = s - s.mean(axis=1, keepdims=True)
-    norm = np.linalg.norm(s, axis=1)
-    cosine = np.sum(s[1:] * s[:-1], axis=1) / np.maximum(norm[1:] * norm[:-1], 1e-12)
-    return 1.0 + float(np.sum(np.arccos(np.clip(np.abs(cosine), 0, 1)))) / (np.pi / 2)

@@ -12,8 +12,9 @@ from thermocald.simulation import effects as catalogue
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from thermocald.discovery.evidence.image_space import Displaced, NoiseGrowth
+    from thermocald.discovery.evidence.image_space import Displaced
     from thermocald.reduction.hypothesis import Block, Fit
+    from thermocald.reduction.noise_growth import NoiseGrowth
     from thermocald.reduction.series import ReducedSeries
 
     Array = NDArray[np.float64]

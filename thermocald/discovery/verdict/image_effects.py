@@ -11,9 +11,9 @@ from thermocald.discovery.verdict.found import EffectFound
 from thermocald.simulation import effects as catalogue
 
 if TYPE_CHECKING:
-    from thermocald.discovery.evidence.image_space import NoiseGrowth
     from thermocald.discovery.search.examination import Examination
     from thermocald.discovery.verdict.gap import Gap
+    from thermocald.reduction.noise_growth import NoiseGrowth
     from thermocald.reduction.series import ReducedSeries
 
 __all__ = ["image_effects", "image_places"]

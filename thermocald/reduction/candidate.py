@@ -1,0 +1,70 @@
+"""A candidate: one effect acting on one set of parameters, with the grid to search."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.reduction.grid import trial_values
+from thermocald.reduction.hypothesis import Term
+from thermocald.simulation import effects as catalogue
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from thermocald.reduction.series import ReducedSeries
+    from thermocald.simulation.effects import Effect
+
+    Array = NDArray[np.float64]
+
+__all__ = ["Candidate", "candidate_of"]
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """One effect acting on one set of parameters.
+
+    parameters: columns of the reduced series; name: of the searched non-linear parameter, "" where
+    there is none; grid: its trial values; fixed: non-linear values that are given.
+    """
+
+    effect: str
+    parameters: tuple[str, ...]
+    name: str
+    grid: Array
+    fixed: tuple[tuple[str, Any], ...] = ()
+
+    @property
+    def kind(self) -> Effect:
+        """The effect itself."""
+        return catalogue.get(self.effect)
+
+    def term(self, value: float | None, series: int) -> Term:
+        """The term at one value of the grid; `series`: how many series there are."""
+        if self.kind.is_event:
+            return Term(self.effect, self.parameters, self.fixed, ((),) * series)
+        own = () if value is None else ((self.name, float(value)),)
+        return Term(self.effect, self.parameters, self.fixed + own)
+
+
+def candidate_of(
+    effect: Effect,
+    parameters: tuple[str, ...],
+    series: Sequence[ReducedSeries],
+    fixed: tuple[tuple[str, Any], ...] = (),
+) -> Candidate:
+    """An effect on some of its coefficients; what belongs to a series but an event is not searched.
+
+    fixed: non-linear values that are given.
+    """
+    given = dict(fixed)
+    columns = tuple(effect.column(p) for p in parameters)
+    for key, parameter in effect.nonlinear.items():
+        own = key in effect.fresh and parameter.role != "event"
+        if not (parameter.text or own or key in given):
+            return Candidate(effect.name, columns, key, trial_values(parameter, series), fixed)
+    return Candidate(effect.name, columns, "", np.zeros(0), fixed)

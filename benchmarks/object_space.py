@@ -19,10 +19,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thermocald.analysis.study.reference import QUOTED
-from thermocald.analysis.thermal.reduction import reduce_series
-from thermocald.analysis.thermal.series import ModelSeries
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
+from thermocald.reduction.reduce import reduce_series
+from thermocald.reduction.series import ReducedSeries
+from thermocald.reduction.source import epochs_input
 from thermocald.simulation import effects
 from thermocald.simulation.model import ModelEffect
 from thermocald.simulation.observations import Simulation
@@ -69,14 +70,18 @@ def measure(preset: str, seed: int = 1) -> Row:
         for e in first.model.effects
         if e.name != "defocus"  # moves no point
     ]
-    series = reduce_series(first.head, first.field, list(first.epochs()), "M1")
+    series = reduce_series(
+        epochs_input(first.head, first.field, list(first.epochs()), "M1"),
+        affinity=False,
+        strict=False,
+    )
     about_mean, uncorrected, base = _errors(series, [], second)
     *_, corrected = _errors(series, listed, second)
     return Row(preset, about_mean, uncorrected, base, corrected)
 
 
 def _errors(
-    series: ModelSeries, listed: list[ModelEffect], second: Simulation
+    series: ReducedSeries, listed: list[ModelEffect], second: Simulation
 ) -> tuple[float, float, float]:
     """Mean distances mm of M2: about its mean, from its begin, and with the model."""
     model = fit_thermal_model([series], listed).model

@@ -22,9 +22,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from thermocald.analysis.thermal.reduction import reduce_series
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.analysis.thermal.thermal_model import FittedModel, fit_thermal_model
+from thermocald.reduction.reduce import reduce_series
+from thermocald.reduction.source import epochs_input
 from thermocald.simulation.course import Course
 from thermocald.simulation.model import ModelEffect
 from thermocald.simulation.presets import preset_simulation
@@ -40,7 +41,8 @@ def fitted() -> tuple[FittedModel, bool]:
         s = replace(s, programme=replace(s.programme, epochs=EPOCHS, sources={"housing": lamp}))
         epochs = list(s.epochs())
         begin = time.thread_time()
-        series.append(reduce_series(s.head, s.field, epochs, f"M{k}"))
+        source = epochs_input(s.head, s.field, epochs, f"M{k}")
+        series.append(reduce_series(source, affinity=False, strict=False))
         reducing += time.thread_time() - begin
     listed = [
         ModelEffect("permanent_set", {"x0": 0.0, "y0": 0.0}),

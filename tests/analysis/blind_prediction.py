@@ -18,9 +18,9 @@ from typer.testing import CliRunner
 from tests.blind.case import SINGLE, Case
 from tests.blind.generator import generate, write
 from thermocald.analysis.thermal.prediction_test import predicted_error
-from thermocald.analysis.thermal.reduction import model_series
-from thermocald.analysis.thermal.thermal_model import targets_of
 from thermocald.cli import application
+from thermocald.reduction.reduce import reduce_series
+from thermocald.reduction.source import series_input
 from thermocald.simulation.model import ModelEffect
 from thermocald.simulation.model_file import read_model
 from thermocald.store.recording.reader import read_recording
@@ -74,7 +74,8 @@ def predict_case(
     stated = json.loads(_run("predict", "--model", model, "--test", folder / "M2", "--json", "-"))
     (said,) = stated["series"]
     fitted = read_model(model)
-    second = model_series(read_recording(folder / "M2"), targets_of(fitted.effects))
+    source = series_input(read_recording(folder / "M2"))
+    second = reduce_series(source, affinity=False, strict=False)
     true = predicted_error(_with_true_noise(fitted, truth), second, READING_SD)
     return Tested(name, seed, said["rms_px"] / true.floor_px, said["coverage"], said["rms_px"])
 

@@ -10,13 +10,14 @@ import pytest
 from typer.testing import CliRunner
 
 from thermocald.analysis.thermal.prediction_test import predicted_error
-from thermocald.analysis.thermal.reduction import model_series, reduce_series
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.analysis.thermal.type_model import type_model
 from thermocald.cli import application
 from thermocald.errors import ConfigurationError, DataError, ThermocaldError, UsageError
 from thermocald.photogrammetry.camera.camera_model import project
+from thermocald.reduction.reduce import reduce_series
+from thermocald.reduction.source import epochs_input, series_input
 from thermocald.simulation.course import Course
 from thermocald.simulation.model import ModelEffect
 from thermocald.simulation.presets import preset_simulation
@@ -35,8 +36,12 @@ def simulated(seed, series="M1", epochs=120, listed=(LAG,), power=9.0, **changes
     return replace(s, model=replace(s.model, effects=tuple(listed), **changes), programme=programme)
 
 
+def for_fit(source):
+    return reduce_series(source, affinity=False, strict=False)
+
+
 def reduced(s):
-    return reduce_series(s.head, s.field, list(s.epochs()), s.programme.series)
+    return for_fit(epochs_input(s.head, s.field, list(s.epochs()), s.programme.series))
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +147,7 @@ def test_a_lens_mean_offset_of_targets_is_no_drift():
     rng = np.random.default_rng(8)
     wrong = replace(s.field, points=s.field.points + rng.normal(0, 0.05, s.field.points.shape),
                     sigmas=np.full(s.field.points.shape, 0.05))  # fmt: skip
-    series = reduce_series(s.head, wrong, list(s.epochs()), "M1")
+    series = for_fit(epochs_input(s.head, wrong, list(s.epochs()), "M1"))
     f = fit_thermal_model([series], [START])
     assert abs(f.sigma0 - 1.0) < 0.05
     for n in ("c", "x0", "y0"):
@@ -153,21 +158,22 @@ def test_a_lens_mean_offset_of_targets_is_no_drift():
 
 def test_refusals(fitted):
     _, (first, second) = fitted
+    other = replace(second, source=replace(second.source, camera="another"))
     with pytest.raises(DataError, match="no series"):
         fit_thermal_model([])
     with pytest.raises(DataError, match="belongs to one camera"):
-        fit_thermal_model([first, replace(second, camera="another")])
+        fit_thermal_model([first, other])
     steady = simulated(4, power=0.0)
     with pytest.raises(DataError, match="heat the camera by several kelvin"):
         fit_thermal_model([reduced(steady)])
     with pytest.raises(ConfigurationError, match="belongs to one camera"):
-        predicted_error(fitted[0].model, replace(second, camera="another"), 0.05)
+        predicted_error(fitted[0].model, other, 0.05)
     nobody = ModelEffect("target_displacement", {"time": 1.0, "targets": ("nobody",), "dX": 0.0})
     with pytest.raises(DataError, match="none of the targets"):
         fit_thermal_model([first], [nobody])
     few = list(steady.epochs())[:2]
     with pytest.raises(DataError, match="fewer than 3 epochs"):
-        reduce_series(steady.head, steady.field, few, "few")
+        for_fit(epochs_input(steady.head, steady.field, few, "few"))
 
 
 def test_type_model_of_three_cameras(fitted):
@@ -206,7 +212,7 @@ def test_fit_command(folder):
     assert abs(tau["value"] - 70.0) < 3 * tau["sd"]
     camera = ThermalCamera.load(folder / "cam.yaml")
     assert camera.model.covariance is not None
-    same = fit_thermal_model([model_series(read_recording(folder / "M1"))], [LAG])
+    same = fit_thermal_model([for_fit(series_input(read_recording(folder / "M1")))], [LAG])
     assert same.model.effects[0].values["tau"] == pytest.approx(tau["value"], abs=0.05)
 
 

@@ -13,8 +13,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermocald.analysis.thermal.reduction import model_series
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
+from thermocald.reduction.reduce import reduce_series
+from thermocald.reduction.source import series_input
 from thermocald.simulation import effects
 from thermocald.simulation.course import Course
 from thermocald.simulation.demonstration import demonstration_field, demonstration_model
@@ -88,8 +89,7 @@ def test_every_effect_is_here():
 def test_parameters_are_found_again(tmp_path, name):
     true, known = CASES[name]
     simulation, recording = record(tmp_path, ModelEffect(name, true))
-    targets = true.get("targets", ())
-    series = model_series(recording, keep_targets=targets)
+    series = reduce_series(series_input(recording), affinity=False, strict=False)
     kind = effects.get(name)
     start = {**dict.fromkeys(kind.usual, 0.0), **known}
     fitted = fit_thermal_model([series], [ModelEffect(name, start)], T0=simulation.model.T0)
@@ -112,7 +112,7 @@ def test_a_lag_is_found_again(tmp_path):
     """The quick one of the above."""
     true = ModelEffect("thermal_lag", {"tau": 84.0})
     simulation, recording = record(tmp_path, true, seed=11)
-    series = model_series(recording)
+    series = reduce_series(series_input(recording), affinity=False, strict=False)
     fitted = fit_thermal_model(
         [series], [ModelEffect("thermal_lag", {"tau": 10.0})], T0=simulation.model.T0
     )

@@ -61,9 +61,10 @@ def correct(
     Example: thermocald correct --model camera.thermal.yaml --log weather.csv points.csv
     """
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
-    from thermocald.cli.predict import read_log, warnings_said
+    from thermocald.cli.predict import read_log, say_what_is_missing, warnings_said
 
     thermal = ThermalCamera.load(model)
+    say_what_is_missing(thermal)
     table = read_log(thermal, log, column, timezone)
     if image_size is not None:
         thermal = thermal.for_images(*_size(image_size))

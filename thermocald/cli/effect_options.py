@@ -17,7 +17,7 @@ from thermocald.errors import ConfigurationError, UsageError
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from thermocald.analysis.thermal.series import ModelSeries
+    from thermocald.reduction.series import ReducedSeries
     from thermocald.simulation.model import ModelEffect
 
 __all__ = ["check_names", "parse_effect"]
@@ -63,23 +63,23 @@ def parse_effect(text: str) -> ModelEffect:
         raise UsageError(f"--effect {text}: {error}") from error
 
 
-def check_names(listed: Iterable[ModelEffect], series: Iterable[ModelSeries]) -> None:
+def check_names(listed: Iterable[ModelEffect], series: Iterable[ReducedSeries]) -> None:
     """UsageError where an effect names a channel or a target that a series does not have."""
     effects = list(listed)
     for s in series:
         for effect in effects:
             channel = effect.values.get("channel")
-            if channel is not None and channel not in s.history.readings:
+            if channel is not None and channel not in s.source.readings:
                 raise UsageError(
-                    f"effect {effect.name}: {s.source} has no temperature column {channel!r}; "
-                    f"{_nearest(channel, s.history.readings)}"
+                    f"effect {effect.name}: {s.source.name} has no temperature column {channel!r}; "
+                    f"{_nearest(channel, s.source.readings)}"
                 )
             targets = effect.values.get("targets", ())
             for target in (targets,) if isinstance(targets, str) else targets:
-                if target not in s.field.index:
+                if target not in s.source.field.index:
                     raise UsageError(
-                        f"effect {effect.name}: the test field of {s.source} has no target "
-                        f"{target!r}; {_nearest(target, s.field.index)}"
+                        f"effect {effect.name}: the test field of {s.source.name} has no target "
+                        f"{target!r}; {_nearest(target, s.source.field.index)}"
                     )
 
 

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from thermocald.analysis.thermal.prediction_test import PredictedError
-    from thermocald.analysis.thermal.series import ModelSeries
-    from thermocald.analysis.thermal.thermal_model import FittedModel
+    from thermocald.analysis.thermal.result import FittedModel
+    from thermocald.reduction.series import ReducedSeries
     from thermocald.simulation.model import ModelEffect
 
 __all__ = ["register"]
@@ -62,7 +62,7 @@ def fit(
 
     listed, T0 = _structure(effect or [], model, reference_temperature)
     with progress(None, "reading and measuring") as advance:
-        series = _read(inputs, listed, advance)
+        series = _read(inputs, advance)
     check_names(listed, series)
     if type_name is not None:
         fitted_model, document = _type(series, listed, T0, type_name)
@@ -77,17 +77,18 @@ def fit(
         _say(document)
 
 
-def _read(
-    inputs: list[Path], listed: list[ModelEffect], advance: Callable[[int], None]
-) -> list[ModelSeries]:
-    from thermocald.analysis.thermal.reduction import load_model_series
-    from thermocald.analysis.thermal.thermal_model import targets_of
+def _read(inputs: list[Path], advance: Callable[[int], None]) -> list[ReducedSeries]:
+    from thermocald.reduction.reduce import reduce_series
+    from thermocald.reduction.source import load_series
 
     for path in inputs:
         if not path.exists():
             raise UsageError(f"{path}: does not exist; give a recording or a store")
-    moving = targets_of(listed)
-    return [s for path in inputs for s in load_model_series(path, moving, advance)]
+    return [
+        reduce_series(s, affinity=False, strict=False)
+        for path in inputs
+        for s in load_series(path, advance)
+    ]
 
 
 def _structure(
@@ -110,7 +111,7 @@ def _structure(
 
 
 def _one(
-    series: list[ModelSeries], listed: list[ModelEffect], T0: float | None
+    series: list[ReducedSeries], listed: list[ModelEffect], T0: float | None
 ) -> tuple[FittedModel, list[PredictedError]]:
     """The fit to everything, and the error on what a fit to the rest predicts."""
     from thermocald.analysis.thermal.prediction_test import predicted_error
@@ -144,13 +145,14 @@ def _document(fitted: FittedModel, held: list[PredictedError]) -> dict[str, Any]
         "effects": written["effects"],
         "validity": written["validity"],
         "sigma0": fitted.sigma0,
+        **fitted.missing.as_mapping(),
         "series": [asdict(s) for s in fitted.series],
         "held_out": [asdict(h) for h in held],
     }
 
 
 def _type(
-    series: list[ModelSeries], listed: list[ModelEffect], T0: float | None, name: str
+    series: list[ReducedSeries], listed: list[ModelEffect], T0: float | None, name: str
 ) -> tuple[Any, dict[str, Any]]:
     import numpy as np
 
@@ -158,11 +160,12 @@ def _type(
     from thermocald.analysis.thermal.type_model import type_model
     from thermocald.simulation.model_file import model_document
 
-    cameras = list(dict.fromkeys(s.camera for s in series))
+    cameras = list(dict.fromkeys(s.source.camera for s in series))
     if T0 is None:
         T0 = round(float(np.mean([s.history.temperature().mean() for s in series])), 1)
     models = [
-        fit_thermal_model([s for s in series if s.camera == c], listed, T0).model for c in cameras
+        fit_thermal_model([s for s in series if s.source.camera == c], listed, T0).model
+        for c in cameras
     ]
     found = type_model(models, name)
     written = model_document(found)
@@ -180,9 +183,17 @@ def _type(
 def _say(document: dict[str, Any]) -> None:
     typer.echo(f"{document['model']}: {document['camera']}")
     low, high = next(iter(document["validity"].values()))
-    typer.echo(
-        f"  valid from {low:g} to {high:g} °C, T0 = {document['reference_temperature']:g} °C"
-    )
+    T0 = f"T0 = {document['reference_temperature']:g} °C"
+    if document.get("effect_missing"):
+        typer.echo(
+            f"  an effect is missing: the model leaves {document['misfit_px']:.3f} px in smooth "
+            f"trajectories ({document['significance_sigmas']:.0f} standard deviations); "
+            "run: thermocald discover\n"
+            f"  fitted from {low:g} to {high:g} °C, {T0}; standard deviations are widened by what "
+            "is left, and no 95 % band is stated"
+        )
+    else:
+        typer.echo(f"  valid from {low:g} to {high:g} °C, {T0}")
     for name, rate in document["rates"].items():
         sd = f" ± {rate['sd'] * 1e3:.5f}" if "sd" in rate else ""
         typer.echo(f"  {name:>4}: {rate['value'] * 1e3:+.5f}{sd} µm/K")

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from thermocald.analysis.thermal.correction import TemperatureLog
     from thermocald.analysis.thermal.thermal_camera import Along, ThermalCamera
 
-__all__ = ["read_log", "register", "warnings_said"]
+__all__ = ["read_log", "register", "say_what_is_missing", "warnings_said"]
 
 
 @contextmanager
@@ -32,6 +32,19 @@ def warnings_said() -> Iterator[None]:
         yield
     for text in dict.fromkeys(str(w.message) for w in caught):
         say(f"warning: {text}")
+
+
+def say_what_is_missing(thermal: ThermalCamera) -> None:
+    """A warning on standard error where the model's own fit found that an effect is missing."""
+    from thermocald.cli.common import say
+
+    if thermal.model.misses_an_effect:
+        left = thermal.model.evidence["fit"]["misfit_px"]
+        say(
+            f"warning: the model misses an effect: it left {left:.3f} px in its own series. "
+            "Standard deviations hold what it left there, not what it leaves elsewhere; "
+            "thermocald discover looks for the effect"
+        )
 
 
 def register(app: typer.Typer) -> None:
@@ -86,6 +99,7 @@ def predict(
     if sum(option is not None for option in (temperature, log, test, programme)) != 1:
         raise UsageError("give one of --temperature, --log, --test, --programme")
     thermal = ThermalCamera.load(model)
+    say_what_is_missing(thermal)
     with warnings_said():
         if temperature is not None:
             others = _channels(channel or [])
@@ -112,11 +126,10 @@ def _tested(thermal: ThermalCamera, path: Path) -> tuple[dict[str, Any], list[st
 
     import numpy as np
 
-    from thermocald.analysis.thermal.noise import thermometer_noise
     from thermocald.analysis.thermal.prediction_test import predicted_error
-    from thermocald.analysis.thermal.reduction import load_model_series
-    from thermocald.analysis.thermal.thermal_model import targets_of
     from thermocald.cli.common import progress
+    from thermocald.reduction.reduce import reduce_series
+    from thermocald.reduction.source import load_series
 
     if not path.exists():
         raise UsageError(f"{path}: does not exist; give a recording or a store")
@@ -124,15 +137,22 @@ def _tested(thermal: ThermalCamera, path: Path) -> tuple[dict[str, Any], list[st
              if "thermometer_sd_K" in f]  # fmt: skip
     found, lines = [], []
     with progress(None, "reading and measuring") as advance:
-        series = load_model_series(path, targets_of(thermal.model.effects), advance)
+        series = [
+            reduce_series(s, affinity=False, strict=False) for s in load_series(path, advance)
+        ]
     for s in series:
-        sd = float(np.median(known)) if known else thermometer_noise(s)
-        scaled = thermal.for_images(s.sensor.width, s.sensor.height, s.camera)
+        sensor = s.source.sensor
+        noise = s.thermometers[s.history.reference].noise
+        sd = float(np.median(known)) if known else noise
+        scaled = thermal.for_images(sensor.width, sensor.height, s.source.camera)
         error = predicted_error(scaled.model, s, sd)
         found.append(asdict(error))
+        bands = f"{error.coverage:.1%} inside their 95 % bands"
+        if thermal.model.misses_an_effect:
+            bands = "no 95 % band is stated, as the model misses an effect"
         lines.append(
-            f"{s.source}: predicted to {error.rms_px:.4f} px (noise alone {error.floor_px:.4f}), "
-            f"{error.coverage:.1%} inside their 95 % bands, {error.object_mm:.2f} mm at 10 m"
+            f"{s.source.name}: predicted to {error.rms_px:.4f} px (noise alone "
+            f"{error.floor_px:.4f}), {bands}, {error.object_mm:.2f} mm at 10 m"
         )
     document = {
         "format": "thermocald-prediction-test/1",

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["relinearised"]
+__all__ = ["curved", "relinearised"]
 
 _WORTH_PX = 0.0005
 
@@ -61,3 +61,11 @@ def relinearised(fitter: HypothesisFitter, fit: Fit, series: int) -> ReducedSeri
         yy=np.einsum("ek,ek->e", values, b),
         hidden=e.hidden.less(curved) if e.hidden else None,
     )
+
+
+def curved(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries] | None:
+    """All series with the curvature taken off; None where it matters in none."""
+    out = [relinearised(fitter, fit, s) for s in range(len(fitter.series))]
+    if all(e is None for e in out):
+        return None
+    return [e or old for e, old in zip(out, fitter.series, strict=True)]

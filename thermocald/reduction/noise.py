@@ -28,8 +28,9 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["jumps", "slow_together", "with_correlated_noise", "with_jumps"]
+__all__ = ["jumps", "noisier", "slow_together", "with_correlated_noise", "with_jumps"]
 
+_FEWEST = 60  # epochs that tell how much the series jumps
 _UNUSUAL = 1.7  # a variance from 170 second differences has 13 % of standard deviation
 
 
@@ -148,3 +149,13 @@ def with_jumps(evidence: ReducedSeries, factors: Array, W: Array) -> ReducedSeri
     N = 0.5 * (N + N.swapaxes(1, 2))
     b = np.einsum("epq,eq->ep", N, evidence.values)
     return replace(evidence, N=N, b=b, yy=np.einsum("ep,ep->e", evidence.values, b))
+
+
+def noisier(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries] | None:
+    """All series with what still jumps from epoch to epoch as noise; None where nothing does."""
+    if any(len(e.times) < _FEWEST for e in fitter.series):
+        return None
+    out = [with_jumps(e, *jumps(fitter, fit, s)) for s, e in enumerate(fitter.series)]
+    if all(e is None for e in out):
+        return None
+    return [e or old for e, old in zip(out, fitter.series, strict=True)]

@@ -7,12 +7,13 @@ touched again; `reduction` makes the evidence, `condensing` puts the epochs of l
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
+from thermocald.simulation.history import History
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.series.normals import ObservationGrid, Partials
     from thermocald.reduction.random_effects import HiddenTargets, Movement
     from thermocald.reduction.thermometer import Thermometer
-    from thermocald.simulation.history import History
 
     Array = NDArray[np.float64]
 
@@ -124,6 +124,28 @@ class ReducedSeries:
     blocks: Blocks | None = None
     hidden: HiddenTargets | None = None
     movement: Movement | None = None
+
+    @property
+    def readings_history(self) -> History:
+        """The temperature as it was read, without smoothing, at the rows' times."""
+        s = self.source
+        there = np.isfinite(s.reading_times)
+        readings = {n: np.asarray(r, dtype=float)[there] for n, r in s.readings.items()}
+        times = s.reading_times[there] - s.frame_times[0]
+        frames = s.frame_times - s.frame_times[0]
+        return History(frames, times, readings, self.history.reference, self.T0)
+
+    def rescaled(self, scale: Array) -> ReducedSeries:
+        """The same in other px per unit of each column (19,)."""
+        f = self.scale / scale  # a scaled value is unit × scale
+        return replace(
+            self,
+            scale=scale,
+            columns=self.columns * f,
+            N=self.N * np.outer(f, f),
+            b=self.b * f,
+            values=self.values / f,
+        )
 
     @property
     def numbers(self) -> NDArray[np.int64]:

@@ -169,6 +169,12 @@ class ThermalModel:
         kept = tuple(e for e in self.effects if e.name not in names)
         return replace(self, effects=kept, version=self.version + 1)
 
+    @property
+    def misses_an_effect(self) -> bool:
+        """Whether its fit found that an effect is missing; then its numbers hold no band."""
+        found = self.evidence.get("fit") or {}
+        return bool(found.get("effect_missing", False))
+
     def parameter_names(self) -> tuple[str, ...]:
         """The names of all numbers of the model, as `sds` and `covariance_names` use them."""
         numbers = [f"interior.{n}" for n in IOP_NAMES] + [f"rates.{n}" for n in RATED]

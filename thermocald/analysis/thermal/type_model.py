@@ -17,10 +17,10 @@ from thermocald.analysis.statistics.random_effects import (
     odd_specimens,
     population,
 )
-from thermocald.analysis.thermal.state import is_event
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, InteriorOrientation
 from thermocald.photogrammetry.linalg import scaled_inverse
+from thermocald.simulation import effects
 from thermocald.simulation.model import RATED, ModelEffect, ThermalModel
 
 if TYPE_CHECKING:
@@ -44,7 +44,10 @@ def type_model(models: Sequence[ThermalModel], name: str) -> ThermalModel:
     if len(models) < 2:
         raise DataError("a type model needs at least two cameras")
     # what happened to one camera at one time is nothing of the type
-    models = [replace(m, effects=tuple(e for e in m.effects if not is_event(e))) for m in models]
+    models = [
+        replace(m, effects=tuple(e for e in m.effects if not effects.get(e.name).is_event))
+        for m in models
+    ]
     first = models[0]
     for m in models[1:]:
         same = [e.name for e in m.effects] == [e.name for e in first.effects]

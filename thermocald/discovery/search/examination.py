@@ -13,9 +13,9 @@ from thermocald.discovery.search.search import Search, Solution
 from thermocald.reduction.adequacy import Adequacy, examine
 from thermocald.reduction.blocks import in_blocks
 from thermocald.reduction.calibrated import calibrated_thermometers
-from thermocald.reduction.curvature import relinearised
+from thermocald.reduction.curvature import curved
 from thermocald.reduction.fit import HypothesisFitter
-from thermocald.reduction.noise import jumps, with_correlated_noise, with_jumps
+from thermocald.reduction.noise import noisier, with_correlated_noise
 from thermocald.reduction.noise_growth import NoiseGrowth, noise_growth
 from thermocald.reduction.reduce import reweighted
 
@@ -89,36 +89,15 @@ def examine_series(
         cleaned = [reweighted(e, n) for e, n in zip(cleaned, growth.noise, strict=True)]
     ready = [in_blocks(with_correlated_noise(e)) for e in calibrated_thermometers(cleaned)]
     found = _searched(HypothesisFitter(ready), say, given)
-    curved = _curved(found)
-    if curved is not None:
+    bent = curved(found.fitter, found.best.fit)
+    if bent is not None:
         say("curvature of the projection: once more")
-        found = _searched(HypothesisFitter(curved), say, given)
-    noisy = _noisier(found)
+        found = _searched(HypothesisFitter(bent), say, given)
+    noisy = noisier(found.fitter, found.best.fit)
     if noisy is not None:
         say("noise that targets share: once more")
         found = _searched(HypothesisFitter(noisy), say, given)
     return replace(found, displaced=tuple(displaced), noise_growth=growth, original=tuple(series))
-
-
-def _curved(found: Examination) -> list[ReducedSeries] | None:
-    """The series with the projection's curvature taken off; None where it does not matter."""
-    fitter = found.fitter
-    out = [relinearised(fitter, found.best.fit, s) for s in range(len(fitter.series))]
-    if all(e is None for e in out):
-        return None
-    return [e or old for e, old in zip(out, fitter.series, strict=True)]
-
-
-def _noisier(found: Examination) -> list[ReducedSeries] | None:
-    """The series with what still jumps from epoch to epoch as noise; None where nothing does."""
-    fitter, out = found.fitter, []
-    for s, e in enumerate(fitter.series):
-        if len(e.times) < 60:
-            return None
-        out.append(with_jumps(e, *jumps(fitter, found.best.fit, s)))
-    if all(e is None for e in out):
-        return None
-    return [e or old for e, old in zip(out, fitter.series, strict=True)]
 
 
 def _searched(

@@ -1,0 +1,299 @@
+"""A fitted hypothesis as a thermal model, with the covariance of all its numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.analysis.thermal.level import (
+    FREE_INTERIOR,
+    Level,
+    estimate_level,
+    projected,
+    series_means,
+)
+from thermocald.analysis.thermal.missing import Missing, missing
+from thermocald.analysis.thermal.terms import unknowns_of_base, unknowns_of_term
+from thermocald.photogrammetry.camera.camera_model import (
+    EOP_NAMES,
+    ExteriorOrientation,
+    InteriorOrientation,
+)
+from thermocald.photogrammetry.linalg import scaled_inverse
+from thermocald.photogrammetry.series.normals import chunks
+from thermocald.reduction.series import COLUMNS
+from thermocald.simulation import effects
+from thermocald.simulation.model import RATED, ModelEffect, ThermalModel
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from thermocald.analysis.thermal.displacement import Moved
+    from thermocald.analysis.thermal.terms import Unknown
+    from thermocald.reduction.fit import HypothesisFitter
+    from thermocald.reduction.hypothesis import Fit
+    from thermocald.reduction.noise_growth import NoiseGrowth
+    from thermocald.reduction.series import ReducedSeries
+
+    Array = NDArray[np.float64]
+
+__all__ = ["FittedModel", "SeriesFit", "fitted_model"]
+
+_INTERIOR = [COLUMNS.index(n) for n in FREE_INTERIOR]
+_EXTERIOR = [COLUMNS.index(n) for n in EOP_NAMES]
+
+
+@dataclass(frozen=True, slots=True)
+class SeriesFit:
+    """How well one series is explained: RMS px of the image points, thermometer's noise K."""
+
+    name: str
+    epochs: int
+    rms_px: float
+    thermometer_sd: float
+
+
+@dataclass(frozen=True, eq=False)
+class FittedModel:
+    """A fitted model and what the fit says about itself.
+
+    names (p,): of the unknowns, as `ThermalModel.covariance_names` writes them, what belongs to
+    series k as `exterior.X0@k`; covariance (p, p); sigma0: of the image points against their stated
+    sigmas; missing: whether an effect is missing. The model's own events and phases are those of
+    the first series.
+    """
+
+    model: ThermalModel
+    names: tuple[str, ...]
+    covariance: Array
+    sigma0: float
+    series: tuple[SeriesFit, ...]
+    missing: Missing
+
+    def sd(self, name: str) -> float:
+        """The standard deviation of one unknown."""
+        i = self.names.index(name)
+        return float(np.sqrt(self.covariance[i, i]))
+
+
+@dataclass(eq=False)
+class _Parts:
+    """A fit on its way to a model: series as they came, and the numbers of its terms."""
+
+    fitter: HypothesisFitter
+    fit: Fit
+    series: Sequence[ReducedSeries]
+    listed: Sequence[ModelEffect]
+    growth: NoiseGrowth | None
+    moved: Sequence[Moved]
+    unknowns: list[Unknown] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        scale = self.series[0].scale
+        self.unknowns = unknowns_of_base(self.fit, scale)
+        for i in range(len(self.fit.terms)):
+            self.unknowns += unknowns_of_term(self.fit, i, scale)
+
+    def effect(self, e: ModelEffect, k: int) -> ModelEffect:
+        """One effect with the values of series k."""
+        kind = effects.get(e.name)
+        if kind.seen_in == "noise":
+            assert self.growth is not None
+            (key,) = kind.linear
+            return ModelEffect(e.name, {key: self.growth.factor}, {key: self.growth.sd})
+        if kind.seen_in == "targets":
+            m = self.moved[k]
+            vector = dict(zip(kind.linear, m.vector.tolist(), strict=True))
+            time = {n: m.time for n, p in kind.nonlinear.items() if p.role == "event"}
+            return ModelEffect(e.name, {**e.values, **vector, **time})
+        term = next(t for t in self.fit.terms if t.effect == e.name)
+        own = term.values(k)
+        values = {**e.values, **dict.fromkeys((n for n in kind.linear if n in e.values), 0.0)}
+        for name, value in (own or {}).items():
+            event = kind.nonlinear[name].role == "event"
+            values[name] = self._between(float(value), k) if event else value
+        for u in self.unknowns:
+            group, key = u.name.split("@")[0].split(".")
+            series = int(u.name.split("@")[1]) if "@" in u.name else 0
+            shared = key not in kind.fresh and not kind.is_event
+            if group == e.name and (shared or (series == k and own is not None)):
+                values[key] = u.value
+        return ModelEffect(e.name, values)
+
+    def _between(self, time: float, k: int) -> float:
+        """An event lies anywhere between two frames."""
+        times = self.fitter.series[k].times
+        return float(0.5 * (time + times[max(int(np.searchsorted(times, time - 1e-6)) - 1, 0)]))
+
+    def model(self, k: int, level: Level | None) -> ThermalModel:
+        """The model with what belongs to series k."""
+        s = self.series[k]
+        rates = {u.name.split(".")[1]: u.value for u in self.unknowns[: len(RATED)]}
+        return ThermalModel(
+            s.source.camera,
+            s.source.sensor,
+            s.T0,
+            level.interior if level else InteriorOrientation.from_array(self.series[0].at.iop),
+            rates,
+            tuple(self.effect(e, k) for e in self.listed),
+            level.exteriors[k] if level else ExteriorOrientation.from_array(s.at.eop),
+            name=s.source.camera,
+            version=1,
+        )
+
+    def covariance(self, gap: Missing, level: Level) -> tuple[list[str], Array]:
+        """Names and covariance of all unknowns: interior, drifts, each series' own."""
+        n, size = len(_INTERIOR), len(self.fit.covariance)
+        Q = scaled_inverse(_joint_normal(self.fitter, self.fit))
+        Q[:n, :n] += gap.parameters
+        Q[n : n + size, n : n + size] += gap.unknowns
+        scale = self.series[0].scale
+        names = [f"interior.{p}" for p in FREE_INTERIOR]
+        rows = [np.zeros(len(Q)) for _ in names]
+        for i, c in enumerate(_INTERIOR):
+            rows[i][i] = 1.0 / scale[c]
+        for u in self.unknowns:
+            names.append(u.name)
+            rows.append(np.concatenate([np.zeros(n), u.row, np.zeros(len(Q) - n - size)]))
+        for k in range(len(self.series)):
+            for i, c in enumerate(_EXTERIOR):
+                row = np.zeros(len(Q))
+                row[n + size + 6 * k + i] = 1.0 / scale[c]
+                names.append(f"exterior.{EOP_NAMES[i]}@{k}")
+                rows.append(row)
+        R = np.array(rows)
+        covariance = R @ Q @ R.T
+        own = [*range(n), *range(len(names) - 6 * len(self.series), len(names))]
+        covariance[np.ix_(own, own)] += level.field
+        for k, m in enumerate(self.moved):
+            e = next(e for e in self.listed if effects.get(e.name).seen_in == "targets")
+            suffix = f"@{k}" if k else ""
+            names += [f"{e.name}.{key}{suffix}" for key in effects.get(e.name).linear]
+            old = len(covariance)
+            covariance = np.pad(covariance, (0, 3))
+            covariance[old:, old:] = m.covariance
+        return names, covariance
+
+    def image_sigma(self) -> float:
+        """The noise of an image coordinate at T₀, px."""
+        total, count = 0.0, 0
+        for k, s in enumerate(self.series):
+            w = s.weights[..., :2].mean(axis=(1, 2), where=s.weights[..., :2] > 0)
+            rise = self.growth.noise[k] if self.growth else np.ones(len(w))
+            ok = s.n > 0
+            total += float(np.sum(s.n[ok] / w[ok] / rise[ok] ** 2))
+            count += int(s.n[ok].sum())
+        return float(np.sqrt(total / count))
+
+
+def fitted_model(
+    fitter: HypothesisFitter,
+    fit: Fit,
+    series: Sequence[ReducedSeries],
+    listed: Sequence[ModelEffect],
+    growth: NoiseGrowth | None,
+    moved: Sequence[Moved],
+) -> FittedModel:
+    """The model of a fit; series: as they came, unblocked; growth, moved: of effects beyond it."""
+    parts = _Parts(fitter, fit, series, listed, growth, moved)
+    starts = [parts.model(k, None) for k in range(len(series))]
+    level = estimate_level(series, starts)
+    gap = missing(fitter, fit, _INTERIOR)
+    names, covariance = parts.covariance(gap, level)
+    sd = dict(zip(names, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True))
+    written = [n for n in names if "@" not in n]
+    kept = [names.index(n) for n in written]
+    sigma = parts.image_sigma()
+    stated = np.concatenate([s.source.grid.weights[s.source.grid.observed][:, 0] for s in series])
+    fits = tuple(
+        SeriesFit(
+            s.source.series or s.source.name,
+            int((s.n > 0).sum()),
+            _rms(s, parts.model(k, level)),
+            fitter.series[k].thermometers[s.history.reference].noise,
+        )
+        for k, s in enumerate(series)
+    )
+    first = parts.model(0, level)
+    channels = dict.fromkeys(c for s in series for c in s.source.readings)
+    model = replace(
+        first,
+        effects=tuple(_with_sds(e, sd, series[0]) for e in first.effects),
+        image_sigma=sigma,
+        sds={n: s for n, s in sd.items() if n.split(".")[0] in ("interior", "rates")},
+        covariance_names=tuple(written),
+        covariance=tuple(tuple(row) for row in covariance[np.ix_(kept, kept)].tolist()),
+        validity={c: _span(series, c) for c in channels},
+        fitted_on=tuple(
+            {"series": f.name, "recording": s.source.name, "epochs": f.epochs,
+             "rms_px": round(f.rms_px, 5), "thermometer_sd_K": round(f.thermometer_sd, 5)}
+            for s, f in zip(series, fits, strict=True)
+        ),
+        evidence={"fit": gap.as_mapping()},
+    )  # fmt: skip
+    sigma0 = sigma * float(np.sqrt(np.median(stated)))
+    return FittedModel(model, tuple(names), covariance, sigma0, fits, gap)
+
+
+def _joint_normal(fitter: HypothesisFitter, fit: Fit) -> Array:
+    """Normal matrix of interior (8) at T₀, the fit's unknowns (K + L), exteriors (6 each), px.
+
+    The thermometers' errors are eliminated from all of them alike.
+    """
+    n, K, size = len(_INTERIOR), len(fit.coefficients), len(fit.covariance)
+    M = np.zeros((n + size + 6 * len(fitter.series),) * 2)
+    for s in range(len(fitter.series)):
+        C, V = fitter.design(fit.terms, fit.blocks, s, centred=False)[:2]
+        index = fit.designs[s][2]
+        dC, dV, mapping = fitter.derivatives(fit, list(fit.searched), s, centred=False)
+        A, _, coupling = fit.weightings[s].joint(np.hstack([C, dC]), np.hstack([V, dV]))
+        R, P = len(A), len(coupling)
+        T = np.zeros((R + P, len(M)))
+        T[np.arange(C.shape[1]), n + index] = 1.0
+        T[C.shape[1] : R, n + K : n + size] = mapping
+        T[R + np.array(_INTERIOR), np.arange(n)] = 1.0
+        T[R + np.array(_EXTERIOR), n + size + 6 * s + np.arange(6)] = 1.0
+        own = np.block([[A, coupling.T], [coupling, fit.weightings[s].level_normal]])
+        M += T.T @ own @ T
+    empty = np.diag(M) <= 0
+    M[empty, empty] = 1e12  # a coefficient of a series that takes no part
+    return M
+
+
+def _span(series: Sequence[ReducedSeries], channel: str) -> tuple[float, float]:
+    values = [s.source.readings[channel] for s in series if channel in s.source.readings]
+    both = np.concatenate(values)
+    low, high = float(np.nanmin(both)), float(np.nanmax(both))
+    return float(np.floor(low * 10) / 10), float(np.ceil(high * 10) / 10)
+
+
+def _rms(series: ReducedSeries, model: ThermalModel) -> float:
+    """Measured minus predicted from the readings, constant offsets of targets taken off, px."""
+    prediction = model.predict(series.readings_history, series.source.field)
+    mean, _, moved = series_means(series, prediction)
+    points, weights = series.source.grid.points, series.weights[..., :2]
+    total, count = 0.0, 0
+    for part in chunks(*points.shape[:2]):
+        left = points[part] - projected(series, prediction, part) - mean
+        use = (weights[part] > 0) & ~moved[:, None]
+        total += float(np.sum(np.where(use, left, 0.0) ** 2))
+        count += int(use.sum())
+    return float(np.sqrt(total / max(count, 1)))
+
+
+def _with_sds(effect: ModelEffect, sd: dict[str, float], series: ReducedSeries) -> ModelEffect:
+    kind = effects.get(effect.name)
+    if kind.seen_in == "noise":
+        return effect
+    found: dict[str, Any] = {
+        k: sd[f"{effect.name}.{k}"] for k in effect.values if f"{effect.name}.{k}" in sd
+    }
+    for key, parameter in kind.nonlinear.items():
+        if parameter.role == "event":
+            # a time between two frames: uniform over the interval
+            found[key] = float(np.median(np.diff(series.times)) / np.sqrt(12.0))
+    return ModelEffect(effect.name, effect.values, found)

@@ -145,6 +145,7 @@ class ReducedSeries:
             N=self.N * np.outer(f, f),
             b=self.b * f,
             values=self.values / f,
+            hidden=replace(self.hidden, vectors=self.hidden.vectors * f) if self.hidden else None,
         )
 
     @property

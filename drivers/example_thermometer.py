@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 
 
 class Tc74Thermometer(Thermometer):
-    """One chip; each key of its stanza but name and driver is an argument."""
+    """One chip; each key of its stanza except name and driver is an argument."""
+
+    device_classes = ("char-i2c",)
 
     def __init__(self, *, clock: Clock, bus: int = 1, address: int = 0x4D) -> None:
         if not 0x48 <= address <= 0x4F:

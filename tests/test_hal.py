@@ -102,6 +102,11 @@ def test_a_missing_option_is_named(kind, driver, options, message):
         open_device(kind, driver, options, VirtualClock())
 
 
+def test_a_devices_name_cannot_leave_its_comment():
+    found = hal.Found({"serial": "x"}, "Cam\n- {driver: evil}\x1b[31m °")
+    assert found.about == "Cam?- {driver: evil}?[31m °"
+
+
 def test_nothing_is_inferred_from_names_or_attributes():
     """What the program needs to know of a driver or an error is a member of its class."""
     root = Path(hal.__file__).parent

@@ -114,6 +114,11 @@ class Found:
     about: str
     certain: bool = True
 
+    def __post_init__(self) -> None:
+        # names come from devices: no line break may leave the comment, no escape code be printed
+        shown = "".join(c if c.isprintable() else "?" for c in self.about)
+        object.__setattr__(self, "about", shown)
+
 
 @dataclass(frozen=True, slots=True)
 class KnownScene:

@@ -8,13 +8,13 @@
         folder: /sdcard/DCIM/Camera
         width: 4032
         height: 3024
-        delete: true                  # the photograph from the phone, after it is safely here
+        delete: true                  # delete the photograph on the phone once it is here
         refuse_unlocked: null         # null: focus, focal length, zoom; true: exposure too; false
         minimum_free_mb: 200          # less free storage is an error
         timeout_s: 15
-        host: 127.0.0.1               # the adb server's, and its
+        host: 127.0.0.1               # of the adb server
         port: 5037
-        start_server: true            # where none runs
+        start_server: true            # if none runs
     thermometers:
       - {name: pixel, driver: android, serial: 0A1B2C3D4E,
          sensors: {temperature: battery, skin: "thermal:skin", soc: "zone:cpu-0-0"},
@@ -55,7 +55,7 @@ from thermocald_drivers import (
     pixel_formats,
     support,
 )
-from thermocald_drivers.android_phone import AdbPhone
+from thermocald_drivers.android_phone import AdbPhone, list_devices
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -98,19 +98,8 @@ def _phone(
     )
 
 
-def _attached() -> list[str]:
-    """Serial numbers that a running adb server lists; none is started for a listing."""
-    adbutils = support.library("adbutils", "android")
-    phone = AdbPhone("", "127.0.0.1", 5037, 1.0, start_server=False)
-    try:
-        phone._server_is_there()
-        return [f"{d.serial} {d.state}" for d in adbutils.AdbClient(socket_timeout=1.0).list()]
-    except (OSError, adbutils.AdbError):
-        return []
-
-
 class AndroidCamera(Camera):
-    """A phone's camera app, triggered from here."""
+    """The camera app of a phone, triggered through adb."""
 
     device_classes = ADB_CLASSES
 
@@ -158,8 +147,8 @@ class AndroidCamera(Camera):
     def attached(cls, sysfs: str = "/sys") -> list[Found]:  # noqa: ARG003
         """Phones that the adb server lists, whatever their state."""
         return [
-            Found({"serial": line.split()[0], "width": 4032, "height": 3024}, line)
-            for line in _attached()
+            Found({"serial": serial, "width": 4032, "height": 3024}, f"{serial} {state}")
+            for serial, state in list_devices()
         ]
 
     def open(self) -> None:
@@ -203,11 +192,11 @@ class AndroidCamera(Camera):
             )
         tags |= photograph.focus_state(self.phone.shell("dumpsys media.camera"))
         locked, why = self._lock(tags)
-        instant, source = self._instant(tags, triggered)
+        start, source = self._exposure_start(tags, triggered)
         image, _ = pixel_formats.decode(memoryview(jpeg), "JPEG", self.width, self.height)
         if self.delete:
             self.phone.shell(f"rm -f '{path}'")
-        middle = instant + float(tags.get("exposure_s", 0.0)) / 2.0
+        middle = start + float(tags.get("exposure_s", 0.0)) / 2.0
         monotonic, utc = support.on_clock(self.clock, middle - time.time() + time.monotonic())
         metadata = {**tags, "file": path, "locked": locked, "locked_why": why, "time_from": source}
         metadata["phone_clock_offset_s"] = self._offset
@@ -223,7 +212,7 @@ class AndroidCamera(Camera):
         )
 
     def _wake(self) -> None:
-        """Screen on and past a lock that wants no PIN; DeviceDenied where one is wanted."""
+        """Switch the screen on and dismiss a lock without PIN; DeviceDenied if it has one."""
         self.phone.shell(f"input keyevent {WAKE_KEY}; wm dismiss-keyguard")
         state = self.phone.shell(STATE)
         if "Lockscreen=true" in state or "isKeyguardShowing=true" in state:
@@ -235,7 +224,7 @@ class AndroidCamera(Camera):
             raise DeviceGone(f"{self.phone.where}: the screen does not come on")
 
     def _require_space(self) -> None:
-        """PermanentDeviceError where the phone is full; a phone that does not tell is believed."""
+        """PermanentDeviceError if the storage is full; unknown free space is accepted."""
         lines = self.phone.shell(f"df -k '{self.folder}' 2>/dev/null || df -k /sdcard").split("\n")
         fields = lines[-1 if lines[-1].strip() else -2].split() if len(lines) > 1 else []
         if len(fields) >= 4 and fields[3].isdigit():
@@ -247,7 +236,7 @@ class AndroidCamera(Camera):
                 )
 
     def _new_photograph(self, before: set[str]) -> tuple[str, bytes]:
-        """(path, bytes) of the one photograph that was not there before, when it is complete."""
+        """(path, bytes) of the one new photograph, once it is complete."""
         deadline = time.monotonic() + self.timeout_s
         last_size, name, short = -1, "", ""
         while time.monotonic() < deadline:
@@ -295,17 +284,17 @@ class AndroidCamera(Camera):
             )
         return locked, why
 
-    def _instant(self, tags: Mapping[str, Any], triggered: float) -> tuple[float, str]:
-        """(s UTC on this machine's clock when the exposure began, where that comes from)."""
-        told = photograph.instant(tags, self._zone)
-        if told is None:
+    def _exposure_start(self, tags: Mapping[str, Any], triggered: float) -> tuple[float, str]:
+        """(start of the exposure, s UTC on this machine's clock; where that comes from)."""
+        exif = photograph.exposure_start(tags, self._zone)
+        if exif is None:
             return triggered, "trigger"
-        begin = told.utc - self._offset
-        if abs(begin - triggered) > CLOCKS_DIFFER_S:
-            return triggered, f"trigger (EXIF is {begin - triggered:+.1f} s off)"
-        if told.resolution_s >= 1.0:  # whole seconds: the trigger, within that second
-            return min(max(triggered, begin), begin + 1.0), "trigger within EXIF's second"
-        return begin, "exif"
+        start = exif.utc - self._offset
+        if abs(start - triggered) > CLOCKS_DIFFER_S:
+            return triggered, f"trigger (EXIF is {start - triggered:+.1f} s off)"
+        if exif.resolution_s >= 1.0:  # whole seconds: the trigger, within that second
+            return min(max(triggered, start), start + 1.0), "trigger within EXIF's second"
+        return start, "exif"
 
 
 class AndroidThermometer(Thermometer):
@@ -347,7 +336,7 @@ class AndroidThermometer(Thermometer):
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:  # noqa: ARG003
         """Phones that the adb server lists."""
-        return [Found({"serial": line.split()[0]}, line) for line in _attached()]
+        return [Found({"serial": serial}, f"{serial} {state}") for serial, state in list_devices()]
 
     def open(self) -> None:
         self.phone.connect()

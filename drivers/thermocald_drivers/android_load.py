@@ -1,22 +1,23 @@
-"""Warming a phone up on demand: processor load under a programme, with a temperature limit.
+"""Warms a phone up by processor load, under a programme and with a temperature limit.
 
     outputs:
       - name: warm-pixel
         driver: android_load
         serial: 0A1B2C3D4E
-        limit_c: 42                   # of the battery, read here and now: off, and off for good
+        limit_c: 42                   # of the battery: at and above it off, until reopened
         programme: [{seconds: 600, hold_c: null}, {seconds: 1800, hold_c: 38}]
         processes: 4
         lease_s: 30
-        unknown_s: 60                 # no temperature for so long: off
+        unknown_s: 60                 # off after so long without a temperature
         hysteresis_k: 0.5
         timeout_s: 5
-        host: 127.0.0.1               # the adb server's, and its
+        host: 127.0.0.1               # of the adb server
         port: 5037
-        start_server: true            # where none runs
+        start_server: true            # if none runs
 
-For cold/warm experiments. The load ends by itself `lease_s` after it was last renewed, so that a
-phone whose cable falls out cools down. See `heating` for the programme.
+For experiments with a cold and a warm phone. The load ends by itself `lease_s` after it was last
+renewed, so that a phone whose cable falls out cools down. The battery's temperature is read by this
+driver itself. See `heating` for the programme.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ MARK = "thermocald_load"
 
 
 class AndroidLoadOutput(Output):
-    """Busy loops on the phone while the programme wants heat."""
+    """Busy loops on the phone while the programme asks for heat."""
 
     device_classes = ("char-usb_device",)
     heats = True
@@ -86,14 +87,14 @@ class AndroidLoadOutput(Output):
         self.programme.reset()
         self._begin = self.clock.monotonic()
         self._renewed = float("-inf")
-        self._stop()  # of a program that died
+        self._stop()  # what a crashed program left behind
 
     def close(self) -> None:
         with contextlib.suppress(DeviceError):  # out of reach: the lease ends the load
             self._stop()
         self.phone.disconnect()
 
-    def emit(self, result: Mapping[str, Any]) -> None:  # noqa: ARG002 - the phone is asked itself
+    def emit(self, result: Mapping[str, Any]) -> None:  # noqa: ARG002 - it reads the phone
         battery = android_temperatures.battery(self.phone.shell("dumpsys battery"))
         was_tripped = self.programme.tripped
         now = self.clock.monotonic()

@@ -1,7 +1,7 @@
-"""A phone at the end of an adb server: state, shell, listing, pull; each fault its own error.
+"""A phone behind an adb server: state, shell, listing, pull; each fault has its own error.
 
-Uses adbutils, which speaks the adb server's protocol (127.0.0.1:5037); the server is Android's own
-(`adb start-server`), and one server serves several phones by their serial numbers.
+Uses adbutils, which implements the adb server's protocol (127.0.0.1:5037). The server is Android's
+own (`adb start-server`); one server serves several phones by their serial numbers.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from thermocald_drivers import support
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["AdbPhone", "FileEntry"]
+__all__ = ["AdbPhone", "FileEntry", "list_devices"]
 
 DENIED = (
     "unauthorized: unlock the phone and confirm 'Allow USB debugging' (tick 'always'); "
@@ -47,8 +47,28 @@ class FileEntry:
     size: int
 
 
+def list_devices(timeout_s: float = 1.0) -> list[tuple[str, str]]:
+    """(serial, state) of what a running adb server lists; [] without one."""
+    adbutils = support.library("adbutils", "android")
+    try:
+        AdbPhone("", "127.0.0.1", 5037, timeout_s, start_server=False).require_server()
+        return _devices(adbutils.AdbClient(socket_timeout=timeout_s))
+    except (OSError, adbutils.AdbError):
+        return []
+
+
+def _devices(client: Any) -> list[tuple[str, str]]:
+    """(serial, state) of `host:devices`; adbutils' own list cuts both at blanks."""
+    with client.make_connection() as line:
+        line.send_command("host:devices")
+        line.check_okay()
+        rows = line.read_string_block().replace("\r", "").split("\n")
+    pairs = [row.partition("\t") for row in rows if "\t" in row]
+    return [(serial.strip(), state.strip()) for serial, _, state in pairs]
+
+
 class AdbPhone:
-    """One phone; `connect` before anything else, `seen` after it succeeded once."""
+    """One phone: `connect` before anything else; `seen` once that has succeeded."""
 
     def __init__(
         self, serial: str, host: str, port: int, timeout_s: float, start_server: bool
@@ -62,10 +82,10 @@ class AdbPhone:
         self.seen = False
 
     def connect(self) -> None:
-        """Find the phone among the server's; DeviceError says why it cannot be used."""
+        """Find the phone among the server's devices; DeviceError says why it cannot be used."""
         adbutils = support.library("adbutils", "android")
         if not self._start_server:
-            self._server_is_there()
+            self.require_server()
         client = adbutils.AdbClient(self._host, self._port, socket_timeout=self._timeout_s)
         connect = client.make_connection
 
@@ -74,7 +94,7 @@ class AdbPhone:
             return self._lines[-1]
 
         client.make_connection = remembering
-        listed = self._call(lambda: [(d.serial, d.state) for d in client.list()])
+        listed = self._call(lambda: _devices(client))
         states = [state for serial, state in listed if serial == self.serial]
         if len(states) > 1:
             raise WrongDevice(
@@ -99,12 +119,13 @@ class AdbPhone:
             raise support.denied(f"{self.where}: {DENIED}", seen=self.seen)
         if state == "offline":
             raise DeviceGone(f"{self.where}: {OFFLINE}")
-        if state == "no" or state.startswith("no perm"):  # "no permissions (…)", cut at blanks
+        if state == "no" or state.startswith("no perm"):  # "no permissions (…); see http…"
             message = f"{self.where}: no permissions; see the udev rules in systemd/"
             raise support.denied(message, seen=self.seen)
         raise DeviceGone(f"{self.where}: its state is {state!r}; let it boot into Android")
 
-    def _server_is_there(self) -> None:
+    def require_server(self) -> None:
+        """Raise a DeviceError unless an adb server answers; none is started."""
         try:
             socket.create_connection((self._host, self._port), timeout=self._timeout_s).close()
         except OSError as error:
@@ -118,7 +139,7 @@ class AdbPhone:
         self._device = None
 
     def shell(self, command: str) -> str:
-        """The command's output (both streams); its exit status is not judged."""
+        """The command's output (both streams); its exit status is ignored."""
         device = self._connected()
         answer = self._call(lambda: device.shell2(command, timeout=self._timeout_s, v2=True))
         return str(answer.output)
@@ -137,8 +158,9 @@ class AdbPhone:
     def clock_offset(self, tries: int = 12) -> tuple[float, str, float]:
         """(phone minus this machine in s, the phone's time zone as +hhmm, uncertainty in s).
 
-        Each round trip bounds the offset by its two ends; the middle of what fits all of them, as
-        soon as that is within 2 ms. A clock that is set meanwhile fits nothing: the shortest then.
+        Each round trip bounds the offset by its two ends; the result is the middle of the interval
+        that satisfies all bounds, as soon as it is within 2 ms. If the clock is set meanwhile, no
+        interval does: the shortest round trip then counts.
         """
         low, high = -math.inf, math.inf
         found: list[tuple[float, str, float]] = []
@@ -151,10 +173,10 @@ class AdbPhone:
         return (low + high) / 2.0, found[-1][1], (high - low) / 2.0
 
     def _ask_clock(self) -> tuple[float, str, float]:
-        # the line is opened first: adbutils sleeps 10 ms while opening and closing one, on one side
-        # of the round trip only
+        # the connection is opened first: adbutils sleeps 10 ms while opening and closing one, which
+        # would lengthen one side of the round trip only
         line = self._connected().open_transport(timeout=self._timeout_s)
-        begin = time.time()
+        start = time.time()
         line.send_command("shell:date '+%s.%N %z'")
         line.check_okay()
         text = line.read_until_close().split()
@@ -163,7 +185,7 @@ class AdbPhone:
             phone = support.parse_number(text[0])
         except (ValueError, IndexError) as error:
             raise BadReading(f"{self.where}: `date` says {' '.join(text)!r}") from error
-        return phone - (begin + end) / 2.0, "".join(text[1:2]), (end - begin) / 2.0
+        return phone - (start + end) / 2.0, "".join(text[1:2]), (end - start) / 2.0
 
     def _connected(self) -> Any:
         if self._device is None:
@@ -171,7 +193,7 @@ class AdbPhone:
         return self._device
 
     def _call(self, action: Callable[[], Any]) -> Any:
-        """Adbutils' errors, told apart by what the server says, become ours."""
+        """Translate adbutils' errors, by what the server answers."""
         adbutils = support.library("adbutils", "android")
         try:
             return action()
@@ -182,9 +204,11 @@ class AdbPhone:
         except (EOFError, struct.error, ConnectionError) as error:
             raise DeviceGone(f"{self.where}: the connection broke off ({error})") from error
         except ValueError as error:
-            raise BadReading(f"{self.where}: the adb server answers nonsense ({error})") from error
+            raise BadReading(
+                f"{self.where}: the adb server's answer cannot be read ({error})"
+            ) from error
         finally:
-            for line in self._lines:  # adbutils leaves a connection open that the server refused
+            for line in self._lines:  # adbutils leaves a refused connection open
                 line.close()
             self._lines.clear()
 

@@ -38,7 +38,7 @@ _RECORD = re.compile(
     r"mName=(?P<name>(?:(?!Temperature\{).)*?), mStatus=[0-9]+\}",
     re.DOTALL,
 )
-_HEADING = re.compile(r"^[^\s,}][^{}]*:[ \t]*$", re.MULTILINE)
+_HEADING = re.compile(r"^[^\s,}][^{}\n]*:[ \t]*$", re.MULTILINE)
 
 
 def battery(text: str, unit: str = "") -> float | None:

@@ -27,7 +27,8 @@ COOLER_K = 10.0
 """No zone of a phone is colder than its coldest other zone by more than this."""
 
 _OTHER_QUANTITIES = re.compile(
-    r"soc|socd|soc_?d|(?:.*[-_ ])?(?:ibat|vbat|vph|bcl|icl|ocp|vsys|vbus|ibus|curr|current|volt"
+    r"soc|socd|(?:batt?(?:ery)?|bms|maxfg|fg)[-_]?soc"
+    r"|(?:.*[-_ ])?(?:ibat|vbat|vph|bcl|icl|ocp|vsys|vbus|ibus|curr|current|volt"
     r"|voltage|power|pwr|percent|pct|capacity|cycle|cycles|level|duty|pwm|fan|minus|smpl|reduce"
     r"|lvl[0-9]*|mv|ma|uv|ua|mw)(?:[-_ ].*)?|batoilo[0-9]*|vdroop[0-9]*|smpl_gm",
     re.IGNORECASE,

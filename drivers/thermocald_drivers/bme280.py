@@ -3,10 +3,10 @@
     thermometers:
       - {name: air, driver: bme280, bus: 1, address: 0x76, channel: air}
 
-The identity register must read 0x60. Each reading is a forced measurement whose end is awaited, so
-that no old value is read; 0x80000, the value of a channel that was not measured, is refused. The
-factory's calibration is read at each open. Humidity and pressure go into the metadata. The chip
-warms itself: its temperature is of the board. Source: data sheet BST-BME280-DS002 1.23, 4.2 and
+The identity register must read 0x60. Each reading is a forced measurement, and its end is awaited;
+0x80000, the value of a channel that was not measured, is refused. The factory's calibration is read
+at each open. Humidity and pressure go into the metadata. The chip warms itself: what it measures is
+the temperature of its board. Source: data sheet BST-BME280-DS002 1.23, 4.2 and
 8.1 (compensation in floating point).
 """
 

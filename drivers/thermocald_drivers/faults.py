@@ -1,4 +1,4 @@
-"""Faults on demand: what the mocks use to fail as hardware fails.
+"""Faults on demand: how the mocks fail as hardware fails.
 
     faults:
       - {kind: timeout, at: 3}                      # the 3rd capture or reading does not answer
@@ -7,8 +7,8 @@
 
 Kinds: `timeout` (no answer within `timeout_s`), `unplugged` (gone, also for `open`), `truncated`
 (half a frame, half a line: what a driver refuses as a bad reading), `wrong_size` (a frame of
-another size, an answer of another length), `stuck` (the value or picture stays, with new instants:
-no driver can tell). A test may also call `inject` while the device is open.
+another size, an answer of another length), `stuck` (the same value or image with new times, which
+no driver can detect). A test may also call `inject` while the device is open.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Kind = Literal["timeout", "unplugged", "truncated", "wrong_size", "stuck"]
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One fault: from call number `at` on for `count` calls, or from `at_s` on for `for_s`."""
+    """One fault: `count` calls from call number `at`, or `for_s` seconds from `at_s`."""
 
     kind: Kind
     at: int = 1
@@ -46,7 +46,7 @@ class Fault:
 
 
 class Faults:
-    """The faults of one mock device; ConfigurationError for a plan that is none."""
+    """The faults of one mock device; ConfigurationError for an invalid plan."""
 
     def __init__(
         self, where: str, clock: Clock, plan: Sequence[Mapping[str, object]], timeout_s: float = 1.0
@@ -65,11 +65,11 @@ class Faults:
         )
 
     def clear(self) -> None:
-        """No more faults: the plug is back in."""
+        """Remove all faults: the device is plugged in again."""
         self._faults.clear()
 
     def on_open(self) -> None:
-        """To be called by `open`: DeviceGone while unplugged; such an attempt is a call."""
+        """Called by `open`: DeviceGone while unplugged; such an attempt counts as a call."""
         if self._begin is None:
             self._begin = self._clock.monotonic()
         if self._kind(self._calls + 1) == "unplugged":
@@ -77,10 +77,10 @@ class Faults:
             raise DeviceGone(f"{self._where}: unplugged")
 
     def on_call(self) -> Kind | None:
-        """To be called by every capture or reading.
+        """Called by every capture or reading.
 
-        Raises DeviceTimeout, after the time has passed, or DeviceGone; returns the kinds that the
-        mock itself must play, None if all is well.
+        Raises DeviceTimeout, after the time has passed, or DeviceGone. Returns a kind that the mock
+        itself must imitate, None without a fault.
         """
         self._calls += 1
         kind = self._kind(self._calls)
@@ -92,7 +92,7 @@ class Faults:
         return kind
 
     def refuse(self, kind: Kind | None, unit: str) -> None:
-        """Raise BadReading for an answer that a driver must not pass on."""
+        """Raise BadReading for an answer that a driver must refuse."""
         if kind in ("truncated", "wrong_size"):
             what = "is cut off" if kind == "truncated" else "has the wrong size"
             raise BadReading(f"{self._where}: the {unit} {what}")
@@ -109,7 +109,7 @@ def _parse(where: str, entry: object) -> Fault:
     known = set(Fault.__slots__)
     if unknown := set(entry) - known:
         raise ConfigurationError(
-            f"{where}: a fault has no {min(map(str, unknown))!r}; known are {', '.join(known)}"
+            f"{where}: a fault has no key {min(map(str, unknown))!r}; known are {', '.join(known)}"
         )
     kind = support.choice(f"{where}: faults.kind", entry.get("kind"), get_args(Kind))
     whole = {

@@ -5,20 +5,20 @@
       - name: lamp
         driver: relay
         pin: 27
-        active_high: false                         # most relay boards switch at low
+        active_high: false                         # most relay boards switch on at low
         limit_c: 60
-        watchdog_s: 30                             # no epoch for so long: off
-        unknown_s: 60                              # no temperature for so long: off
+        watchdog_s: 30                             # off after so long without an epoch
+        unknown_s: 60                              # off after so long without a temperature
         channel: temperature                       # of the epoch's result
         hysteresis_k: 0.5
         programme: [{seconds: 600, hold_c: null}, {seconds: 1500, hold_c: 45}]
 
 The LED is steady while epochs have results and blinks while they have none.
 
-The relay fails safe: it is off before the first result, after the last, at the limit (for good),
-without a temperature, when no result comes for `watchdog_s`, when the program closes it, and, since
-the kernel releases the pins of a process that dies, after a crash (choose the relay's wiring so
-that a released pin is off). See `heating` for the programme.
+The relay fails safe. It is off before the first result and after the last, at the limit (until it
+is reopened), without a temperature, without a result for `watchdog_s`, and when it is closed. The
+kernel releases the pins of a process that crashes: wire the relay so that a released pin is off.
+See `heating` for the programme.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ log = logging.getLogger(__name__)
 
 
 def _pin(kind: str, pin: int, active_high: bool) -> Any:
-    """A gpiozero device; its own errors become ours."""
+    """A gpiozero device; its errors are translated."""
     gpiozero = support.library("gpiozero", "gpio")
     try:
         return getattr(gpiozero, kind)(pin, active_high=active_high, initial_value=False)
@@ -90,7 +90,7 @@ class LedOutput(Output):
             raise DeviceGone(f"LED at GPIO {self.pin}: not open")
         good = result.get("status") == "ok"
         if good == self._good:
-            return  # restarting the blinking at each epoch would hide it
+            return  # restarting at each epoch would hide the blinking
         self._good = good
         if good:
             self._led.on()
@@ -99,7 +99,7 @@ class LedOutput(Output):
 
 
 class RelayOutput(Output):
-    """A heating lamp under a programme; see the module's docstring for when it is off."""
+    """A relay that heats by a programme; the module's docstring lists when it is off."""
 
     device_classes = GPIO_CLASSES
     heats = True

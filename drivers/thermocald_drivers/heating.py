@@ -1,12 +1,11 @@
-"""The heating programme that a relay and a phone's processor load follow, with a hard limit.
+"""The heating programme of `relay` and `android_load`, with a hard limit.
 
-A pure decision: (elapsed time, temperature) → heat or not. Three things switch off for good until
-the device is opened again: the limit, a temperature that stays unknown, and the end of the
-programme. Options shared by `relay` and `android_load`:
+A pure decision: (elapsed time, temperature) → heat or not. The limit switches off until the device
+is opened again; so does the end of the programme. The options of both drivers:
 
     channel: temperature          # the key of the epoch's result that is limited
-    limit_c: 60                   # at and above it: off, and off for good
-    unknown_s: 60                 # no temperature for so long: off until one is known
+    limit_c: 60                   # at and above it: off until the device is opened again
+    unknown_s: 60                 # off after so long without a temperature
     programme:                    # in order; hold_c: null is "do not heat"
       - {seconds: 600, hold_c: null}
       - {seconds: 1500, hold_c: 45}
@@ -37,7 +36,7 @@ class Step:
 
 
 class HeatingProgramme:
-    """Decides at each epoch; times are s since the programme began."""
+    """Decides at each epoch; times are s since the start of the programme."""
 
     def __init__(
         self,
@@ -71,13 +70,13 @@ class HeatingProgramme:
         )
 
     def reset(self) -> None:
-        """Begin anew: heating off, no trip."""
+        """Start again: heating off, not tripped."""
         self.heating = False
         self.tripped = ""
         self._known_at = 0.0
 
     def step_at(self, elapsed_s: float) -> Step | None:
-        """The step under way; None after the last one."""
+        """The current step; None after the last one."""
         for step in self.steps:
             elapsed_s -= step.seconds
             if elapsed_s < 0:
@@ -85,7 +84,7 @@ class HeatingProgramme:
         return None
 
     def decide(self, elapsed_s: float, temperature_c: float | None) -> bool:
-        """Whether to heat now; sets `tripped` (a sentence) where it never will again."""
+        """Whether to heat now; sets `tripped` (a sentence) once the limit was reached."""
         known = temperature_c is not None and math.isfinite(temperature_c)
         if known and temperature_c is not None and temperature_c >= self.limit_c:
             self.tripped = (

@@ -4,9 +4,9 @@
       - {name: log, driver: jsonl, path: /var/lib/thermocald/results.jsonl}
       - {name: feed, driver: jsonl, path: /run/thermocald/results.fifo, timeout_s: 1}
 
-A line is written whole or not at all: a disk that fills up in mid-line has the piece taken off
-again. A file that was moved away (logrotate) is begun anew. A pipe nobody reads is an error, not a
-wait. A value that is not a number becomes null, since JSON has no NaN.
+A line is written completely or not at all: if the disk fills up within a line, the incomplete line
+is removed. A file that was moved away (logrotate) is created again. A pipe without a reader is an
+error; it is not waited for. NaN and infinities become null, since JSON has neither.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class JsonLinesOutput(Output):
             self.open()
 
     def _write(self, line: bytes) -> None:
-        """The whole line; on failure what was written of it is taken off again."""
+        """Write the whole line; on failure remove what was written of it."""
         begin = os.fstat(self._file).st_size
         deadline = time.monotonic() + self.timeout_s
         written = 0

@@ -4,7 +4,7 @@
       - {name: lens, driver: hwmon, chip: lm75}                  # or chip: 1-0048 (the bus address)
       - {name: board, driver: hwmon, chip: sht3x, channels: {housing: temp1}}
       - {name: sensor, driver: iio, chip: tmp117}
-      - {name: soc, driver: thermal_zone, zone: cpu-thermal}
+      - {name: soc, driver: thermal_zone, zone: cpu-thermal, unit: thousandths}   # the default
 
 `channels` maps channel names to the kernel's input (`temp1`, `in_temp_ambient`) or its label;
 without it every temperature input is read, a single one as `temperature`. `minimum_c` and
@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, ClassVar
 from thermocald.errors import BadReading, ConfigurationError, DeviceGone, WrongDevice
 from thermocald.hal import Found, Thermometer
 from thermocald_drivers import support
+from thermocald_drivers.android_zones import UNITS, is_temperature
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -255,11 +256,18 @@ class ThermalZoneThermometer(_KernelThermometer):
         *,
         clock: Clock,
         zone: str,
+        unit: str | None = None,
         channels: Mapping[str, str] | None = None,
         minimum_c: float = -55.0,
         maximum_c: float = 125.0,
         sysfs: str = "/sys",
     ) -> None:
+        self.scale = UNITS[support.choice("unit", unit or "thousandths", list(UNITS))]
+        if unit is None and not is_temperature(zone):
+            raise ConfigurationError(
+                f"zone: {zone!r} holds percent, mA or mV on the machines that have it; if yours "
+                "is a temperature, write unit: thousandths (or degC, tenths)"
+            )
         super().__init__(
             clock=clock,
             chip=support.text("zone", zone),
@@ -275,6 +283,7 @@ class ThermalZoneThermometer(_KernelThermometer):
         return [
             Found({"zone": name if name else folder.name}, str(folder))
             for folder, name, _ in cls.devices(Path(sysfs))
+            if is_temperature(name)
         ]
 
     @classmethod
@@ -283,7 +292,7 @@ class ThermalZoneThermometer(_KernelThermometer):
 
     def _convert(self, folder: Path, key: str) -> float:
         try:
-            value = _number(folder / key) / 1000.0
+            value = round(_number(folder / key) * self.scale, 6)
         except OSError as error:
             if error.errno in (errno.EAGAIN, errno.ENODATA, errno.EINVAL):
                 raise BadReading(f"{folder.name}: the zone is disabled or asleep") from error

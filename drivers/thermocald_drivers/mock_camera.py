@@ -1,4 +1,4 @@
-"""A camera that is rendered: a known test field, a known thermal drift.
+"""A simulated camera: rendered images of a known test field with a known thermal drift.
 
     cameras:
       - name: mock
@@ -6,15 +6,15 @@
         testfield: markers            # markers, circles, plain, or the path of a testfield.csv
         model: camera.thermal.yaml    # default: an RPi camera v2.1, half a pixel per kelvin
         programme: [[0, 25.0], [700, 50.0], [1500, 27.0]]   # s since the first open, °C
-        seed: 0                       # of the noise, which hangs on the instant alone
+        seed: 0                       # of the noise, which depends on the time alone
         exposure_s: 0.02
         latency_s: 0.3                # from the call to the end of the exposure
         faults: []                    # see thermocald_drivers/faults.py
         timeout_s: 1
 
-Between the programme's points it is a straight line, before and after them constant: the mock
-thermometer's programme, and its default, so that both together are a warming camera. The device
-has its own time from the first `open` on: unplugging it does not cool it.
+The programme is linear between its points and constant before and after them. It is the mock
+thermometer's, with the same default, so that both together are a camera that warms up. Time counts
+from the first `open`: unplugging the device does not cool it.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ __all__ = ["MockCamera"]
 
 
 class MockCamera(Camera):
-    """Renders what a warming camera would see; the same instants give the same frames."""
+    """Renders what a warming camera would see; equal times give equal frames."""
 
     def __init__(
         self,
@@ -88,7 +88,7 @@ class MockCamera(Camera):
 
     @property
     def scene(self) -> Scene:
-        """The test field before the camera; loaded when first asked for."""
+        """The test field in front of the camera; loaded at first use."""
         if self._scene is None:
             from thermocald.simulation.demonstration import demonstration_model, load_field
             from thermocald.simulation.model_file import read_model
@@ -101,8 +101,8 @@ class MockCamera(Camera):
                 self._model = read_model(Path(self._model_path))
             if self._model.exterior is None:
                 raise ConfigurationError(
-                    f"{self._model_path}: has no exterior orientation; the mock camera must stand "
-                    "somewhere before its test field"
+                    f"{self._model_path}: has no exterior orientation; the mock camera needs "
+                    "one in front of its test field"
                 )
             self._scene = Scene(self._model.sensor, field)
         return self._scene
@@ -112,7 +112,7 @@ class MockCamera(Camera):
 
     @property
     def field(self) -> TestField:
-        """The test field that is drawn."""
+        """The test field that is rendered."""
         return self.scene.field
 
     @property
@@ -135,7 +135,7 @@ class MockCamera(Camera):
         return Frame(self._last, monotonic, utc, exposure=self._exposure_s, sequence=self._sequence)
 
     def truth(self, monotonic: float) -> Prediction:
-        """The true orientation and effects at an instant of the monotonic clock."""
+        """The true orientation and effects at a time of the monotonic clock."""
         from thermocald.simulation.history import History
 
         elapsed = monotonic - (monotonic if self._begin is None else self._begin)

@@ -1,4 +1,4 @@
-"""An output that keeps what it got.
+"""An output that keeps what it was given.
 
 outputs:
   - {name: kept, driver: mock, keep: 1000, timeout_s: 1, faults: []}   # see faults.py

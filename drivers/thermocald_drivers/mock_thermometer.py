@@ -1,4 +1,4 @@
-"""A thermometer that plays a programme, as an instrument does: lag, offset, noise, quantisation.
+"""A simulated thermometer: a programme with lag, offset, noise and quantisation.
 
     thermometers:
       - name: mock
@@ -6,13 +6,13 @@
         programme: [[0, 25.0], [700, 50.0], [1500, 27.0]]   # s since the first open, °C
         channels:                       # default: one channel `temperature` with these values
           temperature: {lag_s: 0, offset_k: 0, gain: 1, noise_k: 0.02, resolution_k: 0.0625}
-        seed: 0                         # of the noise, which hangs on the instant alone
+        seed: 0                         # of the noise, which depends on the time alone
         conversion_s: 0.1               # from the call to the value
         faults: []                      # see thermocald_drivers/faults.py
         timeout_s: 1
 
-Between the programme's points it is a straight line, before and after them constant. `gain` scales
-the difference to the first temperature: a second channel that warms more.
+The programme is linear between its points and constant before and after them. `gain` scales the
+difference to the first temperature, for a second channel that warms more.
 """
 
 from __future__ import annotations
@@ -49,16 +49,16 @@ _BOUNDS = {
 def lagged(
     times: NDArray[np.float64], values: NDArray[np.float64], lag_s: float, at: float
 ) -> float:
-    """A first-order lag's answer to a course of straight lines, at an instant.
+    """The response of a first-order lag to a piecewise linear temperature, at a time.
 
-    times (n,) s, values (n,) °C; in equilibrium before the first. On a line of slope m the answer
-    is value - m·lag plus what decays of the state before (closed form, no step width).
+    times (n,) s, values (n,) °C; in equilibrium before the first. On a line of slope m the response
+    is value - m·lag plus the decaying rest of the state before (closed form, no step size).
     """
     if lag_s == 0.0:
         return float(np.interp(at, times, values))
     state, now = float(values[0]), float(times[0])
-    courses = zip(times, np.append(times[1:], math.inf), values, strict=True)
-    for i, (begin, end, value) in enumerate(courses):
+    pieces = zip(times, np.append(times[1:], math.inf), values, strict=True)
+    for i, (begin, end, value) in enumerate(pieces):
         if at <= begin:
             break
         slope = 0.0 if math.isinf(end) else (values[i + 1] - value) / (end - begin)
@@ -72,7 +72,7 @@ def lagged(
 
 
 class MockThermometer(Thermometer):
-    """Reads a programme; the same instants give the same readings."""
+    """Reads a programme; equal times give equal readings."""
 
     def __init__(
         self,
@@ -117,20 +117,20 @@ class MockThermometer(Thermometer):
         begin = self.clock.monotonic()
         self.clock.sleep_until(begin + self._conversion_s)
         self.faults.refuse(kind, "answer")
-        instant = begin + 0.5 * self._conversion_s
+        middle = begin + 0.5 * self._conversion_s
         if kind != "stuck" or not self._last:
-            self._last = {name: self._value(name, instant) for name in self._channels}
+            self._last = {name: self._value(name, middle) for name in self._channels}
         return support.middle_reading(self.clock, self._last, begin)
 
     def truth(self, monotonic: float) -> float:
-        """The programme's temperature °C at an instant of the monotonic clock."""
+        """The programme's temperature (°C) at a time of the monotonic clock."""
         return lagged(self._times, self._values, 0.0, self._elapsed(monotonic))
 
-    def _value(self, name: str, instant: float) -> float:
+    def _value(self, name: str, at: float) -> float:
         options = self._channels[name]
-        true = lagged(self._times, self._values, options["lag_s"], self._elapsed(instant))
+        true = lagged(self._times, self._values, options["lag_s"], self._elapsed(at))
         value = self._values[0] + options["gain"] * (true - self._values[0]) + options["offset_k"]
-        seed = [self._seed, list(self._channels).index(name), round(instant * 1e6) & 2**63 - 1]
+        seed = [self._seed, list(self._channels).index(name), round(at * 1e6) & 2**63 - 1]
         value += options["noise_k"] * float(np.random.default_rng(seed).standard_normal())
         step = options["resolution_k"]
         return float(round(value / step) * step if step > 0 else value)
@@ -143,7 +143,7 @@ def _channel(name: str, options: Mapping[str, float]) -> dict[str, float]:
     for key in options:
         if key not in _DEFAULTS:
             raise ConfigurationError(
-                f"channels.{name}: there is no {key!r}; known are {', '.join(_DEFAULTS)}"
+                f"channels.{name}: it has no {key!r}; known are {', '.join(_DEFAULTS)}"
             )
     return {
         key: support.number(f"channels.{name}.{key}", options.get(key, default), *_BOUNDS[key])

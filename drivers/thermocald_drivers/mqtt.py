@@ -8,11 +8,11 @@
         username: thermocald                 # and password_file: /etc/thermocald/mqtt-password
         topic: thermocald                    # thermocald/<device>/result and …/available
         discovery: homeassistant             # null: none
-        device: thermocald                   # the name where a result has none
+        device: thermocald                   # the name of results that have none
         timeout_s: 5
 
-Each result is one JSON object with QoS 1; `emit` waits for the broker's acknowledgement, at most
-`timeout_s`, so that nothing is lost unnoticed. The last will sets the device to `offline`.
+Each result is one JSON object with QoS 1. `emit` waits for the broker's acknowledgement, at most
+`timeout_s`, so that a loss is noticed. The last will sets the device to `offline`.
 Source: paho-mqtt 2 (callback API 2), Home Assistant "MQTT discovery".
 """
 
@@ -50,7 +50,7 @@ SENSORS: Mapping[str, tuple[str, str | None, str | None]] = {
 
 
 def discovery_messages(prefix: str, topic: str, device: str) -> dict[str, dict[str, Any]]:
-    """{topic: configuration} that make Home Assistant show the device's sensors."""
+    """{topic: configuration} with which Home Assistant shows the device's sensors."""
     node = re.sub(r"[^A-Za-z0-9_-]", "_", device)
     about = {"identifiers": [f"thermocald-{node}"], "name": device, "manufacturer": "thermocald"}
     messages = {}
@@ -72,7 +72,7 @@ def discovery_messages(prefix: str, topic: str, device: str) -> dict[str, dict[s
 
 
 class MqttOutput(Output):
-    """One connection; the library's own thread keeps it alive."""
+    """One connection, kept alive by the library's thread."""
 
     def __init__(
         self,
@@ -141,7 +141,7 @@ class MqttOutput(Output):
                 try:
                     info.wait_for_publish(self.timeout_s)
                 except (RuntimeError, ValueError):
-                    break  # the line went down in between: the last will says it
+                    break  # the connection broke: the broker sends the last will
         client.disconnect()
         client.loop_stop()
 

@@ -86,6 +86,8 @@ def decode(content: str, where: str, family: str = "28") -> tuple[float, bytes]:
 def power_on_value(pad: bytes, family: str) -> float | None:
     """°C that this scratchpad holds if the chip has not converted yet; None if it has."""
     raw = int.from_bytes(pad[:2], "little")
+    if family == "3b" and pad[4] & 0x80:
+        raw &= ~3
     if raw == (0x00AA if family == "10" else 0x0550):
         return POWER_ON_C
     counterfeit = pad[5] != 0xFF or pad[7] != 0x10

@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
 __all__ = [
-    "Instant",
+    "ExposureStart",
     "exif",
+    "exposure_start",
     "focus_state",
     "image_moved",
-    "instant",
     "lock_verdict",
     "settings",
 ]
@@ -46,11 +46,11 @@ EXPOSURE = ("exposure_s", "iso")
 LENS = ("f_number", "focal_length_mm", "digital_zoom")
 FOCUS = ("subject_distance_m", "focus_distance_dioptres")
 SETTINGS = (*EXPOSURE, *LENS, *FOCUS)
-"""What a photograph tells of its camera's settings, stored with its epoch."""
+"""What a photograph reports of its camera's settings, stored with its epoch."""
 
 
 def exif(jpeg: bytes) -> dict[str, Any]:
-    """The tags of TAGS that the photograph has, and `width`, `height`, `make`, `model`."""
+    """Those of TAGS that the photograph has, and `width`, `height`, `make`, `model`."""
     image_module = support.library("PIL.Image", "android")
     try:
         with image_module.open(io.BytesIO(jpeg)) as image:
@@ -77,15 +77,15 @@ def _plain(value: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class Instant:
-    """When the exposure began, s UTC by the phone's clock, and the resolution of that (s)."""
+class ExposureStart:
+    """Start of the exposure, s UTC by the phone's clock, and its resolution (s)."""
 
     utc: float
     resolution_s: float
 
 
-def instant(tags: Mapping[str, Any], zone: str) -> Instant | None:
-    """The photograph's instant; zone: +hhmm, used where the photograph has none."""
+def exposure_start(tags: Mapping[str, Any], zone: str) -> ExposureStart | None:
+    """The photograph's time; zone: +hhmm, used if the photograph has none."""
     text = tags.get("time")
     if not isinstance(text, str):
         return None
@@ -100,8 +100,8 @@ def instant(tags: Mapping[str, Any], zone: str) -> Instant | None:
     seconds = naive.replace(tzinfo=timezone(offset) if sign else UTC).timestamp()
     digits = str(tags.get("subsecond", ""))
     if re.fullmatch(r"\d+", digits):
-        return Instant(seconds + int(digits) / 10 ** len(digits), 10.0 ** -len(digits))
-    return Instant(seconds, 1.0)
+        return ExposureStart(seconds + int(digits) / 10 ** len(digits), 10.0 ** -len(digits))
+    return ExposureStart(seconds, 1.0)
 
 
 def focus_state(dump: str) -> dict[str, Any]:
@@ -126,7 +126,7 @@ def image_moved(first: Mapping[str, Any], now: Mapping[str, Any]) -> str:
 
 
 def settings(tags: Mapping[str, Any]) -> dict[str, float]:
-    """The numbers among SETTINGS that the photograph tells."""
+    """The numbers among SETTINGS that the photograph reports."""
     found = {name: tags[name] for name in SETTINGS if name in tags}
     return {
         name: float(value)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["BAYER_ORDERS", "FORMATS", "decode", "jpeg_end"]
 
 BAYER_ORDERS = {
-    # V4L2's names tell the first row: RG10 begins R G
+    # V4L2's names give the first row: RG10 starts with R G
     "RGGB": "RGGB", "RG10": "RGGB", "RG12": "RGGB", "RG16": "RGGB", "pRAA": "RGGB",
     "BA81": "BGGR", "BG10": "BGGR", "BG12": "BGGR", "BYR2": "BGGR", "pBAA": "BGGR",
     "GBRG": "GBRG", "GB10": "GBRG", "GB12": "GBRG", "GB16": "GBRG", "pGAA": "GBRG",
@@ -102,7 +102,7 @@ FORMATS: dict[str, Callable[[memoryview, int, int, int], Grey]] = {
 
 
 def jpeg_end(data: bytes) -> bool:
-    """Whether the bytes begin and end as a JPEG does; cameras pad the end with zeros."""
+    """Whether the bytes start and end as a JPEG; cameras pad the end with zeros."""
     return data[:2] == b"\xff\xd8" and data.rstrip(b"\0")[-2:] == b"\xff\xd9"
 
 

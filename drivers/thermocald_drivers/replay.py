@@ -34,7 +34,7 @@ __all__ = ["ReplayCamera", "ReplayThermometer"]
 
 
 class _Replay(Device):
-    """The epochs of a recording, one after the other; opening it again goes on, not back."""
+    """The epochs of a recording in order; opening it again continues where it was."""
 
     def __init__(self, *, clock: Clock, recording: str | Path, loop: bool = False) -> None:
         self.clock = clock
@@ -81,18 +81,18 @@ class _Replay(Device):
             raise DeviceFinished(f"{self._path}: the recording has ended")
         return epoch
 
-    def _instants(self, recorded: float) -> tuple[float, float]:
-        """(monotonic, utc) of a recorded UTC instant."""
+    def _times(self, recorded: float) -> tuple[float, float]:
+        """(monotonic, utc) of a recorded UTC time."""
         utc = recorded + self._shift_s
         return utc - self.clock.utc() + self.clock.monotonic(), utc
 
 
 class ReplayCamera(_Replay, Camera):
-    """Gives the frames, or the measurements, of a recording."""
+    """Delivers the frames, or the measurements, of a recording."""
 
     def capture(self) -> Frame:
         epoch = self._next()
-        monotonic, utc = self._instants(epoch.frame_time)
+        monotonic, utc = self._times(epoch.frame_time)
         metadata: dict[str, Any] = {"epoch": epoch.number}
         if epoch.observations is not None and self._recording is not None:
             from thermocald.photogrammetry.field.exchange import observations_to_lists
@@ -117,19 +117,19 @@ class ReplayCamera(_Replay, Camera):
 
 
 class ReplayThermometer(_Replay, Thermometer):
-    """Gives the readings of a recording, of all its channels."""
+    """Delivers the readings of all channels of a recording."""
 
     def read(self) -> Reading:
         epoch = self._next()
         values = {name: t for name, t in epoch.temperatures.items() if t == t}  # not NaN
         if not values:
             raise BadReading(f"{self._path}: epoch {epoch.number} has no temperature")
-        monotonic, utc = self._instants(epoch.temperature_time)
+        monotonic, utc = self._times(epoch.temperature_time)
         return Reading(values, monotonic, utc, {"epoch": epoch.number})
 
 
 def _decoded(data: bytes, path: Path) -> Any:
-    """A picture's grey values (H, W); BadReading if it is none."""
+    """The grey values (H, W) of an image file; BadReading if it cannot be read."""
     import cv2
     import numpy as np
 
@@ -138,5 +138,5 @@ def _decoded(data: bytes, path: Path) -> Any:
         flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if image is None:
-        raise BadReading(f"{path}: is no image")
+        raise BadReading(f"{path}: is not an image")
     return image

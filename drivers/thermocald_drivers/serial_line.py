@@ -1,10 +1,10 @@
-r"""Thermometers on a serial line that speak in lines of text.
+r"""Thermometers on a serial line that send lines of text.
 
     thermometers:
       - {name: air, driver: serial, port: /dev/ttyUSB0, instrument: vaisala-hmp}
       - name: probe
         driver: serial
-        port: /dev/serial/by-id/usb-FTDI_FT232R_A50285BI-if00-port0   # lasts over re-plugs
+        port: /dev/serial/by-id/usb-FTDI_FT232R_A50285BI-if00-port0   # the same after a re-plug
         baud: 9600
         framing: 8N1                            # data bits, parity (N, E, O), stop bits
         command: "T?\\r\\n"                      # sent for each reading; empty: it sends by itself
@@ -59,7 +59,7 @@ NO_SENSOR_C = (-127.0, -50.0, -46.85, -45.0, -40.0, 85.0, 125.0)
 NO_SENSOR_STEP_K = 0.006
 DEGREES = str.maketrans("ºø˚∘ß℃", "°°°°°°")
 """What a degree sign of another encoding becomes in Latin-1: masculine ordinal, 0xF8, 0xDF."""
-POLL_S = 0.05  # changing pyserial's time-out later would set up the whole port anew
+POLL_S = 0.05  # changing pyserial's time-out later would configure the port again
 QUEUE = 4000
 """Bytes that may have waited before the kernel's buffer (4096) could have lost some."""
 
@@ -200,7 +200,7 @@ class SerialThermometer(Thermometer):
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:  # noqa: ARG003
-        """Serial ports with their lasting names; what is on them cannot be known."""
+        """Serial ports by their permanent names; what is connected cannot be known."""
         ports = support.library("serial.tools.list_ports").comports(include_links=True)
         links = [p for p in ports if "/by-id/" in p.device]
         return [
@@ -272,7 +272,7 @@ class SerialThermometer(Thermometer):
         return DeviceGone(f"{self.where}: unplugged ({error})")
 
     def _skip_queue(self) -> None:
-        """Drop what came before now, but keep the head of the line that is under way."""
+        """Discard what came before now, but keep the start of the current line."""
         waiting = self._serial.read(self._serial.in_waiting)
         if len(waiting) >= QUEUE:
             self._line, self._synchronous = b"", False  # bytes may be missing in the middle
@@ -315,7 +315,7 @@ class SerialThermometer(Thermometer):
             self._line += _one_end(self._serial.read(max(1, self._serial.in_waiting)))
 
     def _nothing(self, skipped: list[str], problem: str) -> BadReading | DeviceTimeout:
-        """Why no line was good enough."""
+        """The error for a time-out: what was wrong with the lines that came."""
         rest = self._line.decode("ascii", "backslashreplace")
         self._line, self._synchronous = b"", False
         if problem:

@@ -26,7 +26,7 @@ CONVERSION_S = 0.0155
 
 
 def crc8(data: bytes) -> int:
-    """The chip's CRC: polynomial 0x31, start 0xFF; of BE EF it is 0x92 (data sheet, table 20)."""
+    """CRC of the chip: polynomial 0x31, initial value 0xFF; BE EF gives 0x92 (table 20)."""
     crc = 0xFF
     for byte in data:
         crc ^= byte
@@ -43,7 +43,7 @@ class Sht3xThermometer(I2cThermometer):
     range_c = (-40.0, 125.0)
 
     def _identify(self) -> Mapping[str, str]:
-        self._command(SOFT_RESET)  # out of the periodic mode of whoever was here before
+        self._command(SOFT_RESET)  # leave the periodic mode of an earlier user
         self._wait(0.002)
         self._command(SERIAL_NUMBER)
         self._wait(0.001)

@@ -51,6 +51,7 @@ CLOCK_TRIES = 10
 CLOCK_SPREAD_S = 1e-4
 NEIGHBOUR_AGE_S = 60.0
 NEIGHBOUR_STEP_K = 5.0
+LARGEST = 1e15
 LOWEST_C, HIGHEST_C = -273.15, 2000.0
 _NUMBER = re.compile(r"[-+]?(?:[0-9]+(?:[.,][0-9]*)?|[.,][0-9]+)(?:[eE][-+]?[0-9]{1,2})?")
 _GONE = {errno.ENOENT, errno.ENXIO, errno.ENODEV, errno.EREMOTEIO, errno.ENOTCONN, errno.ESHUTDOWN}
@@ -70,8 +71,10 @@ def number(
 ) -> float:
     """An option as a number within its bounds; ConfigurationError names option, value, limits."""
     suffix = f" {unit}" if unit else ""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or value != value:
         raise ConfigurationError(f"{name}: {value!r} is not a number{suffix and ' in' + suffix}")
+    if abs(value) > LARGEST:  # also infinity, and integers that no float can hold
+        raise ConfigurationError(f"{name}: the number is too large{suffix and ' for' + suffix}")
     if not low <= value <= high:
         raise ConfigurationError(
             f"{name}: {value:g}{suffix} is not within {low:g} … {high:g}{suffix}"

@@ -4,8 +4,8 @@
       - {name: lens, driver: tmp117, bus: 1, address: 0x48, channel: lens}
 
 The device identity 0x117 is checked. Every read starts a one-shot conversion (8 averages, 0.125 s)
-and waits for its Data_Ready flag, so that a value is never read twice; 0x8000 (−256 °C) stands in
-the register before the first conversion and is refused. Source: data sheet SNOSD82D, 7.6.
+and waits for its Data_Ready flag, so that no value is read twice; 0x8000 (−256 °C), the register's
+value before the first conversion, is refused. Source: data sheet SNOSD82D, 7.6.
 """
 
 from __future__ import annotations

@@ -126,7 +126,7 @@ class V4l2Camera(Camera):
 
     @classmethod
     def attached(cls, sysfs: str = "/sys", dev: str = "/dev") -> list[Found]:
-        """Capture nodes by their lasting names (by-id, by-path), else /dev/videoN."""
+        """Capture nodes by their permanent names (by-id, by-path), else /dev/videoN."""
         found = []
         for node in sorted(Path(sysfs).glob("class/video4linux/video*")):
             try:
@@ -159,7 +159,7 @@ class V4l2Camera(Camera):
         except DeviceError as error:
             self.close()
             if self._seen and isinstance(error, WrongDevice):
-                # it was the right one before: another may sit at its number until the next plug
+                # it was the right one before: another may have its number until the next plug
                 raise TransientDeviceError(str(error)) from error
             raise
         except OSError as error:
@@ -236,7 +236,7 @@ class V4l2Camera(Camera):
                     f"monotonic clock ({arrived:.3f} s)"
                 )
             if stamp is None or stamp > arrived:
-                return dropped >= BUFFERS  # it says nothing: take the first that cannot have waited
+                return dropped >= BUFFERS  # no information: take the first that cannot have waited
             return stamp - (0.0 if start_of_exposure else exposure or 0.0) >= called
 
         while True:

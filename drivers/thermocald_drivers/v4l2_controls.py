@@ -3,7 +3,7 @@
 A camera that focuses is another camera. Whatever is not configured is locked at the value it has
 when the camera is opened, and set to the same value again after a re-plug: focus, exposure, gain,
 white balance; zoom, pan, tilt and iris; image stabilisation is switched off. An automatic mode that
-cannot be switched off is an error, unless it is asked for by name (`focus: auto`).
+cannot be switched off is an error, unless the stanza asks for it by name (`focus: auto`).
 Source: Linux Documentation/userspace-api/media/v4l/ext-ctrls-camera.rst, control.rst.
 """
 
@@ -93,7 +93,7 @@ class CameraControls:
         self._available: dict[int, Control] = {}
 
     def warnings(self) -> list[str]:
-        """A sentence for each automatic mode that is asked for by name."""
+        """A sentence for each automatic mode that the stanza asks for."""
         return [
             f"{lock.option}: auto lets the camera change it; every change is another camera"
             for lock in LOCKS
@@ -184,12 +184,12 @@ class CameraControls:
     def _set(self, stream: Access, control: int, value: int, locked: set[int]) -> None:
         try:
             if control in locked and stream.get(control) == value:
-                return  # some cameras refuse to be told what they do already
+                return  # some cameras refuse a value that they already have
             stream.set(control, value)
         except OSError as error:
             limits = self._limits(control)
             if control in locked and control not in self._modes():
-                return  # it cannot be set, so it stays; every frame tells
+                return  # it cannot be set, so it stays; every frame is checked
             remedy = self._remedy(control) or f"it takes {limits}"
             raise WrongDevice(
                 f"{self._where}: does not take {self._name(control)} = {value} "

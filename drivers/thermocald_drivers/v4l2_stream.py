@@ -59,7 +59,7 @@ OPENCV_PROPERTIES = {
 
 @dataclass(frozen=True)
 class Grab:
-    """One buffer: stamp (s, CLOCK_MONOTONIC, None if the driver gives none), what it marks."""
+    """One buffer: time stamp (s, CLOCK_MONOTONIC; None if the driver gives none), what it marks."""
 
     image: Grey
     encoded: bytes | None
@@ -71,8 +71,8 @@ class Grab:
 class Stream(Protocol):
     """What the camera needs of a stream.
 
-    `grab` gives the next buffer, or None if `accept(stamp, start_of_exposure)` does not want it (an
-    old frame is not worth decoding); it raises BadReading for a buffer in error.
+    `grab` returns the next buffer, or None if `accept(stamp, start_of_exposure)` is false (an old
+    frame is not decoded); it raises BadReading for a damaged buffer.
     """
 
     card: str
@@ -140,7 +140,7 @@ class LinuxpyStream:
         buffer = self._dequeue(deadline)
         stamp: float | None = buffer.timestamp.secs + buffer.timestamp.usecs * 1e-6
         if not stamp or (not buffer.flags & TYPE_MASK and abs(stamp - time.monotonic()) > OLDEST_S):
-            stamp = None  # none, or (drivers that do not say which clock) not the monotonic one
+            stamp = None  # none, or of another clock (drivers that do not say which)
         at_start = bool(buffer.flags & START_OF_EXPOSURE)
         try:
             if not accept(stamp, at_start):
@@ -197,7 +197,7 @@ class OpenCvStream:
         self._capture = cv2.VideoCapture(path, cv2.CAP_V4L2)
         if not self._capture.isOpened():
             raise DeviceGone(f"{path}: OpenCV cannot open it (busy, or no capture device)")
-        self.card = "unknown: OpenCV does not tell"
+        self.card = "unknown: OpenCV does not report it"
         # OpenCV resets a device to 640×480 on open; order matters: format, then size
         self._capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*fourcc))
         self._capture.set(cv2.CAP_PROP_FRAME_WIDTH, width)
@@ -276,7 +276,7 @@ def _controls(video: Any, device: Any) -> dict[int, Control]:
 
 
 def current_settings(path: str) -> dict[str, float]:
-    """{option: value} of a camera as it is now, {} where it cannot be asked; sets nothing."""
+    """{option: value} of a camera as it is now, {} if it cannot be opened; sets nothing."""
     try:
         video = support.library("linuxpy.video.device", "v4l2")
         logging.getLogger("linuxpy").setLevel(logging.WARNING)

@@ -123,7 +123,7 @@ def test_injected_while_it_runs(clock):
     ("plan", "message"),
     [
         ([{"kind": "explode"}], "is not one of timeout, unplugged"),
-        ([{"kind": "timeout", "att": 3}], "a fault has no 'att'"),
+        ([{"kind": "timeout", "att": 3}], "a fault has no key 'att'"),
         ([{"kind": "timeout", "at": 0}], "is not within 1"),
         ([{"kind": "timeout", "at": 1.5}], "not a whole number"),
         ([{"kind": "timeout", "at_s": -1}], "not within"),

@@ -9,6 +9,7 @@ import pytest
 from tests.drivers.fakes.sysfs import Sysfs
 from thermocald.errors import (
     BadReading,
+    ConfigurationError,
     DeviceGone,
     DeviceNotFound,
     TransientDeviceError,
@@ -166,6 +167,14 @@ def test_the_power_on_value_of_a_1_wire_sensor_under_hwmon(sysfs):
         device.read()
     with thermometer("hwmon", sysfs, chip="it87") as device:
         assert device.read().values == {"temperature": 85.0}
+
+
+def test_a_zone_of_another_quantity_needs_its_unit(sysfs):
+    with pytest.raises(ConfigurationError, match="write unit: thousandths"):
+        thermometer("thermal_zone", sysfs, zone="pm8150b-vbat-lvl0")
+    sysfs.zone(0, "soc", "310")
+    with thermometer("thermal_zone", sysfs, zone="soc", unit="tenths") as device:
+        assert device.read().values == {"temperature": 31.0}
 
 
 def test_a_zone_that_is_not_fitted(sysfs):

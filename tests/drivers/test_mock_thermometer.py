@@ -81,7 +81,7 @@ def test_noise_has_the_stated_size_and_is_seeded():
         ({"programme": [[0, 20], [0, 30]]}, "times must increase"),
         ({"programme": [0, 20]}, "list of"),
         ({"programme": "warm"}, "list of"),
-        ({"channels": {"t": {"lag": 3}}}, "channels.t: there is no 'lag'"),
+        ({"channels": {"t": {"lag": 3}}}, "channels.t: it has no 'lag'"),
         ({"channels": {"t": {"noise_k": -1}}}, "channels.t.noise_k: -1 K is not within"),
         ({"seed": 1.5}, "seed: 1.5 is not a whole number"),
         ({"conversion_s": -1}, "conversion_s"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from thermocald_drivers.photograph import exif, focus_state, instant, lock_verdict
+from thermocald_drivers.photograph import exif, exposure_start, focus_state, lock_verdict
 
 from tests.drivers.fakes.adb_server import photograph as make
 from thermocald.errors import BadReading
@@ -34,15 +34,15 @@ def test_no_photograph(data):
     [(None, "", 0), (None, "+0000", 0), ("+01:00", "+0000", -3600), (None, "-0330", 12600)],
 )
 def test_the_instant_and_its_zone(photo_zone, phone_zone, shift):
-    told = instant(exif(make(WHEN, zone=photo_zone)), phone_zone)
+    told = exposure_start(exif(make(WHEN, zone=photo_zone)), phone_zone)
     assert told.utc == WHEN + 0.25 + shift
     assert told.resolution_s == 0.001
 
 
 def test_whole_seconds_are_coarse():
-    assert instant(exif(make(WHEN, subsecond=None)), "").resolution_s == 1.0
-    assert instant({"time": "0000:00:00 00:00:00"}, "") is None
-    assert instant({}, "") is None
+    assert exposure_start(exif(make(WHEN, subsecond=None)), "").resolution_s == 1.0
+    assert exposure_start({"time": "0000:00:00 00:00:00"}, "") is None
+    assert exposure_start({}, "") is None
 
 
 def test_focus_out_of_the_camera_service():

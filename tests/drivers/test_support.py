@@ -40,3 +40,21 @@ def test_numbers_are_bounded(value):
 def test_a_missing_library_says_how_to_install_it():
     with pytest.raises(DriverMissing, match=r"pip install 'thermocald\[gpio\]'"):
         support.library("no_such_library_anywhere", "gpio")
+
+
+@pytest.mark.parametrize("value", [10**400, -(10**400), float("inf"), 1e300, float("nan"), True])
+def test_numbers_that_are_none(value):
+    with pytest.raises(ConfigurationError, match="width"):
+        support.number("width", value, 0, 20000, "px")
+
+
+@pytest.mark.parametrize("text", ["2_5.0", "nan", "inf", "1e300", "٢٥", "0x19", "", "1,5", "--1"])
+def test_texts_that_are_not_numbers(text):
+    with pytest.raises(ValueError, match="not a plain decimal number"):
+        support.parse_number(text)
+
+
+@pytest.mark.parametrize("points", [[[0, 1e300]], [[0, -300]], [[0, "nan"]], [[0, float("inf")]]])
+def test_programmes_of_temperatures_that_do_not_exist(points):
+    with pytest.raises(ConfigurationError, match="programme"):
+        support.programme(points)

@@ -40,7 +40,8 @@ ExteriorOption = Annotated[
     str,
     typer.Option(
         "--exterior",
-        help="per_epoch: every epoch has its own orientation; series: the camera stood still.",
+        help="per_epoch: every epoch has its own orientation; series: one for all epochs; mount: "
+        "one and movements of the mount, whose size is estimated; auto: what the data show.",
     ),
 ]
 

@@ -26,6 +26,13 @@ if TYPE_CHECKING:
 __all__ = ["register"]
 
 
+_EXTERIOR_WORDS = {
+    "per_epoch": "per epoch",
+    "series": "of the series",
+    "mount": "of the series with movements of the mount",
+}
+
+
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     app.command("replay")(replay)
@@ -38,7 +45,7 @@ def replay(
         Path | None,
         typer.Option("--store", help="Keep all in this store; an interrupted replay goes on."),
     ] = None,
-    exterior: ExteriorOption = "per_epoch",
+    exterior: ExteriorOption = "auto",
     free: FreeOption = DEFAULT_FREE_TEXT,
     json: JsonOption = None,
 ) -> None:
@@ -75,7 +82,7 @@ def export(
     output: Annotated[
         str, typer.Option("--output", "-o", help="File; - is standard output.")
     ] = "-",
-    exterior: ExteriorOption = "per_epoch",
+    exterior: ExteriorOption = "auto",
     free: FreeOption = DEFAULT_FREE_TEXT,
     series: Annotated[
         str | None, typer.Option("--series", help="Which of a store: CAMERA/SERIES or SERIES.")
@@ -122,8 +129,10 @@ def _existing(path: Path) -> Path:
 
 
 def _check_exterior(exterior: str) -> None:
-    if exterior not in ("per_epoch", "series"):
-        raise UsageError(f"--exterior {exterior}: must be per_epoch or series")
+    from thermocald.photogrammetry.series.result import EXTERIOR_CHOICES
+
+    if exterior not in EXTERIOR_CHOICES:
+        raise UsageError(f"--exterior {exterior}: must be one of {', '.join(EXTERIOR_CHOICES)}")
 
 
 def _recording_table(path: Path, settings: AdjustmentSettings, exterior: str) -> SeriesTable:
@@ -172,6 +181,7 @@ def _summary(
         "recording": recording,
         "store": store,
         "exterior": table.exterior,
+        "exterior_choice": None if table.adjustment is None else table.adjustment.choice,
         "epochs": len(table.number),
         "ok": int(ok.sum()),
         "sigma0": float(np.median(table.sigma0[ok])) if ok.any() else None,
@@ -242,10 +252,13 @@ def _tell(document: dict[str, Any]) -> None:
     console = Console()
     console.print(
         f"{document['ok']} of {document['epochs']} epochs calibrated, exterior orientation "
-        f"{'per epoch' if document['exterior'] == 'per_epoch' else 'of the series'}, "
-        f"{document['rejected']} gross errors",
+        f"{_EXTERIOR_WORDS[document['exterior']]}, {document['rejected']} gross errors",
         highlight=False,
     )
+    if document["exterior_choice"]:
+        console.print(
+            f"--exterior {document['exterior']}: {document['exterior_choice']}", highlight=False
+        )
     for name in document["left_out"]:
         console.print(
             f"left out: target {name} and what belongs to it moves by itself", highlight=False

@@ -7,7 +7,7 @@ were stored; with `exterior="series"` all epochs are adjusted together from thei
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from thermocald.photogrammetry.series.adjustment import (
     SeriesSettings,
     adjust_series,
 )
+from thermocald.photogrammetry.series.mount import drift_period
 from thermocald.store.recording.reader import interpolate_readings
 
 if TYPE_CHECKING:
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
     from thermocald.photogrammetry.field.testfield import Observations, TestField
     from thermocald.store.recording.head import Head
+
+    from thermocald.photogrammetry.series.result import Exterior
 
     Array = NDArray[np.float64]
 
@@ -146,13 +149,16 @@ def table_of_series(
             f"most {_MOST_TOGETHER}); use --exterior per_epoch"
         )
     start = np.median(apart.values[ok], axis=0)
+    settings = replace(settings, drift_period=drift_period(apart.frame_time, apart.temperature))
 
     def without(rows: NDArray[np.int64], quick: bool) -> SeriesTable:
         left = [None if o is None else o.select(~np.isin(o.targets, rows)) for o in observations]
         if quick:
             used = result.observed
             left = [None if o is None else o.select(used[e, o.targets]) for e, o in enumerate(left)]
-        rough = replace(settings, snooping_alpha=0.0, target_noise=False) if quick else settings
+        rough = replace(settings, exterior=result.exterior)
+        if quick:
+            rough = replace(rough, snooping_alpha=0.0, target_noise=False)
         return table_of_series(head, testfield, apart, left, rough)
 
     result = adjust_series(
@@ -183,7 +189,7 @@ def table_of_series(
         rejected,
         tuple(word for word, _ in pairs),
         tuple(reason for _, reason in pairs),
-        settings.exterior,
+        result.exterior,
         result.level_sd,
         result,
         _groups(testfield, result),
@@ -203,7 +209,7 @@ def _groups(testfield: TestField, result: SeriesAdjustment) -> dict[str, NDArray
 def settings_for_series(settings: AdjustmentSettings, exterior: str) -> SeriesSettings:
     """The series' settings that go with those of single epochs."""
     return SeriesSettings(
-        exterior="series" if exterior == "series" else "per_epoch",
+        exterior=cast("Exterior", exterior),
         free=settings.free,
         scale=settings.scale,
         bounds=settings.bounds,

@@ -16,7 +16,7 @@ from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES, parti
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
     from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.field.testfield import Observations, TestField
@@ -25,12 +25,14 @@ if TYPE_CHECKING:
     Mask = NDArray[np.bool_]
 
 __all__ = [
+    "TRUSTED_REDUNDANCY",
     "NoConvergenceError",
     "Problem",
     "Rejections",
     "Solution",
     "chi2_2d",
     "cofactor_root",
+    "fails_global_test",
     "point_covariances",
     "point_tests",
     "resolve",
@@ -41,7 +43,10 @@ __all__ = [
 _ITERATIONS = 30
 _SMALL = 0.3  # standard deviations: a last step that leaves less than 1e-3 px in c, x0, y0
 _LINEAR = 10.0  # standard deviations that a solution may move without new partials
-_TRUSTED_REDUNDANCY = 20  # from here on the residuals themselves tell the noise
+TRUSTED_REDUNDANCY = 20
+"""From here on the residuals themselves tell the noise."""
+
+_GLOBAL_TEST_NORMAL = 3.09  # quantile of the normal distribution: error probability 0.1 %
 
 
 class NoConvergenceError(Exception):
@@ -133,6 +138,18 @@ class Solution:
 def chi2_2d(alpha: float) -> float:
     """Quantile 1 - alpha of chi-square with two degrees of freedom, which has a closed form."""
     return float(-2.0 * np.log(alpha)) if alpha > 0 else float("inf")
+
+
+def fails_global_test(unit: ArrayLike, redundancy: ArrayLike) -> NDArray[np.bool_]:
+    """Whether residuals are too large for their sigmas, where they are too few to tell the noise.
+
+    unit: variance of unit weight; redundancy: its degrees of freedom. Chi-square at 0.1 %, by
+    Wilson and Hilferty's approximation (1931).
+    """
+    r = np.maximum(np.asarray(redundancy, dtype=float), 1.0)
+    ninth = 2.0 / (9.0 * r)
+    bound = (1.0 - ninth + _GLOBAL_TEST_NORMAL * np.sqrt(ninth)) ** 3
+    return np.asarray((np.asarray(redundancy) < TRUSTED_REDUNDANCY) & (np.asarray(unit) > bound))
 
 
 def point_covariances(
@@ -336,7 +353,7 @@ def snoop(test: Array, use: Mask, unknowns: int, alpha: float) -> Mask:
     used = test if n == len(use) else test[use]
     # Median of chi-square(2) is 2 ln 2: a scale that the gross errors do not reach.
     variance = float(np.partition(used, n // 2)[n // 2]) / (2 * np.log(2))
-    if 2 * n - unknowns < _TRUSTED_REDUNDANCY:
+    if 2 * n - unknowns < TRUSTED_REDUNDANCY:
         variance = max(1.0, variance)
     limit = chi2_2d(alpha) * max(variance, 1e-12)
     keep: Mask = use | (test <= limit)

@@ -8,7 +8,7 @@ and the targets' uncertainty), is stated beside it and cancels in every drift.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
@@ -20,33 +20,42 @@ from thermocald.photogrammetry.camera.camera_model import (
 )
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, Adjustment
 from thermocald.photogrammetry.epoch.geometry import GeometryBounds
+from thermocald.photogrammetry.parameters import EOP, EOP_COLUMNS, IOP
+from thermocald.photogrammetry.series.mount import STILL, Movement
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Array = NDArray[np.float64]
 
-__all__ = ["EOP_COLUMNS", "SeriesAdjustment", "SeriesSettings"]
+__all__ = ["EXTERIOR_CHOICES", "Exterior", "SeriesAdjustment", "SeriesSettings"]
 
-EOP_COLUMNS = np.arange(10, 16)
-"""Positions of the exterior orientation in `PARAMETER_NAMES`."""
+Exterior = Literal["per_epoch", "series", "mount", "auto"]
+"""How the exterior orientation of a series is estimated."""
+
+EXTERIOR_CHOICES: tuple[str, ...] = get_args(Exterior)
+"""The words for it."""
 
 
 @dataclass(frozen=True, slots=True)
 class SeriesSettings:
     """What is estimated per epoch and what once.
 
-    exterior: `series` for a camera that stands still; free: IOP per epoch, the others are held;
+    exterior: `per_epoch`: every epoch its own orientation; `series`: one for all epochs; `mount`:
+    one for all and a movement of each epoch, whose variance is estimated; `auto`: what the data
+    choose of the three; free: IOP per epoch, the others are held;
     target_offsets: a constant offset per target, with the test field's sigmas as prior;
     target_noise: the measuring noise, also its correlations within a marker and what neighbouring
-    epochs scatter beyond it, from the series' own scatter where it is long enough; snooping_alpha,
-    max_rejected, scale, bounds as in `AdjustmentSettings`.
+    epochs scatter beyond it, from the series' own scatter where it is long enough; drift_period:
+    the shortest of the camera's drift in epochs (`mount.drift_period`), 0 for a series too short
+    for one; snooping_alpha, max_rejected, scale, bounds as in `AdjustmentSettings`.
     """
 
-    exterior: Literal["per_epoch", "series"] = "series"
+    exterior: Exterior = "series"
     free: tuple[str, ...] = DEFAULT_FREE
     target_offsets: bool = True
     target_noise: bool = True
+    drift_period: float = 24.0
     snooping_alpha: float = 0.002
     max_rejected: float = 0.35
     scale: Literal["posterior", "prior"] = "posterior"
@@ -56,14 +65,14 @@ class SeriesSettings:
     def per_epoch(self) -> NDArray[np.int64]:
         """Positions of the parameters that every epoch has of its own."""
         own = [i for i, name in enumerate(IOP_NAMES) if name in self.free]
-        if self.exterior == "per_epoch":
+        if self.exterior != "series":
             own += list(EOP_COLUMNS)
         return np.array(own, dtype=np.int64)
 
     @property
     def common(self) -> NDArray[np.int64]:
         """Positions of the parameters that are estimated once."""
-        return EOP_COLUMNS if self.exterior == "series" else np.empty(0, dtype=np.int64)
+        return np.empty(0, dtype=np.int64) if self.exterior == "per_epoch" else EOP_COLUMNS
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +87,9 @@ class SeriesAdjustment:
     (16,): by how much neighbouring epochs scatter beyond their noise because the set-up trembles
     or the light flickers; contained in the covariance, 0 where it is not significant; trend_sd
     (16,): what a straight line from the first epoch to the last owes to targets: their coordinates'
-    uncertainty where the visible ones changed on the way, and slow errors of their own.
+    uncertainty where the visible ones changed on the way, slow errors of their own, and a mount
+    with memory; noise_ratio: the noise found over the one stated; movement: of the mount; choice:
+    how the exterior orientation was estimated and why.
     """
 
     settings: SeriesSettings
@@ -97,14 +108,21 @@ class SeriesAdjustment:
     stillness: Array
     excess_sd: Array
     trend_sd: Array
+    noise_ratio: float = 1.0
+    movement: Movement = STILL
+    choice: str = ""
+
+    @property
+    def exterior(self) -> Exterior:
+        """How the exterior orientation was estimated."""
+        return self.settings.exterior
 
     @property
     def sd(self) -> Array:
-        """Standard deviations (E, 16), NaN where held; common parameters have their level's."""
+        """Standard deviations (E, 16), NaN where held; of common parameters with the level."""
         variance = np.diagonal(self.covariance, axis1=1, axis2=2).copy()
-        level = np.diag(self.level_covariance)
         common = self.settings.common
-        variance[:, common] = level[common]
+        variance[:, common] += np.diag(self.level_covariance)[common]
         out: Array = np.sqrt(np.where(variance > 0, variance, np.nan))
         out[~self.ok] = np.nan
         return out
@@ -146,15 +164,15 @@ class SeriesAdjustment:
         targets = np.flatnonzero(self.observed[row] | self.rejected[row])
         covariance = self.covariance[row].copy()
         common = np.ix_(self.settings.common, self.settings.common)
-        covariance[common] = self.level_covariance[common]
+        covariance[common] += self.level_covariance[common]
         n = len(targets)
         return Adjustment(
             self.status[row],
             self.reasons[row],
-            InteriorOrientation.from_array(self.values[row, :10]) if ok else None,
-            ExteriorOrientation.from_array(self.values[row, 10:]) if ok else None,
+            InteriorOrientation.from_array(self.values[row, IOP]) if ok else None,
+            ExteriorOrientation.from_array(self.values[row, EOP]) if ok else None,
             covariance if ok else np.zeros((16, 16)),
-            tuple(PARAMETER_NAMES[i] for i in self.settings.per_epoch if i < 10),
+            tuple(PARAMETER_NAMES[i] for i in self.settings.per_epoch if i < EOP.start),
             float(self.sigma0[row]),
             int(self.redundancy[row]) if ok else 0,
             targets,

@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.photogrammetry.epoch.gauss_markov import fails_global_test
 from thermocald.photogrammetry.epoch.geometry import weaknesses
+from thermocald.photogrammetry.parameters import PRINCIPAL_POINT, free_columns
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -26,7 +28,9 @@ _FEW = 0.6  # share of a series' targets below which an epoch's geometry is look
 
 def enough_targets(grid: ObservationGrid, s: SeriesSettings) -> Mask:
     """(E,): epochs with enough targets for their own parameters."""
-    count = 2 * grid.observed.sum(axis=1) - len(s.per_epoch)
+    # A bound mount costs an epoch hardly anything.
+    needed = len(s.per_epoch) if s.exterior == "per_epoch" else len(free_columns(s.free))
+    count = 2 * grid.observed.sum(axis=1) - needed
     enough: Mask = count >= s.bounds.minimum_redundancy
     return enough
 
@@ -40,11 +44,14 @@ def judge(
     use: Mask,
     carried: Mask,
     covariance: Array,
+    unit: Array,
+    redundancy: Array,
 ) -> tuple[list[str], list[str]]:
     """Status and reason of every epoch.
 
     values (E, 16); use (E, T): what took part; carried (E,): whose targets carry the parameters;
-    covariance (E, 16, 16).
+    covariance (E, 16, 16); unit (E,): variance of unit weight over the series' own; redundancy
+    (E,).
     """
     observed, bounds = grid.observed, s.bounds
     offered, used = observed.sum(axis=1), use.sum(axis=1)
@@ -70,15 +77,21 @@ def judge(
         "blurred image",
     )
     say(~carried, "weak_geometry", "these targets cannot carry the parameters")
+    say(
+        fails_global_test(unit, redundancy),
+        "global_test",
+        "the residuals are larger than the series' noise allows, and too few to tell which target "
+        "is wrong: show more targets",
+    )
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     c, pitch = values[:, 0], sensor.pixel_pitch
     say(
-        np.sqrt(variance[:, 0]) > bounds.relative_sd_c * c,
+        np.sqrt(np.maximum(variance[:, 0], 0.0)) > bounds.relative_sd_c * c,
         "weak_geometry",
         f"the principal distance is known to worse than {bounds.relative_sd_c:.1%}",
     )
     say(
-        np.sqrt(variance[:, 1:3].max(axis=1)) > bounds.sd_point_px * pitch,
+        np.sqrt(variance[:, PRINCIPAL_POINT].max(axis=1).clip(0.0)) > bounds.sd_point_px * pitch,
         "weak_geometry",
         f"the principal point is known to worse than {bounds.sd_point_px:.0f} px",
     )

@@ -1,7 +1,8 @@
 """The linearised series: normal equations of all epochs with their common unknowns reduced.
 
 The working half of `series`: arrays only. Own parameters are per epoch (p of them), common ones are
-the series' (q parameters, then the offsets in x and in y of the T targets).
+the series' (q parameters, then the offsets in x and in y of the T targets). A parameter may be
+both: an epoch's own part is then its deviation from the common one, a random effect with a prior.
 
 Source: the reduction of common unknowns as Helmert blocking, Wolf, H. (1978): The Helmert block
 method.
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.linalg import inverse_of_determined, root_of
+from thermocald.photogrammetry.parameters import EOP_COLUMNS
 from thermocald.photogrammetry.series.cofactors import among_all, cofactors
 from thermocald.photogrammetry.series.normals import (
     chunks,
@@ -35,7 +37,7 @@ if TYPE_CHECKING:
     Mask = NDArray[np.bool_]
     Columns = NDArray[np.int64]
 
-__all__ = ["SeriesSystem", "Step", "alike"]
+__all__ = ["SeriesSystem", "Step", "alike", "line_weights"]
 
 _CHUNK = 128  # epochs whose couplings with the offsets are held at a time
 
@@ -55,10 +57,11 @@ class SeriesSystem:
     """Normal equations at one linearisation.
 
     weights (E, T, 3): a priori; use (E, T): which points take part; own (p,), common (q,): columns;
-    N (E, 16, 16), empty where nothing is common; Q (E, p, p): cofactors of an epoch's own
-    parameters, the common ones held; good (E,): epochs that carry theirs; Q_common: (q, q), or with
-    offsets (q + 2T, q + 2T); prior (T, 3) px⁻² of the offsets, or None; alike: which epochs have
-    the same matrices, as of `same_rows`, or None where that is no longer known.
+    own_prior (p, p): weights with which own parameters are drawn to the common ones, 0 for those
+    without a prior; N (E, 16, 16), empty where nothing is common; Q (E, p, p): cofactors of an
+    epoch's own parameters, the common ones held; good (E,): epochs that carry theirs; Q_common:
+    (q, q), or with offsets (q + 2T, q + 2T); prior (T, 3) px⁻² of the offsets, or None; alike:
+    which epochs have the same matrices, as of `same_rows`, or None where that is no longer known.
     """
 
     at: Partials
@@ -72,6 +75,7 @@ class SeriesSystem:
     Q_common: Array
     prior: Array | None
     alike: tuple[Columns, Columns] | None
+    own_prior: Array
 
     @classmethod
     def build(
@@ -82,22 +86,25 @@ class SeriesSystem:
         own: Columns,
         common: Columns,
         prior: Array | None,
+        own_prior: Array | None = None,
     ) -> SeriesSystem:
         """Form, invert, and reduce the normal equations."""
+        drawn = np.zeros((len(own), len(own))) if own_prior is None else own_prior
         first, of = alike(weights, use)
         w = _used(weights[first], use[first])
         apart = len(common) == 0 and prior is None
         N = normal_matrices(w, at.A[..., own] if apart else at.A)
-        Q, good = cofactors(N if apart else N[:, own[:, None], own])
+        Q, good = cofactors((N if apart else N[:, own[:, None], own]) + drawn)
         good &= use[first].any(axis=1)
         if len(first) < len(of):
             Q, good = Q[of], good[of]
         if apart:
             none = np.empty((0, 0))
-            return cls(at, weights, use, own, common, N[:0], Q, good, none, None, (first, of))
+            same = (first, of)
+            return cls(at, weights, use, own, common, N[:0], Q, good, none, None, same, drawn)
         N = N[of]
         full = _common_matrix(at.A, N[good], _used(weights, use)[good], common, prior)
-        system = cls(at, weights, use, own, common, N, Q, good, full, prior, (first, of))
+        system = cls(at, weights, use, own, common, N, Q, good, full, prior, (first, of), drawn)
         for part, C in system.couplings():
             half = np.swapaxes(np.linalg.cholesky(Q[part]), 1, 2) @ C
             half = half.reshape(-1, half.shape[-1])
@@ -122,11 +129,16 @@ class SeriesSystem:
         ax, ay = self.at.A[:, 0, self.own].T, self.at.A[:, 1, self.own].T
         return np.concatenate([parameters, wx * ax + wxy * ay, wxy * ax + wy * ay], axis=2)
 
-    def step(self, residuals: Array, offsets: Array) -> Step:
-        """One Gauss-Newton step from residuals (E, T, 2) px and the offsets they stand at."""
+    def step(self, residuals: Array, offsets: Array, deviations: Array | None = None) -> Step:
+        """One Gauss-Newton step from residuals (E, T, 2) px and the offsets they stand at.
+
+        deviations (E, p): of own parameters from what their prior draws them to.
+        """
         b = right_hand_sides(self.weights, residuals, self.at.A, self.use)
         b[~self.good] = 0.0
         right = b[:, self.own]
+        if deviations is not None:
+            right = right - (deviations @ self.own_prior) * self.good[:, None]
         q = len(self.common)
         total = b[:, self.common].sum(axis=0)
         if self.prior is not None:
@@ -200,7 +212,7 @@ class SeriesSystem:
         if width:
             cofactors = cofactors.copy()
             mean, tilt = np.zeros((len(own), width)), np.zeros((len(own), width))
-            line = _line_weights(self.good)
+            line = line_weights(self.good)
             for part, C in self.couplings():
                 G = self.Q[part] @ C
                 mean += G.sum(axis=0)
@@ -212,12 +224,11 @@ class SeriesSystem:
             for part, C in self.couplings():
                 deviation = (self.Q[part] @ C - mean) @ root
                 cofactors[part] += deviation @ np.swapaxes(deviation, 1, 2)
-            own_level = mean @ root
-            common_root = root[: len(common)]
-            level[own[:, None], own] = own_level @ own_level.T
-            level[common[:, None], common] = common_root @ common_root.T
-            level[own[:, None], common] = -own_level @ common_root.T
-            level[common[:, None], own] = level[own[:, None], common].T
+            # A parameter that is both own and common takes both ways.
+            all_level = np.zeros((16, width))
+            all_level[common] = root[: len(common)]
+            all_level[own] -= mean @ root
+            level = all_level @ all_level.T
         relative = among_all(cofactors, own)
         relative[~self.good] = 0.0
         return relative, level, trend
@@ -234,7 +245,7 @@ class SeriesSystem:
             return out
         w = np.sqrt(_used(self.weights, self.use)[self.good].mean(axis=0)[:, :2])
         J = self.at.A[..., self.own] * w[..., None]
-        inverse, good = cofactors(np.einsum("tkp,tkq->pq", J, J)[None])
+        inverse, good = cofactors((np.einsum("tkp,tkq->pq", J, J) + self.own_prior)[None])
         if not good[0]:
             return out
         total = np.zeros((len(self.own), len(self.own)))
@@ -265,6 +276,36 @@ class SeriesSystem:
         drawn[least >= 0] = 1.0
         return among_all(drawn[:, None, None] * own, self.own)
 
+    def own_count(self) -> Array:
+        """How many parameters of its own every epoch uses up (E,); a prior leaves less than p."""
+        held = np.einsum("epq,qp->e", self.Q, self.own_prior)
+        count: Array = len(self.own) - held
+        return count
+
+    def from_priors(self) -> Array:
+        """The part (E, p, p) of the cofactors that the priors contribute, Q P Q."""
+        part: Array = self.Q @ self.own_prior @ self.Q
+        part[~self.good] = 0.0
+        return part
+
+    def gradient(self, residuals: Array) -> Array:
+        """Aᵀ P l (E, 16) of every epoch."""
+        return right_hand_sides(self.weights, residuals, self.at.A, self.use)
+
+    def typical_sensitivity(self) -> Array:
+        """By how much own parameters (p,) follow an error of the pose (6,), in a typical epoch."""
+        N = self.N[self.good].mean(axis=0)
+        Q, _ = cofactors((N[self.own[:, None], self.own] + self.own_prior)[None])
+        sensitivity: Array = Q[0] @ N[self.own[:, None], EOP_COLUMNS]
+        return sensitivity
+
+    def of_common(self, covariance: Array) -> Array:
+        """Covariance (E, p, p) of own parameters where the common ones (q, q) err in an epoch."""
+        G = self.Q @ self.N[:, self.own[:, None], self.common]
+        part: Array = G @ covariance @ np.swapaxes(G, 1, 2)
+        part[~self.good] = 0.0
+        return part
+
     def offset_cofactors(self) -> Array:
         """Cofactors (T, 2) px² of the offsets in x and y; NaN without offsets."""
         if self.prior is None:
@@ -292,7 +333,7 @@ def _used(weights: Array, use: Mask) -> Array:
     return used
 
 
-def _line_weights(good: Mask) -> Array:
+def line_weights(good: Mask) -> Array:
     """Weights (E,) that give the change of a straight line from the first epoch to the last."""
     t = np.flatnonzero(good).astype(np.float64)
     weights = np.zeros(len(good))

@@ -150,17 +150,25 @@ def slow_errors(residuals: Array, used: Mask) -> Array:
     return slow
 
 
-def excess_scatter(values: Array, variances: Array, kinks: bool) -> Array:
+def excess_scatter(values: Array, variances: Array, kinks: bool, drift: bool = True) -> Array:
     """Variance (k,) by which epochs scatter about a smooth course beyond their variances.
 
     values, variances (E, k) of consecutive epochs. The smooth course is a local cubic over 15
     epochs, which leaves a drift with a time constant of 30 epochs its thousandth; kinks: whether
-    single kinks of the course (a lamp switched) exceed the noise, so that a median must judge; 0
-    where the excess is not significant (5 %).
+    single kinks of the course (a lamp switched) exceed the noise, so that a median must judge;
+    drift: whether the camera may drift at all, else the course is constant; 0 where the excess is
+    not significant (5 %).
     """
     half = _SMOOTH // 2
     if len(values) < 2 * _SMOOTH:
         return np.zeros(values.shape[1])
+    if not drift:
+        normed = (values - values.mean(axis=0)) ** 2 / variances
+        ratio = normed.mean(axis=0) * len(values) / (len(values) - 1)
+        significant = ratio > 1 + 1.65 * np.sqrt(2 / len(values))
+        # The mean of the squares themselves: what few epochs with large variances add is theirs.
+        wide = (values - values.mean(axis=0)) ** 2 - variances
+        return np.where(significant, np.maximum(wide.mean(axis=0), 0.0), 0.0)
     x = np.arange(-half, half + 1) / half
     smooth = np.linalg.pinv(np.vander(x, 4))[-1]  # weights of the cubic's value in the middle
     inner = slice(half, len(values) - half)

@@ -34,9 +34,8 @@ if TYPE_CHECKING:
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
     from thermocald.photogrammetry.field.testfield import Observations, TestField
-    from thermocald.store.recording.head import Head
-
     from thermocald.photogrammetry.series.result import Exterior
+    from thermocald.store.recording.head import Head
 
     Array = NDArray[np.float64]
 

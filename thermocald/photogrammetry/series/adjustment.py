@@ -398,7 +398,7 @@ class _Series:
         if s.exterior == "series" and len(use) >= FEWEST_EPOCHS:
             movement = self.observed_movement(estimate)
         mount_trend = np.zeros((16, 16))
-        if not movement.still and sound.any():
+        if movement.covariance.any() and sound.any():
             if s.exterior == "series":
                 relative[block] += system.of_common(movement.covariance)
             G = system.typical_sensitivity()

@@ -11,8 +11,7 @@ in the cosine domain, direction by direction of the movement that the field show
 Does not hold: a change of the interior orientation as abrupt as a tremble is taken for the mount's,
 which makes the standard deviations larger than they need be, not smaller.
 
-Source: variance components as Patterson and Thompson (1971); the likelihood as Whittle (1953); its
-maximisation by multiplicative updates as Févotte and Idier (2011), Neural Computation 23.
+Source: variance components as Patterson and Thompson (1971), Biometrika 58, 545-554.
 """
 
 from __future__ import annotations
@@ -24,6 +23,8 @@ import numpy as np
 
 from thermocald.photogrammetry.linalg import mad_sd, stacked_inverses, symmetric_power
 from thermocald.photogrammetry.parameters import EOP, EOP_COLUMNS
+from thermocald.photogrammetry.series.jumps import Perspective, jumps
+from thermocald.photogrammetry.series.variance_components import components, mean_variance
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -41,17 +42,11 @@ _WINDOW = 15  # epochs of the local cubic that smooths the interior orientation
 _CUBIC = 0.6  # of the drift's shortest period: the window of the local cubic that follows it
 _SPIKE = 6.0  # robust standard deviations: a passer-by, not the mount
 _WEAK = 3.0  # times the usual variance of the pose: an epoch that says little of the movement
-_PHI = np.array([0.5, 0.7, 0.8, 0.88, 0.93, 0.96, 0.98])
-_LONG_PHI = np.append(_PHI, [0.99, 0.995, 0.998])  # where no drift can be mistaken for it
-_UPDATES = 150
-_WHITE_COST = 4.5  # log-likelihood that a component must gain to be believed
-_SLOW_COST = 4.0
-_NEGLIGIBLE = 0.02  # of the noise's variance
 _FASTEST_DRIFT_S = 240.0  # period beyond which a camera hardly follows its temperature
 _FEWEST_A_PERIOD = 12.0  # epochs
 _LEAST_WARMING_K = 0.5
 _PERIODS = 2.5  # a series must be so many periods long to show a drift
-_MOST_FREQUENCIES = 2000
+_HIDDEN = 0.3  # of the noise's variance: too little to estimate it epoch by epoch
 _FLAT = 1e-6  # of the noise: directions without movement
 
 
@@ -62,13 +57,14 @@ class Movement:
     white, slow (6, 6): covariance of the exterior orientation, rad and mm, of a movement without
     and with memory, about the mean over the series; memory: epochs after which the latter has lost
     63 % of its correlation; noise (6, 6): covariance of the pose of one epoch with its interior
-    orientation held.
+    orientation held; jumps: the epochs from which on it stood elsewhere.
     """
 
     white: Array
     slow: Array
     memory: float
     noise: Array
+    jumps: tuple[int, ...] = ()
 
     @property
     def covariance(self) -> Array:
@@ -77,14 +73,20 @@ class Movement:
 
     @property
     def still(self) -> bool:
-        """Whether no movement was found."""
-        return not (self.white.any() or self.slow.any())
+        """Whether no movement was found that one epoch's noise would not hide."""
+        whiten = self._whitening()
+        inside = np.linalg.eigvalsh(whiten @ self.covariance @ whiten.T)
+        return bool(inside[-1] < _HIDDEN)
+
+    def _whitening(self) -> Array:
+        """T with T · noise · Tᵀ = 1."""
+        root = symmetric_power(_scaled(self.noise), -0.5, 1e-12)
+        whitening: Array = root / np.sqrt(np.diag(self.noise))
+        return whitening
 
     def precision(self) -> Array:
         """Inverse covariance (6, 6); directions without movement are held to 1e-3 of the noise."""
-        root = symmetric_power(_scaled(self.noise), -0.5, 1e-12)
-        scale = 1.0 / np.sqrt(np.diag(self.noise))
-        T = root * scale
+        T = self._whitening()
         inside = T @ self.covariance @ T.T
         return T.T @ symmetric_power(inside, -1.0, _FLAT) @ T
 
@@ -110,7 +112,7 @@ class Movement:
         for w in weights.tolist():
             total += w * (w + 2.0 * carried)
             carried = phi * (carried + w)
-        about_mean = 1.0 - _mean_variance(phi, int(np.count_nonzero(weights)))
+        about_mean = 1.0 - mean_variance(phi, int(np.count_nonzero(weights)))
         return white + self.slow * (total / max(about_mean, 1e-6))
 
 
@@ -162,6 +164,8 @@ def estimate_movement(
         noise += inverse.T @ correlated @ inverse
     whiten = symmetric_power(noise, -0.5, 1e-3)
     course = _filled(course @ whiten, weak)
+    found = jumps(course, _perspective(N, b, own, root, whiten))
+    course = found.removed(course)
     period = min(period, len(course) / _PERIODS)
     if period:
         smooth = _smoothed(course, int(_CUBIC * period))
@@ -171,13 +175,28 @@ def estimate_movement(
     rough = course - smooth
     limit = _SPIKE * mad_sd(rough - np.median(rough, axis=0), axis=0)
     rough = np.clip(rough, -limit, limit)
-    _, directions = np.linalg.eigh(rough.T @ rough)
-    white, slow, memory = _components((smooth + rough) @ directions, period)
-    back = np.linalg.inv(root) @ np.linalg.inv(whiten) @ directions
+    directions = _directions(rough, whiten @ _visible(N, own, root) @ whiten)
+    parts = components((smooth + rough) @ directions, period)
+    back = np.linalg.inv(root) @ np.linalg.inv(whiten)
+    axes = back @ directions
+    slow = (axes * parts.slow) @ axes.T + back @ found.covariance(len(course)) @ back.T
+    memory = max(parts.memory, len(course) / 2.0) if found.rows else parts.memory
     return Movement(
-        (back * white) @ back.T, (back * slow) @ back.T, memory,
-        np.linalg.inv(root) @ noise @ np.linalg.inv(root).T,
+        (axes * parts.white) @ axes.T, slow, memory, back @ back.T,
+        tuple(int(rows[k]) for k in found.rows),
     )  # fmt: skip
+
+
+def _perspective(N: Array, b: Array, own: Columns, root: Array, whiten: Array) -> Perspective:
+    """What the perspective alone says of the pose, the interior orientation eliminated."""
+    M, g = N[:, EOP, EOP], b[:, EOP]
+    if len(own):
+        Q, _ = stacked_inverses(N[:, own[:, None], own])
+        QC = Q @ N[:, own[:, None], EOP_COLUMNS]
+        M = M - np.swapaxes(N[:, own[:, None], EOP_COLUMNS], 1, 2) @ QC
+        g = g - np.einsum("epi,ep->ei", QC, b[:, own])
+    back = np.linalg.inv(root) @ np.linalg.inv(whiten)
+    return Perspective(np.swapaxes(back, 0, 1) @ M @ back, g @ back)
 
 
 def _courses(N: Array, b: Array, own: Columns) -> tuple[Array | None, Array, Mask]:
@@ -209,6 +228,37 @@ def _courses(N: Array, b: Array, own: Columns) -> tuple[Array | None, Array, Mas
     return pose @ root.T, root, weak
 
 
+def _visible(N: Array, own: Columns, root: Array) -> Array:
+    """How much of a movement (6, 6) an epoch sees by its perspective, 0 to 1, in units of `root`.
+
+    The rest looks like a change of the interior orientation.
+    """
+    usual = N.mean(axis=0)
+    seen = usual[EOP, EOP].copy()
+    if len(own):
+        coupling = usual[own[:, None], EOP_COLUMNS]
+        Q, _ = stacked_inverses(usual[own[:, None], own][None])
+        seen -= coupling.T @ Q[0] @ coupling
+    inverse = np.linalg.inv(root)
+    visible: Array = inverse.T @ seen @ inverse
+    return visible
+
+
+def _directions(rough: Array, visible: Array) -> Array:
+    """Orthonormal directions (6, 6) of the movements, from their rough part (E, 6).
+
+    Those that an epoch sees and those that it does not are kept apart: a chance correlation of the
+    two would let the one predict the other.
+    """
+    share, axes = np.linalg.eigh(visible)
+    found = []
+    for part in (axes[:, share < 0.5], axes[:, share >= 0.5]):
+        if part.shape[1]:
+            inside = rough @ part
+            found.append(part @ np.linalg.eigh(inside.T @ inside)[1])
+    return np.concatenate(found, axis=1)
+
+
 def _filled(course: Array, missing: Mask) -> Array:
     """The course with missing epochs interpolated between their neighbours."""
     if not missing.any() or missing.all():
@@ -233,139 +283,6 @@ def _smoothed(course: Array, window: int = _WINDOW) -> Array:
             hat[half + 1 :] @ course[-window:],
         ]
     )
-
-
-def _components(course: Array, period: float) -> tuple[Array, Array, float]:
-    """Variances (k,) of the white part and of that with memory, and the memory in epochs.
-
-    course (E, k) in units of its noise; period: the shortest of the drift in epochs, 0 for none. A
-    component that the likelihood does not ask for is 0.
-    """
-    power = _cosine_power(_level_at_its_ends(course) if period else course)
-    n = len(course)
-    omega = np.pi * np.arange(1, n) / n
-    if len(power) > _MOST_FREQUENCIES:  # the high ones are pooled, they look alike
-        power, omega, count = _pooled(power, omega)
-    else:
-        count = np.ones(len(power))
-    one = np.ones_like(omega)
-    drift = _drift(omega, period)
-    still = _fit(power, count, np.stack([drift]))
-    trembling = _fit(power, count, np.stack([drift, one]))
-    swaying = []
-    memories = _PHI if period else _LONG_PHI
-    for phi in memories:
-        sway = (1 - phi**2) / (1 - 2 * phi * np.cos(omega) + phi**2)
-        swaying.append(_fit(power, count, np.stack([drift, one, sway])))
-    evidence = np.empty((len(memories), 3, power.shape[1]))  # still, white, with memory
-    evidence[:, 0] = still.likelihood
-    evidence[:, 1] = trembling.likelihood - _WHITE_COST
-    evidence[:, 2] = [f.likelihood - _WHITE_COST - _SLOW_COST for f in swaying]
-    evidence -= evidence.max(axis=(0, 1))
-    plausible = np.exp(evidence)
-    each = plausible.sum(axis=1)  # of a memory, by direction; the mount has one memory for all
-    together = np.log(each).sum(axis=1)
-    of_memory = np.exp(together - together.max())
-    of_memory /= of_memory.sum()
-    plausible *= of_memory[:, None, None] / each[:, None]
-    white = plausible[:, 1].sum(axis=0) * trembling.sizes[1]
-    white += sum(p * f.sizes[1] for p, f in zip(plausible[:, 2], swaying, strict=True))
-    by_memory = np.array([p * f.sizes[2] for p, f in zip(plausible[:, 2], swaying, strict=True)])
-    by_memory *= np.array([1.0 - _mean_variance(phi, n) for phi in memories])[:, None]
-    if not period:  # without a drift of the camera, whatever wanders is the mount
-        missing = (count @ power) / n - 1.0 - white - by_memory.sum(axis=0)
-        by_memory[-1] = np.maximum(by_memory[-1] + missing, 0.0)
-    negligible = white + by_memory.sum(axis=0) < _NEGLIGIBLE
-    white[negligible], by_memory[:, negligible] = 0.0, 0.0
-    slow = by_memory.sum(axis=0)
-    total = float(slow.sum())
-    memory = float(by_memory.sum(axis=1) @ (-1.0 / np.log(memories))) / total if total else 0.0
-    return white, slow, memory
-
-
-def _drift(omega: Array, period: float) -> Array:
-    """Spectrum of a camera that warms up: an integrated random walk without fast movements.
-
-    period: the shortest in epochs, 0 for a random walk without a bound.
-    """
-    x = 2.0 - 2.0 * np.cos(omega)
-    if not period:
-        return (x[0] / x) ** 2
-    fast = 2.0 - 2.0 * np.cos(2.0 * np.pi / period)
-    shape: Array = 1.0 / (x * (1.0 + (x / fast) ** 2)) ** 2
-    shape /= shape.max()
-    return shape
-
-
-def _level_at_its_ends(course: Array) -> Array:
-    """The course (E, k) less the parabola with its slopes at both ends.
-
-    Its mirror image then continues it smoothly, and a drift stays at the low frequencies.
-    """
-    n = len(course)
-    m = max(min(_WINDOW, n // 2), 4)
-    t = np.arange(m) - 0.5 * (m - 1)
-    V = np.vander(t, 3)
-    slopes = np.linalg.pinv(V)
-    first = 2 * (slopes[0] @ course[:m]) * t[0] + slopes[1] @ course[:m]
-    last = 2 * (slopes[0] @ course[-m:]) * t[-1] + slopes[1] @ course[-m:]
-    u = np.arange(n)[:, None]
-    level: Array = course - first * u - (last - first) * u**2 / (2 * (n - 1))
-    return level
-
-
-def _cosine_power(course: Array) -> Array:
-    """Squared coefficients (E - 1, k) of the orthonormal cosine transform, without the mean."""
-    n = len(course)
-    even = np.concatenate([course, course[::-1]])
-    spectrum = np.fft.rfft(even, axis=0)[1:n]
-    turn = np.exp(-0.5j * np.pi * np.arange(1, n) / n)[:, None]
-    power: Array = (spectrum * turn).real ** 2 / (2 * n)
-    return power
-
-
-def _pooled(power: Array, omega: Array) -> tuple[Array, Array, Array]:
-    """The low frequencies one by one, the others in equal groups, and how many each stands for."""
-    half = _MOST_FREQUENCIES // 2
-    groups = np.array_split(np.arange(half, len(power)), half)
-    return (
-        np.concatenate([power[:half], np.stack([power[g].mean(axis=0) for g in groups])]),
-        np.concatenate([omega[:half], [omega[g].mean() for g in groups]]),
-        np.concatenate([np.ones(half), [len(g) for g in groups]]),
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """sizes (components, k) and the likelihood (k,)."""
-
-    sizes: Array
-    likelihood: Array
-
-
-def _fit(power: Array, count: Array, shapes: Array) -> _Fit:
-    """Most likely sizes of spectra (components, m) beside white noise of variance 1."""
-    weight = count[:, None]
-    # Spectra are steep: start where each alone would give the power of its own frequencies.
-    share = shapes * weight[:, 0] / np.maximum((shapes * weight[:, 0]).sum(axis=1), 1e-300)[:, None]
-    peak = (shapes * share).sum(axis=1)[:, None]
-    sizes = (share @ power) / np.maximum(peak, 1e-300) / len(shapes)
-    for _ in range(_UPDATES):
-        model = 1.0 + shapes.T @ sizes
-        up = shapes @ (weight * power / model**2)
-        down = shapes @ (weight / model)
-        sizes = sizes * np.sqrt(up / np.maximum(down, 1e-300))
-    model = 1.0 + shapes.T @ sizes
-    likelihood = -0.5 * (weight * (np.log(model) + power / model)).sum(axis=0)
-    return _Fit(sizes, likelihood)
-
-
-def _mean_variance(phi: float, n: int) -> float:
-    """Variance of the mean of n values with unit variance and correlation φ^|i-j|."""
-    if n <= 1 or phi >= 1:
-        return 1.0
-    sum_ = (1 + phi) / (1 - phi) - 2 * phi * (1 - phi**n) / (n * (1 - phi) ** 2)
-    return float(min(sum_ / n, 1.0))
 
 
 def _rms_px(A: Array, covariance: Array) -> float:

@@ -1,0 +1,73 @@
+"""Series of a camera on a mount that trembles, as arrays and without files: the truth is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import corner_camera as scene
+import numpy as np
+
+from thermocald.photogrammetry.camera.camera_model import project
+from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.photogrammetry.parameters import EOP, PRINCIPAL
+from thermocald.photogrammetry.series.adjustment import SeriesSettings, adjust_series
+from thermocald.photogrammetry.series.normals import ObservationGrid, linearise
+
+
+@dataclass(frozen=True)
+class Tremble:
+    """px of the image, and the correlation of neighbouring epochs."""
+
+    px: float
+    memory: float = 0.0
+
+
+def small_field(per_side: int = 4) -> TestField:
+    """Targets on three mutually perpendicular planes."""
+    a, b = (
+        g.ravel()
+        for g in np.meshgrid(np.linspace(60, 600, per_side), np.linspace(60, 600, per_side))
+    )
+    z = np.zeros_like(a)
+    points = np.vstack([np.c_[a, b, z], np.c_[a, z, b], np.c_[z, a, b]])
+    return TestField.build([str(i) for i in range(len(points))], points)
+
+
+def simulate(rng, field: TestField, epochs: int, tremble: Tremble):
+    """Observations and the truth (E, 16) of a camera that warms up on a mount that moves."""
+    truth = np.tile(
+        np.concatenate([scene.INTERIOR.as_array(), scene.EXTERIOR.as_array()]), (epochs, 1)
+    )
+    at = linearise(scene.SENSOR, field, truth[0, :10], truth[0, 10:])
+    per_px = 1.0 / np.sqrt((at.A[..., EOP] ** 2).sum(axis=1).mean(axis=0))
+    warm = 8.0 * (1 - np.exp(-np.arange(epochs) / 25))
+    truth[:, PRINCIPAL] += warm[:, None] * np.array([1e-4, 5e-4, -4e-4])
+    move = rng.normal(size=(epochs, 3))
+    for e in range(1, epochs):
+        move[e] = tremble.memory * move[e - 1] + np.sqrt(1 - tremble.memory**2) * move[e]
+    truth[:, 10:13] += tremble.px * move * per_px[:3]
+    points = np.array(
+        [project(scene.SENSOR, t[:10], t[10:], field.points) for t in truth]
+    ) + rng.normal(0, scene.SIGMA_PX, (epochs, len(field), 2))
+    weights = np.zeros((epochs, len(field), 3))
+    weights[..., :2] = scene.SIGMA_PX**-2
+    weights[rng.random(weights.shape[:2]) < 0.03] = 0.0
+    points[weights[..., 0] == 0] = np.nan
+    return ObservationGrid(points, weights), truth
+
+
+def standardised(seed: int, count: int, epochs: int, tremble: Tremble, exterior: str = "auto"):
+    """Errors of c, x0, y0 about the series' mean over their sds (count·E, 3), and the sds in px."""
+    field = small_field()
+    z, sds = [], []
+    for k in range(count):
+        rng = np.random.default_rng([seed, k])
+        grid, truth = simulate(rng, field, epochs, tremble)
+        r = adjust_series(
+            scene.SENSOR, field, grid, scene.INTERIOR, scene.EXTERIOR,
+            SeriesSettings(exterior=exterior),
+        )  # fmt: skip
+        error = (r.values - truth)[r.ok, PRINCIPAL]
+        z.append((error - error.mean(axis=0)) / r.sd[r.ok, PRINCIPAL])
+        sds.append(r.sd[r.ok, PRINCIPAL])
+    return np.concatenate(z), np.concatenate(sds) / scene.SENSOR.pixel_pitch

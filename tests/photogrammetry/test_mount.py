@@ -1,0 +1,123 @@
+"""The mount as a random effect: the standard deviations that a camera on a tripod deserves."""
+
+from __future__ import annotations
+
+import corner_camera as scene
+import numpy as np
+import pytest
+from mount_cases import Tremble, simulate, small_field, standardised
+
+from thermocald.photogrammetry.camera.camera_model import project
+from thermocald.photogrammetry.parameters import PRINCIPAL, PRINCIPAL_POINT
+from thermocald.photogrammetry.series.adjustment import SeriesSettings, adjust_series
+from thermocald.photogrammetry.series.mount import Movement, drift_period
+
+STILL, TREMBLES, SWAYS = Tremble(0.0), Tremble(0.1), Tremble(0.1, 0.8)
+
+
+def rms(values: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.mean(values**2, axis=0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("memory", [0.0, 0.5, 0.8])
+@pytest.mark.parametrize("px", [0.02, 0.1])
+def test_errors_are_as_large_as_stated_whatever_the_mount_does(px, memory):
+    """200 series of 100 epochs; their errors about the series' mean, c, x0 and y0."""
+    z, _ = standardised(40, 200, 100, Tremble(px, memory))
+    assert rms(z) == pytest.approx(np.ones(3), abs=0.1)
+
+
+@pytest.mark.slow
+def test_a_mount_that_stands_still_costs_nothing():
+    """200 series without a tremble: the sds of `series`, within 5 %."""
+    z, sd = standardised(41, 200, 100, STILL)
+    _, still = standardised(41, 200, 100, STILL, "series")
+    assert rms(z) == pytest.approx(np.ones(3), abs=0.1)
+    assert rms(sd) == pytest.approx(rms(still), rel=0.05)
+
+
+@pytest.mark.parametrize("tremble", [STILL, TREMBLES, SWAYS])
+def test_errors_are_as_large_as_stated(tremble):
+    """The same with six series: they know the ratio to some 8 %, with memory to 20 %."""
+    z, sd = standardised(42, 6, 100, tremble)
+    assert rms(z) == pytest.approx(np.ones(3), abs=0.4 if tremble.memory else 0.2)
+    if tremble is STILL:
+        assert rms(sd)[PRINCIPAL_POINT].max() < 0.012
+    else:
+        assert rms(sd)[PRINCIPAL_POINT] == pytest.approx([0.095, 0.09], rel=0.25)
+
+
+def test_series_states_what_the_movement_does_too():
+    """One orientation for all: the estimate stays, its sds hold the movement."""
+    z, sd = standardised(43, 5, 100, TREMBLES, "series")
+    assert rms(z) == pytest.approx(np.ones(3), abs=0.2)
+    assert rms(sd)[1] == pytest.approx(0.1, rel=0.25)
+
+
+def adjusted(seed: int, epochs: int, tremble: Tremble, **settings):
+    field = small_field()
+    grid, truth = simulate(np.random.default_rng(seed), field, epochs, tremble)
+    r = adjust_series(
+        scene.SENSOR, field, grid, scene.INTERIOR, scene.EXTERIOR,
+        SeriesSettings(exterior="auto", **settings),
+    )  # fmt: skip
+    return r, truth
+
+
+def test_auto_says_what_it_chose_and_why():
+    chosen = {}
+    for name, epochs, tremble in (
+        ("short", 12, STILL), ("moves", 60, TREMBLES),
+    ):  # fmt: skip
+        r, _ = adjusted(44, epochs, tremble)
+        chosen[name] = r.exterior
+        assert r.choice
+        assert r.ok.all()
+    assert chosen == {"short": "per_epoch", "moves": "mount"}
+    kinds = [adjusted(seed, 80, STILL)[0].exterior for seed in range(4)]
+    assert kinds.count("series") >= 1
+
+
+def test_a_knock_makes_the_mount_loose_not_the_camera_wrong():
+    """The tripod is moved by 2 px in mid-series: sds as of orientations per epoch, and true."""
+    field = small_field()
+    rng = np.random.default_rng(45)
+    grid, truth = simulate(rng, field, 80, STILL)
+    moved = truth.copy()
+    moved[40:, 10] += 0.0007
+    shift = [
+        project(scene.SENSOR, m[:10], m[10:], field.points)
+        - project(scene.SENSOR, t[:10], t[10:], field.points)
+        for m, t in zip(moved, truth, strict=True)
+    ]
+    grid.points[...] += np.array(shift)
+    r = adjust_series(
+        scene.SENSOR, field, grid, scene.INTERIOR, scene.EXTERIOR, SeriesSettings(exterior="auto")
+    )
+    assert r.exterior == "mount"
+    assert r.movement.jumps == (40,)
+    error = (r.values - truth)[:, PRINCIPAL]
+    error -= error.mean(axis=0)
+    assert rms(error / r.sd[:, PRINCIPAL]).max() < 1.5
+
+
+def test_a_straight_line_through_a_swaying_mount_is_as_uncertain_as_stated():
+    """Movement.tilt against the scatter of lines through simulated movements."""
+    n, phi = 60, np.exp(-1 / 12)
+    rng = np.random.default_rng(46)
+    m = rng.normal(size=(20_000, n))
+    for e in range(1, n):
+        m[:, e] = phi * m[:, e - 1] + np.sqrt(1 - phi**2) * m[:, e]
+    about = m - m.mean(axis=1, keepdims=True)
+    weights = np.linspace(-1, 1, n)
+    movement = Movement(np.zeros((1, 1)), np.full((1, 1), about.var()), 12.0, np.eye(1))
+    assert movement.tilt(weights)[0, 0] == pytest.approx((about @ weights).var(), rel=0.05)
+
+
+def test_a_camera_cannot_drift_within_a_minute_unless_it_warms_up():
+    minute, hour = np.arange(0, 60, 0.5), np.arange(0, 3600, 10.0)
+    unknown = np.full(len(minute), np.nan)
+    assert drift_period(minute, unknown) == 0.0
+    assert drift_period(minute, np.linspace(20, 23, len(minute))) > 0
+    assert drift_period(hour, np.full(len(hour), 20.0)) == 24.0

@@ -95,7 +95,7 @@ def test_check_says_what_a_recording_is(recording):
         (("replay",), 2, "Missing argument"),
         (("export", "{recording}", "--format", "xlsx"), 2, "csv and json"),
         (("replay", "{recording}", "--free", "c,zoom"), 2, "'zoom' is no IOP"),
-        (("replay", "{recording}", "--exterior", "both"), 2, "per_epoch or series"),
+        (("replay", "{recording}", "--exterior", "both"), 2, "per_epoch, series, mount, auto"),
         (("export", "{recording}", "-o", "/no/such/folder/x.csv"), 2, "does not exist"),
         (("calibrate", "{image}", "--testfield", "{field}"), 1, "is no image"),
         (("calibrate", "{empty}", "--testfield", "{field}"), 1, "0 bytes"),

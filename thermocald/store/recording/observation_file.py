@@ -1,4 +1,4 @@
-"""`observations.csv` (CONVENTIONS §3): image points by epoch, whole or as a stream.
+"""`observations.csv` (CONVENTIONS §3) or `.parquet`: image points by epoch, whole or as a stream.
 
 Besides the columns of the format, `sxy` (px², the covariance of x and y) is read where it stands,
 and further numeric columns become the observations' quality; other columns are ignored.
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.store.recording.parquet_table import ParquetTable
 from thermocald.store.recording.table import Chunk, Table
 
 if TYPE_CHECKING:
@@ -81,7 +82,8 @@ class ObservationFile:
     """The file of a recording; numbers: the (E,) epoch numbers of epochs.csv, increasing."""
 
     def __init__(self, path: Path, field: TestField, numbers: NDArray[np.int64]) -> None:
-        self._table = Table(path, _REQUIRED)
+        columnar = path.suffix == ".parquet"
+        self._table = ParquetTable(path, _REQUIRED) if columnar else Table(path, _REQUIRED)
         self._field = field
         self._numbers = numbers
         self._quality = self._numeric_extras()
@@ -174,17 +176,11 @@ class ObservationFile:
         return _Block(chunk.first, epochs, self._targets(chunk), values)
 
     def _targets(self, chunk: Chunk) -> NDArray[np.int64]:
-        index = self._field.index
-        names = chunk.text("target")
-        try:
-            return np.fromiter(map(index.__getitem__, names), dtype=np.int64, count=len(names))
-        except KeyError:
-            rows = [index.get(name.strip(), -1) for name in names]
-            targets = np.array(rows, dtype=np.int64)
+        targets = chunk.places("target", self._field.index)
         chunk.check(
             "target",
             targets < 0,
-            lambda row: f"target {names[row]!r} does not stand in testfield.csv",
+            lambda row: f"target {chunk.text('target')[row]!r} does not stand in testfield.csv",
         )
         return targets
 
@@ -206,12 +202,5 @@ class ObservationFile:
         if not extras:
             return []
         first = next(self._table.chunks(1), None)
-        return [] if first is None else [name for name in extras if _is_number(first.text(name)[0])]
+        return [] if first is None else [name for name in extras if first.is_number(name)]
 
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text or "nan")
-    except ValueError:
-        return False
-    return True

@@ -124,7 +124,7 @@ class Recording:
     def iter_epochs(self) -> Iterator[Epoch]:
         """One epoch after the other; a recording of months in constant memory.
 
-        Then the rows of observations.csv must stand in the order of the epochs.
+        Then the rows of the observations must be in the order of the epochs.
         """
         size = self._observation_path.stat().st_size if self.has_observations else 0
         if "epochs" in self.__dict__ or size < _STREAMED_ABOVE_BYTES:
@@ -135,7 +135,8 @@ class Recording:
 
     @property
     def _observation_path(self) -> Path:
-        return self.path / "observations.csv"
+        parquet = self.path / "observations.parquet"
+        return parquet if parquet.exists() else self.path / "observations.csv"
 
     @property
     def _observation_file(self) -> ObservationFile:
@@ -187,7 +188,10 @@ def open_recording(path: Path) -> Recording:
     head = read_head(path)
     field = read_testfield(path / "testfield.csv")
     require_millimetres(field, str(path / "testfield.csv"), head.camera.principal_distance)
-    has_observations = (path / "observations.csv").exists()
+    kept = [n for n in ("observations.csv", "observations.parquet") if (path / n).exists()]
+    if len(kept) > 1:
+        raise RecordingError(f"{path}: has {' and '.join(kept)}; keep one of them")
+    has_observations = bool(kept)
     columns = _read_epochs(path, list(head.channels))
     if not has_observations and not any(columns.frames):
         raise RecordingError(

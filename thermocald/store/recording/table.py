@@ -9,14 +9,14 @@ from __future__ import annotations
 import csv
 import io
 from itertools import islice
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from thermocald.errors import RecordingError, ThermocaldError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
     from typing import NoReturn, TextIO
 
@@ -116,8 +116,16 @@ class Table:
             return reader.line_num
 
 
+class _Rows(Protocol):
+    """What a chunk comes from."""
+
+    def fail(self, row: int, column: str | None, message: str) -> NoReturn: ...
+
+
 class Chunk:
     """Some consecutive rows of a table as columns. first: the first row's number in the table."""
+
+    table: _Rows
 
     def __init__(self, table: Table, first: int, rows: list[list[str]]) -> None:
         self.table = table
@@ -169,6 +177,22 @@ class Chunk:
             row = int(np.argmax(wrong))
             self.fail(row, name, f"{self._columns[name][row]!r} is not an integer from 0 on")
         return values.astype(np.int64)
+
+    def places(self, name: str, index: Mapping[str, int]) -> NDArray[np.int64]:
+        """Where `index` has each word of a column, (n,), -1 where it has not."""
+        words = self.text(name)
+        try:
+            return np.fromiter(map(index.__getitem__, words), dtype=np.int64, count=self._size)
+        except KeyError:
+            return np.array([index.get(word.strip(), -1) for word in words], dtype=np.int64)
+
+    def is_number(self, name: str) -> bool:
+        """Whether a column begins with a number, or with nothing."""
+        try:
+            float(self.text(name)[0] or "nan")
+        except ValueError:
+            return False
+        return True
 
     def check(
         self, name: str, wrong: NDArray[np.bool_], message: Callable[[int], str] | str

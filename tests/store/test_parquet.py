@@ -1,0 +1,93 @@
+"""Observations as Parquet: the same numbers as CSV, the same checks, and back again."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from thermocald.cli import application
+from thermocald.errors import RecordingError
+from thermocald.store.recording.reader import open_recording, read_recording
+
+pyarrow = pytest.importorskip("pyarrow", reason="pip install thermocald[parquet]")
+parquet = pytest.importorskip("pyarrow.parquet")
+
+
+def convert(path, to):
+    result = CliRunner().invoke(application(), ["convert", str(path), "--to", to])
+    assert result.exit_code == 0, result.exception
+
+
+def same(a, b):
+    for one, other in zip(a.epochs, b.epochs, strict=True):
+        x, y = one.observations, other.observations
+        assert np.array_equal(x.targets, y.targets)
+        assert np.array_equal(x.points, y.points)
+        assert np.array_equal(x.sigmas, y.sigmas)
+        assert set(x.quality) == set(y.quality)
+        for name in x.quality:
+            assert np.array_equal(x.quality[name], y.quality[name], equal_nan=True)
+
+
+def test_there_and_back_is_the_same_file(recording_path):
+    csv = recording_path / "observations.csv"
+    before, text = read_recording(recording_path), csv.read_bytes()
+    convert(recording_path, "parquet")
+    assert not csv.exists()
+    same(before, read_recording(recording_path))
+    streamed = list(open_recording(recording_path)._observation_file.stream())
+    assert [len(s) for s in streamed] == [len(e.observations) for e in before.epochs]
+    convert(recording_path, "csv")
+    assert csv.read_bytes() == text
+
+
+def test_digits_beyond_ours_are_kept(recording_path):
+    csv = recording_path / "observations.csv"
+    lines = csv.read_text().splitlines()
+    cells = lines[1].split(",")
+    cells[2] = "1234.567890123456"
+    lines[0] += ",blur,comment"
+    lines[1] = ",".join(cells)
+    rows = [f"{line},{'' if i % 2 else 0.1 + i},word {i}" for i, line in enumerate(lines[1:])]
+    csv.write_text("\n".join([lines[0], *rows]) + "\n")
+    before = read_recording(recording_path)
+    convert(recording_path, "parquet")
+    same(before, read_recording(recording_path))
+    convert(recording_path, "csv")
+    same(before, read_recording(recording_path))
+    assert "word 3" in csv.read_text()
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "words"),
+    [
+        ("x", float("inf"), "row 3, column x: inf is not a finite number"),
+        ("sx", -1.0, "row 3, column sx: a standard deviation must be above 0"),
+        ("target", "nobody", "row 3, column target: target 'nobody'"),
+        ("epoch", 77, "row 3, column epoch: epoch 77"),
+        ("y", None, "row 3, column y: is empty"),
+    ],
+)
+def test_what_is_wrong_is_said_with_row_and_column(recording_path, column, value, words):
+    convert(recording_path, "parquet")
+    path = recording_path / "observations.parquet"
+    table = parquet.read_table(path).to_pydict()
+    table[column][2] = value
+    parquet.write_table(pyarrow.table(table), path)
+    with pytest.raises(RecordingError, match=words):
+        read_recording(recording_path)
+
+
+def test_damage_and_doubt_are_one_line(recording_path):
+    csv = (recording_path / "observations.csv").read_bytes()
+    convert(recording_path, "parquet")
+    path = recording_path / "observations.parquet"
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    with pytest.raises(RecordingError, match="not readable as Parquet"):
+        read_recording(recording_path)
+    path.write_bytes(data)
+    (recording_path / "observations.csv").write_bytes(csv)
+    with pytest.raises(RecordingError, match="keep one of them"):
+        open_recording(recording_path)

@@ -153,6 +153,8 @@ def test_photographs_of_apriltags(shared):
         "GeneralField3": {7, 8}, "SpeakerCenter_143in": {3, 4}, "SpeakerCenter_19in": {3, 4},
         "StageLeft_51in": {15},
     }  # fmt: skip
+    if int(cv2.__version__.split(".")[0]) < 5:
+        expected["GeneralField3"] = {7}  # OpenCV 4 does not find the small one, number 8
     for name, numbers in expected.items():
         path = shared / "data" / "frc" / f"{name}.jpg"
         observed = measure_markers(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), field)

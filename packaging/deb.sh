@@ -1,0 +1,64 @@
+#!/bin/sh
+# Build the Debian package: packaging/deb.sh [RELEASE [ARCHITECTURE [FOLDER]]]
+#
+# RELEASE is bookworm or trixie, ARCHITECTURE amd64 or arm64; without them, this machine's. Nothing
+# is compiled, so any Debian with debhelper builds for all four. What the release's own modules do
+# not serve comes as wheels with the hashes of packaging/lock/RELEASE.txt.
+set -eu
+cd "$(dirname "$0")/.."
+top=$PWD
+here=$(. /etc/os-release && echo "${VERSION_CODENAME:-trixie}")
+release=${1:-$here}
+architecture=${2:-$(dpkg --print-architecture)}
+out=$(mkdir -p "${3:-dist}" && cd "${3:-dist}" && pwd)
+python=$top/.venv/bin/python
+lock=$top/packaging/lock/$release
+
+case $release in
+    bookworm) number=12 ;;
+    trixie) number=13 ;;
+    *) echo "no lock for $release; there is one for bookworm and trixie" >&2; exit 2 ;;
+esac
+case $architecture in
+    amd64) machine=x86_64 ;;
+    arm64) machine=aarch64 ;;
+    *) echo "the package is made for amd64 and arm64, not for $architecture" >&2; exit 2 ;;
+esac
+for tool in dh dpkg-buildpackage; do
+    command -v $tool >/dev/null || { echo "$tool is missing: sudo apt-get install debhelper dpkg-dev" >&2; exit 2; }
+done
+
+PYTHON=$(sed -n 's/^# python //p' "$lock.in")
+PLATFORMS="manylinux_2_28_$machine manylinux_2_27_$machine manylinux_2_17_$machine manylinux2014_$machine any"
+RELEASE=$release BUILD_PYTHON=$python
+SOURCE_DATE_EPOCH=${SOURCE_DATE_EPOCH:-$(git log -1 --format=%ct)}
+export PYTHON PLATFORMS RELEASE BUILD_PYTHON SOURCE_DATE_EPOCH
+version=$("$python" -c 'import thermocald; print(thermocald.__version__)')+deb$number${DEB_REVISION:-}
+
+work=$top/build/deb/$release-$architecture
+tree=$work/thermocald
+rm -rf "$work"
+mkdir -p "$tree/wheels"
+"$python" -m pip wheel --quiet --no-deps --wheel-dir "$tree/wheels" .
+platforms=$(printf -- '--platform %s ' $PLATFORMS)
+# shellcheck disable=SC2086
+"$python" -m pip download --quiet --no-deps --require-hashes --only-binary=:all: $platforms \
+    --implementation cp --python-version "$PYTHON" --dest "$tree/wheels" --requirement "$lock.txt"
+"$python" packaging/manual.py "$tree/manual"
+cp -r packaging/debian systemd docs config.yaml README.md "$tree"
+cat > "$tree/debian/changelog" <<END
+thermocald ($version) $release; urgency=medium
+
+  * What changed: docs/CHANGELOG.md beside this file
+
+ -- the thermocald founders <thermocald@localhost>  $(date -R -u -d "@$SOURCE_DATE_EPOCH")
+END
+cp CHANGELOG.md "$tree/docs"
+cd "$tree"
+if ! DEB_BUILD_OPTIONS=nocheck dpkg-buildpackage --host-arch="$architecture" --no-check-builddeps --build=binary \
+    --no-sign > "$work/build.log" 2>&1; then
+    tail -n 40 "$work/build.log" >&2
+    exit 1
+fi
+cp "$work"/thermocald_*.deb "$out"
+ls -l "$out"/thermocald_"$version"_"$architecture".deb

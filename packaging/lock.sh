@@ -1,0 +1,38 @@
+#!/bin/sh
+# Resolve what is installed: the locks of CI and of the Debian packages (hashes), and the lowest versions.
+#   packaging/lock.sh [PACKAGE…]     # no package: all to the newest
+set -eu
+cd "$(dirname "$0")/.."
+uv=${UV:-.venv/bin/uv}
+locks=packaging/lock
+upgrade=--upgrade
+[ $# = 0 ] || upgrade=$(printf -- '--upgrade-package %s ' "$@")
+runtime="--extra dashboard --extra report --extra android --extra v4l2 --extra mqtt --extra gpio --extra server"
+
+resolve() { # OUT ARGUMENTS…: hashes of every wheel, and no name of an index
+    out=$locks/$1; shift
+    echo "$out"
+    # shellcheck disable=SC2086
+    "$uv" pip compile --quiet --no-header --no-emit-index-url --no-emit-find-links --generate-hashes \
+        $upgrade "$@" --output-file "$out" pyproject.toml
+}
+
+
+# what CI and `make setup` install, for every Python that is supported
+resolve development.txt --universal --python-version 3.11 --extra dev
+
+# what the Debian packages bring themselves: all that Debian's own modules do not serve
+for release in bookworm trixie; do
+    own=""
+    for module in $(sed -n 's/^\([a-z0-9-]*\)==.*/\1/p' "$locks/$release.in"); do
+        own="$own --no-emit-package $module"
+    done
+    # shellcheck disable=SC2086
+    resolve $release.txt $runtime $own --constraint "$locks/$release.in" \
+        --python-version "$(sed -n 's/^# python //p' "$locks/$release.in")"
+done
+
+# the lowest that pyproject.toml allows; what depends on nothing of ours is held where it fits
+"$uv" pip compile --quiet --no-header --no-annotate --no-emit-index-url --no-emit-find-links \
+    --resolution lowest-direct --python-version 3.11 $runtime --upgrade \
+    --constraint "$locks/lowest.in" --output-file "$locks/lowest.txt" pyproject.toml

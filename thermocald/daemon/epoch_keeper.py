@@ -11,7 +11,7 @@ from thermocald.daemon.plan import check_series, series_head
 from thermocald.daemon.store_guard import Row
 from thermocald.errors import StoreError
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
-from thermocald.store.database.row import NOT_CALIBRATED, EpochResult, Event
+from thermocald.store.database.row import NOT_CALIBRATED, EpochResult, Event, StoredSeries
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from thermocald.daemon.store_guard import StoreGuard
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.field.testfield import Observations
-    from thermocald.store.database.row import StoredSeries
+    from thermocald.store.database.epoch_table import StoredEpoch
 
 __all__ = ["EpochKeeper", "result_row"]
 
@@ -75,22 +75,27 @@ class EpochKeeper:
     @property
     def series(self) -> StoredSeries | None:
         """The series in the store; None before its first epoch."""
+        if self._series is not None:
+            try:
+                self._series = self._guard.series(self._series)
+            except StoreError as error:
+                log.debug("the series cannot be asked for now: %s", error)
         return self._series
 
     @property
     def first_number(self) -> int:
         """The number with which acquisition goes on."""
-        if self._series is None:
-            return 1
-        return (self._guard.store.last_epoch(self._series) or 0) + 1
+        series = self.series
+        return 1 if series is None else (self._guard.store.last_epoch(series) or 0) + 1
 
     def recent(self, count: int) -> Iterator[tuple[Observations, bool]]:
         """The last epochs with a result: observations, and whether the camera changed then."""
-        if self._series is None:
+        series = self.series
+        if series is None:
             return
         first = max(1, self.first_number - count)
         try:
-            for stored in self._guard.store.epochs(self._series, first):
+            for stored in self._guard.store.epochs(series, first):
                 seen = stored.epoch.observations
                 if seen is not None and stored.result.status == "ok":
                     yield seen, "event" in stored.extra
@@ -134,12 +139,8 @@ class EpochKeeper:
         epoch = calibrated.epoch
         result = EpochResult.from_adjustment(calibrated.adjustment)
         try:
-            self._guard.store.amend(
-                self._series,
-                epoch.number,
-                result,
-                observations=None if self._guard.thin else epoch.observations,
-                extra=calibrated.extra,
+            self._guard.amend(
+                self._series, epoch.number, result, epoch.observations, calibrated.extra
             )
         except StoreError as error:
             # that the store is away was told once
@@ -148,10 +149,20 @@ class EpochKeeper:
             self._searched_to = min(self._searched_to, epoch.number - 1)
             return
         wanted = self._frames.wanted(epoch.number, not calibrated.adjustment.ok)
-        stored = next(self._guard.store.epochs(self._series, epoch.number, epoch.number), None)
+        stored = self._stored(epoch.number)
         if not wanted and stored is not None and stored.epoch.frame is not None:
             self._frames.delete(stored.epoch.frame)
             self.kept_frames -= 1
+
+    def _stored(self, number: int) -> StoredEpoch | None:
+        series = self.series
+        if series is None:
+            return None
+        try:
+            return next(self._guard.store.epochs(series, number, number), None)
+        except StoreError as error:
+            log.warning("epoch %d cannot be read: %s", number, error)
+            return None
 
     def backlog(self, below: int) -> Epoch | None:
         """The oldest epoch that was kept uncalibrated and whose frame is still there."""
@@ -166,45 +177,37 @@ class EpochKeeper:
 
     def _search(self, below: int) -> bool:
         """Look through the next epochs of the store, each once; False if there are no more."""
-        assert self._series is not None
+        series = self.series
         first = self._searched_to + 1
-        if first >= below:
+        if series is None or first >= below:
             return False
-        end = min(below - 1, self._guard.store.last_epoch(self._series) or 0)
+        end = min(below - 1, self._guard.store.last_epoch(series) or 0)
         if end < first:
             return False
         last = min(end, first + _CATCH_UP_BATCH - 1)
-        for stored in self._guard.store.epochs(self._series, first, last, details=False):
+        # passed over for good if they cannot be read: a damaged row is damaged every time
+        self._searched_to = last
+        for stored in self._guard.store.epochs(series, first, last, details=False):
             frame = stored.epoch.frame
             if stored.result.status == NOT_CALIBRATED and frame is not None:
                 path = self._frames.root / frame
                 if path.is_file():
                     self._backlog.append(replace(stored.epoch, frame=path))
-        self._searched_to = last
         return True
 
     def _begin_series(self, acquired: AcquiredEpoch) -> StoredSeries:
+        """The series; a new one is made with its first row, as soon as the store can be written."""
         if self._series is None:
             assert acquired.epoch is not None
             channels = list(acquired.epoch.temperatures) or list(self.plan.config.thermometers)
             head, field, settings = series_head(self.plan, acquired.frame, channels)
-            self._series = self._guard.store.create_series(
-                head,
-                field,
-                start=self._start,
-                identity=self._identity(),
-                settings=settings,
-                created_utc=acquired.frame.utc,
+            utc = acquired.frame.utc
+            self._series = StoredSeries(
+                0, head, field, self._start, self._identity(), settings, utc
             )
-            self._guard.event(
-                Event(
-                    acquired.frame.utc,
-                    "series_begun",
-                    f"camera {self.plan.name}: series {self.plan.series} begins",
-                    self._series.id,
-                    acquired.number,
-                )
-            )
+            series, text = self.series, f"camera {self.plan.name}: series {self.plan.series} begins"
+            known = None if series is None or not series.id else series.id
+            self._guard.event(Event(utc, "series_begun", text, known, acquired.number))
         return self._series
 
 

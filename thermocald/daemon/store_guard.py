@@ -1,18 +1,20 @@
-"""The store under hard conditions: a disk that fills up loses observations before results, and a
-store that cannot be written keeps its results waiting in memory.
+"""The store under hard conditions: a full disk loses observations before results, results wait in
+memory for a store that cannot be written, and a file that was deleted or replaced is noticed.
 """
 
 from __future__ import annotations
 
-import fcntl
+import contextlib
 import logging
 import os
 import shutil
 import threading
+import time
 from collections import deque
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
+from thermocald.daemon.store_file import StoreFile
 from thermocald.errors import StoreError, StoreFullError
 from thermocald.store.database.row import Event
 from thermocald.store.database.store import Store
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from thermocald.epoch import Epoch
+    from thermocald.photogrammetry.field.testfield import Observations
     from thermocald.store.database.row import EpochResult, LoggedReading, StoredSeries
 
 __all__ = ["Row", "StoreGuard"]
@@ -45,6 +48,7 @@ class Row:
     extra: Mapping[str, float]
     clock_trusted: bool
     told: Callable[[bool], None] = field(default=lambda _: None)
+    stored: bool = False  # committed, and in the file that is at the store's path
 
     def thin(self) -> Row:
         """The same without observations and covariance."""
@@ -62,22 +66,6 @@ def _without_covariance(result: EpochResult) -> EpochResult:
     return replace(result, covariance=np.diag(np.diag(result.covariance)))
 
 
-def _claim(path: Path) -> int:
-    """Lock the store for this process; the kernel gives it back however the process ends."""
-    try:
-        handle = os.open(f"{path}.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-    except OSError as error:
-        raise StoreError(f"{path}: cannot be written: {error.strerror}") from error
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        os.close(handle)
-        raise StoreError(
-            f"{path}: another thermocald writes it; end that one first, or choose another store"
-        ) from error
-    return handle
-
-
 class StoreGuard:
     """An open store that does not give up; threads may share it.
 
@@ -85,20 +73,29 @@ class StoreGuard:
     """
 
     def __init__(self, path: Path, *, durable: bool = True) -> None:
-        self._claim = _claim(path)
-        try:
-            self.store = Store.open(path, "append", durable=durable)
-        except BaseException:
-            os.close(self._claim)
-            raise
         self.path = path
         self.lost = 0
         self.away = ""  # why the store cannot be written, empty while it can
+        self.notice = ""  # what happened to the file while it was open, empty if nothing
         self.thin = False
+        self._durable = durable
         self._waiting: deque[Row] = deque()
         self._events: deque[Event] = deque(maxlen=1000)
         self._readings: deque[LoggedReading] = deque(maxlen=_MOST_WAITING)
         self._lock = threading.RLock()
+        self._series: dict[tuple[str, str], StoredSeries] = {}
+        self._open()
+
+    def _open(self) -> None:
+        self._file = StoreFile(self.path)
+        try:
+            self.store = Store.open(self.path, "append", durable=self._durable)
+        except BaseException:
+            self._file.discard_empty()
+            self._file.release()
+            raise
+        self._file.remember_wal()
+        self._series.clear()
 
     @property
     def waiting(self) -> int:
@@ -111,19 +108,66 @@ class StoreGuard:
             self.flush()
             if self._waiting:
                 log.error("%s: %d epochs could not be kept", self.path, len(self._waiting))
-            try:
-                self.store.close()
-            except StoreError as error:
-                log.error("%s", error)
-            os.close(self._claim)
+            self._close()
+
+    def _close(self) -> None:
+        """Close the file; its -wal file goes too, or it would be taken for another database's.
+
+        SQLite leaves it where it was when the file is not at its path any more.
+        """
+        stale = not self._file.there and self._file.wal_there
+        try:
+            self.store.close()
+        except StoreError as error:
+            log.error("%s", error)
+        if stale:
+            wal = self._file.wal_path
+            for name in (wal, wal.with_name(wal.name.removesuffix("-wal") + "-shm")):
+                with contextlib.suppress(OSError):
+                    name.unlink(missing_ok=True)
+        self._file.release()
+
+    def series(self, wanted: StoredSeries) -> StoredSeries:
+        """The series of that camera and name in the file that is open now; begun if need be."""
+        key = (wanted.camera, wanted.name)
+        with self._lock:
+            if key not in self._series:
+                found = {(s.camera, s.name): s for s in self.store.all_series()}
+                self._series[key] = found.get(key) or self.store.create_series(
+                    wanted.head,
+                    wanted.testfield,
+                    start=wanted.start,
+                    identity=wanted.identity,
+                    settings=wanted.settings,
+                    created_utc=wanted.created_utc,
+                )
+            return self._series[key]
 
     def append(self, row: Row) -> None:
         """Keep an epoch, now or when the store can be written again."""
         with self._lock:
             self._waiting.append(row)
-            before = len(self._waiting)
             self.flush()
-            row.told(len(self._waiting) < before)
+            row.told(row.stored)
+
+    def amend(
+        self,
+        series: StoredSeries,
+        number: int,
+        result: EpochResult,
+        observations: Observations | None,
+        extra: Mapping[str, float],
+    ) -> None:
+        """Keep a later calibration of an epoch; raises StoreError."""
+        with self._lock:
+            self._watch()
+            self.store.amend(
+                self.series(series),
+                number,
+                result,
+                observations=None if self.thin else observations,
+                extra=extra,
+            )
 
     def event(self, event: Event) -> None:
         """Keep an event, now or when the store can be written again."""
@@ -138,13 +182,18 @@ class StoreGuard:
     def flush(self) -> None:
         """Write what waits, oldest first, until the store refuses."""
         with self._lock:
+            self._watch()
             while self._waiting:
-                error = self._write(self._waiting[0])
+                row = self._waiting[0]
+                error = self._write(row)
                 if error is None:
+                    if not self._in_place and self._watch() != "carried over":
+                        continue  # it was written to a file that is gone: once more
                     self._waiting.popleft()
+                    row.stored = True
                     self._back()
                 elif self._takes_all_but(error):
-                    row = self._waiting.popleft()
+                    self._waiting.popleft()
                     self.lost += 1
                     log.error("epoch %d was not kept: %s", row.epoch.number, error)
                 else:
@@ -153,6 +202,64 @@ class StoreGuard:
             self._flush_events()
             self._flush_readings()
 
+    @property
+    def _in_place(self) -> bool:
+        return self._file.there and self._file.wal_there
+
+    def _watch(self) -> str:
+        """Look whether the file is still where it was, and go on with the one that is there.
+
+        Returns `carried over` where a deleted file was written again with all that it held.
+        """
+        if self.store.closed:
+            return self._try(self._open)
+        self._file.remember_wal()
+        return "" if self._in_place else self._try(self._follow)
+
+    def _try(self, action: Callable[[], str | None]) -> str:
+        try:
+            return action() or ""
+        except StoreError as error:
+            self._out(error, time.time())
+            return ""
+
+    def _follow(self) -> str:
+        """The file, or its -wal file, is gone or another: open what is there now."""
+        file, copy = self._file, None
+        carried = ""
+        if not file.deleted:
+            self.store.checkpoint()
+        if file.there:
+            text = "its -wal file was deleted; what it held was moved into the store"
+            carried = "carried over"
+        elif file.deleted:
+            copy = self._rescued()
+            if self.path.exists():
+                text = f"was replaced by another file, which is used now; what it held is in {copy}"
+            else:
+                text = "was deleted; it was written again with all that it held"
+                carried = "carried over"
+        elif self.path.exists():
+            text = "was moved away, and another file is in its place, which is used now"
+        else:
+            text = "was moved away; a new store was begun"
+        self._close()
+        if carried and copy is not None:
+            os.replace(copy, self.path)
+        self._open()
+        self.notice = text
+        log.error("%s: %s", self.path, text, extra={"event": "store_followed"})
+        self._events.append(Event(time.time(), "store_followed", f"{self.path.name} {text}"))
+        return carried
+
+    def _rescued(self) -> Path:
+        """A copy of the deleted file that is still open, beside where it was."""
+        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+        copy = self.path.with_name(f"{self.path.stem}-rescued-{stamp}.db")
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self.store.copy_to(copy)
+        return copy
+
     def _write(self, row: Row) -> StoreError | None:
         self._look_at_the_disk(row)
         attempts = [row.thin()] if self.thin else [row, row.thin()]
@@ -160,7 +267,7 @@ class StoreGuard:
         for attempt in attempts:
             try:
                 self.store.append(
-                    attempt.series,
+                    self.series(attempt.series),
                     attempt.epoch,
                     attempt.result,
                     extra=attempt.extra,
@@ -253,4 +360,5 @@ class StoreGuard:
             "why": self.away,
             "waiting": self.waiting,
             "lost": self.lost,
+            "notice": self.notice,
         }

@@ -70,6 +70,7 @@ class Store:
 
     def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
         self.path = path
+        self.closed = False
         self._db = connection
         self._lock = threading.RLock()
         self._unchunked: set[int] = set()  # series whose chunks cannot be built
@@ -87,6 +88,7 @@ class Store:
     def close(self) -> None:
         """Close the file; may be called twice."""
         with self._lock, in_words(self.path, "the store cannot be closed"):
+            self.closed = True
             self._db.close()
 
     def __enter__(self) -> Self:

@@ -1,0 +1,184 @@
+"""The store's file goes away underneath a running daemon, or is opened twice by another name."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sqlite3
+import subprocess
+import sys
+
+import pytest
+
+from tests.daemon.conftest import ENVIRONMENT
+from thermocald.daemon.store_guard import Row, StoreGuard
+from thermocald.epoch import Epoch
+from thermocald.errors import StoreError
+from thermocald.photogrammetry.camera.camera_model import Sensor
+from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.store.database.row import EpochResult
+from thermocald.store.database.store import Store
+from thermocald.store.recording.head import CameraSpec, Channel, Head
+
+
+@pytest.fixture
+def path(tmp_path):
+    folder = tmp_path / "kept"
+    folder.mkdir()
+    return folder / "t.db"
+
+
+@pytest.fixture
+def guard(path):
+    import numpy as np
+
+    guard = StoreGuard(path, durable=False)
+    head = Head("a", "M1", 10.0, CameraSpec("rpi", Sensor(640, 480, 0.001)), {"t": Channel()})
+    field = TestField.build(["a"], np.zeros((1, 3)))
+    series = guard.store.create_series(head, field, start="cold")
+    guard.told = {}
+
+    def keep(number: int) -> None:
+        values = EpochResult("ok", "", np.full(16, float(number)), np.eye(16), 1.0, 5, 9)
+        row = Row(series, Epoch(number, 1e9 + number, 1e9 + number, {"t": 20.0}), values, {}, True)
+        row.told = lambda stored: guard.told.__setitem__(number, stored)
+        guard.append(row)
+
+    guard.keep = keep
+    for number in (1, 2, 3):
+        keep(number)
+    yield guard
+    guard.close()
+
+
+def numbers(path) -> list[int]:
+    with Store.open(path) as store:
+        store.check()
+        return [s.epoch.number for s in store.epochs(store.find_series())]
+
+
+def delete_all(path) -> None:
+    for name in path.parent.glob("t.db*"):
+        name.unlink()
+
+
+def delete_folder(path) -> None:
+    shutil.rmtree(path.parent)
+
+
+def delete_wal(path) -> None:
+    path.with_name("t.db-wal").unlink()
+
+
+@pytest.mark.parametrize("how", [lambda p: p.unlink(), delete_all, delete_folder, delete_wal])
+def test_a_deleted_store_is_written_again_with_all_that_it_held(guard, path, how):
+    how(path)
+    for number in (4, 5):
+        guard.keep(number)
+    assert numbers(path) == [1, 2, 3, 4, 5]
+    assert all(guard.told.values())
+    assert "was deleted" in guard.status()["notice"]
+    assert [e.kind for e in guard.store.events()] == ["store_followed"]
+    assert guard.status()["state"] == "ok"
+    assert list(path.parent.glob("*rescued*")) == []
+
+
+def test_a_store_that_was_moved_away_stays_whole_and_a_new_one_is_begun(guard, path):
+    for name in list(path.parent.glob("t.db*")):
+        name.rename(name.with_name(name.name.replace("t.db", "old.db")))
+    guard.keep(4)
+    assert numbers(path) == [4]
+    assert numbers(path.with_name("old.db")) == [1, 2, 3]
+    assert "moved away" in guard.notice
+
+
+def test_another_file_in_its_place_is_used_and_the_old_one_is_rescued(guard, path, tmp_path):
+    guard.store.copy_to(tmp_path / "copy.db")
+    guard.keep(4)
+    os.replace(tmp_path / "copy.db", path)
+    guard.keep(5)
+    assert numbers(path) == [1, 2, 3, 5]
+    (rescued,) = path.parent.glob("t-rescued-*.db")
+    assert numbers(rescued) == [1, 2, 3, 4]
+    assert str(rescued) in guard.notice
+
+
+def test_a_file_that_is_no_store_is_left_alone_and_results_wait(guard, path):
+    path.unlink()
+    path.write_text("mine, and not a store")
+    guard.keep(4)
+    guard.keep(5)
+    assert path.read_text() == "mine, and not a store"
+    assert (guard.status()["state"], guard.waiting, guard.told[4]) == ("out", 2, False)
+    path.unlink()
+    guard.flush()
+    assert guard.status()["state"] == "ok"
+    assert numbers(path) == [4, 5]
+    (rescued,) = path.parent.glob("t-rescued-*.db")
+    assert numbers(rescued) == [1, 2, 3]
+
+
+def test_a_refused_row_is_not_called_stored(guard):
+    guard.keep(2)  # its number is taken
+    guard.keep(4)
+    assert (guard.told[2], guard.told[4], guard.lost) == (False, True, 1)
+
+
+@pytest.mark.parametrize("kind", ["same", "link", "hard link", "relative", "replaced name"])
+@pytest.mark.parametrize("process", ["this", "another"])
+def test_the_file_is_locked_whatever_it_is_called(guard, path, tmp_path, kind, process):
+    other = tmp_path / "other.db"
+    if kind == "link":
+        other.symlink_to(path)
+    elif kind == "hard link":
+        os.link(path, other)
+    elif kind == "relative":
+        other = tmp_path / "kept/../kept/t.db"
+    else:
+        other = path
+    if process == "this":
+        with pytest.raises(StoreError, match="another thermocald writes it"):
+            StoreGuard(other)
+    else:
+        script = (
+            "import sys; from pathlib import Path; "
+            "from thermocald.daemon.store_guard import StoreGuard; StoreGuard(Path(sys.argv[1]))"
+        )
+        done = subprocess.run(
+            [sys.executable, "-c", script, str(other)],
+            env=ENVIRONMENT, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        assert "another thermocald writes it" in done.stderr
+    guard.keep(4)
+    assert numbers(path) == [1, 2, 3, 4]
+
+
+def test_a_store_that_cannot_be_made_leaves_nothing_behind(tmp_path):
+    database = sqlite3.connect(tmp_path / "foreign.db")
+    database.execute("CREATE TABLE x (y)")
+    database.close()
+    with pytest.raises(StoreError, match="no thermocald store"):
+        StoreGuard(tmp_path / "foreign.db")
+    with pytest.raises(StoreError, match="cannot be written"):
+        StoreGuard(tmp_path / "away/t.db")
+    assert [p.name for p in tmp_path.iterdir()] == ["foreign.db"]
+
+
+def test_the_running_daemon_says_so_and_loses_nothing(daemon, devices):
+    daemon.configure(**devices())
+    daemon.start()
+    daemon.until(lambda: len(daemon.results()) > 3)
+    for name in daemon.folder.glob("thermocald.db*"):
+        if name.is_file():
+            name.unlink()
+    daemon.until(lambda: "was deleted" in daemon.log())
+    count = len(daemon.results())
+    daemon.until(lambda: len(daemon.results()) > count + 3)
+    status = daemon.folder / "thermocald.db.live/status.json"
+    daemon.until(lambda: "was deleted" in json.loads(status.read_text())["store"]["notice"])
+    daemon.kill()
+    stored = {r["epoch"] for r in daemon.results() if r["stored"]}
+    numbers, _ = daemon.stored()
+    assert stored <= set(numbers)
+    assert numbers == list(range(1, len(numbers) + 1))

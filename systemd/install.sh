@@ -3,12 +3,14 @@
 set -eu
 here=$(cd "$(dirname "$0")" && pwd)
 root=${DESTDIR:-}
-units="thermocald.service thermocald@.service thermocald-archive.service thermocald-archive.timer"
+units="thermocald.service thermocald@.service thermocald-dashboard.service thermocald-dashboard@.service
+    thermocald-archive.service thermocald-archive.timer thermocald-backup.service thermocald-backup.timer"
 
 place() { install -D -m "$1" "$2" "$root$3"; echo "  $root$3"; }
 
 if [ "${1:-}" = --uninstall ]; then
-    [ -n "$root" ] || systemctl disable --now thermocald.service thermocald-archive.timer || true
+    [ -n "$root" ] || systemctl disable --now thermocald.service thermocald-dashboard.service \
+        thermocald-archive.timer thermocald-backup.timer || true
     for unit in $units; do rm -f "$root/etc/systemd/system/$unit"; done
     rm -f "$root/usr/lib/sysusers.d/thermocald.conf" "$root/usr/lib/tmpfiles.d/thermocald.conf" \
         "$root/etc/udev/rules.d/60-thermocald.rules"
@@ -36,4 +38,4 @@ udevadm control --reload && udevadm trigger || true
 systemctl daemon-reload
 sed -i 's|^  path: thermocald.db|  path: /var/lib/thermocald/thermocald.db|;s|^  folder: frames|  folder: /var/lib/thermocald/frames|' \
     /etc/thermocald/config.yaml
-echo "now: edit /etc/thermocald/config.yaml, then  systemctl enable --now thermocald thermocald-archive.timer"
+echo "now: edit /etc/thermocald/config.yaml, then  systemctl enable --now thermocald thermocald-archive.timer thermocald-backup.timer"

@@ -25,6 +25,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
+from thermocald.addresses import is_loopback
 from thermocald.errors import ConfigurationError
 from thermocald.yaml_file import read_yaml
 
@@ -241,14 +242,15 @@ class DashboardConfig(_Section):
     port: Annotated[int, Field(ge=1, le=65535)] = 8437
     """Of the page."""
     token_file: Path | None = None
-    """A file that holds the token."""
+    """A file that holds the token; others must not be able to read it."""
+    names: tuple[Annotated[str, Field(min_length=1, max_length=253)], ...] = ()
+    """Further names by which the page may be asked for, such as that of a proxy."""
 
     _token_file = field_validator("token_file")(_relative_to_file)
 
     @model_validator(mode="after")
     def _guarded(self) -> Self:
-        local = self.host in ("localhost", "::1") or self.host.startswith("127.")
-        if not local and self.token_file is None:
+        if not is_loopback(self.host) and self.token_file is None:
             raise _wrong(f"host {self.host} is open to others; name a token_file too")
         return self
 

@@ -139,3 +139,34 @@ def test_random_bytes_never_end_it(ear):
 def test_a_wrong_request_raises_where_it_is_asked(ear):
     with pytest.raises(UsageError, match="epochs"):
         ask(ear.folder, "session start", session={**SESSION, "epochs": -1})
+
+
+def test_silent_connections_delay_nobody(ear):
+    silent = [connect(ear) for _ in range(20)]
+    begin = time.monotonic()
+    for _ in range(5):
+        assert ask(ear.folder, "session status") is not None
+    assert time.monotonic() - begin < 1.0
+    for channel in silent:
+        channel.close()
+
+
+def test_a_full_backlog_is_not_nobody(tmp_path):
+    with socket.socket(socket.AF_UNIX) as deaf:
+        deaf.bind(str(tmp_path / "control.sock"))
+        deaf.listen(0)
+        waiting = []
+        for _ in range(3):
+            channel = socket.socket(socket.AF_UNIX)
+            channel.setblocking(False)
+            try:
+                channel.connect(str(tmp_path / "control.sock"))
+            except BlockingIOError:
+                channel.close()
+                break
+            waiting.append(channel)
+        with pytest.raises(DataError, match="does not answer"):
+            ask(tmp_path, "session status")
+        for channel in waiting:
+            channel.close()
+    assert ask(tmp_path, "session status") is None  # the file is there, and nobody listens

@@ -26,7 +26,7 @@ def analyze():
 
 
 @pytest.mark.parametrize(
-    "unit", ["thermocald.service", "thermocald@.service", "thermocald-archive.service"]
+    "unit", sorted(path.name for path in UNITS.glob("*.service"))
 )
 def test_the_exposure_is_at_most_two_and_a_half(analyze, unit):
     done = analyze("security", "--offline=true", "--no-pager", str(UNITS / unit))
@@ -57,12 +57,14 @@ def test_the_daemon_is_in_every_group_that_its_devices_belong_to():
     assert groups == set(made)
 
 
-def test_the_template_is_the_plain_unit_with_a_name():
-    plain = (UNITS / "thermocald.service").read_text().splitlines()[1:]
-    template = (UNITS / "thermocald@.service").read_text().splitlines()[1:]
+@pytest.mark.parametrize("name", ["thermocald", "thermocald-dashboard"])
+def test_the_template_is_the_plain_unit_with_a_name(name):
+    plain = (UNITS / f"{name}.service").read_text().splitlines()[1:]
+    template = (UNITS / f"{name}@.service").read_text().splitlines()[1:]
     for a, b in zip(plain, template, strict=True):
         # not below /run/thermocald, which goes when the plain unit ends
         b = b.replace("RuntimeDirectory=thermocald-%i", "RuntimeDirectory=thermocald")
+        b = b.replace("@%i.service", ".service")
         assert b.replace("/%i.yaml", "/config.yaml").replace(" (%i)", "").replace("/%i", "") == a
 
 
@@ -83,6 +85,10 @@ def test_everything_is_installed_where_it_belongs(tmp_path):
         "etc/systemd/system/thermocald@.service",
         "etc/systemd/system/thermocald-archive.service",
         "etc/systemd/system/thermocald-archive.timer",
+        "etc/systemd/system/thermocald-backup.service",
+        "etc/systemd/system/thermocald-backup.timer",
+        "etc/systemd/system/thermocald-dashboard.service",
+        "etc/systemd/system/thermocald-dashboard@.service",
         "etc/thermocald/config.yaml",
         "etc/udev/rules.d/60-thermocald.rules",
         "usr/lib/sysusers.d/thermocald.conf",
@@ -91,3 +97,21 @@ def test_everything_is_installed_where_it_belongs(tmp_path):
     subprocess.run([*script, "--uninstall"], env=environment, check=True, capture_output=True)
     left = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()}
     assert left == {"etc/thermocald/config.yaml"}
+
+
+def test_the_page_shares_neither_memory_nor_processor_with_the_daemon():
+    """A control group of its own, ended first when there is no memory; the daemon is ended last."""
+
+    def values(unit: str) -> dict[str, str]:
+        lines = (UNITS / unit).read_text().splitlines()
+        return dict(line.split("=", 1) for line in lines if re.match(r"\w+=", line))
+
+    for at in ("", "@"):
+        page = values(f"thermocald-dashboard{at}.service")
+        daemon = values(f"thermocald{at}.service")
+        assert int(page["OOMScoreAdjust"]) > 0 > int(daemon["OOMScoreAdjust"])
+        assert int(page["MemoryMax"].removesuffix("M")) <= 200
+        assert int(daemon["MemoryMin"].removesuffix("M")) >= 100
+        assert int(page["CPUWeight"]) < 100 < int(daemon["CPUWeight"])
+        assert "MemoryMax" in daemon
+        assert page["RestartPreventExitStatus"] == "2"

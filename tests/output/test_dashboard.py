@@ -202,10 +202,55 @@ def test_another_host_name_is_refused(client_of):
     assert client.get("/api/status").status_code == 400
 
 
+@pytest.mark.parametrize(
+    ("base", "headers", "status"),
+    [
+        ("http://127.0.0.1.evil.com", {}, 400),
+        ("http://[::1]:8437", {}, 200),
+        ("http://LOCALHOST.:1", {}, 200),
+        ("http://127.0.0.1", {"origin": "http://evil.com"}, 403),
+        ("http://127.0.0.1", {"origin": "null"}, 403),
+        ("http://127.0.0.1", {"origin": "http://localhost:8437"}, 200),
+        ("http://127.0.0.1", {"sec-fetch-site": "cross-site", "sec-fetch-mode": "no-cors"}, 403),
+        ("http://127.0.0.1", {"sec-fetch-site": "cross-site", "sec-fetch-mode": "navigate"}, 200),
+    ],
+)
+def test_dns_rebinding_and_foreign_pages_are_refused(client_of, base, headers, status):
+    assert client_of(base=base).get("/api/status", headers=headers).status_code == status
+
+
+def test_with_a_token_a_foreign_origin_is_refused(client_of):
+    client = client_of(TOKEN, "0.0.0.0", "http://station.example")
+    bearer = {"authorization": f"Bearer {TOKEN}"}
+    assert client.get("/", headers={**bearer, "origin": "http://evil.com"}).status_code == 403
+    own = {**bearer, "origin": "http://station.example"}
+    assert client.get("/", headers=own).status_code == 200
+
+
+def test_a_series_is_read_page_by_page(client_of, monkeypatch):
+    """One page in memory, whatever the length; and no transaction is open between them."""
+    from thermocald.output.dashboard import view
+    from thermocald.store.database import columns
+
+    asked = []
+    page = columns.read_page
+    monkeypatch.setattr(view, "_ROWS_AT_ONCE", 100)
+    monkeypatch.setattr(columns, "read_columns", None)
+    monkeypatch.setattr(
+        columns, "read_page", lambda *a: (asked.append(a[-2:]), page(*a))[1]
+    )
+    answer = client_of().get("/api/series.csv", params={"camera": "rpi", "series": "M1"})
+    assert len(answer.text.splitlines()) == 1201
+    assert asked == [(-1, 100), *((after, 100) for after in range(100, 1201, 100))]
+
+
 def test_open_to_others_it_wants_a_token(tmp_path):
     with pytest.raises(ConfigurationError, match="token-file"):
         serve(tmp_path / "t.db", tmp_path, "0.0.0.0", 8437)
     short = tmp_path / "token"
     short.write_text("short")
+    with pytest.raises(ConfigurationError, match="everybody may read"):
+        serve(tmp_path / "t.db", tmp_path, "0.0.0.0", 8437, short)
+    short.chmod(0o640)
     with pytest.raises(ConfigurationError, match="16"):
         serve(tmp_path / "t.db", tmp_path, "0.0.0.0", 8437, short)

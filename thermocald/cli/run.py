@@ -157,7 +157,7 @@ def _name(text: str) -> str:
 
 
 def dashboard(
-    store: Annotated[Path, typer.Option("--store", help="The daemon's store.")],
+    store: Annotated[Path | None, typer.Option("--store", help="The daemon's store.")] = None,
     live: Annotated[
         Path | None, typer.Option("--live", help="The folder of the daemon's live state.")
     ] = None,
@@ -168,12 +168,34 @@ def dashboard(
     token_file: Annotated[
         Path | None, typer.Option("--token-file", help="A file that holds the token.")
     ] = None,
+    name: Annotated[
+        list[str] | None, typer.Option("--name", help="A further name of the page; repeatable.")
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option("--config", "-c", help="All of these from a configuration.")
+    ] = None,
 ) -> None:
     """The web page of a daemon, in a process of its own; it only reads.
 
+    With --config it ends at once where the configuration has `dashboard: {enabled: false}`.
+
     Example: thermocald dashboard --store thermocald.db
     """
+    from thermocald.cli.common import say
+    from thermocald.config import load_config
     from thermocald.daemon.live_state import find_state
     from thermocald.output.dashboard import serve
 
-    serve(store, live or find_state(store), host, port, token_file)
+    names = name or []
+    if config is not None:
+        read = load_config(config)
+        if not read.dashboard.enabled:
+            say(f"{config}: dashboard.enabled is false; there is no page")
+            return
+        page = read.dashboard
+        store = store or read.store.path
+        host, port, token_file = page.host, page.port, page.token_file
+        names = [*names, *page.names]
+    if store is None:
+        raise UsageError("give --store FILE or --config FILE")
+    serve(store, live or find_state(store), host, port, token_file, names)

@@ -202,7 +202,7 @@ def _ask(config: Path | None, do: str, **values: Any) -> dict[str, Any]:
 def _take_in_the_daemon(folder: Path, session: Session, wait: bool) -> None:
     """Have a running daemon take the session, and look on."""
     from thermocald.cli.session_progress import Progress
-    from thermocald.daemon.control import ask
+    from thermocald.daemon.control import DaemonBusy, ask
 
     told = ask(folder, "session start", session=session.model_dump(mode="json"))
     if told is None:
@@ -213,7 +213,10 @@ def _take_in_the_daemon(folder: Path, session: Session, wait: bool) -> None:
     progress, seen, away_since = Progress(session.epochs), 0, 0.0
     while True:
         time.sleep(_LOOK_EVERY_S)
-        told = ask(folder, "session status")
+        try:
+            told = ask(folder, "session status")
+        except DaemonBusy:
+            told = None
         if told is None:
             if not away_since:
                 away_since = time.monotonic()

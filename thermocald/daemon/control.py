@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-__all__ = ["FORMAT", "ControlSocket", "Request", "ask"]
+__all__ = ["FORMAT", "ControlSocket", "DaemonBusy", "Request", "ask"]
 
 log = logging.getLogger(__name__)
 
@@ -39,6 +39,12 @@ _NAME = "control.sock"
 _LONGEST = 65536
 _REQUEST_S = 2.0
 _ANSWER_S = 60.0
+_BACKLOG = 64
+_AT_ONCE = 32  # connections that are served; more wait in the backlog
+
+
+class DaemonBusy(DataError):
+    """A daemon listens, but did not answer: it may when it is asked again."""
 
 
 class _Asked(BaseModel):
@@ -75,13 +81,17 @@ class _Envelope(BaseModel):
 
 
 class ControlSocket:
-    """Listens in a thread of its own; answer(request) → what is told, raises ThermocaldError."""
+    """Listens in a thread of its own, and serves every connection in one.
+
+    answer(request) → what is reported, raises ThermocaldError.
+    """
 
     def __init__(self, folder: Path, answer: Callable[[Request], dict[str, Any]]) -> None:
         self._folder = folder
         self._answer = answer
         self._stop = threading.Event()
         self._socket: socket.socket | None = None
+        self._free = threading.BoundedSemaphore(_AT_ONCE)
         self._thread = threading.Thread(target=self._serve, name="control", daemon=True)
 
     def open(self) -> None:
@@ -95,7 +105,7 @@ class ControlSocket:
                 os.fchmod(channel.fileno(), 0o600)  # until the group is let in, too
                 channel.bind(path)
                 os.chmod(path, 0o660)
-            channel.listen(8)
+            channel.listen(_BACKLOG)
         except OSError as error:
             channel.close()
             log.warning("%s: no control socket: %s", self._folder, error)
@@ -124,13 +134,23 @@ class ControlSocket:
                 if not self._stop.is_set():
                     log.error("the control socket failed: %s", error)
                 return
+            if not self._free.acquire(timeout=_REQUEST_S):
+                connection.close()  # who asked is told so by the end of the connection
+                continue
+            threading.Thread(
+                target=self._serve_one, args=(connection,), name="control request", daemon=True
+            ).start()
+
+    def _serve_one(self, connection: socket.socket) -> None:
+        try:
             with connection:
-                try:
-                    told = self._respond(connection)
-                    connection.settimeout(_REQUEST_S)
-                    connection.sendall(json.dumps(plain(told)).encode() + b"\n")
-                except OSError as error:  # who asked has gone, or says nothing
-                    log.debug("control: %s", error)
+                told = self._respond(connection)
+                connection.settimeout(_REQUEST_S)
+                connection.sendall(json.dumps(plain(told)).encode() + b"\n")
+        except OSError as error:  # who asked has gone, or says nothing
+            log.debug("control: %s", error)
+        finally:
+            self._free.release()
 
     def _respond(self, connection: socket.socket) -> dict[str, Any]:
         try:
@@ -156,6 +176,13 @@ def ask(folder: Path, do: str, **values: Any) -> dict[str, Any] | None:
         except PermissionError as error:
             raise DataError(
                 f"{folder / _NAME}: you may not ask this daemon; join its group, or use sudo"
+            ) from error
+        except (FileNotFoundError, NotADirectoryError, ConnectionRefusedError):
+            return None  # nobody listens
+        except (BlockingIOError, TimeoutError, ConnectionError) as error:
+            raise DaemonBusy(
+                f"{folder / _NAME}: the daemon is there but does not answer: too many ask at once, "
+                "or it ended just now; ask again"
             ) from error
         except (OSError, ValueError):
             return None

@@ -176,6 +176,7 @@ class Service:
             "store": {**self._guard.status(), "path": str(self.config.store.path.absolute())},
             "stalled": self._station.stalled(),
             "sessions": self._sessions.status(self._station),
+            "dashboard": {"enabled": self.config.dashboard.enabled, "why": self._dashboard.why},
             **self._station.status(),
         }
 

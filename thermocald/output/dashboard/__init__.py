@@ -7,11 +7,14 @@ dies, acquisition does not notice.
 from __future__ import annotations
 
 import logging
+import stat
 from typing import TYPE_CHECKING
 
+from thermocald.addresses import is_loopback
 from thermocald.errors import ConfigurationError, DriverMissing
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
 __all__ = ["serve"]
@@ -21,41 +24,46 @@ log = logging.getLogger(__name__)
 _SHORTEST_TOKEN = 16
 
 
-def serve(store: Path, live: Path, host: str, port: int, token_file: Path | None = None) -> None:
-    """Serve until ended. Raises ConfigurationError, DriverMissing without the extra `dashboard`."""
+def serve(
+    store: Path,
+    live: Path,
+    host: str,
+    port: int,
+    token_file: Path | None = None,
+    names: Sequence[str] = (),
+) -> None:
+    """Serve until ended.
+
+    names: further names by which the page may be asked for. Raises ConfigurationError, also where
+    the port is in use; DriverMissing without the extra `dashboard`.
+    """
     token = _read_token(token_file)
-    local = host in ("localhost", "::1") or host.startswith("127.")
-    if not local and token is None:
+    if not is_loopback(host) and token is None:
         raise ConfigurationError(f"host {host} is open to others; give --token-file too")
     try:
-        import uvicorn
-
         from thermocald.output.dashboard.application import build_application
+        from thermocald.output.dashboard.server import bind, run_server
     except ImportError as error:
         raise DriverMissing(
             f"the page needs the extra `dashboard`: pip install 'thermocald[dashboard]' ({error})"
         ) from error
-    application = build_application(store, live, token, host)
-    log.warning("the page is at http://%s:%d/", f"[{host}]" if ":" in host else host, port)
-    uvicorn.run(
-        application,
-        host=host,
-        port=port,
-        log_level="warning",
-        access_log=False,
-        lifespan="off",
-        server_header=False,
-        timeout_graceful_shutdown=1,
-    )
+    with bind(host, port) as listening:
+        application = build_application(store, live, token, host, names)
+        log.warning("the page is at http://%s:%d/", f"[{host}]" if ":" in host else host, port)
+        run_server(application, listening)
 
 
 def _read_token(path: Path | None) -> str | None:
     if path is None:
         return None
     try:
+        mode = path.stat().st_mode
         token = path.read_text(encoding="utf-8").strip()
-    except OSError as error:
-        raise ConfigurationError(f"{path}: the token cannot be read: {error.strerror}") from error
+    except (OSError, UnicodeDecodeError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise ConfigurationError(f"{path}: the token cannot be read: {why}") from error
+    if mode & (stat.S_IROTH | stat.S_IWOTH):
+        raise ConfigurationError(f"{path}: everybody may read the token; chmod o-rw {path}")
     if len(token) < _SHORTEST_TOKEN:
         raise ConfigurationError(
             f"{path}: the token has {len(token)} characters; at least {_SHORTEST_TOKEN} are needed"

@@ -8,6 +8,7 @@ import hmac
 import json
 import math
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,12 +17,14 @@ from starlette.middleware import Middleware
 from starlette.responses import JSONResponse, RedirectResponse, Response, StreamingResponse
 from starlette.routing import Route
 
+from thermocald.addresses import HostNames
 from thermocald.errors import DataError, ThermocaldError, UsageError
 from thermocald.output.dashboard.metrics import metrics_text
+from thermocald.output.dashboard.server import Limits
 from thermocald.output.dashboard.view import View
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Sequence
 
     from starlette.requests import Request
     from starlette.types import ASGIApp, Receive, Scope, Send
@@ -42,14 +45,17 @@ _HEADERS = {
     "referrer-policy": "no-referrer",
     "cache-control": "no-store",
 }
+_PLOTLY = "package_data/plotly.min.js"
 _COOKIE = "thermocald_token"
 _STREAM_EVERY_S = 0.5
 _ALIVE_EVERY = 30
 _NAME_LENGTH = 64
 
 
-def build_application(store: Path, live: Path, token: str | None, host: str) -> Starlette:
-    """The application; token: None if whoever reaches it may look."""
+def build_application(
+    store: Path, live: Path, token: str | None, host: str, names: Sequence[str] = ()
+) -> Starlette:
+    """The application; token: None if whoever reaches it may look; names: further ones of ours."""
     application = Starlette(
         routes=[
             Route("/", _page),
@@ -66,7 +72,10 @@ def build_application(store: Path, live: Path, token: str | None, host: str) -> 
             Route("/healthz", _health),
             Route("/metrics", _metrics),
         ],
-        middleware=[Middleware(_Guard, token=token, host=host)],
+        middleware=[
+            Middleware(_Guard, token=token, names=HostNames(host, names)),
+            Middleware(Limits),
+        ],
         exception_handlers={ThermocaldError: _refuse},
     )
     application.state.view = View(store, live)
@@ -79,10 +88,10 @@ class _Guard:
     The token comes as `Authorization: Bearer …`, or once as `?token=…`, which sets a cookie.
     """
 
-    def __init__(self, app: ASGIApp, token: str | None, host: str) -> None:
+    def __init__(self, app: ASGIApp, token: str | None, names: HostNames) -> None:
         self._app = app
         self._token = token
-        self._hosts = {"localhost", "127.0.0.1", "[::1]", host, f"[{host}]"}
+        self._names = names
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -93,9 +102,10 @@ class _Guard:
         response: Response | None = None
         if scope["method"] not in ("GET", "HEAD"):
             response = JSONResponse({"error": "this page only reads"}, 405)
+        elif self._is_foreign(request):
+            response = JSONResponse({"error": "another site's page asks for this"}, 403)
         elif self._token is None:
-            name = request.headers.get("host", "").rsplit(":", 1)[0]
-            if name not in self._hosts and not name.startswith("127."):
+            if not self._names.allow_host(",".join(request.headers.getlist("host"))):
                 response = JSONResponse({"error": "unknown host name"}, 400)
         elif request.url.path != "/healthz":
             response = self._check(request)
@@ -109,6 +119,19 @@ class _Guard:
             await send(message)
 
         await (response or self._app)(scope, receive, send_with_headers)
+
+    def _is_foreign(self, request: Request) -> bool:
+        """Whether a browser says that a page of another site asks."""
+        origin = request.headers.get("origin")
+        if origin is not None:
+            own = request.headers.get("host", "")
+            return not (
+                self._names.allow_origin(origin)
+                if self._token is None
+                else own and origin.partition("://")[2].lower() == own.lower()
+            )
+        site, mode = (request.headers.get(f"sec-fetch-{key}", "") for key in ("site", "mode"))
+        return site == "cross-site" and mode != "navigate"
 
     def _check(self, request: Request) -> Response | None:
         assert self._token is not None
@@ -149,9 +172,11 @@ def _static(request: Request) -> Response:
 
 @cache
 def _plotly_script() -> bytes:
-    from plotly.offline import get_plotlyjs
-
-    return gzip.compress(get_plotlyjs().encode(), 6)
+    # read from its package without importing that: 30 MB of memory
+    found = find_spec("plotly")
+    if found is None or found.origin is None:
+        raise DataError("the page's charts need plotly: pip install 'thermocald[dashboard]'")
+    return gzip.compress((Path(found.origin).parent / _PLOTLY).read_bytes(), 6)
 
 
 def _plotly(_: Request) -> Response:

@@ -28,7 +28,7 @@ __all__ = ["View"]
 
 _SHOWN = ("c", "x0", "y0")
 _MOST_POINTS = 2000
-_ROWS_AT_ONCE = 5000
+_ROWS_AT_ONCE = 500
 _OLD_S = 30.0
 
 
@@ -104,21 +104,25 @@ class View:
         since_s: the last so many s before `until` (UTC s, default: the last epoch); None: all.
         Standard deviations are means too: a bin's mean is better than they say.
         """
-        names = ["frame_time", "sigma0", *_SHOWN, *(f"sd_{n}" for n in _SHOWN)]
+        names = ["sigma0", *_SHOWN, *(f"sd_{n}" for n in _SHOWN)]
         with Store.open(self._store) as store:
             found = store.find_series(camera, series)
             channels = list(found.head.channels)
-            columns = store.series_columns(found, [*names, *channels])
-        times = columns["frame_time"]
-        chosen = np.ones(len(times), dtype=bool)
-        if until is not None:
-            chosen &= times <= until
-        if since_s is not None and chosen.any():
-            chosen &= times >= times[chosen].max() - since_s
-        rows = np.flatnonzero(chosen)
-        points = max(2, min(points, _MOST_POINTS))
-        bins = np.array_split(rows, min(points, len(rows))) if len(rows) else []
-        averaged = {name: _means(values, bins) for name, values in columns.items()}
+            # one column at a time: a year of them would not fit into the page's memory
+            times = store.series_columns(found, ["frame_time"])["frame_time"]
+            chosen = np.ones(len(times), dtype=bool)
+            if until is not None:
+                chosen &= times <= until
+            if since_s is not None and chosen.any():
+                chosen &= times >= times[chosen].max() - since_s
+            rows = np.flatnonzero(chosen)
+            points = max(2, min(points, _MOST_POINTS))
+            bins = np.array_split(rows, min(points, len(rows))) if len(rows) else []
+            averaged = {"frame_time": _means(times, bins)}
+            for name in (*names, *channels):
+                # an epoch that came meanwhile is not among the times
+                column = store.series_columns(found, [name])[name][: len(times)]
+                averaged[name] = _means(column, bins)
         return {
             "camera": camera,
             "series": series,
@@ -142,15 +146,13 @@ class View:
         with Store.open(self._store) as store:
             found = store.find_series(camera, series)
             names = _csv_names(found)
-            columns = store.series_columns(found, names)
-        yield ",".join(names) + "\n"
-        count = len(columns["epoch"])
-        for begin in range(0, count, _ROWS_AT_ONCE):
-            text = io.StringIO()
-            writer = csv.writer(text, lineterminator="\n")
-            part = [columns[name][begin : begin + _ROWS_AT_ONCE].tolist() for name in names]
-            writer.writerows([_cell(value) for value in row] for row in zip(*part, strict=True))
-            yield text.getvalue()
+            yield ",".join(names) + "\n"
+            for page in store.column_pages(found, names, _ROWS_AT_ONCE):
+                text = io.StringIO()
+                writer = csv.writer(text, lineterminator="\n")
+                columns = [page[name].tolist() for name in names]
+                writer.writerows(list(map(_cell, row)) for row in zip(*columns, strict=True))
+                yield text.getvalue()
 
     def require(self, camera: str, series: str) -> None:
         """Raise StoreError if there is no such series."""

@@ -36,6 +36,7 @@ __all__ = [
     "loose_rows",
     "note_amended",
     "read_columns",
+    "read_page",
     "rebuild_chunks",
 ]
 
@@ -82,6 +83,21 @@ def _read_columns(
         column[chunks.rows :] = tail.get(name, np.nan)
         column[rows] = late.get(name, np.nan)
     return dict(zip(names, columns, strict=True))
+
+
+def read_page(
+    connection: sqlite3.Connection, series: int, names: Sequence[str], after: int, rows: int
+) -> dict[str, Array]:
+    """Columns of at most `rows` epochs numbered above `after`; as `read_columns`, from the rows."""
+    end = connection.execute(
+        "SELECT number FROM epoch WHERE series_id = ? AND number > ? AND revision = 0 "
+        "ORDER BY number LIMIT 1 OFFSET ?",
+        (series, after, rows - 1),
+    ).fetchone()
+    fields = [name.split(".")[0] for name in names]
+    columns = latest_columns(connection, series, fields, after, end[0] if end else None)
+    absent = np.full(columns["number"].size, np.nan)
+    return {name: columns.get(name, absent) for name in names}
 
 
 def checked_chunks(connection: sqlite3.Connection) -> Iterator[str]:

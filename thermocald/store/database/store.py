@@ -317,11 +317,37 @@ class Store:
                     self._db, series.id, list(dict.fromkeys(source.values()))
                 )
             )
-            if "status" in columns:
-                codes = status_codes(self._db)
-                words = np.array([codes.get(i, "") for i in range(max(codes, default=0) + 1)])
-                columns["status"] = words[columns["status"].astype(np.int64)]
+            self._name_statuses(columns)
         return {name: columns[source[name]] for name in names}
+
+    def column_pages(
+        self, series: StoredSeries, names: Sequence[str], rows: int = 1000
+    ) -> Iterator[dict[str, NDArray[Any]]]:
+        """The same columns, `rows` epochs at a time, in constant memory.
+
+        Every page is read by itself: who takes long over one holds no writer up, and epochs that
+        come meanwhile follow.
+        """
+        source = {name: _source(name, series) for name in names}
+        wanted = list(dict.fromkeys(["number", *source.values()]))
+        after = -1
+        while True:
+            with self._lock, in_words(self.path, "columns cannot be read", reading=True):
+                columns: dict[str, NDArray[Any]] = dict(
+                    column_chunks.read_page(self._db, series.id, wanted, after, rows)
+                )
+                self._name_statuses(columns)
+            if not len(columns["number"]):
+                return
+            after = int(columns["number"][-1])
+            yield {name: columns[source[name]] for name in names}
+
+    def _name_statuses(self, columns: dict[str, NDArray[Any]]) -> None:
+        """Put words in the place of the codes in the column `status`."""
+        if "status" in columns:
+            codes = status_codes(self._db)
+            words = np.array([codes.get(i, "") for i in range(max(codes, default=0) + 1)])
+            columns["status"] = words[columns["status"].astype(np.int64)]
 
     def temperatures_at_frame(self, series: StoredSeries) -> dict[str, Array]:
         """Every channel brought to the instants of the frames, {name: (E,) °C}."""

@@ -1,0 +1,196 @@
+"""The page under clients that read slowly, say nothing, or ask for everything."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.daemon.conftest import ENVIRONMENT
+from thermocald.epoch import Epoch
+from thermocald.photogrammetry.camera.camera_model import Sensor
+from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.store.database.row import EpochResult
+from thermocald.store.database.store import Store
+from thermocald.store.recording.head import CameraSpec, Channel, Head
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def resident_mb(pid: int) -> float:
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return int(next(line for line in lines if line.startswith("VmRSS")).split()[1]) / 1024
+
+
+def make_store(path: Path, epochs: int) -> None:
+    head = Head("a", "M1", 10.0, CameraSpec("rpi", Sensor(640, 480, 0.001)), {"t": Channel()})
+    covariance = np.eye(16)
+    with Store.open(path, "append", durable=False) as store:
+        series = store.create_series(head, TestField.build(["a"], np.zeros((1, 3))))
+        for k in range(1, epochs + 1):
+            result = EpochResult("ok", "", np.full(16, k / 7), covariance, 1.0, 5, 9)
+            store.append(series, Epoch(k, 1e9 + 10 * k, 1e9 + 10 * k, {"t": k / 9}), result)
+
+
+class Page:
+    """A page in a process of its own."""
+
+    def __init__(self, folder: Path, store: Path) -> None:
+        self.port = free_port()
+        command = [sys.executable, "-m", "thermocald", "dashboard", "--store", str(store)]
+        self.process = subprocess.Popen(
+            [*command, "--port", str(self.port)], cwd=folder, env=ENVIRONMENT
+        )
+        deadline = time.monotonic() + 60
+        while True:
+            try:
+                self.get("/healthz")
+                return
+            except urllib.error.HTTPError:
+                return
+            except OSError:
+                assert time.monotonic() < deadline
+                time.sleep(0.05)
+
+    def get(self, path: str) -> bytes:
+        with urllib.request.urlopen(f"http://127.0.0.1:{self.port}{path}", timeout=60) as answer:
+            return answer.read()
+
+    def slow(self, path: str) -> socket.socket:
+        """Ask, and read nothing."""
+        channel = socket.socket()
+        channel.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        channel.connect(("127.0.0.1", self.port))
+        channel.sendall(f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
+        return channel
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+
+@pytest.fixture
+def page_of(tmp_path):
+    pages = []
+
+    def start(store: Path) -> Page:
+        pages.append(Page(tmp_path, store))
+        return pages[-1]
+
+    yield start
+    for page in pages:
+        page.close()
+
+
+CSV = "/api/series.csv?camera=rpi&series=M1"
+
+
+def test_slow_and_silent_clients_take_no_memory_and_hold_nobody_up(tmp_path, page_of):
+    make_store(tmp_path / "s.db", 6000)
+    page = page_of(tmp_path / "s.db")
+    assert len(page.get(CSV).splitlines()) == 6001
+    before = resident_mb(page.process.pid)
+    slow = [page.slow(CSV) for _ in range(50)]
+    silent = [socket.create_connection(("127.0.0.1", page.port)) for _ in range(30)]
+    time.sleep(1.0)
+    refused = 0
+    for channel in slow:
+        channel.setblocking(False)
+        try:
+            refused += b" 503 " in channel.recv(60)
+        except BlockingIOError:
+            continue
+    begin = time.monotonic()
+    for _ in range(10):
+        page.get("/api/status")
+        page.get("/api/columns?camera=rpi&series=M1&points=500")
+    assert time.monotonic() - begin < 60.0  # on a busy machine
+    assert refused == 46  # four are served at once
+    assert resident_mb(page.process.pid) < before + 25.0
+    # who says nothing is let go
+    for channel in silent:
+        channel.settimeout(25.0)
+        assert channel.recv(1) == b""
+        channel.close()
+    for channel in slow:
+        channel.close()
+
+
+def test_a_port_in_use_is_one_error_and_the_daemon_goes_on(daemon, devices):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        daemon.configure(**devices(), dashboard={"enabled": True, "port": port})
+        daemon.start(INVOCATION_ID="")
+        daemon.until(lambda: "acquisition goes on without it" in daemon.log(), 90.0)
+        count = len(daemon.results())
+        daemon.until(lambda: len(daemon.results()) > count + 3)
+        assert daemon.log().count("in use by another program") == 1
+        assert "the page is at" not in daemon.log()
+        status = json.loads((daemon.folder / "thermocald.db.live/status.json").read_text())
+        assert "cannot be used" in status["dashboard"]["why"]
+        assert daemon.stop() == 0
+
+
+def test_under_systemd_the_page_is_not_the_daemons_child(daemon, devices):
+    daemon.configure(**devices(), dashboard={"enabled": True, "port": free_port()})
+    daemon.start(INVOCATION_ID="0" * 32)
+    daemon.until(lambda: len(daemon.results()) > 3)
+    children = Path(f"/proc/{daemon.process.pid}/task/{daemon.process.pid}/children")
+    assert children.read_text().split() == []
+    assert daemon.stop() == 0
+
+
+@pytest.mark.slow
+def test_fifty_slow_readers_and_a_browser_leave_the_rhythm_as_it_was(daemon, devices, page_of):
+    """p99 of the lateness at most twice that of the idle page, or 5 ms on a busy machine."""
+    daemon.configure(**devices(period_s=0.1), frames={"keep": "none"})
+    daemon.start()
+    status = daemon.folder / "thermocald.db.live/status.json"
+
+    def ticks() -> int:
+        return json.loads(status.read_text())["cameras"]["one"]["ticks"]
+
+    def late_p99(seen: int) -> float:
+        steps = np.diff([r["frame_time"] for r in daemon.results()[seen:]])
+        return float(np.percentile(np.abs(steps - np.round(steps / 0.1) * 0.1), 99))
+
+    daemon.until(lambda: status.exists() and ticks() > 20)
+    page = page_of(daemon.store)
+    seen = len(daemon.results())
+    time.sleep(15.0)
+    idle = late_p99(seen)
+    make_store(daemon.folder / "big.db", 30000)
+    attacked = page_of(daemon.folder / "big.db")
+    slow = [attacked.slow(CSV) for _ in range(50)]
+    begin, loads = ticks(), 0
+    end = time.monotonic() + 15.0
+    seen = len(daemon.results())
+    while time.monotonic() < end:
+        page.get("/api/status")
+        attacked.get("/api/columns?camera=rpi&series=M1&points=1000")
+        loads += 1
+        time.sleep(0.2)
+    attack = late_p99(seen)
+    memory = [resident_mb(p) for p in (page.process.pid, attacked.process.pid, daemon.process.pid)]
+    print(f"lateness p99 {1e3 * idle:.2f} ms idle, {1e3 * attack:.2f} ms under attack, "
+          f"{ticks() - begin} ticks, {loads} page loads, resident {memory} MB")  # fmt: skip
+    for channel in slow:
+        channel.close()
+    assert ticks() - begin > 20
+    assert attack <= max(2.0 * idle, 0.005 * (1 + os.getloadavg()[0]))
+    assert sum(memory) < 400.0
+    assert daemon.stop() == 0

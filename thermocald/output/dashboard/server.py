@@ -1,0 +1,139 @@
+"""The page's server: it binds first, and neither silent nor slow clients hold it up or fill memory.
+
+A connection that sends no whole request, or takes up nothing of its answer for so many seconds, is
+ended; beyond a number of connections, and of costly requests at once, the answer is 503.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import socket
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any
+
+import uvicorn
+from starlette.responses import JSONResponse
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from thermocald.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from starlette.types import ASGIApp, Receive, Scope, Send
+
+__all__ = ["Limits", "bind", "run_server"]
+
+_CONNECTIONS = 100
+_LOOK_EVERY_S = 2.0
+_REQUEST_S = 10.0  # for a request's head to arrive
+_STUCK_S = 20.0  # for a client to take up 64 kB
+_SEND_BUFFER_BYTES = 131_072  # what the kernel holds of an answer, else up to 4 MB a connection
+# path → (requests served at once, requests that may wait for that)
+_COSTLY = {
+    "/api/series.csv": (4, 0),
+    "/api/columns": (2, 20),
+    "/api/stream": (20, 0),
+    "/api/events": (2, 20),
+    "/api/series": (2, 20),
+}
+
+
+def bind(host: str, port: int) -> socket.socket:
+    """A listening socket; raises ConfigurationError where the address cannot be had."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listening = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
+        # the kernel's own limit for who takes up nothing: inherited by every connection
+        listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(1000 * _STUCK_S))
+        listening.bind((host, port))
+    except OSError as error:
+        listening.close()
+        if error.errno == errno.EADDRINUSE:
+            why = "it is in use by another program; choose another dashboard.port"
+        else:
+            why = error.strerror or str(error)
+        raise ConfigurationError(f"the page cannot be at {host}, port {port}: {why}") from error
+    return listening
+
+
+def run_server(application: ASGIApp, listening: socket.socket) -> None:
+    """Serve until ended by a signal."""
+    config = uvicorn.Config(
+        application,
+        http=_Connection,
+        ws="none",
+        log_level="warning",
+        access_log=False,
+        lifespan="off",
+        server_header=False,
+        backlog=64,
+        limit_concurrency=_CONNECTIONS,
+        timeout_graceful_shutdown=1,
+    )
+    uvicorn.Server(config).run(sockets=[listening])
+
+
+class _Connection(H11Protocol):
+    """A connection that is ended when its client neither asks nor takes up what it asked for."""
+
+    def connection_made(self, transport: Any) -> None:
+        super().connection_made(transport)
+        self._progress_at = self.loop.time()
+        self._watching = self.loop.call_later(_LOOK_EVERY_S, self._watch)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._watching.cancel()
+        super().connection_lost(exc)
+
+    def _watch(self) -> None:
+        now = self.loop.time()
+        answering = self.cycle is not None and not self.cycle.response_complete
+        if answering:
+            limit = _STUCK_S
+            if not self.flow.write_paused:
+                self._progress_at = now
+        else:
+            limit = _REQUEST_S
+        if now - self._progress_at > limit:
+            self.transport.abort()
+            return
+        self._watching = self.loop.call_later(_LOOK_EVERY_S, self._watch)
+
+
+class Limits:
+    """Serves so many costly requests at once; some wait, the rest are answered with 503."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+        self._slots = {path: asyncio.Semaphore(most) for path, (most, _) in _COSTLY.items()}
+        self._waiting = dict.fromkeys(_COSTLY, 0)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        path = scope.get("path", "")
+        if path not in _COSTLY:
+            await self._app(scope, receive, send)
+            return
+        if self._slots[path].locked() and self._waiting[path] >= _COSTLY[path][1]:
+            busy = JSONResponse(
+                {"error": "too many ask for this at once; ask again"}, 503, {"retry-after": "5"}
+            )
+            await busy(scope, receive, send)
+            return
+        async with self._slot(path):
+            await self._app(scope, receive, send)
+
+    @asynccontextmanager
+    async def _slot(self, path: str) -> AsyncIterator[None]:
+        self._waiting[path] += 1
+        try:
+            await self._slots[path].acquire()
+        finally:
+            self._waiting[path] -= 1
+        try:
+            yield
+        finally:
+            self._slots[path].release()

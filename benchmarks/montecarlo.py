@@ -18,8 +18,9 @@ import tracemalloc
 import cv2
 import numpy as np
 
+from thermocald.analysis.camera.image_grid import image_grid
 from thermocald.analysis.study.montecarlo import draw_root, plane_errors, simulate_errors
-from thermocald.analysis.study.object_plane import image_raster, on_plane
+from thermocald.analysis.study.object_plane import on_plane
 from thermocald.photogrammetry.camera.camera_model import Sensor
 
 SENSOR = Sensor(3264, 2448, 0.0014)
@@ -58,7 +59,7 @@ def best(run, repeats: int = REPEATS) -> float:
 
 def main() -> int:
     cv2.setNumThreads(1)
-    points = image_raster(SENSOR)
+    points = image_grid(SENSOR)
     root = draw_root(SDS, CORRELATION)
     sets = IOP + np.random.default_rng(0).standard_normal((SETS, len(root))) @ root
     ours = best(lambda: simulate_errors(SENSOR, IOP, SDS, CORRELATION, sets=SETS))

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from thermocald.analysis.camera.image_grid import image_grid
 from thermocald.analysis.study.deviations import deviation, image_displacement
-from thermocald.analysis.study.object_plane import image_raster
 from thermocald.photogrammetry.camera.camera_model import Sensor
 
 SENSOR = Sensor(3264, 2448, 0.0014)
@@ -27,7 +27,7 @@ def test_a_moved_principal_point_moves_every_image_point_by_as_much():
     first = np.array([3.97, 0.01, -0.02, 5e-3, -4e-4, 0, 1e-4, -1e-4, 0, 0])
     later = first.copy()
     later[1:3] += np.array([10.0, 5.0]) * 0.0014
-    moved = image_displacement(SENSOR, first, later, image_raster(SENSOR))
+    moved = image_displacement(SENSOR, first, later, image_grid(SENSOR))
     np.testing.assert_allclose(moved, np.tile([10.0, -5.0], (9, 1)), atol=1e-6)
 
 
@@ -35,6 +35,6 @@ def test_a_longer_principal_distance_moves_points_outwards_in_proportion():
     first = np.array([3.97, 0, 0, 0, 0, 0, 0, 0, 0, 0.0])
     later = first.copy()
     later[0] *= 1.002
-    points = image_raster(SENSOR)
+    points = image_grid(SENSOR)
     moved = image_displacement(SENSOR, first, later, points)
     np.testing.assert_allclose(moved, 0.002 * (points - SENSOR.centre), atol=1e-9)

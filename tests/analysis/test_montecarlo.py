@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
+from thermocald.analysis.camera.image_grid import image_grid
 from thermocald.analysis.study import montecarlo
 from thermocald.analysis.study.montecarlo import draw_root, plane_errors, simulate_errors
-from thermocald.analysis.study.object_plane import image_raster, on_plane, plane_jacobian, propagate
+from thermocald.analysis.study.object_plane import on_plane, plane_jacobian, propagate
 from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera.camera_model import Sensor
 
@@ -43,14 +44,14 @@ def opencv_distances(sets, points, distance_mm):
 
 def test_distances_are_opencvs_to_a_millionth_of_a_millimetre():
     sets = IOP + np.random.default_rng(1).standard_normal((5000, 8)) @ draw_root(SDS, CORRELATION)
-    points = image_raster(SENSOR)
+    points = image_grid(SENSOR)
     ours = np.linalg.norm(plane_errors(SENSOR, IOP, sets, points, 1e4), axis=2)
     np.testing.assert_allclose(ours, opencv_distances(sets, points, 1e4), atol=1e-6, rtol=0)
 
 
 def test_affine_terms_are_inverted_as_the_camera_model_does():
     sets = IOP + np.random.default_rng(2).standard_normal((50, 10)) * [*SDS[:8], 1e-4, 1e-4]
-    points = image_raster(SENSOR)
+    points = image_grid(SENSOR)
     expected = [
         on_plane(SENSOR, one, points, 1e4) - on_plane(SENSOR, IOP, points, 1e4) for one in sets
     ]

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from thermocald.analysis.camera.image_grid import image_grid
 from thermocald.analysis.study.object_plane import (
     DistanceLaw,
-    image_raster,
     on_plane,
     plane_jacobian,
     propagate,
@@ -17,13 +17,13 @@ IOP = np.array([3.97, 0.021, -0.034, 0.0051, -4e-4, 1e-5, 1.2e-4, -0.9e-4, 1e-4,
 STEPS = np.array([1e-4, 1e-4, 1e-4, 1e-5, 1e-6, 1e-7, 1e-6, 1e-6, 1e-5, 1e-5])
 
 
-def test_raster_goes_from_corner_to_corner():
-    points = image_raster(SENSOR)
+def test_the_grid_goes_from_corner_to_corner():
+    points = image_grid(SENSOR)
     np.testing.assert_array_equal(points[[0, 4, 8]], [[0, 0], SENSOR.centre, [3263, 2447]])
 
 
 def test_jacobian_is_that_of_differences():
-    points = image_raster(SENSOR)
+    points = image_grid(SENSOR)
     jacobian = plane_jacobian(SENSOR, IOP, points, 1e4)
     for k, step in enumerate(STEPS):
         change = np.zeros(10)
@@ -51,7 +51,7 @@ def test_law_of_distances_is_that_of_a_million_draws(axes):
 
 def test_propagation_is_the_scatter_of_small_errors():
     rng = np.random.default_rng(2)
-    points = image_raster(SENSOR)
+    points = image_grid(SENSOR)
     sds = STEPS * 0.1
     jacobian = plane_jacobian(SENSOR, IOP, points, 1e4)
     covariance = propagate(jacobian, np.diag(sds**2))

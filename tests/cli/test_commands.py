@@ -150,6 +150,21 @@ def test_photographs_of_markers_give_the_camera(tmp_path):
         assert abs(found - getattr(model.interior, name)) < 4 * sd
     assert len(document["correlations"]["matrix"]) == 8
 
+    # The folder, and its pixel pitch by option; files for the next command and for people.
+    out, page = tmp_path / "found.json", tmp_path / "page.html"
+    done = run("calibrate", tmp_path, "--testfield", tmp_path / "field.csv", "--pixel-pitch",
+               model.sensor.pixel_pitch, "--camera-out", out, "--report", page)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    written = json.loads(out.read_text())
+    c, sd = written["interior"]["c"], written["interior"]["sd_c"]
+    assert abs(c - model.interior.c) < 4 * sd
+    assert f"written: {out}" in done.stdout.replace("\n", "")
+    for words in ("Residuals and coverage", "Made on", "3 of 3 photographs"):
+        assert words in page.read_text(encoding="utf-8")
+    done = run("calibrate", images[0], "--testfield", tmp_path / "field.csv", "--camera", out,
+               "--free", "none", "--json", "-")  # fmt: skip
+    assert json.loads(done.stdout)["interior"]["c"] == c
+
 
 def test_the_demo_finds_what_was_put_in(tmp_path):
     """Thirty epochs: drift found within 4 sd of the drift put in, and files that can be read."""

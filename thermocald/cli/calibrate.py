@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 
 __all__ = ["register"]
 
+_IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".tif", ".tiff", ".webp"})
+_ASSUMED_PITCH = 0.001
+
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
@@ -32,7 +35,10 @@ def register(app: typer.Typer) -> None:
 
 
 def calibrate(
-    images: Annotated[list[Path], typer.Argument(metavar="IMAGE…", help="Photographs.")],
+    images: Annotated[
+        list[Path],
+        typer.Argument(metavar="IMAGE_OR_FOLDER…", help="Photographs, or folders of them."),
+    ],
     testfield: Annotated[Path, typer.Option("--testfield", help="testfield.csv, in mm.")],
     camera: Annotated[
         Path | None,
@@ -44,7 +50,22 @@ def calibrate(
     ] = None,
     pixel_pitch: Annotated[
         float | None,
-        typer.Option("--pixel-pitch", help="Size of a pixel in mm, where --camera lacks it."),
+        typer.Option(
+            "--pixel-pitch",
+            min=1e-6,
+            help="Size of a pixel in mm, without --camera or where that lacks it.",
+        ),
+    ] = None,
+    camera_out: Annotated[
+        Path | None,
+        typer.Option(
+            "--camera-out",
+            help="Write the camera: .json with covariance (what every --camera takes), or .yaml.",
+        ),
+    ] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option("--report", help="Write residuals and coverage as one HTML file."),
     ] = None,
     free: FreeOption = DEFAULT_FREE_TEXT,
     json: JsonOption = None,
@@ -54,15 +75,26 @@ def calibrate(
     All photographs share one interior orientation. Where their geometry does not carry it and the
     camera file has one, that is held and each photograph gets its pose.
 
-    Example: thermocald calibrate a.jpg b.jpg --testfield testfield.csv --camera rpi.yaml --json -
+    Example: thermocald calibrate photos/ --testfield testfield.csv --pixel-pitch 0.00112
+    --camera-out camera.json --report calibration.html
     """
     from thermocald.analysis.camera.photographs import calibrate_photographs
     from thermocald.store.recording.reader import read_testfield
 
-    if not images:
-        raise UsageError("give at least one photograph")
+    images = _photographs(images)
+    for out in (camera_out, report):
+        if out is not None and not out.resolve().parent.is_dir():
+            raise UsageError(f"{out}: the folder {out.resolve().parent} does not exist")
+    if camera_out is not None and camera_out.suffix.lower() not in (".json", ".yaml", ".yml"):
+        raise UsageError(
+            f"{camera_out}: --camera-out writes .json or .yaml; for another program convert it "
+            "with `thermocald camera convert`"
+        )
     field = read_testfield(testfield)
-    file = read_camera(camera, pixel_pitch) if camera is not None else _unknown_camera(images)
+    if camera is not None:
+        file = read_camera(camera, pixel_pitch)
+    else:
+        file = _unknown_camera(images, pixel_pitch)
     with progress(len(images), "measuring") as advance:
         result = calibrate_photographs(
             images,
@@ -73,17 +105,37 @@ def calibrate(
             file.interior,
             advance,
         )
-    document = _document(result, file, camera is None)
+    assumed = camera is None and pixel_pitch is None
+    document = _document(result, file, assumed)
+    written = _write(result, file, camera_out, report)
     if json is not None:
         write_json(document, json)
     if json != "-":
-        _tell(document)
+        _print(document)
+        for line in written:
+            typer.echo(f"written: {line}")
     if not any(p.status == "ok" for p in result.photographs) and result.status != "ok":
         raise DataError(f"no photograph has a result: {result.reason}")
 
 
-def _unknown_camera(images: list[Path]) -> CameraFile:
-    """A camera of which only the size of the image is known: its pixel counts as 1 µm."""
+def _photographs(given: list[Path]) -> list[Path]:
+    """Files as given, folders as the images that they hold, by name; UsageError where none."""
+    images: list[Path] = []
+    for path in given:
+        if not path.is_dir():
+            images.append(path)
+            continue
+        found = sorted(p for p in path.iterdir() if p.suffix.lower() in _IMAGES)
+        if not found:
+            raise UsageError(f"{path}: the folder holds no image ({', '.join(sorted(_IMAGES))})")
+        images += found
+    if not images:
+        raise UsageError("give at least one photograph")
+    return images
+
+
+def _unknown_camera(images: list[Path], pixel_pitch: float | None) -> CameraFile:
+    """A camera of which no file says anything; without its pitch a pixel counts as 1 µm."""
     from thermocald.photogrammetry.targets.image_file import decode_grey
 
     first: ImageError | None = None
@@ -93,9 +145,65 @@ def _unknown_camera(images: list[Path]) -> CameraFile:
         except ImageError as error:
             first = first or error
             continue
-        return CameraFile("unknown", Sensor(width, height, 0.001), None, None)
+        pitch = _ASSUMED_PITCH if pixel_pitch is None else pixel_pitch
+        return CameraFile("camera", Sensor(width, height, pitch), None, None)
     assert first is not None
     raise first
+
+
+def _write(
+    result: Photographs, file: CameraFile, camera_out: Path | None, report: Path | None
+) -> list[str]:
+    """The files that were asked for; returns their names."""
+    written = []
+    if camera_out is not None:
+        if result.interior is None or not result.estimated:
+            raise DataError(
+                f"{camera_out}: not written, the camera was not calibrated: {result.reason}"
+            )
+        _write_camera(camera_out, result, file)
+        written.append(str(camera_out))
+    if report is not None:
+        from thermocald.output.calibration.report import render_calibration
+        from thermocald.output.study.report import write_report
+
+        write_report(report, render_calibration(result, file.sensor, file.name))
+        written.append(str(report))
+    return written
+
+
+def _write_camera(path: Path, result: Photographs, file: CameraFile) -> None:
+    assert result.interior is not None
+    comment = (
+        f"calibrated by thermocald from {len(result.photographs)} photographs, "
+        f"sigma0 {result.sigma0:.2f}"
+    )
+    if path.suffix.lower() == ".json":
+        from thermocald.output import camera_files
+        from thermocald.photogrammetry.camera.camera_model import CameraModel
+
+        model = CameraModel(file.sensor, result.interior)
+        covariance = result.covariance[:10, :10]
+        camera_files.write(model, path, "json", covariance, comment, file.name)
+        return
+    import yaml
+
+    values = dict(zip(IOP_NAMES, result.interior.as_array().tolist(), strict=True))
+    document = {
+        "name": file.name,
+        "width": file.sensor.width,
+        "height": file.sensor.height,
+        "pixel_pitch": file.sensor.pixel_pitch,
+        "principal_distance": values["c"],
+        "interior": values,
+    }
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        partial.write_text(f"# {comment}\n{yaml.safe_dump(document, sort_keys=False)}", "utf-8")
+        partial.replace(path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise DataError(f"{path}: cannot be written: {error.strerror}") from None
 
 
 def _document(result: Photographs, file: CameraFile, assumed: bool) -> dict[str, Any]:
@@ -153,9 +261,11 @@ def _photograph(p: PhotographResult) -> dict[str, Any]:
     return out
 
 
-def _tell(document: dict[str, Any]) -> None:
+def _print(document: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
+
+    from thermocald.output.figures.numbers import UNITS, plain, with_sd
 
     console = Console()
     interior = document["interior"]
@@ -166,16 +276,21 @@ def _tell(document: dict[str, Any]) -> None:
             highlight=False,
         )
         table = Table(box=None, pad_edge=False)
-        for title in ("", "value", "sd"):
-            table.add_column(title, justify="left" if not title else "right")
+        for title in ("", "value ± sd", "in px"):
+            table.add_column(title)
+        pitch = document["camera"]["pixel_pitch"]
         for name in IOP_NAMES:
             sd = interior.get(f"sd_{name}")
-            table.add_row(name, f"{interior[name]:.6g}", "held" if sd is None else f"{sd:.2g}")
+            if sd is None:
+                table.add_row(name, f"{plain(interior[name], UNITS[name], 6)} (held)", "")
+                continue
+            px = with_sd(interior[name] / pitch, sd / pitch) if name in ("c", "x0", "y0") else ""
+            table.add_row(name, with_sd(interior[name], sd, UNITS[name]), px)
         console.print(table, highlight=False)
         if document["camera"]["pixel_pitch_assumed"]:
             console.print(
                 "the pixel pitch is not known and taken as 1 µm: c, x0, y0 in mm are thousandths "
-                "of px; give --camera",
+                "of px; give --pixel-pitch or --camera",
                 highlight=False,
             )
     else:
@@ -187,7 +302,7 @@ def _tell(document: dict[str, Any]) -> None:
         if p["exterior"] is not None:
             e = p["exterior"]
             line += f", {p['rms_px']:.2f} px, at " + ", ".join(
-                f"{e[n]:.0f} ± {e['sd_' + n]:.0f}" for n in ("X0", "Y0", "Z0")
+                with_sd(e[n], e["sd_" + n]) for n in ("X0", "Y0", "Z0")
             )
             line += " mm"
         if p["reason"]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
 from thermocald.cli.common import progress, write_json
@@ -58,8 +59,9 @@ def study(
     distance: Annotated[
         float, typer.Option("--distance", min=0.01, help="Of the object plane, m.")
     ] = 10.0,
-    raster: Annotated[
-        int, typer.Option("--raster", min=2, max=9, help="Image points per row and column.")
+    grid: Annotated[
+        int,
+        typer.Option("--grid", "--raster", min=2, max=9, help="Image points per row and column."),
     ] = 3,
     focus: Annotated[
         float, typer.Option("--focus", min=0.01, help="Focus distance for the depth of field, m.")
@@ -106,7 +108,7 @@ def study(
         sets=sets,
         seed=seed,
         distance_mm=1000 * distance,
-        raster=raster,
+        grid=grid,
         focus_mm=1000 * focus,
         f_number=f_number,
         confusion_mm=confusion,
@@ -133,13 +135,38 @@ def _study(
     from thermocald.analysis.study.study import study as run
 
     series: list[MeasuredSeries] = []
-    for text in inputs:
-        label, path = _labelled(text)
+    labelled = [_labelled(text) for text in inputs]
+    _refuse_duplicates([path for _, path in labelled])
+    for label, path in labelled:
         with progress(_epochs(path), f"calibrating {path.name}") as advance:
             series += load_series(path, label, settings.thermometer_sd, exterior, free, advance)
+    _refuse_copies(series)
     cameras = len({one.label for one in series})
     with progress(settings.sets * cameras, "simulating") as advance:
         return run(series, settings, advance)
+
+
+def _refuse_duplicates(paths: list[Path]) -> None:
+    """UsageError where one series is given twice: it would count as two that agree."""
+    seen: dict[Path, Path] = {}
+    for path in paths:
+        real = path.resolve()
+        if real in seen:
+            raise UsageError(
+                f"{path} is the same series as {seen[real]}; give each series once (a copy would "
+                "count as a second measurement that agrees perfectly)"
+            )
+        seen[real] = path
+
+
+def _refuse_copies(series: list[MeasuredSeries]) -> None:
+    """DataError where two inputs hold the same epochs."""
+    for i, one in enumerate(series):
+        for other in series[:i]:
+            if len(one) > 1 and len(one) == len(other) and np.array_equal(one.values, other.values):
+                raise DataError(
+                    f"{one.source} holds the same epochs as {other.source}; give each series once"
+                )
 
 
 def _epochs(path: Path) -> int | None:
@@ -220,11 +247,11 @@ def _comparison(c: Comparison) -> dict[str, Any]:
 
 def _print_comparisons(comparisons: list[Comparison]) -> None:
     """Reference beside ours, one line per figure."""
-    typer.echo(f"{'camera':18}{'quantity':42}{'reference':>10}{'ours':>10}  reproduced")
+    typer.echo(f"{'camera':17}{'quantity':43}{'reference':>12}{'ours':>9}  met")
     for c in comparisons:
         unit = f" {c.unit}" if c.unit else ""
         typer.echo(
-            f"{c.camera:18}{c.quantity + unit:42}{c.text:>10}{c.ours:>10.4g}  "
+            f"{c.camera:17}{c.quantity + unit:43}{c.text:>12}{c.ours:>9.3g}  "
             f"{'yes' if c.reproduced else 'NO'}"
         )
 

@@ -35,7 +35,11 @@ __all__ = ["PhotographResult", "Photographs", "calibrate_observations", "calibra
 
 @dataclass(frozen=True, eq=False)
 class PhotographResult:
-    """One photograph: status `ok` where it has a pose, and the reason where it has none."""
+    """One photograph: status `ok` where it has a pose, and the reason where it has none.
+
+    points (n, 2) px: its image points; residuals (n, 2) px, measured minus adjusted; used (n,):
+    which took part. Empty where there is no pose.
+    """
 
     path: Path | str
     status: str
@@ -45,6 +49,9 @@ class PhotographResult:
     rms_px: float = float("nan")
     exterior: ExteriorOrientation | None = None
     exterior_sd: Array = field(default_factory=lambda: np.full(6, np.nan))
+    points: Array = field(default_factory=lambda: np.empty((0, 2)))
+    residuals: Array = field(default_factory=lambda: np.empty((0, 2)))
+    used: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=bool))
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +153,7 @@ def calibrate_observations(
             results.append(PhotographResult(name, "weak_geometry", why, n))
         else:
             pose = pose_only(sensor, testfield, o, interior, settings)
-            results.append(_posed(name, pose, testfield))
+            results.append(_posed(name, pose, testfield, o))
     return Photographs(
         "held" if not settings.free else "weak_geometry",
         reason,
@@ -229,6 +236,9 @@ def _estimated(
                 float(np.sqrt(np.mean(residuals[used] ** 2))),
                 together.exteriors[i],
                 np.sqrt(np.diag(together.exterior_covariances[i])),
+                o.points,
+                residuals,
+                used,
             )
         )
     return Photographs(
@@ -243,7 +253,9 @@ def _estimated(
     )
 
 
-def _posed(name: str, pose: Adjustment, testfield: TestField) -> PhotographResult:
+def _posed(
+    name: str, pose: Adjustment, testfield: TestField, observations: Observations
+) -> PhotographResult:
     if not pose.ok:
         return PhotographResult(name, pose.status, pose.reason, pose.n_observations)
     kept = ~np.isin(pose.targets, pose.rejected)
@@ -256,4 +268,7 @@ def _posed(name: str, pose: Adjustment, testfield: TestField) -> PhotographResul
         float(np.sqrt(np.mean(pose.residuals[kept] ** 2))),
         pose.exterior,
         pose.sd[10:],
+        observations.points,
+        pose.residuals,
+        kept,
     )

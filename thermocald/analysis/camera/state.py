@@ -1,4 +1,4 @@
-"""A camera at one instant: interior orientation with covariance, and what can be done with it."""
+"""A camera at one time: interior orientation with covariance, and what can be done with it."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.analysis.camera.image_grid import image_grid
 from thermocald.analysis.camera.undistortion import undistorted_points
 from thermocald.photogrammetry.camera.camera_model import (
     IOP_NAMES,
@@ -23,20 +24,12 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["CameraState", "image_raster"]
-
-
-def image_raster(sensor: Sensor) -> Array:
-    """Corners, edge middles and centre of the image, (9, 2) px, row by row."""
-    x = np.array([0.0, (sensor.width - 1) / 2, sensor.width - 1.0])
-    y = np.array([0.0, (sensor.height - 1) / 2, sensor.height - 1.0])
-    grid = np.meshgrid(x, y)
-    return np.stack([grid[0].ravel(), grid[1].ravel()], axis=1)
+__all__ = ["CameraState"]
 
 
 @dataclass(frozen=True, eq=False)
 class CameraState:
-    """The camera at one instant.
+    """The camera at one time.
 
     temperature °C; values (10,), covariance (10, 10) in the order of IOP_NAMES; extrapolated: by
     how many kelvin the temperature lies outside what the model was fitted on, 0 inside.
@@ -99,18 +92,18 @@ class CameraState:
 
         image_points (n, 2) px: by default corners, edge middles and centre, row by row.
         """
-        points = image_raster(self.sensor) if image_points is None else image_points
+        points = image_grid(self.sensor) if image_points is None else image_points
         covariance = self.point_covariance(points) * self.sensor.pixel_pitch**2
         variance = np.trace(covariance, axis1=1, axis2=2)
         result: Array = np.sqrt(variance) * distance_mm / self.interior.c
         return result
 
     def object_distance(self, other: CameraState, distance_mm: float) -> Array:
-        """Distances (9,) mm on a plane between where this and another state put the raster."""
-        raster = image_raster(self.sensor)
+        """Distances (9,) mm on a plane between where this and another state puts the grid."""
+        grid = image_grid(self.sensor)
         places = []
         for state in (self, other):
-            r = state.rays(raster)
+            r = state.rays(grid)
             places.append(distance_mm * r[..., :2] / -r[..., 2:])
         result: Array = np.linalg.norm(places[0] - places[1], axis=1)
         return result

@@ -39,6 +39,8 @@ _FIRST_BAND = 4  # low frequencies of the first band; the next have four times a
 _WIDENING = 4
 _LEAST_FAST = 4
 _JUMP = 6.0  # sd of the increments; noise never does that
+_NORMAL_MEDIAN = 0.6745  # of |x| of a standard normal x
+_MEDIAN_SD = 1.5  # times 1/√n: relative sd of that median over third differences of white noise
 _NOTHING = 1e-200  # variance of a series that does not scatter at all
 
 
@@ -206,7 +208,10 @@ def _excess(whole: _Spectrum, fast: _Spectrum, band: int, redundancy: float) -> 
 
 
 def _noise(calm: Array) -> tuple[float, float]:
-    """Scatter between neighbours over the stated sds, and its sd, from the upper half."""
-    upper = _cosines(calm)[len(calm) // 2 :]
-    ratio = float(np.sqrt(np.mean(upper**2)))
-    return ratio, ratio / float(np.sqrt(2 * len(upper)))
+    """Scatter between neighbours over the stated sds, and its sd.
+
+    From third differences, to which a drift of a thousand sds adds nothing, by their median.
+    """
+    third = np.abs(np.diff(calm, n=3))
+    ratio = float(np.median(third)) / (_NORMAL_MEDIAN * np.sqrt(20.0))
+    return ratio, ratio * _MEDIAN_SD / float(np.sqrt(len(third)))

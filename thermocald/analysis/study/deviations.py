@@ -26,9 +26,10 @@ __all__ = ["Deviation", "deviation", "image_displacement", "sd_of_sigma0"]
 
 @dataclass(frozen=True, slots=True)
 class Deviation:
-    """Last minus first value with its standard deviation, and the largest departure from the first.
+    """Last minus first value with its standard deviation, the largest departure, the range.
 
-    largest is signed; it tells a course that comes back from one that never left.
+    largest: signed, from the first value; range: largest minus smallest value; both tell a camera
+    that comes back from one that never left, and of noise alone they are some sds as well.
     """
 
     first: float
@@ -36,7 +37,13 @@ class Deviation:
     change: float
     sd_change: float
     largest: float
+    range: float
     sd_over_time: float
+
+    @property
+    def returned(self) -> bool:
+        """Whether it went much farther than it ended: `change` alone would hide it."""
+        return abs(self.largest) > max(1.5 * abs(self.change), 6 * self.sd_change)
 
 
 def deviation(values: Array, sds: Array) -> Deviation | None:
@@ -56,6 +63,7 @@ def deviation(values: Array, sds: Array) -> Deviation | None:
         float(difference[-1]),
         float(np.hypot(sds[first], sds[last])),
         float(difference[np.argmax(np.abs(difference))]),
+        float(np.ptp(difference)),
         float(np.std(values[have], ddof=1)),
     )
 

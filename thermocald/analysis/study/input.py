@@ -60,7 +60,7 @@ def load_series(
 
     label: what the study treats as one camera, by default the camera's name, in a store with the
     start condition; thermometer_sd: K, by default from the readings; free: IOP to estimate, for a
-    recording (a store knows its own); advance: told how many epochs of a recording are done.
+    recording (a store knows its own); advance: receives how many epochs of a recording are done.
     Raises DataError where nothing can be studied.
     """
     if path.is_dir():
@@ -160,7 +160,7 @@ def _from_columns(
         values: Array = store.series_columns(series, [name])[name]
         return values
 
-    ok, lost = _judged(store.series_columns(series, ["status"])["status"])
+    ok, lost = _assessed(store.series_columns(series, ["status"])["status"])
     source = f"{store.path}: {series.camera}/{series.name}"
     if not ok.any():
         raise DataError(f"{source}: no epoch has a result ({_in_words(lost)})")
@@ -198,6 +198,7 @@ def _from_columns(
         str(series.settings.get("exterior", "per_epoch")),
         lost,
         _stored_clip(store, series, number),
+        float(frame_time[0]),
     )
 
 
@@ -209,10 +210,10 @@ def _from_table(
     label: str,
     clip: Clip | None,
 ) -> MeasuredSeries:
-    """A series that was adjusted together; thermometers at the instants of all its epochs."""
+    """A series that was adjusted together; thermometers at the times of all its epochs."""
     adjustment = table.adjustment
     assert adjustment is not None  # table_of_series always has one
-    ok, lost = _judged(np.array(table.status))
+    ok, lost = _assessed(np.array(table.status))
     ok = _whole(ok, table.values[:, :10], table.sd[:, :10], lost)
     if not ok.any():
         why = next((reason for reason in table.reasons if reason), _in_words(lost))
@@ -238,6 +239,7 @@ def _from_table(
         table.exterior,
         lost,
         clip,
+        float(time_s[0]),
     )
 
 
@@ -270,7 +272,7 @@ def _stored_thermometers(
     ]
 
 
-def _judged(status: NDArray[np.str_]) -> tuple[NDArray[np.bool_], dict[str, int]]:
+def _assessed(status: NDArray[np.str_]) -> tuple[NDArray[np.bool_], dict[str, int]]:
     """Which epochs have a result, and how many have none for which reason."""
     ok = status == "ok"
     words, counts = np.unique(status[~ok], return_counts=True)

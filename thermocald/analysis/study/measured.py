@@ -59,7 +59,8 @@ class MeasuredSeries:
     the first epoch of the series; thermometers: the first is the reference; values (E, 10): IOP;
     sds (E, 10): NaN where held fixed; sigma0, redundancy (E,); correlations (m, 10, 10) of the IOP
     in the adjustments of the epochs `correlation_rows` (m,), a sample where a series is long;
-    exterior: `series` or `per_epoch`; without_result: {reason: epochs}.
+    exterior: `series` or `per_epoch`; without_result: {reason: epochs}; start_utc: s UTC of the
+    first epoch, 0 where it has no date.
     """
 
     label: str
@@ -79,6 +80,7 @@ class MeasuredSeries:
     exterior: str
     without_result: Mapping[str, int] = field(default_factory=dict)
     clip: Clip | None = None
+    start_utc: float = 0.0
 
     def __len__(self) -> int:
         return len(self.time_s)

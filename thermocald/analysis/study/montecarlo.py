@@ -1,7 +1,7 @@
 """Monte-Carlo: what a drifting interior orientation does to points on an object plane.
 
 Sets of IOP are drawn from a normal distribution with given standard deviations and correlations;
-every image point of a raster is projected with every set on a plane parallel to the sensor, and its
+every image point of a grid is projected with every set on a plane parallel to the sensor, and its
 distance to the expected point is clustered (Elias et al. 2020, sections 3.2 and 4.4). Drawing,
 projection and clustering go through the sets in chunks, so memory does not grow with their number.
 Seeded: the same seed gives the same sets, whatever the chunks.
@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.study.object_plane import image_raster, on_plane, plane_jacobian
+from thermocald.analysis.camera.image_grid import image_grid
+from thermocald.analysis.study.object_plane import on_plane, plane_jacobian
 from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera.camera_model import image_to_mm
 
@@ -41,7 +42,7 @@ _CONVERGED = 1e-12  # of the distance: 1e-8 mm at 10 m
 
 @dataclass(frozen=True, eq=False)
 class MonteCarlo:
-    """Distances on the plane, per raster point (k,), mm.
+    """Distances on the plane, per grid point (k,), mm.
 
     image_points (k, 2) px; expected (k, 2) mm; counts (k, m+1): sets per cluster, limits
     `clusters_mm`; mean, largest (k,); mean_error (k, 2): second-order bias; covariance (k, 2, 2)
@@ -106,16 +107,16 @@ def simulate_errors(
     sets: int = 50_000,
     seed: int = 0,
     distance_mm: float = 10_000.0,
-    raster: int = 3,
+    grid: int = 3,
     clusters_mm: tuple[float, ...] = CLUSTERS_MM,
     progress: Callable[[int], None] | None = None,
 ) -> MonteCarlo:
     """Draw IOP about `iop` (10,) and cluster the errors on the plane.
 
     sds (10,) in the units of the IOP, correlation (10, 10); progress is told how many sets were
-    done. Raises GeometryError where the expected point of a raster point does not exist.
+    done. Raises GeometryError where the expected point of a grid point does not exist.
     """
-    points = image_raster(sensor, raster)
+    points = image_grid(sensor, grid)
     root = draw_root(sds, correlation)
     project = _PlaneErrors(sensor, iop, points, distance_mm)
     k = len(points)

@@ -1,4 +1,4 @@
-"""Image points on an object plane parallel to the sensor: the raster, and first-order errors.
+"""Image points on an object plane parallel to the sensor: the grid, and first-order errors.
 
 The plane lies at a distance in front of the projection centre; a point is where the ray of an image
 point meets it, (X, Y) mm in camera axes. The interior orientation shifts it.
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "DistanceLaw",
-    "image_raster",
     "on_plane",
     "plane_jacobian",
     "propagate",
@@ -71,13 +70,6 @@ class DistanceLaw:
             missing = 1 - law.cumulative(steps * large[k])[0] ** draws
             result[k] = large[k] * float(np.sum((missing[1:] + missing[:-1]) * np.diff(steps)) / 2)
         return result
-
-
-def image_raster(sensor: Sensor, size: int = 3) -> Array:
-    """A raster of image points (size², 2) px from corner to corner, row by row from the top."""
-    x = np.linspace(0.0, sensor.width - 1.0, size)
-    y = np.linspace(0.0, sensor.height - 1.0, size)
-    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
 def on_plane(sensor: Sensor, iop: ArrayLike, points: Array, distance_mm: float) -> Array:

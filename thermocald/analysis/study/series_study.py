@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.analysis.camera.image_grid import image_grid
 from thermocald.analysis.statistics.dependence import (
     Dependence,
     correlation_matrix,
@@ -29,7 +30,6 @@ from thermocald.analysis.study.deviations import (
     image_displacement,
     sd_of_sigma0,
 )
-from thermocald.analysis.study.object_plane import image_raster
 from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 
@@ -60,7 +60,7 @@ _LEAST_DEPENDENCE = 4
 class StudySettings:
     """What the user may choose; lengths mm, temperatures K.
 
-    window, alpha: of the F-test; sets, seed, distance_mm, raster, clusters_mm: of the Monte-Carlo;
+    window, alpha: of the F-test; sets, seed, distance_mm, grid, clusters_mm: of the Monte-Carlo;
     focus_mm, f_number, confusion_mm: of the depth of field, None: 1/2000 of the image diagonal;
     thermometer_sd: None takes it from the readings themselves.
     """
@@ -70,7 +70,7 @@ class StudySettings:
     sets: int = 50_000
     seed: int = 0
     distance_mm: float = 10_000.0
-    raster: int = 3
+    grid: int = 3
     clusters_mm: tuple[float, ...] = (15.0, 50.0, 100.0)
     focus_mm: float = 1000.0
     f_number: float = 2.0
@@ -131,7 +131,7 @@ class FocusChange:
 class SeriesStudy:
     """What one series says.
 
-    deviations: by IOP, `sigma0`, and thermometer; raster, displacement (k, 2) px: image
+    deviations: by IOP, `sigma0`, and thermometer; grid, displacement (k, 2) px: image
     points of a still scene, first to last epoch, y down; columns, matrix (n, n): Pearson's r among
     free IOP, sigma0 and thermometers; noise_ratio: scatter between neighbouring epochs over the
     stated standard deviations, NaN where it was not found.
@@ -140,7 +140,7 @@ class SeriesStudy:
     series: MeasuredSeries
     deviations: Mapping[str, Deviation]
     focus: FocusChange | None
-    raster: Array
+    grid: Array
     displacement: Array | None
     significance: Mapping[str, Significance]
     channels: tuple[ChannelStudy, ...]
@@ -157,12 +157,12 @@ def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy
     significance = _significance(series, settings, notes)
     channels = tuple(_channel(series, t) for t in series.thermometers)
     notes += [c.reason for c in channels if c.reason]
-    raster = image_raster(series.sensor)
+    grid = image_grid(series.sensor)
     displacement = None
     if len(series) > 1:
         try:
             displacement = image_displacement(
-                series.sensor, series.values[0], series.values[-1], raster
+                series.sensor, series.values[0], series.values[-1], grid
             )
         except GeometryError as error:
             notes.append(f"The movement of the image cannot be computed: {error}.")
@@ -176,7 +176,7 @@ def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy
         series,
         deviations,
         _focus(series, settings, deviations, notes),
-        raster,
+        grid,
         displacement,
         significance,
         channels,

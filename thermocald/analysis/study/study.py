@@ -15,6 +15,11 @@ from thermocald.analysis.statistics.correlations import IopCorrelations, median_
 from thermocald.analysis.study.montecarlo import MonteCarlo, draw_root, simulate_errors
 from thermocald.analysis.study.object_plane import DistanceLaw, plane_jacobian, propagate
 from thermocald.analysis.study.series_study import SeriesStudy, StudySettings, study_series
+from thermocald.analysis.study.trajectory import (
+    Trajectory,
+    correlations_over_time,
+    trajectories,
+)
 from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 
@@ -32,7 +37,7 @@ __all__ = ["CameraStudy", "FirstOrder", "Study", "StudySettings", "study", "stud
 
 @dataclass(frozen=True, eq=False)
 class FirstOrder:
-    """The same covariance propagated to first order, per raster point (k,), mm.
+    """The same covariance propagated to first order, per grid point (k,), mm.
 
     covariance (k, 2, 2) mm²; mean; expected_largest: of as many draws as the Monte-Carlo had;
     shares (m+1,): of the clusters over all points.
@@ -49,7 +54,9 @@ class CameraStudy:
     """One camera (label): its series, and what they say together.
 
     iop (10,): mean over the series; sds (10,): standard deviations over time, 0 where held, pooled
-    over the series; correlations: None where no epoch has a covariance matrix.
+    over the series; correlations: within the adjustments, None where no epoch has a covariance
+    matrix; over_time (10, 10): of the parameters over the epochs; trajectories: what the camera's
+    own path does in object space, empty where it cannot be computed.
     """
 
     label: str
@@ -59,6 +66,8 @@ class CameraStudy:
     correlations: IopCorrelations | None
     montecarlo: MonteCarlo | None
     first_order: FirstOrder | None
+    over_time: Array
+    trajectories: tuple[Trajectory, ...]
     notes: tuple[str, ...]
 
 
@@ -75,7 +84,7 @@ def study(
     settings: StudySettings | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Study:
-    """Study every camera; `progress` is told how many sets of IOP were simulated."""
+    """Study every camera; `progress` receives how many sets of IOP were simulated."""
     s = settings or StudySettings()
     labels = dict.fromkeys(one.label for one in series)
     cameras = [
@@ -119,8 +128,22 @@ def study_camera(
             f"{montecarlo.folded} of {montecarlo.sets} drawn sets of IOP fold the image over "
             "itself and were left out."
         )
+    try:
+        paths = trajectories(series, settings.distance_mm, settings.grid, settings.clusters_mm)
+    except GeometryError as error:
+        paths = ()
+        notes.append(f"The camera's path cannot be projected on the plane: {error}.")
     return CameraStudy(
-        label, studies, iop, sds, correlations, montecarlo, first_order, tuple(notes)
+        label,
+        studies,
+        iop,
+        sds,
+        correlations,
+        montecarlo,
+        first_order,
+        correlations_over_time(series),
+        paths,
+        tuple(notes),
     )
 
 
@@ -152,7 +175,7 @@ def _object_space(
         sets=s.sets,
         seed=s.seed,
         distance_mm=s.distance_mm,
-        raster=s.raster,
+        grid=s.grid,
         clusters_mm=s.clusters_mm,
         progress=progress,
     )

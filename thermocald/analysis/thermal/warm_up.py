@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.camera.state import image_raster
+from thermocald.analysis.camera.image_grid import image_grid
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import rays
 
@@ -44,7 +44,7 @@ def warm_up(along: Along, distance_mm: float, wanted_mm: float) -> WarmUp:
     """
     if len(along) < 10:
         raise DataError("a warm-up needs a history of at least 10 instants")
-    points = image_raster(along.sensor)
+    points = image_grid(along.sensor)
     r = rays(along.sensor, along.values, np.broadcast_to(points, (len(along), *points.shape)))
     places = distance_mm * r[..., :2] / -r[..., 2:]
     error = np.linalg.norm(places - places[-1], axis=2).max(axis=1)

@@ -43,6 +43,7 @@ _STYLE: dict[str, Any] = {
     "figure.max_open_warning": 0,
 }
 _PANEL_INCHES = (3.4, 2.5)
+_LEGEND_LETTERS = 52  # in a line above a panel
 
 
 def _figure(width: float, height: float, layout: Literal["constrained"] | None) -> Any:
@@ -100,8 +101,11 @@ def draw_panel(panel: Panel, *, legend: bool = True) -> Any:
     with _style():
         # Fixed margins fit the short labels; fitting them exactly triples the time of a report.
         drawing = _figure(*_PANEL_INCHES, None)
-        drawing.subplots_adjust(left=0.19, right=0.98, bottom=0.19, top=0.89)
-        _fill(drawing.subplots(), panel, legend=legend)
+        axis = drawing.subplots()
+        rows = _fill(axis, panel, legend=legend)
+        longest = max((len(text) for text in _tick_labels(axis)), default=0)
+        left = min(0.32, 0.135 + 0.0155 * longest)
+        drawing.subplots_adjust(left=left, right=0.95, bottom=0.19, top=0.89 - 0.055 * rows)
         return drawing
 
 
@@ -120,7 +124,17 @@ def draw_figure(figure: Figure) -> Any:
         return drawing
 
 
-def _fill(axis: Any, panel: Panel, *, legend: bool) -> None:
+def _tick_labels(axis: Any) -> list[str]:
+    """The labels of the y axis that will be drawn, without drawing it."""
+    low, high = axis.get_ylim()
+    ticks = [tick for tick in axis.get_yticks() if low <= tick <= high]
+    labels: list[str] = axis.yaxis.get_major_formatter().format_ticks(ticks)
+    # A power of ten is typeset: its markup is longer than what is seen.
+    return [re.sub(r"\$|\\mathdefault|[{}^]", "", label) for label in labels]
+
+
+def _fill(axis: Any, panel: Panel, *, legend: bool) -> int:
+    """Draw a panel; returns the rows of its legend, which is above it, clear of the data."""
     for curve in panel.curves:
         _draw_curve(axis, curve)
     for y, label in panel.horizontal:
@@ -139,12 +153,26 @@ def _fill(axis: Any, panel: Panel, *, legend: bool) -> None:
         axis.set_yscale("log")
     if panel.equal:
         axis.set_aspect("equal", adjustable="datalim")
-    axis.set_title(panel.title, loc="left")
     axis.set_xlabel(panel.x_label)
     axis.set_ylabel(panel.y_label)
-    named = [c for c in panel.curves if c.name]
-    if legend and len({c.name for c in named}) > 1:
-        axis.legend(fontsize=7, loc="best", handlelength=1.2, borderaxespad=0.2)
+    names = {c.name for c in panel.curves if c.name}
+    rows = 0
+    if legend and len(names) > 1:
+        columns = max(1, min(len(names), _LEGEND_LETTERS // (max(map(len, names)) + 4)))
+        rows = -(-len(names) // columns)
+        axis.legend(
+            fontsize=7,
+            loc="lower left",
+            bbox_to_anchor=(0.0, 1.0),
+            ncols=columns,
+            handlelength=1.2,
+            columnspacing=1.0,
+            labelspacing=0.2,
+            borderaxespad=0.1,
+            borderpad=0.2,
+        )
+    axis.set_title(panel.title, loc="left", pad=6 + 10 * rows)
+    return rows
 
 
 def _draw_curve(axis: Any, curve: Curve) -> None:

@@ -7,6 +7,7 @@ import math
 __all__ = [
     "UNITS",
     "coefficient",
+    "duration",
     "p_text",
     "parameter_label",
     "percent",
@@ -65,6 +66,11 @@ def rounded(value: float, sd: float, unit: str = "") -> str:
     """A number to the second digit of its standard deviation, which is not shown."""
     if not math.isfinite(value) or not math.isfinite(sd) or sd <= 0:
         return plain(value, unit, 6)
+    if max(abs(value), sd) < 1e-3:
+        exponent = math.floor(math.log10(max(abs(value), sd)))
+        decimals = max(0, 1 + exponent - math.floor(math.log10(sd)))
+        body = f"{value / 10**exponent:.{decimals}f}·10{superscript(exponent)}"
+        return f"{body} {unit}".rstrip().replace("-", _MINUS)
     decimals = max(0, 1 - math.floor(math.log10(sd)))
     return f"{value:.{decimals}f} {unit}".rstrip().replace("-", _MINUS)
 
@@ -76,11 +82,22 @@ def plain(value: float, unit: str = "", digits: int = 4) -> str:
     if value == 0:
         return f"0 {unit}".rstrip()
     exponent = math.floor(math.log10(abs(value)))
-    if -4 <= exponent < 5:
+    if -3 <= exponent < 5:
         body = f"{value:.{max(0, digits - 1 - exponent)}f}"
     else:
         body = f"{value / 10**exponent:.{digits - 1}f}·10{superscript(exponent)}"
     return f"{body} {unit}".rstrip().replace("-", _MINUS)
+
+
+def duration(seconds: float) -> str:
+    """`25 minutes`, `1 minute`, `3.5 hours`, `12 days`: as long as a person would say it."""
+    for unit, length in (("day", 86_400.0), ("hour", 3600.0), ("minute", 60.0)):
+        if seconds >= 2 * length or (unit == "minute" and seconds >= 59.5):
+            count = seconds / length
+            shown = f"{count:.0f}" if count >= 10 or unit == "minute" else f"{count:.1f}"
+            return f"{shown} {unit}{'' if shown == '1' else 's'}"
+    shown = f"{seconds:.0f}"
+    return f"{shown} second{'' if shown == '1' else 's'}"
 
 
 def percent(share: float, decimals: int = 0) -> str:

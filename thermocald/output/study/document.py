@@ -30,7 +30,8 @@ def study_document(study: Study) -> dict[str, Any]:
                 "sets": s.sets,
                 "seed": s.seed,
                 "distance_mm": s.distance_mm,
-                "raster": s.raster,
+                "grid": s.grid,
+                "raster": s.grid,  # its name until the next version
                 "clusters_mm": list(s.clusters_mm),
                 "focus_mm": s.focus_mm,
                 "f_number": s.f_number,
@@ -59,7 +60,21 @@ def _camera(camera: CameraStudy) -> dict[str, Any]:
         "interior_orientation": dict(zip(IOP_NAMES, camera.iop.tolist(), strict=True)),
         "sd_over_time": dict(zip(IOP_NAMES, camera.sds.tolist(), strict=True)),
         "iop_correlations": correlations,
+        "correlations_over_time": {
+            "parameters": list(IOP_NAMES),
+            "r": camera.over_time.tolist(),
+        },
         "object_space": _object_space(camera),
+        "trajectory": [
+            {
+                "reference": one.reference,
+                "fractions": one.fractions.tolist(),
+                "mean_mm": one.mean,
+                "mean_of_maxima_mm": one.mean_largest,
+                "epochs": one.epochs,
+            }
+            for one in camera.trajectories
+        ],
         "notes": list(camera.notes),
     }
 
@@ -84,6 +99,7 @@ def _series(study: SeriesStudy) -> dict[str, Any]:
                 "change": d.change,
                 "sd_change": d.sd_change,
                 "largest": d.largest,
+                "range": d.range,
                 "sd_over_time": d.sd_over_time,
             }
             for name, d in study.deviations.items()
@@ -101,7 +117,7 @@ def _series(study: SeriesStudy) -> dict[str, Any]:
         },
         "image_displacement_px": None
         if study.displacement is None
-        else {"points": study.raster.tolist(), "displacement": study.displacement.tolist()},
+        else {"points": study.grid.tolist(), "displacement": study.displacement.tolist()},
         "significance": {name: _significance(t) for name, t in study.significance.items()},
         "temperature_dependence": {
             channel.thermometer.name: _channel(channel) for channel in study.channels

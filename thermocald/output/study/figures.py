@@ -155,7 +155,7 @@ def movement_figure(camera: CameraStudy) -> Figure | None:
             continue
         width = study.series.sensor.width
         factor = _round_factor(_ARROW_SHARE * width / longest)
-        start, end = study.raster, study.raster + factor * study.displacement
+        start, end = study.grid, study.grid + factor * study.displacement
         height = study.series.sensor.height
         curves = [
             Curve("", np.array([a[0], b[0]]), height - np.array([a[1], b[1]]), "line", PALETTE[1])

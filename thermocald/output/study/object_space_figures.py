@@ -22,7 +22,7 @@ _DRAWN = 400
 
 
 def error_figure(camera: CameraStudy) -> Figure | None:
-    """Error clouds on the object plane, one panel per raster point (Figures 10 and 11)."""
+    """Error clouds on the object plane, one panel per grid point (Figures 10 and 11)."""
     mc, first = camera.montecarlo, camera.first_order
     if mc is None or first is None:
         return None
@@ -65,7 +65,7 @@ def error_figure(camera: CameraStudy) -> Figure | None:
 
 
 def point_figure(camera: CameraStudy) -> Figure | None:
-    """Mean and largest error of each raster point, and the mean of the largest (Figure 11)."""
+    """Mean and largest error of each grid point, and the mean of the largest (Figure 11)."""
     mc, first = camera.montecarlo, camera.first_order
     if mc is None or first is None:
         return None
@@ -111,7 +111,7 @@ def _cluster_name(limits: tuple[float, ...], j: int) -> str:
 
 
 def _place(k: int, size: int) -> str:
-    """Name of a raster point."""
+    """Name of a grid point."""
     if size != 3:
         return f"row {k // size + 1}, column {k % size + 1}"
     vertical, horizontal = ("top", "", "bottom")[k // 3], ("left", "", "right")[k % 3]

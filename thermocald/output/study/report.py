@@ -10,6 +10,8 @@ import base64
 import gzip
 import json
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +34,7 @@ __all__ = ["render_report", "save_figures", "write_report"]
 
 _TEMPLATES = Path(__file__).parent / "templates"
 _CLIP_PX = 96
+_A_YEAR = 31_557_600.0
 _LEAD = (
     "How the interior orientation of this camera changes with its temperature, whether the changes "
     "are significant, and what they do to measurements in object space. The analysis is that of "
@@ -71,8 +74,13 @@ class _Matrix:
     values: Any = field(repr=False)
 
 
-def render_report(study: Study, title: str = "Thermal study of a camera") -> str:
-    """The report as HTML text."""
+def render_report(
+    study: Study, title: str = "Thermal study of a camera", made: datetime | None = None
+) -> str:
+    """The report as HTML text.
+
+    made: the time that it bears, by default now.
+    """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
     from plotly.offline import get_plotlyjs
 
@@ -86,6 +94,7 @@ def render_report(study: Study, title: str = "Thermal study of a camera") -> str
         {
             "id": f"camera-{i}",
             "label": camera.label,
+            "device": _device(camera),
             "summary": summary(camera),
             "notes": _notes(camera),
             "parts": _parts(camera, study, f"c{i}"),
@@ -99,8 +108,36 @@ def render_report(study: Study, title: str = "Thermal study of a camera") -> str
         style=(_TEMPLATES / "study.css").read_text(encoding="utf-8"),
         script=(_TEMPLATES / "study.js").read_text(encoding="utf-8"),
         plotly=_packed(get_plotlyjs()),
+        made=_made(made),
         footer=f"thermocald {__version__}",
     )
+
+
+def _made(at: datetime | None) -> str:
+    """When and with what the report was made."""
+    at = at or datetime.now(tz=UTC)
+    versions = ", ".join(f"{name} {version(name)}" for name in ("numpy", "scipy"))
+    return f"Made on {at:%Y-%m-%d at %H:%M} UTC with thermocald {__version__} ({versions})."
+
+
+def _device(camera: CameraStudy) -> str:
+    """The camera, its sensor, and when each series was measured."""
+    sensor = camera.series[0].series.sensor
+    names = ", ".join(dict.fromkeys(study.series.camera for study in camera.series))
+    measured = "; ".join(
+        f"{s.name} {_day(s.start_utc)}" for s in (study.series for study in camera.series)
+    )
+    return (
+        f"{names}, {sensor.width} × {sensor.height} px of {sensor.pixel_pitch * 1000:g} µm. "
+        f"Measured: {measured}."
+    )
+
+
+def _day(start_utc: float) -> str:
+    """The start of a series, or that it has no date: simulated recordings count from 1970."""
+    if not start_utc > _A_YEAR:
+        return "(no date)"
+    return f"{datetime.fromtimestamp(start_utc, tz=UTC):%Y-%m-%d %H:%M} UTC"
 
 
 def write_report(path: Path, html: str) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from thermocald.output.figures.numbers import (
     UNITS,
     coefficient,
+    duration,
     p_text,
     parameter_label,
     percent,
@@ -43,6 +44,9 @@ __all__ = [
 ]
 
 
+_FIXED = {"first": "first epoch", "mean": "mean", "last": "last epoch"}
+
+
 @dataclass(frozen=True, slots=True)
 class Table:
     """Headings and rows of text; note: what the columns mean."""
@@ -59,16 +63,16 @@ def overview_table(camera: CameraStudy) -> Table:
     for study in camera.series:
         s = study.series
         lost = sum(s.without_result.values())
-        t = study.deviations.get(s.reference.name) if s.reference else None
         rows.append(
             (
                 s.name,
                 s.camera,
                 f"{s.sensor.width} × {s.sensor.height} px of {s.sensor.pixel_pitch * 1000:g} µm",
                 f"{len(s)}" + (f" of {len(s) + lost}" if lost else ""),
-                f"{(s.time_s[-1] - s.time_s[0]) / 60:.1f} min",
+                duration(float(s.time_s[-1] - s.time_s[0])),
                 f"{s.interval_s:.1f} s" if len(s) > 1 else "–",
-                f"{t.first:.1f} to {t.last:.1f} °C" if t else "–",
+                _temperatures(study),
+                _noise(study),
                 ", ".join(parameter_label(name) for name in s.free),
             )
         )
@@ -82,10 +86,26 @@ def overview_table(camera: CameraStudy) -> Table:
             "duration",
             "interval",
             "temperature",
+            "σ₀; noise / stated",
             "estimated",
         ),
         tuple(rows),
+        "Temperature: first to last epoch, and its range. σ₀ is that of the adjustments, against "
+        "the stated standard deviations of the image points; noise / stated is the scatter between "
+        "neighbouring epochs over the stated standard deviations of the parameters.",
     )
+
+
+def _temperatures(study: SeriesStudy) -> str:
+    s = study.series
+    t = study.deviations.get(s.reference.name) if s.reference else None
+    return f"{t.first:.1f} to {t.last:.1f} °C, range {t.range:.1f} K" if t else "–"
+
+
+def _noise(study: SeriesStudy) -> str:
+    sigma0 = float(np.sqrt(np.mean(np.square(study.series.sigma0))))
+    ratio = f"{study.noise_ratio:.2f}" if np.isfinite(study.noise_ratio) else "–"
+    return f"{sigma0:.2f}; {ratio}"
 
 
 def deviation_table(camera: CameraStudy) -> Table:
@@ -110,6 +130,7 @@ def deviation_table(camera: CameraStudy) -> Table:
                     with_sd(k * d.change, k * d.sd_change, change_unit),
                     _in_pixels(name, d, study.series.sensor.pixel_pitch),
                     plain(k * d.largest, change_unit, 3),
+                    plain(k * d.range, change_unit, 3),
                     plain(k * d.sd_over_time, change_unit, 3),
                 )
             )
@@ -123,12 +144,14 @@ def deviation_table(camera: CameraStudy) -> Table:
             "last − first ± sd",
             "in px",
             "largest",
+            "range",
             "sd over time",
         ),
         tuple(rows),
         "The standard deviation beside a difference is that of the two adjustments (for "
         "temperatures: of the two readings). Largest is the greatest departure from the first "
-        "epoch; sd over time is what the simulation below draws from.",
+        "epoch, range the largest minus the smallest value, noise included; sd over "
+        "time is what the simulation below draws from.",
     )
 
 
@@ -298,7 +321,7 @@ def correlation_noise_table(camera: CameraStudy) -> Table | None:
 
 
 def cluster_table(camera: CameraStudy) -> Table | None:
-    """Shares of the errors, means, maxima (Table 7)."""
+    """Fractions of the errors, means, maxima (Table 7), and of the camera's own path."""
     mc, first = camera.montecarlo, camera.first_order
     if mc is None or first is None:
         return None
@@ -307,8 +330,8 @@ def cluster_table(camera: CameraStudy) -> Table | None:
     names += [f"{a:g}–{b:g} cm" for a, b in pairwise(cm)]
     names.append(f"> {cm[-1]:g} cm")
 
-    def row(label: str, shares: object, mean: float, largest: float) -> tuple[str, ...]:
-        shown = [percent(float(v), 1) for v in np.asarray(shares, dtype=float)]
+    def row(label: str, fractions: object, mean: float, largest: float) -> tuple[str, ...]:
+        shown = [percent(float(v), 1) for v in np.asarray(fractions, dtype=float)]
         return (label, *shown, f"{mean / 10:.2f} cm", f"{largest / 10:.1f} cm")
 
     return Table(
@@ -322,16 +345,22 @@ def cluster_table(camera: CameraStudy) -> Table | None:
                 float(first.mean.mean()),
                 float(first.expected_largest.mean()),
             ),
+            *(
+                row(f"own path, {_FIXED[t.reference]} fixed", t.fractions, t.mean, t.mean_largest)
+                for t in camera.trajectories
+            ),
         ),
         f"{mc.sets:,} sets of interior orientation, seed {mc.seed}, {len(mc.image_points)} image "
         "points. First order is the analytic propagation of the same covariance: where it differs "
         "from the simulation, linear error propagation fails. The mean of maxima depends on the "
-        "number of sets and, by some per cent, on the seed.",
+        "number of sets and, by some per cent, on the seed. The draws are normal about the series' "
+        "mean, with the correlations of the adjustments; the own path is that of the measured "
+        "epochs, against one interior orientation that is held fixed.",
     )
 
 
 def point_table(camera: CameraStudy) -> Table | None:
-    """Errors per raster point (Figure 11)."""
+    """Errors per grid point (Figure 11)."""
     mc, first = camera.montecarlo, camera.first_order
     if mc is None or first is None:
         return None

@@ -349,7 +349,7 @@ class AndroidThermometer(Thermometer):
         return {"serial": self.phone.serial}
 
     def read(self) -> Reading:
-        begin = self.clock.monotonic()
+        start = self.clock.monotonic()
         kinds = {source.partition(":")[0] for source in self.sensors.values()}
         texts = {kind: self.phone.shell(DUMPS[kind]) for kind in sorted(kinds)}
         found = self._battery_and_service(texts) | self._zones(texts)
@@ -365,7 +365,7 @@ class AndroidThermometer(Thermometer):
         if not values:
             raise BadReading(f"{self.phone.where}: {'; '.join(missing.values())}")
         about = {"missing": missing} if missing else {}
-        return support.middle_reading(self.clock, values, begin, about)
+        return support.middle_reading(self.clock, values, start, about)
 
     def _stated(self) -> dict[str, float]:
         """{zone: factor to °C} of the units in the stanza."""

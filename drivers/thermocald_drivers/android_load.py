@@ -85,7 +85,7 @@ class AndroidLoadOutput(Output):
     def open(self) -> None:
         self.phone.connect()
         self.programme.reset()
-        self._begin = self.clock.monotonic()
+        self._started = self.clock.monotonic()
         self._renewed = float("-inf")
         self._stop()  # what a crashed program left behind
 
@@ -98,7 +98,7 @@ class AndroidLoadOutput(Output):
         battery = android_temperatures.battery(self.phone.shell("dumpsys battery"))
         was_tripped = self.programme.tripped
         now = self.clock.monotonic()
-        if not self.programme.decide(now - self._begin, battery):
+        if not self.programme.decide(now - self._started, battery):
             self._stop()
             if self.programme.tripped and not was_tripped:
                 raise BadReading(f"{self.phone.where}: off for good, {self.programme.tripped}")

@@ -56,7 +56,7 @@ class Faults:
         self._timeout_s = support.number(f"{where}: timeout_s", timeout_s, 0.0, 3600.0, "s")
         self._faults = [_parse(where, entry) for entry in plan]
         self._calls = 0
-        self._begin: float | None = None
+        self._started: float | None = None
 
     def inject(self, kind: Kind, count: int = 1) -> None:
         """Let the next `count` calls fail."""
@@ -70,8 +70,8 @@ class Faults:
 
     def on_open(self) -> None:
         """Called by `open`: DeviceGone while unplugged; such an attempt counts as a call."""
-        if self._begin is None:
-            self._begin = self._clock.monotonic()
+        if self._started is None:
+            self._started = self._clock.monotonic()
         if self._kind(self._calls + 1) == "unplugged":
             self._calls += 1
             raise DeviceGone(f"{self._where}: unplugged")
@@ -99,7 +99,7 @@ class Faults:
 
     def _kind(self, call: int) -> Kind | None:
         now = self._clock.monotonic()
-        elapsed = 0.0 if self._begin is None else now - self._begin
+        elapsed = 0.0 if self._started is None else now - self._started
         return next((f.kind for f in self._faults if f.active(call, elapsed)), None)
 
 

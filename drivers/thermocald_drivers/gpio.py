@@ -135,7 +135,7 @@ class RelayOutput(Output):
     def open(self) -> None:
         self._relay = _pin("DigitalOutputDevice", self.pin, self.active_high)
         self.programme.reset()
-        self._begin = self.clock.monotonic()
+        self._started = self.clock.monotonic()
 
     def close(self) -> None:
         self._stop_watchdog()
@@ -153,7 +153,7 @@ class RelayOutput(Output):
                 raise DeviceGone(f"relay at GPIO {self.pin}: not open")
             value = result.get(self.programme.channel)
             temperature = float(value) if isinstance(value, int | float) else None
-            heat = self.programme.decide(self.clock.monotonic() - self._begin, temperature)
+            heat = self.programme.decide(self.clock.monotonic() - self._started, temperature)
             self._relay.value = heat
         if self.programme.tripped:
             if not was_tripped:

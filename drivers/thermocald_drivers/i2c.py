@@ -102,13 +102,13 @@ class I2cThermometer(Thermometer):
     def read(self) -> Reading:
         if self._smbus is None:
             raise DeviceGone(f"{self.where}: not open")
-        begin = self.clock.monotonic()
+        start = self.clock.monotonic()
         try:
             value, about = self._measure()
         except OSError as error:
             raise support.fault(error, self.where, seen=True) from error
         support.believable(value, *self.range_c, self.where)
-        return support.middle_reading(self.clock, {self.channel: value}, begin, about)
+        return support.middle_reading(self.clock, {self.channel: value}, start, about)
 
     def _identify(self) -> Mapping[str, str]:
         """Check that it is this chip and make it convert; WrongDevice if it is another."""

@@ -109,7 +109,7 @@ class JsonLinesOutput(Output):
 
     def _write(self, line: bytes) -> None:
         """Write the whole line; on failure remove what was written of it."""
-        begin = os.fstat(self._file).st_size
+        start = os.fstat(self._file).st_size
         deadline = time.monotonic() + self.timeout_s
         written = 0
         try:
@@ -123,5 +123,5 @@ class JsonLinesOutput(Output):
         except OSError:
             if written and not self._pipe:
                 with contextlib.suppress(OSError):
-                    os.ftruncate(self._file, begin)
+                    os.ftruncate(self._file, start)
             raise

@@ -133,7 +133,7 @@ class _KernelThermometer(Thermometer):
     def read(self) -> Reading:
         if self._device is None:
             raise DeviceGone(f"{self.chip}: not open")
-        begin = self.clock.monotonic()
+        start = self.clock.monotonic()
         values: dict[str, float] = {}
         missing: dict[str, str] = {}
         for channel, key in self._channels.items():
@@ -154,7 +154,7 @@ class _KernelThermometer(Thermometer):
         if not values:
             raise BadReading("; ".join(missing.values()))
         return support.middle_reading(
-            self.clock, values, begin, {"missing": missing} if missing else {}
+            self.clock, values, start, {"missing": missing} if missing else {}
         )
 
     def _same_device(self) -> None:

@@ -67,7 +67,7 @@ class MockCamera(Camera):
         latency = support.number("latency_s", latency_s, 0.0, 60.0, "s")
         self._latency_s = max(latency, self._exposure_s)
         self.faults = Faults("mock camera", clock, faults, timeout_s)
-        self._begin: float | None = None
+        self._started: float | None = None
         self._sequence = 0
         self._open = False
         self._scene: Scene | None = None
@@ -76,8 +76,8 @@ class MockCamera(Camera):
     def open(self) -> None:
         self.faults.on_open()
         _ = self.scene
-        if self._begin is None:
-            self._begin = self.clock.monotonic()
+        if self._started is None:
+            self._started = self.clock.monotonic()
         self._open = True
 
     def close(self) -> None:
@@ -138,7 +138,7 @@ class MockCamera(Camera):
         """The true orientation and effects at a time of the monotonic clock."""
         from thermocald.simulation.history import History
 
-        elapsed = monotonic - (monotonic if self._begin is None else self._begin)
+        elapsed = monotonic - (monotonic if self._started is None else self._started)
         readings = {"temperature": self._values}
         history = History(np.array([elapsed]), self._times, readings, "temperature", 0.0)
         return self.model.predict(history, self.field)

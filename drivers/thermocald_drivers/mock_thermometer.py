@@ -58,13 +58,13 @@ def lagged(
         return float(np.interp(at, times, values))
     state, now = float(values[0]), float(times[0])
     pieces = zip(times, np.append(times[1:], math.inf), values, strict=True)
-    for i, (begin, end, value) in enumerate(pieces):
-        if at <= begin:
+    for i, (start, end, value) in enumerate(pieces):
+        if at <= start:
             break
-        slope = 0.0 if math.isinf(end) else (values[i + 1] - value) / (end - begin)
+        slope = 0.0 if math.isinf(end) else (values[i + 1] - value) / (end - start)
         until = min(at, end)
-        settled_before, settled = value - slope * lag_s, value + slope * (until - begin - lag_s)
-        state = settled + (state - settled_before) * math.exp(-(until - begin) / lag_s)
+        settled_before, settled = value - slope * lag_s, value + slope * (until - start - lag_s)
+        state = settled + (state - settled_before) * math.exp(-(until - start) / lag_s)
         now = until
         if now >= at:
             break
@@ -94,14 +94,14 @@ class MockThermometer(Thermometer):
         self._seed = int(support.number("seed", seed, 0, 2**31, whole=True))
         self._conversion_s = support.number("conversion_s", conversion_s, 0.0, 60.0, "s")
         self.faults = Faults("mock thermometer", clock, faults, timeout_s)
-        self._begin: float | None = None
+        self._started: float | None = None
         self._open = False
         self._last: dict[str, float] = {}
 
     def open(self) -> None:
         self.faults.on_open()
-        if self._begin is None:
-            self._begin = self.clock.monotonic()
+        if self._started is None:
+            self._started = self.clock.monotonic()
         self._open = True
 
     def close(self) -> None:
@@ -114,13 +114,13 @@ class MockThermometer(Thermometer):
         if not self._open:
             raise DeviceGone("mock thermometer: it is not open")
         kind = self.faults.on_call()
-        begin = self.clock.monotonic()
-        self.clock.sleep_until(begin + self._conversion_s)
+        start = self.clock.monotonic()
+        self.clock.sleep_until(start + self._conversion_s)
         self.faults.refuse(kind, "answer")
-        middle = begin + 0.5 * self._conversion_s
+        middle = start + 0.5 * self._conversion_s
         if kind != "stuck" or not self._last:
             self._last = {name: self._value(name, middle) for name in self._channels}
-        return support.middle_reading(self.clock, self._last, begin)
+        return support.middle_reading(self.clock, self._last, start)
 
     def truth(self, monotonic: float) -> float:
         """The programme's temperature (°C) at a time of the monotonic clock."""
@@ -136,7 +136,7 @@ class MockThermometer(Thermometer):
         return float(round(value / step) * step if step > 0 else value)
 
     def _elapsed(self, monotonic: float) -> float:
-        return monotonic - (monotonic if self._begin is None else self._begin)
+        return monotonic - (monotonic if self._started is None else self._started)
 
 
 def _channel(name: str, options: Mapping[str, float]) -> dict[str, float]:

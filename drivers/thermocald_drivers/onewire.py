@@ -170,14 +170,14 @@ class Ds18b20Thermometer(Thermometer):
     def read(self) -> Reading:
         if not self._open:
             raise DeviceGone("1-wire: not open")
-        begin = self.clock.monotonic()
+        start = self.clock.monotonic()
         patience_s = self.timeout_s * len(self.sensors)
         for channel in self.sensors:
             self._start(channel)
         values: dict[str, float] = {}
         missing: dict[str, DeviceError] = {}
         for channel, rom in self.sensors.items():
-            left = max(0.0, patience_s - (self.clock.monotonic() - begin))
+            left = max(0.0, patience_s - (self.clock.monotonic() - start))
             try:
                 values[channel] = self._pending[channel].result(timeout=left)
                 del self._pending[channel]
@@ -189,7 +189,7 @@ class Ds18b20Thermometer(Thermometer):
         if not values:
             raise next(iter(missing.values()))
         about = {"missing": {k: str(v) for k, v in missing.items()}} if missing else {}
-        return support.middle_reading(self.clock, values, begin, about)
+        return support.middle_reading(self.clock, values, start, about)
 
     def _start(self, channel: str) -> None:
         """Start reading a sensor; one that still hangs from the last time is not read twice."""

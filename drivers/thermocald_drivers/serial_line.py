@@ -247,7 +247,7 @@ class SerialThermometer(Thermometer):
     def read(self) -> Reading:
         if self._serial is None:
             raise DeviceGone(f"{self.where}: not open")
-        begin = self.clock.monotonic()
+        start = self.clock.monotonic()
         try:
             if self.command:
                 self._serial.reset_input_buffer()
@@ -261,7 +261,7 @@ class SerialThermometer(Thermometer):
                 raise
             raise self._lost(error) from error
         if self.command:
-            return support.middle_reading(self.clock, values, begin, {"line": line})
+            return support.middle_reading(self.clock, values, start, {"line": line})
         monotonic, utc = support.on_clock(self.clock, ended)
         return Reading(values=values, monotonic=monotonic, utc=utc, metadata={"line": line})
 

@@ -143,25 +143,25 @@ def on_clock(clock: Clock, monotonic: float) -> tuple[float, float]:
     """
     tries = []
     for _ in range(CLOCK_TRIES):
-        begin = time.monotonic()
+        start = time.monotonic()
         scales = clock.monotonic(), clock.utc()
-        tries.append((time.monotonic() - begin, begin, scales))
+        tries.append((time.monotonic() - start, start, scales))
         if tries[-1][0] < CLOCK_SPREAD_S:
             break
-    spread, begin, scales = min(tries)
-    age = begin + spread / 2.0 - monotonic
+    spread, start, scales = min(tries)
+    age = start + spread / 2.0 - monotonic
     return scales[0] - age, scales[1] - age
 
 
 def middle_reading(
     clock: Clock,
     values: Mapping[str, float],
-    begin: float,
+    start: float,
     metadata: Mapping[str, Any] | None = None,
 ) -> Reading:
-    """A reading timed half-way between `begin` (clock's monotonic, s) and now."""
+    """A reading timed half-way between `start` (clock's monotonic, s) and now."""
     now = time.monotonic()
-    half = (clock.monotonic() - begin) / 2.0
+    half = (clock.monotonic() - start) / 2.0
     monotonic, utc = on_clock(clock, now)
     return Reading(
         values=dict(values),

@@ -204,7 +204,7 @@ class V4l2Camera(Camera):
         metadata: dict[str, Any] = {
             "timestamp": "buffer" if stamp == grab.stamp else "arrival",
             "stale_frames_dropped": dropped,
-            "controls": self._controls.by_name(values),
+            "controls": self._controls.configured(values),
         }
         if disobeyed:
             metadata["disobeyed"] = disobeyed

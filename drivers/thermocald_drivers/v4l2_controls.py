@@ -90,6 +90,7 @@ class CameraControls:
         self._held: dict[int, int] = {}
         self._asked: dict[int, int] = {}
         self._automatic: list[Lock] = []
+        self._configured: set[int] = set()
         self._available: dict[int, Control] = {}
 
     def warnings(self) -> list[str]:
@@ -105,6 +106,7 @@ class CameraControls:
         self._available = stream.controls()
         self._asked, self._automatic = {}, []
         locked = self._collect(stream)
+        self._configured = set(self._asked) - locked - set(OFF)
         for control, value in self._asked.items():
             self._set(stream, control, value, locked)
         for control in locked & set(self._asked):
@@ -223,9 +225,9 @@ class CameraControls:
         others = {c: v for c, v in values.items() if c not in named}
         return found | {self._name(control): float(value) for control, value in others.items()}
 
-    def by_name(self, values: Mapping[int, int]) -> dict[str, int]:
-        """The values by the device's own names."""
-        return {self._name(control): value for control, value in values.items()}
+    def configured(self, values: Mapping[int, int]) -> dict[str, int]:
+        """The values of what the stanza sets, by the device's own names."""
+        return {self._name(c): v for c, v in values.items() if c in self._configured}
 
     def _of(self, lock: Lock) -> Iterable[int]:
         return [c for c in (lock.automatic, lock.control) if c in self._available]

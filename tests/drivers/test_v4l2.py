@@ -132,7 +132,9 @@ def test_manual_controls_are_set(kernel):
     assert [kernel.controls[c][4] for c in (0x9A0901, 0x9A0902, 0x980913, 0x980918)] == [
         1, 156, 10, 1,
     ]  # fmt: skip
-    assert frame.metadata["controls"]["exposure_time_absolute"] == 156
+    assert frame.metadata["controls"] == {
+        "auto_exposure": 1, "exposure_time_absolute": 156, "gain": 10, "power_line_frequency": 1,
+    }  # fmt: skip
 
 
 def test_a_camera_that_does_not_obey(kernel):

@@ -56,6 +56,7 @@ __all__ = [
 
 # Above this size (a day of 150 targets every 10 s) `iter_epochs` streams instead of loading.
 _STREAMED_ABOVE_BYTES = 100_000_000
+_HOTTEST_C = 1000.0  # no camera works there: another unit, or a damaged line
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -248,6 +249,7 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
             untimed = np.isfinite(readings[-1]) & np.isnan(times["temperature_time"][-1])
             chunk.check("temperature_time", untimed, f"is empty although {name} was read")
             chunk.check(name, readings[-1] < -273.15, "is below absolute zero")
+            chunk.check(name, readings[-1] > _HOTTEST_C, f"is above {_HOTTEST_C:g} °C")
         for row, text in enumerate(chunk.text("frame")):
             frame = text.strip()
             if frame and files.find(frame) is None:

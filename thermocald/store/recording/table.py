@@ -153,6 +153,10 @@ class Chunk:
     def numbers(self, name: str, *, empty_is_nan: bool = False) -> Array:
         """A column as (n,) finite numbers; empty fields are NaN if that is allowed."""
         column = self._columns[name]
+        joined = "".join(column)
+        if "_" in joined or not joined.isascii():  # Python reads 2_5.0 and digits of any script
+            row = next(i for i, t in enumerate(column) if "_" in t or not t.isascii())
+            self.fail(row, name, f"{column[row][:40]!r} is not a number")
         try:
             values = np.fromiter(map(float, column), dtype=np.float64, count=self._size)
         except ValueError:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,7 +23,14 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["Unknown", "event_worth", "term_of", "unknowns_of_base", "unknowns_of_term"]
+__all__ = [
+    "Unknown",
+    "event_worth",
+    "term_of",
+    "unknowns_of_base",
+    "unknowns_of_term",
+    "without_chance_events",
+]
 
 _EVENT_MARGIN = 16.0  # χ² that an event has to explain beyond what its search may find by chance
 
@@ -76,6 +83,22 @@ def event_worth(series: ReducedSeries, coefficients: int) -> float:
     """χ² that an event has to explain: its coefficients and time, and every time was a trial."""
     n = max(int((series.n > 0).sum()), 2)
     return float((coefficients + 2) * np.log(n) + _EVENT_MARGIN)
+
+
+def without_chance_events(fitter: HypothesisFitter, fit: Fit) -> tuple[Term, ...]:
+    """The terms of a fit without events that explain no more than chance beside the others."""
+    terms = list(fit.terms)
+    for block in fit.blocks:
+        if block.term < 0 or not terms[block.term].kind.is_event or block.series is None:
+            continue
+        place = slice(block.start, block.stop)
+        heights, cofactor = fit.coefficients[place], fit.covariance[place, place]
+        gain = float(heights @ np.linalg.solve(cofactor, heights))
+        if gain <= event_worth(fitter.series[block.series], len(heights)):
+            fresh = list(terms[block.term].fresh)
+            fresh[block.series] = None
+            terms[block.term] = replace(terms[block.term], fresh=tuple(fresh))
+    return tuple(terms)
 
 
 def unknowns_of_base(fit: Fit, scale: Array) -> list[Unknown]:

@@ -19,7 +19,7 @@ import numpy as np
 
 from thermocald.analysis.thermal.displacement import moved_targets
 from thermocald.analysis.thermal.result import FittedModel, fitted_model
-from thermocald.analysis.thermal.terms import term_of
+from thermocald.analysis.thermal.terms import term_of, without_chance_events
 from thermocald.errors import DataError
 from thermocald.reduction.blocks import in_blocks
 from thermocald.reduction.calibrated import calibrated_thermometers
@@ -97,6 +97,9 @@ def _fitted(
         if effects.get(effect.name).seen_in == "trajectory":
             fit = fitter.fit((*fit.terms, term_of(fitter, fit, effect, search)))
     fit = fitter.refine(fit, max_iterations=20)
+    terms = without_chance_events(fitter, fit)
+    if terms != fit.terms:
+        fit = fitter.refine(fitter.fit(terms), max_iterations=20)
     for again in (curved, noisier):
         better = again(fitter, fit)
         if better is not None:

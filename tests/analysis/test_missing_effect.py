@@ -1,0 +1,161 @@
+"""A fit that misses an effect says so, widens its standard deviations, and states no band."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.analysis.test_thermal_model import LAG, for_fit, reduced, run, simulated
+from thermocald.analysis.thermal.prediction_test import predicted_error
+from thermocald.analysis.thermal.thermal_model import fit_thermal_model
+from thermocald.reduction.source import epochs_input
+from thermocald.simulation import effects
+from thermocald.simulation.effects.base import Effect
+from thermocald.simulation.effects.parameter import coefficient_units
+from thermocald.simulation.model import ModelEffect
+
+SIZE = {"c": 3e-4, "x0": 6e-4, "y0": -4e-4}
+NOISE_PX = 0.04
+
+
+class Outside(Effect):
+    """An effect that is not in the catalogue."""
+
+    kind = "signal"
+    noun = "something else"
+    linear = coefficient_units("1")
+    usual = ("c", "x0", "y0")
+
+
+class Tanh(Outside):
+    name = "tanh"
+
+    def signal(self, history, **_):
+        return np.tanh((history.temperature() - 38.0) / 5.0)[:, None]
+
+
+class SignedSquare(Outside):
+    name = "signed_square"
+
+    def signal(self, history, **_):
+        rate = np.gradient(history.temperature(), history.times) / 0.03
+        return (np.sign(rate) * rate**2)[:, None]
+
+
+class Integral(Outside):
+    name = "integral"
+
+    def signal(self, history, **_):
+        steps = np.diff(history.times, prepend=history.times[0])
+        return (np.cumsum((history.temperature() - history.T0) * steps) / 1e4)[:, None]
+
+
+CASES = {
+    "lag": ModelEffect("thermal_lag", {"tau": 120.0}),
+    "tanh": ("tanh", SIZE),
+    "signed_square": ("signed_square", SIZE),
+    "integral": ("integral", SIZE),
+}
+
+
+@pytest.fixture
+def outside(monkeypatch):
+    """The catalogue with effects that no fit is told of."""
+    own = {c.name: c() for c in (Tanh, SignedSquare, Integral)}
+    inside = effects.get
+    monkeypatch.setattr(effects, "get", lambda name: own.get(name) or inside(name))
+
+
+def hidden(name):
+    case = CASES[name]
+    return case if isinstance(case, ModelEffect) else ModelEffect(*case)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_camera_outside_the_family(outside, name):
+    """M1 is fitted by the base model; M2, heated otherwise, gets no band that it does not keep."""
+    first = simulated(1, "M1", listed=(hidden(name),))
+    second = simulated(51, "M2", listed=(hidden(name),), power=6.5)
+
+    f = fit_thermal_model([reduced(first)], [])
+    error = predicted_error(f.model, reduced(second), f.series[0].thermometer_sd)
+
+    assert f.missing.found
+    assert f.missing.misfit_px > 2 * 0.004
+    assert f.model.misses_an_effect
+    # the noise is not what the model lacks: neither the image's nor the thermometer's
+    assert abs(f.sigma0 - 1.0) < 0.03
+    assert f.series[0].thermometer_sd < 0.06
+    assert error.floor_px < 1.2 * NOISE_PX
+    assert error.rms_px > 2 * error.floor_px
+    assert np.isnan(error.coverage)
+    if name != "tanh":  # whose linear part is a rate like any other
+        for n in ("c", "x0", "y0"):
+            assert abs(f.model.rates[n] - first.model.rates[n]) < 3 * f.sd(f"rates.{n}"), n
+
+
+def test_inside_the_family_nothing_is_missing():
+    for listed in ((), (LAG,)):
+        f = fit_thermal_model([reduced(simulated(3, listed=listed))], listed)
+        assert not f.missing.found
+        assert not f.model.misses_an_effect
+
+
+def test_the_command_says_it(tmp_path):
+    for k, name in enumerate(("M1", "M2")):
+        simulated(k, name, listed=(hidden("lag"),)).write(tmp_path / name)
+    model = tmp_path / "camera.yaml"
+    fitted = run("fit", tmp_path / "M1", "-o", model, "--json", tmp_path / "fit.json")
+    tested = run("predict", "--model", model, "--test", tmp_path / "M2")
+    written = json.loads(run("predict", "--model", model, "--test", tmp_path / "M2",
+                             "--json", "-").stdout)  # fmt: skip
+
+    assert "an effect is missing" in fitted.stdout
+    assert "run: thermocald discover" in fitted.stdout
+    assert "valid from" not in fitted.stdout
+    document = json.loads((tmp_path / "fit.json").read_text())
+    assert document["effect_missing"] is True
+    assert "no 95 % band is stated" in tested.stdout
+    assert "the model misses an effect" in tested.stderr
+    assert written["series"][0]["coverage"] is None
+
+
+def level_pulls(draws, epochs, noise=0.1, field=0.02):
+    """Errors of the level and the drifts over their stated sd, (draws, 11)."""
+    pulls = []
+    for seed in range(draws):
+        s = simulated(seed, epochs=epochs)
+        thermometers = {k: replace(t, noise=noise) for k, t in s.device.thermometers.items()}
+        s = replace(s, device=replace(s.device, thermometers=thermometers))
+        rng = np.random.default_rng(1000 + seed)
+        wrong = s.field.points + rng.normal(0, field, s.field.points.shape)
+        said = replace(s.field, points=wrong, sigmas=np.full(wrong.shape, field))
+        source = epochs_input(s.head, said, list(s.epochs()), "M1")
+        f = fit_thermal_model([for_fit(source)], [LAG], T0=30.0, search=False)
+        true = s.model.interior.as_array() + 5.0 * s.model.rate_vector
+        names = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2")
+        pull = [
+            (getattr(f.model.interior, n) - t) / f.sd(f"interior.{n}")
+            for n, t in zip(names, true, strict=False)
+        ]
+        pull += [
+            (f.model.rates[n] - s.model.rates[n]) / f.sd(f"rates.{n}") for n in ("c", "x0", "y0")
+        ]
+        pulls.append(pull)
+    return np.array(pulls)
+
+
+@pytest.mark.slow
+def test_standard_deviations_of_the_level_are_true():
+    """200 draws, thermometer noise 0.1 K, field 0.02 mm: error over sd, 1 ± 2 / √400 per number."""
+    spread = np.sqrt(np.mean(level_pulls(200, 40) ** 2, axis=0))
+    assert np.all(np.abs(spread - 1.0) < 0.1), spread
+
+
+def test_the_level_is_not_as_uncertain_as_the_thermometer_is_noisy():
+    """A few draws: ± 0.4 px is the field's share; 2.8 px was stated for 0.1 K of noise."""
+    spread = np.sqrt(np.mean(level_pulls(4, 40)[:, :3] ** 2))
+    assert 0.5 < spread < 1.6

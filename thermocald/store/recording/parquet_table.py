@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["ColumnChunk", "ParquetTable", "csv_to_parquet", "parquet_to_csv"]
+__all__ = ["ColumnChunk", "ParquetTable", "csv_to_parquet", "parquet_to_csv", "write_parquet"]
 
 _ROWS = 1 << 18
 _MOST_COLUMNS = 200
@@ -134,8 +134,9 @@ class _Writer:
         pyarrow = _pyarrow()
         batch = pyarrow.table(dict(columns))
         if self._writer is None:
+            words = [f.name for f in batch.schema if f.type == pyarrow.string()]
             self._writer = pyarrow.parquet.ParquetWriter(
-                self._partial, batch.schema, compression="zstd", use_dictionary=["target"]
+                self._partial, batch.schema, compression="zstd", use_dictionary=words
             )
         self._writer.write_table(batch)
 
@@ -147,6 +148,17 @@ class _Writer:
                 self._partial.replace(self._path)
         finally:
             self._partial.unlink(missing_ok=True)
+
+
+def write_parquet(path: Path, columns: Mapping[str, Any]) -> None:
+    """Write columns {name: (n,)} as one Parquet file, whole or not at all; NaN becomes null."""
+    pyarrow = _pyarrow()
+    arrays = {
+        name: pyarrow.array(values, from_pandas=isinstance(values, np.ndarray))
+        for name, values in columns.items()
+    }
+    with _Writer(path) as writer:
+        writer.write(arrays)
 
 
 def csv_to_parquet(source: Path, target: Path, advance: Any = lambda _: None) -> None:

@@ -1,0 +1,141 @@
+"""Archives calibrated again: every engine gives the same bits, and a bad block costs itself."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from contextlib import ExitStack
+from dataclasses import replace
+
+import pytest
+
+from tests.fleet.deadly import die
+from thermocald.errors import DataError, UsageError
+from thermocald.fleet import reprocess
+from thermocald.fleet.reprocess import find_blocks, run_blocks
+from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE
+from thermocald.simulation.presets import preset_simulation
+
+parquet = pytest.importorskip("pyarrow.parquet", reason="pip install thermocald[parquet]")
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("archive")
+    for name in ("M1", "M2"):
+        preset_simulation("rpi-v2.1-heating", 1, name).write(folder / name)
+    return folder
+
+
+def files(out):
+    return {p.relative_to(out): p.read_bytes() for p in sorted(out.rglob("*.parquet"))}
+
+
+def blocks_of(archive, out, size=40):
+    return find_blocks([archive], out, tuple(DEFAULT_FREE), size)
+
+
+def test_processes_give_the_bits_of_one(archive, tmp_path):
+    run_blocks(blocks_of(archive, tmp_path / "one"))
+    done = run_blocks(blocks_of(archive, tmp_path / "two"), jobs=2)
+    assert sum(o.calibrated for o in done) == 300
+    assert files(tmp_path / "one") == files(tmp_path / "two")
+    table = parquet.read_table(tmp_path / "one")
+    assert table.num_rows == 300
+    assert table.column("sd_x0").null_count == 0
+
+
+def test_an_interrupted_run_goes_on(archive, tmp_path):
+    blocks = blocks_of(archive, tmp_path)
+    run_blocks(blocks[:3])
+    assert blocks_of(archive, tmp_path) == blocks[3:]
+
+
+def test_what_fails_costs_itself(archive, tmp_path):
+    blocks = blocks_of(archive, tmp_path, 75)
+    blocks[1] = replace(blocks[1], recording=tmp_path / "gone")
+    done = run_blocks(blocks, jobs=2)
+    assert sorted(bool(o.error) for o in done) == [False, False, False, True]
+    assert len(files(tmp_path)) == 3
+
+
+def test_a_block_that_kills_its_process_costs_itself(archive, tmp_path, monkeypatch):
+    monkeypatch.setattr(reprocess, "calibrate_block", die)
+    done = run_blocks(blocks_of(archive, tmp_path, 75), jobs=2)
+    assert sorted(o.error for o in done) == ["", "", "", "its process died twice"]
+
+
+def test_bad_usage_is_said(archive, tmp_path):
+    with pytest.raises(DataError, match="no recording"):
+        find_blocks([tmp_path], tmp_path, ())
+    with pytest.raises(UsageError, match="there is `local`"):
+        run_blocks([], "fast")
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    """A real scheduler and two real worker processes: its address, and the workers."""
+    pytest.importorskip("distributed", reason="pip install thermocald[dask]")
+    known = tmp_path / "scheduler.json"
+
+    def start(program, *options):
+        command = [sys.executable, "-m", f"distributed.cli.{program}", "--scheduler-file", known]
+        return subprocess.Popen(
+            [*map(str, command), *options], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+
+    with ExitStack() as stack:
+        scheduler = start("dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard")
+        stack.callback(scheduler.wait)
+        stack.callback(scheduler.kill)
+        deadline = time.monotonic() + 60
+        while not known.exists():
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        workers = [start("dask_worker", "--nthreads", "1", "--no-dashboard", "--no-nanny")
+                   for _ in range(2)]  # fmt: skip
+        for worker in workers:
+            stack.callback(worker.wait)
+            stack.callback(worker.kill)
+        yield json.loads(known.read_text())["address"], workers
+
+
+@pytest.mark.slow
+def test_a_cluster_gives_the_bits_of_one_process(archive, tmp_path, cluster):
+    """Two workers; one of them is killed while it works."""
+    address, workers = cluster
+    run_blocks(blocks_of(archive, tmp_path / "one", 10))
+    out = tmp_path / "again"
+    program = (
+        "import sys; from pathlib import Path;"
+        "from thermocald.fleet.reprocess import find_blocks, run_blocks;"
+        "from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE;"
+        "b = find_blocks([Path(sys.argv[1])], Path(sys.argv[2]), tuple(DEFAULT_FREE), 10);"
+        "print([o.error for o in run_blocks(b, sys.argv[3]) if o.error])"
+    )
+    client = subprocess.Popen(
+        [sys.executable, "-c", program, archive, out, address], stdout=subprocess.PIPE, text=True
+    )
+    deadline = time.monotonic() + 120
+    while len(list(out.rglob("*.parquet"))) < 4:
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    workers[0].kill()
+    errors, _ = client.communicate(timeout=180)
+    assert errors.splitlines()[-1] == "[]"
+    assert files(tmp_path / "one") == files(out)
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_is_not_there_is_said(archive, tmp_path):
+    pytest.importorskip("distributed", reason="pip install thermocald[dask]")
+    done = subprocess.run(
+        [sys.executable, "-m", "thermocald", "reprocess", archive, "--out", tmp_path / "o",
+         "--engine", "tcp://127.0.0.1:9"],
+        check=False, capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "the scheduler cannot be reached" in done.stderr
+    assert "Traceback" not in done.stderr

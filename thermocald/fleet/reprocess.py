@@ -1,0 +1,213 @@
+"""Archives calibrated again, block by block, on the cores of this machine or on a Dask cluster.
+
+    recordings ─► blocks of epochs ─► frame, observations, adjustment ─► one Parquet file a block
+
+A block depends on nothing but its recording: it begins with a search of the whole frame, whoever
+computes it, so a cluster gives the same bits as one core. A file that is there is not made again,
+which is how an interrupted run goes on. A block that fails, or kills its process, is reported and
+costs nothing but itself.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from importlib import import_module
+from itertools import islice
+from multiprocessing import get_context
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.acquisition.calibrator import Calibrator
+from thermocald.errors import DataError, ServerGone, ThermocaldError, UsageError
+from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
+from thermocald.store.database.row import EpochResult
+from thermocald.store.recording.parquet_table import write_parquet
+from thermocald.store.recording.reader import open_recording
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
+
+__all__ = ["Block", "Outcome", "calibrate_block", "find_blocks", "run_blocks"]
+
+log = logging.getLogger(__name__)
+
+BLOCK = 360
+"""Epochs of a block: an hour at 10 s. The search that it begins with is a hundredth of its work."""
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Epochs of a recording by their position, `first` to before `stop`, and where they go."""
+
+    recording: Path
+    first: int
+    stop: int
+    target: Path
+    free: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of a block: epochs, how many have a result; `error` is empty where it is done."""
+
+    block: Block
+    epochs: int
+    calibrated: int
+    error: str = ""
+
+
+def find_blocks(
+    archives: Sequence[Path], out: Path, free: tuple[str, ...], size: int = BLOCK
+) -> list[Block]:
+    """The blocks of all recordings at or below some folders, but those that are done.
+
+    Raises DataError where there is no recording, or two would be written to one place.
+    """
+    found = sorted({p.parent for a in archives for p in a.rglob("recording.yaml")})
+    if not found:
+        raise DataError(f"{', '.join(map(str, archives))}: no recording is there")
+    blocks: list[Block] = []
+    taken: dict[Path, Path] = {}
+    for path in found:
+        recording = open_recording(path)
+        folder = out / f"{recording.camera.name}-{recording.series}".replace(os.sep, "_")
+        if other := taken.get(folder):
+            raise DataError(
+                f"{path} and {other} are the same series {recording.camera.name}/"
+                f"{recording.series}; reprocess them into folders of their own"
+            )
+        taken[folder] = path
+        for first in range(0, len(recording.columns), size):
+            target = folder / f"part-{first:08d}.parquet"
+            if not target.exists():
+                stop = min(first + size, len(recording.columns))
+                blocks.append(Block(path, first, stop, target, free))
+    return blocks
+
+
+def calibrate_block(block: Block) -> Outcome:
+    """Calibrate one block and write its file, whole or not at all; never raises for its data."""
+    try:
+        columns, calibrated = _columns(block)
+        block.target.parent.mkdir(parents=True, exist_ok=True)
+        write_parquet(block.target, columns)
+    except (ThermocaldError, OSError) as error:
+        return Outcome(block, 0, 0, str(error))
+    return Outcome(block, block.stop - block.first, calibrated)
+
+
+def run_blocks(
+    blocks: Sequence[Block],
+    engine: str = "local",
+    jobs: int = 1,
+    report: Callable[[Outcome], None] = lambda _: None,
+) -> list[Outcome]:
+    """Calibrate blocks, on `jobs` processes of this machine or on a Dask scheduler's workers.
+
+    engine: `local`, or the address of a scheduler, `tcp://host:8786`, whose workers see the same
+    folders. report: told of each block as it is done. Raises UsageError, ServerGone.
+    """
+    if engine == "local":
+        run = _alone(blocks) if jobs == 1 else _processes(blocks, jobs)
+    elif "://" in engine:
+        run = _cluster(blocks, engine)
+    else:
+        raise UsageError(f"--engine {engine}: there is `local`, or a scheduler's tcp://HOST:PORT")
+    outcomes = []
+    for outcome in run:
+        outcomes.append(outcome)
+        report(outcome)
+    return outcomes
+
+
+def _alone(blocks: Sequence[Block]) -> Iterator[Outcome]:
+    return map(calibrate_block, blocks)
+
+
+def _processes(blocks: Sequence[Block], jobs: int) -> Iterator[Outcome]:
+    """On processes of this machine; where one dies, its blocks are tried again one by one."""
+    lost: list[Block] = []
+    # not forked: OpenCV's and BLAS's threads do not survive that
+    fresh = get_context("spawn")
+    with ProcessPoolExecutor(jobs, fresh) as pool:
+        futures = {pool.submit(calibrate_block, block): block for block in blocks}
+        for future in as_completed(futures):
+            try:
+                yield future.result()
+            except BrokenProcessPool:
+                lost.append(futures[future])
+    for block in lost:
+        with ProcessPoolExecutor(1, fresh) as pool:
+            try:
+                yield pool.submit(calibrate_block, block).result()
+            except BrokenProcessPool:
+                yield Outcome(block, 0, 0, "its process died twice")
+
+
+def _cluster(blocks: Sequence[Block], address: str) -> Iterator[Outcome]:
+    try:
+        distributed: Any = import_module("distributed")
+    except ImportError as error:
+        raise UsageError(
+            f"--engine {address} needs Dask: pip install 'thermocald[dask]'"
+        ) from error
+    try:
+        client = distributed.Client(address, timeout="20s", set_as_default=False)
+    except (OSError, TimeoutError) as error:
+        raise ServerGone(f"{address}: the scheduler cannot be reached ({error})") from error
+    with client:
+        futures = client.map(calibrate_block, blocks, pure=False, retries=1)
+        which = {future.key: block for future, block in zip(futures, blocks, strict=True)}
+        for future in distributed.as_completed(futures, loop=client.loop):
+            if future.status == "finished":
+                yield future.result()
+            else:
+                yield Outcome(which[future.key], 0, 0, str(future.exception()).splitlines()[0])
+            future.release()
+
+
+def _columns(block: Block) -> tuple[dict[str, Any], int]:
+    """The block's rows as columns, and how many epochs have a result."""
+    recording = open_recording(block.recording)
+    camera = recording.camera
+    calibrator = Calibrator(
+        camera.sensor,
+        recording.testfield,
+        AdjustmentSettings(free=block.free),
+        nominal_c=camera.principal_distance,
+        interior=camera.interior,
+    )
+    epochs = [
+        calibrator.calibrate(epoch)
+        for epoch in islice(recording.iter_epochs(), block.first, block.stop)
+    ]
+    results = [EpochResult.from_adjustment(done.adjustment) for done in epochs]
+    values = np.array([r.values for r in results])
+    sds = np.array([r.sd for r in results])
+    temperatures = {
+        name: recording.columns.at_frame(name)[block.first : block.stop]
+        for name in recording.channels
+    }
+    columns: dict[str, Any] = {
+        "camera": [camera.name] * len(epochs),
+        "series": [recording.series] * len(epochs),
+        "epoch": np.array([d.epoch.number for d in epochs], dtype=np.int64),
+        "frame_time": np.array([d.epoch.frame_time for d in epochs]),
+        **temperatures,
+        **{name: values[:, i] for i, name in enumerate(PARAMETER_NAMES)},
+        **{f"sd_{name}": sds[:, i] for i, name in enumerate(PARAMETER_NAMES)},
+        "sigma0": np.array([r.sigma0 for r in results]),
+        "redundancy": np.array([r.redundancy for r in results], dtype=np.int64),
+        "n_observations": np.array([r.n_observations for r in results], dtype=np.int64),
+        "n_rejected": np.array([len(r.rejected) for r in results], dtype=np.int64),
+        "status": [r.status for r in results],
+        "reason": [r.reason for r in results],
+    }
+    return columns, sum(r.status == "ok" for r in results)

@@ -76,3 +76,35 @@ def test_a_folder_that_cannot_be_written_is_no_error(tmp_path):
     folder = FrameFolder(FramesConfig(folder=tmp_path / "file" / "frames", min_free_gb=0))
     assert folder.keep("cam", "M1", 1, frame()) is None
     assert folder.paused
+
+
+def test_without_a_trusted_clock_nothing_is_deleted_for_its_age(folder_of):
+    folder = folder_of(max_age_days=1)
+    path = folder.root / folder.keep("cam", "M1", 1, frame())
+    os.utime(path, (1.75e9, 1.75e9))
+    assert folder.enforce(None) == []
+    assert [d.frames for d in folder.enforce(1.76e9)] == [1]
+
+
+def test_frames_taken_before_the_clock_was_set_are_as_old_as_they_are(folder_of):
+    """Found on a Pi without a battery: NTP came, and all frames looked 90 days old."""
+    folder = folder_of(max_age_days=90)
+    wrong = 100 * 86400.0  # the clock stood at the time of the last shutdown
+    paths = [folder.root / folder.keep("cam", "M1", n, frame()) for n in (1, 2)]
+    older = folder.root / folder.keep("cam", "M1", 3, frame())
+    now = time.time()
+    folder._since = now - wrong - 60.0
+    for path in paths:
+        os.utime(path, (now - wrong - 10.0,) * 2)
+    os.utime(older, (now - wrong - 7200.0,) * 2)  # of the run before
+    folder.restamp(wrong)
+    assert [abs(p.stat().st_mtime - (now - 10.0)) < 5.0 for p in paths] == [True, True]
+    assert [d.frames for d in folder.enforce(now)] == [1]
+    assert not older.exists()
+
+
+def test_a_frame_of_1970_has_no_age(folder_of):
+    folder = folder_of(max_age_days=1)
+    path = folder.root / folder.keep("cam", "M1", 1, frame())
+    os.utime(path, (3600.0, 3600.0))
+    assert folder.enforce(time.time()) == []

@@ -2,46 +2,89 @@
 
 from __future__ import annotations
 
+import pytest
+
 from thermocald.acquisition.scheduler import Schedule
 from thermocald.acquisition.steady_clock import SteadyClock
 from thermocald.hal import VirtualClock
 
 
-def test_an_hour_back_and_forth_never_turns_time_stamps_back():
-    machine = VirtualClock(utc=1.7e9)
-    clock = SteadyClock(machine)
-    schedule = Schedule(clock, 10.0)
-    stamps, steps = [], []
-    for k in range(12):
-        schedule.wait()
-        stamps.append(clock.utc())
-        if k == 3:
-            machine.step_utc(-3600.0)
-        if k == 7:
-            machine.step_utc(3600.0)
-        if (step := clock.check()) is not None:
-            steps.append((step.seconds, step.adopted))
-    assert stamps == [1.7e9 + 10.0 * k for k in range(12)]
-    assert steps == [(-3600.0, False), (3600.0, False)]
-    assert clock.error_s == 0.0
+@pytest.fixture
+def make():
+    """machine → its steady clock, which is watched four times a second as in the daemon."""
+
+    class Watched(SteadyClock):
+        def watch(self, machine, seconds):
+            steps = []
+            for _ in range(int(4 * seconds)):
+                machine.advance(0.25)
+                steps += [step] if (step := self.check()) is not None else []
+            return [(round(s.seconds), s.adopted) for s in steps]
+
+    def build(machine, synchronised=lambda: True):
+        return Watched(machine, synchronised=synchronised)
+
+    return build
 
 
-def test_a_pi_that_learns_the_time_after_boot_follows_forwards():
-    machine = VirtualClock(utc=0.0)  # no battery: 1970
-    clock = SteadyClock(machine)
+@pytest.mark.parametrize("seconds", [120 * 86400.0, -3600.0, 5.0])
+def test_a_glitch_moves_nothing(make, seconds):
+    machine = VirtualClock(utc=1.75e9)
+    clock = make(machine)
+    assert clock.settled()
+    machine.step_utc(seconds)
+    clock.check()
     assert not clock.trusted()
-    machine.step_utc(1.75e9)
+    assert not clock.settled()
+    assert clock.watch(machine, 3.0) == []
+    machine.step_utc(-seconds)
+    assert clock.watch(machine, 100.0) == [(-seconds, False)]
+    assert clock.utc() == 1.75e9 + 103.0
+    assert clock.trusted()
+    # ages are not judged for a day after a leap
+    assert clock.settled() is (abs(seconds) < 3600.0)
+    clock.watch(machine, 86400.0)
+    assert clock.settled()
+
+
+@pytest.mark.parametrize("seconds", [7200.0, -7200.0])
+def test_a_time_that_stands_is_followed_in_both_directions(make, seconds):
+    machine = VirtualClock(utc=1.75e9)
+    clock = make(machine)
+    machine.step_utc(seconds)
+    assert clock.watch(machine, 59.0) == [(seconds, False)]
+    assert clock.utc() == 1.75e9 + 59.0
+    assert clock.watch(machine, 3.0) == [(seconds, True)]
+    assert clock.utc() == 1.75e9 + 62.0 + seconds
+    assert clock.trusted()
+
+
+@pytest.mark.parametrize("start", [0.0, 1.74e9])  # no battery at all, or the time it was shut down
+def test_a_pi_that_learns_the_time_after_boot_follows_at_once(make, start):
+    known = []
+    machine = VirtualClock(utc=start)
+    clock = make(machine, synchronised=lambda: bool(known))
+    assert not clock.trusted()
+    machine.advance(30.0)
+    machine.step_utc(1.75e9 - start)
+    known.append(True)
     step = clock.check()
     assert step is not None
     assert step.adopted
-    assert clock.utc() == 1.75e9
+    assert clock.utc() == 1.75e9 + 30.0
+    assert clock.trusted()
     assert clock.check() is None
 
 
-def test_while_the_machine_was_set_back_its_time_is_not_trusted():
-    machine = VirtualClock(utc=1.75e9)
-    clock = SteadyClock(machine)
-    machine.step_utc(-3600.0)
-    clock.check()
-    assert clock.error_s == -3600.0
-    assert not clock.trusted()
+def test_the_rhythm_does_not_notice_any_of_it(make):
+    machine = VirtualClock(utc=1.7e9)
+    clock = make(machine)
+    schedule = Schedule(clock, 10.0)
+    ticks = []
+    for k in range(12):
+        schedule.wait()
+        ticks.append(clock.monotonic())
+        if k in (3, 7):
+            machine.step_utc(3600.0 if k == 3 else -3600.0)
+        clock.check()
+    assert ticks == [10.0 * k for k in range(12)]

@@ -5,6 +5,7 @@
 #include <fcntl.h>
 #include <stdlib.h>
 #include <sys/time.h>
+#include <sys/timex.h>
 #include <time.h>
 #include <unistd.h>
 
@@ -41,4 +42,16 @@ time_t time(time_t *where) {
   clock_gettime(CLOCK_REALTIME, &now);
   if (where) *where = now.tv_sec;
   return now.tv_sec;
+}
+
+/* The kernel's word on synchronisation, where CLOCK_SYNCHRONISED is set: it is. */
+int adjtimex(struct timex *state) {
+  static int (*real)(struct timex *);
+  if (!real) real = (int (*)(struct timex *))dlsym(RTLD_NEXT, "adjtimex");
+  int done = real(state);
+  if (getenv("CLOCK_SYNCHRONISED")) {
+    state->status &= ~STA_UNSYNC;
+    return TIME_OK;
+  }
+  return done;
 }

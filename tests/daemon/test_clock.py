@@ -1,4 +1,4 @@
-"""The wall clock of the real daemon's process is set forth and back by an hour.
+"""The wall clock of the real daemon's process is set by others, for seconds and for good.
 
 Real: the process, its threads, what `clock_gettime`, `gettimeofday` and `time` of the C library
 tell it. Not real: the kernel's clock itself: file times and its word on synchronisation stay.
@@ -13,40 +13,75 @@ from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import read_recording
 
 HOUR = 3600.0
+DAY = 86400.0
 
 
-def test_an_hour_forth_and_back_loses_and_disorders_nothing(daemon, devices, shim, tmp_path):
+def content(daemon, folder):
+    """(columns, clock steps, archived times) of the one series."""
+    with Store.open(daemon.store) as store:
+        store.check()
+        series = store.find_series()
+        names = ["epoch", "frame_time", "temperature_time", "clock_trusted"]
+        columns = store.series_columns(series, names)
+        steps = [e.data for e in store.events() if e.kind == "clock_step"]
+        archive_series(store, series, folder / "archive")
+    return columns, steps, read_recording(folder / "archive").columns.frame_time
+
+
+def test_a_glitch_moves_no_time_and_deletes_no_frame(daemon, devices, shim, tmp_path):
+    """120 days ahead for 3 s, an hour back: found to delete all frames and to leave times wrong."""
     offset = tmp_path / "offset"
     offset.write_text("0")
-    daemon.configure(**devices(period_s=0.3))
+    frames = {"keep": "all", "folder": str(tmp_path / "frames"), "max_age_days": 90,
+              "min_free_gb": 0.0}  # fmt: skip
+    daemon.configure(**devices(period_s=0.3), frames=frames)
     daemon.start(LD_PRELOAD=shim("clock_offset"), CLOCK_OFFSET_FILE=str(offset))
     daemon.until(lambda: len(daemon.results()) > 4)
-    for hours, steps in ((1, 1), (-1, 2), (0, 3)):
+    for seconds, steps in ((120 * DAY, 1), (0, 2), (-HOUR, 3), (0, 4)):
         # written over, since the process holds the file open
-        offset.write_text(str(int(hours * HOUR)).ljust(8))
+        offset.write_text(str(int(seconds)).ljust(12))
         daemon.until(lambda n=steps: daemon.log().count("the clock was set") == n)
         count = len(daemon.results())
         daemon.until(lambda n=count: len(daemon.results()) > n + 4)
     assert daemon.stop() == 0
-    with Store.open(daemon.store) as store:
-        store.check()
-        series = store.find_series()
-        columns = store.series_columns(series, ["epoch", "frame_time", "temperature_time"])
-        trusted = [e.clock_trusted for e in store.epochs(series, details=False)]
-        events = [e for e in store.events() if e.kind == "clock_step"]
-        archive_series(store, series, tmp_path / "archive")
-    # every step is told: forth is followed, back is not, and forth again to where we are already
-    told = [(round(e.data["seconds"] / HOUR), e.data["adopted"]) for e in events]
-    assert told == [(1, True), (-2, False), (1, False)]
-    assert columns["epoch"].astype(int).tolist() == [r["epoch"] for r in daemon.results()]
+    columns, steps, archived = content(daemon, tmp_path)
+    told = [(round(step["seconds"] / HOUR), step["adopted"]) for step in steps]
+    assert told == [(2880, False), (-2880, False), (-1, False), (1, False)]
+    numbers = columns["epoch"].astype(int).tolist()
+    assert numbers == [r["epoch"] for r in daemon.results()]
     for name in ("frame_time", "temperature_time"):
         times = columns[name][np.isfinite(columns[name])]
         assert (np.diff(times) > 0).all()
-    steps_s = np.diff(columns["frame_time"])
-    assert (steps_s > 0.5 * HOUR).sum() == 1
-    # the rhythm did not notice: the monotonic clock is its own
-    assert np.sort(steps_s)[-2] < 60.0
-    # while ours and the machine's differ, no time stamp is called trusted
-    back = next(i for i, e in enumerate(columns["frame_time"]) if e > events[1].utc)
-    assert not any(trusted[back + 1 :])
-    assert len(read_recording(tmp_path / "archive").epochs) == len(trusted)
+        assert np.ptp(times) < 600.0
+    assert np.abs(archived - columns["frame_time"]).max() < 2e-6
+    assert len(list((tmp_path / "frames").rglob("*.png"))) == len(numbers)
+    assert "frames_deleted" not in daemon.events()
+
+
+def test_a_pi_that_starts_without_a_clock_loses_nothing_when_ntp_comes(
+    daemon, devices, shim, tmp_path
+):
+    import time
+
+    offset = tmp_path / "offset"
+    offset.write_text(str(-int(time.time()) + 60).ljust(12))  # a minute after 1970 began
+    frames = {"keep": "all", "folder": str(tmp_path / "frames"), "max_age_days": 90,
+              "min_free_gb": 0.0}  # fmt: skip
+    daemon.configure(**devices(period_s=0.3), frames=frames)
+    daemon.start(LD_PRELOAD=shim("clock_offset"), CLOCK_OFFSET_FILE=str(offset))
+    daemon.until(lambda: len(daemon.results()) > 4)
+    offset.write_text("0".ljust(12))
+    daemon.until(lambda: "time stamps follow" in daemon.log())
+    count = len(daemon.results())
+    daemon.until(lambda: len(daemon.results()) > count + 4)
+    assert daemon.stop() == 0
+    columns, steps, archived = content(daemon, tmp_path)
+    assert [step["adopted"] for step in steps] == [True]
+    numbers = columns["epoch"].astype(int).tolist()
+    assert numbers == [r["epoch"] for r in daemon.results()] == list(range(1, len(numbers) + 1))
+    assert len(list((tmp_path / "frames").rglob("*.png"))) == len(numbers)
+    assert columns["frame_time"][0] < 1e6
+    # what was taken before is put in its place
+    assert np.diff(archived).max() < 60.0
+    assert (np.diff(archived) > 0).all()
+    assert abs(archived[-1] - time.time()) < 600.0

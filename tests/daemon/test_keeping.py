@@ -21,10 +21,10 @@ from thermocald.store.recording.reader import read_recording
 UNITS = Path(__file__).resolve().parents[2] / "systemd"
 
 
-def thermocald(*options: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+def thermocald(*options: str, cwd: Path, **more: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", "thermocald", *options],
-        cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, check=False,
+        cwd=cwd, env={**ENVIRONMENT, **more}, capture_output=True, text=True, check=False,
     )  # fmt: skip
 
 
@@ -98,7 +98,13 @@ def test_readings_wait_for_a_store_that_cannot_be_written(daemon, devices):
 
 
 @pytest.fixture
-def timer_command(tmp_path):
+def synchronised(shim) -> dict[str, str]:
+    """A machine whose clock is synchronised: without that nothing is deleted for its age."""
+    return {"LD_PRELOAD": shim("clock_offset"), "CLOCK_SYNCHRONISED": "1"}
+
+
+@pytest.fixture
+def timer_command(tmp_path, synchronised):
     """The command line of the timer's unit, its paths moved below a folder of the test."""
     lines = (UNITS / "thermocald-archive.service").read_text().splitlines()
     (line,) = [one for one in lines if one.startswith("ExecStart=")]
@@ -109,14 +115,14 @@ def timer_command(tmp_path):
         words = [word.replace(old, new) for word in words]
 
     def run() -> subprocess.CompletedProcess[str]:
-        return thermocald(*words[1:], cwd=tmp_path)
+        return thermocald(*words[1:], cwd=tmp_path, **synchronised)
 
     return run
 
 
 @pytest.mark.slow
 def test_the_timers_command_archives_what_has_ended_and_deletes_old_frames(
-    daemon, devices, timer_command
+    daemon, devices, timer_command, synchronised
 ):
     assert timer_command().returncode == 2  # no configuration: one line, no traceback
     limits = {"keep": "all", "folder": str(daemon.folder / "frames"), "max_age_days": 1,
@@ -126,7 +132,7 @@ def test_the_timers_command_archives_what_has_ended_and_deletes_old_frames(
     for series in ("M1", "M2"):
         sections = devices(series=series)
         daemon.configure(**sections, frames=limits)
-        daemon.start()
+        daemon.start(**synchronised)
         count = len(daemon.results())
         daemon.until(lambda n=count: len(daemon.results()) > n + 3)
         if series == "M1":

@@ -58,3 +58,24 @@ def test_corrections_of_several_steps():
     corrected = times + clock_corrections(times, 10.0)
     assert corrected.tolist() == [-40, -30, -20, -10, 0, 10]
     assert not clock_corrections(np.array([0.0, 10, 500]), 10.0).any()
+
+
+def test_a_glitch_moves_back_and_leaves_what_was_right():
+    """Found: 120 days ahead for some epochs, and it was the right ones that were moved."""
+    right = np.arange(20) * 10.0
+    stamped = right.copy()
+    stamped[5:9] += 120 * 86400.0
+    assert (stamped + clock_corrections(stamped, 10.0)).tolist() == right.tolist()
+
+
+def test_what_was_taken_before_the_time_was_learned_moves_by_that_step():
+    right = 1.75e9 + np.arange(20) * 10.0
+    stamped, trusted = right.copy(), np.ones(20)
+    stamped[4:9] -= 1.0e7  # restarted with the time of the last shutdown, and then NTP came
+    trusted[4:9] = 0
+    corrected = stamped + clock_corrections(stamped, 10.0, trusted, [1.0e7])
+    assert corrected == pytest.approx(right)
+    # a camera that was off for as long is not a step
+    off = right.copy()
+    off[9:] += 1.0e7
+    assert not clock_corrections(off, 10.0, trusted, []).any()

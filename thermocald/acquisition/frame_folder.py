@@ -26,6 +26,7 @@ __all__ = ["Deleted", "FrameFolder"]
 log = logging.getLogger(__name__)
 
 _DAY_S = 86400.0
+_NOT_BEFORE = 1_700_000_000.0
 _GB = 1e9
 _PER_FOLDER = 1000
 _FAST_PNG = 1  # of 9: what takes longer makes it hardly smaller
@@ -52,6 +53,7 @@ class FrameFolder:
         self.config = config
         self.root = config.folder
         self.paused = ""  # why no frame is written just now
+        self._since = time.time()
 
     def wanted(self, number: int, eventful: bool) -> bool:
         """Whether the configuration wants the frame of an epoch."""
@@ -114,15 +116,19 @@ class FrameFolder:
         except OSError:
             return 0
 
-    def enforce(self, now_utc: float | None = None) -> list[Deleted]:
-        """Delete what is too old, then the oldest of what is too much."""
+    def enforce(self, now_utc: float | None) -> list[Deleted]:
+        """Delete what is too old, then the oldest of what is too much.
+
+        now_utc: None where the time is not known for sure: then nothing is deleted for its age.
+        """
         config = self.config
         files = sorted(self._files())
         deleted: list[Deleted] = []
-        if config.max_age_days is not None:
-            limit = (time.time() if now_utc is None else now_utc) - config.max_age_days * _DAY_S
-            old = [f for f in files if f[0] < limit]
-            files = files[len(old) :]
+        if config.max_age_days is not None and now_utc is not None:
+            limit = now_utc - config.max_age_days * _DAY_S
+            # of before the program existed: taken while the clock was not set, of unknown age
+            old = [f for f in files if _NOT_BEFORE <= f[0] < limit]
+            files = [f for f in files if not _NOT_BEFORE <= f[0] < limit]
             why = f"older than {config.max_age_days:g} days"
             deleted += self._delete(old, why)
         surplus, why = 0, ""
@@ -142,6 +148,18 @@ class FrameFolder:
         for one in deleted:
             log.info(one.text, extra={"event": "frames_deleted"})
         return deleted
+
+    def restamp(self, seconds: float) -> None:
+        """Move the times of what this process wrote before the clock was set by so many seconds.
+
+        A frame that was taken before NTP was heard must not look as old as the clock was wrong.
+        """
+        after = time.time() - seconds  # the clock as it was, now
+        for modified, _, path in self._files():
+            if self._since - 1.0 <= modified <= after + 1.0:
+                with contextlib.suppress(OSError):
+                    os.utime(path, (modified + seconds,) * 2)
+        self._since += seconds
 
     def _delete(self, files: list[tuple[float, int, str]], why: str) -> list[Deleted]:
         count = size = 0

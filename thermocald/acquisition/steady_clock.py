@@ -1,9 +1,11 @@
-"""One clock for all time stamps of a daemon: UTC that never runs backwards while it runs.
+"""One clock for all time stamps of a daemon, that a glitch of the machine's clock does not move.
 
 The machine's UTC may be stepped, by NTP or by hand, and at boot a Raspberry Pi without a battery
 does not know it at all. Intervals are measured on the monotonic clock, which never steps; UTC is
-that plus an offset, which follows a step forwards and does not follow one backwards: what was
-stored keeps its order. Every step is told.
+that plus an offset. The offset follows a step of the machine's clock in either direction, at once
+where the machine just learned the time (it was not synchronised, and is now), else when the new
+time has stood for a while: what is back after some seconds was a glitch, and moves nothing. Every
+step is reported.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from thermocald.hal import SystemClock
 
 if TYPE_CHECKING:
     import threading
+    from collections.abc import Callable
 
     from thermocald.hal import Clock
 
@@ -28,6 +31,9 @@ log = logging.getLogger(__name__)
 
 _STEP_S = 0.5
 _WRONG_S = 1.0
+_CONFIRM_S = 60.0  # for which a new time must stand before it is followed
+_LEAP_S = 3600.0
+_SETTLE_S = 86400.0  # after a leap, before anything is deleted for its age
 _NOT_BEFORE = 1_700_000_000.0  # no machine has taken frames with this program before then
 _SYNCHRONISED = Path("/run/systemd/timesync/synchronized")
 _STA_UNSYNC = 0x40
@@ -35,34 +41,54 @@ _STA_UNSYNC = 0x40
 
 @dataclass(frozen=True, slots=True)
 class ClockStep:
-    """The machine's UTC was stepped by so many seconds; adopted: whether time stamps followed."""
+    """The machine's UTC was stepped by `seconds`; adopted: whether time stamps followed, else
+    pending: whether the step waits to be confirmed. utc: as stamped from now on.
+    """
 
     utc: float
     seconds: float
     adopted: bool
+    pending: bool = False
 
     @property
     def text(self) -> str:
         """The step in a sentence."""
         where = "forwards" if self.seconds > 0 else "back"
         then = "time stamps follow" if self.adopted else "time stamps go on as before"
+        if self.pending:
+            then += f" until that has stood for {_CONFIRM_S:.0f} s"
         return f"the clock was set {where} by {abs(self.seconds):.1f} s; {then}"
 
 
 class SteadyClock:
-    """A clock for devices and the store; threads may share it."""
+    """A clock for devices and the store; threads may share it.
 
-    def __init__(self, machine: Clock | None = None) -> None:
+    synchronised: whether the machine knows the time; confirm_s: for how long a new time must stand
+    before it is followed.
+    """
+
+    def __init__(
+        self,
+        machine: Clock | None = None,
+        *,
+        synchronised: Callable[[], bool] | None = None,
+        confirm_s: float = _CONFIRM_S,
+    ) -> None:
         self._machine = machine or SystemClock()
+        self._synchronised = synchronised or machine_clock_trusted
+        self._confirm_s = confirm_s
         self._offset = self._machine.utc() - self._machine.monotonic()
         self._seen = self._offset
+        self._seen_at = float("-inf")
+        self._was_synchronised = self._synchronised()
+        self._leapt_at = float("-inf")
 
     def monotonic(self) -> float:
         """Seconds that never step."""
         return self._machine.monotonic()
 
     def utc(self) -> float:
-        """Seconds since 1970 that never run backwards."""
+        """Seconds since 1970."""
         return self._machine.monotonic() + self._offset
 
     def sleep_until(self, monotonic: float, wake: threading.Event | None = None) -> bool:
@@ -70,27 +96,48 @@ class SteadyClock:
         return self._machine.sleep_until(monotonic, wake)
 
     def check(self) -> ClockStep | None:
-        """Look whether the machine's clock was stepped since the last look."""
-        offset = self._machine.utc() - self._machine.monotonic()
+        """Look whether the machine's clock was stepped, or a step has stood for long enough."""
+        now = self._machine.monotonic()
+        offset = self._machine.utc() - now
+        learned = not self._was_synchronised and self._synchronised()
+        self._was_synchronised = self._synchronised()
         step = offset - self._seen
-        if abs(step) < _STEP_S:
-            return None
-        self._seen = offset
-        adopted = offset > self._offset
-        if adopted:
+        stepped = abs(step) >= _STEP_S
+        if stepped:
+            self._seen, self._seen_at = offset, now
+            if abs(step) >= _LEAP_S:
+                self._leapt_at = now
+        pending = offset - self._offset
+        if abs(pending) < _STEP_S:
+            if not stepped:
+                return None
+            return self._report(ClockStep(self.utc(), step, adopted=False))
+        # a clock that shows a time before this program existed has just learned the time, too
+        learned |= self.utc() < _NOT_BEFORE <= self._machine.utc()
+        if learned or now - self._seen_at >= self._confirm_s:
             self._offset = offset
-        found = ClockStep(self.utc(), step, adopted)
-        log.warning(found.text, extra={"event": "clock_step"})
-        return found
+            return self._report(ClockStep(self.utc(), pending, adopted=True))
+        if not stepped:
+            return None
+        return self._report(ClockStep(self.utc(), step, adopted=False, pending=True))
+
+    def _report(self, step: ClockStep) -> ClockStep:
+        log.warning(step.text, extra={"event": "clock_step"})
+        return step
 
     @property
     def error_s(self) -> float:
-        """The machine's UTC minus ours: not 0 after a step back."""
+        """The machine's UTC minus ours: not 0 while a step is not followed."""
         return self._machine.utc() - self.utc()
 
     def trusted(self) -> bool:
         """Whether a time stamp taken now is known to be right to a second."""
-        return abs(self.error_s) < _WRONG_S and machine_clock_trusted()
+        return abs(self.error_s) < _WRONG_S and self._synchronised()
+
+    def settled(self) -> bool:
+        """Whether ages may be judged by this clock: it is trusted, and has not leapt for a day."""
+        since_leap = self._machine.monotonic() - self._leapt_at
+        return self.trusted() and since_leap >= _SETTLE_S and self.utc() >= _NOT_BEFORE
 
 
 class _Timex(ctypes.Structure):

@@ -117,12 +117,14 @@ def _retention(config: Config) -> list[str]:
     if told is not None:
         return [str(sentence) for sentence in told["deleted"]]
     from thermocald.acquisition.frame_folder import FrameFolder
+    from thermocald.acquisition.steady_clock import machine_clock_trusted
     from thermocald.daemon.store_guard import StoreGuard
     from thermocald.store.database.row import Event
 
     guard = StoreGuard(config.store.path)
     try:
-        sentences = [deleted.text for deleted in FrameFolder(config.frames).enforce()]
+        now = time.time() if machine_clock_trusted() else None
+        sentences = [deleted.text for deleted in FrameFolder(config.frames).enforce(now)]
         for sentence in sentences:
             guard.event(Event(time.time(), "frames_deleted", sentence))
     finally:

@@ -147,6 +147,8 @@ class Service:
             if (step := self.clock.check()) is not None:
                 data = {"seconds": step.seconds, "adopted": step.adopted}
                 self._guard.event(Event(step.utc, "clock_step", step.text, data=data))
+                if step.adopted:
+                    self._station.clock_stepped(step.seconds)
             if self._station.preview:
                 self._dashboard.keep(self.config.dashboard)
             stalled = self._station.stalled()

@@ -243,7 +243,11 @@ class Station:
                 for output in self.outputs
             },
             "readings_logged": self.logged,
-            "frames": {"keep": self.config.frames.keep, "paused": self.frames.paused},
+            "frames": {
+                "keep": self.config.frames.keep,
+                "paused": self.frames.paused,
+                "ages_known": self.clock.settled(),
+            },
         }
 
     def _all_loops(self) -> list[DeviceLoop]:
@@ -277,10 +281,15 @@ class Station:
 
     def retain(self) -> list[str]:
         """Delete the frames that may go; sentences about what was deleted."""
-        told = [deleted.text for deleted in self.frames.enforce(self.clock.utc())]
+        now = self.clock.utc() if self.clock.settled() else None
+        told = [deleted.text for deleted in self.frames.enforce(now)]
         for text in told:
             self.guard.event(Event(self.clock.utc(), "frames_deleted", text))
         return told
+
+    def clock_stepped(self, seconds: float) -> None:
+        """Time stamps have followed a step: frames on disk follow too."""
+        self.frames.restamp(seconds)
 
     def _retain(self) -> None:
         while True:

@@ -14,6 +14,8 @@ from thermocald.store.recording.paths import FileFolder
 from thermocald.store.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from thermocald.epoch import Epoch
@@ -22,19 +24,55 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
+_TOLERANCE_S = 10.0
+
 __all__ = ["archive_readings", "archive_series", "clock_corrections"]
 
 
-def clock_corrections(frame_time: Array, interval: float) -> Array:
-    """Seconds (E,) to add to times (E,) so that they never run backwards.
+def clock_corrections(
+    frame_time: Array, interval: float, trusted: Array | None = None, steps: Sequence[float] = ()
+) -> Array:
+    """Seconds (E,) to add to times (E,) so that they are right where that is known, and in order.
 
-    Where the clock was set back, what was taken before is moved to end one interval earlier than
-    what follows: the later setting is the better known one. Zero where nothing was set back.
+    trusted: (E,) 0 where the clock was not synchronised; steps: s, those that time stamps followed.
+    In this order: what was taken before the machine learned the time moves by that step; what lies
+    between a step forwards and the same step back was a glitch of the clock, and moves back; before
+    any other step back all that came earlier is moved to end one interval before what follows, as
+    the later setting is the better known one. Zero elsewhere.
     """
     corrections = np.zeros(len(frame_time))
-    for last in np.flatnonzero(np.diff(frame_time) < 0)[::-1]:
-        corrections[: last + 1] += frame_time[last + 1] - interval - frame_time[last]
+    tolerance = max(_TOLERANCE_S, 3.0 * interval)
+    for step in steps:
+        _learned(frame_time + corrections, interval, trusted, step, tolerance, corrections)
+    for j in np.flatnonzero(np.diff(frame_time + corrections) < 0) + 1:
+        leaps = np.diff(frame_time + corrections) - interval
+        back = -float(leaps[j - 1])
+        same = np.flatnonzero((leaps[: j - 1] > 0) & (np.abs(leaps[: j - 1] - back) < tolerance))
+        if same.size:
+            corrections[same[-1] + 1 : j] -= back
+    times = frame_time + corrections
+    for last in np.flatnonzero(np.diff(times) < 0)[::-1]:
+        corrections[: last + 1] += times[last + 1] - interval - times[last]
     return corrections
+
+
+def _learned(
+    times: Array,
+    interval: float,
+    trusted: Array | None,
+    step: float,
+    tolerance: float,
+    corrections: Array,
+) -> None:
+    """Move the epochs before a step forwards that were taken without a synchronised clock."""
+    if trusted is None or step < tolerance:
+        return
+    fits = np.abs(np.diff(times) - interval - step) < tolerance
+    for i in np.flatnonzero(fits & (trusted[:-1] == 0)) + 1:
+        known = np.flatnonzero(trusted[:i] != 0)
+        first = int(known[-1]) + 1 if known.size else 0
+        if times[i] - times[i - 1] > tolerance:
+            corrections[first:i] += step
 
 
 def archive_series(
@@ -47,8 +85,15 @@ def archive_series(
     Times that ran backwards are mended (`clock_corrections`), the head then holds `clock_set_back`
     [{epoch, seconds}]. Raises RecordingError, StoreError.
     """
-    columns = store.series_columns(series, ["epoch", "frame_time"])
-    corrections = clock_corrections(columns["frame_time"], series.head.interval)
+    columns = store.series_columns(series, ["epoch", "frame_time", "clock_trusted"])
+    followed = [
+        float(event.data["seconds"])
+        for event in store.events()
+        if event.kind == "clock_step" and event.data.get("adopted") is True
+    ]
+    corrections = clock_corrections(
+        columns["frame_time"], series.head.interval, columns["clock_trusted"], followed
+    )
     known = {"start": series.start, "device": series.identity, "calibration": series.settings}
     told = {key: value for key, value in known.items() if value}
     head = replace(series.head, extra={**series.head.extra, **told})

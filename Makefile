@@ -3,22 +3,24 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
+# what is installed, with hashes; `make LOCK= setup` takes the newest that pyproject.toml allows
+LOCK   ?= packaging/lock/development.txt
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help setup demo test lint test-slow bench hil docs clean
+.PHONY: help setup demo test lint test-slow test-lowest bench hil docs lock deb release clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
 
 setup: $(STAMP) ## the virtual environment in .venv
 
-$(STAMP): pyproject.toml
+$(STAMP): pyproject.toml $(LOCK)
 	@echo "== setting up $(VENV)"
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' \
 	  || { echo "Python 3.11 to 3.13 is needed; set PYTHON=python3.12 or the like" >&2; exit 2; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) \
 	  || { echo "the venv module is missing: sudo apt-get install python3-venv" >&2; exit 2; }
-	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(if $(LOCK),$(BIN)/python -m pip install --quiet --require-hashes --requirement $(LOCK))
 	$(BIN)/python -m pip install --quiet --editable '.[dev]'
 	@touch $@
 
@@ -41,6 +43,9 @@ test: lint ## lint, then the quick tests
 test-slow: $(STAMP) ## long statistics and browser tests
 	$(BIN)/python -m pytest -q -m slow -n 2 --dist loadfile
 
+test-lowest: ## the quick tests with the lowest versions that pyproject.toml allows
+	.ci/lowest
+
 bench: $(STAMP) ## ratios to peers, in one run on one thread
 	@for b in benchmarks/*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done
 
@@ -50,6 +55,16 @@ hil: $(STAMP) ## the laboratory: real kernel drivers without hardware (needs roo
 docs: $(STAMP) ## the documentation as a site in build/site
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 	@echo "build/site/index.html"
+
+lock: $(STAMP) ## resolve the locks again: CI's, the Debian packages', the lowest
+	$(BIN)/python -m pip install --quiet uv
+	packaging/lock.sh
+
+deb: $(STAMP) ## the Debian package in dist: RELEASE=bookworm or trixie, ARCH=amd64 or arm64
+	packaging/deb.sh $(RELEASE) $(ARCH)
+
+release: $(STAMP) ## all that is published in dist, and tests of it
+	packaging/release.sh
 
 clean: ## remove what was made
 	rm -rf build .venv

@@ -21,6 +21,10 @@ resolve() { # OUT ARGUMENTS…: hashes of every wheel, and no name of an index
 # what CI and `make setup` install, for every Python that is supported
 resolve development.txt --universal --python-version 3.11 --extra dev
 
+# what users have: the container, and the environment in which a release is tested
+# shellcheck disable=SC2086
+resolve runtime.txt --universal --python-version 3.11 $runtime
+
 # what the Debian packages bring themselves: all that Debian's own modules do not serve
 for release in bookworm trixie; do
     own=""

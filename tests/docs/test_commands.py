@@ -23,6 +23,14 @@ from thermocald.store.database.store import Store
 ROOT_NEEDED = "changes the machine: needs root, and a package index"
 NOT_RUN = {
     "sudo apt-get install python3-venv git": ROOT_NEEDED,
+    "sudo apt-get install debhelper dpkg-dev make git python3-venv": ROOT_NEEDED,
+    "sudo apt-get install ./thermocald_*.deb": ROOT_NEEDED + "; .ci/deb",
+    "sudo apt-get install python3-picamera2": ROOT_NEEDED,
+    "sudo apt-get remove thermocald": "root; .ci/deb",
+    "sudo apt-get purge thermocald": "root; .ci/deb",
+    "make deb": "downloads from a package index; .ci/deb",
+    "make deb RELEASE=trixie ARCH=arm64": "downloads from a package index; .ci/arm64",
+    "docker compose up --detach": "needs a container engine; tests/packaging/test_container.py",
     "sudo apt-get install python3-venv adb": ROOT_NEEDED,
     "sudo apt-get install python3-venv python3-picamera2": ROOT_NEEDED,
     "sudo EXTRAS=dashboard,v4l2,gpio systemd/install.sh": "root; tests/daemon/test_systemd.py",

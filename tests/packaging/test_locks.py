@@ -64,7 +64,7 @@ def test_a_package_s_modules_are_debian_s_or_its_own(release):
         assert re.search(rf"python3-({re.escape(name)}|{re.escape(short)})\b", depends), name
 
 
-@pytest.mark.parametrize("lock", ["development.txt", "bookworm.txt", "trixie.txt"])
+@pytest.mark.parametrize("lock", ["development.txt", "runtime.txt", "bookworm.txt", "trixie.txt"])
 def test_everything_locked_has_a_hash_and_no_address(lock):
     text = (LOCKS / lock).read_text()
     assert "://" not in text

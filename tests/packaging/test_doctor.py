@@ -1,0 +1,124 @@
+"""`thermocald doctor` on folders that stand for machines."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from thermocald.cli import application
+from thermocald.machine import Machine
+
+PI = "proc/device-tree/model"
+FINE = {
+    PI: "Raspberry Pi 4 Model B Rev 1.4\x00",
+    "etc/os-release": 'PRETTY_NAME="Debian GNU/Linux 13 (trixie)"\n',
+    "boot/firmware/config.txt": "# as delivered\ncamera_auto_detect=1\n",
+    "dev/i2c-1": "", "dev/video0": "", "dev/gpiochip0": "",
+    "sys/devices/platform/soc/soc:firmware/get_throttled": "0\n",
+    "sys/class/thermal/thermal_zone0/temp": "48312\n",
+    "usr/bin/adb": "",
+}  # fmt: skip
+
+
+@pytest.fixture
+def look(tmp_path):
+    """Findings by name of a machine with these files; None as a text: the file is not there."""
+
+    def of(files=(), *, groups=("video", "i2c", "gpio"), uid=1000, synchronised=True, modules=True):
+        for name, text in {**FINE, **dict(files)}.items():
+            if text is not None:
+                path = tmp_path / name
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_text(text)
+        machine = Machine(
+            tmp_path, "pi", uid, frozenset(groups), synchronised, lambda name: modules
+        )
+        return {finding.name: finding for finding in machine.findings()}
+
+    return of
+
+
+def test_nothing_is_missing_on_a_pi_that_is_set_up(look):
+    found = look()
+    assert {name for name, f in found.items() if f.state == "missing"} == set()
+    assert "Raspberry Pi 4" in found["machine"].text
+    assert "trixie" in found["machine"].text
+
+
+@pytest.mark.parametrize(
+    ("changes", "name", "remedy"),
+    [
+        ({"modules": False}, "camera stack", "apt-get install python3-picamera2"),
+        ({"groups": ("video",)}, "groups", "usermod -aG i2c,gpio pi"),
+        ({"files": {"dev/i2c-1": None}}, "I2C", "raspi-config nonint do_i2c 0"),
+        (
+            {"files": {"boot/firmware/config.txt": "camera_auto_detect=0\n"}},
+            "camera connector", "camera_auto_detect=1",
+        ),
+        ({"synchronised": False}, "clock", "timedatectl set-ntp true"),
+        (
+            {"files": {"sys/devices/platform/soc/soc:firmware/get_throttled": "50005"}},
+            "power", "power supply",
+        ),
+    ],
+)  # fmt: skip
+def test_what_is_missing_has_the_line_that_mends_it(look, changes, name, remedy):
+    finding = look(**changes)[name]
+    assert finding.state == "missing"
+    assert remedy in finding.remedy
+
+
+def test_an_environment_that_does_not_see_picamera2(look):
+    installed = {"usr/lib/python3/dist-packages/picamera2/__init__.py": ""}
+    assert "--system-site-packages" in look(installed, modules=False)["camera stack"].remedy
+
+
+@pytest.mark.parametrize(
+    ("bits", "state", "text"),
+    [
+        ("0x0", "ok", "no under-voltage"),
+        ("50000", "warning", "too low since the start"),
+        ("8", "missing", "temperature limit now"),
+        ("nonsense", "warning", "does not report"),
+    ],
+)
+def test_the_firmware_s_bits(look, bits, state, text):
+    found = look({"sys/devices/platform/soc/soc:firmware/get_throttled": bits})["power"]
+    assert (found.state, text in found.text) == (state, True)
+
+
+def test_under_voltage_from_hwmon_where_the_firmware_s_file_is_absent(look):
+    found = look(
+        {
+            "sys/devices/platform/soc/soc:firmware/get_throttled": None,
+            "sys/class/hwmon/hwmon1/name": "rpi_volt\n",
+            "sys/class/hwmon/hwmon1/in0_lcrit_alarm": "1\n",
+        }
+    )["power"]
+    assert found.state == "missing"
+
+
+def test_an_empty_folder_is_a_machine_without_anything(tmp_path):
+    machine = Machine(tmp_path, "me", 1000, frozenset(), None, lambda name: False)
+    assert [f.name for f in machine.findings() if f.state == "missing"] == []
+
+
+def test_the_command_works_on_this_machine():
+    done = CliRunner().invoke(application(), ["doctor", "--json", "-"])
+    assert done.exit_code == 0, done.output
+    document = json.loads(done.stdout)
+    assert document["format"] == "thermocald-doctor/1"
+    assert {"machine", "clock", "disk"} <= {f["name"] for f in document["findings"]}
+
+
+def test_lines_are_for_people(tmp_path):
+    (tmp_path / "proc/device-tree").mkdir(parents=True)
+    (tmp_path / PI).write_text("Raspberry Pi 3 Model B")
+    done = CliRunner().invoke(application(), ["doctor", "--root", str(tmp_path)])
+    assert "MISSING  I2C" in done.stdout
+    assert "→ sudo raspi-config nonint do_i2c 0" in done.stdout
+    assert done.stdout.splitlines()[-1].startswith("to mend: ")
+    assert Path(PI).name not in done.stdout

@@ -1,0 +1,293 @@
+"""The machine: what cameras, thermometers and true times need of it, and what is missing.
+
+Every check reads files below `root` only, so that a folder can stand for a machine; what is not
+there is no error. Nothing is changed.
+
+Sources: Raspberry Pi documentation, config.txt (camera_auto_detect, dtparam=i2c_arm, w1-gpio) and
+vcgencmd get_throttled (the bits); systemd-timesyncd(8) for the clock; kernel documentation of
+/proc/device-tree, hwmon and 1-wire.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shutil
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+__all__ = ["Finding", "Machine", "State"]
+
+State = Literal["ok", "missing", "warning", "not needed"]
+
+# bits of get_throttled: now, and since the start
+_THROTTLED = {
+    0: "the supply voltage is too low now",
+    1: "the processor's frequency is capped now",
+    2: "the processor is throttled now",
+    3: "the processor is at its temperature limit now",
+    16: "the supply voltage was too low since the start",
+    17: "the processor's frequency was capped since the start",
+    18: "the processor was throttled since the start",
+    19: "the processor was at its temperature limit since the start",
+}
+_SUPPLY_BITS = (0, 16)
+_HOT_C = 80.0  # the firmware throttles from 80 °C on
+_FREE_BYTES = 1_000_000_000
+# device nodes → the group that may open them, and what they are for
+_GROUPS = {
+    "video": ("video*", "media*", "dma_heap/*"),
+    "i2c": ("i2c-*",),
+    "dialout": ("ttyUSB*", "ttyACM*", "ttyAMA*"),
+    "gpio": ("gpiochip*",),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that was looked at; remedy: the command that mends it, or nothing."""
+
+    name: str
+    state: State
+    text: str
+    remedy: str = ""
+
+
+def _has_module(name: str) -> bool:
+    return importlib.util.find_spec(name) is not None
+
+
+@dataclass(frozen=True)
+class Machine:
+    """A machine as its files show it.
+
+    root: the folder that is its `/`.
+    user, groups: who asks, and the groups of this process; uid 0 may open everything.
+    synchronised: whether its clock is; None: not known.
+    has_module: whether this Python finds a module.
+    """
+
+    root: Path
+    user: str
+    uid: int
+    groups: frozenset[str]
+    synchronised: bool | None
+    has_module: Callable[[str], bool] = _has_module
+
+    def findings(self) -> list[Finding]:
+        """Everything that was looked at, in the order in which it is best mended."""
+        checks = (
+            self._board, self._camera_stack, self._camera_enabled, self._groups, self._i2c,
+            self._one_wire, self._phones, self._clock, self._power, self._heat, self._disk,
+            self._service,
+        )  # fmt: skip
+        return [finding for check in checks for finding in check()]
+
+    def _read(self, path: str) -> str | None:
+        """A file's text without NULs and white space at its ends; None where it cannot be read."""
+        try:
+            text = (self.root / path).read_text(encoding="utf-8", errors="replace")
+        except OSError:
+            return None
+        return text.replace("\x00", "").strip()
+
+    def _found(self, *patterns: str) -> list[Path]:
+        return sorted(path for pattern in patterns for path in self.root.glob(pattern))
+
+    @property
+    def board(self) -> str:
+        """Such as "Raspberry Pi 4 Model B Rev 1.4"; empty on machines without a device tree."""
+        return self._read("proc/device-tree/model") or ""
+
+    @property
+    def _is_pi(self) -> bool:
+        return self.board.startswith("Raspberry Pi")
+
+    @property
+    def _settings(self) -> list[str]:
+        """The lines of config.txt that hold."""
+        text = self._read("boot/firmware/config.txt") or self._read("boot/config.txt") or ""
+        return [line.split("#")[0].strip() for line in text.splitlines()]
+
+    def _board(self) -> Iterator[Finding]:
+        system = self._read("etc/os-release") or ""
+        names = dict(line.split("=", 1) for line in system.splitlines() if "=" in line)
+        name = names.get("PRETTY_NAME", "an unknown system").strip('"')
+        yield Finding("machine", "ok", f"{self.board or 'not a Raspberry Pi'}, {name}")
+
+    def _camera_stack(self) -> Iterator[Finding]:
+        absent = [name for name in ("libcamera", "picamera2") if not self.has_module(name)]
+        if not absent:
+            yield Finding("camera stack", "ok", "picamera2 and libcamera are found")
+        elif not self._is_pi:
+            yield Finding(
+                "camera stack", "not needed", "picamera2 is for the camera of a Raspberry Pi"
+            )
+        elif self._found("usr/lib/python3/dist-packages/picamera2"):
+            yield Finding(
+                "camera stack", "missing",
+                "picamera2 is installed, but this Python environment does not see the system's "
+                "modules",
+                "python3 -m venv --system-site-packages --upgrade .venv",
+            )  # fmt: skip
+        else:
+            yield Finding(
+                "camera stack", "missing", f"{' and '.join(absent)} not installed",
+                "sudo apt-get install python3-picamera2",
+            )  # fmt: skip
+
+    def _camera_enabled(self) -> Iterator[Finding]:
+        if not self._is_pi or not self._settings:
+            return
+        wanted = ("camera_auto_detect=1", "dtoverlay=imx", "dtoverlay=ov", "dtoverlay=arducam")
+        if any(line.startswith(wanted) for line in self._settings):
+            yield Finding("camera connector", "ok", "config.txt enables it")
+        else:
+            yield Finding(
+                "camera connector", "missing", "config.txt does not enable it",
+                "echo camera_auto_detect=1 | sudo tee -a /boot/firmware/config.txt && sudo reboot",
+            )  # fmt: skip
+
+    def _groups(self) -> Iterator[Finding]:
+        if self.uid == 0:
+            yield Finding("groups", "ok", "root may open every device")
+            return
+        needed = [
+            group
+            for group, nodes in _GROUPS.items()
+            if self._found(*(f"dev/{node}" for node in nodes))
+        ]
+        lacking = [group for group in needed if group not in self.groups]
+        if lacking:
+            yield Finding(
+                "groups", "missing", f"{self.user} is not in {', '.join(lacking)}",
+                f"sudo usermod -aG {','.join(lacking)} {self.user}    # then log in again",
+            )  # fmt: skip
+        else:
+            yield Finding("groups", "ok", "no group is missing")
+
+    def _i2c(self) -> Iterator[Finding]:
+        buses = self._found("dev/i2c-*")
+        # the connectors of monitors have a bus too, 20 and 21 on a Pi
+        if any(bus.name == "i2c-1" for bus in buses) or (buses and not self._is_pi):
+            yield Finding("I2C", "ok", f"{', '.join(bus.name for bus in buses)}")
+        elif self._is_pi:
+            yield Finding(
+                "I2C", "missing", "off: thermometers on the pins are not seen",
+                "sudo raspi-config nonint do_i2c 0",
+            )  # fmt: skip
+        else:
+            yield Finding("I2C", "not needed", "no bus")
+
+    def _one_wire(self) -> Iterator[Finding]:
+        probes = self._found("sys/bus/w1/devices/*-*")
+        if self._found("sys/bus/w1/devices"):
+            yield Finding("1-wire", "ok", f"{len(probes)} found")
+        elif self._is_pi:
+            yield Finding(
+                "1-wire", "not needed", "off; only a DS18B20 needs it",
+                "echo dtoverlay=w1-gpio | sudo tee -a /boot/firmware/config.txt && sudo reboot",
+            )  # fmt: skip
+
+    def _phones(self) -> Iterator[Finding]:
+        path = os.pathsep.join(str(self.root / folder) for folder in ("usr/bin", "usr/local/bin"))
+        if shutil.which("adb", path=path):
+            yield Finding("phones", "ok", "adb is installed")
+        else:
+            yield Finding(
+                "phones", "not needed", "adb is not installed; only phones need it",
+                "sudo apt-get install adb",
+            )  # fmt: skip
+
+    def _clock(self) -> Iterator[Finding]:
+        if self.synchronised is None:
+            yield Finding("clock", "warning", "it is not known whether it is synchronised")
+        elif self.synchronised:
+            yield Finding("clock", "ok", "synchronised")
+        else:
+            yield Finding(
+                "clock", "missing", "not synchronised: times of epochs may be wrong",
+                "sudo timedatectl set-ntp true",
+            )  # fmt: skip
+
+    def _power(self) -> Iterator[Finding]:
+        text = self._read("sys/devices/platform/soc/soc:firmware/get_throttled")
+        try:
+            bits = int(text, 16) if text else None
+        except ValueError:
+            bits = None
+        if bits is None:
+            alarms = [
+                self._read(str((path.parent / "in0_lcrit_alarm").relative_to(self.root)))
+                for path in self._found("sys/class/hwmon/hwmon*/name")
+                if self._read(str(path.relative_to(self.root))) == "rpi_volt"
+            ]
+            bits = None if not alarms else int("1" in alarms)
+        if bits is None:
+            if self._is_pi:
+                yield Finding("power", "warning", "the firmware does not report under-voltage")
+            return
+        seen = [text for bit, text in _THROTTLED.items() if bits >> bit & 1]
+        if not seen:
+            yield Finding("power", "ok", "no under-voltage, no throttling")
+            return
+        supply = any(bits >> bit & 1 for bit in _SUPPLY_BITS)
+        yield Finding(
+            "power", "missing" if bits & 0xF else "warning", "; ".join(seen),
+            "use the board's own power supply and a short cable" if supply
+            else "give the board a heat sink, or a cooler place",
+        )  # fmt: skip
+
+    def _heat(self) -> Iterator[Finding]:
+        text = self._read("sys/class/thermal/thermal_zone0/temp")
+        if not self._is_pi or text is None or not text.lstrip("-").isdigit():
+            return
+        degrees = int(text) / 1000.0
+        if degrees >= _HOT_C:
+            yield Finding(
+                "board temperature", "warning", f"{degrees:.0f} °C: it throttles",
+                "give the board a heat sink, or a cooler place",
+            )  # fmt: skip
+        else:
+            yield Finding("board temperature", "ok", f"{degrees:.0f} °C")
+
+    def _disk(self) -> Iterator[Finding]:
+        folder = self.root / "var/lib/thermocald"
+        while not folder.exists() and folder != self.root:
+            folder = folder.parent
+        try:
+            about = os.statvfs(folder)
+        except OSError:
+            return
+        free = about.f_bavail * about.f_frsize
+        where = "/" + str(folder.relative_to(self.root)).removeprefix(".")
+        if about.f_flag & os.ST_RDONLY:
+            yield Finding(
+                "disk", "missing", f"{where} is read-only: nothing can be stored",
+                "sudo mount -o remount,rw /    # after a look at the log: dmesg | tail",
+            )  # fmt: skip
+        elif free < _FREE_BYTES:
+            yield Finding(
+                "disk", "warning", f"{where} has {free / 1e6:.0f} MB free",
+                "sudo apt-get clean; thermocald archive --config /etc/thermocald/config.yaml "
+                "--retention",
+            )  # fmt: skip
+        else:
+            yield Finding("disk", "ok", f"{where} has {free / 1e9:.1f} GB free")
+
+    def _service(self) -> Iterator[Finding]:
+        units = self._found("usr/lib/systemd/system/thermocald.service",
+                            "etc/systemd/system/thermocald.service")  # fmt: skip
+        if not units:
+            yield Finding("service", "not needed", "not installed; `thermocald run` works without")
+        elif self._found("etc/systemd/system/multi-user.target.wants/thermocald*.service"):
+            yield Finding("service", "ok", "starts with the machine")
+        else:
+            yield Finding(
+                "service", "warning", "installed, but it does not start with the machine",
+                "sudo systemctl enable --now thermocald",
+            )  # fmt: skip

@@ -38,5 +38,6 @@ done
 
 # the lowest that pyproject.toml allows; what depends on nothing of ours is held where it fits
 "$uv" pip compile --quiet --no-header --no-annotate --no-emit-index-url --no-emit-find-links \
-    --resolution lowest-direct --python-version 3.11 $runtime --upgrade \
+    --resolution lowest-direct --python-version 3.11 $runtime --extra dask --extra parquet \
+    --upgrade \
     --constraint "$locks/lowest.in" --output-file "$locks/lowest.txt" pyproject.toml

@@ -9,7 +9,7 @@ import numpy as np
 import typer
 
 from thermocald.cli.common import progress, write_json
-from thermocald.cli.options import DEFAULT_FREE_TEXT, FreeOption, free_names
+from thermocald.cli.options import DEFAULT_FREE_TEXT, ExteriorOption, FreeOption, free_names
 from thermocald.errors import DataError, UsageError
 
 if TYPE_CHECKING:
@@ -75,13 +75,7 @@ def study(
         float | None,
         typer.Option("--thermometer-sd", min=0.0, help="Noise of the thermometers, K [estimated]."),
     ] = None,
-    exterior: Annotated[
-        str,
-        typer.Option(
-            "--exterior",
-            help="series: the camera stood still; per_epoch: every epoch its own orientation.",
-        ),
-    ] = "series",
+    exterior: ExteriorOption = "auto",
     free: FreeOption = DEFAULT_FREE_TEXT,
     reference: Annotated[
         bool,
@@ -114,8 +108,10 @@ def study(
         confusion_mm=confusion,
         thermometer_sd=thermometer_sd,
     )
-    if exterior not in ("per_epoch", "series"):
-        raise UsageError(f"--exterior {exterior}: must be per_epoch or series")
+    from thermocald.photogrammetry.series.result import EXTERIOR_CHOICES
+
+    if exterior not in EXTERIOR_CHOICES:
+        raise UsageError(f"--exterior {exterior}: must be one of {', '.join(EXTERIOR_CHOICES)}")
     # Refused before the work, not after it.
     for path in (report, figures):
         if path is not None and not path.resolve().parent.is_dir():

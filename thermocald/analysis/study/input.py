@@ -1,8 +1,9 @@
 """Measured series for the study, from recordings and stores.
 
-With `exterior="series"` all epochs are adjusted together from their observations, one exterior
-orientation for the camera that stood still. A series too long for that, or `exterior="per_epoch"`
-from a store, is read as it was stored, column by column, with a sample of its covariance matrices.
+Unless `exterior="per_epoch"` all epochs are adjusted together from their observations: one exterior
+orientation for a camera that stood still, movements of its mount, or what the data show. A series
+too long for that, or `exterior="per_epoch"` from a store, is read as it was stored, column by
+column, with a sample of its covariance matrices.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ def load_series(
     path: Path,
     label: str | None = None,
     thermometer_sd: float | None = None,
-    exterior: str = "series",
+    exterior: str = "auto",
     free: Sequence[str] = DEFAULT_FREE,
     advance: Callable[[int], None] | None = None,
 ) -> list[MeasuredSeries]:
@@ -79,7 +80,7 @@ def from_recording(
     recording: Recording,
     label: str | None = None,
     thermometer_sd: float | None = None,
-    exterior: str = "series",
+    exterior: str = "auto",
     free: Sequence[str] = DEFAULT_FREE,
     advance: Callable[[int], None] | None = None,
 ) -> MeasuredSeries:
@@ -133,16 +134,16 @@ def from_store(
     series: StoredSeries,
     label: str | None = None,
     thermometer_sd: float | None = None,
-    exterior: str = "series",
+    exterior: str = "auto",
 ) -> MeasuredSeries:
     """One series of a store; DataError where no epoch has a result."""
     start = f"-{series.start}" if series.start else ""
     label = label or series.camera + start
     count = len(store.series_columns(series, ["epoch"])["epoch"])
-    if exterior == "series" and 0 < count <= _MOST_TOGETHER:
+    if exterior != "per_epoch" and 0 < count <= _MOST_TOGETHER:
         free = tuple(series.settings.get("free", DEFAULT_FREE))
         table = stored_table(
-            store.path, f"{series.camera}/{series.name}", AdjustmentSettings(free=free), "series"
+            store.path, f"{series.camera}/{series.name}", AdjustmentSettings(free=free), exterior
         )
         thermometers = _stored_thermometers(store, series, table.frame_time, thermometer_sd)
         source = f"{store.path}: {series.camera}/{series.name}"
@@ -240,6 +241,8 @@ def _from_table(
         lost,
         clip,
         float(time_s[0]),
+        adjustment.choice,
+        adjustment.noise_ratio,
     )
 
 

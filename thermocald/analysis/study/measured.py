@@ -59,8 +59,9 @@ class MeasuredSeries:
     the first epoch of the series; thermometers: the first is the reference; values (E, 10): IOP;
     sds (E, 10): NaN where held fixed; sigma0, redundancy (E,); correlations (m, 10, 10) of the IOP
     in the adjustments of the epochs `correlation_rows` (m,), a sample where a series is long;
-    exterior: `series` or `per_epoch`; without_result: {reason: epochs}; start_utc: s UTC of the
-    first epoch, 0 where it has no date.
+    exterior: how the exterior orientation was estimated, choice: why; without_result: {reason:
+    epochs}; start_utc: s UTC of the first epoch, 0 where it has no date; image_noise_ratio: noise
+    of the image points found over the one stated, NaN where epochs were adjusted one by one.
     """
 
     label: str
@@ -81,6 +82,8 @@ class MeasuredSeries:
     without_result: Mapping[str, int] = field(default_factory=dict)
     clip: Clip | None = None
     start_utc: float = 0.0
+    choice: str = ""
+    image_noise_ratio: float = float("nan")
 
     def __len__(self) -> int:
         return len(self.time_s)

@@ -119,7 +119,7 @@ def reference_series(
         for name, seed in SERIES:
             path = Path(folder) / name
             preset_simulation(preset, seed, name).write(path)
-            one = from_recording(open_recording(path), preset)
+            one = from_recording(open_recording(path), preset, exterior="series")
             # The folder is gone when the study is read.
             measured.append(replace(one, source=f"preset {preset}, series {name}, seed {seed}"))
             advance(1)

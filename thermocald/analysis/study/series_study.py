@@ -213,6 +213,8 @@ def _circumstances(series: MeasuredSeries) -> list[str]:
             f"{', '.join(held)} {'was' if len(held) == 1 else 'were'} held fixed in the "
             "adjustment: not tested, not correlated, not varied in the simulation."
         )
+    if series.choice:
+        notes.append(f"Exterior orientation: {series.exterior} ({series.choice}).")
     if series.exterior == "per_epoch":
         notes.append(
             "Every epoch has an exterior orientation of its own: its movements and the principal "

@@ -90,6 +90,8 @@ def _series(study: SeriesStudy) -> dict[str, Any]:
         "without_result": dict(s.without_result),
         "sigma0": float(np.sqrt(np.mean(np.square(s.sigma0)))),
         "noise_ratio": study.noise_ratio,
+        "image_noise_ratio": s.image_noise_ratio,
+        "exterior_choice": s.choice or None,
         "exterior": s.exterior,
         "free": list(s.free),
         "deviations": {

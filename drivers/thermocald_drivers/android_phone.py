@@ -26,7 +26,7 @@ from thermocald_drivers import support
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["AdbPhone", "FileEntry", "list_devices"]
+__all__ = ["ADB_CLASSES", "AdbPhone", "FileEntry", "list_devices", "make_phone"]
 
 DENIED = (
     "unauthorized: unlock the phone and confirm 'Allow USB debugging' (tick 'always'); "
@@ -37,6 +37,8 @@ OFFLINE = (
 )
 
 _CLOCK_S = 0.002
+ADB_CLASSES = ("char-usb_device",)
+"""Opened by the adb server where this driver starts it."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,19 @@ class FileEntry:
 
     name: str
     size: int
+
+
+def make_phone(
+    serial: object, host: object, port: object, timeout_s: float, start_server: object
+) -> AdbPhone:
+    """A phone from the options of a stanza, bounded."""
+    return AdbPhone(
+        support.text("serial", serial),
+        support.text("host", host),
+        int(support.number("port", port, 1, 65535, whole=True)),
+        support.number("timeout_s", timeout_s, 0.1, 600, "s"),
+        bool(start_server),
+    )
 
 
 def list_devices(timeout_s: float = 1.0) -> list[tuple[str, str]]:

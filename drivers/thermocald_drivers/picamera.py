@@ -50,6 +50,12 @@ from thermocald.errors import (
 )
 from thermocald.hal import Camera, Found, Frame
 from thermocald_drivers import support
+from thermocald_drivers.picamera_metadata import (
+    agrees,
+    frame_settings,
+    jsonable,
+    sensor_temperature,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -60,28 +66,10 @@ __all__ = ["Picamera2Camera", "sensor_temperature"]
 
 log = logging.getLogger(__name__)
 
-CLAMP_LOW_C, CLAMP_HIGH_C = -20.0, 80.0
 CLOSE_S = 3.0
 AUTO = "auto"
 MANUAL_FOCUS, CONTINUOUS_FOCUS = 0, 2
 """libcamera's AfModeManual and AfModeContinuous."""
-
-
-def sensor_temperature(metadata: Mapping[str, Any]) -> float | None:
-    """°C of the sensor; None where it is absent or a value that means "unknown"."""
-    value = metadata.get("SensorTemperature")
-    if isinstance(value, bool) or not isinstance(value, int | float) or value == 0.0:
-        return None
-    return float(value) if CLAMP_LOW_C < value < CLAMP_HIGH_C else None
-
-
-def _jsonable(value: Any) -> Any:
-    """Libcamera's rectangles and tuples as lists."""
-    if isinstance(value, dict):
-        return {str(key): _jsonable(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_jsonable(entry) for entry in value]
-    return value if isinstance(value, str | int | float | bool | None) else str(value)
 
 
 def _number_or_auto(
@@ -290,7 +278,7 @@ class Picamera2Camera(Camera):
         sleep_s = time.clock_gettime(time.CLOCK_BOOTTIME) - time.monotonic()  # since booting
         middle = metadata["SensorTimestamp"] * 1e-9 - sleep_s - exposure / 2.0
         monotonic, utc = support.on_clock(self.clock, middle)
-        kept = _jsonable(dict(metadata))
+        kept = jsonable(dict(metadata))
         kept["sensor_temperature_c"] = sensor_temperature(metadata)
         return Frame(
             image=plane,
@@ -298,7 +286,7 @@ class Picamera2Camera(Camera):
             utc=utc,
             exposure=exposure,
             metadata=kept,
-            settings=self._settings(metadata),
+            settings=frame_settings(metadata) | self._modes(metadata),
         )
 
     def _fresh(self, camera: Any, called_ns: int) -> tuple[Any, Mapping[str, Any]]:
@@ -337,37 +325,18 @@ class Picamera2Camera(Camera):
             asked["ColourGains"] = self.colour_gains
         for name, value in asked.items():
             got = metadata.get(name)
-            if not self._agrees(value, got):
+            if not agrees(value, got, self.tolerance):
                 shown = f"{value:g}" if isinstance(value, int | float) else f"{value}"
                 raise BadReading(f"{self.where}: {name} was set to {shown} and is {got}")
 
-    def _agrees(self, asked: Any, got: Any) -> bool:
-        if isinstance(asked, tuple | list):
-            same = isinstance(got, tuple | list) and len(got) == len(asked)
-            return same and all(map(self._agrees, asked, got))
-        if isinstance(got, bool) or not isinstance(got, int | float):
-            return False
-        return bool(abs(got - asked) <= self.tolerance * max(abs(asked), 1e-9))
-
-    def _settings(self, metadata: Mapping[str, Any]) -> dict[str, float]:
-        """What moves the image, as the sensor reports it."""
+    def _modes(self, metadata: Mapping[str, Any]) -> dict[str, float]:
+        """Which settings are left to the camera, as 1.0 and 0.0."""
         found = {
             "exposure_auto": float(AUTO in (self.exposure_s, self.gain)),
             "white_balance_auto": float(self.colour_gains == AUTO),
         }
-        for name, key, unit in (
-            ("exposure_s", "ExposureTime", 1e-6),
-            ("gain", "AnalogueGain", 1.0),
-            ("digital_gain", "DigitalGain", 1.0),
-            ("focus_dioptres", "LensPosition", 1.0),
-        ):
-            if isinstance(metadata.get(key), int | float):
-                found[name] = round(float(metadata[key]) * unit, 9)
         if "LensPosition" in metadata:
             found["focus_auto"] = float(self.focus_dioptres == AUTO)
-        gains = metadata.get("ColourGains")
-        if isinstance(gains, tuple | list) and len(gains) == 2:
-            found["colour_gain_red"], found["colour_gain_blue"] = map(float, gains)
         return found
 
     def _in_time(self, work: Any, what: str, timeout_s: float | None = None) -> Any:

@@ -20,7 +20,8 @@ r"""Thermometers on a serial line that send lines of text.
 Each named group of `pattern` is a channel, scaled and offset, then converted to °C by `unit`. The
 pattern must match the **whole** line: the rest of a line whose start was lost (`3.5C` of `+023.5C`)
 is not a reading. A decimal comma is read as a point. A `°` in the pattern matches the degree signs
-of UTF-8, Latin-1, code page 437 and LCD fonts. Instruments by name: see INSTRUMENTS.
+of UTF-8, Latin-1, code page 437 and LCD fonts. Instruments by name: see
+`serial_instruments`.
 
 Firmware prints a fixed number where its sensor does not answer: −127 and 85 (DS18B20), −45 and
 −46.85 (SHT), −50 (an input at 0 V), −40 and 125 (ends of a scale). With `pattern` these are refused
@@ -34,28 +35,30 @@ garbage are skipped until `timeout_s`; the error then quotes what was received.
 from __future__ import annotations
 
 import contextlib
-import functools
-import operator
 import re
 import termios
 import time
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from thermocald.errors import BadReading, ConfigurationError, DeviceGone, DeviceTimeout
 from thermocald.hal import Found, Reading, Thermometer
 from thermocald_drivers import support
+from thermocald_drivers.serial_instruments import (
+    CHECKSUMS,
+    INSTRUMENTS,
+    NO_SENSOR_C,
+    UNITS,
+    Instrument,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from thermocald.hal import Clock
 
-__all__ = ["INSTRUMENTS", "Instrument", "SerialThermometer"]
+__all__ = ["SerialThermometer"]
 
-NUMBER = r"[-+]?\d+(?:\.\d+)?"
 LONGEST_LINE = 512
-NO_SENSOR_C = (-127.0, -50.0, -46.85, -45.0, -40.0, 85.0, 125.0)
 NO_SENSOR_STEP_K = 0.006
 DEGREES = str.maketrans("ºø˚∘ß℃", "°°°°°°")
 """What a degree sign of another encoding becomes in Latin-1: masculine ordinal, 0xF8, 0xDF."""
@@ -64,65 +67,9 @@ QUEUE = 4000
 """Bytes that may have waited before the kernel's buffer (4096) could have lost some."""
 
 
-@dataclass(frozen=True)
-class Instrument:
-    """A line protocol; `framing` is data bits, parity, stop bits."""
-
-    pattern: str
-    command: str = ""
-    baud: int = 9600
-    framing: str = "8N1"
-    unit: str = "C"
-    scale: float = 1.0
-    offset: float = 0.0
-    checksum: str = "none"
-    timeout_s: float = 2.0
-    range_c: tuple[float, float] = (-100.0, 300.0)
-    refuse_c: tuple[float, ...] = ()
-
-
-INSTRUMENTS = {
-    # Papouch TM, TMU: sends by itself every 10 s, ends with CR alone.
-    "papouch-tm": Instrument(r"(?P<temperature>[-+]\d{3}\.\d)C", timeout_s=22.0),
-    # Vaisala HMP230/240/260 series, user's guides, appendix "Serial commands".
-    "vaisala-hmp": Instrument(
-        rf"(?:RH= *{NUMBER} *%RH +)?T= *(?P<temperature>{NUMBER}) *'C(?: .*)?",
-        command="SEND\r",
-        baud=4800,
-        framing="7E1",
-    ),
-    # Lake Shore 218, user's manual 6.2: eight inputs in one line; kelvin keeps the sign simple.
-    "lakeshore-218": Instrument(
-        ",".join(rf"(?P<input{k}>[-+]\d+\.\d+)" for k in range(1, 9)),
-        command="KRDG?\r\n",
-        framing="7O1",
-        unit="K",
-    ),
-    # Fluke 1522, user's guide 8.2.1; the unit is set at the instrument and must be C.
-    "fluke-1522": Instrument(r"t: *(?P<temperature>[-+]?\d+\.\d+) C", command="read?\r", baud=2400),
-}
-
-
 def _one_end(received: bytes) -> bytes:
     """CR, LF and CR LF all end a line; empty lines are skipped anyway."""
     return received.replace(b"\r", b"\n")
-
-
-def _xor(text: bytes) -> int:
-    return functools.reduce(operator.xor, text, 0)
-
-
-CHECKSUMS: Mapping[str, Callable[[bytes], int]] = {
-    "none": len,  # not called
-    "xor": _xor,
-    "sum8": lambda text: sum(text) & 0xFF,
-    "nmea": lambda text: _xor(text.strip(b"$*")),
-}
-UNITS: Mapping[str, Callable[[float], float]] = {
-    "C": lambda value: value,
-    "F": lambda value: (value - 32.0) / 1.8,
-    "K": lambda value: value - 273.15,
-}
 
 
 class SerialThermometer(Thermometer):

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 
 from thermocald.photogrammetry.targets import ring_code
+from thermocald.photogrammetry.targets.dictionary import marker_cells
 from thermocald.photogrammetry.targets.markers import is_marker, parse_marker
 from thermocald.simulation.portable import sin_cos
 
@@ -143,9 +143,8 @@ def _disc_polygons(diameter: float, code: str) -> list[Array]:
 @lru_cache(maxsize=1024)
 def _marker_polygons(dictionary: str, marker: int) -> tuple[tuple[float, Array], ...]:
     """(sign, outline (k, 2) in units of the side, from corner 0 to 1 and to 3) of a marker."""
-    codes = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
-    modules = int(codes.markerSize) + 2
-    pattern = cv2.aruco.generateImageMarker(codes, marker, modules, borderBits=1)
+    pattern = ~marker_cells(dictionary, marker)
+    modules = len(pattern)
     result = [(1.0, _box(0, 0, modules, modules) / modules)]
     for y in range(modules):
         x = 0

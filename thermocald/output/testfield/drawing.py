@@ -7,7 +7,6 @@ One list of paths serves both formats; circles are Bézier curves of eight segme
 from __future__ import annotations
 
 import importlib.util
-from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from thermocald.errors import DriverMissing, UsageError
 from thermocald.output.testfield.layout import STRIP, TRIM
 from thermocald.output.testfield.plan import draw_plan
 from thermocald.photogrammetry.targets import ring_code
+from thermocald.photogrammetry.targets.dictionary import marker_cells
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -155,16 +155,10 @@ def _ring_segment(target: Target, r: float, begin: float, end: float) -> Any:
     return Curve(vertices, codes)
 
 
-@cache
 def _marker_bits(code: str) -> NDArray[np.bool_]:
     """The cells of a marker, its black border included, True where black; first row on top."""
-    import cv2
-
-    family, number = code.split(":")[:2]
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, family))
-    cells = dictionary.markerSize + 2
-    image = cv2.aruco.generateImageMarker(dictionary, int(number), cells)
-    return np.asarray(image) < 128
+    name, number = code.split(":")[:2]
+    return marker_cells(name, int(number))
 
 
 def _white_cells(marker: Marker) -> list[Any]:

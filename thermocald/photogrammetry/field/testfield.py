@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["KINDS", "Observations", "TestField"]
 
-KINDS = ("circle", "marker_corner")
+KINDS = ("circle", "marker_corner", "chess_corner")
 
 
 @dataclass(frozen=True, eq=False)

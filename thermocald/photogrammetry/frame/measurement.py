@@ -21,13 +21,16 @@ from thermocald.photogrammetry.field.planes import field_normals
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.photogrammetry.orientation.identification import Orientation, orient, refine
 from thermocald.photogrammetry.targets import ring_code
+from thermocald.photogrammetry.targets.chessboard import find_chessboards, locate_chess_corners
 from thermocald.photogrammetry.targets.circle import fit_circles
 from thermocald.photogrammetry.targets.coded_circles import find_coded
 from thermocald.photogrammetry.targets.frame_status import OK, FrameStatus, inspect_frame
+from thermocald.photogrammetry.targets.marker_order import corners_turned_deg
 from thermocald.photogrammetry.targets.markers import (
     MarkerCorners,
     locate_markers,
     measure_corners,
+    predicted_markers,
 )
 from thermocald.photogrammetry.targets.outline import LocalMap, local_maps
 
@@ -55,6 +58,15 @@ _GROSS_PX = 3.0
 _USUAL_BLUR_PX = 0.9
 _WIDE_BLUR_PX = 1.1
 _SETTLED_PX = 0.002
+_TURNED = (
+    "the corners of the markers are numbered in another order in the test field: turned by {}°. "
+    "Corner 0 is OpenCV's first, in an upright AprilTag the bottom right one, then clockwise; "
+    "`thermocald testfield import` writes it so"
+)
+_WORTH_A_SECOND_LOOK = {
+    "not found", "no corner where the marker has one", "the fit does not converge"
+}  # fmt: skip
+_FEW_CORNERS = 12
 _REMEDIES = {
     "saturated": "expose less, paper should be at three quarters of full scale",
     "too little contrast": "more light, or expose longer",
@@ -113,9 +125,57 @@ def measure(
     sensor = prior.sensor or Sensor(image.shape[1], image.shape[0], 1.0)
     missed: dict[int, str] = {}
     markers = locate_markers(image, testfield, missed)
+    if turned := corners_turned_deg(markers, testfield):
+        return Measurement(_nothing(), FrameStatus("other_field", _TURNED.format(turned)), missed)
     corners = measure_corners(image, markers, missed)
+    if "chess_corner" in testfield.kinds:
+        plain = find_chessboards(image, testfield, missed)
+        corners = join(corners, plain) if len(plain) else corners
+    corners = _by_orientation(image, testfield, prior, sensor, corners, markers, missed)
     found = _measure(image, testfield, prior, sensor, corners, missed, eccentricity)
     return replace(found, markers=markers)
+
+
+def _by_orientation(
+    image: Image,
+    testfield: TestField,
+    prior: Prior,
+    sensor: Sensor,
+    corners: Observations,
+    markers: MarkerCorners,
+    missed: dict[int, str],
+) -> Observations:
+    """Corners that detection does not give, where the orientation from the others has them: those
+    of markers whose outline it got wrong, and of the squares of ChArUco boards.
+    """
+    again = [row for row, why in missed.items() if why in _WORTH_A_SECOND_LOOK]
+    chess = any(
+        kind == "chess_corner" and not code
+        for kind, code in zip(testfield.kinds, testfield.codes, strict=True)
+    )
+    again = again if len(corners) >= max(_FEW_CORNERS, len(again)) else []
+    if len(corners) < _FEWEST or not (again or chess):
+        return corners
+    try:
+        known = orient(
+            sensor, testfield.points[corners.targets], corners.points, prior.principal_distance,
+            prior.interior,
+        )  # fmt: skip
+    except GeometryError:
+        return corners
+    places = [locate_chess_corners(testfield, known)] if chess else []
+    if again:
+        points = known.camera.project(known.exterior, testfield.points)
+        inside = sensor.contains(np.nan_to_num(points, nan=-1e9), 3.0)
+        rows = [row for row in again if inside[row]]
+        places.append(predicted_markers(testfield, rows, points, markers))
+    for place in places:
+        if len(place):
+            found = measure_corners(image, place, missed)
+            for row in found.targets.tolist():
+                missed.pop(row, None)
+            corners = join(corners, found) if len(found) else corners
+    return corners
 
 
 def _measure(

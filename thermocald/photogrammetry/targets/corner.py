@@ -7,6 +7,9 @@ Levenberg's method for all corners at once; the covariance is that of least squa
 variance of the fit's own residuals, so that it is true where the noise is white. A JPEG's noise is
 not: there the standard deviations are too small by a factor that this module cannot know.
 
+Where squares touch at a corner (chessboards, AprilGrids) the opposite quadrant is dark as well: the
+same model with both quadrants added, chosen by the grey values.
+
 Source: the quadrant probability as Mehler's tetrachoric series; the idea of fitting a parametric
 grey-value corner, Deriche, R. and Giraudon, G. (1993): A computational approach for corner and
 vertex detection, IJCV 10(2), 101–124.
@@ -36,6 +39,7 @@ _CONVERGED_PX = 2e-4
 _LARGEST_MOVE_PX = 1.5
 _LARGEST_MOVE_SHARE = 0.015  # of the marker's side: an outline cut short in a reduced image
 _BLUR_LIMITS_PX = (0.3, 4.0)
+_SADDLE_REACH = 0.25  # of the marker's side
 _SLOWEST_CORRELATION = 0.93  # the series is not good enough for edges that meet at less than 22°
 
 
@@ -113,11 +117,12 @@ def _wedge(h: Single, k: Single, rho: Single) -> Single:
     return value
 
 
-def _model(p: Array, x: Array, y: Array) -> tuple[Single, Single]:
+def _model(p: Array, x: Array, y: Array, saddle: NDArray[np.bool_]) -> tuple[Single, Single]:
     """Grey values (n, m) and derivatives (n, m, 7) by x, y, angle1, angle2, blur, b, a.
 
-    p (n, 7); the angles are those of the inward normals of the two edges; x, y (n, m) px. Float32:
-    its rounding is a thousandth of a grey value's.
+    saddle (n,): where the opposite quadrant is dark too. p (n, 7); the angles are those of the
+    inward normals of the two edges; x, y (n, m) px. Float32: its rounding is a thousandth of a grey
+    value's.
     """
     t1, t2, s, b, a = (p[:, i, None].astype(np.float32) for i in range(2, 7))
     c1, s1, c2, s2 = np.cos(t1), np.sin(t1), np.cos(t2), np.sin(t2)
@@ -131,6 +136,13 @@ def _model(p: Array, x: Array, y: Array) -> tuple[Single, Single]:
     wh = norm * np.exp(-0.5 * h * h) * normal_cdf((k - rho * h) / root)
     wk = norm * np.exp(-0.5 * k * k) * normal_cdf((h - rho * k) / root)
     wr = np.exp(-0.5 * (h * h - 2 * rho * h * k + k * k) / root**2) / (2 * np.pi * root)
+    if saddle.any():
+        # the opposite quadrant added: P(H > h, K > k) = 1 − Φ(h) − Φ(k) + P(H < h, K < k)
+        both = saddle[:, None]
+        w = np.where(both, 1 - normal_cdf(h) - normal_cdf(k) + 2 * w, w)
+        wh = np.where(both, 2 * wh - norm * np.exp(-0.5 * h * h), wh)
+        wk = np.where(both, 2 * wk - norm * np.exp(-0.5 * k * k), wk)
+        wr = np.where(both, 2 * wr, wr)
     sine = s1 * c2 - c1 * s2  # dρ/dt2 = −dρ/dt1
     j = np.empty((*h.shape, 7), np.float32)
     j[..., 0] = -a * (wh * c1 + wk * c2) / s
@@ -141,6 +153,21 @@ def _model(p: Array, x: Array, y: Array) -> tuple[Single, Single]:
     j[..., 5] = 1.0
     j[..., 6] = w
     return b + a * w, j
+
+
+def _is_saddle(grey: Array, d1: Array, d2: Array, near: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Where the quadrant opposite to a corner's own is as dark as that: squares that touch (n,)."""
+
+    def mean(mask: NDArray[np.bool_]) -> Array:
+        count = np.maximum((near & mask).sum(axis=1), 1)
+        total: Array = np.sum(grey * (near & mask), axis=1) / count
+        return total
+
+    clear = (np.abs(d1) > 1.5) & (np.abs(d2) > 1.5)
+    own, beside = mean(clear & (d1 > 0) & (d2 > 0)), mean(clear & (d1 * d2 < 0))
+    opposite = mean(clear & (d1 < 0) & (d2 < 0))
+    found: NDArray[np.bool_] = np.abs(opposite - own) < np.abs(opposite - beside)
+    return found & (clear & near & (d1 < 0) & (d2 < 0)).any(axis=1)
 
 
 def _fit(
@@ -170,7 +197,12 @@ def _fit(
     depth = np.minimum(d1, d2)
     # A margin of two px keeps the blurred bits and neighbours out, but an edge needs two px itself.
     margin = np.maximum(cell - 2.0, 2.0)[:, None]
-    use = inside & (np.abs(depth) <= margin) & (np.hypot(dx, dy) <= along[:, None])
+    saddle = _is_saddle(grey, d1, d2, inside & (np.hypot(dx, dy) <= along[:, None]))
+    # the square opposite to a marker of an AprilGrid is a third as large as the marker
+    along = np.where(saddle, np.minimum(along, _SADDLE_REACH * side), along)
+    near = np.where(saddle[:, None], np.minimum(np.abs(d1), np.abs(d2)), np.abs(depth))
+    use = inside & (near <= margin) & (np.hypot(dx, dy) <= along[:, None])
+    depth = np.where(saddle[:, None], np.sign(d1 * d2) * near, depth)
     cut_off = np.any(~inside & (np.hypot(dx, dy) < 3), axis=1)
     m = use.sum(axis=1)
     # the pixels of each corner that are used come first: the others are not calculated with
@@ -199,7 +231,7 @@ def _fit(
     damping = np.full(n, 1e-2)
 
     def cost(q: Array, rows: NDArray[np.int64]) -> tuple[Array, Array, Single]:
-        value, j = _model(q, px[rows], py[rows])
+        value, j = _model(q, px[rows], py[rows], saddle[rows])
         r = (grey[rows] - value) * weight[rows]
         return np.sum(r * r, axis=1, dtype=float), r, j
 

@@ -1,9 +1,9 @@
 """Square markers of OpenCV's dictionaries: found, identified, and their corners measured.
 
 A test field names marker corners in its `code` column as `DICT_APRILTAG_36h11:17:0`: dictionary,
-marker, corner in OpenCV's order (clockwise in the image of an upright marker, beginning at its top
-left; OpenCV's AprilTags are turned by 180° against the printed original). Detection is OpenCV's,
-in a reduced image where the frame is large; the corner positions are our own fit (`corner`).
+marker, corner in the order that `dictionary` defines (clockwise as seen; in an upright AprilTag
+from its bottom right). Detection is OpenCV's, in a reduced image where the frame is large, with a
+black border of one cell, or of two as Kalibr prints it; the corners are our own fit (`corner`).
 
 A marker that is seen twice in an image is dropped: one of the two is not what it says.
 """
@@ -12,8 +12,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass
-from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -21,6 +20,12 @@ import numpy as np
 from thermocald.errors import TestFieldError
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.photogrammetry.targets.corner import fit_corners
+from thermocald.photogrammetry.targets.dictionary import (
+    corner_shift,
+    detector,
+    dictionary,
+    marker_size,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -40,11 +45,13 @@ __all__ = [
     "measure_corners",
     "measure_markers",
     "parse_marker",
+    "predicted_markers",
     "to_8_bit",
 ]
 
 _LARGE_PIXELS = 3_000_000
 _SMALLEST_SIDE_PX = 16.0
+_LEAST_STEP_DN = 5.0
 
 
 def is_marker(code: str) -> bool:
@@ -63,45 +70,26 @@ def parse_marker(code: str) -> tuple[str, int, int | None]:
         raise TestFieldError(
             f"{code!r} is no marker code: write DICT_APRILTAG_36h11:17:0 for corner 0 of marker 17"
         )
-    dictionary = _dictionary(parts[0])
-    marker = int(numbers[0])
+    known = len(dictionary(parts[0]).bytesList)
+    marker = int(numbers[0][:9])
     corner = int(numbers[1]) if len(numbers) == 2 else None
-    if marker >= len(dictionary.bytesList):
-        raise TestFieldError(
-            f"{code!r}: {parts[0]} has markers 0 to {len(dictionary.bytesList) - 1}"
-        )
+    if marker >= known:
+        raise TestFieldError(f"{code!r}: {parts[0]} has markers 0 to {known - 1}")
     if corner is not None and corner > 3:
         raise TestFieldError(f"{code!r}: a marker has corners 0 to 3")
     return parts[0], marker, corner
 
 
-@cache
-def _dictionary(name: str) -> Any:
-    number = getattr(cv2.aruco, name, None)
-    if not name.startswith("DICT_") or not isinstance(number, int):
-        raise TestFieldError(
-            f"{name!r} is no dictionary of OpenCV's; DICT_4X4_50, DICT_5X5_1000, or "
-            "DICT_APRILTAG_36h11 are"
-        )
-    return cv2.aruco.getPredefinedDictionary(number)
-
-
-@cache
-def _detector(name: str) -> Any:
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
-    parameters.minMarkerPerimeterRate = 0.01
-    # A bit is read from a third of its cell: the default of eight px a cell gives blur a chance.
-    return cv2.aruco.ArucoDetector(_dictionary(name), parameters)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectedMarkers:
-    """Markers of one dictionary: numbers (m,), corners (m, 4, 2) px, good to about a pixel."""
+    """Markers of one dictionary: numbers (m,), corners (m, 4, 2) px, good to about a pixel; border:
+    cells of their black border.
+    """
 
     dictionary: str
     numbers: NDArray[np.int64]
     corners: Array
+    border: int = 1
 
 
 def to_8_bit(image: Image) -> NDArray[np.uint8]:
@@ -112,34 +100,60 @@ def to_8_bit(image: Image) -> NDArray[np.uint8]:
 
 
 def detect_markers(
-    image: Image, dictionary: str, expected: frozenset[int] | None = None
+    image: Image, name: str, expected: frozenset[int] | None = None
 ) -> DetectedMarkers:
     """Find the markers of one dictionary in an image; `expected` numbers, others are ignored.
 
     A number that is found twice is dropped. A large image is searched at half its size first, and
-    at full size where that found less than half of what is expected.
+    at full size where that found less than half of what is expected; then with the wide border of
+    Kalibr's AprilGrids, where there may be some.
     """
     grey = to_8_bit(image)
-    scales = (2, 1) if grey.size > _LARGE_PIXELS else (1,)
+    large = grey.size > _LARGE_PIXELS
+    searches = [(scale, 1) for scale in ((2, 1) if large else (1,))]
+    if name.startswith("DICT_APRILTAG"):
+        searches += [(scale, 2) for scale, _ in searches]
     best: dict[int, Array] = {}
-    for scale in scales:
+    best_border = 1
+    for scale, border in searches:
         small = cv2.resize(grey, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA)
-        found, numbers, _ = _detector(dictionary).detectMarkers(small if scale > 1 else grey)
+        found, numbers, _ = detector(name, border).detectMarkers(small if scale > 1 else grey)
         seen: defaultdict[int, list[Array]] = defaultdict(list)
         if numbers is not None:
             for number, corners in zip(numbers.ravel().tolist(), found, strict=True):
                 if expected is None or number in expected:
                     # cv2.resize maps pixel centres as x = scale·x' + (scale − 1)/2.
                     at = scale * corners.reshape(4, 2).astype(float) + (scale - 1) / 2
-                    seen[number].append(at)
+                    if _outlined(grey, at):
+                        seen[number].append(np.roll(at, corner_shift(name), axis=0))
         single = {number: at[0] for number, at in seen.items() if _one_place(at)}
         if len(single) > len(best):
-            best = single
+            best, best_border = single, border
         if len(best) > 0.5 * (len(expected) if expected is not None else 0) and best:
             break
     numbers = np.array(sorted(best), dtype=np.int64)
     corners = np.array([best[n] for n in numbers.tolist()]).reshape(-1, 4, 2)
-    return DetectedMarkers(dictionary, numbers, corners)
+    return DetectedMarkers(name, numbers, corners, best_border)
+
+
+def _outlined(grey: NDArray[np.uint8], quad: Array) -> bool:
+    """Whether the image gets lighter across the sides of a marker: OpenCV takes a tag with a border
+    of two cells for one with a border of one, a cell too small.
+    """
+    following = np.roll(quad, -1, axis=0)
+    middle = quad.mean(axis=0)
+    along = np.array([0.3, 0.5, 0.7])[:, None, None]
+    places = quad + along * (following - quad)
+    outwards = places - middle
+    distance = np.linalg.norm(outwards, axis=-1)[..., None]
+    step = outwards * np.maximum(0.06, 2.0 / np.maximum(distance, 1e-9))
+    high = np.array(grey.shape[::-1]) - 1
+
+    def at(where: Array) -> Array:
+        x, y = np.moveaxis(np.clip(np.rint(where), 0, high).astype(np.int64), -1, 0)
+        return grey[y, x].astype(float)
+
+    return bool(np.median(at(places + step) - at(places - step)) > _LEAST_STEP_DN)
 
 
 def _one_place(found: list[Array]) -> bool:
@@ -207,10 +221,10 @@ def locate_markers(
     missed = {} if missed is None else missed
     rows: list[int] = []
     corners, before, after, cell = [], [], [], []
-    for dictionary, known in marker_rows(testfield).items():
+    for name, known in marker_rows(testfield).items():
         expected = frozenset(marker for marker, _ in known)
-        found = detect_markers(image, dictionary, expected)
-        cells = _dictionary(dictionary).markerSize + 2
+        found = detect_markers(image, name, expected)
+        cells = marker_size(name, found.border)
         for number, quad in zip(found.numbers.tolist(), found.corners, strict=True):
             side = np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1).min()
             for k in range(4):
@@ -220,13 +234,44 @@ def locate_markers(
                     corners.append(quad[k])
                     before.append(quad[k - 1])
                     after.append(quad[(k + 1) % 4])
-                    cell.append(side / cells)
+                    cell.append(found.border * side / cells)
                 elif row is not None:
                     missed[row] = "too small"
         missing = expected.difference(found.numbers.tolist())
         missed.update({r: "not found" for (m, _), r in known.items() if m in missing})
     return MarkerCorners(
         np.array(rows, dtype=np.int64), _xy(corners), _xy(before), _xy(after),
+        np.array(cell, dtype=float),
+    )  # fmt: skip
+
+
+def predicted_markers(
+    testfield: TestField, rows: list[int], image_points: Array, found: MarkerCorners
+) -> MarkerCorners:
+    """Marker corners (rows of the field) where an orientation has them.
+
+    image_points (N, 2) px of the whole field; found: those that were detected, for the width of the
+    border. Corners of which a neighbour is not in the field are left out.
+    """
+    side = np.linalg.norm(found.before - found.corners, axis=1)
+    share = float(np.median(found.cell / np.maximum(side, 1e-9))) if len(found) else 0.1
+    row_of = {(n, *key): row for n, m in marker_rows(testfield).items() for key, row in m.items()}
+    places, corners, before, after, cell = [], [], [], [], []
+    for row in rows:
+        name, marker, k = parse_marker(testfield.codes[row])
+        ends = [row_of.get((name, marker, ((k or 0) + step) % 4)) for step in (-1, 1)]
+        if ends[0] is None or ends[1] is None:
+            continue
+        at, first, second = (image_points[r] for r in (row, ends[0], ends[1]))
+        size = min(float(np.linalg.norm(first - at)), float(np.linalg.norm(second - at)))
+        if size >= _SMALLEST_SIDE_PX:
+            places.append(row)
+            corners.append(at)
+            before.append(first)
+            after.append(second)
+            cell.append(share * size)
+    return MarkerCorners(
+        np.array(places, dtype=np.int64), _xy(corners), _xy(before), _xy(after),
         np.array(cell, dtype=float),
     )  # fmt: skip
 

@@ -1,0 +1,151 @@
+"""Boards that people own, as their programs draw them: all found, where they are, and numbered."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.photogrammetry import board_images as images
+from tests.photogrammetry.network_cases import looking_at
+from tests.photogrammetry.printed_sheets import photograph
+from thermocald.errors import TestFieldError
+from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
+from thermocald.photogrammetry.frame.measurement import measure
+from thermocald.photogrammetry.targets import boards, dictionary
+from thermocald.store.recording.board_file import read_board, read_rings
+
+CAMERA = CameraModel(Sensor(1640, 1232, 0.00224), InteriorOrientation(3.05, 0.02, -0.01, A1=-2e-3))
+
+
+def seen(sheet, field, stand, roll=0.3):
+    """A measurement of a photograph, and its errors (n, 2) px."""
+    middle = field.points.mean(axis=0)
+    station = looking_at(middle + np.array(stand), middle, roll)
+    found = measure(photograph([sheet], CAMERA, station), field)
+    truth = CAMERA.project(station, field.points)
+    visible = int(CAMERA.sensor.contains(truth, 6.0).sum())
+    return found, found.observations.points - truth[found.observations.targets], visible
+
+
+@pytest.fixture(scope="module")
+def april():
+    return images.aprilgrid_sheet(6, 6, 40.0, 0.3), boards.aprilgrid(6, 6, 40.0, 0.3)
+
+
+@pytest.mark.parametrize(
+    "stand", [(0.0, 0.0, 420.0), (150.0, -120.0, 380.0), (-250.0, 60.0, 300.0)]
+)
+def test_all_corners_of_an_aprilgrid(april, stand):
+    found, errors, visible = seen(*april, stand)
+    assert found.status.ok
+    assert len(found.observations) >= visible >= 138
+    assert np.sqrt(np.mean(errors**2)) < 0.015
+
+
+def test_the_tags_of_an_aprilgrid_are_those_of_its_makers():
+    """Drawn from the published word, not from OpenCV's picture."""
+    cells = dictionary.marker_cells("DICT_APRILTAG_36h11", 0)[1:7, 1:7]
+    word = "".join("01"[int(not black)] for black in cells[::-1, ::-1].ravel())
+    assert int(word, 2) == images.APRIL_TAG_0
+
+
+@pytest.mark.parametrize("turn", [1, 2, 3])
+def test_corners_in_another_order_are_not_ok(april, turn):
+    sheet, field = april
+    codes = tuple(f"{c[:-1]}{(int(c[-1]) + turn) % 4}" for c in field.codes)
+    found, _, _ = seen(sheet, replace(field, codes=codes), (0.0, 0.0, 420.0))
+    assert found.status.word == "other_field"
+    assert "another order" in found.status.reason
+    if turn == 2:
+        assert "180°" in found.status.reason
+
+
+@pytest.mark.parametrize(
+    ("name", "columns", "rows", "legacy"),
+    [("DICT_5X5_250", 11, 8, False), ("DICT_4X4_50", 9, 6, True)],
+)
+def test_all_corners_of_a_charuco_board(name, columns, rows, legacy):
+    field = boards.charuco(columns, rows, 30.0, 22.5, name, legacy=legacy)
+    sheet = images.charuco_sheet(columns, rows, 30.0, 22.5, name, legacy)
+    found, errors, visible = seen(sheet, field, (150.0, -120.0, 380.0))
+    assert found.status.ok
+    assert len(found.observations) == visible == len(field)
+    chess = np.array([field.kinds[r] == "chess_corner" for r in found.observations.targets])
+    assert chess.sum() == (columns - 1) * (rows - 1)
+    assert np.sqrt(np.mean(errors[chess] ** 2)) < 0.01
+    ratio = errors[chess] / found.observations.sigmas[chess]
+    assert 0.7 < np.sqrt(np.mean(ratio**2)) < 1.4
+
+
+@pytest.mark.parametrize("roll", [0.0, 1.5, 3.1, 4.5])
+def test_a_chessboard_is_numbered_however_it_is_turned(roll):
+    field = boards.chessboard(9, 6, 25.0)
+    sheet = images.chessboard_sheet(9, 6, 25.0)
+    found, errors, _ = seen(sheet, field, (150.0, -120.0, 330.0), roll)
+    assert len(found.observations) == 54
+    assert np.sqrt(np.mean(errors**2)) < 0.02
+
+
+def test_a_chessboard_that_looks_the_same_upside_down_is_refused():
+    with pytest.raises(TestFieldError, match="looks the same turned by 180°"):
+        boards.chessboard(8, 6, 25.0)
+
+
+KALIBR = "target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 6\ntagSize: 0.04\ntagSpacing: 0.3\n"
+OPENCV = """{"type": "charuco", "squaresX": 11, "squaresY": 8, "squareLength": 0.03,
+"markerLength": 0.0225, "dictionary": "5X5_250"}"""
+CHECKER = """target_type: checkerboard
+targetCols: 9
+targetRows: 6
+rowSpacingMeters: 0.025
+colSpacingMeters: 0.025
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (KALIBR, boards.aprilgrid(6, 6, 40.0, 0.3)),
+        (OPENCV, boards.charuco(11, 8, 30.0, 22.5, "DICT_5X5_250")),
+        (CHECKER, boards.chessboard(9, 6, 25.0)),
+    ],
+    ids=["Kalibr's yaml", "OpenCV's parameters", "Kalibr's checkerboard"],
+)
+def test_files_that_describe_boards(tmp_path, text, expected):
+    (tmp_path / "board.yaml").write_text(text)
+    field, said = read_board(tmp_path / "board.yaml")
+    assert field.names == expected.names
+    assert field.codes == expected.codes
+    assert field.points == pytest.approx(expected.points)
+    assert " × " in said
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (KALIBR.replace("0.04", "-0.04"), "tagsize"),
+        (KALIBR.replace("tagCols: 6", "tagCols: 1e9"), "tagcols"),
+        (KALIBR.replace("aprilgrid", "circlegrid"), "aprilgrid, checkerboard"),
+        (OPENCV.replace("5X5_250", "9X9"), "9X9"),
+        ("[1, 2]", "key: value"),
+    ],
+)
+def test_files_that_do_not_are_refused(tmp_path, text, reason):
+    (tmp_path / "board.yaml").write_text(text)
+    with pytest.raises(TestFieldError, match=reason):
+        read_board(tmp_path / "board.yaml")
+
+
+def test_ring_targets_are_numbered_as_in_other_programs(tmp_path):
+    (tmp_path / "targets.txt").write_text(
+        "# Metashape\ntarget 1, 0, 0, 0\ntarget 2, 200, 0, 0.5\ntarget 147,0,200,1\n4 200 200 2\n"
+    )
+    field = read_rings(tmp_path / "targets.txt", 12, 10.0)
+    assert field.codes[0] == "RING12:65"
+    assert len(set(field.codes)) == 4
+    assert field.points[1].tolist() == [200, 0, 0.5]
+    (tmp_path / "targets.txt").write_text("target 148, 0, 0, 0\n1,0,0,0\n2,0,1,0\n3,1,0,0\n")
+    with pytest.raises(TestFieldError, match="147 codes"):
+        read_rings(tmp_path / "targets.txt", 12, 10.0)

@@ -1,0 +1,162 @@
+"""Boards as other programs describe them: Kalibr's target.yaml, OpenCV's board parameters, lists of
+ring-coded targets.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.errors import TestFieldError
+from thermocald.photogrammetry.targets import boards
+from thermocald.yaml_file import read_yaml
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from thermocald.photogrammetry.field.testfield import TestField
+
+__all__ = ["read_board", "read_rings"]
+
+_MOST_LINES = 20_000
+_LARGEST_BYTES = 5_000_000
+_SYNONYMS = {
+    "columns": ("squaresx", "squares_x", "cols", "columns", "width", "targetcols", "tagcols"),
+    "rows": ("squaresy", "squares_y", "rows", "height", "targetrows", "tagrows"),
+    "square": ("squarelength", "square_length", "square_size", "squaresize", "square"),
+    "marker": ("markerlength", "marker_length", "marker_size", "markersize", "marker"),
+    "dictionary": ("dictionary", "dict", "aruco_dict", "dictionary_name"),
+}
+
+
+def read_board(path: Path, sigma: float | None = None) -> tuple[TestField, str]:
+    """The board in a YAML or JSON file, and what it was taken for.
+
+    Kalibr: target_type aprilgrid or checkerboard, lengths in metres. Others: type charuco or
+    chessboard with OpenCV's names for the parameters; lengths below 1 are metres, else mm.
+    Raises TestFieldError naming the file and the key.
+    """
+    document = {str(k).lower(): v for k, v in read_yaml(path, TestFieldError).items()}
+    kind = str(document.get("target_type", document.get("type", ""))).lower()
+    if kind in ("aprilgrid", "april_grid"):
+        columns, rows = _count(path, document, "tagcols"), _count(path, document, "tagrows")
+        size, spacing = (
+            1e3 * _number(path, document, "tagsize"),
+            _number(path, document, "tagspacing"),
+        )
+        first = int(document.get("startid", document.get("low_id", 0)) or 0)
+        field = boards.aprilgrid(columns, rows, size, spacing, first=first, sigma=sigma)
+        said = (
+            f"Kalibr's AprilGrid of {columns} × {rows} tags of {size:g} mm, {spacing * size:g} mm"
+        )
+        return field, said + " apart"
+    if kind in ("checkerboard", "chessboard") and "rowspacingmeters" in document:
+        columns, rows = _count(path, document, "targetcols"), _count(path, document, "targetrows")
+        wide = 1e3 * _number(path, document, "colspacingmeters")
+        high = 1e3 * _number(path, document, "rowspacingmeters")
+        field = boards.chessboard(columns, rows, wide, high, sigma=sigma)
+        return field, f"Kalibr's checkerboard of {columns} × {rows} corners, {wide:g} × {high:g} mm"
+    if kind in ("charuco", "charucoboard", "checkerboard", "chessboard", "checker"):
+        columns, rows = (_count(path, document, *_SYNONYMS[k]) for k in ("columns", "rows"))
+        square = _length(path, document, "square")
+        if "charuco" not in kind:
+            field = boards.chessboard(columns, rows, square, sigma=sigma)
+            return field, f"a chessboard of {columns} × {rows} inner corners, {square:g} mm"
+        marker = _length(path, document, "marker")
+        name = _dictionary(path, _value(path, document, *_SYNONYMS["dictionary"]))
+        legacy = bool(document.get("legacy", document.get("legacy_pattern", False)))
+        field = boards.charuco(columns, rows, square, marker, name, legacy=legacy, sigma=sigma)
+        return field, (
+            f"a ChArUco board of {columns} × {rows} squares of {square:g} mm, markers of "
+            f"{marker:g} mm of {name}"
+        )
+    raise TestFieldError(
+        f"{path}, key target_type: {kind or 'is missing'}; aprilgrid, checkerboard, charuco and "
+        "chessboard are read"
+    )
+
+
+def _value(path: Path, document: dict[str, Any], *names: str) -> Any:
+    for name in names:
+        if document.get(name) is not None:
+            return document[name]
+    raise TestFieldError(
+        f"{path}: key {names[0]} is missing; there are {', '.join(document)[:200]}"
+    )
+
+
+def _number(path: Path, document: dict[str, Any], *names: str) -> float:
+    value = _value(path, document, *names)
+    try:
+        number = float(value) if isinstance(value, int | float | str) else np.nan
+    except (ValueError, OverflowError):
+        number = np.nan
+    if isinstance(value, bool) or not 0 < number < 1e6:
+        raise TestFieldError(
+            f"{path}, key {names[0]}: {str(value)[:40]!r} is not a length or count"
+        )
+    return number
+
+
+def _count(path: Path, document: dict[str, Any], *names: str) -> int:
+    number = _number(path, document, *names)
+    if number != int(number) or number > 1000:
+        raise TestFieldError(f"{path}, key {names[0]}: {number:g} is not a count up to 1000")
+    return int(number)
+
+
+def _length(path: Path, document: dict[str, Any], key: str) -> float:
+    """A length in mm; below 1 it is in metres, as ROS and OpenCV's samples have it."""
+    length = _number(path, document, *_SYNONYMS[key])
+    return 1e3 * length if length < 1 else length
+
+
+def _dictionary(path: Path, value: Any) -> str:
+    """OpenCV's name of a dictionary, from its name with or without DICT_, or its number."""
+    import cv2
+
+    if isinstance(value, int):
+        names = [n for n in dir(cv2.aruco) if n.startswith("DICT_")]
+        known = [n for n in names if getattr(cv2.aruco, n) == value]
+        if known:
+            return sorted(known)[0]
+    name = str(value).strip()
+    name = name if name.startswith("DICT_") else f"DICT_{name}"
+    if not isinstance(getattr(cv2.aruco, name, None), int):
+        raise TestFieldError(f"{path}: {str(value)[:40]!r} is not a dictionary of OpenCV's")
+    return name
+
+
+def read_rings(path: Path, bits: int, diameter: float, sigma: float | None = None) -> TestField:
+    """Ring-coded targets from a list as Metashape and AICON write it: label, X, Y, Z in mm.
+
+    A label is the target's number, alone or after a word (`target 12`). Lines that hold none are
+    passed over. Raises TestFieldError naming file and line.
+    """
+    try:
+        if path.stat().st_size > _LARGEST_BYTES:
+            raise TestFieldError(f"{path}: is larger than {_LARGEST_BYTES // 1_000_000} MB")
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as cause:
+        raise TestFieldError(f"{path}: cannot be read: {cause}") from cause
+    numbers: list[int] = []
+    points: list[list[float]] = []
+    for line, text in enumerate(lines[:_MOST_LINES], 1):
+        found = re.match(r"\s*(?:[A-Za-z_]+[\s_]*)?(\d{1,4})[\s,;]+(.*)", text)
+        if found is None or text.lstrip().startswith("#"):
+            continue
+        fields = [f for f in re.split(r"[\s,;]+", found[2]) if f]
+        try:
+            point = [float(f) for f in fields[:3]]
+        except ValueError:
+            raise TestFieldError(f"{path}, line {line}: {found[2][:40]!r} is not X, Y, Z") from None
+        if len(point) < 3 or not np.isfinite(point).all():
+            raise TestFieldError(f"{path}, line {line}: X, Y, Z (mm) are needed after the label")
+        numbers.append(int(found[1]))
+        points.append(point)
+    if not numbers:
+        raise TestFieldError(f"{path}: holds no line `label, X, Y, Z`")
+    sigmas = None if sigma is None else np.full((len(points), 3), sigma)
+    return boards.numbered_rings(numbers, np.array(points), bits, diameter, sigmas=sigmas)

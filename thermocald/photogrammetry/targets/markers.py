@@ -151,7 +151,7 @@ def _outlined(grey: NDArray[np.uint8], quad: Array) -> bool:
 
     def at(where: Array) -> Array:
         x, y = np.moveaxis(np.clip(np.rint(where), 0, high).astype(np.int64), -1, 0)
-        return grey[y, x].astype(float)
+        return np.asarray(grey[y, x], dtype=float)
 
     return bool(np.median(at(places + step) - at(places - step)) > _LEAST_STEP_DN)
 

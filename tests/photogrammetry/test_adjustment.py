@@ -237,3 +237,35 @@ def test_a_mirrored_pose_is_said():
     obs = Observations(np.arange(8), noisy, np.full((8, 2), 0.3))
     a = pose_only(scene.SENSOR, field, obs, camera)
     assert a.status == "ambiguous_pose"
+
+
+def test_one_gross_error_among_twelve_targets_is_found_or_the_epoch_has_no_result():
+    """200 epochs: never `ok` with residuals that contradict the sigmas, and true sds where ok."""
+    field, z, ok = scene.corner_field(), [], 0
+    for k in range(200):
+        rng = np.random.default_rng([12, k])
+        o = scene.observe(field, rng).select(rng.choice(140, 12, replace=False))
+        o.points[rng.integers(12)] += rng.choice([-1, 1], 2) * rng.uniform(1, 30, 2)
+        r = adjust(scene.SENSOR, field, o, scene.INTERIOR, scene.EXTERIOR)
+        if r.ok:
+            ok += 1
+            assert r.sigma0 < 3
+            z.append((r.values[:3] - scene.INTERIOR.as_array()[:3]) / r.sd[:3])
+        else:
+            assert r.reason
+    assert ok > 130
+    assert np.sqrt(np.mean(np.square(z), axis=0)) == pytest.approx(np.ones(3), abs=0.2)
+
+
+def test_twelve_clean_targets_pass_the_global_test():
+    field, words = scene.corner_field(), []
+    for k in range(100):
+        rng = np.random.default_rng([13, k])
+        o = scene.observe(field, rng).select(rng.choice(140, 12, replace=False))
+        words.append(adjust(scene.SENSOR, field, o, scene.INTERIOR, scene.EXTERIOR).status)
+    assert words.count("ok") >= 97
+    noisy = scene.observe(field, np.random.default_rng(3), sigma_px=0.4)
+    few = Observations(noisy.targets[::12], noisy.points[::12], noisy.sigmas[::12] / 10)
+    assert adjust(scene.SENSOR, field, few, scene.INTERIOR, scene.EXTERIOR).status in (
+        "global_test", "too_many_rejected",
+    )  # fmt: skip

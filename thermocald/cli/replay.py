@@ -185,6 +185,7 @@ def _summary(
         "epochs": len(table.number),
         "ok": int(ok.sum()),
         "sigma0": float(np.median(table.sigma0[ok])) if ok.any() else None,
+        "noise_ratio": None if table.adjustment is None else table.adjustment.noise_ratio,
         "rejected": int(table.n_rejected.sum()),
         "left_out": list(table.left_out),
         "parameters": [
@@ -197,6 +198,8 @@ def _summary(
                 "scatter_over_sd": c.scatter / c.sd,
                 "change": c.change,
                 "sd_change": c.sd_change,
+                "last_minus_first": c.last_minus_first,
+                "sd_last_minus_first": c.sd_last_minus_first,
                 "p": c.p,
                 "drift": c.moves,
                 "per_kelvin": c.per_kelvin,
@@ -255,6 +258,11 @@ def _tell(document: dict[str, Any]) -> None:
         f"{_EXTERIOR_WORDS[document['exterior']]}, {document['rejected']} gross errors",
         highlight=False,
     )
+    if document["sigma0"] is not None:
+        console.print(
+            f"sigma0 {document['sigma0']:.2f}: the noise found is that many times the stated one",
+            highlight=False,
+        )
     if document["exterior_choice"]:
         console.print(
             f"--exterior {document['exterior']}: {document['exterior_choice']}", highlight=False
@@ -264,7 +272,16 @@ def _tell(document: dict[str, Any]) -> None:
             f"left out: target {name} and what belongs to it moves by itself", highlight=False
         )
     table = Table(box=None, pad_edge=False)
-    for title in ("", "mean mm", "scatter mm", "stated sd mm", "ratio", "change mm", "drift"):
+    for title in (
+        "",
+        "mean mm",
+        "scatter mm",
+        "stated sd mm",
+        "ratio",
+        "line mm",
+        "last - first mm",
+        "drift",
+    ):
         table.add_column(title, justify="left" if not title else "right")
     for p in document["parameters"]:
         table.add_row(
@@ -274,6 +291,7 @@ def _tell(document: dict[str, Any]) -> None:
             f"{p['stated_sd']:.6f}",
             f"{p['scatter_over_sd']:.2f}",
             f"{p['change']:+.6f} ± {p['sd_change']:.6f}",
+            f"{p['last_minus_first']:+.6f} ± {p['sd_last_minus_first']:.6f}",
             _drift(p),
         )
     if document["parameters"]:

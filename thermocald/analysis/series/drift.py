@@ -31,6 +31,7 @@ _LEVEL = 0.01
 _FEWEST = 10
 _LEAST_WARMING_K = 0.5  # below, the thermometer's own noise is all there is
 _SUSPECTS = 5  # groups that are left out in turn
+_SHRUNK = 0.5  # of its change must go with a group that a parameter's drift rests on
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +43,7 @@ class Course:
     much, corrected for the number of parameters; drifts: p below 1 %, with and without any single
     group of targets; rests_on: the group without which there would be no drift, or "";
     per_kelvin, p_temperature: slope on the reference temperature and its p-value, corrected, NaN
-    where that is constant or not known.
+    where that is constant or not known; last_minus_first: between the first and the last epoch.
     """
 
     name: str
@@ -56,6 +57,8 @@ class Course:
     rests_on: str = ""
     per_kelvin: float = float("nan")
     p_temperature: float = float("nan")
+    last_minus_first: float = float("nan")
+    sd_last_minus_first: float = float("nan")
 
     @property
     def moves(self) -> bool:
@@ -63,8 +66,20 @@ class Course:
         return self.drifts or self.p_temperature < _LEVEL
 
 
-def courses(table: SeriesTable, names: tuple[str, ...] = ("c", "x0", "y0")) -> list[Course]:
-    """How parameters went over a series; those that were held are left out."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Line:
+    """A straight line through one parameter: values and sds (n,), its change, sd and p-value."""
+
+    name: str
+    values: Array
+    sds: Array
+    change: float
+    sd_change: float
+    p: float
+
+
+def _lines(table: SeriesTable, names: tuple[str, ...]) -> dict[str, _Line]:
+    """Lines through the parameters that were estimated, p corrected for their number (Holm)."""
     found = []
     ok = table.ok
     t = table.frame_time[ok]
@@ -74,27 +89,35 @@ def courses(table: SeriesTable, names: tuple[str, ...] = ("c", "x0", "y0")) -> l
         if len(y) < _FEWEST or not np.isfinite(sd).all() or np.ptp(t) == 0:
             continue
         tilt = table.adjustment.trend_sd[column] if table.adjustment is not None else 0.0
-        found.append((name, y, sd, *_line(t, y, float(tilt))))
-    corrected = holm([p for *_, p in found])
-    warm = _with_temperature(table.temperature[ok], [y for _, y, *_ in found])
+        found.append(_Line(name, y, sd, *_line(t, y, float(tilt))))
+    corrected = holm([line.p for line in found])
+    return {line.name: replace(line, p=p) for line, p in zip(found, corrected, strict=True)}
+
+
+def courses(table: SeriesTable, names: tuple[str, ...] = ("c", "x0", "y0")) -> list[Course]:
+    """How parameters changed over a series; those that were held are left out."""
+    ok = table.ok
+    lines = _lines(table, names)
+    warm = _with_temperature(table.temperature[ok], [line.values for line in lines.values()])
     result = []
-    for (name, y, sd, change, sd_change, _), p, (slope, p_warm) in zip(
-        found, corrected, warm, strict=True
-    ):
-        rests_on = _single_support(table, name, sd_change, len(found)) if p < _LEVEL else ""
+    for line, (slope, p_warm) in zip(lines.values(), warm, strict=True):
+        rests_on = _single_support(table, line, tuple(lines)) if line.p < _LEVEL else ""
+        y, sd = line.values, line.sds
         result.append(
             Course(
-                name,
+                line.name,
                 float(y.mean()),
                 float(y.std(ddof=1)),
                 float(np.sqrt(np.mean(sd**2))),
-                change,
-                sd_change,
-                p,
-                p < _LEVEL and not rests_on,
+                line.change,
+                line.sd_change,
+                line.p,
+                line.p < _LEVEL and not rests_on,
                 rests_on,
                 slope,
                 p_warm,
+                float(y[-1] - y[0]),
+                float(np.hypot(sd[-1], sd[0])),
             )
         )
     return result
@@ -125,22 +148,25 @@ def settled(table: SeriesTable) -> tuple[SeriesTable, list[Course]]:
     return left, courses(left)
 
 
-def _single_support(table: SeriesTable, name: str, sd_change: float, tests: int) -> str:
-    """The group of targets without which a parameter drifts least, if it then does not, or ""."""
+def _single_support(table: SeriesTable, line: _Line, names: tuple[str, ...]) -> str:
+    """The group of targets that alone makes a parameter drift, or "".
+
+    Without it the change must shrink by more than half and no longer be significant, corrected as
+    with it: a group whose absence only makes the change less certain is not accused.
+    """
     if table.without is None or len(table.groups) < 3:
         return ""
-    column = IOP_NAMES.index(name)
-    best, best_p = "", 0.0
+    best, least = "", _SHRUNK * abs(line.change)
     for first in _suspects(table):
-        rows = table.groups[first]
-        left = table.without(rows, True)
-        good = left.ok
-        if good.sum() < _FEWEST:
+        left = table.without(table.groups[first], True)
+        if left.ok.sum() < _FEWEST:
             continue
-        _, _, p = _line(left.frame_time[good], left.values[good, column], sd_change)
-        if p > best_p:
-            best, best_p = first, p
-    return best if best_p * tests >= _LEVEL else ""
+        without = _lines(left, names).get(line.name)
+        if without is None or without.p < _LEVEL:
+            continue
+        if abs(without.change) < least:
+            best, least = first, abs(without.change)
+    return best
 
 
 def _suspects(table: SeriesTable) -> list[str]:

@@ -29,16 +29,20 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
 )
 from thermocald.photogrammetry.epoch.gauss_markov import (
+    TRUSTED_REDUNDANCY,
     NoConvergenceError,
     Problem,
     Rejections,
     Solution,
+    fails_global_test,
+    most_rejected,
     point_tests,
     resolve,
     snoop,
     solve,
 )
 from thermocald.photogrammetry.epoch.geometry import GeometryBounds, weaknesses
+from thermocald.photogrammetry.parameters import EOP, IOP
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -62,7 +66,6 @@ __all__ = [
 DEFAULT_FREE = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2")
 
 _ROUNDS = 12  # of data snooping; each may reject several targets
-_TRUSTED_REDUNDANCY = 20  # from here on the residuals themselves tell the noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +92,7 @@ class AdjustmentSettings:
         for name in (*self.free, *self.priors):
             if name not in PARAMETER_NAMES:
                 raise ConfigurationError(
-                    f"{name!r} is no parameter; there are {', '.join(PARAMETER_NAMES)}"
+                    f"{name!r} is not a parameter; choose from {', '.join(PARAMETER_NAMES)}"
                 )
 
     @property
@@ -205,6 +208,7 @@ def adjust(
     start = np.concatenate([interior.as_array(), exterior.as_array()])
     problem = Problem.build(sensor, testfield, observations, unknowns, s.priors, s.target_sigmas)
     use = np.ones(n, dtype=bool) if suspects is None else ~suspects
+    most = most_rejected(s.max_rejected, 2 * n - len(unknowns))
     try:
         solution = solve(problem, start, use)
         tests = point_tests(solution, use)
@@ -215,7 +219,7 @@ def adjust(
             if keep is use:
                 break
             use = keep
-            if use.sum() < (1 - s.max_rejected) * n:
+            if use.sum() < (1 - most) * n:
                 return failed(
                     "too_many_rejected",
                     f"{n - int(use.sum())} of {n} targets contradict the others: a moved test "
@@ -249,15 +253,15 @@ def _result(
         rejected = tuple(problem.observations.targets[~use].tolist())
     sigma0 = float(np.sqrt(problem.cost(v, solution.values) / redundancy))
     factor = sigma0**2 if s.scale == "posterior" else 1.0
-    if redundancy < _TRUSTED_REDUNDANCY:
+    if redundancy < TRUSTED_REDUNDANCY:
         factor = max(1.0, factor)  # a handful of residuals may be small by luck
     covariance = np.zeros((16, 16))
     covariance[u[:, None], u] = solution.root @ solution.root.T * factor
     result = Adjustment(
         "ok",
         "",
-        InteriorOrientation.from_array(solution.values[:10]),
-        ExteriorOrientation.from_array(solution.values[10:]),
+        InteriorOrientation.from_array(solution.values[IOP]),
+        ExteriorOrientation.from_array(solution.values[EOP]),
         covariance,
         tuple(n for n in IOP_NAMES if n in s.free),
         sigma0,
@@ -268,6 +272,13 @@ def _result(
         test,
         rejected,
     )
+    if s.snooping_alpha > 0 and fails_global_test(sigma0**2, redundancy):
+        why = (
+            f"the residuals are {sigma0:.1f} times as large as their sigmas say, and a redundancy "
+            f"of {redundancy} does not show which target is wrong: show more targets, or state "
+            "larger sigmas"
+        )
+        return replace(result, status="global_test", reason=why)
     reasons = weaknesses(
         problem.sensor,
         points,

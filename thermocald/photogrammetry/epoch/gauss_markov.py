@@ -33,6 +33,7 @@ __all__ = [
     "chi2_2d",
     "cofactor_root",
     "fails_global_test",
+    "most_rejected",
     "point_covariances",
     "point_tests",
     "resolve",
@@ -46,6 +47,7 @@ _LINEAR = 10.0  # standard deviations that a solution may move without new parti
 TRUSTED_REDUNDANCY = 20
 """From here on the residuals themselves tell the noise."""
 
+_MOST_OF_FEW = 0.15  # one of 7 to 13 targets, two of 14 and more
 _GLOBAL_TEST_NORMAL = 3.09  # quantile of the normal distribution: error probability 0.1 %
 
 
@@ -150,6 +152,14 @@ def fails_global_test(unit: ArrayLike, redundancy: ArrayLike) -> NDArray[np.bool
     ninth = 2.0 / (9.0 * r)
     bound = (1.0 - ninth + _GLOBAL_TEST_NORMAL * np.sqrt(ninth)) ** 3
     return np.asarray((np.asarray(redundancy) < TRUSTED_REDUNDANCY) & (np.asarray(unit) > bound))
+
+
+def most_rejected(fraction: float, redundancy: int) -> float:
+    """Fraction of the targets that may be rejected.
+
+    Where residuals are few a second gross error is hardly told from the good ones that it bends.
+    """
+    return min(fraction, _MOST_OF_FEW) if redundancy < TRUSTED_REDUNDANCY else fraction
 
 
 def point_covariances(
@@ -353,12 +363,14 @@ def snoop(test: Array, use: Mask, unknowns: int, alpha: float) -> Mask:
     used = test if n == len(use) else test[use]
     # Median of chi-square(2) is 2 ln 2: a scale that the gross errors do not reach.
     variance = float(np.partition(used, n // 2)[n // 2]) / (2 * np.log(2))
-    if 2 * n - unknowns < TRUSTED_REDUNDANCY:
-        variance = max(1.0, variance)
+    few = 2 * n - unknowns < TRUSTED_REDUNDANCY
+    if few:
+        variance = 1.0  # one gross error reaches every residual: the stated sigmas are the scale
     limit = chi2_2d(alpha) * max(variance, 1e-12)
     keep: Mask = use | (test <= limit)
     suspicious = use & (test > limit)
     if suspicious.any():
         # One gross error lifts its neighbours: only those near the worst go at once.
-        keep[suspicious & (test >= 0.5 * used.max())] = False
+        near = 1.0 if few else 0.5
+        keep[suspicious & (test >= near * used.max())] = False
     return keep

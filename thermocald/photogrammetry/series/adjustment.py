@@ -39,7 +39,11 @@ from thermocald.photogrammetry.series.result import (
     SeriesAdjustment,
     SeriesSettings,
 )
-from thermocald.photogrammetry.series.snooping import point_tests, snoop_series
+from thermocald.photogrammetry.series.snooping import (
+    point_tests,
+    snoop_series,
+    typical_variance,
+)
 from thermocald.photogrammetry.series.status import enough_targets, judge
 from thermocald.photogrammetry.series.system import SeriesSystem, line_weights
 from thermocald.photogrammetry.series.target_noise import (
@@ -278,9 +282,13 @@ class _Series:
         """Data snooping where all epochs share unknowns: every round solves the series again."""
         variance, offered = 1.0, use
         rejections = Rejections(use)
+        typical = None
         for _ in range(_ROUNDS):
             tests = point_tests(estimate.system, estimate.residuals)
-            keep = snoop_series(tests, offered, use, len(self.s.per_epoch), self.s.snooping_alpha)
+            typical = typical or typical_variance(tests, use)
+            keep = snoop_series(
+                tests, offered, use, self.s.unknowns, self.s.snooping_alpha, typical
+            )
             keep = rejections.settle(use, keep)
             previous, variance = variance, self.variance(estimate)
             settled = not self.has_offsets or abs(variance / previous - 1) < 0.02
@@ -299,10 +307,12 @@ class _Series:
         offered, use, rows = use, whole.use, np.arange(len(use))
         rejections = Rejections(use)
         part: slice | NDArray[np.int64] = slice(None)  # without a copy
+        typical = None
         for _ in range(_ROUNDS):
             tests = point_tests(system, residuals[part])
+            typical = typical or typical_variance(tests, use)
             keep = snoop_series(
-                tests, offered[part], use[part], len(self.s.per_epoch), self.s.snooping_alpha
+                tests, offered[part], use[part], self.s.unknowns, self.s.snooping_alpha, typical
             )
             keep = rejections.settle(use[part], keep, part)
             changed = (keep != use[part]).any(axis=1)

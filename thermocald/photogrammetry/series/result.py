@@ -13,14 +13,13 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import (
-    IOP_NAMES,
     PARAMETER_NAMES,
     ExteriorOrientation,
     InteriorOrientation,
 )
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, Adjustment
 from thermocald.photogrammetry.epoch.geometry import GeometryBounds
-from thermocald.photogrammetry.parameters import EOP, EOP_COLUMNS, IOP
+from thermocald.photogrammetry.parameters import EOP, EOP_COLUMNS, IOP, free_columns
 from thermocald.photogrammetry.series.mount import STILL, Movement
 
 if TYPE_CHECKING:
@@ -64,10 +63,16 @@ class SeriesSettings:
     @property
     def per_epoch(self) -> NDArray[np.int64]:
         """Positions of the parameters that every epoch has of its own."""
-        own = [i for i, name in enumerate(IOP_NAMES) if name in self.free]
+        own = free_columns(self.free)
         if self.exterior != "series":
             own += list(EOP_COLUMNS)
         return np.array(own, dtype=np.int64)
+
+    @property
+    def unknowns(self) -> int:
+        """How many unknowns an epoch has to carry: a movement of the mount costs hardly any."""
+        interior = free_columns(self.free)
+        return len(interior) + (6 if self.exterior == "per_epoch" else 0)
 
     @property
     def common(self) -> NDArray[np.int64]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.epoch.gauss_markov import chi2_2d
+from thermocald.photogrammetry.epoch.gauss_markov import TRUSTED_REDUNDANCY, chi2_2d
 from thermocald.photogrammetry.series.normals import chunks, products
 from thermocald.photogrammetry.series.system import alike
 
@@ -22,9 +22,8 @@ if TYPE_CHECKING:
     Mask = NDArray[np.bool_]
     Columns = NDArray[np.int64]
 
-__all__ = ["point_tests", "snoop_series"]
+__all__ = ["point_tests", "snoop_series", "typical_variance"]
 
-_TRUSTED_REDUNDANCY = 20  # from here on the residuals themselves tell the noise
 
 
 def point_tests(system: SeriesSystem, residuals: Array) -> Array:
@@ -73,25 +72,45 @@ def _test_weights(
     return inverse
 
 
-def snoop_series(tests: Array, offered: Mask, used: Mask, unknowns: int, alpha: float) -> Mask:
-    """Which image points (E, T) stay, epoch by epoch, as `gauss_markov.snoop` does."""
+def typical_variance(tests: Array, used: Mask) -> float:
+    """Variance of unit weight that most epochs agree on."""
+    variances = _variances(tests, used)
+    return float(np.median(variances[used.any(axis=1)])) if used.any() else 1.0
+
+
+def snoop_series(
+    tests: Array, offered: Mask, used: Mask, unknowns: int, alpha: float, typical: float
+) -> Mask:
+    """Which image points (E, T) stay, epoch by epoch, as `gauss_markov.snoop` does.
+
+    typical: variance of unit weight of the series, for epochs too poor to tell their own.
+    """
     keep = np.empty_like(used)
     for part in chunks(*used.shape):
-        keep[part] = _staying(tests[part], offered[part], used[part], unknowns, alpha)
+        keep[part] = _staying(tests[part], offered[part], used[part], unknowns, alpha, typical)
     return keep
 
 
-def _staying(tests: Array, offered: Mask, used: Mask, unknowns: int, alpha: float) -> Mask:
+def _variances(tests: Array, used: Mask) -> Array:
+    """Variance of unit weight (E,) from each epoch's median, which gross errors do not reach."""
     n = used.sum(axis=1)
     half = np.minimum(n // 2, tests.shape[1] - 1)
     ordered = np.where(used, tests, np.inf)
     ordered.sort(axis=1)
     middle = ordered[np.arange(len(n)), half]
-    variance = np.where(n > 0, middle, 1.0) / (2 * np.log(2))
-    variance = np.where(2 * n - unknowns < _TRUSTED_REDUNDANCY, np.maximum(variance, 1), variance)
+    variance: Array = np.where(n > 0, middle, 1.0) / (2 * np.log(2))
+    return variance
+
+
+def _staying(
+    tests: Array, offered: Mask, used: Mask, unknowns: int, alpha: float, typical: float
+) -> Mask:
+    few = 2 * used.sum(axis=1) - unknowns < TRUSTED_REDUNDANCY
+    variance = np.where(few, typical, _variances(tests, used))
     limit = (chi2_2d(alpha) * np.maximum(variance, 1e-12))[:, None]
     worst = np.where(used, tests, 0.0).max(axis=1, initial=0.0)[:, None]
     small = tests <= limit
-    suspicious = used & ~small & (tests >= 0.5 * worst)
+    near = np.where(few, 1.0, 0.5)[:, None]
+    suspicious = used & ~small & (tests >= near * worst)
     keep: Mask = offered & (used | small) & ~suspicious
     return keep

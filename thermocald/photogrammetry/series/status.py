@@ -6,9 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.epoch.gauss_markov import fails_global_test
+from thermocald.photogrammetry.epoch.gauss_markov import (
+    TRUSTED_REDUNDANCY,
+    fails_global_test,
+    most_rejected,
+)
 from thermocald.photogrammetry.epoch.geometry import weaknesses
-from thermocald.photogrammetry.parameters import PRINCIPAL_POINT, free_columns
+from thermocald.photogrammetry.parameters import PRINCIPAL_POINT
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,9 +32,7 @@ _FEW = 0.6  # share of a series' targets below which an epoch's geometry is look
 
 def enough_targets(grid: ObservationGrid, s: SeriesSettings) -> Mask:
     """(E,): epochs with enough targets for their own parameters."""
-    # A bound mount costs an epoch hardly anything.
-    needed = len(s.per_epoch) if s.exterior == "per_epoch" else len(free_columns(s.free))
-    count = 2 * grid.observed.sum(axis=1) - needed
+    count = 2 * grid.observed.sum(axis=1) - s.unknowns
     enough: Mask = count >= s.bounds.minimum_redundancy
     return enough
 
@@ -63,15 +65,17 @@ def judge(
                 status[row] = word
                 reasons[row] = sentence.format(n=offered[row], bad=offered[row] - used[row])
 
+    few = 2 * offered - s.unknowns < TRUSTED_REDUNDANCY
+    most = np.where(few, most_rejected(s.max_rejected, 0), s.max_rejected)
     say(offered == 0, "no_observations", "no target was measured")
     say(
         ~enough_targets(grid, s),
         "too_few_targets",
-        f"{{n}} targets for {len(s.per_epoch)} unknowns of the epoch leave too little "
+        f"{{n}} targets for {s.unknowns} unknowns of the epoch leave too little "
         "redundancy: show more targets or hold parameters fixed",
     )
     say(
-        used < (1 - s.max_rejected) * offered,
+        used < (1 - most) * offered,
         "too_many_rejected",
         "{bad} of {n} targets contradict the others: a moved test field, a wrong one, or a "
         "blurred image",

@@ -272,26 +272,18 @@ def _tell(document: dict[str, Any]) -> None:
             f"left out: target {name} and what belongs to it moves by itself", highlight=False
         )
     table = Table(box=None, pad_edge=False)
-    for title in (
-        "",
-        "mean mm",
-        "scatter mm",
-        "stated sd mm",
-        "ratio",
-        "line mm",
-        "last - first mm",
-        "drift",
-    ):
+    titles = ("", "mean mm", "scatter µm", "sd µm", "ratio", "line µm", "last - first", "drift")
+    for title in titles:
         table.add_column(title, justify="left" if not title else "right")
     for p in document["parameters"]:
         table.add_row(
             p["name"],
             f"{p['mean']:.5f}",
-            f"{p['scatter']:.6f}",
-            f"{p['stated_sd']:.6f}",
+            f"{1e3 * p['scatter']:.2f}",
+            f"{1e3 * p['stated_sd']:.2f}",
             f"{p['scatter_over_sd']:.2f}",
-            f"{p['change']:+.6f} ± {p['sd_change']:.6f}",
-            f"{p['last_minus_first']:+.6f} ± {p['sd_last_minus_first']:.6f}",
+            f"{1e3 * p['change']:+.2f} ± {1e3 * p['sd_change']:.2f}",
+            f"{1e3 * p['last_minus_first']:+.2f} ± {1e3 * p['sd_last_minus_first']:.2f}",
             _drift(p),
         )
     if document["parameters"]:

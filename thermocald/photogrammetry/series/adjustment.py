@@ -181,11 +181,14 @@ class _Series:
             still = replace(self, s=replace(self.s, exterior="series"), bound=None)
             return still, f"no movement of the mount beyond the noise of an epoch ({noise:.3f} px)"
         mount = replace(self, bound=movement.precision(), movement=movement)
-        memory = ""
+        how = ""
         if movement.memory:
             part = movement.slow_fraction(estimate.system.at.A)
-            memory = f", {part:.0%} of it over about {movement.memory:.0f} epochs"
-        return mount, f"the mount moves by {px:.3f} px between epochs{memory}"
+            slowly = f"over about {movement.memory:.0f} epochs"
+            how = f", {part:.0%} of it {slowly if movement.memory < good / 3 else 'slowly'}"
+        if movement.jumps:
+            how += f", with jumps at row {', '.join(map(str, movement.jumps))}"
+        return mount, f"the mount moves by {px:.3f} px about its mean pose{how}"
 
     def observed_movement(self, estimate: _Estimate) -> Movement:
         """The variance components of the mount's movements."""

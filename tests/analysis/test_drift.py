@@ -1,0 +1,67 @@
+"""Drift of a series: the camera's is claimed, a target's is not, and no target is accused."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from thermocald.analysis.series.drift import courses, settled
+from thermocald.analysis.series.table import SeriesTable, table_of_series
+from thermocald.photogrammetry.camera.camera_model import project
+from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.photogrammetry.series.result import SeriesSettings
+from thermocald.simulation.demonstration import demonstration_model
+from thermocald.simulation.testfields import corner_field
+
+SIGMA = 0.05
+
+
+def series(seed: int, *, warms: bool = True, wanders: float = 0.0, epochs: int = 60) -> SeriesTable:
+    """60 circles before a camera that warms up within 400 s; one of them may wander by some px."""
+    plain = corner_field("plain", per_side=5, pitch_mm=124.0)
+    rng = np.random.default_rng(seed)
+    rows = rng.permutation(len(plain))[:60]
+    field = TestField.build([plain.names[i] for i in rows], plain.points[rows], 0.02)
+    true = field.points + rng.normal(0, 0.02, field.points.shape)
+    model = demonstration_model(plain)
+    iop, eop = model.interior.as_array(), model.exterior.as_array()
+    observations = []
+    for k in range(epochs):
+        now = iop.copy()
+        if warms:
+            now[:3] += np.array([8e-4, -1.8e-3, -1.2e-3]) * (1 - np.exp(-10.0 * k / 400.0))
+        points = project(model.sensor, now, eop, true)
+        points[7, 0] += wanders * k / epochs
+        points += rng.normal(0, SIGMA, points.shape)
+        observations.append(Observations(np.arange(60), points, np.full((60, 2), SIGMA)))
+    start = np.tile(np.r_[iop, eop], (epochs, 1))
+    zero = np.zeros(epochs, dtype=np.int64)
+    apart = SeriesTable(
+        np.arange(epochs), 10.0 * np.arange(epochs), np.full(epochs, np.nan), start,
+        np.ones((epochs, 16)), np.ones(epochs), zero, zero, ("ok",) * epochs, ("",) * epochs,
+        "per_epoch",
+    )  # fmt: skip
+    head = SimpleNamespace(name="test", camera=SimpleNamespace(sensor=model.sensor))
+    return table_of_series(head, field, apart, observations, SeriesSettings(exterior="auto"))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_target_is_accused_of_what_the_camera_did(seed):
+    table, found = settled(series(seed))
+    assert table.left_out == ()
+    assert any(c.drifts for c in found)
+    assert all(not c.rests_on for c in found)
+    x0 = found[1]
+    assert x0.last_minus_first == pytest.approx(-1.39e-3, abs=4 * x0.sd_last_minus_first)
+
+
+def test_a_target_that_wanders_is_no_drift_of_the_camera():
+    _, found = settled(series(11, warms=False, wanders=3.0))
+    assert not any(c.drifts for c in found)
+
+
+def test_without_a_drift_none_is_claimed():
+    claims = [any(c.drifts for c in courses(series(s, warms=False))) for s in range(20, 26)]
+    assert sum(claims) <= 1

@@ -10,7 +10,6 @@ from thermocald.analysis.statistics.dependence import (
     dependence,
     holm,
     pearson_p_value,
-    thermometer_noise,
 )
 
 N = 150
@@ -49,17 +48,6 @@ def test_correlation_matrix_is_numpys_and_silent_on_constants():
     assert np.isnan(matrix[2]).all()
     keep = np.arange(50) != 7
     assert matrix[0, 3] == pytest.approx(np.corrcoef(columns[0][keep], columns[3][keep])[0, 1])
-
-
-def test_noise_of_a_thermometer_is_seen_through_a_warm_up():
-    rng = np.random.default_rng(4)
-    found = [thermometer_noise(25 + 12 * WARM + 0.05 * rng.standard_normal(N)) for _ in range(200)]
-    assert np.mean(found) == pytest.approx(0.05, rel=0.03)
-
-
-def test_a_quantised_thermometer_is_never_better_than_its_resolution():
-    steps = np.round((25 + 0.2 * WARM) / 0.0625) * 0.0625
-    assert thermometer_noise(steps, 0.0625) >= 0.0625 / np.sqrt(12)
 
 
 @pytest.mark.parametrize("thermometer_sd", [0.05, 1.5])

@@ -49,10 +49,16 @@ def test_no_effect_no_name(evidence_of):
     assert (found.verdict, found.effects) == ("adequate", ())
 
 
-@pytest.mark.slow
-def test_an_outside_influence_gets_no_name(evidence_of):
-    evidence, _ = evidence_of("outside", px=0.1, seed=24)
+@pytest.mark.parametrize("seed", [24, pytest.param(26, marks=pytest.mark.slow)])
+def test_an_outside_influence_gets_no_name(evidence_of, seed):
+    """Its size is what it moves the image by, its parameters are those that moved."""
+    evidence, truth = evidence_of("outside", px=0.3, seed=seed, with_m2=False)
     found = discover_series(evidence)
+    size = found.effects[0].estimates["size"]["value"]
+    assert size == pytest.approx(0.3, rel=0.05)
+    moved = {k.removeprefix("a_") for k in truth["effects"][0][0] if k.startswith("a_")}
+    assert found.effects[0].where["parameters"]
+    assert set(found.effects[0].where["parameters"]) <= moved
     assert found.verdict == "unexplained"
     assert [e.effect for e in found.effects] == ["unnamed"]
     assert found.effects[0].evidence["bridge"]["transferable"] is False

@@ -69,3 +69,19 @@ def test_thermometers_are_not_read_at_even_intervals():
     t = 10.0 * np.arange(200) + rng.uniform(-1, 1, 200)
 
     assert reading_noise(t, 20 + 0.1 * t + rng.normal(0, 0.01, 200), None) < 0.013
+
+
+def test_noise_is_seen_through_a_warm_up():
+    """One estimate for the study, the fit and the discovery: right to its own 3 %."""
+    rng = np.random.default_rng(4)
+    t = 10.0 * np.arange(150)
+    warm = 25 + 12 * (1 - np.exp(-t / 400.0))
+    found = [reading_noise(t, warm + 0.05 * rng.standard_normal(150), None) for _ in range(200)]
+    assert np.mean(found) == pytest.approx(0.05, rel=0.03)
+
+
+def test_a_reading_without_a_time_is_no_reading():
+    t = 10.0 * np.arange(400)
+    y = np.random.default_rng(0).normal(20, 0.05, 400)
+    t[7] = np.nan
+    assert reading_noise(t, y, None) == pytest.approx(0.05, rel=0.2)

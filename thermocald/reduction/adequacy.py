@@ -15,8 +15,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.reduction.series import COLUMNS
-
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -95,13 +93,3 @@ def examine(fitter: HypothesisFitter, fit: Fit, series: int) -> Adequacy:
         (total - free) / np.sqrt(2.0 * free),
         evidence.sigma_px * float(np.sqrt(excess * evidence.correlation / coordinates)),
     )
-
-
-def names_of(directions: Array, scores: Array) -> list[tuple[str, float]]:
-    """Which parameters the rest is seen in, with their share, largest first."""
-    power = np.sum(scores**2, axis=0) - len(scores)
-    power = np.maximum(power, 0.0)
-    share = (directions**2) @ power
-    total = float(share.sum()) or 1.0
-    order = np.argsort(-share)
-    return [(COLUMNS[i], float(share[i]) / total) for i in order if share[i] > 0.02 * total]

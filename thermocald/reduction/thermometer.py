@@ -73,7 +73,7 @@ def reading_noise(times: Array, readings: Array, resolution: float | None) -> fl
     again and again, so that a switched lamp, which spoils four of them, does not count as noise. A
     thermometer that repeats one step for long has the error of the step.
     """
-    there = np.isfinite(readings)
+    there = np.isfinite(readings) & np.isfinite(times)
     t, values = times[there], readings[there]
     floor = (resolution or 0.0) / np.sqrt(12.0)
     if len(values) < 8:
@@ -93,11 +93,18 @@ def reading_noise(times: Array, readings: Array, resolution: float | None) -> fl
 
 def _third_differences(t: Array, y: Array) -> Array:
     """Third divided differences of four neighbours, with the variance of one reading."""
-    T = np.lib.stride_tricks.sliding_window_view(t, 4)
-    apart = T[:, :, None] - T[:, None, :] + np.eye(4)
-    weights = 1.0 / np.prod(np.where(apart == 0.0, 1e-3, apart), axis=2)
-    weights /= np.linalg.norm(weights, axis=1, keepdims=True)
-    out: Array = np.sum(weights * np.lib.stride_tricks.sliding_window_view(y, 4), axis=1)
+    n = len(t) - 3
+    at = [t[k : k + n] for k in range(4)]
+    total, square = np.zeros(n), np.zeros(n)
+    for i in range(4):
+        product = np.ones(n)
+        for j in range(4):
+            if i != j:
+                apart = at[i] - at[j]
+                product *= np.where(apart == 0.0, 1e-3, apart)
+        total += y[i : i + n] / product
+        square += product**-2.0
+    out: Array = total / np.sqrt(square)
     return out
 
 

@@ -31,7 +31,6 @@ __all__ = [
     "holm",
     "pearson_p_value",
     "slope_p_value",
-    "thermometer_noise",
 ]
 
 _LEAST_EFFECTIVE = 3.0
@@ -169,21 +168,3 @@ def correlation_matrix(columns: Sequence[Array]) -> Array:
             r = np.dot(a, b) / np.sqrt(np.dot(a, a) * np.dot(b, b))
             matrix[i, j] = matrix[j, i] = np.clip(r, -1.0, 1.0)
     return matrix
-
-
-def thermometer_noise(temperature: Array, resolution: float | None = None) -> float:
-    """Noise of a thermometer in K from its own readings (n,), NaN left out.
-
-    From second differences, which a slow temperature leaves alone, without the largest 2 % (jumps
-    of the temperature itself); never below the noise of its resolution (K), resolution/√12.
-    """
-    floor = resolution / np.sqrt(12.0) if resolution else 0.0
-    t = temperature[np.isfinite(temperature)]
-    if len(t) < 5:
-        return float(floor)
-    second = np.sort(np.square(t[1:-1] - 0.5 * (t[:-2] + t[2:])))
-    kept = second[: max(1, int(np.ceil(0.98 * len(second))))]
-    # 1.5 is the variance of a second difference of unit noise; 0.873 what is left of the mean of a
-    # chi-square variable of one degree of freedom without its largest 2 %.
-    share = 0.873 if len(kept) < len(second) else 1.0
-    return float(max(floor, np.sqrt(np.mean(kept) / (1.5 * share))))

@@ -20,11 +20,11 @@ from thermocald.analysis.series.table import (
     table_of_series,
 )
 from thermocald.analysis.statistics.correlations import correlations_of
-from thermocald.analysis.statistics.dependence import thermometer_noise
 from thermocald.analysis.study.measured import Clip, MeasuredSeries, Thermometer
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
+from thermocald.reduction.thermometer import reading_noise
 from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import open_recording
 from thermocald.store.recording.readings import interpolate_readings
@@ -255,7 +255,8 @@ def _thermometer(
     sd: float | None,
 ) -> Thermometer:
     values = interpolate_readings(frame_time, reading_time, readings)
-    return Thermometer(name, values, thermometer_noise(readings, resolution) if sd is None else sd)
+    known = reading_noise(reading_time, readings, resolution) if sd is None else sd
+    return Thermometer(name, values, known)
 
 
 def _stored_thermometers(

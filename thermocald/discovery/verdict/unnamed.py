@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.reduction.adequacy import names_of
+from thermocald.photogrammetry.linalg import inverse_of_determined
 from thermocald.reduction.series import COLUMNS
 
 if TYPE_CHECKING:
@@ -20,6 +20,11 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
 
 __all__ = ["Description", "describe_unnamed"]
+
+_NEARLY = 0.95  # of the movement that the named parameters have to make
+_WORTH = 0.02  # of the movement that one more has to add
+# a shift of the image is told by the principal point before it is told by a tilt
+_IN_ORDER = (range(3), range(3, 10), range(10, 16), range(16, len(COLUMNS)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,15 +42,23 @@ class Description:
 
 
 def describe_unnamed(x: Examination) -> Description:
-    """Time series, spatial pattern and correlations of what the base model leaves in M1."""
+    """Time series, spatial pattern and correlations of what the base model leaves in M1.
+
+    Its size is what it moves the image points by, in px, and its parameters are the fewest whose
+    movement of the image is nearly all of it.
+    """
     a, e = x.base_adequacy[0], x.fitter.series[0]
-    u, s, v = np.linalg.svd(a.scores, full_matrices=False)
-    norms = np.linalg.norm(a.trajectories, axis=1)
-    trajectory = (u[:, 0] * s[0] / norms) @ a.trajectories
-    direction = a.directions @ v[0]
-    image = np.einsum("tij,j->ti", e.columns, direction)
-    pattern = float(np.sqrt(np.mean(image[e.weights[..., 0].any(axis=0)] ** 2)))
-    course_px = trajectory * pattern
+    rest = a.trajectories.T @ a.amplitudes  # (E, P), px-scaled
+    rest = rest - rest.mean(axis=0)
+    seen = e.columns[e.weights[..., 0].any(axis=0)].reshape(-1, rest.shape[1])
+    metric = seen.T @ seen / len(seen)
+    moved = rest.T @ rest / len(rest)
+    size = float(np.sqrt(np.sum(metric * moved)))
+    values, vectors = np.linalg.eigh(metric)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    u, s, _ = np.linalg.svd(rest @ root, full_matrices=False)
+    course_px = u[:, 0] * s[0]
+    direction = rest.T @ u[:, 0] / s[0]
     T = e.history.temperature()  # on all epochs; the rows may be blocks of them
     recorded: dict[str, Array] = {
         "temperature": e.averaged(T),
@@ -61,15 +74,13 @@ def describe_unnamed(x: Examination) -> Description:
         for name, values in recorded.items()
         if np.std(values) > 0
     }
-    shares = names_of(a.directions, a.scores)
     power = np.sum(a.scores**2, axis=1)
     order = int(np.argmax(power)) + 1
     duration = float(e.times[-1] - e.times[0])
     most = np.abs(course_px - course_px.mean())
     large = np.flatnonzero(most > 0.5 * most.max())
-    parameters = [name for name, share in shares if share > 0.1][:5]
+    parameters = _movers(metric, moved)
     strongest = max(correlation, key=lambda k: abs(correlation[k]))
-    size = float(np.sqrt(np.mean((course_px - course_px.mean()) ** 2)))
     statement = (
         f"something that no effect of the catalogue explains moves the image by {size:.3f} px RMS, "
         f"in {', '.join(parameters)}; strongest correlation {correlation[strongest]:+.2f} with "
@@ -83,7 +94,7 @@ def describe_unnamed(x: Examination) -> Description:
             "image_region": None,
         },
         {
-            "size": {"value": size, "sd": size / max(float(s[0]), 1.0), "unit": "px"},
+            "size": {"value": size, "sd": size / float(np.sqrt(max(a.excess, 1.0))), "unit": "px"},
             "time_scale": {"value": duration / order, "sd": duration / order / 4, "unit": "s"},
         },
         {
@@ -95,6 +106,31 @@ def describe_unnamed(x: Examination) -> Description:
         course_px,
         direction,
     )
+
+
+def _movers(metric: Array, moved: Array) -> list[str]:
+    """The fewest parameters that move the image by nearly all that is left, interior ones first.
+
+    metric (P, P): mean products of the image's partial derivatives; moved (P, P): mean products of
+    the rest.
+    """
+    total = float(np.sum(metric * moved))
+    chosen: list[int] = []
+    explained = 0.0
+    for group in _IN_ORDER:
+        left = [i for i in group if metric[i, i] > 0]
+        while left and explained < _NEARLY * total:
+            gains = []
+            for i in left:
+                some = [*chosen, i]
+                inner = inverse_of_determined(metric[np.ix_(some, some)])
+                gains.append(float(np.sum((metric[:, some] @ inner @ metric[some]) * moved)))
+            best = int(np.argmax(gains))
+            if gains[best] < explained + _WORTH * total:
+                break
+            explained = gains[best]
+            chosen.append(left.pop(best))
+    return [COLUMNS[i] for i in chosen]
 
 
 def _bridge(a: Adequacy, e: ReducedSeries) -> dict[str, Any]:

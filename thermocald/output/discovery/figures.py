@@ -114,7 +114,7 @@ def signature(discovery: Discovery) -> str:
     own = (before - after) @ root @ v[0] * unit
     figure, axes = _figure(9.0, 3.4, 2)
     minutes = e.times / 60.0
-    T = e.history.temperature()
+    T = e.averaged(e.history.temperature())
     named = discovery.verdict == "effects_found"
     for axis, x, label in ((axes[0], minutes, "time / min"), (axes[1], T, "T / °C")):
         axis.plot(x, measured, ".", color=_PALE, ms=3, label="measured minus base model")

@@ -1,0 +1,37 @@
+"""Long series are examined on blocks of epochs; everything that is said of them fits together."""
+
+from __future__ import annotations
+
+import pytest
+
+from thermocald.discovery.search import examination
+from thermocald.discovery.verdict.misfit import resolve
+from thermocald.discovery.verdict.result import discover_series
+from thermocald.output.discovery.report import report_html
+from thermocald.reduction.blocks import in_blocks
+
+
+@pytest.fixture
+def short_blocks(monkeypatch):
+    """Every series counts as long: 180 epochs on 60 rows."""
+    monkeypatch.setattr(examination, "in_blocks", lambda series: in_blocks(series, rows=60))
+
+
+def test_an_effect_in_a_long_series(short_blocks, evidence_of):
+    evidence, _ = evidence_of("nonlinear_expansion", px=0.2, seed=12, with_m2=False)
+    found = discover_series(evidence)
+    assert [e.effect for e in found.effects] == ["nonlinear_expansion"]
+    first, last = found.effects[0].where["epochs"]
+    assert 0 <= first < last <= evidence[0].source.numbers[-1]
+    assert last > 60  # epochs, not rows
+    assert "<svg" in report_html(found, "long")
+
+
+def test_what_is_unexplained_in_a_long_series(short_blocks, evidence_of):
+    """The rate of the temperature is of all epochs, the misfit of blocks: np.gradient of both."""
+    evidence, _ = evidence_of("outside", px=0.3, seed=24, with_m2=False)
+    found = discover_series(evidence)
+    rows = {what: sigmas for what, _, sigmas in resolve(found.examination).rows}
+    assert "rate of temperature" in rows
+    assert found.as_json(None)["effects"][0]["evidence"]["base_misfit"]["against"]
+    assert "<svg" in report_html(found, "long")

@@ -56,6 +56,7 @@ from thermocald_drivers.picamera_metadata import (
     jsonable,
     sensor_temperature,
 )
+from thermocald_drivers.support import AUTO
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -67,15 +68,8 @@ __all__ = ["Picamera2Camera", "sensor_temperature"]
 log = logging.getLogger(__name__)
 
 CLOSE_S = 3.0
-AUTO = "auto"
 MANUAL_FOCUS, CONTINUOUS_FOCUS = 0, 2
 """libcamera's AfModeManual and AfModeContinuous."""
-
-
-def _number_or_auto(
-    name: str, value: object, low: float, high: float, unit: str = ""
-) -> float | str:
-    return AUTO if value == AUTO else support.number(name, value, low, high, unit)
 
 
 def _colour_gains(value: object) -> tuple[float, float] | str | None:
@@ -83,7 +77,7 @@ def _colour_gains(value: object) -> tuple[float, float] | str | None:
     if value is None or value == AUTO:
         return None if value is None else AUTO
     if not isinstance(value, list | tuple) or len(value) != 2:
-        raise ConfigurationError(f"colour_gains: {value!r} is not [red, blue]")
+        raise ConfigurationError(f"colour_gains: {value!r} is neither [red, blue] nor {AUTO}")
     red, blue = (support.number("colour_gains", gain, 0, 32) for gain in value)
     return red, blue
 
@@ -130,12 +124,12 @@ class Picamera2Camera(Camera):
         self.model = model
         self.width = int(support.number("width", width, 64, 20000, "px", whole=True))
         self.height = int(support.number("height", height, 64, 20000, "px", whole=True))
-        self.exposure_s = _number_or_auto("exposure_s", exposure_s, 1e-5, 200, "s")
-        self.gain = _number_or_auto("gain", gain, 1, 64)
+        self.exposure_s = support.number_or_auto("exposure_s", exposure_s, 1e-5, 200, "s")
+        self.gain = support.number_or_auto("gain", gain, 1, 64)
         self.focus_dioptres = (
             None
             if focus_dioptres is None
-            else _number_or_auto("focus_dioptres", focus_dioptres, 0, 32, "1/m")
+            else support.number_or_auto("focus_dioptres", focus_dioptres, 0, 32, "1/m")
         )
         self.colour_gains = _colour_gains(colour_gains)
         self.tolerance = support.number("tolerance", tolerance, 0, 1)

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from thermocald.hal import Clock
 
 __all__ = [
+    "AUTO",
     "Neighbour",
     "absent",
     "believable",
@@ -41,12 +42,15 @@ __all__ = [
     "library",
     "middle_reading",
     "number",
+    "number_or_auto",
     "on_clock",
     "parse_number",
     "programme",
     "text",
 ]
 
+AUTO = "auto"
+"""What a stanza says to leave a setting to the camera."""
 CLOCK_TRIES = 10
 CLOCK_SPREAD_S = 1e-4
 NEIGHBOUR_AGE_S = 60.0
@@ -82,6 +86,15 @@ def number(
     if whole and value != int(value):
         raise ConfigurationError(f"{name}: {value:g} is not a whole number")
     return value
+
+
+def number_or_auto(
+    name: str, value: object, low: float, high: float, unit: str = "", *, whole: bool = False
+) -> float | str:
+    """A number as `number` bounds it, or the word AUTO."""
+    if isinstance(value, str) and value != AUTO:
+        raise ConfigurationError(f"{name}: {value!r} is neither a number nor {AUTO}")
+    return AUTO if value == AUTO else number(name, value, low, high, unit, whole=whole)
 
 
 def choice(name: str, value: object, allowed: Sequence[str]) -> str:

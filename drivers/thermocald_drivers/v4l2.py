@@ -46,7 +46,7 @@ from thermocald.errors import (
 )
 from thermocald.hal import Camera, Found, Frame
 from thermocald_drivers import pixel_formats, support
-from thermocald_drivers.v4l2_controls import AUTO, CameraControls
+from thermocald_drivers.v4l2_controls import CameraControls
 from thermocald_drivers.v4l2_stream import (
     BUFFERS,
     OLDEST_S,
@@ -102,13 +102,11 @@ class V4l2Camera(Camera):
         known = ["MJPG", *(name.strip() for name in pixel_formats.FORMATS)]
         self.pixel_format = support.choice("pixel_format", pixel_format, known).ljust(4)
         wanted = {"gain": gain, "focus": focus, "white_balance_k": white_balance_k}
-        for name, value in {"exposure_s": exposure_s, **wanted}.items():
-            if value is None or value == AUTO:
-                continue
-            if name == "exposure_s":
-                support.number(name, value, 1e-5, 60, "s")
-            else:
-                support.number(name, value, 0, 1e6, whole=True)
+        if exposure_s is not None:
+            support.number_or_auto("exposure_s", exposure_s, 1e-5, 60, "s")
+        for name, value in wanted.items():
+            if value is not None:
+                support.number_or_auto(name, value, 0, 1e6, whole=True)
         self._controls = CameraControls(
             f"camera {device or serial}", {"exposure_s": exposure_s, **wanted}, dict(controls or {})
         )

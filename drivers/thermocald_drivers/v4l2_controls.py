@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING, Protocol
 
 from thermocald.errors import WrongDevice
 from thermocald_drivers import support
+from thermocald_drivers.support import AUTO
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
     Wanted = float | str | None
 
-__all__ = ["AUTO", "EXPOSURE", "LOCKS", "CameraControls", "Control", "standing_values"]
+__all__ = ["EXPOSURE", "LOCKS", "CameraControls", "Control", "standing_values"]
 
-AUTO = "auto"
 EXPOSURE = 0x009A0902
 EXPOSURE_UNIT_S = 1e-4
 _UNREADABLE = {errno.EINVAL, errno.EACCES, errno.ENOTTY}

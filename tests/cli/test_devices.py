@@ -181,3 +181,12 @@ def test_check_refuses_what_a_driver_does_not_take(sysfs, check):
     assert "config.yaml: thermometer box: " in str(error)
     assert "0x48" in str(error)
     assert said is None
+
+
+def test_check_warns_of_a_camera_that_may_focus(check):
+    camera = {"name": "web", "driver": "v4l2", "device": "/dev/video9", "width": 64, "height": 48}
+    document = {"store": {"path": "t.db"}, "cameras": [{**camera, "focus": "auto"}]}
+    error, lines, _ = check(document)
+    assert error is None
+    (warning,) = [line for line in lines if "warning" in line]
+    assert "camera web: warning: focus: auto lets the camera change it" in warning

@@ -242,7 +242,7 @@ def test_auto_by_name_switches_it_on(focusing):
         assert device.capture().exposure is None
     with pytest.raises(WrongDevice, match="no automatic mode"):
         camera(focusing, gain="auto").open()
-    with pytest.raises(ConfigurationError):
+    with pytest.raises(ConfigurationError, match="neither a number nor auto"):
         camera(focusing, focus="manual")
 
 

@@ -126,12 +126,13 @@ def _config(path: Path, probe: bool) -> dict[str, Any]:
     for kind, entries in groups:
         for entry in entries:
             try:
-                open_device(kind, entry.driver, entry.options, clock)  # touches no hardware
+                device = open_device(kind, entry.driver, entry.options, clock)  # not opened
             except ConfigurationError as error:
                 raise ConfigurationError(f"{path}: {kind} {entry.name}: {error}") from error
             devices.append({"kind": kind, "name": entry.name, "driver": entry.driver})
             if not probe or kind == "output":
                 lines.append(f"  {kind} {entry.name}: driver {entry.driver}")
+            lines += [f"  {kind} {entry.name}: warning: {text}" for text in device.warnings()]
     lines += [
         f"  test field of {plan.name}: {len(plan.testfield)} targets"
         for plan in plan_cameras(config, clock)

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 __all__ = ["dump_yaml", "read_yaml"]
 
 _MOST_VALUES = 100_000
+_MOST_BYTES = 20_000_000
+_DEEPEST = 60
 
 # What PyYAML's constructors let through on hostile scalars (`!!bool x`, `!!int ""`, 2020-99-99).
 _CONSTRUCTION = (ValueError, KeyError, IndexError, AttributeError, TypeError, OverflowError)
@@ -43,11 +45,17 @@ def read_yaml(path: Path, error: type[ThermocaldError] = ConfigurationError) -> 
     YAML, holds a key twice, or holds something else than a mapping with text keys.
     """
     try:
+        if path.exists() and not path.is_file():
+            raise error(f"{path}: is not a file")
+        if path.exists() and path.stat().st_size > _MOST_BYTES:
+            raise error(f"{path}: is larger than {_MOST_BYTES // 1_000_000} MB")
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as cause:
         what = cause.strerror if isinstance(cause, OSError) else "is not UTF-8 text"
         raise error(f"{path}: cannot be read: {what}") from cause
     try:
+        if _is_too_deep(text):
+            raise error(f"{path}: is nested deeper than {_DEEPEST} levels")
         document = yaml.load(text, Loader=_Loader)
     except yaml.MarkedYAMLError as cause:
         mark = cause.problem_mark
@@ -69,6 +77,19 @@ def read_yaml(path: Path, error: type[ThermocaldError] = ConfigurationError) -> 
     if _is_too_large(document):
         raise error(f"{path}: holds more than {_MOST_VALUES} values, or aliases without end")
     return document
+
+
+def _is_too_deep(text: str) -> bool:
+    """Whether lists and mappings are nested so deep that building them would exhaust the stack."""
+    depth = 0
+    for event in yaml.parse(text, Loader=_Loader):
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+            if depth > _DEEPEST:
+                return True
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+    return False
 
 
 def _is_too_large(document: dict[str, Any]) -> bool:

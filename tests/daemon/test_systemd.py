@@ -25,9 +25,7 @@ def analyze():
     return run
 
 
-@pytest.mark.parametrize(
-    "unit", sorted(path.name for path in UNITS.glob("*.service"))
-)
+@pytest.mark.parametrize("unit", sorted(path.name for path in UNITS.glob("*.service")))
 def test_the_exposure_is_at_most_two_and_a_half(analyze, unit):
     done = analyze("security", "--offline=true", "--no-pager", str(UNITS / unit))
     found = re.search(r"Overall exposure level for \S+: ([0-9.]+)", done.stdout)

@@ -236,9 +236,7 @@ def test_a_series_is_read_page_by_page(client_of, monkeypatch):
     page = columns.read_page
     monkeypatch.setattr(view, "_ROWS_AT_ONCE", 100)
     monkeypatch.setattr(columns, "read_columns", None)
-    monkeypatch.setattr(
-        columns, "read_page", lambda *a: (asked.append(a[-2:]), page(*a))[1]
-    )
+    monkeypatch.setattr(columns, "read_page", lambda *a: (asked.append(a[-2:]), page(*a))[1])
     answer = client_of().get("/api/series.csv", params={"camera": "rpi", "series": "M1"})
     assert len(answer.text.splitlines()) == 1201
     assert asked == [(-1, 100), *((after, 100) for after in range(100, 1201, 100))]

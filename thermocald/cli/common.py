@@ -18,15 +18,26 @@ from thermocald.errors import DataError, UsageError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-__all__ = ["jsonable", "log_to_stderr", "progress", "say", "write_json", "write_text"]
+__all__ = ["jsonable", "log_to_stderr", "printable", "progress", "say", "write_json", "write_text"]
 
 _LINES = 10  # progress lines where there is no terminal
 
 
 def say(text: str) -> None:
-    """A line for a person, on standard error: standard output belongs to results."""
-    sys.stderr.write(text + "\n")
+    """A line for a person, on standard error: standard output belongs to results.
+
+    Control characters, which a file's name may hold and a terminal would obey, are shown as codes.
+    """
+    sys.stderr.write(printable(text) + "\n")
     sys.stderr.flush()
+
+
+def printable(text: str) -> str:
+    """The text with control characters but line ends and tabs written as codes."""
+    return "".join(
+        c if (c >= " " and not "\x7f" <= c <= "\x9f") or c in "\n\t" else f"\\x{ord(c):02x}"
+        for c in text
+    )
 
 
 def log_to_stderr(level: str = "WARNING") -> None:

@@ -110,8 +110,10 @@ def read_camera(path: Path, pixel_pitch: float | None = None) -> CameraFile:
         value = camera.get(key)
         if value is None and not required:
             return None
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
-            raise ConfigurationError(f"{path}: {key} must be a number > 0, it is {value!r}")
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < 1e5:
+            raise ConfigurationError(
+                f"{path}: {key} must be a number above 0 and below 100000, it is {str(value)[:40]}"
+            )
         return float(value)
 
     width, height, pitch = number("width"), number("height"), number("pixel_pitch")

@@ -52,7 +52,8 @@ def target_normals(points: Array) -> Array:
     normals = np.full((n, 3), np.nan)
     if n < _PLATE:
         return normals
-    distance = np.linalg.norm(points[:, None] - points[None], axis=2)
+    # axis by axis: three times less memory than all differences at once
+    distance = np.sqrt(sum(np.square(np.subtract.outer(x, x)) for x in points.T))
     near = np.argsort(distance, axis=1, kind="stable")[:, 1 : _NEIGHBOURS + 1]
     spacing = float(np.median(np.take_along_axis(distance, near, 1)[:, 0]))
     if spacing == 0:
@@ -69,7 +70,12 @@ def target_normals(points: Array) -> Array:
         holds[s] = np.abs(planes[s] @ points.T - offset[s, None]) < tolerance
     left = np.ones(n, dtype=bool)
     while left.sum() >= _FEWEST:
-        score = np.einsum("ij,ij->i", closeness[seeds], holds & left)
+        score = np.concatenate(
+            [
+                np.einsum("ij,ij->i", closeness[seeds[i : i + 4096]], holds[i : i + 4096] & left)
+                for i in range(0, len(seeds), 4096)
+            ]
+        )
         best = int(np.argmax(score))
         sheet = np.nonzero(holds[best] & left)[0]
         if len(sheet) < _FEWEST:

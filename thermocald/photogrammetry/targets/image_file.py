@@ -9,11 +9,15 @@ import cv2
 import numpy as np
 
 from thermocald.errors import ImageError
+from thermocald.photogrammetry.targets.image_header import image_size
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 __all__ = ["decode_grey"]
+
+_MOST_PIXELS = 250_000_000
+_MOST_BYTES = 1_000_000_000
 
 
 def decode_grey(source: Path | bytes) -> NDArray[Any]:
@@ -25,6 +29,10 @@ def decode_grey(source: Path | bytes) -> NDArray[Any]:
     name = str(source) if isinstance(source, Path) else "the frame"
     if isinstance(source, Path):
         try:
+            if source.exists() and not source.is_file():
+                raise ImageError(f"{name}: is not a file")
+            if source.exists() and source.stat().st_size > _MOST_BYTES:
+                raise ImageError(f"{name}: is larger than {_MOST_BYTES // 10**6} MB")
             data = source.read_bytes()
         except OSError as error:
             raise ImageError(f"{name}: cannot be read: {error.strerror or error}") from error
@@ -32,6 +40,12 @@ def decode_grey(source: Path | bytes) -> NDArray[Any]:
         data = source
     if not data:
         raise ImageError(f"{name}: is empty (0 bytes)")
+    size = image_size(data)
+    if size is not None and size[0] * size[1] > _MOST_PIXELS:
+        raise ImageError(
+            f"{name}: says that it has {size[0]} × {size[1]} px; at most {_MOST_PIXELS // 10**6} "
+            "million are decoded"
+        )
     if data[:2] == b"\xff\xd8" and b"\xff\xd9" not in data[-64:]:
         raise ImageError(f"{name}: the JPEG is cut off: its end is missing")
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION

@@ -27,6 +27,7 @@ __all__ = [
 ]
 
 FORMAT = "thermocald-recording/1"
+_LONGEST_NAME = 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +84,12 @@ class _Reader:
             raise self.fail(key, "is missing")
         if isinstance(value, bool) or not isinstance(value, str | int | float):
             raise self.fail(key, "must be text")
-        return str(value)
+        text = str(value)
+        if not text.isprintable() or len(text) > _LONGEST_NAME:
+            raise self.fail(
+                key, f"{text[:40]!r} must be printable text of at most {_LONGEST_NAME} characters"
+            )
+        return text
 
     def positive(self, key: str, unit: str) -> float:
         value = self.number(key)
@@ -181,6 +187,8 @@ def _channels(top: _Reader) -> dict[str, Channel]:
     for name, value in mapping.items():
         if not isinstance(name, str):
             raise reader.fail(str(name), "a column's name must be text")
+        if not name.isprintable():
+            raise reader.fail(repr(name), "a column's name must be printable")
         if value is not None and not isinstance(value, dict):
             raise reader.fail(name, "must hold `unit: degC, resolution: …`")
         inner = _Reader(top._path, value or {}, f"temperatures.{name}.")

@@ -203,4 +203,3 @@ class ObservationFile:
             return []
         first = next(self._table.chunks(1), None)
         return [] if first is None else [name for name in extras if first.is_number(name)]
-

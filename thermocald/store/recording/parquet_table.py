@@ -109,9 +109,7 @@ class ColumnChunk(Chunk):
         if not hasattr(encoded, "dictionary"):
             encoded = encoded.dictionary_encode()
         if encoded.null_count:
-            return np.where(
-                np.asarray(encoded.is_null()), -1, super().places(name, index)
-            )
+            return np.where(np.asarray(encoded.is_null()), -1, super().places(name, index))
         known = [index.get(str(word), -1) for word in encoded.dictionary.to_pylist()]
         found: NDArray[np.int64] = np.array([*known, -1], dtype=np.int64)[
             encoded.indices.to_numpy(zero_copy_only=False)

@@ -56,6 +56,7 @@ __all__ = [
 
 # Above this size (a day of 150 targets every 10 s) `iter_epochs` streams instead of loading.
 _STREAMED_ABOVE_BYTES = 100_000_000
+_KELVIN_FROM = 220.0  # hotter than any camera, and a cold day in kelvin
 _HOTTEST_C = 1000.0  # no camera works there: another unit, or a damaged line
 
 
@@ -250,6 +251,11 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
             chunk.check("temperature_time", untimed, f"is empty although {name} was read")
             chunk.check(name, readings[-1] < -273.15, "is below absolute zero")
             chunk.check(name, readings[-1] > _HOTTEST_C, f"is above {_HOTTEST_C:g} °C")
+            known = readings[-1][np.isfinite(readings[-1])]
+            if len(known) and known.min() > _KELVIN_FROM:
+                chunk.check(
+                    name, readings[-1] > _KELVIN_FROM, "reads as kelvin: subtract 273.15, K to °C"
+                )
         for row, text in enumerate(chunk.text("frame")):
             frame = text.strip()
             if frame and files.find(frame) is None:

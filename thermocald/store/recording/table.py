@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 __all__ = ["Chunk", "Table"]
 
 _MAX_EXACT_INTEGER = 2**53
+_MOST_COLUMNS = 1000
+_LONGEST_HEADER = 200_000
 
 
 class Table:
@@ -78,6 +80,9 @@ class Table:
         if self._text is not None:
             return io.StringIO(self._text, newline="")
         try:
+            # a link to a device never ends
+            if self.path.exists() and not self.path.is_file():
+                raise self._error(f"{self.path}: is not a file")
             return self.path.open(newline="", encoding="utf-8-sig")
         except OSError as cause:
             raise self._error(f"{self.path}: cannot be read: {cause.strerror}") from cause
@@ -85,6 +90,11 @@ class Table:
     def _header(self) -> list[str]:
         with self._open() as file:
             try:
+                if len(file.readline(_LONGEST_HEADER)) >= _LONGEST_HEADER:
+                    raise self._error(
+                        f"{self.path}, line 1: is longer than {_LONGEST_HEADER} characters"
+                    )
+                file.seek(0)
                 header = next(filter(None, csv.reader(file, strict=True)), None)
             except (csv.Error, UnicodeDecodeError, OSError) as cause:
                 raise self._error(
@@ -93,6 +103,10 @@ class Table:
         if header is None:
             raise self._error(f"{self.path}: is empty; the first line must name the columns")
         names = [name.strip() for name in header]
+        if len(names) > _MOST_COLUMNS:
+            raise self._error(
+                f"{self.path}, line 1: has {len(names)} columns; at most {_MOST_COLUMNS} are read"
+            )
         for name in names:
             if name and names.count(name) > 1:
                 raise self._error(f"{self.path}, line 1: column {name!r} stands twice")

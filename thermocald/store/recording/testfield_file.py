@@ -24,6 +24,7 @@ __all__ = [
     "write_testfield",
 ]
 
+_MOST_TARGETS = 4000
 _REQUIRED = ("target", "X", "Y", "Z", "diameter", "sX", "sY", "sZ")
 
 # No camera of ours can look at a field smaller than this; one in metres is (a room: 6 "mm").
@@ -63,6 +64,8 @@ def _read(table: Table, *, may_be_empty: bool = False) -> TestField:
             name = text.strip()
             if not name:
                 chunk.fail(row, "target", "is empty; every target needs a name")
+            if not " ".join(name.splitlines()).isprintable():
+                chunk.fail(row, "target", f"{name[:40]!r} must be printable")
             if name in lines:
                 chunk.fail(row, "target", f"target {name!r} stands twice")
             lines[name] = row
@@ -82,6 +85,11 @@ def _read(table: Table, *, may_be_empty: bool = False) -> TestField:
             kinds.append(kind)
         found = chunk.text("code") if "code" in table.columns else empty
         codes.extend(code.strip() for code in found)
+        if len(names) > _MOST_TARGETS:
+            raise TestFieldError(
+                f"{table.path}: holds more than {_MOST_TARGETS} targets; leave out what no camera "
+                "of yours sees"
+            )
     if not names and not may_be_empty:
         raise TestFieldError(f"{table.path}: holds no targets")
     return TestField.build(

@@ -1,0 +1,147 @@
+"""What asks for more than there is: bounds before work, one line each, quickly."""
+
+from __future__ import annotations
+
+import os
+import struct
+import time
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+
+from thermocald.cli.common import printable
+from thermocald.cli.options import read_camera
+from thermocald.errors import ConfigurationError, ImageError, RecordingError, TestFieldError
+from thermocald.photogrammetry.targets.image_file import decode_grey
+from thermocald.photogrammetry.targets.image_header import image_size
+from thermocald.store.recording.reader import read_recording
+from thermocald.store.recording.table import Table
+from thermocald.store.recording.testfield_file import read_testfield
+from thermocald.yaml_file import read_yaml
+
+HEAD = """format: thermocald-recording/1
+name: x
+series: M1
+interval: 10
+camera: {name: c, width: 640, height: 480, pixel_pitch: 0.003}
+temperatures: {housing: {unit: degC}}
+"""
+FIELD = "target,X,Y,Z,diameter,sX,sY,sZ\n" + "".join(
+    f"{i},{100 * (i % 2)},{100 * (i // 2)},0,10,0.1,0.1,0.1\n" for i in range(4)
+)
+EPOCHS = "epoch,frame_time,temperature_time,housing,frame\n1,10,10,{},\n2,20,20,{},\n"
+
+
+@pytest.fixture
+def recording(tmp_path):
+    (tmp_path / "recording.yaml").write_text(HEAD)
+    (tmp_path / "testfield.csv").write_text(FIELD)
+    (tmp_path / "epochs.csv").write_text(EPOCHS.format("21.5", "21.6"))
+    (tmp_path / "observations.csv").write_text("epoch,target,x,y,sx,sy\n1,0,5,5,1,1\n")
+    read_recording(tmp_path)
+    return tmp_path
+
+
+def png_of_nothing(width, height):
+    """The head of a PNG that says so many pixels, and hardly any bytes of them."""
+
+    def chunk(name, data):
+        return (
+            struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+        )
+
+    head = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(bytes(9)))
+
+
+def test_an_image_too_large_is_refused_before_it_is_decoded(monkeypatch):
+    def decode(*_):
+        raise AssertionError("was decoded")
+
+    monkeypatch.setattr(cv2, "imdecode", decode)
+    with pytest.raises(ImageError, match="30000 × 30000 px"):
+        decode_grey(png_of_nothing(30000, 30000))
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif", ".bmp", ".pgm"])
+def test_sizes_are_read_from_heads(suffix):
+    data = cv2.imencode(suffix, np.zeros((37, 53), np.uint8))[1].tobytes()
+    assert image_size(data) == (53, 37)
+    for cut in range(0, 40, 3):
+        image_size(data[:cut])  # damage is no error here
+
+
+def test_many_columns_are_refused_quickly(tmp_path):
+    (tmp_path / "t.csv").write_text(",".join(f"c{i}" for i in range(20_000)) + "\n1\n")
+    begin = time.perf_counter()
+    with pytest.raises(RecordingError, match="20000 columns; at most 1000"):
+        Table(tmp_path / "t.csv", ["c1"])
+    assert time.perf_counter() - begin < 2
+    (tmp_path / "t.csv").write_text("a" * 300_000 + "\n1\n")
+    with pytest.raises(RecordingError, match="longer than"):
+        Table(tmp_path / "t.csv", ["c1"])
+
+
+def test_a_field_of_two_hundred_thousand_targets_is_refused(tmp_path):
+    lines = (f"{i},{i % 500},{i // 500},0,1,0.1,0.1,0.1\n" for i in range(200_000))
+    (tmp_path / "testfield.csv").write_text("target,X,Y,Z,diameter,sX,sY,sZ\n" + "".join(lines))
+    with pytest.raises(TestFieldError, match="more than 4000 targets"):
+        read_testfield(tmp_path / "testfield.csv")
+
+
+@pytest.mark.parametrize(
+    "name", ["observations.csv", "epochs.csv", "testfield.csv", "recording.yaml"]
+)
+def test_links_to_devices_are_refused(recording, name):
+    (recording / name).unlink()
+    os.symlink("/dev/zero", recording / name)
+    with pytest.raises((RecordingError, TestFieldError), match=r"is not a file|is missing"):
+        read_recording(recording)
+
+
+@pytest.mark.parametrize(
+    "text", ["a: " + "[" * 5000 + "]" * 5000, "\n".join(" " * i + "a:" for i in range(2000))]
+)
+def test_deep_yaml_is_refused(tmp_path, text):
+    (tmp_path / "x.yaml").write_text(text)
+    with pytest.raises(ConfigurationError, match="nested deeper than 60"):
+        read_yaml(tmp_path / "x.yaml")
+
+
+def test_a_width_of_ten_to_the_400_is_refused(recording, tmp_path):
+    huge = "1" + "0" * 400
+    (recording / "recording.yaml").write_text(HEAD.replace("640", huge))
+    with pytest.raises(RecordingError, match=r"camera\.width"):
+        read_recording(recording)
+    (tmp_path / "camera.yaml").write_text(f"width: {huge}\nheight: 480\npixel_pitch: 0.003\n")
+    with pytest.raises(ConfigurationError, match="width must be a number"):
+        read_camera(tmp_path / "camera.yaml")
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"),
+    [
+        (("1e300", "21.5"), "above 1000 °C"),
+        (("21.5", "2_5.0"), r"line 3, column housing: '2_5\.0' is not a number"),
+        (("294.5", "294.6"), r"kelvin: subtract 273\.15"),
+    ],
+)
+def test_impossible_temperatures_are_refused(recording, values, reason):
+    (recording / "epochs.csv").write_text(EPOCHS.format(*values))
+    with pytest.raises(RecordingError, match=reason):
+        read_recording(recording)
+
+
+def test_names_that_a_terminal_would_obey_are_refused_or_shown_as_codes(recording):
+    (recording / "recording.yaml").write_text(HEAD.replace("name: x", 'name: "x\\e[2J"'))
+    with pytest.raises(RecordingError, match="printable") as refused:
+        read_recording(recording)
+    assert "\x1b" not in str(refused.value)
+    (recording / "recording.yaml").write_text(HEAD)
+    (recording / "testfield.csv").write_text(FIELD.replace("\n0,", "\n0\x1b[2J,"))
+    with pytest.raises(TestFieldError, match="printable") as refused:
+        read_recording(recording)
+    assert "\x1b" not in str(refused.value)
+    assert printable("a\x1b[31mb\x9b°\nc") == "a\\x1b[31mb\\x9b°\nc"

@@ -40,10 +40,21 @@ tree=$work/thermocald
 rm -rf "$work"
 mkdir -p "$tree/wheels"
 "$python" -m pip wheel --quiet --no-deps --wheel-dir "$tree/wheels" .
-platforms=$(printf -- '--platform %s ' $PLATFORMS)
+# adbutils is published for amd64 only, and only because of the adb in it, which Debian has itself
+awk -v others="$work/others.txt" -v adb="$work/adb.txt" \
+    '/^[a-z]/ { out = /^adbutils==/ ? adb : others } { print > out }' "$lock.txt"
+load() { # REQUIREMENTS PLATFORM…
+    requirements=$1; shift
+    # shellcheck disable=SC2046
+    "$python" -m pip download --quiet --no-deps --require-hashes --only-binary=:all: --implementation cp \
+        --python-version "$PYTHON" $(printf -- '--platform %s ' "$@") --dest "$tree/wheels" -r "$requirements"
+}
 # shellcheck disable=SC2086
-"$python" -m pip download --quiet --no-deps --require-hashes --only-binary=:all: $platforms \
-    --implementation cp --python-version "$PYTHON" --dest "$tree/wheels" --requirement "$lock.txt"
+load "$work/others.txt" $PLATFORMS
+load "$work/adb.txt" manylinux1_x86_64 manylinux2014_x86_64 any
+for wheel in "$tree"/wheels/adbutils-*manylinux*.whl; do
+    [ ! -e "$wheel" ] || mv "$wheel" "${wheel%manylinux*}any.whl"
+done
 "$python" packaging/manual.py "$tree/manual"
 cp -r packaging/debian systemd docs config.yaml README.md "$tree"
 cat > "$tree/debian/changelog" <<END

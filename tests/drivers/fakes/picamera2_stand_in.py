@@ -57,8 +57,8 @@ class StandIn:
         assert main["format"] == "YUV420"
         return {"main": main, "controls": controls}
 
-    def configure(self, configuration) -> None:
-        self.configuration = configuration
+    def configure(self, camera_config) -> None:
+        self.configuration = camera_config
 
     def start(self) -> None:
         self.started = True

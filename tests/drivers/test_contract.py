@@ -157,6 +157,14 @@ def test_identity_is_text(device):
 
 
 @each_driver
+def test_what_a_driver_declares(kind, name, device):
+    assert all(c.startswith("char-") for c in type(device).device_classes)
+    assert all(isinstance(text, str) for text in device.warnings())
+    if kind == "output":  # a session replaces the programme of what heats
+        assert type(device).heats == ("programme" in option_names(kind, name))
+
+
+@each_driver
 def test_opened_again_it_works(kind, device):
     for _ in range(2):
         with device:
@@ -204,6 +212,10 @@ def test_frames_keep_the_contract(device, bench):
         assert math.isfinite(frame.utc)
         assert frame.exposure is None or frame.exposure > 0
         json.dumps(dict(frame.metadata))
+        assert all(isinstance(value, float) for value in frame.settings.values())
+        assert all(map(math.isfinite, frame.settings.values()))
+        size = device.frame_size()
+        assert size is None or frame.image is None or frame.image.shape == size[::-1]
     instants = [frame.monotonic for frame in frames]
     assert instants == sorted(set(instants)), "every frame has its own, later instant"
     numbers = [frame.sequence for frame in frames if frame.sequence is not None]

@@ -158,6 +158,16 @@ def test_every_real_metadata_is_stored_and_its_temperature_judged(shared):
 
 
 @pytest.mark.parametrize(
+    ("value", "celsius"),
+    [(29.0, 29.0), (-3.0, -3.0), (0.0, None), (-20.0, None), (80.0, None), (255.0, None),
+     (float("nan"), None), (1e300, None), ("29.0", None), (True, None), (None, None)],
+)  # fmt: skip
+def test_a_sensor_temperature_that_means_unknown(value, celsius):
+    assert sensor_temperature({"SensorTemperature": value}) == celsius
+    assert sensor_temperature({}) is None
+
+
+@pytest.mark.parametrize(
     ("extra", "message"),
     [
         ({"ExposureTime": 1_064_891}, "ExposureTime was set to 4000 and is 1064891"),

@@ -131,16 +131,18 @@ class Prior(_Section):
 class CalibrationConfig(_Section):
     """How epochs are adjusted.
 
-    exterior: one orientation per epoch, or one for the series of a camera that stands still,
+    exterior: one orientation `per_epoch`, or one for the `series` of a camera that stands still,
     estimated from all its epochs so far (an epoch that contradicts it has the status `moved`, the
-    second in a row begins anew); target_offsets: a constant offset per target, estimated from all
-    epochs so far with the test field's sigmas as prior, else these are noise of each epoch;
+    second in a row starts again), or that and movements of the `mount` whose size the epochs show;
+    `auto` is `mount`, held where nothing moves;
+    target_offsets: a constant offset per target, estimated from all epochs so far with the test
+    field's sigmas as prior, else these are noise of each epoch;
     free: what is estimated; fixed: values of what is not; priors: values with their sd; the
     bounds as in `photogrammetry.geometry`.
     """
 
-    exterior: Literal["per_epoch", "series"] = "per_epoch"
-    """One orientation per epoch, or one for the series of a camera that stands still."""
+    exterior: Literal["auto", "mount", "per_epoch", "series"] = "auto"
+    """One orientation per epoch or for the series, or one and movements of the mount."""
     free: tuple[InteriorName, ...] = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2")
     """Interior parameters that are estimated."""
     fixed: dict[InteriorName, float] = Field(default_factory=dict)

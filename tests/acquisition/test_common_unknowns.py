@@ -63,7 +63,7 @@ def run(scene, epochs: int, settings=None, **options):
 @pytest.mark.parametrize("exterior", ["series", "per_epoch"])
 def test_after_the_last_epoch_it_is_the_adjustment_of_the_whole_series(scene, exterior):
     sensor, field, _ = scene
-    results, alone, _, seen = run(scene, 40, still=exterior == "series", offsets=True)
+    results, alone, _, seen = run(scene, 40, exterior=exterior, offsets=True)
     start = alone[-1]
     settings = SeriesSettings(exterior=exterior, target_noise=False, snooping_alpha=0.001)
     whole = adjust_series(
@@ -81,7 +81,7 @@ def test_after_the_last_epoch_it_is_the_adjustment_of_the_whole_series(scene, ex
 
 
 def test_one_orientation_makes_the_principal_point_ten_times_as_sure_and_truly_so(scene):
-    results, alone, truth, _ = run(scene, 40, still=True, offsets=True)
+    results, alone, truth, _ = run(scene, 40, exterior="series", offsets=True)
     late = slice(20, None)
     x0 = np.array([r.values[1] for r in results])[late] - truth[late, 1]
     x0_alone = np.array([r.values[1] for r in alone])[late] - truth[late, 1]
@@ -96,7 +96,7 @@ def test_one_orientation_makes_the_principal_point_ten_times_as_sure_and_truly_s
 
 
 def test_offsets_take_the_jumps_out_that_hidden_targets_make(scene):
-    with_offsets, alone, truth, _ = run(scene, 40, still=False, offsets=True)
+    with_offsets, alone, truth, _ = run(scene, 40, exterior="per_epoch", offsets=True)
     late = slice(20, None)
 
     def scatter(results) -> float:
@@ -110,7 +110,7 @@ def test_an_epoch_that_was_moved_has_no_result_and_the_next_begins_anew(scene):
     sensor, field, epoch = scene
     settings = AdjustmentSettings()
     calibrator = Calibrator(sensor, field, settings, nominal_c=3.04)
-    common = CommonUnknowns(sensor, field, settings, still=True, offsets=True)
+    common = CommonUnknowns(sensor, field, settings, exterior="series", offsets=True)
     words = []
     for k in range(24):
         observations, _ = epoch(k, knocked=k >= 20)
@@ -121,7 +121,7 @@ def test_an_epoch_that_was_moved_has_no_result_and_the_next_begins_anew(scene):
 
 
 def test_nothing_shared_leaves_the_epoch_as_it_is(scene):
-    results, alone, _, _ = run(scene, 3, still=False, offsets=False)
+    results, alone, _, _ = run(scene, 3, exterior="per_epoch", offsets=False)
     assert all(a is b for a, b in zip(results, alone, strict=True))
 
 
@@ -129,8 +129,53 @@ def test_priors_and_what_is_held_are_kept(scene):
     settings = AdjustmentSettings(
         free=("c", "x0", "y0"), priors={"c": (3.1, 1e-6), "Z0": (1000.0, 1e9)}
     )
-    results, _, _, _ = run(scene, 4, settings, still=True, offsets=True)
+    results, _, _, _ = run(scene, 4, settings, exterior="series", offsets=True)
     good = [r for r in results if r.interior is not None]
     for r in good:
         assert r.values[0] == pytest.approx(3.1, abs=1e-4)
         assert (r.values[3:10] == 0).all()
+
+
+@pytest.mark.parametrize(("tremble_px", "field_sd"), [(0.0, 0.0), (0.1, 0.0), (0.1, 0.05)])
+def test_a_mount_that_trembles_has_true_standard_deviations(tremble_px, field_sd):
+    """Ten running series of 80 epochs, the last 40 of each about their mean; c, x0, y0."""
+    plain = corner_field("plain", per_side=4, pitch_mm=150.0)
+    model = demonstration_model(plain)
+    iop, eop = model.interior.as_array(), model.exterior.as_array()
+    z, sds = [], []
+    for seed in range(10):
+        rng = np.random.default_rng([61, seed])
+        given = plain.points + rng.normal(0, max(field_sd, 1e-9), plain.points.shape)
+        field = TestField.build(plain.names, given, field_sd)
+        calibrator = Calibrator(model.sensor, field, nominal_c=3.04)
+        common = CommonUnknowns(
+            model.sensor, field, AdjustmentSettings(), exterior="auto", offsets=True
+        )
+        errors, stated = [], []
+        for _ in range(80):
+            pose = eop.copy()
+            pose[:3] += rng.normal(0, tremble_px * model.sensor.pixel_pitch / 3.04, 3)
+            points = project(model.sensor, iop, pose, plain.points)
+            points += rng.normal(0, NOISE, points.shape)
+            seen = Observations(np.arange(len(plain)), points, np.full((len(plain), 2), NOISE))
+            result = common.refine(seen, calibrator.adjust(seen))
+            assert result.ok
+            errors.append(result.values[:3] - iop[:3])
+            stated.append(result.sd[:3])
+        late = np.array(errors)[40:]
+        z.append((late - (late.mean(axis=0) if field_sd else 0.0)) / np.array(stated)[40:])
+        sds.append(np.array(stated)[-1, 1] / model.sensor.pixel_pitch)
+    rms = np.sqrt(np.mean(np.square(z), axis=(0, 1)))
+    if field_sd:  # the field's errors are common to all epochs and part of the stated sds
+        assert rms.max() < 1.1
+    else:
+        assert rms == pytest.approx(np.ones(3), abs=0.3 if tremble_px else 0.6)
+    if not tremble_px:
+        assert np.median(sds) < 0.15
+
+
+def test_the_first_epochs_are_not_surer_than_they_are(scene):
+    """With an uncertain field the offsets use up a first epoch; its sd is that of the epoch."""
+    results, alone, _, _ = run(scene, 6, exterior="series", offsets=True)
+    for together, apart in zip(results, alone, strict=True):
+        assert (together.sd[:3] > 0.6 * apart.sd[:3]).all()

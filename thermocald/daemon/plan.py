@@ -123,8 +123,9 @@ def common_unknowns(plan: CameraPlan) -> CommonUnknowns | None:
         plan.sensor,
         plan.testfield,
         adjustment_settings(plan.calibration),
-        still=plan.calibration.exterior == "series",
+        exterior=plan.calibration.exterior,
         offsets=plan.calibration.target_offsets,
+        interval_s=plan.config.period_s,
     )
     return common if common.any else None
 

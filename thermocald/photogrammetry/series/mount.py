@@ -33,16 +33,25 @@ if TYPE_CHECKING:
     Mask = NDArray[np.bool_]
     Columns = NDArray[np.int64]
 
-__all__ = ["FEWEST_EPOCHS", "STILL", "Movement", "drift_period", "estimate_movement"]
+__all__ = [
+    "FASTEST_DRIFT_S",
+    "FEWEST_EPOCHS",
+    "STILL",
+    "Movement",
+    "drift_period",
+    "estimate_movement",
+]
 
 FEWEST_EPOCHS = 20
 """Below, the epochs do not tell a tremble from their own noise."""
+
+FASTEST_DRIFT_S = 240.0
+"""Period below which a camera hardly follows its temperature."""
 
 _WINDOW = 15  # epochs of the local cubic that smooths the interior orientation
 _CUBIC = 0.6  # of the drift's shortest period: the window of the local cubic that follows it
 _SPIKE = 6.0  # robust standard deviations: a passer-by, not the mount
 _WEAK = 3.0  # times the usual variance of the pose: an epoch that says little of the movement
-_FASTEST_DRIFT_S = 240.0  # period beyond which a camera hardly follows its temperature
 _FEWEST_A_PERIOD = 12.0  # epochs
 _LEAST_WARMING_K = 0.5
 _PERIODS = 2.5  # a series must be so many periods long to show a drift
@@ -131,9 +140,9 @@ def drift_period(time_s: Array, temperature: Array) -> float:
     interval = float(np.median(np.diff(time_s)))
     known = temperature[np.isfinite(temperature)]
     warms = len(known) > 1 and float(np.ptp(known)) >= _LEAST_WARMING_K
-    if interval <= 0 or (float(np.ptp(time_s)) < _FASTEST_DRIFT_S and not warms):
+    if interval <= 0 or (float(np.ptp(time_s)) < FASTEST_DRIFT_S and not warms):
         return 0.0
-    return max(_FASTEST_DRIFT_S / interval, _FEWEST_A_PERIOD)
+    return max(FASTEST_DRIFT_S / interval, _FEWEST_A_PERIOD)
 
 
 def estimate_movement(

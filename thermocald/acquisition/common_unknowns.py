@@ -216,8 +216,8 @@ class CommonUnknowns:
             one = self._reduce(at, weights, points, own)
             if self._solved is None or self.epochs + 1 > (1 + _SOLVED_AFTER) * self._solved.epochs:
                 self._solve(self._H + one.S, self._h + one.s)
-            solved = self._solved
-            assert solved is not None
+            assert self._solved is not None
+            solved: _Solved = self._solved
             step = one.Qn - one.QC @ solved.g
             own[self._own] += step
             if np.abs(at.A[:, :, self._own] @ step).max(initial=0.0) < _STRAIGHT_PX:

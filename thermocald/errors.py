@@ -2,7 +2,8 @@
 
     ThermocaldError
      ├── UsageError (ValueError)              exit 2: wrong usage
-     │    └── ConfigurationError              exit 2: config.yaml, camera, model or programme file
+     │    ├── ConfigurationError              exit 2: config.yaml, camera, model or programme file
+     │    └── OutputError                     exit 2, or 3 where the disk is full or fails
      ├── DataError (ValueError)               exit 1: the data do not allow it
      │    ├── RecordingError                  a recording is broken
      │    ├── TestFieldError                  a test field is broken
@@ -43,6 +44,7 @@ __all__ = [
     "DriverMissing",
     "GeometryError",
     "ImageError",
+    "OutputError",
     "PermanentDeviceError",
     "RecordingError",
     "ServerError",
@@ -74,6 +76,14 @@ class ConfigurationError(UsageError):
     """A configuration, camera, model or programme file is wrong."""
 
 
+class OutputError(UsageError):
+    """A file cannot be written; status 2 where another place helps, 3 where the disk fails."""
+
+    def __init__(self, message: str, exit_status: int = 2) -> None:
+        super().__init__(message)
+        self.exit_status = exit_status
+
+
 class DataError(ThermocaldError, ValueError):
     """The data do not allow what was asked."""
 
@@ -98,6 +108,8 @@ class StoreError(DataError):
 
 class StoreFullError(StoreError):
     """There is no room on the disk; what was stored before is not lost."""
+
+    exit_status = 3
 
 
 class StoreVersionError(StoreError):

@@ -10,7 +10,7 @@ import pytest
 
 from thermocald.analysis.study.measured import Clip
 from thermocald.analysis.study.study import StudySettings, study
-from thermocald.errors import DataError
+from thermocald.errors import DataError, OutputError
 from thermocald.output.figures.clips import cut_clip
 from thermocald.output.study.document import study_document
 from thermocald.output.study.report import render_report, save_figures, write_report
@@ -138,7 +138,7 @@ def test_json_has_no_nan_and_a_standard_deviation_beside_each_value(warm_study, 
 def test_a_report_that_cannot_be_written_is_one_error_and_leaves_nothing(tmp_path):
     target = tmp_path / "report.html"
     target.mkdir()
-    with pytest.raises(DataError, match="cannot be written"):
+    with pytest.raises(OutputError, match="cannot be written"):
         write_report(target, "text")
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
 

@@ -5,9 +5,11 @@ Exit status: 0 done, 1 the data do not allow it, 2 wrong usage or configuration,
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import os
 import pkgutil
+import signal
 import sys
 from typing import Annotated
 
@@ -18,6 +20,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import typer
 
 from thermocald import __version__
+from thermocald.atomic_file import cannot_write
 from thermocald.cli.common import log_to_stderr, say
 from thermocald.errors import ThermocaldError
 
@@ -64,8 +67,11 @@ def _options(
 
 def main() -> None:
     """Run the command line; every foreseen error is one line, none is a traceback."""
+    with contextlib.suppress(ValueError):  # not in the main thread
+        signal.signal(signal.SIGTERM, _end)  # so that nothing half-written stays
     try:
         application()()
+        sys.stdout.flush()
     except ThermocaldError as error:
         say(f"error: {error}")
         sys.exit(error.exit_status)
@@ -76,3 +82,22 @@ def main() -> None:
         # The reader of our output has gone, as `head` does.
         sys.stderr.close()
         sys.exit(0)
+    except OSError as error:
+        # a folder that may not be written, a full disk: wherever it shows first
+        if error.filename is None and error.errno is None:
+            raise
+        failed = cannot_write(str(error.filename or "standard output"), error)
+        what = error.strerror if isinstance(error.filename, str) and _is_read(error) else None
+        say(f"error: {error.filename}: cannot be read: {what}" if what else f"error: {failed}")
+        with contextlib.suppress(OSError):
+            sys.stdout.close()  # else Python writes what is left in it again, and fails again
+        sys.exit(failed.exit_status)
+
+
+def _end(*_: object) -> None:
+    sys.exit(128 + signal.SIGTERM)
+
+
+def _is_read(error: OSError) -> bool:
+    """Whether it is an input that is missing or may not be read."""
+    return isinstance(error, FileNotFoundError) and not os.path.lexists(str(error.filename))

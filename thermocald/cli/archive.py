@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from thermocald.atomic_file import make_folder
 from thermocald.cli.common import say, write_json
 from thermocald.cli.options import JsonOption
 from thermocald.errors import UsageError
@@ -85,7 +86,7 @@ def archive(
         if finished:
             newest = {one.camera: one.id for one in opened.all_series()}
             chosen = [one for one in chosen if newest[one.camera] != one.id]
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         for one in chosen:
             path = folder / f"{one.camera}-{one.name}"
             last = opened.last_epoch(one)

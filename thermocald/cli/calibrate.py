@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
+from thermocald.atomic_file import write_text
 from thermocald.cli.common import progress, write_json
 from thermocald.cli.options import (
     DEFAULT_FREE_TEXT,
@@ -197,13 +198,7 @@ def _write_camera(path: Path, result: Photographs, file: CameraFile) -> None:
         "principal_distance": values["c"],
         "interior": values,
     }
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        partial.write_text(f"# {comment}\n{yaml.safe_dump(document, sort_keys=False)}", "utf-8")
-        partial.replace(path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise DataError(f"{path}: cannot be written: {error.strerror}") from None
+    write_text(path, f"# {comment}\n{yaml.safe_dump(document, sort_keys=False)}")
 
 
 def _document(result: Photographs, file: CameraFile, assumed: bool) -> dict[str, Any]:

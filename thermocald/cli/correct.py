@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from thermocald.atomic_file import make_folder, new_file
 from thermocald.cli.options import TimezoneOption, device_clock
 from thermocald.errors import DataError, ImageError, UsageError
 
@@ -166,7 +167,7 @@ def _images(
     from thermocald.cli.common import progress, write_json
 
     _, rows, numbers = read_rows(path, ("time",), device_clock(timezone))
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     sensor = thermal.model.sensor
     done: list[dict[str, Any]] = []
     with progress(len(rows), "correcting images") as advance:
@@ -187,8 +188,11 @@ def _images(
                 )
             c = next(corrections)
             corrected = cv2.remap(image, c.map_x, c.map_y, cv2.INTER_CUBIC)
-            if not cv2.imwrite(str(written), corrected):
-                raise DataError(f"{written}: cannot be written")
+            encoded, data = cv2.imencode(written.suffix, corrected)
+            if not encoded:
+                raise DataError(f"{written}: its format cannot be written")
+            with new_file(written) as partial:
+                partial.write_bytes(data.tobytes())
             done.append(
                 {
                     "image": str(source),

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
+from thermocald.atomic_file import make_folder
 from thermocald.cli.common import progress, say, write_json
 from thermocald.cli.options import JsonOption
 from thermocald.errors import DataError
@@ -98,7 +99,7 @@ def _acquire(out: Path, epochs: int, seed: int) -> _Run:
     clock = VirtualClock()
     camera = open_device("camera", "mock", {"seed": seed}, clock)
     thermometer = open_device("thermometer", "mock", {"seed": seed + 1}, clock)
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     with camera, thermometer:
         sensor, field = camera.model.sensor, camera.field
         settings = AdjustmentSettings()

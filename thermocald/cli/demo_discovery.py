@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from thermocald.atomic_file import make_folder
 from thermocald.cli.common import say
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ def discover_hidden_effect(out: Path, seed: int, quiet: bool) -> dict[str, Any]:
                        and e.is_drive)  # fmt: skip
     say(f"hiding an effect: the camera follows the thermometer with a lag of {_TAU_S:.0f} s")
     folder = out / "discovery"
-    folder.mkdir(parents=True)
+    make_folder(folder)
     for number, name in enumerate(("M1", "M2")):
         simulation = preset_simulation("rpi-v2.1-heating", seed + number, name, None)
         hidden = (ModelEffect(lag.name, {lag.delay: _TAU_S}),)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
+from thermocald.atomic_file import make_folder
 from thermocald.cli.common import say, write_json
 from thermocald.cli.options import JsonOption
 from thermocald.errors import ConfigurationError, DataError, UsageError
@@ -80,13 +81,13 @@ def start(
         raise DataError(f"{path}: the recording exists already; choose another --series")
     folder = _daemon(read)
     if folder is None:
-        output.mkdir(parents=True, exist_ok=True)
+        make_folder(output)
         read = take_on_the_desk(read, session)
     else:
         _take_in_the_daemon(folder, session, wait)
         if not wait:
             return
-        output.mkdir(parents=True, exist_ok=True)
+        make_folder(output)
     _finish(read, session, path, report)
 
 

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from thermocald.atomic_file import write_text
 from thermocald.errors import ConfigurationError
 from thermocald.photogrammetry.camera.camera_model import (
     EOP_NAMES,
@@ -66,12 +67,7 @@ def read_model(path: Path) -> ThermalModel:
 
 def write_model(path: Path, model: ThermalModel) -> None:
     """Write a model file, as a whole or not at all."""
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        partial.write_text(dump_yaml(model_document(model)), encoding="utf-8")
-        partial.replace(path)
-    except OSError as cause:
-        raise ConfigurationError(f"{path}: cannot be written: {cause.strerror}") from cause
+    write_text(path, dump_yaml(model_document(model)))
 
 
 def parse_model(document: Mapping[str, Any], path: Path | str = "model") -> ThermalModel:

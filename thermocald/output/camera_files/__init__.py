@@ -8,11 +8,11 @@ Conventions and what is exact: docs/reference/camera_files.md and `photogrammetr
 
 from __future__ import annotations
 
-import os
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.atomic_file import write_text
 from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.output.camera_files import (
     aicon,
@@ -73,13 +73,7 @@ def write(
         raise UsageError(f"a covariance of shape {np.shape(covariance)}, not (10, 10)")
     record = Record(model, name, covariance, comment)
     text, statement = _format(format).encode(record)
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        partial.write_text(text, encoding="utf-8")
-        os.replace(partial, path)
-    except OSError as cause:
-        partial.unlink(missing_ok=True)
-        raise UsageError(f"{path}: cannot be written: {cause.strerror}") from cause
+    write_text(path, text)
     return statement
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from thermocald.atomic_file import new_file
 from thermocald.output.figures.numbers import coefficient
 
 if TYPE_CHECKING:
@@ -91,8 +92,11 @@ def save(drawing: Any, folder: Path, name: str) -> list[Path]:
     """A drawing as <name>.svg and <name>.png (200 dpi)."""
     paths = [folder / f"{name}.svg", folder / f"{name}.png"]
     with _style():
-        drawing.savefig(paths[0], metadata={"Date": None, "Creator": "thermocald"})
-        drawing.savefig(paths[1], dpi=200)
+        with new_file(paths[0]) as partial:
+            about = {"Date": None, "Creator": "thermocald"}
+            drawing.savefig(partial, format="svg", metadata=about)
+        with new_file(paths[1]) as partial:
+            drawing.savefig(partial, format="png", dpi=200)
     return paths
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from thermocald import __version__
-from thermocald.errors import DataError
+from thermocald.atomic_file import make_folder, write_text
 from thermocald.output.figures.clips import clip_png, cut_clip, data_uri
 from thermocald.output.figures.draw import draw_figure, draw_matrix, draw_panel, inline_svg, save
 from thermocald.output.figures.numbers import parameter_label
@@ -141,14 +141,8 @@ def _day(start_utc: float) -> str:
 
 
 def write_report(path: Path, html: str) -> None:
-    """Write the file whole or not at all; DataError if it cannot be."""
-    temporary = path.with_name(f".{path.name}.part")
-    try:
-        temporary.write_text(html, encoding="utf-8")
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise DataError(f"{path}: the report cannot be written: {error.strerror}") from None
+    """Write the file whole or not at all; OutputError if it cannot be."""
+    write_text(path, html)
 
 
 def _packed(script: str) -> str:
@@ -158,10 +152,7 @@ def _packed(script: str) -> str:
 
 def save_figures(study: Study, folder: Path) -> list[Path]:
     """Every figure as SVG and PNG in `folder`, which is made; returns the files."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(f"{folder}: the figures cannot be written: {error.strerror}") from None
+    make_folder(folder)
     paths = []
     for camera in study.cameras:
         prefix = _file_name(camera.label) + "-" if len(study.cameras) > 1 else ""

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.errors import DriverMissing, UsageError
+from thermocald.atomic_file import cannot_write
+from thermocald.errors import DriverMissing
 from thermocald.output.testfield.layout import STRIP, TRIM
 from thermocald.output.testfield.plan import draw_plan
 from thermocald.photogrammetry.targets import ring_code
@@ -250,7 +251,7 @@ def write_pdf(sheets: Sequence[Sheet], path: Path) -> None:
             if len(sheets) == 3:
                 pages.savefig(draw_plan(sheets))
     except OSError as cause:
-        raise UsageError(f"{path}: cannot be written: {cause.strerror}") from cause
+        raise cannot_write(path, cause) from cause
 
 
 def write_svg(sheet: Sheet, path: Path) -> None:
@@ -263,7 +264,7 @@ def write_svg(sheet: Sheet, path: Path) -> None:
         with rc_context({"svg.hashsalt": "thermocald"}):
             draw(sheet).savefig(path, format="svg", metadata=about)
     except OSError as cause:
-        raise UsageError(f"{path}: cannot be written: {cause.strerror}") from cause
+        raise cannot_write(path, cause) from cause
 
 
 def _require_matplotlib() -> None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from thermocald.atomic_file import cannot_write
 from thermocald.errors import UsageError
 from thermocald.output.testfield.drawing import write_pdf, write_svg
 from thermocald.output.testfield.layout import field_of, lay_out
@@ -52,7 +53,7 @@ def print_testfield(design: Design, folder: Path, *, replace_printed: bool = Fal
         folder.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=".testfield-", dir=folder))
     except OSError as cause:
-        raise UsageError(f"{folder}: cannot be written into: {cause.strerror}") from cause
+        raise cannot_write(folder, cause) from cause
     try:
         names = ["testfield.pdf"]
         write_pdf(sheets, work / "testfield.pdf")
@@ -64,6 +65,8 @@ def print_testfield(design: Design, folder: Path, *, replace_printed: bool = Fal
         names.append("testfield.csv")
         for name in names:
             os.replace(work / name, folder / name)
+    except OSError as cause:
+        raise cannot_write(folder, cause) from cause
     finally:
         shutil.rmtree(work, ignore_errors=True)
     return Printed(tuple(folder / name for name in names), sheets, field)

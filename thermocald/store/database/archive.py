@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.errors import DataError
+from thermocald.atomic_file import new_file
 from thermocald.store.recording.paths import FileFolder
 from thermocald.store.recording.writer import RecordingWriter
 
@@ -125,7 +125,7 @@ def archive_readings(store: Store, folder: Path) -> dict[str, Path]:
     """Write what thermometers said apart from epochs, {thermometer: `thermometer-<name>.csv`}.
 
     Columns: time (s UTC), clock_trusted, one per channel (°C, empty where it was not read). Raises
-    StoreError, DataError if the folder cannot be written.
+    StoreError, OutputError if the folder cannot be written.
     """
     channels: dict[str, dict[str, None]] = {}
     for reading in store.readings():
@@ -133,17 +133,15 @@ def archive_readings(store: Store, folder: Path) -> dict[str, Path]:
     written: dict[str, Path] = {}
     for name, columns in channels.items():
         written[name] = folder / f"thermometer-{name}.csv"
-        partial = folder / f".thermometer-{name}.csv.partial"
-        try:
-            with partial.open("w", encoding="utf-8", newline="") as file:
-                rows = csv.writer(file, lineterminator="\n")
-                rows.writerow(["time", "clock_trusted", *columns])
-                for reading in store.readings(name):
-                    values = [reading.values.get(channel, "") for channel in columns]
-                    rows.writerow([f"{reading.utc:.6f}", int(reading.clock_trusted), *values])
-            partial.replace(written[name])
-        except OSError as error:
-            raise DataError(f"{written[name]}: cannot be written: {error.strerror}") from error
+        with (
+            new_file(written[name]) as partial,
+            partial.open("w", encoding="utf-8", newline="") as file,
+        ):
+            rows = csv.writer(file, lineterminator="\n")
+            rows.writerow(["time", "clock_trusted", *columns])
+            for reading in store.readings(name):
+                values = [reading.values.get(channel, "") for channel in columns]
+                rows.writerow([f"{reading.utc:.6f}", int(reading.clock_trusted), *values])
     return written
 
 

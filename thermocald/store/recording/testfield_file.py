@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.atomic_file import write_text
 from thermocald.errors import TestFieldError
 from thermocald.photogrammetry.field.testfield import KINDS, TestField
 from thermocald.store.recording.table import Table
@@ -142,10 +142,4 @@ def testfield_csv(field: TestField) -> str:
 
 def write_testfield(path: Path, field: TestField) -> None:
     """Write `testfield.csv`; an existing file is replaced as a whole or not at all."""
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        partial.write_text(testfield_csv(field), encoding="utf-8")
-        os.replace(partial, path)
-    except OSError as cause:
-        partial.unlink(missing_ok=True)
-        raise TestFieldError(f"{path}: cannot be written: {cause.strerror}") from cause
+    write_text(path, testfield_csv(field))

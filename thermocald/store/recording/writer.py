@@ -8,6 +8,7 @@ import os
 import shutil
 from typing import TYPE_CHECKING, Self
 
+from thermocald.atomic_file import cannot_write
 from thermocald.errors import RecordingError
 from thermocald.store.recording.head import CameraSpec, Channel, Head, head_yaml
 from thermocald.store.recording.testfield_file import testfield_csv
@@ -139,9 +140,10 @@ class RecordingWriter:
         shutil.rmtree(self._partial, ignore_errors=True)
 
     def _failed(self, cause: OSError) -> RecordingError:
-        return RecordingError(
-            f"{self.path}: cannot be written: {cause.strerror}; nothing was kept of it"
-        )
+        failed = cannot_write(self.path, cause)
+        error = RecordingError(f"{failed}; nothing was kept of it")
+        error.exit_status = failed.exit_status
+        return error
 
     def _keep_frame(self, epoch: Epoch, image: bytes | NDArray[Any] | None) -> str:
         if image is None and epoch.frame is None:

@@ -10,7 +10,7 @@ import pytest
 
 from thermocald.analysis.study.measured import Clip
 from thermocald.analysis.study.study import StudySettings, study
-from thermocald.errors import DataError, OutputError
+from thermocald.errors import OutputError
 from thermocald.output.figures.clips import cut_clip
 from thermocald.output.study.document import study_document
 from thermocald.output.study.report import render_report, save_figures, write_report

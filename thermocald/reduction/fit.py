@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.reduction.hypothesis import BASE, Block, Fit, Term
-from thermocald.reduction.likelihood import NormalEquations, ReadingErrorTerm, Weighting, prepare
+from thermocald.reduction.likelihood import (
+    NormalEquations,
+    ReadingErrorTerm,
+    Weighting,
+    prepare,
+    with_error_term,
+)
 from thermocald.reduction.series import COLUMNS
 from thermocald.simulation import effects as catalogue
 from thermocald.simulation.drive import drive, drive_matrix, driven_history
@@ -155,7 +161,7 @@ class HypothesisFitter:
         self, terms: Sequence[Term], blocks: Sequence[Block], x: Array, series: int
     ) -> Weighting:
         """The covariance of a series at some coefficients."""
-        carried = []
+        carried: list[ReadingErrorTerm] = []
         for block in blocks:
             if block.series not in (None, series) or block.trajectories > 1:
                 continue
@@ -168,7 +174,9 @@ class HypothesisFitter:
                 _, operator, channel = self.trajectories(terms[block.term], series, terms)
             if operator is not None and d.any():
                 unresolved = self._unresolved(terms, block, series)
-                carried.append(ReadingErrorTerm(d, operator, channel, unresolved))
+                carried = with_error_term(
+                    carried, ReadingErrorTerm(d, operator, channel, unresolved)
+                )
         return prepare(self.series[series], carried, self.thermometer_factor)
 
     def _unresolved(self, terms: Sequence[Term], block: Block, series: int) -> Array | None:

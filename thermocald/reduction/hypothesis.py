@@ -15,6 +15,8 @@ from thermocald.reduction.series import COLUMNS
 from thermocald.simulation import effects as catalogue
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     from thermocald.reduction.likelihood import NormalEquations, Weighting
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["BASE", "Block", "Fit", "Term"]
+__all__ = ["BASE", "Block", "Fit", "Term", "known_term"]
 
 BASE = ("c", "x0", "y0")
 
@@ -122,3 +124,22 @@ class Fit:
         _, _, index = self.designs[series]
         r, part = self.reduced[series], x[index]
         return float(r.yy - 2 * part @ r.c + part @ r.A @ part)
+
+
+def known_term(name: str, values: Mapping[str, Any], series: int) -> Term:
+    """A term of an effect whose values are known, as a start; series: how many there are.
+
+    An event is the first series'; what a cycle has of its own is not searched.
+    """
+    effect = catalogue.get(name)
+    parameters = tuple(effect.column(p) for p in effect.linear if p in values)
+    shared = tuple(
+        (k, v if isinstance(v, str) else float(v))
+        for k, v in values.items()
+        if k in effect.nonlinear and k not in effect.fresh
+    )
+    fresh: tuple[tuple[tuple[str, Any], ...] | None, ...] = ()
+    if effect.is_event:
+        own = tuple((k, float(values[k])) for k in effect.fresh if k in values)
+        fresh = (own, *(None,) * (series - 1))
+    return Term(name, parameters or BASE, shared, fresh)

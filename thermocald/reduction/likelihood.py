@@ -17,7 +17,7 @@ Processes for Machine Learning, section 2.7 for marginalised linear terms.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["NormalEquations", "ReadingErrorTerm", "Weighting", "prepare"]
+__all__ = ["NormalEquations", "ReadingErrorTerm", "Weighting", "prepare", "with_error_term"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +45,19 @@ class ReadingErrorTerm:
     operator: Array
     channel: str
     unresolved: Array | None = None
+
+
+def with_error_term(
+    terms: list[ReadingErrorTerm], new: ReadingErrorTerm
+) -> list[ReadingErrorTerm]:
+    """Terms with one more; two that carry the readings in the same way become one direction."""
+    for i, old in enumerate(terms):
+        alike = old.channel == new.channel and old.operator.shape == new.operator.shape
+        plain = old.unresolved is None and new.unresolved is None
+        if alike and plain and np.array_equal(old.operator, new.operator):
+            both = replace(old, direction=old.direction + new.direction)
+            return [*terms[:i], both, *terms[i + 1 :]]
+    return [*terms, new]
 
 
 @dataclass(frozen=True, eq=False)

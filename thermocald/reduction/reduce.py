@@ -25,6 +25,7 @@ from thermocald.photogrammetry.series.normals import (
     right_hand_sides,
     sums_of_squares,
 )
+from thermocald.reduction.gross_errors import outlying, spikes
 from thermocald.reduction.random_effects import hidden_targets
 from thermocald.reduction.requirements import (
     LEAST_EPOCHS,
@@ -50,7 +51,6 @@ if TYPE_CHECKING:
 
 __all__ = ["reduce_series", "reduce_together", "reweighted", "without_targets"]
 
-_GROSS = 4.5  # standard deviations beyond which a point is a gross error
 _ANY_GEOMETRY = GeometryBounds(0, 2.0, 1e9, 1e9, 0.0, 0.0)
 
 
@@ -116,36 +116,6 @@ def reduce_together(inputs: Sequence[SeriesInput], T0: float | None = None) -> l
     return out
 
 
-def _running_median(values: Array, width: int = 5) -> Array:
-    """Median over time (axis 0) of up to `width` neighbours, NaN ignored."""
-    half = width // 2
-    padded = np.pad(values, ((half, half), *((0, 0),) * (values.ndim - 1)), constant_values=np.nan)
-    stack = np.stack([padded[k : k + len(values)] for k in range(width)])
-    stack.sort(axis=0)  # NaN go to the end
-    count = np.isfinite(stack).sum(axis=0)
-    low = np.maximum(count - 1, 0) // 2
-    high = np.minimum(count // 2, width - 1)
-    pick = np.take_along_axis
-    middle: Array = 0.5 * (pick(stack, low[None], 0)[0] + pick(stack, high[None], 0)[0])
-    return middle
-
-
-def _spikes(misclosure: Array, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Points that leap out of their own neighbours in time while the others do not.
-
-    Found before any adjustment, where a gross error of many pixels would hide itself and others.
-    """
-    d = misclosure - _running_median(misclosure)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
-        d = d - np.nanmedian(d, axis=1, keepdims=True)  # the whole image may move
-        own = 1.4826 * np.nanmedian(np.abs(d), axis=(1, 2))
-    level = float(np.nanmedian(own)) if np.isfinite(own).any() else 0.0
-    limit = 7.0 * np.fmax(np.nan_to_num(own), level)
-    bad: NDArray[np.bool_] = seen & (np.max(np.abs(np.nan_to_num(d)), axis=2) > limit[:, None])
-    return bad
-
-
 def _loose(source: SeriesInput, affinity: bool) -> AdjustmentSettings:
     """All parameters free: where C1 or C2 is held, the principal point makes up for it, and the
     partials are those of another camera. Weak ones stay near zero.
@@ -194,25 +164,14 @@ def _reduce(
     misclosure = source.grid.points - at.predicted
     weights = source.grid.weights
     seen = source.grid.observed
-    bad = _spikes(misclosure, seen)
+    bad = spikes(misclosure, seen)
     offsets = np.zeros((len(X), 2))
-    s0: float = 1.0
     for turn in range(5):
         w = source.grid.reject(bad).weights
         N = normal_matrices(w, A)
         offsets, b, values, v = _offsets_and_cameras(w, N, A, misclosure, offsets)
         if turn >= 1:
-            normal = np.abs(np.nan_to_num(v)) * np.sqrt(weights[..., :2])
-            s0 = 1.4826 * float(np.median(normal[seen & ~bad]))
-            local = np.nan_to_num(v - _running_median(np.where(bad[..., None], np.nan, v)))
-            # noise may grow with heat: each epoch is judged by its own spread
-            spread = np.array(
-                [1.4826 * np.median(x[k]) if k.any() else s0
-                 for x, k in zip(normal, seen & ~bad, strict=True)]
-            )  # fmt: skip
-            limit = _GROSS * np.maximum(spread, s0)[:, None]
-            outlying = np.max(np.abs(local) * np.sqrt(weights[..., :2]), axis=2)
-            bad = seen & (outlying > limit)
+            bad = outlying(v, weights, seen, bad)
     w = source.grid.reject(bad).weights
     N = normal_matrices(w, A)
     offsets, b, values, v = _offsets_and_cameras(w, N, A, misclosure, offsets)

@@ -6,7 +6,7 @@ All constants are the model's; an amplitude keeps its size, and an event its own
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from thermocald.analysis.thermal.terms import event_worth
 from thermocald.photogrammetry.linalg import scaled_solve
 from thermocald.reduction.candidate import candidate_of
 from thermocald.reduction.fit import HypothesisFitter
-from thermocald.reduction.hypothesis import BASE, Term
+from thermocald.reduction.hypothesis import BASE, Term, known_term
 from thermocald.reduction.scan import Scanner
 from thermocald.reduction.series import COLUMNS
 from thermocald.simulation import effects
@@ -57,24 +57,11 @@ def _nothing(effect: ModelEffect) -> ModelEffect:
     )
 
 
-def _as_term(effect: ModelEffect) -> Term:
-    kind = effects.get(effect.name)
-    columns = tuple(kind.column(n) for n in kind.linear if n in effect.values)
-    own = {n: v for n, v in effect.values.items() if n in kind.nonlinear}
-    shared = tuple(
-        (n, v) for n, v in own.items() if kind.nonlinear[n].role not in ("event", "phase")
-    )
-    fresh: tuple[tuple[tuple[str, Any], ...] | None, ...] = ()
-    if kind.is_event:
-        fresh = (tuple((n, v) for n, v in own.items() if n in kind.fresh),)
-    return Term(effect.name, columns or BASE, shared, fresh)
-
-
 def _known(
     fitter: HypothesisFitter, model: ThermalModel, listed: dict[str, ModelEffect]
 ) -> tuple[Fit, Array]:
     """A fit of some effects, and their coefficients as the model has them, px-scaled."""
-    fit = fitter.fit([_as_term(e) for e in listed.values()])
+    fit = fitter.fit([known_term(e.name, e.values, 1) for e in listed.values()])
     scale = fitter.series[0].scale
     x = fit.coefficients.copy()
     for block in fit.blocks:

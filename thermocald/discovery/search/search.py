@@ -19,9 +19,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.discovery.search.candidates import candidates
-from thermocald.reduction.hypothesis import BASE, Term
+from thermocald.reduction.hypothesis import Term, known_term
 from thermocald.reduction.scan import Scanner
-from thermocald.simulation import effects as catalogue
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -97,7 +96,7 @@ class Search:
         """The base model, with the effects that a model has already, fitted."""
         if not given:
             return Solution(self.fitter.fit(()), ())
-        terms = tuple(_given_term(name, values, len(self.fitter.series)) for name, values in given)
+        terms = tuple(known_term(name, values, len(self.fitter.series)) for name, values in given)
         return Solution(self.fitter.refine(self.fitter.fit(terms)), (0.0,) * len(terms))
 
     # -- scanning --------------------------------------------------------------------------
@@ -200,19 +199,3 @@ def _worth_fitting(promises: Sequence[Scanned], width: int) -> list[Scanned]:
             best[name] = p.net
             out.append(p)
     return out
-
-
-def _given_term(name: str, values: dict[str, Any], series: int) -> Term:
-    """A term of an effect that a model holds: its non-linear values as a start."""
-    effect = catalogue.get(name)
-    parameters = tuple(effect.column(p) for p in effect.linear if p in values)
-    shared = tuple(
-        (k, v if isinstance(v, str) else float(v))
-        for k, v in values.items()
-        if k in effect.nonlinear and k not in effect.fresh
-    )
-    fresh: tuple[tuple[tuple[str, Any], ...] | None, ...] = ()
-    if effect.is_event:
-        own = tuple((k, float(values[k])) for k in effect.fresh if k in values)
-        fresh = (own, *(None,) * (series - 1))
-    return Term(name, parameters or BASE, shared, fresh)

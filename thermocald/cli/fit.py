@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from thermocald.errors import UsageError
+from thermocald.store.sources import require_source
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -81,12 +82,9 @@ def _read(inputs: list[Path], advance: Callable[[int], None]) -> list[ReducedSer
     from thermocald.reduction.reduce import reduce_series
     from thermocald.reduction.source import load_series
 
-    for path in inputs:
-        if not path.exists():
-            raise UsageError(f"{path}: does not exist; give a recording or a store")
     return [
         reduce_series(s, affinity=False, strict=False)
-        for path in inputs
+        for path in map(require_source, inputs)
         for s in load_series(path, advance)
     ]
 

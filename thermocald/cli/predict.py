@@ -11,6 +11,7 @@ import typer
 
 from thermocald.cli.options import TimezoneOption, device_clock
 from thermocald.errors import UsageError
+from thermocald.store.sources import require_source
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -131,8 +132,7 @@ def _tested(thermal: ThermalCamera, path: Path) -> tuple[dict[str, Any], list[st
     from thermocald.reduction.reduce import reduce_series
     from thermocald.reduction.source import load_series
 
-    if not path.exists():
-        raise UsageError(f"{path}: does not exist; give a recording or a store")
+    require_source(path)
     known = [float(f["thermometer_sd_K"]) for f in thermal.model.fitted_on
              if "thermometer_sd_K" in f]  # fmt: skip
     found, lines = [], []

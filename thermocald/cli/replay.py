@@ -17,6 +17,7 @@ from thermocald.cli.options import (
     adjustment_settings,
 )
 from thermocald.errors import DataError, UsageError
+from thermocald.store.sources import require_source
 
 if TYPE_CHECKING:
     from thermocald.analysis.series.drift import Course
@@ -58,7 +59,7 @@ def replay(
 
     _check_exterior(exterior)
     settings = adjustment_settings(free)
-    opened = open_recording(_existing(recording))
+    opened = open_recording(require_source(recording))
     if store is not None:
         from thermocald.analysis.series.stored import replay_into
 
@@ -99,7 +100,7 @@ def export(
     if format_ not in ("csv", "json"):
         raise UsageError(f"--format {format_}: csv and json are written")
     settings = adjustment_settings(free)
-    if _existing(source).is_dir():
+    if require_source(source).is_dir():
         table = _recording_table(source, settings, exterior)
     else:
         from thermocald.analysis.series.stored import stored_table
@@ -120,12 +121,6 @@ def _value(name: str, text: str) -> Any:
     if name == "status":
         return text
     return float(text) if text else None
-
-
-def _existing(path: Path) -> Path:
-    if not path.exists():
-        raise DataError(f"{path}: does not exist; give a recording (folder) or a store (file)")
-    return path
 
 
 def _check_exterior(exterior: str) -> None:

@@ -15,9 +15,15 @@ _Address = Annotated[
 ]
 
 
+_HELP = """The database of a fleet.
+
+Example: thermocald server init postgresql://owner@db.example/thermocald
+"""
+
+
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    group = typer.Typer(no_args_is_help=True, help="The database of a fleet.")
+    group = typer.Typer(no_args_is_help=True, help=_HELP)
     group.command("init")(init)
     group.command("grant")(grant)
     app.add_typer(group, name="server")

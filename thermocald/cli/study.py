@@ -11,6 +11,8 @@ import typer
 from thermocald.cli.common import progress, write_json
 from thermocald.cli.options import DEFAULT_FREE_TEXT, ExteriorOption, FreeOption, free_names
 from thermocald.errors import DataError, UsageError
+from thermocald.store.server.address import is_server
+from thermocald.store.sources import require_source
 
 if TYPE_CHECKING:
     from thermocald.analysis.study.measured import MeasuredSeries
@@ -178,12 +180,9 @@ def _labelled(text: str) -> tuple[str | None, Path]:
     """`LABEL=PATH` or `PATH`; DataError where there is nothing at the path."""
     label, equals, rest = text.partition("=")
     # A path may hold "="; what exists as it stands is a path.
-    if not equals or Path(text).exists():
+    if not equals or Path(text).exists() or is_server(text):
         label, rest = "", text
-    path = Path(rest)
-    if not path.exists():
-        raise DataError(f"{path}: does not exist; give a recording (folder) or a store (file)")
-    return label or None, path
+    return label or None, require_source(Path(rest))
 
 
 def _reference(settings: StudySettings) -> tuple[Study, list[Comparison]]:

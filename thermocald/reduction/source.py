@@ -86,9 +86,9 @@ def load_series(path: Path, advance: Callable[[int], None] | None = None) -> lis
         from thermocald.store.recording.reader import open_recording
 
         return [series_input(open_recording(path), advance=advance)]
-    from thermocald.store.database.store import Store
+    from thermocald.store.sources import open_source
 
-    with Store.open(path) as store:
+    with open_source(path) as store:
         found = [
             epochs_input(
                 s.head, s.testfield, [e.epoch for e in store.epochs(s)], f"{path}: {s.name}"

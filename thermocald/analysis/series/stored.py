@@ -13,6 +13,7 @@ from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.store.database.row import EpochResult
 from thermocald.store.database.store import Store
+from thermocald.store.sources import open_source
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -21,8 +22,9 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
     from thermocald.store.database.row import StoredSeries
     from thermocald.store.recording.reader import Recording
+    from thermocald.store.sources import SeriesSource
 
-__all__ = ["replay_into", "stored_table"]
+__all__ = ["replay_into", "stored_table", "table_of_stored"]
 
 
 def replay_into(
@@ -58,17 +60,17 @@ def replay_into(
                     extra=done.extra,
                 )
             advance(1)
-        return _table(store, series, settings, exterior)
+        return table_of_stored(store, series, settings, exterior)
 
 
 def stored_table(
     path: Path, name: str | None, settings: AdjustmentSettings, exterior: str
 ) -> SeriesTable:
     """The table of one series of a store; name: `CAMERA/SERIES`, `SERIES`, None: the only one."""
-    with Store.open(path) as store:
+    with open_source(path) as store:
         camera, _, series_name = (name or "").rpartition("/")
         series = store.find_series(camera or None, series_name or None)
-        return _table(store, series, settings, exterior)
+        return table_of_stored(store, series, settings, exterior)
 
 
 def _series(store: Store, recording: Recording, settings: AdjustmentSettings) -> StoredSeries:
@@ -92,9 +94,10 @@ def _series(store: Store, recording: Recording, settings: AdjustmentSettings) ->
     )
 
 
-def _table(
-    store: Store, series: StoredSeries, settings: AdjustmentSettings, exterior: str
+def table_of_stored(
+    store: SeriesSource, series: StoredSeries, settings: AdjustmentSettings, exterior: str
 ) -> SeriesTable:
+    """The table of a series in an open store. Raises DataError where it has no epochs."""
     names = ["epoch", "frame_time", "sigma0", "n_observations", "n_rejected", "status"]
     names += [*PARAMETER_NAMES, *(f"sd_{name}" for name in PARAMETER_NAMES)]
     columns = store.series_columns(series, names)

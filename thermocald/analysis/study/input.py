@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.acquisition.calibrator import Calibrator
-from thermocald.analysis.series.stored import stored_table
+from thermocald.analysis.series.stored import table_of_stored
 from thermocald.analysis.series.table import (
     calibrate_epochs,
     settings_for_series,
@@ -25,9 +25,9 @@ from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
 from thermocald.reduction.thermometer import reading_noise
-from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import open_recording
 from thermocald.store.recording.readings import interpolate_readings
+from thermocald.store.sources import open_source
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from thermocald.store.database.row import StoredSeries
     from thermocald.store.recording.head import Head
     from thermocald.store.recording.reader import Recording
+    from thermocald.store.sources import SeriesSource
 
     Array = NDArray[np.float64]
 
@@ -67,7 +68,7 @@ def load_series(
     if path.is_dir():
         recording = open_recording(path)
         return [from_recording(recording, label, thermometer_sd, exterior, free, advance)]
-    with Store.open(path) as store:
+    with open_source(path) as store:
         found = [
             from_store(store, one, label, thermometer_sd, exterior) for one in store.all_series()
         ]
@@ -130,7 +131,7 @@ def from_recording(
 
 
 def from_store(
-    store: Store,
+    store: SeriesSource,
     series: StoredSeries,
     label: str | None = None,
     thermometer_sd: float | None = None,
@@ -142,9 +143,7 @@ def from_store(
     count = len(store.series_columns(series, ["epoch"])["epoch"])
     if exterior != "per_epoch" and 0 < count <= _MOST_TOGETHER:
         free = tuple(series.settings.get("free", DEFAULT_FREE))
-        table = stored_table(
-            store.path, f"{series.camera}/{series.name}", AdjustmentSettings(free=free), exterior
-        )
+        table = table_of_stored(store, series, AdjustmentSettings(free=free), exterior)
         thermometers = _stored_thermometers(store, series, table.frame_time, thermometer_sd)
         source = f"{store.path}: {series.camera}/{series.name}"
         clip = _stored_clip(store, series, table.number[table.ok])
@@ -153,7 +152,7 @@ def from_store(
 
 
 def _from_columns(
-    store: Store, series: StoredSeries, label: str, thermometer_sd: float | None
+    store: SeriesSource, series: StoredSeries, label: str, thermometer_sd: float | None
 ) -> MeasuredSeries:
     """A series as it was stored; one column at a time, for a year of epochs must fit."""
 
@@ -260,7 +259,7 @@ def _thermometer(
 
 
 def _stored_thermometers(
-    store: Store, series: StoredSeries, frame_time: Array, sd: float | None
+    store: SeriesSource, series: StoredSeries, frame_time: Array, sd: float | None
 ) -> list[Thermometer]:
     reading_time = store.series_columns(series, ["temperature_time"])["temperature_time"]
     return [
@@ -311,7 +310,9 @@ def _spread(count: int, most: int) -> NDArray[np.int64]:
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
 
 
-def _stored_clip(store: Store, series: StoredSeries, number: NDArray[np.int64]) -> Clip | None:
+def _stored_clip(
+    store: SeriesSource, series: StoredSeries, number: NDArray[np.int64]
+) -> Clip | None:
     first, last = (next(store.epochs(series, int(n), int(n))).epoch for n in number[[0, -1]])
     if first.frame is None or last.frame is None:
         return None

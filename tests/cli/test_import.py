@@ -170,3 +170,21 @@ def test_kelvin_in_a_log_is_refused_with_the_remedy(tmp_path):
     (tmp_path / "log.csv").write_text("time,housing\n1,294.5\n2,294.6\n")
     with pytest.raises(ThermocaldError, match=r"kelvin.*subtract 273\.15"):
         read_temperature_log(tmp_path / "log.csv")
+
+
+def test_the_readme_leads_to_a_plot_in_ten_commands():
+    """As many as it lists, every one and every option of them existing (walked: test_first_hour)."""
+    from pathlib import Path
+
+    text = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+    block = text.split("## Your first own plot")[1].split("```text\n")[1].split("```")[0]
+    commands = block.strip().splitlines()
+    assert len(commands) <= 10
+    for command in commands[1:]:
+        words = command.split()
+        names = words[1:3] if words[1] == "testfield" else words[1:2]
+        told = CliRunner().invoke(application(), [*names, "--help"], env={"COLUMNS": "200"})
+        assert told.exit_code == 0, command
+        for option in (w for w in words if w.startswith("--")):
+            assert option in told.output, command
+    assert "study.html" in commands[-1]

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 __all__ = ["point_tests", "snoop_series", "typical_variance"]
 
 
-
 def point_tests(system: SeriesSystem, residuals: Array) -> Array:
     """Chi-square (2) of every image point (E, T) against its epoch.
 

@@ -1,0 +1,195 @@
+"""The first hour of new users, command by command, on what the commands themselves print.
+
+The corner is photographed from its own PDF (`printed_sheets`), the camera drifts by a known amount,
+the logger writes as a German one does; ChArUco and AprilGrid are as their programs draw them. At
+the end stands the drift with its standard deviation, held against the truth.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from datetime import UTC, datetime, timedelta
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from tests.photogrammetry import board_images
+from tests.photogrammetry.network_cases import looking_at
+from tests.photogrammetry.printed_sheets import photograph, put_up
+from thermocald.cli import application
+from thermocald.output.testfield.layout import TRIM, paper_size
+from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
+from thermocald.store.recording.testfield_file import read_testfield
+
+Image = pytest.importorskip("PIL.Image")
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+
+SENSOR = Sensor(1640, 1232, 0.00224)
+COLD = InteriorOrientation(3.05, 0.02, -0.01, A1=-2e-3)
+RATE_C, RATE_X0 = 0.2e-3, -0.4e-3
+"""What the camera does, mm/K."""
+EPOCHS = 16
+START = datetime(2026, 6, 14, 12, 0, 0)
+
+
+def run(*arguments):
+    """One command; its standard output and error."""
+    result = CliRunner().invoke(application(), [str(a) for a in arguments])
+    assert result.exit_code == 0, result.output
+    return result
+
+
+def camera_at(temperature):
+    warm = temperature - 20.0
+    drifted = InteriorOrientation(
+        COLD.c + RATE_C * warm, COLD.x0 + RATE_X0 * warm, COLD.y0, A1=COLD.A1
+    )
+    return CameraModel(SENSOR, drifted)
+
+
+def temperature_of(epoch):
+    return 20.0 + 15.0 * np.sin(np.pi * epoch / (EPOCHS - 1))
+
+
+def write_photograph(path, grey, moment):
+    exif = Image.Exif()
+    exif[0x0110] = "imx219"
+    inner = exif.get_ifd(0x8769)
+    inner[0x9003] = moment.strftime("%Y:%m:%d %H:%M:%S")
+    inner[0x920A] = 3.04
+    Image.fromarray(grey).save(path, exif=exif, quality=95)
+
+
+def write_log(path):
+    rows = []
+    for k in range(-1, EPOCHS + 1):
+        value = f"{temperature_of(min(max(k, 0), EPOCHS - 1)):.3f}".replace(".", ",")
+        moment = START + timedelta(seconds=10 * k)
+        rows.append(f"{moment:%d.%m.%Y};{moment:%H:%M:%S};{value};45,1\n")
+    path.write_text("Logger 17\nDatum;Uhrzeit;Temperatur °C;Feuchte %\n" + "".join(rows), "latin-1")
+
+
+@pytest.fixture(scope="module")
+def corner(tmp_path_factory):
+    """A corner printed, put up (as its PDF says), surveyed from eight photographs; its sheets."""
+    place = tmp_path_factory.mktemp("first-hour")
+    checked = run("testfield", "check", "--paper", "A3")
+    assert checked.stdout.startswith("good: every image")
+    printed = run("testfield", "print", "--paper", "A3", "--out", place / "field")
+    a, b, nominal = re.search(
+        r"measure (\w+) to (\w+) \(nominal ([\d.]+) mm", printed.stdout
+    ).groups()
+    page = paper_size("A3", landscape=True)
+    sheets = put_up(place / "field" / "testfield.pdf", page, TRIM)
+    middle = read_testfield(place / "field" / "testfield.csv").points.mean(axis=0)
+    (place / "survey").mkdir()
+    rng = np.random.default_rng(0)
+    for i in range(8):
+        direction = np.ones(3) + rng.uniform(-0.45, 0.45, 3)
+        where = middle + 680.0 * direction / np.linalg.norm(direction)
+        station = looking_at(where, middle, (i % 4) * np.pi / 2)
+        frame = photograph(sheets, camera_at(20.0), station, seed=i)
+        cv2.imwrite(str(place / "survey" / f"{i}.jpg"), frame, [cv2.IMWRITE_JPEG_QUALITY, 95])
+    run(
+        "testfield", "survey", place / "survey", "--field", place / "field" / "testfield.csv",
+        "--scale", a, b, nominal, "--scale-sd", 0.2, "--pixel-pitch", SENSOR.pixel_pitch, "--out",
+        place / "surveyed.csv",
+    )  # fmt: skip
+    return place, sheets, middle
+
+
+def test_imported_photographs_of_the_printed_corner_show_the_drift(corner):
+    place, sheets, middle = corner
+    (place / "photos").mkdir()
+    stand = middle + 660.0 * np.array([1.0, 0.95, 0.85]) / np.linalg.norm([1.0, 0.95, 0.85])
+    station = looking_at(stand, middle, np.pi / 2 + 0.3)
+    for k in range(EPOCHS):
+        frame = photograph(sheets, camera_at(temperature_of(k)), station, seed=100 + k)
+        moment = START + timedelta(seconds=10 * k)
+        write_photograph(place / "photos" / f"IMG_{k:03d}.jpg", frame, moment)
+    write_log(place / "logger.csv")
+    told = run(
+        "import", place / "photos", "--log", place / "logger.csv", "--timezone", "Europe/Berlin",
+        "--testfield", place / "surveyed.csv", "--pixel-pitch", SENSOR.pixel_pitch, "--out",
+        place / "M1",
+    )  # fmt: skip
+    assert f"known for {EPOCHS} of {EPOCHS} photographs" in told.stderr
+    replayed = run("replay", place / "M1", "--exterior", "series", "--json", "-")
+    document = json.loads(replayed.stdout)
+    assert document["epochs"] == EPOCHS
+    exported = run("export", place / "M1", "--exterior", "series").stdout.splitlines()
+    header = exported[0].split(",")
+    rows = [dict(zip(header, line.split(","), strict=True)) for line in exported[1:]]
+    assert [r["status"] for r in rows] == ["ok"] * EPOCHS
+    assert (
+        float(rows[0]["frame_time"]) == (START - timedelta(hours=2)).replace(tzinfo=UTC).timestamp()
+    )
+    hot = EPOCHS // 2
+    warm = temperature_of(hot) - temperature_of(0)
+    for name, rate in (("c", RATE_C), ("x0", RATE_X0), ("y0", 0.0)):
+        drift = float(rows[hot][name]) - float(rows[0][name])
+        sd = float(np.hypot(float(rows[hot][f"sd_{name}"]), float(rows[0][f"sd_{name}"])))
+        assert 0 < sd < 0.2 * abs(RATE_C * 15)
+        assert drift == pytest.approx(rate * warm, abs=max(5 * sd, 2e-5)), (name, drift, sd)
+    run("study", place / "M1", "--report", place / "study.html")
+    assert (place / "study.html").stat().st_size > 50_000
+
+
+def board_photographs(place, sheet, field, name, temperatures):
+    """Ten poses of one board at each of two temperatures."""
+    middle = field.points.mean(axis=0)
+    reach = 1.35 * float(np.ptp(field.points, axis=0).max())
+    rng = np.random.default_rng(5)
+    for temperature in temperatures:
+        folder = place / f"{name}-{temperature:.0f}"
+        folder.mkdir()
+        for i in range(10):
+            azimuth, tilt = 2 * np.pi * i / 10, 0.25 + 0.4 * (i % 3) / 2
+            direction = np.array(
+                [np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)]
+            )
+            where = middle + reach * rng.uniform(0.9, 1.15) * direction
+            aim = middle + np.array([*rng.uniform(-0.1, 0.1, 2) * reach, 0.0])
+            station = looking_at(where, aim, (i % 4) * np.pi / 2)
+            frame = photograph([sheet], camera_at(temperature), station, seed=i)
+            cv2.imwrite(str(folder / f"{i}.png"), frame)
+    return [place / f"{name}-{t:.0f}" for t in temperatures]
+
+
+@pytest.mark.parametrize("kind", ["charuco", "aprilgrid"])
+def test_the_owner_of_a_board_finds_the_drift_between_cold_and_warm(tmp_path, kind):
+    """One flat board in ten poses, cold and warm: the difference of both calibrations."""
+    if kind == "charuco":
+        sheet = board_images.charuco_sheet(11, 8, 30.0, 22.5, "DICT_5X5_250", False)
+        run(
+            "testfield", "import", "--charuco", "11x8", "--square", 30, "--marker", 22.5,
+            "--dictionary", "DICT_5X5_250", "--sigma", 0.02, "--out", tmp_path / "board.csv",
+        )  # fmt: skip
+    else:
+        sheet = board_images.aprilgrid_sheet(6, 6, 40.0, 0.3)
+        (tmp_path / "target.yaml").write_text(
+            "target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 6\ntagSize: 0.04\ntagSpacing: 0.3\n"
+        )
+        run("testfield", "import", tmp_path / "target.yaml", "--sigma", 0.02, "--out",
+            tmp_path / "board.csv")  # fmt: skip
+    field = read_testfield(tmp_path / "board.csv")
+    (tmp_path / "camera.yaml").write_text(
+        "name: rpi\nwidth: 1640\nheight: 1232\npixel_pitch: 0.00224\nprincipal_distance: 3.04\n"
+    )
+    found = []
+    for folder in board_photographs(tmp_path, sheet, field, kind, (20.0, 50.0)):
+        told = run(
+            "calibrate", *sorted(folder.glob("*.png")), "--testfield", tmp_path / "board.csv",
+            "--camera", tmp_path / "camera.yaml", "--json", "-",
+        )  # fmt: skip
+        found.append(json.loads(told.stdout))
+    cold, hot = found
+    assert cold["status"] == hot["status"] == "ok"
+    for name, rate in (("c", RATE_C), ("x0", RATE_X0), ("y0", 0.0)):
+        drift = hot["interior"][name] - cold["interior"][name]
+        sd = float(np.hypot(hot["interior"][f"sd_{name}"], cold["interior"][f"sd_{name}"]))
+        assert 0 < sd < 3e-4
+        assert drift == pytest.approx(30.0 * rate, abs=max(4 * sd, 5e-5)), (name, drift, sd)

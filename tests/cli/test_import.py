@@ -173,7 +173,7 @@ def test_kelvin_in_a_log_is_refused_with_the_remedy(tmp_path):
 
 
 def test_the_readme_leads_to_a_plot_in_ten_commands():
-    """As many as it lists, every one and every option of them existing (walked: test_first_hour)."""
+    """As many as it lists, with options that exist; test_first_hour walks them."""
     from pathlib import Path
 
     text = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")

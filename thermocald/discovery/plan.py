@@ -241,7 +241,7 @@ def _with_drive(
 ) -> ReducedSeries:
     """The series when the camera follows a drive, at the value that leaves the strength.
 
-    Simulated anew where that can be: the truth behind the readings is not in them.
+    Simulated again where that can be: the truth behind the readings is not in them.
     """
     base = fitter.fit(())
     rates = base.direction(base.blocks[0])[0]

@@ -182,7 +182,7 @@ class HypothesisFitter:
     def _unresolved(self, terms: Sequence[Term], block: Block, series: int) -> Array | None:
         """Uncertainty of a trajectory at single epochs (E,) beyond the readings' errors; or None.
 
-        The rate beside a switched lamp; where a play turns, which reading was the extreme.
+        The rate next to a switched lamp; where a play turns, which reading was the extreme.
         """
         evidence = self.series[series]
         history = evidence.history
@@ -253,7 +253,7 @@ class HypothesisFitter:
 
     def thermometer_scale(self, fit: Fit) -> tuple[float, float]:
         """The factor of the readings' noise that makes a hypothesis most likely, and the objective
-        there. Hypotheses that smooth the readings more than others are else told apart by nothing
+        there. Hypotheses that smooth the readings more than others are separated by nothing else
         but an error of the noise.
         """
         from scipy.optimize import minimize_scalar

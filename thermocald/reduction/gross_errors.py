@@ -82,10 +82,10 @@ def spikes(misclosure: Array, seen: Mask) -> Mask:
 
 
 def outlying(v: Array, weights: Array, seen: Mask, bad: Mask) -> Mask:
-    """Points (E, T) whose residuals v (E, T, 2) px are gross beside their neighbours in time.
+    """Points (E, T) whose residuals v (E, T, 2) px are gross against their neighbours in time.
 
-    bad: those that were so far, which do not count. Noise may grow with heat: each epoch is judged
-    by its own spread, or the series' where that is larger.
+    bad: those that were so far, which do not count. Noise may grow with heat: each epoch is
+    assessed by its own spread, or the series' where that is larger.
     """
     size, own = np.zeros(seen.shape), np.zeros(len(seen))
     good = seen & ~bad

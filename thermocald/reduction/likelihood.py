@@ -3,8 +3,8 @@
 Per epoch the evidence is a small normal matrix N_e over camera parameters. A hypothesis moves the
 parameters along directions v (P,) with trajectories c (E,): Σ v c(t). Trajectories that are made
 from temperatures carry the thermometer's error δ (R,) through their own operator O (E, R): what is
-observed is d·O δ beside the image noise. δ is integrated out exactly (Woodbury), so neither white
-nor lagged thermometer noise is mistaken for an effect:
+observed is d·O δ alongside the image noise. δ is integrated out exactly (Woodbury), so neither
+white nor lagged thermometer noise is mistaken for an effect:
 
     S = N⁻¹ + J C Jᵀ,  J = Σ_k d_k ⊗ O_k,   S⁻¹ = N - N J (C⁻¹ + JᵀN J)⁻¹ JᵀN
 
@@ -100,7 +100,7 @@ class Weighting:
         return out
 
     def joint(self, trajectories: Array, directions: Array) -> tuple[Array, Array, Array]:
-        """Normal equations beside the levels: A (R, R), c (R,), K (P, R).
+        """Normal equations alongside the levels: A (R, R), c (R,), K (P, R).
 
         trajectories (E, R), directions (P, R); K couples them with the levels, whose own normal
         equations are `level_normal` and `level_b`.

@@ -44,7 +44,7 @@ class HiddenTargets:
 
     @property
     def cross(self) -> Array:
-        """Their part of the normal equations beside the epochs' parameters, (S, E, P)."""
+        """Their part of the normal equations alongside the epochs' parameters, (S, E, P)."""
         out: Array = self.patterns[self.group][:, :, None] * self.vectors[:, None, :]
         return out
 

@@ -2,7 +2,7 @@
 
 What is constant over the series says nothing about heat: one offset per target (errors of the
 field's coordinates) is taken out here, together with the cameras, so that a target that is hidden
-now and then does not pass for a drift.
+now and then is not mistaken for a drift.
 """
 
 from __future__ import annotations

@@ -61,14 +61,14 @@ def require(source: SeriesInput) -> None:
     if duration < _MIN_DURATION:
         raise DataError(
             f"{source.name}: the recording lasts {duration:.0f} s; heat needs minutes to reach a "
-            f"camera, and what moves faster is no thermal effect. Record {_MIN_DURATION:.0f} s at "
-            "least, better half an hour"
+            "camera, and what moves faster is not a thermal effect. Record at least "
+            f"{_MIN_DURATION:.0f} s, better half an hour"
         )
     rows = source.grid.observed.any(axis=0)
     if plane_fit(source.field.points[rows])[2]:
         raise DataError(
             f"{source.name}: the {int(rows.sum())} targets seen lie in one plane; principal point "
-            "and tilt cannot be told apart on it. Use a field with depth, such as a corner"
+            "and tilt cannot be separated on it. Use a field with depth, such as a corner"
         )
 
 

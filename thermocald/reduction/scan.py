@@ -1,4 +1,4 @@
-"""The scan: how much χ² each trial value of a candidate would explain beside a fitted hypothesis.
+"""The scan: how much χ² each trial value of a candidate would explain beyond a hypothesis.
 
 A scan over a candidate's whole grid costs one matrix product on the epochs' normal equations.
 """

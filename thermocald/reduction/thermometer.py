@@ -2,7 +2,7 @@
 
 The smooth trajectory is only where non-linear operators are linearised; the readings themselves
 stay the data and their error is carried through each operator (`likelihood`). So a kink that the
-smoothing rounds off does not pass for an effect.
+smoothing rounds off is not mistaken for an effect.
 
 Source: Eilers (2003), A perfect smoother, Analytical Chemistry 75, 3631-3636; generalised
 cross-validation as Golub, Heath, Wahba (1979), Technometrics 21, 215-223.
@@ -42,7 +42,7 @@ class Thermometer:
     times (K,) s; trajectory (K,) °C: smoothed, filled in, the point of linearisation; NaN at knots
     of other columns; deviation (K,) K: reading minus trajectory; sd (K,) K of the independent
     errors; mixing (K, K), sparse: errors of the knots = mixing @ independent errors: a latent time
-    carries the errors of the readings beside it and its own; real (K,): where a knot is an time of
+    carries the errors of the readings next to it and its own; real (K,): where a knot is a time of
     reading; noise: K of one reading.
     """
 
@@ -55,7 +55,7 @@ class Thermometer:
     noise: float
 
     def slope_jump(self, times: Array) -> Array:
-        """How uncertain the rate (E,) K/s is at some times because it jumps beside them."""
+        """How uncertain the rate (E,) K/s is at some times because it jumps next to them."""
         t, y = self.times[self.real], (self.trajectory + self.deviation)[self.real]
         bend, limit = _bends(t, y, self.noise)
         width = np.diff(t)
@@ -185,9 +185,9 @@ def smooth_channel(
 def extend(channel: Thermometer) -> Thermometer:
     """The same column with knots before its begin and after its end, as uncertain as they are.
 
-    Before the begin the temperature is taken as it was at the begin (EFFECTS: the past begins
+    Before the start the temperature is taken as it was at the start (EFFECTS: the past begins
     with the series), after the end it goes on along its slope; both within half of what the slope
-    makes of the time elapsed. A delay asks for such times, and so does the state at the begin.
+    makes of the time elapsed. A delay asks for such times, and so does the state at the start.
     """
     t = channel.times
     k = np.flatnonzero(np.isfinite(channel.trajectory))

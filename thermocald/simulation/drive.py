@@ -45,7 +45,8 @@ def drive(history: History, drives: Drives) -> Array:
 def drive_matrix(history: History, drives: Drives, at_readings: bool = False) -> csr_array | None:
     """∂ drive / ∂ readings, (E, R), sparse.
 
-    at_readings: of the driven readings (R, R) instead, None (the identity) where there is no drive.
+    at_readings: of the driven readings (R, R) instead, None (the identity) where there is no
+    drive.
     """
     chain: csr_array | None = None
     for name, values in drives if at_readings else drives[:-1]:

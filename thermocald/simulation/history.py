@@ -44,16 +44,16 @@ class Polygon:
     matrix: csr_array
 
     def at(self, times: ArrayLike) -> Array:
-        """The temperature (...,) °C at some instants; held beyond the ends."""
+        """The temperature (...,) °C at some times; held beyond the ends."""
         result: Array = np.interp(np.asarray(times, dtype=float), self.times, self.values)
         return result
 
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """What was recorded of the temperature, and the instants for which it is asked.
+    """What was recorded of the temperature, and the times for which it is asked.
 
-    times (E,): s since the series' begin, ascending: the frames; reading_times (R,): s on the same
+    times (E,): s since the series' start, ascending: the frames; reading_times (R,): s on the same
     axis; readings: {channel: (R,)} °C, NaN where missing; reference: the channel that is T;
     T0: the model's reference temperature °C, one value for all series of a camera.
     """
@@ -90,7 +90,7 @@ class History:
         )
 
     def at(self, times: ArrayLike) -> Self:
-        """The same history, asked for other instants."""
+        """The same history, asked for other times."""
         return replace(self, times=np.asarray(times, dtype=float))
 
     def with_reference(self, readings: ArrayLike) -> Self:
@@ -118,7 +118,7 @@ class History:
         return self._polygons[name]
 
     def temperature(self, channel: str | None = None) -> Array:
-        """The temperature (E,) °C of a channel at the frames' instants."""
+        """The temperature (E,) °C of a channel at the frames' times."""
         return self.polygon(channel).at(self.times)
 
     def temperature_matrix(self, channel: str | None = None) -> csr_array:

@@ -34,7 +34,7 @@ _LAG_CUT = 14.0
 
 
 def _edges(knots: Array, at: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """Left knot, right knot, and share of the right one, at instants (E,); held beyond the ends."""
+    """Left knot, right knot, and share of the right one, at times (E,); held beyond the ends."""
     last = len(knots) - 1
     left = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, max(last - 1, 0))
     right = np.minimum(left + 1, last)
@@ -44,7 +44,7 @@ def _edges(knots: Array, at: Array) -> tuple[NDArray[np.int64], NDArray[np.int64
 
 
 def interpolation_matrix(knots: Array, at: Array) -> csr_array:
-    """The matrix (E, K) that interpolates values at knots (K,) linearly at instants (E,)."""
+    """The matrix (E, K) that interpolates values at knots (K,) linearly at times (E,)."""
     from scipy.sparse import csr_array
 
     left, right, share = _edges(knots, at)
@@ -168,7 +168,7 @@ def _play_states(values: Array, half_width: float) -> Array:
 
 
 def play_matrix(knots: Array, values: Array, half_width: float, at: Array) -> csr_array:
-    """∂ play / ∂ values (E, K): each output hangs on the reading that moved it last."""
+    """∂ play / ∂ values (E, K): each output depends on the reading that moved it last."""
     moving, source, _ = _play_moves(knots, values, half_width, at)
     return _switched(knots, at, moving, source)
 
@@ -176,8 +176,8 @@ def play_matrix(knots: Array, values: Array, half_width: float, at: Array) -> cs
 def _play_moves(
     knots: Array, values: Array, half_width: float, at: Array
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.bool_]]:
-    """Whether the play moves since the knot before each instant (E,), the knot that moved it last
-    until then (E,), and whether the instant is that very knot (E,).
+    """Whether the play moves since the knot before each time (E,), the knot that moved it last
+    until then (E,), and whether the time is that very knot (E,).
     """
     states = _play_states(values, half_width)
     moved = np.append(True, states[1:] != states[:-1])
@@ -194,7 +194,7 @@ def play_turns(knots: Array, values: Array, half_width: float, at: Array) -> NDA
     Which reading was the highest, and when the play is used up, is not sure there.
     """
     moving, source, just_moved = _play_moves(knots, values, half_width, at)
-    resting = ~moving & ~just_moved & (source > 0)  # at the begin it has not turned
+    resting = ~moving & ~just_moved & (source > 0)  # at the start it has not turned
     near = np.zeros(len(at), dtype=bool)
     begins = np.flatnonzero(np.diff(resting.astype(int), prepend=0) > 0)
     ends = np.flatnonzero(np.diff(resting.astype(int), append=0) < 0)
@@ -205,7 +205,7 @@ def play_turns(knots: Array, values: Array, half_width: float, at: Array) -> NDA
 
 
 def running_maximum(knots: Array, values: Array, at: Array) -> Array:
-    """The highest value from the first knot to each instant. knots, values (K,), at (E,); (E,)."""
+    """The highest value from the first knot to each time. knots, values (K,), at (E,); (E,)."""
     left, right, share = _edges(knots, at)
     now = values[left] * (1.0 - share) + values[right] * share
     result: Array = np.maximum(np.maximum.accumulate(values)[left], now)
@@ -213,7 +213,7 @@ def running_maximum(knots: Array, values: Array, at: Array) -> Array:
 
 
 def running_maximum_matrix(knots: Array, values: Array, at: Array) -> csr_array:
-    """∂ running_maximum / ∂ values (E, K): each output hangs on the highest reading so far."""
+    """∂ running_maximum / ∂ values (E, K): each output depends on the highest reading so far."""
     highest = np.maximum.accumulate(values)
     risen = np.append(True, values[1:] > highest[:-1])
     source = np.maximum.accumulate(np.where(risen, np.arange(len(values)), 0))
@@ -243,7 +243,7 @@ def _switched(
 
 
 def slope_matrix(knots: Array, at: Array) -> csr_array:
-    """The matrix (E, K) of the rate dT/dt at instants (E,).
+    """The matrix (E, K) of the rate dT/dt at times (E,).
 
     At the knots the slope of the parabola through three neighbours (second order, also for uneven
     steps; one-sided at the ends), linear in between.

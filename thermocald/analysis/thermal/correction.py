@@ -208,7 +208,7 @@ def _number(path: Path, line: int, column: str, text: str) -> float:
     except ValueError:
         value = float("nan")
     if not np.isfinite(value):
-        raise DataError(f"{path}, line {line}, column {column}: {text!r} is no number")
+        raise DataError(f"{path}, line {line}, column {column}: {text!r} is not a number")
     return value
 
 

@@ -79,7 +79,7 @@ def predicted_error(
     points = source.grid.points
     used = weights > 0
     if len(rows):
-        # a target that moves is no gross error where it moves
+        # a target that moves is not a gross error where it moves
         used[:, rows] = (source.grid.weights[:, rows, :2] > 0) & (
             np.abs(np.nan_to_num(points[:, rows] - projected(series, prediction, whole)[:, rows]
                                  - mean[rows])) < 1.0

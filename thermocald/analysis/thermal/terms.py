@@ -86,7 +86,7 @@ def event_worth(series: ReducedSeries, coefficients: int) -> float:
 
 
 def without_chance_events(fitter: HypothesisFitter, fit: Fit) -> tuple[Term, ...]:
-    """The terms of a fit without events that explain no more than chance beside the others."""
+    """The terms of a fit without events that explain no more than chance alongside the others."""
     terms = list(fit.terms)
     for block in fit.blocks:
         if block.term < 0 or not terms[block.term].kind.is_event or block.series is None:

@@ -44,8 +44,8 @@ if TYPE_CHECKING:
 __all__ = ["Along", "ExtrapolationWarning", "ThermalCamera"]
 
 _REFUSED_SHARE = 0.5  # of the fitted range of temperature
-_MARGIN_K = 0.25  # what thermometers differ by is no extrapolation
-_CHUNK = 20_000  # instants at a time
+_MARGIN_K = 0.25  # what thermometers differ by is not an extrapolation
+_CHUNK = 20_000  # times in one go
 
 
 class ExtrapolationWarning(UserWarning):
@@ -192,9 +192,9 @@ class ThermalCamera:
         """The camera along a temperature log.
 
         times (R,) s; temperatures (R,) °C of the reference, or {channel: (R,)}, the first is the
-        reference; at (E,): the instants asked for, by default `times`. The past begins with the
-        first instant. relative_to °C: the covariance is that of the difference to the steady camera
-        at this temperature; temperature_sd K: of a reading, is carried into the covariance.
+        reference; at (E,): the times asked for, by default `times`. The past begins with the first
+        time. relative_to °C: the covariance is that of the difference to the steady camera at this
+        temperature; temperature_sd K: of a reading, is carried into the covariance.
         """
         t = np.asarray(times, dtype=float)
         columns = temperatures if isinstance(temperatures, dict) else {"temperature": temperatures}

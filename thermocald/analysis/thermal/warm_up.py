@@ -1,6 +1,6 @@
 """Warm-up advice: from when on a device is steady enough for a wanted error in object space.
 
-The camera is steady from the instant after which no point of the image, seen on a plane at the
+The camera is steady from the time after which no point of the image, seen on a plane at the
 working distance, lies further from where the end of the history puts it than the wanted error.
 """
 
@@ -27,7 +27,7 @@ __all__ = ["WarmUp", "warm_up"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WarmUp:
-    """steady_from: s since the begin, None where the history ends before the camera is steady;
+    """steady_from: s since the start, None where the history ends before the camera is steady;
     times (E,) s; error (E,) mm: the worst point's distance from where it ends.
     """
 
@@ -37,13 +37,13 @@ class WarmUp:
 
 
 def warm_up(along: Along, distance_mm: float, wanted_mm: float) -> WarmUp:
-    """When the camera is steady enough. DataError for a single instant.
+    """When the camera is steady enough. DataError for a single time.
 
     A history that still moves by more than a tenth of the wanted error over its last tenth has not
     shown its end: then there is no answer.
     """
     if len(along) < 10:
-        raise DataError("a warm-up needs a history of at least 10 instants")
+        raise DataError("a warm-up needs a history of at least 10 times")
     points = image_grid(along.sensor)
     r = rays(along.sensor, along.values, np.broadcast_to(points, (len(along), *points.shape)))
     places = distance_mm * r[..., :2] / -r[..., 2:]

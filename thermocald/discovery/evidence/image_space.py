@@ -34,7 +34,7 @@ _SHARE = 0.6  # of a target's slow movement that the step has to explain
 
 @dataclass(frozen=True, eq=False)
 class Displaced:
-    """Targets that moved together: rows of the field, time s ± s from the series' begin,
+    """Targets that moved together: rows of the field, time s ± s from the series' start,
     displacement (k, 3) mm as far as an image shows it (across the ray), sd (k, 3), step (k, 2) px.
     """
 
@@ -95,7 +95,7 @@ def displaced_targets(evidence: ReducedSeries) -> tuple[list[Displaced], Reduced
         sigma = float(1.0 / np.sqrt(np.mean(w[w > 0])))
         there = np.isfinite(cleaned.residuals[..., 0]).sum(axis=0)
         size = 2.0 * sigma * np.sqrt(gain / np.maximum(there, 1))
-        # real targets have a life of their own: what many of them do is no displacement
+        # real targets have a life of their own: what many of them do is not a displacement
         common = 8.0 * float(np.percentile(gain[there > 0], 85)) if (there > 0).any() else 0.0
         top = float(gain.max(initial=0.0))
         # one moved target drags the camera and with it all others: the largest go first

@@ -39,7 +39,7 @@ _LEFT = 0.03
 _SWAP_BAND = 120.0
 # slow variances over those of white noise: beyond, what one series shows has to be seen in another
 _WANDERING = 3.0
-# a second effect beside an adequate one has to explain as much, in px RMS and as a share of the
+# a second effect alongside an adequate one has to explain as much, in px RMS and as a share of the
 # first: below that, it is the first one's finer points
 _LEFT_PX, _LEFT_SHARE = 0.005, 0.15
 
@@ -117,7 +117,7 @@ def _searched(
     for level in range(1, MAX_EFFECTS + 1):
         grown: list[Solution] = []
         for solution in frontier:
-            say(f"effect {level}: beside {', '.join(solution.names) or 'the base'}")
+            say(f"effect {level}: alongside {', '.join(solution.names) or 'the base'}")
             wide = 6 if level == 1 else 4
             kept = len(base.terms)
             grown += [search.shrink(s, kept) for s in search.expand(solution, wide)]

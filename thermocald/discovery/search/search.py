@@ -36,7 +36,8 @@ if TYPE_CHECKING:
 
 __all__ = ["MARGIN", "Scanned", "Search", "Solution"]
 
-# beyond the penalty for the search: what errors of the noise model itself may feign
+# beyond the penalty for the search: what errors of the noise model itself may
+# look like
 MARGIN = 16.0
 # of an effect's best parameter set that another of its sets has to promise
 _SET_FRACTION = 0.95

@@ -53,7 +53,7 @@ def fit_first(fitter: HypothesisFitter, terms: Sequence[Term]) -> Fit:
 
 
 def carried_over(fit: Fit) -> Fit:
-    """Constants as the first series gave them; what a series has of its own is estimated anew.
+    """Constants as the first series gave them; what a series has of its own is estimated again.
 
     Of an oscillation that is the phase, of a slip its time and height.
     """
@@ -88,7 +88,7 @@ def carried_over(fit: Fit) -> Fit:
 def image_chi2(
     evidence: ReducedSeries, fit: Fit, series: int, epochs: NDArray[np.bool_] | None = None
 ) -> float:
-    """Σ of squared parameter misfits in the metric of the image points, levels estimated anew."""
+    """Σ of squared parameter misfits in the metric of the image points, levels estimated again."""
     C, V, index = fit.designs[series]
     model = (C * fit.coefficients[index]) @ V.T
     r = evidence.values - model
@@ -113,14 +113,14 @@ def gap_of(
 
     displaced: targets taken out, and whether the model knows of their steps; noise: the epochs'
     noise factor the evidence is weighted by, and whether the model knows it; explained: χ² that
-    a bridge takes up beside the model.
+    a bridge takes up alongside the model.
     """
     e = fitter.series[series]
     residuals = np.nan_to_num(e.residuals)
     within = float(np.sum(e.weights[..., :2] * residuals**2))
     coordinates = 2.0 * float(e.n.sum())
     targets = float((e.n.sum() > 0) * np.sum(e.weights[..., 0].any(axis=0)))
-    # what a camera does within one block of a long series is no part of the comparison
+    # what a camera does within one block of a long series is not part of the comparison
     unused = e.blocks.within_free if e.blocks is not None else 0.0
     free = max(coordinates - 2.0 * targets - e.rank - unused, 1.0)
     # `with_correlated_noise` has put correlated noise into the weights; the floor is that of single

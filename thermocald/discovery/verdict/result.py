@@ -164,7 +164,7 @@ def _entry(x: Examination, fit: Fit, k: int, before: Gap, after: Gap, first: boo
 def _undecided(
     x: Examination, fit: Fit, k: int, estimates: dict[str, dict[str, Any]]
 ) -> dict[str, dict[str, Any]]:
-    """Estimates with the standard deviations they have beside one coefficient more.
+    """Estimates with the standard deviations they have alongside one coefficient more.
 
     That a lens's A2 drifts by less than the data show does not make A1 as sure as if A2 stood
     still.

@@ -120,7 +120,7 @@ def _effect(effect: EffectFound) -> str:
         for a in excluded:
             text += (
                 f"<li><b>{escape(a['effect'])}</b>, scoring {a['score_difference']:.1f} worse. "
-                f"To tell them apart: {escape(a['experiment'])}.</li>"
+                f"To separate them: {escape(a['experiment'])}.</li>"
             )
         text += "</ul>"
     if alike:

@@ -116,10 +116,10 @@ class Effect(ABC):
 
     def drive(self, history: History, **nonlinear: Any) -> Array:
         """The temperature (E,) °C that drives the linear terms in place of T."""
-        raise NotImplementedError(f"{self.name} is no drive")
+        raise NotImplementedError(f"{self.name} is not a drive")
 
     def signal(self, history: History, **nonlinear: Any) -> Array:
-        """The time courses (E, k) that the coefficients multiply; k is 1 but for oscillations."""
+        """The time series (E, k) that the coefficients multiply; k is 1 but for oscillations."""
         raise NotImplementedError(f"{self.name} has no signal")
 
     def channel(self, history: History, **nonlinear: Any) -> str:  # noqa: ARG002
@@ -168,7 +168,7 @@ class Effect(ABC):
 
         What happens between two readings, or after the last, no reading tells; their noise is not
         meant. rate_jump (E,) K/s: how uncertain the rate of the temperature is at the frames,
-        because it jumps beside them. Most effects need the temperature alone, which straight lines
+        because it jumps next to them. Most effects need the temperature alone, which straight lines
         between readings tell.
         """
         return np.zeros(len(history.times))
@@ -218,7 +218,7 @@ class Effect(ABC):
         values: Mapping[str, Any],
         field: TestField | None = None,  # noqa: ARG002
     ) -> Influence:
-        """What it changes at the history's instants; a drive changes nothing by itself."""
+        """What it changes at the history's times; a drive changes nothing by itself."""
         epochs = len(history.times)
         searched, coefficients = self.split(values)
         if self.kind != "signal" or not any(coefficients.values()):

@@ -19,7 +19,7 @@ __all__ = ["Creep"]
 
 
 class Creep(OfTime):
-    """Adds a t, t in s from the begin of the series: steady-state (secondary) creep.
+    """Adds a t, t in s from the start of the series: steady-state (secondary) creep.
 
     Source: Findley, Lai, Onaran (1976): Creep and Relaxation of Nonlinear Viscoelastic Materials.
 

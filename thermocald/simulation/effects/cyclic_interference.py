@@ -20,7 +20,7 @@ __all__ = ["CyclicInterference"]
 
 
 class CyclicInterference(OfTime):
-    """Adds a sin(2πt/P + φ), t from the begin of the series.
+    """Adds a sin(2πt/P + φ), t from the start of the series.
 
     Its signals are sin(2πt/P) and cos(2πt/P): the phase φ is linear in a fit, is shared by all
     parameters and belongs to one series.

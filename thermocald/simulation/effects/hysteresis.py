@@ -23,7 +23,7 @@ __all__ = ["Hysteresis"]
 class Hysteresis(Effect):
     """The linear terms follow P = min(max(P, T - r), T + r): a play of half-width r on T.
 
-    P rests until T is r away from it, then follows; the loop closes. P = T at the begin.
+    P rests until T is r away from it, then follows; the loop closes. P = T at the start.
     Source: Krasnosel'skii, Pokrovskii (1989): Systems with Hysteresis.
     """
 

@@ -30,7 +30,7 @@ class Displacement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Influence:
-    """What an effect changes at E instants.
+    """What an effect changes at E times.
 
     iop (E, 10), eop (E, 6): added, in the order of IOP_NAMES and EOP_NAMES; scale (E, 3): factors
     of the object coordinates; displacements: of single targets; noise_factor, blur_factor (E,).

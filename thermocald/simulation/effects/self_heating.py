@@ -20,7 +20,7 @@ __all__ = ["SelfHeating"]
 
 
 class SelfHeating(OfTime):
-    """Adds a (1 - exp(-t/τ)), t from the begin of the series.
+    """Adds a (1 - exp(-t/τ)), t from the start of the series.
 
     The step response of one body with capacity C and conductance G to its own power: τ = C/G.
     Source: Incropera, DeWitt (2007): Fundamentals of Heat and Mass Transfer, 6th ed., section 5.3.

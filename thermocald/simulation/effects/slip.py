@@ -19,7 +19,7 @@ __all__ = ["Slip"]
 
 
 class Slip(OfTime):
-    """Adds a from one instant on: a step at `time` (s from the begin of the series).
+    """Adds a from one instant on: a step at `time` (s from the start of the series).
 
     Each series has its own slip: the time does not carry over, nor does the height.
     """
@@ -44,4 +44,4 @@ class Slip(OfTime):
         return (history.times >= time).astype(float)[:, None]
 
     def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
-        return f"a part slipped at {spoken(estimates['time'])} after the begin"
+        return f"a part slipped at {spoken(estimates['time'])} after the start"

@@ -24,7 +24,7 @@ __all__ = ["TargetDisplacement"]
 
 
 class TargetDisplacement(OfTime):
-    """The named targets are (dX, dY, dZ) mm off from `time` (s from the begin) on."""
+    """The named targets are (dX, dY, dZ) mm off from `time` (s from the start) on."""
 
     name = "target_displacement"
     noun = "displaced targets"
@@ -70,4 +70,4 @@ class TargetDisplacement(OfTime):
     def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
         targets = estimates["targets"]["value"]
         named = targets if isinstance(targets, str) else ", ".join(targets)
-        return f"targets {named} have moved at {spoken(estimates['time'])} after the begin"
+        return f"targets {named} have moved at {spoken(estimates['time'])} after the start"

@@ -21,7 +21,7 @@ __all__ = ["ThermalLag"]
 
 
 class ThermalLag(Effect):
-    """The linear terms follow L instead of T, with τ dL/dt = T - L and L = T at the begin.
+    """The linear terms follow L instead of T, with τ dL/dt = T - L and L = T at the start.
 
     The lumped-capacity body: τ = heat capacity × thermal resistance to where T is measured.
     Source: Incropera, DeWitt (2007): Fundamentals of Heat and Mass Transfer, 6th ed., section 5.1.

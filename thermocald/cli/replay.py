@@ -79,7 +79,7 @@ def replay(
 
 def export(
     source: Annotated[Path, typer.Argument(help="A recording (folder) or a store (file).")],
-    format_: Annotated[str, typer.Option("--format", help="csv, or json.")] = "csv",
+    format_: Annotated[str, typer.Option("--format", help="csv, json, or parquet.")] = "csv",
     output: Annotated[
         str, typer.Option("--output", "-o", help="File; - is standard output.")
     ] = "-",
@@ -88,17 +88,36 @@ def export(
     series: Annotated[
         str | None, typer.Option("--series", help="Which of a store: CAMERA/SERIES or SERIES.")
     ] = None,
+    units: Annotated[
+        str,
+        typer.Option("--units", help="px, um, deg instead of mm and rad; named in the columns."),
+    ] = "",
+    time_: Annotated[
+        str, typer.Option("--time", help="seconds since 1970 UTC, or iso.")
+    ] = "seconds",
+    separator: Annotated[str, typer.Option("--separator", help="Of the columns: , ; | tab")] = ",",
+    decimal: Annotated[str, typer.Option("--decimal", help="The decimal mark: . or ,")] = ".",
 ) -> None:
     """One row per epoch: parameters, standard deviations, sigma0, status.
 
+    With one of --units, --time, --separator, --decimal, and as Parquet, the temperatures of all
+    thermometers follow.
+
     Example: thermocald export rpi-heating-M1 --format csv > M1.csv
+    Example: thermocald export M1 --units px,deg --time iso --separator ';' --decimal ',' -o M1.csv
     """
     from thermocald.analysis.series.drift import settled
     from thermocald.analysis.series.table import CSV_COLUMNS, csv_text
+    from thermocald.output import series_export
 
     _check_exterior(exterior)
-    if format_ not in ("csv", "json"):
-        raise UsageError(f"--format {format_}: csv and json are written")
+    if format_ not in ("csv", "json", "parquet"):
+        raise UsageError(f"--format {format_}: csv, json and parquet are written")
+    style = series_export.style_of(units, time_, separator, decimal)
+    if format_ == "parquet" and output == "-":
+        raise UsageError("--format parquet needs a file: -o FILE")
+    if format_ == "json" and not style.is_plain:
+        raise UsageError("--units, --time, --separator and --decimal are for csv and parquet")
     settings = adjustment_settings(free)
     if require_source(source).is_dir():
         table = _recording_table(source, settings, exterior)
@@ -107,7 +126,14 @@ def export(
 
         table = stored_table(source, series, settings, exterior)
     table, _ = settled(table)
-    if format_ == "csv":
+    if format_ == "parquet" or not style.is_plain:
+        known = series_export.camera_and_thermometers(source, series, table.number)
+        columns = series_export.columns_of(table, style, *known)
+        if format_ == "parquet":
+            series_export.write_parquet(columns, Path(output))
+        else:
+            write_text(series_export.as_csv(columns, style), output)
+    elif format_ == "csv":
         write_text("".join(csv_text(table)), output)
     else:
         lines = [line.rstrip("\n").split(",") for line in csv_text(table)][1:]

@@ -47,9 +47,7 @@ class ReadingErrorTerm:
     unresolved: Array | None = None
 
 
-def with_error_term(
-    terms: list[ReadingErrorTerm], new: ReadingErrorTerm
-) -> list[ReadingErrorTerm]:
+def with_error_term(terms: list[ReadingErrorTerm], new: ReadingErrorTerm) -> list[ReadingErrorTerm]:
     """Terms with one more; two that carry the readings in the same way become one direction."""
     for i, old in enumerate(terms):
         alike = old.channel == new.channel and old.operator.shape == new.operator.shape

@@ -1,0 +1,195 @@
+"""A series as people want it: units, times, separators, all thermometers; CSV or Parquet.
+
+The columns of CONVENTIONS §4 with other units have them in their names (`c_px`, `X0_um`,
+`omega_deg`), so that nobody reads one for the other. The temperatures of all thermometers follow.
+"""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import io
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.errors import DataError, DriverMissing, UsageError
+from thermocald.photogrammetry.parameters import PARAMETER_NAMES
+from thermocald.store.recording.reader import open_recording
+from thermocald.store.sources import open_source
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from thermocald.analysis.series.table import SeriesTable
+
+    Array = NDArray[np.float64]
+    Columns = dict[str, NDArray[np.int64] | Array | tuple[str, ...]]
+
+__all__ = [
+    "ExportStyle",
+    "as_csv",
+    "camera_and_thermometers",
+    "columns_of",
+    "style_of",
+    "write_parquet",
+]
+
+UNITS = ("px", "um", "deg")
+_IN_IMAGE, _ANGLES = ("c", "x0", "y0"), ("omega", "phi", "kappa")
+_PLACE = ("X0", "Y0", "Z0")
+
+
+@dataclass(frozen=True, slots=True)
+class ExportStyle:
+    """units: of UNITS, others stay mm and rad; time: `seconds` or `iso`; separator and decimal."""
+
+    units: frozenset[str] = frozenset()
+    time: str = "seconds"
+    separator: str = ","
+    decimal: str = "."
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether it is the form that other programs of ours read."""
+        return self == ExportStyle()
+
+
+def style_of(units: str, time: str, separator: str, decimal: str) -> ExportStyle:
+    """The style that options describe; UsageError for what there is not."""
+    wanted = [u.strip() for u in units.split(",") if u.strip()]
+    for unit in wanted:
+        if unit not in UNITS:
+            raise UsageError(f"--units {unit}: there are {', '.join(UNITS)}, separated by commas")
+    if time not in ("seconds", "iso"):
+        raise UsageError(f"--time {time}: must be seconds or iso")
+    mark = {"tab": "\t", "\\t": "\t"}.get(separator, separator)
+    if mark not in (",", ";", "\t", "|"):
+        raise UsageError(f"--separator {separator}: must be one of , ; | tab")
+    if decimal not in (".", ","):
+        raise UsageError(f"--decimal {decimal}: must be . or ,")
+    if decimal == mark:
+        raise UsageError("--decimal , needs another --separator, such as ';'")
+    return ExportStyle(frozenset(wanted), time, mark, decimal)
+
+
+def camera_and_thermometers(
+    source: Path, series: str | None, numbers: NDArray[np.int64]
+) -> tuple[float, dict[str, Array]]:
+    """The size of a pixel mm, and {channel: (E,) °C at the frames} of epochs `numbers` (E,).
+
+    source: a recording (folder) or a store; series: `CAMERA/SERIES` or `SERIES` of a store.
+    """
+    if source.is_dir():
+        recording = open_recording(source)
+        known = recording.columns.numbers
+        readings = {name: recording.columns.at_frame(name) for name in recording.channels}
+        pitch = recording.camera.sensor.pixel_pitch
+    else:
+        with open_source(source) as store:
+            camera, _, name = (series or "").rpartition("/")
+            stored = store.find_series(camera or None, name or None)
+            known = store.series_columns(stored, ["epoch"])["epoch"].astype(np.int64)
+            readings = store.temperatures_at_frame(stored)
+            pitch = stored.head.camera.sensor.pixel_pitch
+    row = {int(n): i for i, n in enumerate(known)}
+    rows = [row.get(int(n), -1) for n in numbers]
+    padded = {name: np.append(values, np.nan)[rows] for name, values in readings.items()}
+    return pitch, padded
+
+
+def columns_of(
+    table: SeriesTable,
+    style: ExportStyle,
+    pixel_pitch: float | None = None,
+    thermometers: Mapping[str, Array] | None = None,
+) -> Columns:
+    """The columns of a series in some style.
+
+    pixel_pitch: mm, for px; thermometers {name: (E,) °C at the frames}, NaN where not known.
+    UsageError where px are wanted and the pixel's size is not known.
+    """
+    if "px" in style.units and pixel_pitch is None:
+        raise UsageError("--units px: the size of the pixels is not known here")
+    moments: Array | tuple[str, ...] = table.frame_time
+    if style.time == "iso":
+        moments = tuple(_iso(t) for t in table.frame_time.tolist())
+    columns: Columns = {
+        "epoch": table.number, "frame_time": moments, "temperature": table.temperature
+    }  # fmt: skip
+    for prefix, values in (("", table.values), ("sd_", table.sd)):
+        for k, name in enumerate(PARAMETER_NAMES):
+            suffix, factor = _unit(name, style, pixel_pitch)
+            columns[f"{prefix}{name}{suffix}"] = values[:, k] * factor
+        if not prefix:
+            columns["sigma0"] = table.sigma0
+            columns["n_observations"] = table.n_observations
+            columns["n_rejected"] = table.n_rejected
+            columns["status"] = table.status
+    for name, readings in (thermometers or {}).items():
+        columns[f"temperature {name}"] = readings
+    return columns
+
+
+def _unit(name: str, style: ExportStyle, pixel_pitch: float | None) -> tuple[str, float]:
+    """The ending of a parameter's name, and the factor from mm or rad."""
+    if name in _IN_IMAGE and "px" in style.units and pixel_pitch is not None:
+        return "_px", 1.0 / pixel_pitch
+    if name in (*_IN_IMAGE, *_PLACE) and "um" in style.units:
+        return "_um", 1000.0
+    if name in _ANGLES and "deg" in style.units:
+        return "_deg", 180.0 / np.pi
+    return "", 1.0
+
+
+def _iso(seconds: float) -> str:
+    moment = datetime.fromtimestamp(seconds, UTC)
+    return moment.isoformat(timespec="microseconds").replace("+00:00", "Z")
+
+
+def as_csv(columns: Columns, style: ExportStyle) -> str:
+    """The columns as text; numbers keep every digit, what is not known stays empty."""
+    text = io.StringIO()
+    writer = csv.writer(text, delimiter=style.separator, lineterminator="\n")
+    writer.writerow(columns)
+    cells = [_cells(name, values, style) for name, values in columns.items()]
+    writer.writerows(zip(*cells, strict=True))
+    return text.getvalue()
+
+
+def _cells(
+    name: str, values: NDArray[np.int64] | Array | tuple[str, ...], style: ExportStyle
+) -> list[str]:
+    if isinstance(values, tuple):
+        return list(values)
+    if np.issubdtype(values.dtype, np.integer):
+        return [str(v) for v in values.tolist()]
+    digits = [
+        "" if not np.isfinite(v) else f"{v:.6f}" if name == "frame_time" else repr(v)
+        for v in values.tolist()
+    ]
+    return [d.replace(".", style.decimal) for d in digits] if style.decimal != "." else digits
+
+
+def write_parquet(columns: Columns, path: Path) -> None:
+    """The columns as a Parquet file, whole or not at all; numbers bit for bit."""
+    if importlib.util.find_spec("pyarrow") is None:
+        raise DriverMissing("writing Parquet needs pyarrow: pip install 'thermocald[parquet]'")
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    table = pa.table({name: pa.array(list(v) if isinstance(v, tuple) else v)
+                         for name, v in columns.items()})  # fmt: skip
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        path.absolute().parent.mkdir(parents=True, exist_ok=True)
+        parquet.write_table(table, partial)
+        partial.replace(path)
+    except OSError as cause:
+        partial.unlink(missing_ok=True)
+        raise DataError(f"{path}: cannot be written: {cause.strerror or cause}") from cause

@@ -1,9 +1,12 @@
 """Several photographs of one camera: one interior orientation, an exterior one per photograph.
 
-Each photograph contributes its normal equations with its exterior orientation reduced. A
-photograph too poor to carry an interior orientation of its own takes part all the same.
+A target is where it is in all photographs: its coordinates are unknowns with the test field's
+sigmas as prior, eliminated once over all its rays. The weights of the image points do not depend on
+the unknowns, so that Gauss-Newton ends at the minimum of the sum of squares. A photograph too poor
+to carry an interior orientation of its own takes part all the same.
 
-Source: Luhmann et al. (2014), section 7.3 (test-field calibration).
+Source: Luhmann et al. (2014), section 7.3 (test-field calibration); the elimination of points as
+Brown, D. C. (1976): The bundle adjustment - progress and prospects.
 """
 
 from __future__ import annotations
@@ -20,9 +23,11 @@ from thermocald.photogrammetry.camera.camera_model import (
     partials,
 )
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
-from thermocald.photogrammetry.epoch.gauss_markov import chi2_2d, cofactor_root, point_covariances
+from thermocald.photogrammetry.epoch.gauss_markov import chi2_2d, point_covariances
 from thermocald.photogrammetry.epoch.geometry import image_coverage, obliqueness_deg
+from thermocald.photogrammetry.linalg import diagonal_scale, scaled_inverse
 from thermocald.photogrammetry.orientation.approximate import plane_fit
+from thermocald.photogrammetry.parameters import EOP_COLUMNS, free_columns
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -39,7 +44,9 @@ __all__ = ["CommonInterior", "adjust_common_interior"]
 
 _ITERATIONS = 60
 _CONVERGED = 1e-3
-_ROUNDS = 6
+_ROUNDS = 10
+_UNTESTABLE = 1e-6  # of its variance: a ray whose residual its target takes up
+_LEAST_SIGMA_MM = 1e-6  # of a coordinate without sigma beside others with one
 _LARGEST_OBLIQUENESS_NEEDED_DEG = 20.0
 
 
@@ -62,19 +69,36 @@ class CommonInterior:
     residuals: tuple[Array, ...]
     reasons: tuple[str, ...]
 
+    @property
+    def sd(self) -> Array:
+        """Standard deviations (16,), 0 where held."""
+        return np.sqrt(np.diag(self.covariance))
+
 
 @dataclass(frozen=True, eq=False)
-class _Block:
-    """Normal equations of one photograph: interior (q), coupling, exterior (6), and its cost."""
+class _State:
+    """Parameters iop (10,), eops (n, 6), and corrections (T, 3) mm of the targets."""
+
+    iop: Array
+    eops: Array
+    shifts: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _System:
+    """Normal equations N (u, u), b (u,) of interior (q) and exteriors (6 each) with the targets
+    eliminated; what gives the targets' own step: Q (T, 3, 3), C (u, T, 3), d (T, 3); the weighted
+    sum of squares; residuals px and tests (chi-square, 2) of each photograph.
+    """
 
     N: Array
-    C: Array
-    E: Array
     b: Array
-    e: Array
+    Q: Array
+    C: Array
+    d: Array
     cost: float
-    residuals: Array
-    tests: Array
+    residuals: tuple[Array, ...]
+    tests: tuple[Array, ...]
 
 
 def adjust_common_interior(
@@ -90,18 +114,19 @@ def adjust_common_interior(
     Raises GeometryError where the adjustment does not converge or is singular.
     """
     s = settings or AdjustmentSettings()
-    free = np.array([i for i in AdjustmentSettings(free=s.free).unknowns if i < 10], dtype=np.int64)
-    values = interior.as_array()
+    problem = _Problem(
+        sensor, testfield, tuple(photographs), np.array(free_columns(s.free), dtype=np.int64)
+    )
     eops = np.array([e.as_array() for e in exteriors])
+    state = _State(interior.as_array(), eops, np.zeros((len(testfield), 3)))
     used = [np.ones(len(o), dtype=bool) for o in photographs]
     for _ in range(_ROUNDS):
-        values, eops, blocks, root = _solve(
-            sensor, testfield, photographs, values, eops, used, free
-        )
-        kept = _snoop(blocks, used, s.snooping_alpha)
+        state, system = problem.solve(state, used)
+        kept = _snoop(system.tests, photographs, used, s.snooping_alpha)
         if all(np.array_equal(a, b) for a, b in zip(kept, used, strict=True)):
             break
         used = kept
+    free, values, eops = problem.free, state.iop, state.eops
     n = sum(int(m.sum()) for m in used)
     redundancy = 2 * n - len(free) - 6 * len(photographs)
     if redundancy < s.bounds.minimum_redundancy:
@@ -109,16 +134,14 @@ def adjust_common_interior(
             f"{n} image points in {len(photographs)} photographs leave a redundancy of "
             f"{redundancy}; at least {s.bounds.minimum_redundancy} is needed"
         )
-    variance = sum(b.cost for b in blocks) / redundancy
-    factor = variance if s.scale == "posterior" else 1.0
-    Q = root @ root.T
+    variance = system.cost / redundancy
+    Q = _inverse(system.N) * (variance if s.scale == "posterior" else 1.0)
+    q = len(free)
     covariance = np.zeros((16, 16))
-    covariance[np.ix_(free, free)] = Q * factor
-    exterior_covariances = np.empty((len(photographs), 6, 6))
-    for k, block in enumerate(blocks):
-        own = np.linalg.inv(block.E)
-        G = own @ block.C.T
-        exterior_covariances[k] = (own + G @ Q @ G.T) * factor
+    covariance[np.ix_(free, free)] = Q[:q, :q]
+    exterior_covariances = np.array([Q[k : k + 6, k : k + 6] for k in range(q, len(Q), 6)]).reshape(
+        -1, 6, 6
+    )
     result_eops = tuple(ExteriorOrientation.from_array(e) for e in eops)
     reasons = _weaknesses(sensor, testfield, photographs, used, values, eops, covariance, s)
     return CommonInterior(
@@ -129,103 +152,163 @@ def adjust_common_interior(
         float(np.sqrt(variance)),
         redundancy,
         tuple(used),
-        tuple(b.residuals for b in blocks),
+        system.residuals,
         tuple(reasons),
     )
 
 
-def _block(
-    sensor: Sensor,
-    testfield: TestField,
-    obs: Observations,
-    iop: Array,
-    eop: Array,
-    used: Mask,
-    free: NDArray[np.int64],
-) -> _Block:
-    predicted, A, B = partials(sensor, iop, eop, testfield.points[obs.targets])
-    if not np.isfinite(predicted[used]).all():
-        raise GeometryError("targets came to lie behind the camera during the iteration")
-    residuals = obs.points - predicted
-    variances = testfield.sigmas[obs.targets] ** 2
-    cov = point_covariances(obs, B, variances if variances.any() else None)
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """What does not change in the adjustment; free: positions of the free interior parameters."""
+
+    sensor: Sensor
+    testfield: TestField
+    photographs: tuple[Observations, ...]
+    free: NDArray[np.int64]
+
+    def system(self, state: _State, used: Sequence[Mask]) -> _System:
+        """The normal equations at a state; raises GeometryError for targets behind the camera."""
+        q, T = len(self.free), len(self.testfield)
+        u = q + 6 * len(self.photographs)
+        N, b, C = np.zeros((u, u)), np.zeros(u), np.zeros((u, T, 3))
+        M, d, uncertain, cost = self._priors(state)
+        residuals, rays = [], []
+        for k, (obs, mask) in enumerate(zip(self.photographs, used, strict=True)):
+            points = self.testfield.points[obs.targets] + state.shifts[obs.targets]
+            predicted, A, B = partials(self.sensor, state.iop, state.eops[k], points)
+            if not np.isfinite(predicted[mask]).all():
+                raise GeometryError("targets came to lie behind the camera during the iteration")
+            P, r = _inverse_covariances(obs), obs.points - predicted
+            residuals.append(r)
+            rays.append((B, P))
+            cost += float(np.einsum("ni,nij,nj->", r[mask], P[mask], r[mask]))
+            columns = np.concatenate([self.free, EOP_COLUMNS])
+            rows = np.concatenate([np.arange(q), q + 6 * k + np.arange(6)])
+            Au, Bu, Pu, ru = A[mask][..., columns], B[mask], P[mask], r[mask]
+            PA = Pu @ Au
+            N[np.ix_(rows, rows)] += np.einsum("nik,nil->kl", Au, PA)
+            b[rows] += np.einsum("nik,ni->k", PA, ru)
+            seen = obs.targets[mask]
+            C[rows[:, None], seen] += np.einsum("nik,nij->knj", PA, Bu)
+            M[seen] += np.einsum("nik,nij,njl->nkl", Bu, Pu, Bu)
+            d[seen] += np.einsum("nik,nij,nj->nk", Bu, Pu, ru)
+        C[:, ~uncertain] = 0.0
+        d[~uncertain] = 0.0
+        Q: Array = np.linalg.inv(M).astype(np.float64, copy=False)
+        Q[~uncertain] = 0.0
+        tests = tuple(
+            _tests(r, B, P, Q[obs.targets], mask)
+            for r, (B, P), obs, mask in zip(residuals, rays, self.photographs, used, strict=True)
+        )
+        CQ = np.einsum("utk,tkl->utl", C, Q).reshape(u, -1)
+        N -= CQ @ C.reshape(u, -1).T
+        b -= CQ @ d.ravel()
+        return _System(N, b, Q, C, d, cost, tuple(residuals), tests)
+
+    def _priors(self, state: _State) -> tuple[Array, Array, Mask, float]:
+        """Normal equations (T, 3, 3), (T, 3) of the targets' sigmas, which targets are uncertain,
+        and what their corrections cost.
+        """
+        sigmas = self.testfield.sigmas
+        uncertain: Mask = np.asarray((sigmas > 0).any(axis=1))
+        weight = np.where(uncertain[:, None], 1.0 / np.maximum(sigmas, _LEAST_SIGMA_MM) ** 2, 1.0)
+        M = weight[:, :, None] * np.eye(3)
+        d = -weight * state.shifts
+        return M, d, uncertain, float((weight * state.shifts**2).sum())
+
+    def moved(self, state: _State, system: _System, step: Array, fraction: float) -> _State:
+        """The state after a fraction of a step (u,)."""
+        q = len(self.free)
+        iop = state.iop.copy()
+        iop[self.free] += fraction * step[:q]
+        right = system.d - np.einsum("utk,u->tk", system.C, step)
+        shifts = np.einsum("tkl,tl->tk", system.Q, right)
+        return _State(
+            iop,
+            state.eops + fraction * step[q:].reshape(-1, 6),
+            state.shifts + fraction * shifts,
+        )
+
+    def solve(self, state: _State, used: Sequence[Mask]) -> tuple[_State, _System]:
+        """Gauss-Newton with shorter steps where a whole one does not improve."""
+        system = self.system(state, used)
+        for _ in range(_ITERATIONS):
+            step = _inverse(system.N) @ system.b
+            gain = float(system.b @ step) + float(
+                np.einsum("tk,tkl,tl->", system.d, system.Q, system.d)
+            )
+            for fraction in (1.0, 0.5, 0.25, 0.1, 0.03, 0.01):
+                trial = self.moved(state, system, step, fraction)
+                try:
+                    new = self.system(trial, used)
+                except GeometryError:
+                    continue
+                if new.cost <= system.cost * (1 + 1e-9):
+                    break
+            else:
+                if gain < _CONVERGED * max(system.cost, 1.0):
+                    return state, system
+                raise GeometryError("the adjustment does not converge from its start values")
+            saved = system.cost - new.cost
+            state, system = trial, new
+            if fraction == 1.0 and (gain < _CONVERGED**2 or saved < 1e-8 * system.cost):
+                return state, system
+        raise GeometryError(f"the adjustment did not converge in {_ITERATIONS} iterations")
+
+
+def _inverse_covariances(obs: Observations) -> Array:
+    """Inverse covariance (n, 2, 2) px⁻² of the image points."""
+    cov = point_covariances(obs, None, None)
     det = cov[:, 0] * cov[:, 1] - cov[:, 2] ** 2
     P = np.empty((len(obs), 2, 2))
     P[:, 0, 0], P[:, 1, 1] = cov[:, 1] / det, cov[:, 0] / det
     P[:, 0, 1] = P[:, 1, 0] = -cov[:, 2] / det
-    tests = np.einsum("ni,nij,nj->n", residuals, P, residuals)
-    Au, Pu, ru = A[used], P[used], residuals[used]
-    PA = Pu @ Au
-    full = np.einsum("nik,nil->kl", Au, PA)
-    right = np.einsum("nik,ni->k", PA, ru)
-    e = np.arange(10, 16)
-    return _Block(
-        full[np.ix_(free, free)],
-        full[np.ix_(free, e)],
-        full[np.ix_(e, e)],
-        right[free],
-        right[e],
-        float(tests[used].sum()),
-        residuals,
-        tests,
-    )
+    return P
 
 
-def _solve(
-    sensor: Sensor,
-    testfield: TestField,
-    photographs: Sequence[Observations],
-    values: Array,
-    eops: Array,
-    used: Sequence[Mask],
-    free: NDArray[np.int64],
-) -> tuple[Array, Array, list[_Block], Array]:
-    def blocks_at(v: Array, e: Array) -> list[_Block]:
-        return [
-            _block(sensor, testfield, o, v, eop, m, free)
-            for o, eop, m in zip(photographs, e, used, strict=True)
-        ]
-
-    blocks = blocks_at(values, eops)
-    for _ in range(_ITERATIONS):
-        N, b = np.zeros((len(free), len(free))), np.zeros(len(free))
-        own = [np.linalg.pinv(block.E, hermitian=True) for block in blocks]
-        for block, inverse in zip(blocks, own, strict=True):
-            N += block.N - block.C @ inverse @ block.C.T
-            b += block.b - block.C @ inverse @ block.e
-        root = cofactor_root(N, free) if len(free) else np.zeros((0, 0))
-        d = root @ (root.T @ b)
-        de = np.array([i @ (block.e - block.C.T @ d) for i, block in zip(own, blocks, strict=True)])
-        gain = float(b @ d) + sum(
-            float(block.e @ i @ block.e) for i, block in zip(own, blocks, strict=True)
-        )
-        cost = sum(block.cost for block in blocks)
-        for share in (1.0, 0.5, 0.25, 0.1, 0.03, 0.01):
-            trial, trial_eops = values.copy(), eops + share * de
-            trial[free] += share * d
-            try:
-                new = blocks_at(trial, trial_eops)
-            except GeometryError:
-                continue
-            if sum(block.cost for block in new) <= cost * (1 + 1e-9):
-                break
-        else:
-            raise GeometryError("the adjustment does not converge from its start values")
-        values, eops, blocks = trial, trial_eops, new
-        if share == 1.0 and gain < _CONVERGED**2:
-            return values, eops, blocks, root
-        if share == 1.0 and cost - sum(block.cost for block in new) < 1e-8 * cost:
-            return values, eops, blocks, root
-    raise GeometryError(f"the adjustment did not converge in {_ITERATIONS} iterations")
+def _tests(r: Array, B: Array, P: Array, Q: Array, mask: Mask) -> Array:
+    """Chi-square (2) of residuals (n, 2), what they share with their target's coordinates known."""
+    share = np.einsum("nik,nkl,njl->nij", B, Q, B)
+    V = np.linalg.inv(P) + np.where(mask, -1.0, 1.0)[:, None, None] * share
+    determinant = np.linalg.det(V) * np.linalg.det(P)
+    testable = determinant > _UNTESTABLE
+    V[~testable] = np.eye(2)
+    test = np.einsum("ni,nij,nj->n", r, np.linalg.inv(V), r)
+    return np.where(testable, test, 0.0)
 
 
-def _snoop(blocks: Sequence[_Block], used: Sequence[Mask], alpha: float) -> list[Mask]:
-    """Which image points stay; their own leverage is neglected, as hundreds share few unknowns."""
+def _inverse(N: Array) -> Array:
+    """Inverse of the normal matrix; raises GeometryError where the photographs do not carry it."""
+    scale = diagonal_scale(N)
+    try:
+        np.linalg.cholesky(N * np.outer(scale, scale))
+        return scaled_inverse(N)
+    except np.linalg.LinAlgError:
+        raise GeometryError(
+            "the normal matrix is singular: these photographs do not separate the parameters; "
+            "take some from other directions or hold parameters fixed"
+        ) from None
+
+
+def _snoop(
+    tests: Sequence[Array], photographs: Sequence[Observations], used: Sequence[Mask], alpha: float
+) -> list[Mask]:
+    """Which image points stay; of the rays of one target only the worst goes at a time.
+
+    The leverage on the camera's parameters is neglected, as hundreds of points share few unknowns.
+    """
     if alpha <= 0:
         return list(used)
-    tests = np.concatenate([block.tests[m] for block, m in zip(blocks, used, strict=True)])
-    limit = chi2_2d(alpha) * max(float(np.median(tests)) / (2 * np.log(2)), 1e-12)
-    return [block.tests <= limit for block in blocks]
+    offered = np.concatenate([test[m] for test, m in zip(tests, used, strict=True)])
+    limit = chi2_2d(alpha) * max(float(np.median(offered)) / (2 * np.log(2)), 1e-12)
+    size = 1 + max(int(o.targets.max(initial=0)) for o in photographs)
+    worst = np.zeros(size)
+    for test, o, m in zip(tests, photographs, used, strict=True):
+        np.maximum.at(worst, o.targets[m], test[m])
+    return [
+        (test <= limit) | (m & (test < worst[o.targets]))
+        for test, o, m in zip(tests, photographs, used, strict=True)
+    ]
 
 
 def _weaknesses(
@@ -250,7 +333,7 @@ def _weaknesses(
             reasons.append(
                 f"one plane, in all {len(eops)} photographs within {max(angles):.0f}° of frontal "
                 f"(some at {_LARGEST_OBLIQUENESS_NEEDED_DEG:.0f}° and more are needed): principal "
-                "distance and distance to the field cannot be told apart, however small the "
+                "distance and distance to the field cannot be separated, however small the "
                 "residuals are"
             )
     points = np.concatenate([o.points[m] for o, m in zip(photographs, used, strict=True)])

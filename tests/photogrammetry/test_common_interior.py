@@ -1,0 +1,76 @@
+"""One camera from several photographs: a target's coordinate error is the same in all of them."""
+
+from __future__ import annotations
+
+import corner_camera as scene
+import numpy as np
+import pytest
+
+from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, project
+from thermocald.photogrammetry.epoch.common_interior import adjust_common_interior
+from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.photogrammetry.parameters import PRINCIPAL
+
+STATIONS = [
+    scene.looking_at(centre, [150, 180, 160], roll)
+    for centre, roll in (
+        ([950, 900, 800], 0.0), ([1100, 500, 700], 1.5), ([500, 1100, 750], 0.1),
+        ([800, 800, 1100], 3.1),
+    )
+]  # fmt: skip
+
+
+def photographs(rng, sigma_mm: float, gross: int = 0):
+    """The field as it is known, and image points of the field as it is."""
+    known = scene.corner_field(sigma_mm)
+    rows = np.arange(0, len(known), 2)
+    known = known.subset(rows)
+    true = known.points + rng.normal(0, sigma_mm, known.points.shape)
+    measured = []
+    for station in STATIONS:
+        points = project(scene.SENSOR, scene.INTERIOR.as_array(), station.as_array(), true)
+        seen = np.flatnonzero(np.isfinite(points[:, 0]) & scene.SENSOR.contains(points))
+        points = points[seen] + rng.normal(0, scene.SIGMA_PX, (len(seen), 2))
+        bad = rng.choice(len(seen), gross, replace=False)
+        points[bad] += rng.uniform(3, 20, (gross, 2))
+        measured.append(Observations(seen, points, np.full((len(seen), 2), scene.SIGMA_PX)))
+    return known, measured
+
+
+@pytest.mark.parametrize(
+    ("sigma_mm", "count"),
+    [
+        (0.0, 40),
+        (0.05, 40),
+        pytest.param(0.02, 200, marks=pytest.mark.slow),
+        pytest.param(0.1, 200, marks=pytest.mark.slow),
+    ],
+)
+def test_the_camera_is_as_sure_as_stated(sigma_mm, count):
+    """Draws of field and image noise: error over sd of c, x0, y0, and no draw without end."""
+    z, sigma0 = [], []
+    for k in range(count):
+        known, measured = photographs(np.random.default_rng([7, k]), sigma_mm)
+        r = adjust_common_interior(
+            scene.SENSOR, known, measured, InteriorOrientation(3.0), STATIONS
+        )
+        z.append((r.interior.as_array() - scene.INTERIOR.as_array())[PRINCIPAL] / r.sd[PRINCIPAL])
+        sigma0.append(r.sigma0)
+    rms = np.sqrt(np.mean(np.square(z), axis=0))
+    assert rms == pytest.approx(np.ones(3), abs=3 / np.sqrt(2 * count))
+    assert np.mean(sigma0) == pytest.approx(1.0, abs=0.03)
+
+
+def test_gross_errors_are_found():
+    known, measured = photographs(np.random.default_rng(8), 0.05, gross=2)
+    r = adjust_common_interior(scene.SENSOR, known, measured, InteriorOrientation(3.0), STATIONS)
+    assert sum(int((~m).sum()) for m in r.used) == pytest.approx(8, abs=2)
+    assert r.sigma0 == pytest.approx(1.0, abs=0.15)
+
+
+def test_a_field_without_sigmas_is_taken_as_it_is():
+    known, measured = photographs(np.random.default_rng(9), 0.02)
+    exact = TestField.build(known.names, known.points)
+    r = adjust_common_interior(scene.SENSOR, exact, measured, InteriorOrientation(3.0), STATIONS)
+    s = adjust_common_interior(scene.SENSOR, known, measured, InteriorOrientation(3.0), STATIONS)
+    assert r.sigma0 > 1.2 * s.sigma0

@@ -7,13 +7,20 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from thermocald.acquisition.calibrator import Calibrator
 from thermocald.analysis.series.drift import courses, settled
+from thermocald.analysis.series.stored import stored_table
 from thermocald.analysis.series.table import SeriesTable, table_of_series
+from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import project
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.series.result import SeriesSettings
 from thermocald.simulation.demonstration import demonstration_model
 from thermocald.simulation.testfields import corner_field
+from thermocald.store.database.row import EpochResult
+from thermocald.store.database.store import Store
+from thermocald.store.recording.head import CameraSpec, Channel, Head
 
 SIGMA = 0.05
 
@@ -65,3 +72,30 @@ def test_a_target_that_wanders_is_no_drift_of_the_camera():
 def test_without_a_drift_none_is_claimed():
     claims = [any(c.drifts for c in courses(series(s, warms=False))) for s in range(20, 26)]
     assert sum(claims) <= 1
+
+
+def test_what_is_stored_is_what_is_exported(tmp_path):
+    """A store's export is the numbers in it, as in the dashboard's CSV; not adjusted again."""
+    field = corner_field("plain", per_side=4, pitch_mm=150.0)
+    model, rng = demonstration_model(field), np.random.default_rng(3)
+    camera = CameraSpec("cam", model.sensor, 3.04, None)
+    head = Head("r", "M1", 10.0, camera, {"temperature": Channel("degC", 0.06)})
+    calibrator = Calibrator(model.sensor, field, nominal_c=3.04)
+    points = project(
+        model.sensor, model.interior.as_array(), model.exterior.as_array(), field.points
+    )
+    path = tmp_path / "a.db"
+    with Store.open(path, "append", durable=False) as store:
+        series = store.create_series(head, field)
+        for k in range(1, 6):
+            measured = Observations(
+                np.arange(len(field)), points + rng.normal(0, 0.05, points.shape),
+                np.full((len(field), 2), 0.05),
+            )  # fmt: skip
+            epoch = Epoch(k, 10.0 * k, 10.0 * k, {"temperature": 20.0}, observations=measured)
+            store.append(series, epoch, EpochResult.from_adjustment(calibrator.adjust(measured)))
+        columns = store.series_columns(series, ["c", "sd_c"])
+    table = stored_table(path, None, AdjustmentSettings(), "stored")
+    np.testing.assert_array_equal(table.values[:, 0], columns["c"])
+    np.testing.assert_array_equal(table.sd[:, 0], columns["sd_c"])
+    assert (table.sd[:, 0] > 1e-4).all()

@@ -83,7 +83,14 @@ def export(
     output: Annotated[
         str, typer.Option("--output", "-o", help="File; - is standard output.")
     ] = "-",
-    exterior: ExteriorOption = "auto",
+    exterior: Annotated[
+        str,
+        typer.Option(
+            "--exterior",
+            help="stored: a store's epochs as they were stored; the others adjust the series "
+            "again: auto (of a recording), per_epoch, series, mount.",
+        ),
+    ] = "",
     free: FreeOption = DEFAULT_FREE_TEXT,
     series: Annotated[
         str | None, typer.Option("--series", help="Which of a store: CAMERA/SERIES or SERIES.")
@@ -110,7 +117,10 @@ def export(
     from thermocald.analysis.series.table import CSV_COLUMNS, csv_text
     from thermocald.output import series_export
 
-    _check_exterior(exterior)
+    folder = source.is_dir()
+    exterior = exterior or ("auto" if folder else "stored")
+    if folder or exterior != "stored":
+        _check_exterior(exterior)
     if format_ not in ("csv", "json", "parquet"):
         raise UsageError(f"--format {format_}: csv, json and parquet are written")
     style = series_export.style_of(units, time_, separator, decimal)

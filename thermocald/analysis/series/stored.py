@@ -66,7 +66,10 @@ def replay_into(
 def stored_table(
     path: Path, name: str | None, settings: AdjustmentSettings, exterior: str
 ) -> SeriesTable:
-    """The table of one series of a store; name: `CAMERA/SERIES`, `SERIES`, None: the only one."""
+    """The table of one series of a store; name: `CAMERA/SERIES`, `SERIES`, None: the only one.
+
+    exterior: `stored` for the epochs as they were stored, else how the series is adjusted again.
+    """
     with open_source(path) as store:
         camera, _, series_name = (name or "").rpartition("/")
         series = store.find_series(camera or None, series_name or None)
@@ -127,7 +130,7 @@ def table_of_stored(
         tuple(reasons),
         "per_epoch",
     )
-    if not ok.any():
+    if not ok.any() or exterior == "stored":
         return apart
     observations = [stored.epoch.observations for stored in store.epochs(series)]
     return table_of_series(

@@ -47,7 +47,7 @@ echo "== SBOM of what the wheel was tested with"
     --output-file "dist/thermocald-$version.cdx.json" "$work/venv/bin/python"
 
 if command -v dh >/dev/null; then
-    for release in bookworm trixie; do
+    for release in ${DEBIAN_RELEASES-bookworm trixie}; do
         for architecture in amd64 arm64; do
             echo "== Debian package for $release, $architecture"
             packaging/deb.sh $release $architecture

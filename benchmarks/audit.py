@@ -29,6 +29,7 @@ from thermocald.analysis.online.filter import OnlineFilter
 from thermocald.analysis.statistics.dependence import dependence, holm, slope_p_value
 from thermocald.analysis.statistics.drift_test import drift_test
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
+from thermocald.discovery.verdict.result import discover_series
 from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     InteriorOrientation,
@@ -148,9 +149,11 @@ def epoch(draws: int, rng: np.random.Generator) -> list[Row]:
     return rows
 
 
-def _series(scene: Scene, epochs: int, tremble_px: float, exterior: str):
+def _series(
+    scene: Scene, epochs: int, tremble_px: float, exterior: str, drift: float = 1.0, tau: float = 10
+):
     truth = np.tile(np.concatenate([scene.iop, scene.eop]), (epochs, 1))
-    warm = 1 - np.exp(-np.arange(epochs) / 10)
+    warm = drift * (1 - np.exp(-np.arange(epochs) / tau))
     truth[:, :3] += warm[:, None] * np.array([2e-3, -4.5e-3, 3e-3])
     per_px = scene.sensor.pixel_pitch / scene.iop[0]
     truth[:, 10:13] += tremble_px * per_px * scene.rng.standard_normal((epochs, 3))
@@ -172,7 +175,16 @@ def series(draws: int, rng: np.random.Generator) -> list[Row]:
         sd = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)[:, :3])
         change.append((error[-1] - error[0]) / np.hypot(sd[0], sd[-1]))
         level.append(error.mean(axis=0) / np.sqrt(np.diag(found.level_covariance)[:3]))
+    strong = []
+    for _ in range(max(draws // 10, 4)):
+        scene = Scene(rng, 0.0, 0.5 * NOISE_PX)
+        found, truth = _series(scene, 150, 0.0, "series", drift=4.0, tau=15.0)
+        error = (found.values - truth)[:, :3]
+        sd = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)[:, :3])
+        strong.append((error[-1] - error[0]) / np.hypot(sd[0], sd[-1]))
     return [
+        ratio("`replay`, `study`: a series", "the same, warm-up by 16 px in 150 epochs",
+              "noise of both epochs", np.array(strong)),
         ratio("`replay`, `study`: a series", "sd of last − first; c, x0, y0",
               "noise of both epochs", np.array(change)),
         ratio("`replay`, `study`: a series", "sd of the level; c, x0, y0",
@@ -323,15 +335,29 @@ def thermal(draws: int, rng: np.random.Generator) -> list[Row]:
     return [
         ratio("`fit`", "sd of the rates of c, x0, y0", "image and thermometer noise",
               np.array(rates)),
-        ratio("`fit`, `discover`", "sd of the lag τ", "image and thermometer noise", np.array(tau)),
+        ratio("`fit`", "sd of the lag τ", "image and thermometer noise", np.array(tau)),
     ]  # fmt: skip
 
 
-def _shortened(s, lag: ModelEffect):
+def discovery(draws: int, rng: np.random.Generator) -> list[Row]:
+    """`discover`: the estimate of what was found (false names: discovery-confusion.md)."""
+    tau = []
+    for seed in rng.integers(0, 2**31, max(4, draws // 10)):
+        s = preset_simulation("rpi-v2.1-heating", seed=int(seed))
+        s = _shortened(s, ModelEffect("thermal_lag", {"tau": 70.0}))
+        source = epochs_input(s.head, s.field, list(s.epochs()), "M1")
+        for entry in discover_series([reduce_series(source)]).effects:
+            if entry.effect == "thermal_lag":
+                estimate = entry.estimates["tau"]
+                tau.append((estimate["value"] - 70.0) / estimate["sd"])
+    return [ratio("`discover`", "sd of the lag τ", "image and thermometer noise", np.array(tau))]
+
+
+def _shortened(s, *effects: ModelEffect):
     from dataclasses import replace
 
     programme = replace(s.programme, epochs=120)
-    return replace(s, model=replace(s.model, effects=(lag,)), programme=programme)
+    return replace(s, model=replace(s.model, effects=effects), programme=programme)
 
 
 SECTIONS: dict[str, Callable[[int, np.random.Generator], list[Row]]] = {
@@ -342,6 +368,7 @@ SECTIONS: dict[str, Callable[[int, np.random.Generator], list[Row]]] = {
     "online": online,
     "significance": significance,
     "thermal": thermal,
+    "discovery": discovery,
 }
 
 

@@ -25,7 +25,7 @@ def test_labels_make_cameras_and_series_are_pooled(warm_up):
 def test_first_order_agrees_where_errors_are_small(warm_up):
     camera = study([warm_up()()], StudySettings(sets=50_000)).cameras[0]
     np.testing.assert_allclose(camera.first_order.mean, camera.montecarlo.mean, rtol=0.02)
-    np.testing.assert_allclose(camera.first_order.shares, camera.montecarlo.shares, atol=0.01)
+    np.testing.assert_allclose(camera.first_order.fractions, camera.montecarlo.fractions, atol=0.01)
     # Maxima of 50,000 draws scatter by some per cent.
     np.testing.assert_allclose(
         camera.first_order.expected_largest, camera.montecarlo.largest, rtol=0.2

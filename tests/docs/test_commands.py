@@ -64,6 +64,7 @@ ELSEWHERE = {
     "thermocald study --reference --report reference.html": (
         "tests/cli/test_study_command.py", '"--reference", "--json", "-"',
     ),
+    "python -m benchmarks.audit": ("tests/test_audit.py", "from benchmarks.audit import"),
     "python -m benchmarks.object_space --check": (
         "tests/docs/test_object_space.py", "from benchmarks.object_space import",
     ),

@@ -29,6 +29,7 @@ from thermocald.simulation.demonstration import demonstration_field, demonstrati
 from thermocald.simulation.model import ModelEffect
 from thermocald.simulation.model_file import write_model
 from thermocald.simulation.presets import preset_simulation
+from thermocald.simulation.scene import Scene
 from thermocald.simulation.testfields import corner_field
 from thermocald.store.recording.testfield_file import read_testfield, write_testfield
 
@@ -150,6 +151,20 @@ def photographs_with_times(shelf: Path, folder: Path) -> None:
     write_testfield(folder / "surveyed.csv", corner_field("circles", 4, 150.0))
 
 
+def how_to_calibrate(shelf: Path, folder: Path) -> None:
+    """Three photographs of the markers' corner, rendered."""
+    del shelf
+    field = demonstration_field("markers")
+    camera = demonstration_model(field)
+    scene = Scene(camera.sensor, field)
+    (folder / "photos").mkdir()
+    for k, turn in enumerate((0.0, 0.05, -0.05)):
+        eop = camera.exterior.as_array() + np.array([0, turn, 20 * turn, 400 * turn, 0, 0])
+        frame = scene.render(camera.interior.as_array(), eop, None, [k], 1.0)
+        cv2.imwrite(str(folder / "photos" / f"{k}.png"), frame)
+    write_testfield(folder / "testfield.csv", field)
+
+
 def how_to_daemon(shelf: Path, folder: Path) -> None:
     put_config(folder, "demo")
     put_recordings(shelf, folder, "M1")
@@ -199,6 +214,7 @@ World = Callable[[Path, Path], None]
 WORLDS: dict[str, World] = {
     "docs/explanation/discovery.md": lambda s, f: put_recordings(s, f, "M1", "M2"),
     "docs/explanation/simulation.md": simulation,
+    "docs/how-to/calibrate.md": how_to_calibrate,
     "docs/how-to/daemon.md": how_to_daemon,
     "docs/how-to/dashboard.md": store,
     "docs/how-to/make-a-recording.md": photographs_with_times,

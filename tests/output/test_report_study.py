@@ -89,7 +89,7 @@ def test_a_study_of_nearly_nothing_says_why(empty_study):
 def test_tables_hold_the_numbers_of_the_study(html, warm_study):
     words = " ".join(Page(html).words)
     mc = warm_study.cameras[0].montecarlo
-    assert f"{100 * mc.shares[0]:.1f} %" in words
+    assert f"{100 * mc.fractions[0]:.1f} %" in words
     assert f"{mc.overall_mean / 10:.2f} cm" in words
     for name in ("success ratio", "n effective", "p naive", "noise (sd)", "sd over time"):
         assert name in words

@@ -11,6 +11,7 @@ from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.parameters import PRINCIPAL, PRINCIPAL_POINT
 from thermocald.photogrammetry.series.adjustment import SeriesSettings, adjust_series
 from thermocald.photogrammetry.series.mount import Movement, drift_period
+from thermocald.photogrammetry.series.variance_components import components
 
 STILL, TREMBLES, SWAYS = Tremble(0.0), Tremble(0.1), Tremble(0.1, 0.8)
 
@@ -121,3 +122,13 @@ def test_a_camera_cannot_drift_within_a_minute_unless_it_warms_up():
     assert drift_period(minute, unknown) == 0.0
     assert drift_period(minute, np.linspace(20, 23, len(minute))) > 0
     assert drift_period(hour, np.full(len(hour), 20.0)) == 24.0
+
+
+def test_a_strong_warm_up_is_no_movement_of_the_mount():
+    """16 px with a time constant of 15 epochs, seen to 0.004 px: nothing of it is the mount's."""
+    t = np.arange(150)
+    drift = 4000.0 * (1 - np.exp(-t / 15.0))[:, None] * np.array([1.0, -0.6])
+    for seed in range(5):
+        noise = np.random.default_rng(seed).standard_normal((150, 2))
+        found = components(drift + noise, 24.0)
+        assert found.white.max() + found.slow.max() < 1.0

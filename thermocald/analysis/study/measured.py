@@ -1,8 +1,8 @@
 """A measured series as the study reads it: columns of numbers, whoever calibrated the epochs.
 
 Only epochs with a result are rows; what the others lacked is counted by reason. Standard deviations
-are those that one epoch adds to its series: what all epochs share (the exterior orientation, the
-test field) cancels in every comparison between epochs.
+are those that one epoch adds to its series: what all epochs have in common (the exterior
+orientation, the test field) cancels in every comparison between epochs.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ __all__ = ["Clip", "MeasuredSeries", "Thermometer"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Thermometer:
-    """One channel at the instants of the frames: values (E,) °C, NaN where missing; noise sd K."""
+    """One channel at the times of the frames: values (E,) °C, NaN where missing; noise sd K."""
 
     name: str
     values: Array

@@ -64,8 +64,8 @@ class MonteCarlo:
     folded: int
 
     @property
-    def shares(self) -> Array:
-        """Share of all distances per cluster (m+1,)."""
+    def fractions(self) -> Array:
+        """Fraction of all distances per cluster (m+1,)."""
         return np.asarray(self.counts.sum(axis=0) / self.counts.sum())
 
     @property
@@ -89,7 +89,7 @@ def draw_root(sds: Array, correlation: Array) -> Array:
     free = np.flatnonzero(sds > 0)
     r = correlation[np.ix_(free, free)]
     values, vectors = np.linalg.eigh(0.5 * (r + r.T))
-    # The symmetric root: unlike other roots it hangs neither on the signs nor on the order of the
+    # The symmetric root: unlike other roots it depends neither on the signs nor on the order of the
     # eigenvectors, so that nearly the same matrix gives nearly the same draws.
     factor = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
     factor /= np.linalg.norm(factor, axis=1, keepdims=True)
@@ -113,7 +113,7 @@ def simulate_errors(
 ) -> MonteCarlo:
     """Draw IOP about `iop` (10,) and cluster the errors on the plane.
 
-    sds (10,) in the units of the IOP, correlation (10, 10); progress is told how many sets were
+    sds (10,) in the units of the IOP, correlation (10, 10); progress receives how many sets were
     done. Raises GeometryError where the expected point of a grid point does not exist.
     """
     points = image_grid(sensor, grid)
@@ -191,8 +191,8 @@ def plane_errors(
 class _PlaneErrors:
     """Errors of fixed image points under many sets of IOP.
 
-    The ideal point of each set begins at its first-order value, where its Jacobian is evaluated
-    once; two or three steps then are enough. A general inversion would begin at the image point.
+    The ideal point of each set starts at its first-order value, where its Jacobian is evaluated
+    once; two or three steps then are enough. A general inversion would start at the image point.
     """
 
     def __init__(self, sensor: Sensor, iop: Array, points: Array, distance_mm: float) -> None:

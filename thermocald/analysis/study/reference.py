@@ -40,7 +40,7 @@ class Quoted:
     below: percentage of errors below 1.5 cm; mean_cm, maxima_cm: mean error and mean of the nine
     maxima; direction: where the principal point goes as it warms up; opposed: x0 and y0 run
     against each other (r near -1); B_follows, sigma0_follows: whether the decentring and σ₀ are
-    highly correlated with the temperature; far: what is said of errors from 5 to 10 cm; moved_px,
+    highly correlated with the temperature; far: what it says of errors from 5 to 10 cm; moved_px,
     c_mm: principal point and distance; focus_mm: depth of field at 1 m; sigma0_ratio: at the
     highest temperature over the first.
     """
@@ -247,7 +247,7 @@ def _correlations(camera: CameraStudy, quoted: Quoted) -> list[Comparison]:
 
 def _object_space(camera: CameraStudy, quoted: Quoted, mc: MonteCarlo) -> list[Comparison]:
     """All classes of Table 7 of which the text speaks, means and maxima."""
-    percent = 100 * mc.shares
+    percent = 100 * mc.fractions
     found = _about(camera, "errors below 1.5 cm at 10 m", "%", quoted.below, float(percent[0]), 3.0)
     beyond = float(percent[2] + percent[3])
     if quoted.far == "likely":

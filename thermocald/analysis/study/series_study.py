@@ -1,6 +1,6 @@
 """One measured series studied: deviations, significance, temperature dependence.
 
-Everything that cannot be computed is said in `notes`, in words, and is None in its place.
+What cannot be computed is None, and `notes` says why.
 """
 
 from __future__ import annotations

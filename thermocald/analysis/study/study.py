@@ -40,13 +40,13 @@ class FirstOrder:
     """The same covariance propagated to first order, per grid point (k,), mm.
 
     covariance (k, 2, 2) mm²; mean; expected_largest: of as many draws as the Monte-Carlo had;
-    shares (m+1,): of the clusters over all points.
+    fractions (m+1,): of the clusters over all points.
     """
 
     covariance: Array
     mean: Array
     expected_largest: Array
-    shares: Array
+    fractions: Array
 
 
 @dataclass(frozen=True, eq=False)

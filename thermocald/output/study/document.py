@@ -185,7 +185,8 @@ def _object_space(camera: CameraStudy) -> dict[str, Any] | None:
         "seed": mc.seed,
         "distance_mm": mc.distance_mm,
         "clusters_mm": list(mc.clusters_mm),
-        "shares": mc.shares.tolist(),
+        "fractions": mc.fractions.tolist(),
+        "shares": mc.fractions.tolist(),  # its name until the next version
         "mean_mm": mc.overall_mean,
         "mean_of_maxima_mm": mc.mean_largest,
         "folded_sets": mc.folded,
@@ -207,7 +208,8 @@ def _object_space(camera: CameraStudy) -> dict[str, Any] | None:
             for k in range(len(mc.image_points))
         ],
         "first_order": {
-            "shares": first.shares.tolist(),
+            "fractions": first.fractions.tolist(),
+            "shares": first.fractions.tolist(),  # its name until the next version
             "mean_mm": float(first.mean.mean()),
             "mean_of_maxima_mm": float(first.expected_largest.mean()),
         },

@@ -56,7 +56,7 @@ def error_figure(camera: CameraStudy) -> Figure | None:
         f"Errors on a plane at {mc.distance_mm / 1000:g} m",
         f"Where {mc.sets:,} drawn interior orientations put each image point on a plane at "
         f"{mc.distance_mm / 1000:g} m, relative to where it belongs ({min(_DRAWN, mc.sets)} are "
-        f"drawn). {percent(float(mc.shares[0]))} of all errors are below {limits[0] / 10:g} cm, "
+        f"drawn). {percent(float(mc.fractions[0]))} of all errors are below {limits[0] / 10:g} cm, "
         f"the mean is {mc.overall_mean / 10:.2f} cm; the largest, {mc.largest[worst] / 10:.1f} cm, "
         f"arises at the {_place(worst, size)}.",
         tuple(panels),

@@ -44,7 +44,7 @@ def summary(camera: CameraStudy) -> list[str]:
             "independent normal distributions about the series' mean (the reference's procedure) "
             f"make errors of {mc.overall_mean / 10:.2f} cm on average and up to "
             f"{mc.mean_largest / 10:.1f} cm (mean of the largest of {mc.sets:,} draws); "
-            f"{percent(float(mc.shares[0]))} stay below {mc.clusters_mm[0] / 10:g} cm."
+            f"{percent(float(mc.fractions[0]))} stay below {mc.clusters_mm[0] / 10:g} cm."
         )
         sentences += _trajectory(camera, mc.clusters_mm[0])
     return sentences

@@ -338,10 +338,10 @@ def cluster_table(camera: CameraStudy) -> Table | None:
         f"Errors on a plane at {mc.distance_mm / 1000:g} m",
         ("", *names, "mean", "mean of maxima"),
         (
-            row("simulated", mc.shares, mc.overall_mean, mc.mean_largest),
+            row("simulated", mc.fractions, mc.overall_mean, mc.mean_largest),
             row(
                 "first order",
-                np.maximum(first.shares, 0.0),
+                np.maximum(first.fractions, 0.0),
                 float(first.mean.mean()),
                 float(first.expected_largest.mean()),
             ),

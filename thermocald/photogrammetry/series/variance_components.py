@@ -29,6 +29,8 @@ _WHITE_COST = 8.0  # log-likelihood that a tremble must gain, in the best of six
 _SLOW_COST = 2.0  # that a memory must gain beside it
 _NEGLIGIBLE = 0.02  # of the noise's variance
 _MOST_FREQUENCIES = 2000
+_LEAK_DEGREE = 6
+_LEAST_PER_DEGREE = 20  # fast frequencies: fewer would lose much of the mount itself
 _END = 15  # epochs at each end that tell the slope there
 
 
@@ -49,7 +51,7 @@ def components(course: Array, period: float) -> Components:
     course (E, k) in units of its noise; period: the shortest of the drift in epochs, 0 for none. A
     component that the likelihood does not ask for is 0.
     """
-    power = _cosine_power(_level_at_its_ends(course) if period else course)
+    power = _cosine_power(_without_leak(_level_at_its_ends(course), period) if period else course)
     n = len(course)
     omega = np.pi * np.arange(1, n) / n
     if len(power) > _MOST_FREQUENCIES:  # the high ones are pooled, they look alike
@@ -123,14 +125,37 @@ def _level_at_its_ends(course: Array) -> Array:
     return level
 
 
+def _without_leak(course: Array, period: float) -> Array:
+    """The course (E, k) less the polynomial that explains most of its fast part.
+
+    A strong drift that does not end flat has high frequencies of its own, those of a polynomial;
+    besides a millipixel of noise they would be taken for movements of the mount.
+    """
+    n = len(course)
+    low = int(2 * n / period)
+    if n - 1 - low < _LEAST_PER_DEGREE * _LEAK_DEGREE:
+        return course
+    u = np.linspace(-1.0, 1.0, n)
+    basis = np.stack([u**k for k in range(1, _LEAK_DEGREE + 1)], axis=1)
+    fast, _, _, _ = np.linalg.lstsq(_cosines(basis)[low:], _cosines(course)[low:], rcond=None)
+    clean: Array = course - basis @ fast
+    return clean
+
+
 def _cosine_power(course: Array) -> Array:
     """Squared coefficients (E - 1, k) of the orthonormal cosine transform, without the mean."""
+    power: Array = _cosines(course) ** 2
+    return power
+
+
+def _cosines(course: Array) -> Array:
+    """Coefficients (E - 1, k) of the orthonormal cosine transform, without the mean."""
     n = len(course)
     even = np.concatenate([course, course[::-1]])
     spectrum = np.fft.rfft(even, axis=0)[1:n]
     turn = np.exp(-0.5j * np.pi * np.arange(1, n) / n)[:, None]
-    power: Array = (spectrum * turn).real ** 2 / (2 * n)
-    return power
+    coefficients: Array = (spectrum * turn).real / np.sqrt(2 * n)
+    return coefficients
 
 
 def _pooled(power: Array, omega: Array) -> tuple[Array, Array, Array]:

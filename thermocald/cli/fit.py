@@ -49,6 +49,10 @@ def fit(
         str | None,
         typer.Option("--type", help="Several cameras of one type: fit each, write the type."),
     ] = None,
+    code: Annotated[
+        Path | None,
+        typer.Option("--code", help="Write the model as FILE.h (C, C++) and FILE.py too."),
+    ] = None,
     json: Annotated[
         str | None, typer.Option("--json", help="Write the results as JSON; - for stdout.")
     ] = None,
@@ -72,6 +76,11 @@ def fit(
         fitted_model, document = fitted.model, _document(fitted, held)
     write_model(output, fitted_model)
     document["model"] = str(output)
+    if code is not None:
+        from thermocald.analysis.thermal.thermal_camera import ThermalCamera
+        from thermocald.output.model_code import write_code
+
+        document["code"] = [str(file) for file in write_code(ThermalCamera(fitted_model), code)]
     if json is not None:
         write_json(document, json)
     if json != "-":

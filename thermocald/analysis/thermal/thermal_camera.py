@@ -327,6 +327,21 @@ class ThermalCamera:
     def _steady(self) -> _Steady:
         return self._with(None)
 
+    def steady_polynomials(self) -> tuple[Array, Array, Array]:
+        """The parameters of the steady camera as polynomials in T - T0: three times (10,).
+
+        UsageError for a model that needs more than one thermometer.
+        """
+        if self._uses_channels:
+            raise UsageError("the model needs more than one thermometer: it is no function of T")
+        return self._steady.p
+
+    def steady_knees(self) -> tuple[tuple[float, ...], ...]:
+        """For each knee its temperature °C, and by how much a kelvin beyond it changes each of the
+        ten parameters.
+        """
+        return tuple((knee, *rate.tolist()) for knee, rate, _, _ in self._steady.knees)
+
     def _with(self, channels: Mapping[str, float] | None) -> _Steady:
         """The steady camera as polynomials; see the module's docstring for what steady means."""
         names = self.parameters

@@ -309,7 +309,7 @@ def test_correct_images_command(folder, pair):
         ("time,x,y\n0,5,5\n", None, "outside the temperature log"),
         ("time,x,y\n1600000100,5000,5\n", None, "of another camera, or binned"),
         ("time,x\n1600000100,5\n", None, "no column 'y'"),
-        ("time,x,y\n1600000100,five,5\n", None, "line 2, column x: 'five' is no number"),
+        ("time,x,y\n1600000100,five,5\n", None, "line 2, column x: 'five' is not a number"),
         ("time,x,y\n1600000100,5,5\n", "time,temp_degF\n1600000000,80\n", "must be °C"),
         ("time,x,y\n1600000100,5,5\n", "time,t\n9,20\n5,20\n", "line 3, column time: time runs"),
         ("time,x,y\n1600000100,5,5\n", "when,t\n9,20\n", "rows with a time"),

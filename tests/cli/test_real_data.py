@@ -28,11 +28,14 @@ def run(*arguments):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("exterior", ["auto", "series", "per_epoch"])
 @pytest.mark.parametrize("camera", [0, 1, 2, 6])
-def test_fixed_cameras(shared, camera):
+def test_fixed_cameras(shared, camera, exterior):
     """Scatter explained by the stated sds, 0.8 to 1.3, and no drift: nothing happens in 50 s."""
-    done = run("replay", shared / "data" / f"aviary-cam{camera}", "--json", "-")
+    path = shared / "data" / f"aviary-cam{camera}"
+    done = run("replay", path, "--exterior", exterior, "--json", "-")
     assert done.returncode == 0
+    assert "Warning" not in done.stderr
     document = json.loads(done.stdout)
     assert document["epochs"] == 101
     assert document["ok"] + len(document["without_result"]) == 101

@@ -175,3 +175,36 @@ def test_epochs_without_a_result_have_a_reason():
     assert all(r.reasons[e] for e in (3, 5))
     assert np.isnan(r.values[3]).all()
     assert r.ok.sum() == 10
+
+
+@pytest.mark.parametrize("exterior", ["per_epoch", "series"])
+def test_sigma0_is_against_the_stated_sigmas(exterior):
+    """With noise of twice the stated sigmas it is 2, and the standard deviations follow."""
+    field, truth, observations = series(np.random.default_rng(38), epochs=60, coordinate_error=0.0)
+    halved = [replace(o, sigmas=o.sigmas / 2) for o in observations]
+    settings = SeriesSettings(exterior=exterior)
+    stated, wrong = (
+        adjust_series(scene.SENSOR, field, o, scene.INTERIOR, scene.EXTERIOR, settings)
+        for o in (observations, halved)
+    )
+    assert np.median(stated.sigma0) == pytest.approx(1.0, abs=0.05)
+    assert np.median(wrong.sigma0) == pytest.approx(2.0, abs=0.1)
+    assert wrong.noise_ratio == pytest.approx(2.0, abs=0.1)
+    np.testing.assert_allclose(wrong.sd[:, OWN], stated.sd[:, OWN], rtol=0.05)
+
+
+def test_a_gross_error_among_twelve_targets_of_a_series():
+    """It is rejected, or the epoch has no result; `ok` never hides residuals of 20 sigma."""
+    field, truth, observations = series(np.random.default_rng(39), coordinate_error=0.0, epochs=40)
+    few = [o.select(np.isin(o.targets, np.arange(3, 147, 12))) for o in observations]
+    rng = np.random.default_rng(40)
+    for o in few[::3]:
+        o.points[rng.integers(len(o))] += rng.uniform(2, 20, 2)
+    r = adjust_series(
+        scene.SENSOR, field, few, scene.INTERIOR, scene.EXTERIOR,
+        SeriesSettings(exterior="per_epoch"),
+    )  # fmt: skip
+    assert r.ok.sum() > 25
+    assert r.sigma0[r.ok].max() < 3
+    z = ((r.values - truth) / r.sd)[r.ok][:, :3]
+    assert np.sqrt(np.mean(z**2)) < 1.4

@@ -302,19 +302,19 @@ def _tell(document: dict[str, Any]) -> None:
         console.print(
             f"left out: target {name} and what belongs to it moves by itself", highlight=False
         )
-    table = Table(box=None, pad_edge=False)
-    titles = ("", "mean mm", "scatter µm", "sd µm", "ratio", "line µm", "last - first", "drift")
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    titles = ("", "mean mm", "scatter", "sd", "ratio", "line µm", "last - first", "drift")
     for title in titles:
-        table.add_column(title, justify="left" if not title else "right")
+        table.add_column(title, justify="right" if title else "left", no_wrap=True)
     for p in document["parameters"]:
         table.add_row(
             p["name"],
             f"{p['mean']:.5f}",
-            f"{1e3 * p['scatter']:.2f}",
-            f"{1e3 * p['stated_sd']:.2f}",
+            f"{1e3 * p['scatter']:.3f}",
+            f"{1e3 * p['stated_sd']:.3f}",
             f"{p['scatter_over_sd']:.2f}",
-            f"{1e3 * p['change']:+.2f} ± {1e3 * p['sd_change']:.2f}",
-            f"{1e3 * p['last_minus_first']:+.2f} ± {1e3 * p['sd_last_minus_first']:.2f}",
+            f"{1e3 * p['change']:+.3f} ± {1e3 * p['sd_change']:.3f}",
+            f"{1e3 * p['last_minus_first']:+.3f} ± {1e3 * p['sd_last_minus_first']:.3f}",
             _drift(p),
         )
     if document["parameters"]:

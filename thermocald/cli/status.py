@@ -187,10 +187,16 @@ def _warnings(document: dict[str, Any]) -> list[str]:
     store = document["store"]
     if store["state"] != "ok":
         found.append(f"store: {store['state']}: {store['why']} ({store['waiting']} epochs wait)")
+    if store.get("notice"):
+        found.append(f"store: {store['notice']}")
+    if document.get("dashboard", {}).get("why"):
+        found.append(document["dashboard"]["why"])
     if document["frames"]["paused"]:
         found.append(document["frames"]["paused"])
     if not document["clock"]["trusted"]:
         found.append("the clock is not synchronised: times may be wrong")
+    if not document["frames"].get("ages_known", True):
+        found.append("no frame is deleted for its age until the clock can be trusted")
     for kind in ("camera", "thermometer", "output"):
         for name, device in document[f"{kind}s"].items():
             found += [f"{kind} {name}: {text}" for text in device.get("warnings", ())]

@@ -63,6 +63,8 @@ def test_a_backup_is_made_beside_a_writer_verified_and_old_ones_go(run, store_pa
     assert len(list(folder.glob("*.db"))) == 3
     with Store.open(folder / document["backup"].rsplit("/", 1)[1]) as copy:
         assert copy.last_epoch(copy.find_series()) == 6
+    with Store.open(folder / document["backup"].rsplit("/", 1)[1], "append") as restored:
+        assert restored._db.execute("PRAGMA journal_mode").fetchone() == ("wal",)
 
 
 def test_a_damaged_store_is_not_backed_up_and_check_names_the_place(run, store_path, tmp_path):

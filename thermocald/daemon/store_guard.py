@@ -18,6 +18,7 @@ from thermocald.daemon.store_file import StoreFile
 from thermocald.errors import StoreError, StoreFullError
 from thermocald.store.database.row import Event
 from thermocald.store.database.store import Store
+from thermocald.store.database.wal import lost_commits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -88,6 +89,8 @@ class StoreGuard:
 
     def _open(self) -> None:
         self._file = StoreFile(self.path)
+        lost = lost_commits(self._file.wal_path)
+        kept = self._keep_damaged_wal() if lost else ""
         try:
             self.store = Store.open(self.path, "append", durable=self._durable)
         except BaseException:
@@ -96,6 +99,21 @@ class StoreGuard:
             raise
         self._file.remember_wal()
         self._series.clear()
+        if lost:
+            many = "all transactions" if lost < 0 else f"{lost} transactions"
+            self.notice = f"its -wal file was damaged, {many} in it were lost; a copy is in {kept}"
+            log.error("%s: %s", self.path, self.notice, extra={"event": "wal_damaged"})
+            self._events.append(Event(time.time(), "wal_damaged", self.notice))
+
+    def _keep_damaged_wal(self) -> str:
+        """A copy of the -wal file for who wants to look into it."""
+        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+        copy = self.path.with_name(f"{self.path.stem}-wal-damaged-{stamp}")
+        try:
+            shutil.copyfile(self._file.wal_path, copy)
+        except OSError as error:
+            return f"nowhere: {error.strerror}"
+        return str(copy)
 
     @property
     def waiting(self) -> int:

@@ -95,6 +95,7 @@ def connect(path: Path, mode: Mode, *, durable: bool) -> sqlite3.Connection:
             if version < VERSION:
                 connection = _bring_up_to_date(connection, path, version, mode)
             if mode == "append":
+                connection.execute("PRAGMA journal_mode = WAL")  # a restored backup has it not
                 # with FULL, what is committed survives a power cut; with NORMAL, a killed process
                 connection.execute(f"PRAGMA synchronous = {'FULL' if durable else 'NORMAL'}")
                 limit = _WAL_LIMIT_BYTES[durable]

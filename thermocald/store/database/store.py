@@ -43,6 +43,7 @@ from thermocald.store.database.series_table import (
     select_readings,
     select_series,
 )
+from thermocald.store.database.wal import lost_commits
 from thermocald.store.recording.paths import file_name
 from thermocald.store.recording.readings import interpolate_readings
 
@@ -391,6 +392,10 @@ class Store:
         """
         with self._lock, in_words(self.path, "the store cannot be read", reading=True):
             found = examine(self._db)
+        if lost := lost_commits(self.path.resolve().with_name(f"{self.path.resolve().name}-wal")):
+            many = "all transactions" if lost < 0 else f"{lost} transactions"
+            damaged = (f"the -wal file: {many} in it cannot be read", *found.damaged)
+            found = replace(found, damaged=damaged)
         if not found.damaged:
             for series in self.all_series():
                 self.series_columns(series, self.column_names(series))

@@ -1,0 +1,183 @@
+"""A hostile week at random: kills, flipped bits, clock leaps, deletions, attacks on the page.
+
+Every epoch that was reported as stored is in the store as it was reported, or `check` names it, its
+series' gap, or the file as damaged. THERMOCALD_CHAOS_ROUNDS=300 is the whole of it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.daemon.conftest import ENVIRONMENT
+from tests.daemon.test_page_attacks import Page
+from thermocald.errors import ThermocaldError
+from thermocald.store.database.store import Store
+
+pytestmark = pytest.mark.slow
+
+ROUNDS = int(os.environ.get("THERMOCALD_CHAOS_ROUNDS", "40"))
+SEED = int(os.environ.get("THERMOCALD_CHAOS_SEED", "1"))
+
+
+class Chaos:
+    """The daemons of a folder, and what becomes of them."""
+
+    def __init__(self, daemon, offset: Path, preload: str) -> None:
+        self.daemon = daemon
+        self.folder = daemon.folder
+        self.results = daemon.folder / "results.jsonl"
+        self.results.touch()
+        self.offset = offset
+        self.count: dict[str, int] = {}
+        self.page: Page | None = None
+        environment = {**ENVIRONMENT, "LD_PRELOAD": preload, "CLOCK_OFFSET_FILE": str(offset)}
+        self._forker = subprocess.Popen(
+            [sys.executable, str(Path(__file__).with_name("forking.py"))],
+            cwd=self.folder, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            text=True,
+        )  # fmt: skip
+        assert self._forker.stdout.readline() == "ready\n"
+
+    def start(self) -> int:
+        self._forker.stdin.write(json.dumps(["run", "--config", str(self.daemon.config)]) + "\n")
+        self._forker.stdin.flush()
+        return int(self._forker.stdout.readline())
+
+    def progress(self, pid: int) -> None:
+        """Wait for a result that comes from now on."""
+        size, deadline = self.results.stat().st_size, time.monotonic() + 60
+        while self.results.stat().st_size == size:
+            assert time.monotonic() < deadline, (self.folder / "log.txt").read_text()[-3000:]
+            assert Path(f"/proc/{pid}").exists(), (self.folder / "log.txt").read_text()[-3000:]
+            time.sleep(0.01)
+
+    def kill(self, pid: int) -> None:
+        os.kill(pid, signal.SIGKILL)
+        while Path(f"/proc/{pid}").exists():
+            time.sleep(0.005)
+
+    def close(self) -> None:
+        if self.page is not None:
+            self.page.close()
+        self._forker.stdin.close()
+        self._forker.wait(10)
+        self._forker.stdout.close()
+
+    def told(self) -> dict[int, tuple[float, float]]:
+        """What was reported as stored: {epoch: (c, frame_time)}."""
+        return {
+            r["epoch"]: (r["c"], r["frame_time"]) for r in self.daemon.results() if r["stored"]
+        }
+
+    def compare(self, path: Path) -> tuple[int, bool]:
+        """(reported epochs that are absent or other in a store, whether `check` finds fault)."""
+        told = self.told()
+        try:
+            with Store.open(path) as store:
+                found = store.examine()
+                named = bool(found.damaged or found.gaps)
+                series = store.find_series()
+                kept = {
+                    s.epoch.number: (s.result.values[0], s.epoch.frame_time)
+                    for s in store.epochs(series)
+                }
+        except ThermocaldError:
+            return len(told), True
+        wrong = 0
+        for number, (c, frame_time) in told.items():
+            found_c, found_time = kept.get(number, (None, None))
+            # what could not be calibrated in time may have been since
+            wrong += found_time != frame_time or (c is not None and found_c != c)
+        return wrong, named
+
+    def flip(self, rng: np.random.Generator, scratch: Path) -> None:
+        """Flip bits in a copy of what a killed daemon left, and look at that."""
+        shutil.rmtree(scratch, ignore_errors=True)
+        scratch.mkdir()
+        names = [p for p in self.folder.glob("thermocald.db*") if p.is_file()]
+        for name in names:
+            if not name.name.endswith("-shm"):
+                shutil.copy(name, scratch / name.name)
+        before = self.compare(scratch / "thermocald.db")
+        assert not before[0], f"{before} before any bit was flipped: {self.count}"
+        (scratch / "thermocald.db-shm").unlink(missing_ok=True)
+        victims = [p for p in scratch.iterdir() if p.stat().st_size]
+        victim = victims[int(rng.integers(len(victims)))]
+        data = bytearray(victim.read_bytes())
+        for _ in range(int(rng.integers(1, 4))):
+            data[int(rng.integers(len(data)))] ^= 1 << int(rng.integers(8))
+        victim.write_bytes(data)
+        wrong, named = self.compare(scratch / "thermocald.db")
+        self.note("flips")
+        self.note("flips that showed", bool(wrong))
+        assert not wrong or named, f"{wrong} epochs are not right, and nothing says so: {victim} {self.count}"
+
+    def note(self, what: str, happened: bool = True) -> None:
+        self.count[what] = self.count.get(what, 0) + happened
+
+
+@pytest.fixture
+def chaos(daemon, recording, replayed, shim, tmp_path):
+    offset = tmp_path / "offset"
+    offset.write_text("0".ljust(12))
+    daemon.configure(**replayed(recording))
+    made = Chaos(daemon, offset, shim("clock_offset"))
+    yield made
+    made.close()
+
+
+@pytest.mark.timeout(7200)
+def test_what_was_reported_as_stored_is_there_and_right_or_named(chaos, tmp_path):
+    rng = np.random.default_rng(SEED)
+    attackers: list[socket.socket] = []
+    for number in range(ROUNDS):
+        pid = chaos.start()
+        chaos.progress(pid)
+        if chaos.page is None:
+            chaos.page = Page(tmp_path, chaos.daemon.store)
+        page = chaos.page
+        if rng.random() < 0.3:
+            leap = int(rng.choice([120 * 86400, -3600, 7200, -86400]))
+            chaos.offset.write_text(str(leap).ljust(12))
+            time.sleep(rng.uniform(0.1, 0.6))
+            chaos.offset.write_text("0".ljust(12))
+            chaos.note("clock leaps")
+        if rng.random() < 0.4:
+            for _ in range(5):
+                attackers.append(page.slow("/api/series.csv?camera=rpi&series=watch"))
+                attackers.append(socket.create_connection(("127.0.0.1", page.port)))
+            chaos.note("page attacks")
+        if rng.random() < 0.3:
+            files = sorted(p for p in chaos.folder.glob("thermocald.db*") if p.is_file())
+            chosen = files if rng.random() < 0.5 else [files[int(rng.integers(len(files)))]]
+            for path in chosen:
+                path.unlink(missing_ok=True)
+            chaos.progress(pid)  # what the process still has is written again with the next epoch
+            chaos.progress(pid)
+            chaos.note("deletions")
+        time.sleep(rng.uniform(0.0, 0.25))
+        chaos.kill(pid)
+        chaos.note("kills")
+        if rng.random() < 0.5:
+            chaos.flip(rng, tmp_path / "scratch")
+        if number % 10 == 9 or number == ROUNDS - 1:
+            wrong, _ = chaos.compare(chaos.daemon.store)
+            assert wrong == 0
+        while len(attackers) > 60:
+            attackers.pop(0).close()
+    for channel in attackers:
+        channel.close()
+    log = (chaos.folder / "log.txt").read_text()
+    assert "Traceback" not in log, log[log.index("Traceback") - 500 :][:3000]
+    print(f"{ROUNDS} rounds, {len(chaos.told())} epochs reported as stored, 0 lost: {chaos.count}")

@@ -121,7 +121,8 @@ class Chaos:
         wrong, named = self.compare(scratch / "thermocald.db")
         self.note("flips")
         self.note("flips that showed", bool(wrong))
-        assert not wrong or named, f"{wrong} epochs are not right, and nothing says so: {victim} {self.count}"
+        said = f"{wrong} epochs are not right, and nothing says so: {victim} {self.count}"
+        assert not wrong or named, said
 
     def note(self, what: str, happened: bool = True) -> None:
         self.count[what] = self.count.get(what, 0) + happened

@@ -17,6 +17,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     InteriorOrientation,
 )
+from thermocald.photogrammetry.parameters import EOP, IOP
 from thermocald.photogrammetry.series.adjustment import (
     SeriesAdjustment,
     SeriesSettings,
@@ -164,8 +165,8 @@ def table_of_series(
         head.camera.sensor,
         testfield,
         observations,
-        InteriorOrientation.from_array(start[:10]),
-        ExteriorOrientation.from_array(start[10:]),
+        InteriorOrientation.from_array(start[IOP]),
+        ExteriorOrientation.from_array(start[EOP]),
         settings,
     )
     observed, rejected = result.observed.sum(axis=1), result.rejected.sum(axis=1)

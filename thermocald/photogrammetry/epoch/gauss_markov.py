@@ -12,6 +12,7 @@ import numpy as np
 
 from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES, partials, project
+from thermocald.photogrammetry.parameters import EOP, IOP
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -245,7 +246,7 @@ def solve(problem: Problem, start: Array, use: Mask) -> Solution:
     observed = problem.observations.points.T
     pairs = np.empty((len(u) + 1, *observed.shape))  # the partials and the residuals, px
     for _ in range(_ITERATIONS):
-        predicted, A, B = partials(sensor, values[:10], values[10:], problem.points)
+        predicted, A, B = partials(sensor, values[IOP], values[EOP], problem.points)
         covariance = point_covariances(problem.observations, B, problem.target_variances)
         pairs[:-1] = A.transpose(2, 1, 0)[u]
         np.subtract(observed, predicted.T, out=pairs[-1])
@@ -267,7 +268,7 @@ def solve(problem: Problem, start: Array, use: Mask) -> Solution:
         for step in _trial_steps(N, u, root, gradient):
             trial = values.copy()
             trial[u] += step
-            residuals = observed - project(sensor, trial[:10], trial[10:], problem.points).T
+            residuals = observed - project(sensor, trial[IOP], trial[EOP], problem.points).T
             new = problem.cost(_whiten(covariance, residuals)[:, use], trial)
             if np.isfinite(new) and new <= cost * (1 + 1e-9) + 1e-12:
                 break

@@ -14,6 +14,7 @@ import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, PARAMETER_NAMES, rotation
 from thermocald.photogrammetry.orientation.approximate import plane_fit
+from thermocald.photogrammetry.parameters import EOP
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -88,7 +89,7 @@ def weaknesses(
         else:
             _, axes, flat = plane_fit(points)
         if flat:
-            angle = obliqueness_deg(values[10:], axes[2])
+            angle = obliqueness_deg(values[EOP], axes[2])
             if angle < bounds.plane_obliqueness_deg:
                 reasons.append(
                     f"one plane seen at {angle:.0f}° from frontal (at least "

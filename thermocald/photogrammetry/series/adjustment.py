@@ -403,7 +403,8 @@ class _Series:
         stated = sums_of_squares(self.stated, estimate.residuals, system.use)
         sigma0 = np.sqrt(stated / np.where(positive, redundancy, 1.0))
         sigma0[~positive] = np.nan
-        relative, level, trend = system.covariances()
+        cofactors = system.covariances()
+        relative, level, trend = cofactors.relative, cofactors.level, cofactors.trend
         excess, own, sound = np.zeros(16), system.own, system.good
         block = (slice(None), own[:, None], own)
         if s.scale == "posterior":

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import partials, project
+from thermocald.photogrammetry.parameters import EOP, IOP
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -247,6 +248,6 @@ def series_residuals(
 ) -> Array:
     """Measured minus predicted (E, T, 2) px at each epoch's own parameters (E, 16), into `out`."""
     for part in chunks(*grid.points.shape[:2]):
-        predicted = project(sensor, values[part, :10], values[part, 10:], field_points)
+        predicted = project(sensor, values[part, IOP], values[part, EOP], field_points)
         np.subtract(grid.points[part], predicted, out=out[part])
     return out

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     Mask = NDArray[np.bool_]
     Columns = NDArray[np.int64]
 
-__all__ = ["SeriesSystem", "Step", "alike", "line_weights"]
+__all__ = ["SeriesCofactors", "SeriesSystem", "Step", "alike", "line_weights"]
 
 _FARTHEST_PX = 200.0  # that one step may move an image point by
 _CHUNK = 128  # epochs whose couplings with the offsets are held at a time
@@ -54,6 +54,17 @@ class Step:
     d_offsets: Array
     size: float
     sizes: Array
+
+
+@dataclass(frozen=True, eq=False)
+class SeriesCofactors:
+    """relative (E, 16, 16): to the series; level (16, 16): of what all epochs have in common; trend
+    (16, 16): of what the common unknowns do to a straight line from the first to the last epoch.
+    """
+
+    relative: Array
+    level: Array
+    trend: Array
 
 
 @dataclass(eq=False)
@@ -214,9 +225,8 @@ class SeriesSystem:
         )
         return float(q + 2 * T - held)
 
-    def covariances(self) -> tuple[Array, Array, Array]:
-        """Cofactors (E, 16, 16) relative to the series, (16, 16) of what all epochs have in common,
-        and (16, 16) of what the common unknowns do to a straight line from first to last epoch.
+    def covariances(self) -> SeriesCofactors:
+        """The cofactors of all parameters.
 
         An epoch's parameters depend on the common unknowns by -G; what of G is the same in all
         epochs cancels in differences within the series, the rest is the epoch's own.
@@ -247,7 +257,7 @@ class SeriesSystem:
             level = all_level @ all_level.T
         relative = among_all(cofactors, own)
         relative[~self.good] = 0.0
-        return relative, level, trend
+        return SeriesCofactors(relative, level, trend)
 
     def slow(self, errors: Array, group: NDArray[np.int64]) -> Array:
         """Covariance (16, 16) of a straight line over the series from targets' slow errors.

@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Missing", "missing"]
 
+# of the image noise: a rest that is significant but smaller widens the covariance, and leaves the
+# 95 % bands what they say
+_MATERIAL = 0.2
 _FEWEST = 30  # epochs of a series below which no trajectory of 14 orders can be examined
 
 
@@ -68,7 +71,7 @@ def missing(fitter: HypothesisFitter, fit: Fit, free: list[int]) -> Missing:
         significance = max(significance, a.significance)
         if a.adequate:
             continue
-        found = True
+        found = found or a.misfit_px > _MATERIAL * e.sigma_px
         power = _power(a)
         unknowns += _carried(fitter, fit, s, a, power)
         N = e.N.mean(axis=0)

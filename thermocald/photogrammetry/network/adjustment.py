@@ -25,8 +25,10 @@ from thermocald.photogrammetry.camera.camera_model import (
     Sensor,
 )
 from thermocald.photogrammetry.network import bundle as nb
+from thermocald.photogrammetry.network.checks import refuse_before, refuse_narrow, refuse_weak
 from thermocald.photogrammetry.network.covariance import covariance
 from thermocald.photogrammetry.network.datum import Datum, Distance, bring_to_datum
+from thermocald.photogrammetry.network.result import Network, Rejection, Station
 from thermocald.photogrammetry.network.snooping import MIN_RAYS, Cleaned, snoop
 from thermocald.photogrammetry.network.start import approximate
 
@@ -52,75 +54,6 @@ class Photo:
     observations: Observations
 
 
-@dataclass(frozen=True, slots=True)
-class Station:
-    """Where a photograph was taken from; sd of the projection centre, (3,) mm."""
-
-    photo: str
-    exterior: ExteriorOrientation
-    n_targets: int
-    sd_centre: tuple[float, float, float]
-
-
-@dataclass(frozen=True, slots=True)
-class Rejection:
-    """An image point that was left out: residual in px, and its test value over the limit."""
-
-    photo: str
-    target: str
-    residual: float
-    test: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Network:
-    """The adjusted network.
-
-    names: m targets; points (m, 3) mm with covariance (3m, 3m) mm²; n_rays (m,); angles (m,) rad,
-    the largest angle of intersection of each target; interior with covariance (10, 10), zero for
-    what was held; free: names of what was not; residuals: one (n, 2) px per station; unused:
-    targets and photographs left out, with reasons.
-    """
-
-    names: tuple[str, ...]
-    points: Array
-    covariance: Array
-    n_rays: Index
-    angles: Array
-    camera: CameraModel
-    interior_covariance: Array
-    free: tuple[str, ...]
-    stations: tuple[Station, ...]
-    sigma0: float
-    redundancy: int
-    residuals: tuple[Array, ...]
-    rejected: tuple[Rejection, ...]
-    unused: dict[str, str]
-    datum: str
-    sd_scale: float
-
-    @property
-    def sigmas(self) -> Array:
-        """Standard deviations of the targets (m, 3) mm."""
-        result: Array = np.sqrt(np.diag(self.covariance)).reshape(-1, 3)
-        return result
-
-    @property
-    def extent(self) -> float:
-        """The largest distance between two targets, mm (of their bounding box)."""
-        return float(np.linalg.norm(np.ptp(self.points, axis=0)))
-
-    @property
-    def relative_accuracy(self) -> float:
-        """Mean standard deviation of a coordinate over the extent, without the scale's own."""
-        shape = np.diag(self.covariance).mean() - self._scale_share()
-        return float(np.sqrt(max(shape, 0.0)) / self.extent)
-
-    def _scale_share(self) -> float:
-        centred = self.points - self.points.mean(axis=0)
-        return self.sd_scale**2 * float(np.mean(centred**2))
-
-
 def adjust_network(
     sensor: Sensor,
     photos: Sequence[Photo],
@@ -140,8 +73,6 @@ def adjust_network(
     determined; start: an earlier result for the same photographs, whose orientation is begun with.
     Raises GeometryError where the network cannot carry it, with the reasons.
     """
-    from thermocald.photogrammetry.network.checks import refuse_before, refuse_narrow, refuse_weak
-
     rays, left_out = _collect(photos, len(names), names)
     refuse_before(len(photos), rays, distances, names)
     free_rows = np.array([IOP_NAMES.index(name) for name in free], dtype=int)

@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from thermocald.photogrammetry.network.adjustment import Network
     from thermocald.photogrammetry.network.bundle import ImageRays
     from thermocald.photogrammetry.network.datum import Distance
+    from thermocald.photogrammetry.network.result import Network
 
     Array = NDArray[np.float64]
 

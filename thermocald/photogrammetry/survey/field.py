@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from thermocald.photogrammetry.network.adjustment import Network
+    from thermocald.photogrammetry.network.result import Network
 
     Array = NDArray[np.float64]
 

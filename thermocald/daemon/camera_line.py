@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from thermocald.acquisition.frame_check import FrameCheck
     from thermocald.acquisition.live_pipeline import AcquiredEpoch
     from thermocald.daemon.plan import CameraPlan
-    from thermocald.daemon.station import Station
+    from thermocald.daemon.resources import Resources
     from thermocald.hal import Frame
     from thermocald.photogrammetry.field.testfield import Observations
 
@@ -146,7 +146,7 @@ class SeriesRun:
 class CameraLine:
     """One camera; what it takes is changed by one thread, the service's."""
 
-    def __init__(self, plan: CameraPlan, station: Station, begin: float) -> None:
+    def __init__(self, plan: CameraPlan, station: Resources, begin: float) -> None:
         self.plan = plan
         self.station = station
         self.checked: FrameCheck | None = None

@@ -133,7 +133,7 @@ class Station:
         self._retention.join(1.0)
         return done
 
-    def read_now(self, names: tuple[str, ...]) -> None:
+    def read_now(self, names: Sequence[str]) -> None:
         """Read thermometers in the caller's thread: a recording's come with its frames."""
         for name in names:
             thermometer, link = self._thermometers[name]

@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import gzip
 import hmac
+import io
 import json
 import math
+import shutil
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -176,7 +178,13 @@ def _plotly_script() -> bytes:
     found = find_spec("plotly")
     if found is None or found.origin is None:
         raise DataError("the page's charts need plotly: pip install 'thermocald[dashboard]'")
-    return gzip.compress((Path(found.origin).parent / _PLOTLY).read_bytes(), 6)
+    packed = io.BytesIO()
+    with (
+        (Path(found.origin).parent / _PLOTLY).open("rb") as script,
+        gzip.GzipFile(fileobj=packed, mode="wb", compresslevel=6) as file,
+    ):
+        shutil.copyfileobj(script, file)
+    return packed.getvalue()
 
 
 def _plotly(_: Request) -> Response:

@@ -95,7 +95,7 @@ class EpochKeeper:
             return
         first = max(1, self.first_number - count)
         try:
-            for stored in self._guard.store.epochs(series, first):
+            for stored in self._guard.epochs(series, first):
                 seen = stored.epoch.observations
                 if seen is not None and stored.result.status == "ok":
                     yield seen, "event" in stored.extra
@@ -159,7 +159,7 @@ class EpochKeeper:
         if series is None:
             return None
         try:
-            return next(self._guard.store.epochs(series, number, number), None)
+            return next(iter(self._guard.epochs(series, number, number)), None)
         except StoreError as error:
             log.warning("epoch %d cannot be read: %s", number, error)
             return None
@@ -187,7 +187,7 @@ class EpochKeeper:
         last = min(end, first + _CATCH_UP_BATCH - 1)
         # passed over for good if they cannot be read: a damaged row is damaged every time
         self._searched_to = last
-        for stored in self._guard.store.epochs(series, first, last, details=False):
+        for stored in self._guard.epochs(series, first, last, details=False):
             frame = stored.epoch.frame
             if stored.result.status == NOT_CALIBRATED and frame is not None:
                 path = self._frames.root / frame

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.field.testfield import Observations
+    from thermocald.store.database.epoch_table import StoredEpoch
     from thermocald.store.database.row import EpochResult, LoggedReading, StoredSeries
 
 __all__ = ["Row", "StoreGuard"]
@@ -160,6 +161,13 @@ class StoreGuard:
                     created_utc=wanted.created_utc,
                 )
             return self._series[key]
+
+    def epochs(
+        self, series: StoredSeries, first: int, last: int | None = None, *, details: bool = True
+    ) -> list[StoredEpoch]:
+        """Some epochs, read at once: the file must not be followed to another one meanwhile."""
+        with self._lock:
+            return list(self.store.epochs(series, first, last, details=details))
 
     def append(self, row: Row) -> None:
         """Keep an epoch, now or when the store can be written again."""

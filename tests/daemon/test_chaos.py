@@ -76,9 +76,7 @@ class Chaos:
 
     def told(self) -> dict[int, tuple[float, float]]:
         """What was reported as stored: {epoch: (c, frame_time)}."""
-        return {
-            r["epoch"]: (r["c"], r["frame_time"]) for r in self.daemon.results() if r["stored"]
-        }
+        return {r["epoch"]: (r["c"], r["frame_time"]) for r in self.daemon.results() if r["stored"]}
 
     def compare(self, path: Path) -> tuple[int, bool]:
         """(reported epochs that are absent or other in a store, whether `check` finds fault)."""

@@ -69,7 +69,7 @@ def print_(
         write_json(document, json)
     if json == "-":
         return
-    sheets = "1 sheet" if flat else "3 sheets of a corner and how to put it up, "
+    sheets = "1 sheet" if flat else "3 sheets of a corner (and how to put it up)"
     typer.echo(
         f"{out}: {sheets} of {design.page[0]:g} × {design.page[1]:g} mm, {document['coded']} coded "
         f"and {document['plain']} plain circles of {design.diameter:g} mm, {document['markers']} "

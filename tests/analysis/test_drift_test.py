@@ -104,6 +104,15 @@ def test_the_noise_found_is_the_noise_there_is(size):
     assert 0.9 < np.sqrt(np.mean(np.square(off))) < 1.1
 
 
+def test_sds_that_fluctuate_from_epoch_to_epoch_are_no_noise_of_the_drift():
+    """A drift of 4000 sds, and sds known to 4 %: the noise found stays that of an epoch."""
+    rng = np.random.default_rng(13)
+    sds = 1 + 0.04 * rng.standard_normal(N)
+    result = drift_test(4000 * WARM_UP + sds * noise(rng, 0, 0), sds, REDUNDANCY)
+    assert result.noise_ratio == pytest.approx(1.0, abs=4 * result.sd_noise_ratio)
+    assert result.p_value < 1e-6
+
+
 def test_too_few_or_constant_values_are_not_tested():
     assert drift_test(TIME_S[:5], ONES[:5], REDUNDANCY[:5]) is None
     assert drift_test(ONES, ONES, REDUNDANCY) is None

@@ -86,14 +86,14 @@ def drift_test(values: Array, sds: Array, redundancy: Array, window: int = 31) -
     n = len(values)
     if n < _LEAST_VALUES or not np.ptp(values) > 0:
         return None
-    weight = sds**-2
-    standardised = (values - float(weight @ values / weight.sum())) / sds
+    # By one sd for all: those of single epochs fluctuate, and a large drift would with them.
+    standardised = (values - values.mean()) / np.sqrt(np.mean(sds**2))
     standardised = _without_spikes(standardised)
     calm = _without_jumps(standardised)
     whole, fast = _spectrum(standardised), _spectrum(calm)
     bands = _bands(n, window, whole)
     results = [_slow_against_fast(whole, fast, n, band) for band in bands]
-    noise_ratio, sd_noise_ratio = _noise(calm)
+    noise_ratio, sd_noise_ratio = _noise(values, sds)
     mean_square = float(np.mean(sds**2))
     return DriftTest(
         min(1.0, len(bands) * min(results)),
@@ -207,11 +207,11 @@ def _excess(whole: _Spectrum, fast: _Spectrum, band: int, redundancy: float) -> 
     )
 
 
-def _noise(calm: Array) -> tuple[float, float]:
+def _noise(values: Array, sds: Array) -> tuple[float, float]:
     """Scatter between neighbours over the stated sds, and its sd.
 
     From third differences, to which a drift of a thousand sds adds nothing, by their median.
     """
-    third = np.abs(np.diff(calm, n=3))
+    third = np.abs(np.diff(values, n=3)) / sds[1:-2]
     ratio = float(np.median(third)) / (_NORMAL_MEDIAN * np.sqrt(20.0))
     return ratio, ratio * _MEDIAN_SD / float(np.sqrt(len(third)))

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import socket
+import ssl
 import time
 
 import pytest
 
+from tests.drivers.fakes.certificate import own_certificate
 from tests.drivers.fakes.mqtt_broker import Broker
 from thermocald.errors import ConfigurationError, DeviceDenied, DeviceGone, DeviceTimeout
 from thermocald.hal import SystemClock, open_device
@@ -38,10 +40,17 @@ def test_a_result_arrives_and_is_announced(broker):
     results = [json.loads(p) for t, p, _ in broker.messages if t == "thermocald/rpi_1/result"]
     assert results == [RESULT | {"sigma0": None}, RESULT]
     announced = [t for t in topics(broker) if t.startswith("homeassistant/")]
-    assert len(announced) == 8 == len(set(announced))
+    assert len(announced) == 11 == len(set(announced))
     configuration = json.loads({t: p for t, p, _ in broker.messages}[announced[0]])
     assert configuration["state_topic"] == "thermocald/rpi_1/result"
     assert configuration["unit_of_measurement"] == "°C"
+    sent = {t: json.loads(p) for t, p, _ in broker.messages if t in announced}
+    drift = next(m for t, m in sent.items() if "drift_x0_px" in t)
+    assert (drift["unit_of_measurement"], drift["suggested_display_precision"]) == ("px", 2)
+    # the last will is left at `thermocald`: without it the device is not available either
+    assert {a["topic"] for a in drift["availability"]} == {
+        "thermocald/rpi_1/available", "thermocald/thermocald/available"
+    }  # fmt: skip
     available = [p for t, p, _ in broker.messages if t == "thermocald/rpi_1/available"]
     assert available == [b"online", b"offline"]
 
@@ -96,7 +105,7 @@ def test_a_line_that_breaks_leaves_the_will(broker):
     device.emit(RESULT)
     broker.close()
     deadline = time.monotonic() + 2
-    while device._client.is_connected() and time.monotonic() < deadline:
+    while device._line.connected and time.monotonic() < deadline:
         time.sleep(0.01)
     with pytest.raises(DeviceGone):
         device.emit(RESULT)
@@ -107,3 +116,25 @@ def test_a_line_that_breaks_leaves_the_will(broker):
 def test_a_password_needs_a_name():
     with pytest.raises(ConfigurationError, match="username"):
         open_device("output", "mqtt", {"host": "x", "password_file": "y"}, SystemClock())
+
+
+# paho leaves the socket of a refused handshake to the garbage collector, which says so
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_tls(tmp_path):
+    ca, key = own_certificate(tmp_path)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(ca, key)
+    broker = Broker(context=context)
+    try:
+        with output(broker, ca=str(ca), timeout_s=5) as device:
+            device.emit(RESULT)
+        assert "thermocald/rpi_1/result" in topics(broker)
+        with pytest.raises(DeviceDenied, match="not trusted"):
+            output(broker, tls=True, timeout_s=5).open()
+    finally:
+        broker.close()
+
+
+def test_a_key_needs_its_certificate():
+    with pytest.raises(ConfigurationError, match="cert"):
+        open_device("output", "mqtt", {"host": "x", "key": "y"}, SystemClock())

@@ -20,6 +20,7 @@ from thermocald.acquisition.device_loop import DeviceLoop
 from thermocald.acquisition.frame_check import check_frame
 from thermocald.acquisition.link import Link
 from thermocald.acquisition.live_pipeline import LivePipeline
+from thermocald.daemon.drift import START_EPOCHS, SeriesDrift
 from thermocald.daemon.epoch_keeper import EpochKeeper
 from thermocald.daemon.plan import common_unknowns
 from thermocald.errors import ConfigurationError
@@ -77,6 +78,7 @@ class SeriesRun:
             trusted=station.clock.trusted,
             observe=self._observe,
         )
+        self.drift: SeriesDrift | None = None
         self.last: dict[str, Any] = {}
         self._shown = self._previewed = float("-inf")
 
@@ -131,6 +133,7 @@ class SeriesRun:
         station, name = self._line.station, self.plan.name
         report = {} if self.observer is None else self.observer.report()
         row["state"] = report.get("state", "unknown")
+        row |= self._drift(row)
         self.last = {**row, "online": report}
         for output in station.outputs:
             output.put(row)
@@ -141,6 +144,16 @@ class SeriesRun:
             if station.preview and now - self._previewed >= _PREVIEW_EVERY_S:
                 self._previewed = now
                 station.live.write_frame(name, acquired.frame)
+
+
+    def _drift(self, row: dict[str, Any]) -> dict[str, float]:
+        """Against the start of the series, where the size of the pixels is known."""
+        if self.plan.sensor is None:
+            return {}
+        if self.drift is None:
+            earlier = self.keeper.first_rows(START_EPOCHS)
+            self.drift = SeriesDrift(self.plan.sensor.pixel_pitch, earlier)
+        return self.drift.columns(row)
 
 
 class CameraLine:

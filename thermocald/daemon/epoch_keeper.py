@@ -102,6 +102,19 @@ class EpochKeeper:
         except StoreError as error:
             log.warning("earlier epochs cannot be read: %s", error)
 
+    def first_rows(self, count: int) -> list[dict[str, Any]]:
+        """The first epochs with a result that are stored, as rows for the outputs."""
+        series = self.series
+        rows: list[dict[str, Any]] = []
+        if series is not None and self.first_number > 1:
+            try:
+                for stored in self._guard.store.epochs(series, 1, 20 * count):
+                    if stored.result.status == "ok" and len(rows) < count:
+                        rows.append(result_row(self.plan, stored.epoch, stored.result, {}))
+            except StoreError as error:
+                log.warning("the first epochs cannot be read: %s", error)
+        return rows
+
     def keep(self, acquired: AcquiredEpoch) -> None:
         """Keep an epoch; a calibration that was put off is made up for later from its frame."""
         assert acquired.epoch is not None

@@ -6,13 +6,15 @@ The laboratory uses a real mosquitto; this one can withhold an acknowledgement o
 from __future__ import annotations
 
 import socket
+import ssl
 import threading
 
 
 class Broker:
     """`messages` holds (topic, payload, retain); the will of a line that broke is in it too."""
 
-    def __init__(self, port: int = 0) -> None:
+    def __init__(self, port: int = 0, context: ssl.SSLContext | None = None) -> None:
+        self._context = context
         self.messages: list[tuple[str, bytes, bool]] = []
         self.refuse = 0
         self.acknowledge = True
@@ -38,6 +40,12 @@ class Broker:
     def _serve(self, line: socket.socket) -> None:
         will: tuple[str, bytes, bool] | None = None
         try:
+            if self._context is not None:
+                line = self._context.wrap_socket(
+                    line, server_side=True, do_handshake_on_connect=False
+                )
+                self._lines.append(line)
+                line.do_handshake()
             while packet := self._packet(line):
                 kind, flags, body = packet
                 if kind == 1:

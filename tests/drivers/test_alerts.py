@@ -1,0 +1,181 @@
+"""Alerts: once out, once in; delivered by program, web, mail and MQTT, also after an outage."""
+
+from __future__ import annotations
+
+import json
+import math
+import ssl
+import time
+
+import pytest
+from thermocald_drivers.alert_conditions import Watch, condition_of
+
+from tests.drivers.fakes.alert_servers import MailServer, WebServer
+from tests.drivers.fakes.certificate import own_certificate
+from tests.drivers.fakes.mqtt_broker import Broker
+from thermocald.errors import ConfigurationError, DeviceDenied, DeviceError, DeviceTimeout
+from thermocald.hal import SystemClock, VirtualClock, open_device
+
+
+def result(epoch, **values):
+    return {"device": "cam", "series": "watch", "epoch": epoch, "status": "ok",
+            "frame_time": 1.6e9 + 10 * epoch, **values}  # fmt: skip
+
+
+def told(when, results):
+    """(epoch, state) of all changes."""
+    watch = Watch([condition_of(when)])
+    return [(r["epoch"], a.state) for r in results for a in watch.changes(r, "cam")]
+
+
+def test_a_drift_is_out_once_and_in_once():
+    drifts = [0.1, 0.49, 0.51, 0.48, 0.52, math.nan, 0.41, 0.39, 0.45, -0.6]
+    results = [result(i, drift_c_px=d) for i, d in enumerate(drifts)]
+    # 0.48 and 0.41 are under the threshold but not clearly back
+    assert told({"drift": "c", "px": 0.5}, results) == [(2, "out"), (7, "in"), (9, "out")]
+
+
+def test_a_drift_in_standard_deviations_and_from_a_reference():
+    results = [result(i, drift_x0_px=d, sd_drift_x0_px=0.1) for i, d in enumerate([0.3, 0.6])]
+    assert told({"drift": "x0", "sds": 5}, results) == [(1, "out")]
+    results = [result(i, c=c, sd_c=1e-5, pixel_pitch=0.001) for i, c in enumerate([3.04, 3.0412])]
+    assert told({"drift": "c", "px": 0.1, "from_mm": 3.04}, results) == [(1, "out")]
+
+
+def test_temperature_disk_and_epochs_without_result(tmp_path):
+    results = [result(i, temperature=t) for i, t in enumerate([20, 61, 59.5, 58, -11, -9.5, -8])]
+    when = {"temperature": "temperature", "above_c": 60, "below_c": -10}
+    assert told(when, results) == [(1, "out"), (3, "in"), (4, "out"), (6, "in")]
+    words = ["ok", "bad", "bad", "bad", "bad", "ok"]
+    results = [result(i, status=word) for i, word in enumerate(words)]
+    assert told({"no_result": 3}, results) == [(3, "out"), (5, "in")]
+    assert told({"free_disk_gb": 1e6, "path": str(tmp_path)}, results) == [(0, "out")]
+    assert told({"free_disk_gb": 1e-6, "path": str(tmp_path)}, results) == []
+
+
+@pytest.mark.parametrize(
+    "when",
+    [{}, "c", {"drift": "A1", "px": 1}, {"drift": "c"}, {"drift": "c", "px": 1, "sds": 2},
+     {"drift": "c", "px": -1}, {"temperature": "t"}, {"no_result": 0}, {"no_result": 1, "px": 2},
+     {"temperature": "t", "above_c": 5, "below_c": 4}],
+)  # fmt: skip
+def test_a_wrong_condition_is_named(when):
+    with pytest.raises(ConfigurationError, match="when"):
+        condition_of(when)
+
+
+WHEN = [{"drift": "c", "px": 0.5}]
+OUT, IN = result(1, drift_c_px=0.8), result(2, drift_c_px=0.1)
+
+
+def test_a_program_gets_it_without_a_shell(tmp_path):
+    script, log = tmp_path / "hook", tmp_path / "log"
+    script.write_text(f'#!/bin/sh\necho "$1 $THERMOCALD_STATE" >> {log}\ncat >> {log}\n')
+    script.chmod(0o755)
+    options = {"command": [str(script), "$HOME;ls"], "when": WHEN}
+    with open_device("output", "alert_exec", options, VirtualClock()) as device:
+        device.emit(OUT)
+        device.emit(OUT)
+        device.emit(IN)
+    text = log.read_text()
+    assert text.count("$HOME;ls out") == text.count("$HOME;ls in") == 1
+    assert '"value": 0.8' in text
+
+
+def test_a_program_that_hangs_is_killed(tmp_path):
+    script = tmp_path / "hook"
+    script.write_text("#!/bin/sh\nsleep 60\n")
+    script.chmod(0o755)
+    options = {"command": [str(script)], "when": WHEN, "timeout_s": 0.3}
+    with open_device("output", "alert_exec", options, VirtualClock()) as device:
+        begin = time.monotonic()
+        with pytest.raises(DeviceTimeout):
+            device.emit(OUT)
+        assert time.monotonic() - begin < 10
+        with pytest.raises(DeviceTimeout):  # tried again, though the result is the same
+            device.emit(OUT)
+        device.emit(OUT)  # dropped after three tries
+        device.emit(OUT)
+
+
+def test_a_webhook_and_an_outage(tmp_path):
+    server = WebServer()
+    (tmp_path / "token").write_text("swordfish\n")
+    options = {"url": f"http://127.0.0.1:{server.port}/hook?a=1", "when": WHEN,
+               "token_file": str(tmp_path / "token")}  # fmt: skip
+    try:
+        device = open_device("output", "alert_webhook", options, VirtualClock())
+        device.open()
+        server.answer = 503
+        with pytest.raises(DeviceError, match="503"):
+            device.emit(OUT)
+        device.close()  # as the daemon does, before it tries again
+        server.answer = 204
+        device.open()
+        device.emit(IN)
+        device.close()
+        _, kept, back = server.posts
+        assert kept[2]["state"] == "out"
+        assert back[2]["state"] == "in"
+        assert kept[0] == "/hook?a=1"
+        assert kept[1]["Authorization"] == "Bearer swordfish"
+        assert kept[2]["condition"] == "drift_c_px"
+        assert kept[2]["epoch"] == 1
+        server.answer = 302
+        device.open()
+        with pytest.raises(DeviceError, match="302"):
+            device.emit(result(3, drift_c_px=0.9))
+        server.answer = 403
+        with pytest.raises(DeviceDenied):
+            device.emit(result(3, drift_c_px=0.9))
+        assert not [p for p in server.posts if p[0] == "GET"]
+        device.close()
+    finally:
+        server.close()
+
+
+def test_a_letter_by_starttls(tmp_path):
+    ca, key = own_certificate(tmp_path)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(ca, key)
+    server = MailServer(context=context)
+    (tmp_path / "password").write_text("swordfish\n")
+    options = {"host": "127.0.0.1", "port": server.port, "sender": "pi@example.org",
+               "recipients": ["me@example.org"], "username": "pi", "ca": str(ca),
+               "password_file": str(tmp_path / "password"), "when": WHEN}  # fmt: skip
+    try:
+        with open_device("output", "alert_mail", options, VirtualClock()) as device:
+            device.emit(OUT)
+        (letter,) = server.letters
+        assert "Subject: [thermocald] alert: cam: c is 0.8 px from the start" in letter
+        assert all(secure for _, secure in server.logins)
+        assert server.logins
+        server.refuse_login = True
+        with pytest.raises(DeviceDenied, match="password"):
+            device.open()
+        del options["ca"]
+        with pytest.raises(DeviceError, match=r"certificate|CERTIFICATE"):
+            open_device("output", "alert_mail", options, VirtualClock()).open()
+    finally:
+        server.close()
+
+
+def test_a_password_is_not_sent_in_the_open():
+    options = {"host": "x", "sender": "a@b", "recipients": ["a@b"], "when": WHEN,
+               "username": "u", "password_file": "p", "security": "none"}  # fmt: skip
+    with pytest.raises(ConfigurationError, match="without TLS"):
+        open_device("output", "alert_mail", options, VirtualClock())
+
+
+def test_mqtt_retains_what_is_out():
+    broker = Broker()
+    options = {"host": "127.0.0.1", "port": broker.port, "when": WHEN, "timeout_s": 2}
+    with open_device("output", "alert_mqtt", options, SystemClock()) as device:
+        device.emit(OUT)
+    broker.close()
+    configuration, state = broker.messages
+    assert configuration[0].startswith("homeassistant/binary_sensor/")
+    assert state[0] == "thermocald/cam/alert/drift_c_px"
+    assert json.loads(configuration[1])["state_topic"] == state[0]
+    assert json.loads(state[1])["state"] == "out"
+    assert state[2]

@@ -52,7 +52,7 @@ bench: $(STAMP) ## ratios to peers, in one run on one thread
 hil: $(STAMP) ## the laboratory: real kernel drivers without hardware (needs root, apt)
 	tests/hil/run
 
-docs: $(STAMP) ## the documentation as a site in build/site
+docs: $(if $(wildcard $(BIN)/mkdocs),,$(STAMP)) ## the documentation as a site in build/site
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 	@echo "build/site/index.html"
 

@@ -206,6 +206,27 @@ def test_every_command_has_help_with_an_example():
         assert "Example" in run(name, "--help").stdout, name
 
 
+def test_without_a_configuration_run_says_where_it_looked(tmp_path):
+    done = run_in(tmp_path, "run")
+    assert done.returncode == 2
+    assert "./config.yaml" in done.stderr
+    (tmp_path / "config.yaml").write_text("cameras: 3\n")
+    assert "config.yaml: cameras" in run_in(tmp_path, "run").stderr  # it is read
+
+
+def test_a_page_of_no_store_is_an_error(tmp_path):
+    done = run_in(tmp_path, "dashboard", "--store", "no.db")
+    assert done.returncode == 1
+    assert "does not exist" in done.stderr
+
+
+def run_in(folder, *arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "thermocald", *arguments], cwd=folder,
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+
+
 def resident_mb(imports):
     """Resident memory of a process that imports something and waits."""
     code = (

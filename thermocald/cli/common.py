@@ -18,7 +18,16 @@ from thermocald.errors import UsageError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-__all__ = ["jsonable", "log_to_stderr", "printable", "progress", "say", "write_json", "write_text"]
+__all__ = [
+    "default_config",
+    "jsonable",
+    "log_to_stderr",
+    "printable",
+    "progress",
+    "say",
+    "write_json",
+    "write_text",
+]
 
 _LINES = 10  # progress lines where there is no terminal
 
@@ -98,6 +107,12 @@ def jsonable(value: Any) -> Any:
     if isinstance(value, Path):
         return str(value)
     return value
+
+
+def default_config() -> Path | None:
+    """The configuration where none is named: ./config.yaml, else the system's, None without."""
+    places = (Path("config.yaml"), Path("/etc/thermocald/config.yaml"))
+    return next((path for path in places if path.exists()), None)
 
 
 def write_json(document: Any, destination: str) -> None:

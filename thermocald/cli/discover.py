@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -105,6 +106,8 @@ def _examined(recording: Path, verify: Path | None, model: Path | None) -> Disco
 
 def _lines(found: Discovery) -> list[str]:
     """The result for people."""
+    from thermocald.output.figures.numbers import with_sd
+
     first, last = found.stages[0], found.stages[-1]
     lines = [f"verdict: {found.verdict}"]
     if found.verdict == "adequate":
@@ -113,7 +116,8 @@ def _lines(found: Discovery) -> list[str]:
         lines.append(f"{effect.effect}: {effect.statement}")
         for name, e in effect.estimates.items():
             if isinstance(e["value"], float):
-                lines.append(f"    {name} = {e['value']:.6g} ± {e['sd']:.2g} {e['unit']}")
+                sd = math.nan if e["sd"] is None else e["sd"]
+                lines.append(f"    {name} = {with_sd(e['value'], sd, e['unit'])}")
         lines += [
             f"    not excluded: {a['effect']}; {a['experiment']}"
             for a in effect.alternatives

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -201,12 +202,14 @@ def _say(document: dict[str, Any]) -> None:
         )
     else:
         typer.echo(f"  valid from {low:g} to {high:g} °C, {T0}")
+    from thermocald.output.figures.numbers import with_sd
+
     for name, rate in document["rates"].items():
         sd = f" ± {rate['sd'] * 1e3:.5f}" if "sd" in rate else ""
         typer.echo(f"  {name:>4}: {rate['value'] * 1e3:+.5f}{sd} µm/K")
     for effect in document["effects"]:
         parts = [
-            f"{k} = {v['value']:.4g}" + (f" ± {v['sd']:.2g}" if "sd" in v else "") + f" {v['unit']}"
+            f"{k} = {with_sd(v['value'], v.get('sd', math.nan), v['unit'])}"
             for k, v in effect["parameters"].items()
             if isinstance(v, dict)
         ]

@@ -222,16 +222,18 @@ def _state_document(
         "object_error_mm": float(np.sqrt(np.mean(error**2))),
         "drift_from_reference_mm": float(moved.max()),
     }
+    from thermocald.output.figures.numbers import plain, with_sd
+
     lines = [f"{thermal.model.camera} at {state.temperature:g} °C"]
     lines += [
-        f"  {n:>3} = {values[n]:+.6g} ± {sd[n]:.2g} {PARAMETER_UNITS[n]}"
+        f"  {n:>3} = {with_sd(values[n], sd[n], PARAMETER_UNITS[n])}"
         for n in IOP_NAMES
         if values[n] or sd[n]
     ]
     lines.append(
-        f"  on a plane at {distance:g} m: ± {document['object_error_mm']:.2f} mm from this "
-        f"orientation's uncertainty; the drift since {thermal.model.T0:g} °C is up to "
-        f"{document['drift_from_reference_mm']:.2f} mm"
+        f"  on a plane at {distance:g} m: ± {plain(document['object_error_mm'], 'mm', 2)} "
+        f"from this orientation's uncertainty; the drift since {thermal.model.T0:g} °C is up to "
+        f"{plain(document['drift_from_reference_mm'], 'mm', 3)}"
     )
     return document, lines
 

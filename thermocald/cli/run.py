@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from thermocald.errors import UsageError
+from thermocald.cli.common import default_config
+from thermocald.errors import StoreError, UsageError
 
 if TYPE_CHECKING:
     from thermocald.config import Config
@@ -23,7 +24,10 @@ def register(app: typer.Typer) -> None:
 
 def run(
     config: Annotated[
-        Path | None, typer.Option("--config", "-c", help="The configuration file.")
+        Path | None,
+        typer.Option(
+            "--config", "-c", help="The configuration [./config.yaml, /etc/thermocald/config.yaml]."
+        ),
     ] = None,
     mock: Annotated[
         bool, typer.Option("--mock", help="A rendered camera that warms up, and a thermometer.")
@@ -59,8 +63,15 @@ def run(
     from thermocald.daemon.service import Service
     from thermocald.hal import option_names
 
-    if sum([config is not None, mock, recording is not None]) != 1:
+    if sum([config is not None, mock, recording is not None]) > 1:
         raise UsageError("give one of --config FILE, --mock, --recording FOLDER")
+    if not mock and recording is None:
+        config = config or default_config()
+        if config is None:
+            raise UsageError(
+                "there is neither ./config.yaml nor /etc/thermocald/config.yaml; give one of "
+                "--config FILE, --mock, --recording FOLDER"
+            )
     if fast and recording is None:
         raise UsageError("--fast is for --recording: devices have their own pace")
     if config is not None:
@@ -198,4 +209,7 @@ def dashboard(
         names = [*names, *page.names]
     if store is None:
         raise UsageError("give --store FILE or --config FILE")
+    # with --config the page may be started before the daemon has made its store
+    if config is None and live is None and not store.exists():
+        raise StoreError(f"{store}: does not exist; give the store that the daemon writes")
     serve(store, live or find_state(store), host, port, token_file, names)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from thermocald.cli.common import write_json
+from thermocald.cli.common import default_config, write_json
 from thermocald.cli.options import JsonOption
 from thermocald.errors import DataError
 
@@ -93,13 +93,12 @@ def read_status(config: Path | None, store: Path | None) -> dict[str, Any]:
 def _store(config: Path | None, store: Path | None) -> Path:
     if store is not None:
         return store
-    if config is None and not Path("config.yaml").exists():
-        config = Path("/etc/thermocald/config.yaml")
-        if not config.exists():
-            raise DataError("which daemon? give --config FILE or --store FILE")
+    config = config or default_config()
+    if config is None:
+        raise DataError("which daemon? give --config FILE or --store FILE")
     from thermocald.config import load_config
 
-    return load_config(config or Path("config.yaml")).store.path
+    return load_config(config).store.path
 
 
 def _alive(pid: int) -> bool:
@@ -137,8 +136,10 @@ _LEFT = ("camera", "device", "state")
 
 
 def _headline(document: dict[str, Any]) -> str:
-    hours = (document["utc"] - document["started"]) / 3600.0
-    text = f"thermocald {document['version']}, pid {document['pid']}, for {hours:.1f} h"
+    from thermocald.output.figures.numbers import duration
+
+    running = duration(max(0.0, document["utc"] - document["started"]))
+    text = f"thermocald {document['version']}, pid {document['pid']}, for {running}"
     if document["age_s"] > _OLD_S:
         text += f"; this is {document['age_s']:.0f} s old: it does not answer"
     return text

@@ -36,3 +36,23 @@ def test_boards_that_come_and_go_do_not_pull_at_the_camera(still):
 
     assert found.right
     assert found.gap_closed == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("camera", "effect", "seed"),
+    [("aviary-cam6", "thermal_lag", 1), ("aviary-cam1", "softening", 1)],
+)
+def test_a_cause_is_named_beside_a_mount_that_moves(camera, effect, seed):
+    from tests.real_corners.score import judge
+
+    assert judge(RealCase(camera, (effect,), seed)).right_or_listed
+
+
+@pytest.mark.slow
+def test_a_wander_of_the_mount_is_no_effect():
+    from tests.real_corners.score import judge
+
+    found = [judge(RealCase("aviary-cam0", (), seed)) for seed in (52, 58, 61)]
+
+    assert all(o.right for o in found)

@@ -106,10 +106,11 @@ def _examined(recording: Path, verify: Path | None, model: Path | None) -> Disco
 
 def _lines(found: Discovery) -> list[str]:
     """The result for people."""
+    from thermocald.discovery.verdict.mount import mount_lines
     from thermocald.output.figures.numbers import with_sd
 
     first, last = found.stages[0], found.stages[-1]
-    lines = [f"verdict: {found.verdict}"]
+    lines = [f"verdict: {found.headline}"]
     if found.verdict == "adequate":
         lines.append("the model reproduces the recording; nothing is missing that it could show")
     for effect in found.effects:
@@ -118,15 +119,22 @@ def _lines(found: Discovery) -> list[str]:
             if isinstance(e["value"], float):
                 sd = math.nan if e["sd"] is None else e["sd"]
                 lines.append(f"    {name} = {with_sd(e['value'], sd, e['unit'])}")
+        if "false_alarm_probability" in effect.evidence:
+            surrogates = effect.evidence["surrogates"]
+            lines.append(
+                f"    probability of a false name {effect.evidence['false_alarm_probability']:.3f} "
+                f"(gain {surrogates['gain']:.0f}; the largest of {surrogates['count']} surrogates "
+                f"{surrogates['gains_of_surrogates'][-1]:.0f})"
+            )
         lines += [
             f"    not excluded: {a['effect']}; {a['experiment']}"
             for a in effect.alternatives
             if not a.get("resembles")
         ]
-    for name, before, after in (
-        ("M1", first.fit, last.fit),
-        ("M2", first.verify, last.verify),
-    ):
+    lines += mount_lines(found.examination)
+    names = [Path(e.source.name).name or e.source.name for e in found.examination.fitter.series]
+    gaps = [(first.fit, last.fit), (first.verify, last.verify)]
+    for name, (before, after) in zip(names, gaps, strict=False):
         if before is not None and after is not None:
             lines.append(
                 f"gap on {name}: {before.rms_px:.4f} → {after.rms_px:.4f} px RMS, reduced χ² "

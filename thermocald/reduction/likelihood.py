@@ -18,6 +18,7 @@ Processes for Machine Learning, section 2.7 for marginalised linear terms.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -72,7 +73,9 @@ class Weighting:
     # (R, ·) blocks: L⁻¹ Oᵀ… ; empty lists where no thermometer matters
     operators: tuple[Array, ...]
     places: tuple[slice, ...]  # of their states
+    directions: tuple[Array, ...]  # d_k (P,)
     dN: tuple[Array, ...]  # d_kᵀN_e (E, P)
+    moving: int  # how many of the operators are the mount's movement: the first
     hidden: Array  # (S, E, P) of the hidden targets' offsets
     hidden_at: slice
     factor: Array | None
@@ -82,7 +85,7 @@ class Weighting:
     level_b: Array
     level_factor: Array
 
-    def _carried(self, trajectories: Array, directions: Array) -> Array:
+    def carried(self, trajectories: Array, directions: Array) -> Array:
         """L⁻¹ Jᵀ of regressors: trajectories (E, R), directions (P, R) → (states, R)."""
         from scipy.linalg import solve_triangular
 
@@ -91,10 +94,28 @@ class Weighting:
         for operator, at, dN in zip(self.operators, self.places, self.dN, strict=True):
             total[at] += operator.T @ ((dN @ directions) * trajectories)
         if len(self.hidden):
-            total[self.hidden_at] = np.einsum(
-                "sep,pr,er->sr", self.hidden, directions, trajectories, optimize=True
-            )
+            X = trajectories[:, None, :] * directions
+            total[self.hidden_at] = np.tensordot(self.hidden, X, axes=([1, 2], [0, 1]))
         out: Array = solve_triangular(self.factor, total, lower=True, check_finite=False)
+        return out
+
+    def carried_stack(self, s: Array, directions: Array) -> Array:
+        """L⁻¹ Jᵀ of every trajectory (E, G) along every direction (P, k) → (states, G k)."""
+        from scipy.linalg import solve_triangular
+
+        assert self.factor is not None
+        G, k = s.shape[1], directions.shape[1]
+        total = np.zeros((len(self.factor), G, k))
+        for operator, at, dN in zip(self.operators, self.places, self.dN, strict=True):
+            h = dN @ directions
+            for a in range(k):
+                total[at, :, a] += operator.T @ (s * h[:, a : a + 1])
+        if len(self.hidden):
+            seen = np.swapaxes(self.hidden, 1, 2) @ s  # (S, P, G)
+            total[self.hidden_at] = np.swapaxes(seen, 1, 2) @ directions
+        out: Array = solve_triangular(
+            self.factor, total.reshape(len(total), -1), lower=True, check_finite=False
+        )
         return out
 
     def joint(self, trajectories: Array, directions: Array) -> tuple[Array, Array, Array]:
@@ -103,12 +124,13 @@ class Weighting:
         trajectories (E, R), directions (P, R); K couples them with the levels, whose own normal
         equations are `level_normal` and `level_b`.
         """
-        VNV = np.einsum("pi,epq,qj->eij", directions, self.N, directions, optimize=True)
-        A = np.einsum("ei,ej,eij->ij", trajectories, trajectories, VNV, optimize=True)
+        X = trajectories[:, None, :] * directions
+        NX = self.N @ X
+        A = np.tensordot(X, NX, axes=([0, 1], [0, 1]))
         c = np.einsum("ei,ei->i", trajectories, self.b @ directions)
-        K = np.einsum("epq,qi,ei->pi", self.N, directions, trajectories, optimize=True)
+        K = NX.sum(axis=0)
         if self.factor is not None:
-            U = self._carried(trajectories, directions)
+            U = self.carried(trajectories, directions)
             A = A - U.T @ U
             c = c - U.T @ self.data
             K = K - self.level.T @ U
@@ -154,18 +176,8 @@ class Weighting:
         Kb = np.einsum("epq,qi,ei->pi", self.N, Vb, Cb, optimize=True)
         U = None
         if self.factor is not None:
-            total = np.zeros((len(self.factor), G * m, k))
-            for operator, at, dN in zip(self.operators, self.places, self.dN, strict=True):
-                h = dN @ directions
-                for a in range(k):
-                    total[at, :, a] += operator.T @ (s * h[:, a : a + 1])
-            if len(self.hidden):
-                seen = np.swapaxes(self.hidden, 1, 2) @ s  # (S, P, G m)
-                total[self.hidden_at] = np.swapaxes(seen, 1, 2) @ directions
-            U = solve_triangular(
-                self.factor, total.reshape(len(total), -1), lower=True, check_finite=False
-            )
-            Ub = self._carried(Cb, Vb)
+            U = self.carried_stack(s, directions)
+            Ub = self.carried(Cb, Vb)
             Ug = U.reshape(len(U), G, m * k)
             A = A - np.einsum("rgi,rgj->gij", Ug, Ug, optimize=True)
             c = c - (U.T @ self.data).reshape(G, m * k)
@@ -201,87 +213,141 @@ def prepare(
     """
     from scipy.linalg import cholesky, solve_triangular
 
-    sums = _sums(evidence)
+    sums, own = _sums(evidence), _effects(evidence)
     P = sums.N.shape[1]
-    movement = evidence.movement
-    if not carried and movement is None and not len(sums.right):
+    if not carried and not own.states and not len(sums.right):
         k0, N0 = sums.b.sum(axis=0), sums.N.sum(axis=0)
         return Weighting(
-            sums.N, sums.b, sums.yy, 0.0, (), (), (), sums.cross, slice(0, 0), None, np.zeros(0),
-            np.zeros((0, P)), N0, k0, _level_factor(N0),
+            sums.N, sums.b, sums.yy, 0.0, (), (), (), (), 0, sums.cross, slice(0, 0), None,
+            np.zeros(0), np.zeros((0, P)), N0, k0, _level_factor(N0),
         )  # fmt: skip
-    states: list[tuple[Array, Array, slice]] = []
-    sds: list[Array] = []
-    start = 0
-    if movement is not None:
-        m, K = movement.sd.shape
-        for j in range(m):
-            states.append(
-                (movement.directions[:, j], movement.operator(j), slice(start, start + K))
-            )
-            start += K
-        sds.append(np.ones(start))
-    moving = len(states)
-    own = slice(start, start + len(sums.right))
-    sds.append(np.ones(len(sums.right)))
-    start = own.stop
     places: dict[str, slice] = {}
-    deviations: dict[str, Array] = {}
+    sds, deviations = [], {}
+    fixed = start = own.hidden_at.stop
     for name in dict.fromkeys(c.channel for c in carried):
-        sd_here = evidence.state_sd(name) * thermometer_factor
-        places[name] = slice(start, start + len(sd_here))
+        sd = evidence.state_sd(name) * thermometer_factor
+        places[name] = slice(start, start + len(sd))
         deviations[name] = evidence.state_deviation(name)
-        sds.append(sd_here)
-        start += len(sd_here)
-    states += [(c.direction, c.operator, places[c.channel]) for c in carried]
-    sd = np.concatenate(sds)
+        sds.append(sd)
+        start += len(sd)
     # the readings' own deviation from the smooth trajectory, carried to the camera
     shift = np.zeros((len(sums.N), P))
+    blurred = False
     for item in carried:
         shift += np.outer(item.operator @ deviations[item.channel], item.direction)
         if item.unresolved is not None and item.unresolved.any():
-            sums = sums.blurred(item.direction, item.unresolved**2)
+            sums, blurred = sums.blurred(item.direction, item.unresolved**2), True
     sums = sums.shifted(shift)
-    N, b, cross = sums.N, sums.b, sums.cross
-    N0 = N.sum(axis=0)
-    dN = [np.einsum("p,epq->eq", d, N) for d, _, _ in states]
-    k0 = b.sum(axis=0)
-    M = np.diag(1.0 / sd**2)
-    if movement is not None:
-        Dn = np.einsum("epq,qj->epj", N, movement.directions)
-        G = np.einsum("pi,epj->eij", movement.directions, Dn)
-    for i, (_, Oi, at) in enumerate(states):
-        for j in range(i, len(states)):
-            dj, Oj, to = states[j]
-            weight = G[:, i, j] if j < moving else dN[i] @ dj
-            part = Oi.T @ (weight[:, None] * Oj)
-            M[at, to] += part
-            if i != j:
-                M[to, at] += part.T
-    M[own, own] = sums.normal
-    for d, operator, at in states:
-        part = operator.T @ (cross @ d).T
-        M[at, own] += part
-        M[own, at] += part.T
-    factor = cholesky(M, lower=True, check_finite=False)
-    logdet = sums.logdet + 2 * float(np.sum(np.log(np.diag(factor) * sd)))
+    if blurred:
+        own = own.beside(sums)
+    states = [*own.states, *((c.direction, c.operator, places[c.channel]) for c in carried)]
+    moving = len(own.states)
+    dN = [*own.dN, *(sums.N @ c.direction for c in carried)]
+    cross = sums.cross
+    factor = np.zeros((start, start))
+    factor[:fixed, :fixed] = own.factor
+    logdet = sums.logdet + own.logdet
+    if carried:
+        whole = np.concatenate(sds)
+        beside = np.zeros((fixed, start - fixed))
+        M = np.diag(1.0 / whole**2)
+        for i, (_, Oi, at) in enumerate(states):
+            for j in range(max(i, moving), len(states)):
+                dj, Oj, to = states[j]
+                part = Oi.T @ ((dN[i] @ dj)[:, None] * Oj)
+                here = slice(to.start - fixed, to.stop - fixed)
+                if i < moving:
+                    beside[at, here] += part
+                    continue
+                there = slice(at.start - fixed, at.stop - fixed)
+                M[there, here] += part
+                if i != j:
+                    M[here, there] += part.T
+        for item in carried:
+            at = places[item.channel]
+            here = slice(at.start - fixed, at.stop - fixed)
+            beside[own.hidden_at, here] += (cross @ item.direction) @ item.operator
+        if fixed:
+            low = solve_triangular(own.factor, beside, lower=True, check_finite=False)
+            M = M - low.T @ low
+            factor[fixed:, :fixed] = low.T
+        last = cholesky(M, lower=True, check_finite=False)
+        factor[fixed:, fixed:] = last
+        logdet += 2 * float(np.sum(np.log(np.diag(last) * whole)))
     right = np.zeros((start, P + 1))
     for (d, operator, at), w in zip(states, dN, strict=True):
         right[at, :P] += operator.T @ w
-        right[at, P] += operator.T @ (b @ d)
-    right[own, :P] = cross.sum(axis=1)
-    right[own, P] = sums.right
+        right[at, P] += operator.T @ (sums.b @ d)
+    right[own.hidden_at, :P] = cross.sum(axis=1)
+    right[own.hidden_at, P] = sums.right
     right = solve_triangular(factor, right, lower=True, check_finite=False)
     level, data = right[:, :P], right[:, P]
-    N0 = N0 - level.T @ level
-    k0 = k0 - level.T @ data
+    N0 = sums.N.sum(axis=0) - level.T @ level
+    k0 = sums.b.sum(axis=0) - level.T @ data
     held = _level_factor(N0)
-    if movement is not None:  # its size is estimated: the levels' share counts (restricted)
+    if moving:  # the movement's size is estimated: the levels' share counts (restricted)
         logdet += 2 * float(np.sum(np.log(np.diag(held))))
     return Weighting(
-        N, b, sums.yy - float(data @ data), logdet, tuple(o for _, o, _ in states),
-        tuple(at for _, _, at in states), tuple(dN), cross, own, factor, data, level, N0, k0, held,
+        sums.N, sums.b, sums.yy - float(data @ data), logdet, tuple(o for _, o, _ in states),
+        tuple(at for _, _, at in states), tuple(d for d, _, _ in states), tuple(dN),
+        moving, cross, own.hidden_at, factor, data, level, N0, k0, held,
     )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Effects:
+    """The random effects of a series that no hypothesis changes: movement, then hidden targets.
+
+    states: direction (P,), operator (E, K), place of each mode; factor: Cholesky factor of their
+    normal matrix.
+    """
+
+    states: list[tuple[Array, Array, slice]]
+    dN: list[Array]
+    hidden_at: slice
+    factor: Array
+    logdet: float
+
+    def beside(self, sums: _Sums) -> _Effects:
+        """The same beside other sums."""
+        return _factored(self.states, self.hidden_at, sums)
+
+
+@lru_cache(maxsize=4)
+def _effects(evidence: ReducedSeries) -> _Effects:
+    sums = _sums(evidence)
+    states: list[tuple[Array, Array, slice]] = []
+    start = 0
+    if evidence.movement is not None:
+        m, K = evidence.movement.sd.shape
+        for j in range(m):
+            direction = evidence.movement.directions[:, j]
+            states.append((direction, evidence.movement.operator(j), slice(start, start + K)))
+            start += K
+    return _factored(states, slice(start, start + len(sums.right)), sums)
+
+
+def _factored(
+    states: list[tuple[Array, Array, slice]], hidden_at: slice, sums: _Sums
+) -> _Effects:
+    from scipy.linalg import cholesky
+
+    M = np.eye(hidden_at.stop)
+    dN = [sums.N @ d for d, _, _ in states]
+    for i, (_, Oi, at) in enumerate(states):
+        for j in range(i, len(states)):
+            dj, Oj, to = states[j]
+            part = Oi.T @ ((dN[i] @ dj)[:, None] * Oj)
+            M[at, to] += part
+            if i != j:
+                M[to, at] += part.T
+    M[hidden_at, hidden_at] = sums.normal
+    for d, operator, at in states:
+        M[at, hidden_at] = operator.T @ (sums.cross @ d).T
+        M[hidden_at, at] = M[at, hidden_at].T
+    factor = cholesky(M, lower=True, check_finite=False) if len(M) else M
+    logdet = 2 * float(np.sum(np.log(np.diag(factor))))
+    return _Effects(states, dN, hidden_at, factor, logdet)
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,14 +386,20 @@ class _Sums:
         return _Sums(self.N, self.b - moved, yy, self.logdet, self.cross, self.normal, right)
 
 
+@lru_cache(maxsize=4)
 def _sums(evidence: ReducedSeries) -> _Sums:
     hidden = evidence.hidden
     yy = float(evidence.yy.sum())
     if hidden is None:
         none = np.zeros((0, *evidence.b.shape))
-        return _Sums(evidence.N, evidence.b, yy, 0.0, none, np.zeros((0, 0)), np.zeros(0))
-    normal, right = np.diag(hidden.normal), hidden.right.sum(axis=1)
-    return _Sums(evidence.N, evidence.b, yy, 0.0, hidden.cross, normal, right)
+        sums = _Sums(evidence.N, evidence.b, yy, 0.0, none, np.zeros((0, 0)), np.zeros(0))
+    else:
+        normal, right = np.diag(hidden.normal), hidden.right.sum(axis=1)
+        sums = _Sums(evidence.N, evidence.b, yy, 0.0, hidden.cross, normal, right)
+    if evidence.tremble is not None:
+        for direction in evidence.tremble.T:
+            sums = sums.blurred(direction, np.ones(len(evidence.N)))
+    return sums
 
 
 def _level_factor(N0: Array) -> Array:

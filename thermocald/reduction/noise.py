@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["jumps", "noisier", "slow_together", "with_correlated_noise", "with_jumps"]
+__all__ = ["jumps", "noisier", "slow_together", "trembling", "with_correlated_noise", "with_jumps"]
 
 _FEWEST = 60  # epochs that tell how much the series jumps
 _UNUSUAL = 1.7  # a variance from 170 second differences has 13 % of standard deviation
@@ -148,7 +148,21 @@ def with_jumps(evidence: ReducedSeries, factors: Array, W: Array) -> ReducedSeri
     N = T @ evidence.N @ T.T
     N = 0.5 * (N + N.swapaxes(1, 2))
     b = np.einsum("epq,eq->ep", N, evidence.values)
-    return replace(evidence, N=N, b=b, yy=np.einsum("ep,ep->e", evidence.values, b))
+    hidden = evidence.hidden.turned(T, evidence.values) if evidence.hidden else None
+    return replace(
+        evidence, N=N, b=b, yy=np.einsum("ep,ep->e", evidence.values, b), hidden=hidden
+    )
+
+
+def trembling(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries]:
+    """All series with what jumps from epoch to epoch as a movement of each epoch by itself."""
+    out = []
+    for s, e in enumerate(fitter.series):
+        factors, W = jumps(fitter, fit, s)
+        unusual = factors > _UNUSUAL
+        directions = W[:, unusual] * np.sqrt(factors[unusual] - 1.0)
+        out.append(replace(e, tremble=directions) if unusual.any() else e)
+    return out
 
 
 def noisier(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries] | None:

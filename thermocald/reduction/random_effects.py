@@ -66,6 +66,13 @@ class HiddenTargets:
             right=np.add.reduceat(self.right, starts, axis=1),
         )
 
+    def turned(self, T: Array, values: Array) -> HiddenTargets:
+        """Where the normal matrices are taken to T N Tᵀ about the epochs' own values (E, P)."""
+        vectors = self.vectors @ T.T
+        change = (vectors - self.vectors) @ values.T
+        right = self.right + self.patterns[self.group] * change
+        return replace(self, vectors=vectors, right=right)
+
     def less(self, change: Array) -> HiddenTargets:
         """With changes (E, T, 2) px taken off the image points."""
         parts = [

@@ -98,7 +98,8 @@ class ReducedSeries:
     variance: factor by which the given variances were too small; correlation: how much larger the
     variance of slow trajectories is than that of white noise; gross: rejected points; excluded:
     rows of targets left out; blocks: the epochs behind each row of a long series, or None; hidden,
-    movement: what the likelihood integrates out (`random_effects`), or None.
+    movement: what the likelihood integrates out (`random_effects`), or None; tremble (P, t):
+    directions in which each epoch moves by itself, of unit variance.
     """
 
     source: SeriesInput
@@ -124,6 +125,7 @@ class ReducedSeries:
     blocks: Blocks | None = None
     hidden: HiddenTargets | None = None
     movement: Movement | None = None
+    tremble: Array | None = None
 
     @property
     def readings_history(self) -> History:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from thermocald.errors import DataError
+from thermocald.errors import DataError, UsageError
 from thermocald.reduction.source import series_input
 
 if TYPE_CHECKING:
@@ -20,6 +20,11 @@ def load_pair(first: Path, second: Path | None, say: Callable[[str], None]) -> l
     """Read M1, and M2 where it is given; refuses an M2 of another camera or thermometer."""
     from thermocald.store.recording.reader import read_recording
 
+    if second is not None and first.resolve() == second.resolve():
+        raise UsageError(
+            f"{second} is the recording to explain itself; --verify needs another recording of the "
+            "same camera, made at another time"
+        )
     out = []
     for path in (first, second):
         if path is None:

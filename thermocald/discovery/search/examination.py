@@ -9,13 +9,16 @@ import numpy as np
 
 from thermocald.discovery.evidence.image_space import Displaced, displaced_targets
 from thermocald.discovery.search.cross_validation import confirmed, gains
+from thermocald.discovery.search.mounted import convincing, search_beside_mount, without_slips
 from thermocald.discovery.search.search import Search, Solution
+from thermocald.discovery.search.surrogates import SurrogateTest, surrogate_test
 from thermocald.reduction.adequacy import Adequacy, examine
 from thermocald.reduction.blocks import in_blocks
 from thermocald.reduction.calibrated import calibrated_thermometers
 from thermocald.reduction.curvature import curved
 from thermocald.reduction.fit import HypothesisFitter
-from thermocald.reduction.noise import noisier, with_correlated_noise
+from thermocald.reduction.movement import combinations, steadied
+from thermocald.reduction.noise import noisier, trembling, with_correlated_noise
 from thermocald.reduction.noise_growth import NoiseGrowth, noise_growth
 from thermocald.reduction.reduce import reweighted
 
@@ -24,13 +27,19 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.reduction.hypothesis import Term
+    from thermocald.reduction.movement import Mount
     from thermocald.reduction.series import ReducedSeries
 
     Array = NDArray[np.float64]
 
 __all__ = ["Examination", "examine_series"]
 
-MAX_EFFECTS = 2
+MAX_EFFECTS = 3
+# variance of slow trajectories over that of white noise from which on a mount is asked for
+_MEMORY = 1.9
+# how much more a movement has in its slowest half-waves than a random walk has
+_SMOOTH = 30.0
 # how much worse a solution may score and still not be excluded
 BAND = 14.0
 # a model that leaves less than this share of what the base left has the cause
@@ -50,7 +59,9 @@ class Examination:
 
     fitter: the series as examined, displaced targets out and noise weighted; base, best: solutions;
     ranking: singles by score; rivals: solutions that cannot be excluded; adequacy: of best, per
-    series; cross_validation: gains (blocks,) of its effects on blocks of time left out.
+    series; cross_validation: gains (blocks,) of its effects on blocks of time left out; surrogates:
+    each of its effects against surrogates; mount: its movement, where it moves; knocks: of the
+    mount, terms of the base.
     """
 
     fitter: HypothesisFitter
@@ -64,6 +75,9 @@ class Examination:
     cross_validation: tuple[Array, ...] = ()
     displaced: tuple[tuple[Displaced, ...], ...] = ()
     noise_growth: NoiseGrowth | None = None
+    surrogates: tuple[SurrogateTest, ...] = ()
+    mount: Mount | None = None
+    knocks: tuple[Term, ...] = ()
     original: tuple[ReducedSeries, ...] = ()
 
 
@@ -87,7 +101,22 @@ def examine_series(
     growth = noise_growth(cleaned)
     if growth is not None:
         cleaned = [reweighted(e, n) for e, n in zip(cleaned, growth.noise, strict=True)]
-    ready = [in_blocks(with_correlated_noise(e)) for e in calibrated_thermometers(cleaned)]
+    calibrated = calibrated_thermometers(cleaned)
+    ready = [in_blocks(with_correlated_noise(e)) for e in calibrated]
+    found = None
+    if max(e.correlation for e in calibrated) > _MEMORY:
+        found = _beside_mount(calibrated, say, given)
+    if found is None:
+        found = _still(ready, say, given)
+    return replace(found, displaced=tuple(displaced), noise_growth=growth, original=tuple(series))
+
+
+def _still(
+    ready: list[ReducedSeries],
+    say: Callable[[str], None],
+    given: Sequence[tuple[str, dict[str, Any]]],
+) -> Examination:
+    """The search where the mount stands still."""
     found = _searched(HypothesisFitter(ready), say, given)
     bent = curved(found.fitter, found.best.fit)
     if bent is not None:
@@ -97,7 +126,44 @@ def examine_series(
     if noisy is not None:
         say("noise that targets share: once more")
         found = _searched(HypothesisFitter(noisy), say, given)
-    return replace(found, displaced=tuple(displaced), noise_growth=growth, original=tuple(series))
+    return found
+
+
+def _beside_mount(
+    calibrated: list[ReducedSeries],
+    say: Callable[[str], None],
+    given: Sequence[tuple[str, dict[str, Any]]],
+) -> Examination | None:
+    """The search beside a mount that moves; None where the movement is not one of a mount.
+
+    A smooth influence that nobody recorded is no wander of a mount.
+    """
+    fitter = HypothesisFitter([in_blocks(replace(e, correlation=1.0)) for e in calibrated])
+    fitter = HypothesisFitter(steadied(fitter, fitter.fit(()), combinations(fitter.series)))
+    shaken = trembling(fitter, fitter.fit(()))
+    found = search_beside_mount(HypothesisFitter(shaken), say, given)
+    if found.mount.smoothness(found.fitter, found.best.fit) > _SMOOTH:
+        return None
+    search = Search(found.fitter, say)
+    best, blocks, tests = _named(search, found.base, found.best)
+    if any(t.kind.is_event and t not in best.terms for t in found.best.terms):
+        found = without_slips(found, len(given))  # steps that cannot be named are still there
+        best, blocks, tests = _named(search, found.base, found.best)
+    base = found.base
+    if not convincing(found.fitter, base, best):
+        best, blocks, tests = base, [], ()
+    adequacy = _adequacies(found.fitter, best)
+    rivals: list[Solution] = []
+    for s in sorted(found.seen, key=lambda s: s.score):
+        names = [t.effect for t in s.terms if t not in found.knocks]
+        own = [t.effect for t in best.terms if t not in found.knocks]
+        close = s.score < best.score + BAND and len(names) <= len(own)
+        if close and sorted(names) != sorted(own) and s.names not in [r.names for r in rivals]:
+            rivals.append(s)
+    return Examination(
+        found.fitter, base, best, found.ranking, tuple(rivals), _adequacies(found.fitter, base),
+        adequacy, True, tuple(blocks), surrogates=tests, mount=found.mount, knocks=found.knocks,
+    )  # fmt: skip
 
 
 def _searched(
@@ -136,13 +202,16 @@ def _searched(
         best = champion
         adequate = _adequate(_adequacies(fitter, best), base_adequacy)
         # what is adequate may still lack something too fast for the absolute test
-        frontier = [best] if adequate else _frontier(grown)
+        frontier = [best] if adequate or level > 1 else _frontier(grown)
     # larger combinations that were not accepted are no rivals
     seen = [s for s in seen if len(s.terms) <= len(best.terms)]
     if len(best.terms) > len(base.terms):
         best, seen = _contest(search, best, seen)
         best, seen = _lag_or_delay(search, best, seen)
     best, blocks = _confirmed(search, base, best)
+    tests: tuple[SurrogateTest, ...] = ()
+    if _adequate(_adequacies(fitter, best), base_adequacy):
+        best, blocks, tests = _named(search, base, best)
     adequacy = _adequacies(fitter, best)
     adequate = _adequate(adequacy, base_adequacy)
     if len(best.terms) > len(base.terms) and _unverified(fitter.series):
@@ -157,7 +226,7 @@ def _searched(
             rivals.append(s)
     return Examination(
         fitter, base, best, tuple(ranking), tuple(rivals), base_adequacy, adequacy, adequate,
-        tuple(blocks),
+        tuple(blocks), surrogates=tests,
     )  # fmt: skip
 
 
@@ -209,6 +278,33 @@ def _unverified(series: Sequence[ReducedSeries]) -> bool:
     return len(series) < 2 and max(e.correlation for e in series) > _WANDERING
 
 
+def _named(
+    search: Search, base: Solution, best: Solution
+) -> tuple[Solution, list[Array], tuple[SurrogateTest, ...]]:
+    """The solution without effects that blocks left out or surrogates speak against."""
+    kept = len(base.terms)
+    best, blocks = _confirmed(search, base, best)
+    while len(best.terms) > kept:
+        tests = []
+        for i in range(kept, len(best.terms)):
+            without = _without(search, base, best, i)
+            gain = without.score - best.score
+            tests.append(surrogate_test(search, best.fit, without, gain))
+        worst = max(range(len(tests)), key=lambda i: tests[i].p)
+        if tests[worst].passed:
+            return best, blocks, tuple(tests)
+        search.progress(f"{best.names[kept + worst]} is no more than noise may give")
+        best, blocks = _confirmed(search, base, _without(search, base, best, kept + worst))
+    return best, blocks, ()
+
+
+def _without(search: Search, base: Solution, best: Solution, number: int) -> Solution:
+    """The solution without one of its effects, the others fitted again."""
+    terms = [t for i, t in enumerate(best.terms) if i != number]
+    penalties = [p for i, p in enumerate(best.penalties) if i != number]
+    return search.refine(terms, penalties) if len(terms) > len(base.terms) else base
+
+
 def _confirmed(search: Search, base: Solution, best: Solution) -> tuple[Solution, list[Array]]:
     """The solution without effects that do not predict blocks left out, and what the others gain
     on each block.
@@ -221,9 +317,7 @@ def _confirmed(search: Search, base: Solution, best: Solution) -> tuple[Solution
             return best, blocks
         worst = kept + min(bad, key=lambda i: float(blocks[i].sum()))
         search.progress(f"{best.names[worst]} does not predict the blocks left out")
-        terms = [t for i, t in enumerate(best.terms) if i != worst]
-        penalties = [p for i, p in enumerate(best.penalties) if i != worst]
-        best = search.refine(terms, penalties) if terms else base
+        best = _without(search, base, best, worst)
     return best, []
 
 

@@ -36,6 +36,7 @@ class Gap:
     rms_px: float
     chi2_reduced: float
     object_mm_at_10m: float
+    floor: float = 1.0  # of chi2_reduced: what the measurement leaves about its own cameras
 
     def as_json(self) -> dict[str, float]:
         """As the document has it."""
@@ -138,7 +139,11 @@ def gap_of(
         if not noise_known:
             chi2 *= power / float(np.min(noise) ** 2)
     rms = float(np.sqrt(sigma2 * image / free))
-    return Gap(rms, chi2, _object_mm(e, rms))
+    floor = 1.0
+    if e.movement is not None:
+        # real points are no normal deviates: what free cameras leave is measured, not one
+        floor = (within + moved + e.rank * float((e.n > 0).sum() - 1)) / free
+    return Gap(rms, chi2, _object_mm(e, rms), floor)
 
 
 def _object_mm(evidence: ReducedSeries, rms: float) -> float:

@@ -18,6 +18,7 @@ from thermocald.discovery.verdict.found import EffectFound
 from thermocald.discovery.verdict.gap import Gap, fit_first, gap_of
 from thermocald.discovery.verdict.image_effects import image_effects, image_places
 from thermocald.discovery.verdict.misfit import resolve
+from thermocald.discovery.verdict.mount import mount_of
 from thermocald.discovery.verdict.unnamed import describe_unnamed
 from thermocald.simulation import effects as catalogue
 
@@ -59,9 +60,9 @@ class Discovery:
     def excess_closed(self) -> float | None:
         """Share of the excess of reduced χ² over the floor that is closed on M2."""
         before, after = self.stages[0].verify, self.stages[-1].verify
-        if before is None or after is None or before.chi2_reduced - 1.0 < 0.02:
+        if before is None or after is None or before.chi2_reduced - before.floor < 0.02:
             return None
-        return 1.0 - (after.chi2_reduced - 1.0) / (before.chi2_reduced - 1.0)
+        return 1.0 - (after.chi2_reduced - after.floor) / (before.chi2_reduced - before.floor)
 
     def as_json(self, model: str | None) -> dict[str, Any]:
         """CONVENTIONS §4, exactly."""
@@ -81,8 +82,15 @@ class Discovery:
                 "fit": {"before": first.fit.as_json(), "after": last.fit.as_json()},
                 "verify": verify,
             },
+            "mount": mount_of(self.examination),
             "model": model,
         }
+
+    @property
+    def headline(self) -> str:
+        """Verdict and names in one line: A or B where B cannot be excluded."""
+        names = [" or ".join([e.effect, *e.alternative_names]) for e in self.effects]
+        return f"{self.verdict}: {', and '.join(names)}" if names else self.verdict
 
 
 def discover_series(
@@ -147,11 +155,28 @@ def _entry(x: Examination, fit: Fit, k: int, before: Gap, after: Gap, first: boo
         "left_out_blocks_gain": [float(g) for g in x.cross_validation[k - len(x.base.terms)]],
         "inflation_for_correlated_noise": e.correlation,
     }
+    if x.surrogates:
+        test = x.surrogates[k - len(x.base.terms)]
+        evidence["false_alarm_probability"] = test.p
+        evidence["surrogates"] = {
+            "count": len(test.surrogates),
+            "gain": float(test.gain),
+            "gains_of_surrogates": [float(g) for g in np.sort(test.surrogates)],
+        }
+    statement = effect.sentence(estimates)
+    if x.mount is not None and {"x0", "y0"} & set(term.parameters):
+        statement += (
+            "; beside a mount that moves, its cause in time is told, while a shift of the "
+            "principal point and a tilt of the camera are hardly separable"
+        )
+    others = [a["effect"] for a in _alternatives(x, term, first)]
+    if others:
+        statement += f". Not excluded instead: {', '.join(others)}"
     if len(x.adequacy) < 2:
         evidence["note"] = "one series only: the constants were not verified on another"
     return EffectFound(
         term.effect,
-        effect.sentence(estimates),
+        statement,
         {
             "parameters": acts_on(term.parameters),
             "epochs": _when(x, fit, k),

@@ -1,0 +1,200 @@
+"""The search where the camera moves on its mount: each hypothesis beside the movement it leaves.
+
+What no effect explains is a wander of the mount with a size of its own for each hypothesis, so that
+a cause is held against what a moving mount would do by chance. Knocks of the mount, steps that a
+turn and a shift of the camera explain as well as a slip inside of it, are no effects: they are
+found, kept beside the base model, and reported with time and size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from thermocald.discovery.search.search import Search, Solution
+from thermocald.photogrammetry.camera.camera_model import EOP_NAMES
+from thermocald.reduction.movement import Mount, combinations, estimated, first_guess
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from thermocald.reduction.fit import HypothesisFitter
+    from thermocald.reduction.hypothesis import Fit, Term
+
+__all__ = ["Beside", "Mounted", "convincing", "search_beside_mount", "without_slips"]
+
+_WIDTH = 4  # solutions of a level whose movement is estimated
+_LEVELS = 5
+_EFFECTS = 3
+_KNOCKS = 3
+# χ² by which a slip inside the camera has to fit better than a knock of its mount
+_SLIP_NOT_KNOCK = 20.0
+# beyond the penalty, for each effect after the first: a mount is not quite a random walk
+_FURTHER = 40.0
+_SHARE = 0.25  # of what the first effect gains that a further one has to gain
+_CORNERS = (0.0, 3.0)
+_REST = 0.05
+# penalised gain, in the noise that the effects leave, below which a wander may feign an effect:
+# its size is estimated from some twenty half-waves, and tests against it have heavy tails
+_CLEAR = 150.0
+# share of its own gain in one series by which an effect may worsen the other
+_WORSE = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """A solution and the movement of the mount beside it, in a fitter that has it."""
+
+    solution: Solution
+    fitter: HypothesisFitter
+    mount: Mount
+
+    @property
+    def score(self) -> float:
+        return self.solution.score
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        return self.solution.terms
+
+
+@dataclass(frozen=True, eq=False)
+class Mounted:
+    """What the search found: base (knocks in it) and best in one fitter; knocks of the mount.
+
+    ranking: single effects by score; seen: every solution that was looked at, beside its movement.
+    """
+
+    fitter: HypothesisFitter
+    mount: Mount
+    base: Solution
+    best: Solution
+    knocks: tuple[Term, ...]
+    ranking: tuple[Solution, ...]
+    seen: tuple[Solution, ...]
+
+
+def search_beside_mount(
+    fitter: HypothesisFitter,
+    say: Callable[[str], None],
+    given: Sequence[tuple[str, dict[str, Any]]] = (),
+) -> Mounted:
+    """Effects, one after the other, and knocks, while the penalised likelihood improves."""
+    start = Search(fitter).base(given)
+    W = combinations(fitter.series)
+    guess = first_guess(fitter, start.fit, W)
+    say("movement of the mount")
+    trials = [_beside(fitter, start, Mount(W, guess, corner), 4) for corner in _CORNERS]
+    plain = min(trials, key=lambda t: t.score)
+    best, ranking, seen = plain, list[Solution](), list[Solution]()
+    for level in range(_LEVELS):
+        say(f"beside the mount: {', '.join(best.solution.names) or 'the base'}")
+        search = Search(best.fitter)
+        grown: list[Beside] = []
+        for solution in search.expand(best.solution, 6)[:_WIDTH]:
+            trial = _profiled(best, solution)
+            knock = _as_knock(best, trial)
+            grown.append(knock or trial)
+        if level == 0:
+            ranking = sorted((g.solution for g in grown), key=lambda s: s.score)
+        seen += [g.solution for g in grown]
+        allowed = [g for g in grown if _allowed(g, best, plain, len(start.terms))]
+        if not allowed:
+            break
+        best = min(allowed, key=lambda g: g.score)
+    return _concluded(best, len(start.terms), ranking, seen, False)
+
+
+def _beside(fitter: HypothesisFitter, solution: Solution, mount: Mount, turns: int) -> Beside:
+    own, fit, mount = estimated(fitter, solution.terms, mount, solution.fit.coefficients, turns)
+    return Beside(Solution(fit, solution.penalties), own, mount)
+
+
+def _profiled(best: Beside, solution: Solution) -> Beside:
+    """A solution with the movement that it leaves; its non-linear parameters refined in it."""
+    guess = first_guess(best.fitter, solution.fit, best.mount.combinations)
+    # a share of the movement before: what starts at zero stays there
+    mount = replace(best.mount, covariance=guess + _REST * best.mount.covariance)
+    found = _beside(best.fitter, solution, mount, 5)
+    fit = found.fitter.refine(found.solution.fit, max_iterations=3)
+    return replace(found, solution=Solution(fit, solution.penalties))
+
+
+def _is_knock(term: Term) -> bool:
+    return term.kind.is_event and term.parameters == EOP_NAMES
+
+
+def _as_knock(best: Beside, trial: Beside) -> Beside | None:
+    """The same event as a knock of the mount, where that explains it as well; else None."""
+    term = trial.terms[-1]
+    if not term.kind.is_event:
+        return None
+    terms = (*trial.terms[:-1], replace(term, parameters=EOP_NAMES))
+    more = len(EOP_NAMES) / max(len(term.parameters), 1)
+    penalties = (*trial.solution.penalties[:-1], trial.solution.penalties[-1] * more)
+    fit = best.fitter.fit(terms)
+    knock = _profiled(best, Solution(fit, penalties))
+    if knock.solution.fit.objective < trial.solution.fit.objective + _SLIP_NOT_KNOCK:
+        return knock
+    return None
+
+
+def _allowed(grown: Beside, best: Beside, plain: Beside, given: int) -> bool:
+    """Whether a solution improves enough on the one before."""
+    gain = best.score - grown.score
+    own = [t for t in grown.terms[given:] if not t.kind.is_event]
+    knocks = len(grown.terms) - given - len(own)
+    if len(own) > _EFFECTS or knocks > _KNOCKS or gain <= 0:
+        return False
+    if grown.terms[-1].kind.is_event or len(own) == 1:
+        return True
+    whole = plain.score - best.score
+    return gain > max(_FURTHER, _SHARE * whole)
+
+
+def without_slips(found: Mounted, given: int) -> Mounted:
+    """The same with steps inside the camera taken for nuisances as knocks are."""
+    best = Beside(found.best, found.fitter, found.mount)
+    return _concluded(best, given, found.ranking, found.seen, True)
+
+
+def _concluded(
+    best: Beside, given: int, ranking: Sequence[Solution], seen: Sequence[Solution], all_steps: bool
+) -> Mounted:
+    """Base and best in the fitter of the best, knocks with the base; all_steps: slips too."""
+    terms, penalties = best.terms, best.solution.penalties
+    first = list(zip(terms[:given], penalties[:given], strict=True))
+    rest = list(zip(terms[given:], penalties[given:], strict=True))
+    knocks = [x for x in rest if _is_knock(x[0]) or (all_steps and x[0].kind.is_event)]
+    effects = [x for x in rest if x not in knocks]
+
+    def solution(parts: list[tuple[Term, float]]) -> Solution:
+        fit: Fit = best.fitter.refine(best.fitter.fit([t for t, _ in parts]), max_iterations=3)
+        return Solution(fit, tuple(p for _, p in parts))
+
+    base = solution(first + knocks)
+    whole = solution(first + knocks + effects) if effects else base
+    own = tuple(t for t, _ in knocks)
+    return Mounted(best.fitter, best.mount, base, whole, own, tuple(ranking), tuple(seen))
+
+
+def convincing(fitter: HypothesisFitter, base: Solution, best: Solution) -> bool:
+    """Whether the effects of `best` are more than a wander feigns, and hold from one series to the
+    other.
+
+    Constants from one series are held against the other, both ways; events are new each time.
+    """
+    if base.score - best.score < _CLEAR:
+        return False
+    if len(fitter.series) < 2 or all(t.is_separate for t in best.terms[len(base.terms) :]):
+        return True
+    gains = []
+    for a, b in ((0, 1), (1, 0)):
+        without = fitter.fit(base.terms, only=[a])
+        whole = fitter.refine(fitter.fit(best.terms, only=[a]), only=[a])
+        gains.append(
+            (without.chi2_of(a) - whole.chi2_of(a), without.chi2_of(b) - whole.chi2_of(b))
+        )
+    least = _WORSE * max(own for own, _ in gains)
+    there = [other for _, other in gains]
+    return min(there) > -least and sum(there) > least

@@ -65,7 +65,8 @@ class Discovery:
         return 1.0 - (after.chi2_reduced - after.floor) / (before.chi2_reduced - before.floor)
 
     def as_json(self, model: str | None) -> dict[str, Any]:
-        """CONVENTIONS §4, exactly."""
+        """CONVENTIONS §4; beside a mount that moves, what it did stands under `mount`."""
+        mount = mount_of(self.examination)
         first, last = self.stages[0], self.stages[-1]
         verify = None
         if first.verify is not None and last.verify is not None:
@@ -82,8 +83,8 @@ class Discovery:
                 "fit": {"before": first.fit.as_json(), "after": last.fit.as_json()},
                 "verify": verify,
             },
-            "mount": mount_of(self.examination),
             "model": model,
+            **({"mount": mount} if mount is not None else {}),
         }
 
     @property

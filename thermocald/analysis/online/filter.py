@@ -51,7 +51,8 @@ class FilterSettings:
 
     thermometer_sd K; wander_px: of c, x0, y0 per √epoch beyond the thermal model; lag: fraction of
     a change of temperature that may reach the camera later; alpha: error probability of one test;
-    rate_sd_px: prior sd of the rates per kelvin.
+    rate_sd_px: prior sd of the rates per kelvin; unknown_step K: what the temperature may change by
+    from epoch to epoch where there is no thermometer.
     """
 
     thermometer_sd: float = 0.05
@@ -59,6 +60,7 @@ class FilterSettings:
     lag: float = 0.5
     alpha: float = 1e-6
     rate_sd_px: float = 5.0
+    unknown_step: float = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +133,8 @@ class OnlineFilter:
         before = self._rise
         if not np.isnan(temperature):
             self._read(temperature)
-        self._predict(self._rise - before)
+        unknown = self.settings.unknown_step if np.isnan(self.T0) else 0.0
+        self._predict(np.hypot(self._rise - before, unknown))
         return self._take_in(adjustment, errors)
 
     @property

@@ -17,7 +17,7 @@ from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import read_recording, write_recording
 
 EPOCHS = 24
-PLAIN = {"target_offsets": False}
+PLAIN = {"target_offsets": False, "exterior": "per_epoch"}
 KEYS = {
     "plain": {},
     "exterior": {"exterior": "series"},

@@ -36,6 +36,7 @@ __all__ = ["EpochErrors", "FieldErrors"]
 _MEMORY = 50  # epochs over which the level of the noise is averaged
 _LEAST_DEGREES = 10.0
 _MOVED_PX = 30.0  # from here on the partials are others
+_OTHER_LENS = 0.02  # of c: another lens, and partials that correlate otherwise
 _LOWEST, _HIGHEST = 0.05, 20.0  # of the measured over the stated variance of an image point
 
 
@@ -65,6 +66,7 @@ class FieldErrors:
         self._field = testfield
         self._before: tuple[Array, Array] | None = None
         self._linearised: tuple[Array, Array, Array] | None = None
+        self._c = 0.0
         self._compared = 0
 
     def split(self, adjustment: Adjustment, observations: Observations) -> EpochErrors:
@@ -101,9 +103,11 @@ class FieldErrors:
         at = self._linearised
         if at is not None:
             now = project(self._sensor, values[:10], values[10:], points)
-            if not np.nanmedian(np.abs(now - at[0])) < _MOVED_PX:
+            moved = float(np.nanmedian(np.abs(now - at[0])))
+            if not moved < _MOVED_PX or abs(values[0] / self._c - 1.0) > _OTHER_LENS:
                 at = None
         if at is None:
+            self._c = float(values[0])
             at = self._linearised = partials(self._sensor, values[:10], values[10:], points)
         return at[1], at[2]
 

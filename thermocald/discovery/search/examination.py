@@ -157,7 +157,10 @@ def _beside_mount(
     for s in sorted(found.seen, key=lambda s: s.score):
         names = [t.effect for t in s.terms if t not in found.knocks]
         own = [t.effect for t in best.terms if t not in found.knocks]
-        close = s.score < best.score + BAND and len(names) <= len(own)
+        # between two readings nobody knows the temperature: a delay and its rate look alike
+        differ = [t for t in (*s.terms, *best.terms) if (t in s.terms) != (t in best.terms)]
+        band = _SWAP_BAND if any(t.kind.delay for t in differ) else BAND
+        close = s.score < best.score + band and len(names) <= len(own)
         if close and sorted(names) != sorted(own) and s.names not in [r.names for r in rivals]:
             rivals.append(s)
     return Examination(

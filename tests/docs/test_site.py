@@ -232,3 +232,8 @@ def test_the_makefile_builds_it():
     assert settings["strict"] is True
     assert settings["site_dir"] == "build/site"
     assert settings["theme"]["font"] is False
+    # search from a folder: the index is a script, its worker a frame, and neither comes from a net
+    assert "offline" in settings["plugins"]
+    (script,) = settings["extra"]["polyfills"]
+    assert "iframe-worker" in script  # else the plugin adds one from a public server
+    assert (ROOT / "docs" / script).is_file()

@@ -30,7 +30,7 @@ def recording(tmp_path):
 
 
 def test_epochs_without_a_result_are_counted_and_the_rest_is_relative(recording):
-    (series,) = load_series(recording, free=FREE)
+    (series,) = load_series(recording, free=FREE, exterior="series")
     assert series.number.tolist() == [1, 2, 4, 5, 6, 8, 9, 10]
     assert sum(series.without_result.values()) == 2
     assert series.free == FREE

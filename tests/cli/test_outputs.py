@@ -38,6 +38,7 @@ COMMANDS: dict[str, list[str] | None] = {
     "reprocess": None,
     "session start": None,
     "simulate": ["--preset", "rpi-v2.1-heating", "--out", "{to}/M1"],
+    "testfield import": None,
     "testfield survey": None,
     "fit": ["{M1}", "--output", "{to}/m.yaml"],
     "predict": None,

@@ -91,7 +91,7 @@ def test_faults(camera):
         ({"programme": [[0, 20], [0, 30]]}, "times must increase"),
         ({"programme": "hot"}, r"list of \[seconds, °C\]"),
         ({"exposure_s": -1}, "exposure_s"),
-        ({"faults": [{"kind": "bored"}]}, "none of timeout"),
+        ({"faults": [{"kind": "bored"}]}, "not one of timeout"),
     ],
 )
 def test_bad_options(options, says):

@@ -393,8 +393,9 @@ class Store:
         with self._lock, in_words(self.path, "the store cannot be read", reading=True):
             found = examine(self._db)
         if lost := lost_commits(self.path.resolve().with_name(f"{self.path.resolve().name}-wal")):
-            many = "all transactions" if lost < 0 else f"{lost} transactions"
-            damaged = (f"the -wal file: {many} in it cannot be read", *found.damaged)
+            many = "all transactions" if lost < 0 else f"{lost} transaction{'s'[:lost != 1]}"
+            why = "damage, or cut off when a writer was killed"
+            damaged = (f"the -wal file: {many} in it cannot be read ({why})", *found.damaged)
             found = replace(found, damaged=damaged)
         if not found.damaged:
             for series in self.all_series():

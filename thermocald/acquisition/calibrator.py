@@ -7,7 +7,7 @@ from. Without that, or when a start fails (a knock), it begins from nothing by i
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol, Self
 
 import numpy as np
 
@@ -51,6 +51,24 @@ class CalibratedEpoch:
     searched: str = ""
 
 
+class _Camera(Protocol):
+    @property
+    def sensor(self) -> Sensor: ...
+    @property
+    def principal_distance(self) -> float | None: ...
+    @property
+    def interior(self) -> InteriorOrientation | None: ...
+
+
+class _Recorded(Protocol):
+    """What is read here of a store.recording.reader.Recording."""
+
+    @property
+    def camera(self) -> _Camera: ...
+    @property
+    def testfield(self) -> TestField: ...
+
+
 class Calibrator:
     """Measures and adjusts the epochs of one camera, one after the other.
 
@@ -79,6 +97,20 @@ class Calibrator:
         )
         self._last: Adjustment | None = None
         self._usual = float("nan")
+
+    @classmethod
+    def of_recording(
+        cls, recording: _Recorded, settings: AdjustmentSettings | None = None
+    ) -> Self:
+        """The calibrator of a recording's camera before its test field."""
+        camera = recording.camera
+        return cls(
+            camera.sensor,
+            recording.testfield,
+            settings,
+            nominal_c=camera.principal_distance,
+            interior=camera.interior,
+        )
 
     def reset(self) -> None:
         """Forget where the camera was."""

@@ -178,14 +178,8 @@ def _recording_table(path: Path, settings: AdjustmentSettings, exterior: str) ->
     from thermocald.store.recording.reader import open_recording
 
     recording = open_recording(path)
-    columns, camera = recording.columns, recording.camera
-    calibrator = Calibrator(
-        camera.sensor,
-        recording.testfield,
-        settings,
-        nominal_c=camera.principal_distance,
-        interior=camera.interior,
-    )
+    columns = recording.columns
+    calibrator = Calibrator.of_recording(recording, settings)
     reference = columns.temperatures[next(iter(recording.channels))]
     temperature = frame_temperatures(
         columns.numbers, columns.frame_time, columns.temperature_time, reference

@@ -177,13 +177,7 @@ def _columns(block: Block) -> tuple[dict[str, Any], int]:
     """The block's rows as columns, and how many epochs have a result."""
     recording = open_recording(block.recording)
     camera = recording.camera
-    calibrator = Calibrator(
-        camera.sensor,
-        recording.testfield,
-        AdjustmentSettings(free=block.free),
-        nominal_c=camera.principal_distance,
-        interior=camera.interior,
-    )
+    calibrator = Calibrator.of_recording(recording, AdjustmentSettings(free=block.free))
     epochs = [
         calibrator.calibrate(epoch)
         for epoch in islice(recording.iter_epochs(), block.first, block.stop)

@@ -29,13 +29,7 @@ def measured_epochs(
     """A recording's epochs with their observations; frames are measured where they are not."""
     if recording.has_observations:
         return list(recording.epochs)
-    camera = recording.camera
-    calibrator = Calibrator(
-        camera.sensor,
-        recording.testfield,
-        nominal_c=camera.principal_distance,
-        interior=camera.interior,
-    )
+    calibrator = Calibrator.of_recording(recording)
     epochs = []
     for epoch in recording.iter_epochs():
         epochs.append(calibrator.calibrate(epoch).epoch)

@@ -38,18 +38,11 @@ def replay_into(
 
     Raises StoreError; DataError where the store's series of this name is of something else.
     """
-    camera = recording.camera
     # A replay can be repeated: the end of the process must not lose anything, a power cut may.
     with Store.open(path, "append", durable=False) as store:
         series = _series(store, recording, settings)
         last = store.last_epoch(series)
-        calibrator = Calibrator(
-            camera.sensor,
-            recording.testfield,
-            settings,
-            nominal_c=camera.principal_distance,
-            interior=camera.interior,
-        )
+        calibrator = Calibrator.of_recording(recording, settings)
         for epoch in recording.iter_epochs():
             if last is None or epoch.number > last:
                 done = calibrator.calibrate(epoch)

@@ -88,13 +88,7 @@ def from_recording(
     """A recording, its frames measured where they are not, adjusted as one series."""
     columns, camera = recording.columns, recording.camera
     settings = AdjustmentSettings(free=tuple(free))
-    calibrator = Calibrator(
-        camera.sensor,
-        recording.testfield,
-        settings,
-        nominal_c=camera.principal_distance,
-        interior=camera.interior,
-    )
+    calibrator = Calibrator.of_recording(recording, settings)
     apart, observations = calibrate_epochs(recording.iter_epochs(), calibrator, {}, advance)
     table = table_of_series(
         recording.head,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 from thermocald.errors import (
     DriverMissing,
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from thermocald.store.server.address import ServerAddress
 
-__all__ = ["REVISION", "connect", "in_words", "require_revision"]
+__all__ = ["REVISION", "Connected", "connect", "in_words", "require_revision"]
 
 REVISION = "0001"
 """The schema that this program writes and reads; `thermocald server init` brings a server to it."""
@@ -112,6 +112,23 @@ def _told(address: ServerAddress | str, doing: str, cause: Any) -> StoreError:
     refused = ServerError(message)
     refused.about_values = state[:2] in ("22", "23")
     return refused
+
+
+class Connected:
+    """What holds an engine: it is disposed of at the end of a `with` block."""
+
+    def __init__(self, engine: Engine) -> None:
+        self._engine = engine
+
+    def close(self) -> None:
+        """Close all connections; may be called twice."""
+        self._engine.dispose()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
 
 
 def require_revision(engine: Engine, address: ServerAddress) -> None:

@@ -23,11 +23,10 @@ from thermocald.store.recording.head import parse_head
 from thermocald.store.recording.readings import interpolate_readings
 from thermocald.store.recording.testfield_file import parse_testfield
 from thermocald.store.server.address import ServerAddress
-from thermocald.store.server.connection import connect, in_words, require_revision
+from thermocald.store.server.connection import Connected, connect, in_words, require_revision
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
-    from types import TracebackType
     from uuid import UUID
 
     from numpy.typing import NDArray
@@ -47,14 +46,14 @@ _LATEST = (
 )
 
 
-class ServerStore:
+class ServerStore(Connected):
     """An open store on a server, narrowed to what its address selects; use it in a `with` block."""
 
     def __init__(self, address: ServerAddress) -> None:
         self.address = address
         self.path = Path(str(address))
         self._keys: list[UUID] = []
-        self._engine = connect(address)
+        super().__init__(connect(address))
         try:
             require_revision(self._engine, address)
         except BaseException:
@@ -65,21 +64,6 @@ class ServerStore:
     def open(cls, source: Path | str) -> Self:
         """Open by address. Raises UsageError, ServerGone, ServerError, StoreVersionError."""
         return cls(ServerAddress.parse(source))
-
-    def close(self) -> None:
-        """Close all connections; may be called twice."""
-        self._engine.dispose()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def all_series(self) -> list[StoredSeries]:
         """All series that the address selects, in the order in which they were begun."""

@@ -14,12 +14,10 @@ from uuid import UUID, uuid5
 from thermocald.errors import StoreVersionError
 from thermocald.store.recording.head import head_document
 from thermocald.store.recording.testfield_file import testfield_csv
-from thermocald.store.server.connection import connect, in_words, require_revision
+from thermocald.store.server.connection import Connected, connect, in_words, require_revision
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-    from types import TracebackType
-    from typing import Self
 
     from sqlalchemy import Table
 
@@ -39,7 +37,7 @@ def series_key(station: str, series: StoredSeries) -> UUID:
     return uuid5(_NAMESPACE, text)
 
 
-class ServerWriter:
+class ServerWriter(Connected):
     """An open connection that inserts for one station; use it in a `with` block.
 
     Raises ServerGone (try again later), ServerError, StoreVersionError.
@@ -50,7 +48,7 @@ class ServerWriter:
 
         self.address = address
         self.station = station
-        self._engine = connect(address)
+        super().__init__(connect(address))
         self._sent: set[UUID] = set()
         self._months: set[int] = set()
         try:
@@ -64,20 +62,6 @@ class ServerWriter:
         except BaseException:
             self._engine.dispose()
             raise
-
-    def close(self) -> None:
-        self._engine.dispose()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def write(
         self, table: str, rows: Sequence[Mapping[str, Any]], series: Mapping[int, StoredSeries]

@@ -38,7 +38,7 @@ lint: $(STAMP) ## ruff, mypy --strict, layers
 
 test: lint ## lint, then the quick tests
 	@echo "== pytest"
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 test-slow: $(STAMP) ## long statistics and browser tests
 	$(BIN)/python -m pytest -q -m slow -n 2 --dist loadfile

@@ -107,17 +107,17 @@ def archive_series(
         ]
         head = replace(head, extra={**head.extra, "clock_set_back": steps})
     by_number = dict(zip(columns["epoch"].tolist(), corrections.tolist(), strict=True))
+    shifts = np.unique(np.append(corrections, 0.0)).tolist()
     kept = FileFolder(frames or Path())
     with RecordingWriter(path, head, series.testfield) as writer:
         for stored in store.epochs(series):
             epoch = _with_frame(stored.epoch, kept)
-            shift = by_number[epoch.number]
-            if shift:
-                epoch = replace(
-                    epoch,
-                    frame_time=epoch.frame_time + shift,
-                    temperature_time=epoch.temperature_time + shift,
-                )
+            if len(shifts) > 1:
+                frame_time = epoch.frame_time + by_number[epoch.number]
+                # a reading beside a step of the clock may be stamped by the other of the two
+                at = min((epoch.temperature_time + s for s in shifts),
+                         key=lambda t, f=frame_time: abs(t - f))  # type: ignore[misc]  # fmt: skip
+                epoch = replace(epoch, frame_time=frame_time, temperature_time=at)
             writer.append(epoch)
 
 

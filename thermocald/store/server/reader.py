@@ -26,12 +26,11 @@ from thermocald.store.server.address import ServerAddress
 from thermocald.store.server.connection import Connected, connect, in_words, require_revision
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
     from uuid import UUID
 
     from numpy.typing import NDArray
 
-    from thermocald.photogrammetry.field.testfield import Observations
 
     Array = NDArray[np.float64]
 
@@ -113,10 +112,6 @@ class ServerStore(Connected):
         ((last,),) = self._query("SELECT max(number) FROM epoch WHERE series = %s", (key,))
         return None if last is None else int(last)
 
-    def column_names(self, series: StoredSeries) -> list[str]:
-        """What `series_columns` can give, but extra columns."""
-        return ["epoch", *COLUMN_NAMES[1:], "status", *series.head.channels]
-
     def series_columns(self, series: StoredSeries, names: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Columns (E,) over all epochs by name, as `Store.series_columns`."""
         key = self._keys[series.id]
@@ -179,16 +174,6 @@ class ServerStore(Connected):
             latest = stored
         if latest is not None:
             yield latest
-
-    def observations(
-        self, series: StoredSeries, numbers: Iterable[int]
-    ) -> Iterator[Observations | None]:
-        """The observations of some epochs; StoreError for a number that is not there."""
-        for number in numbers:
-            stored = next(self.epochs(series, number, number), None)
-            if stored is None:
-                raise StoreError(f"{self.path}: series {series.name!r} has no epoch {number}")
-            yield stored.epoch.observations
 
     def events(self, series: StoredSeries | None = None, since_utc: float = 0.0) -> list[Event]:
         """What happened, oldest first; of one series, or of all that the address selects."""

@@ -57,7 +57,7 @@ class ServerWriter(Connected):
                 data = MetaData()
                 self._tables: dict[str, Table] = {
                     name: Table(name, data, autoload_with=self._engine)
-                    for name in ("testfield", "series", "epoch", "event", "reading", "frame")
+                    for name in ("testfield", "series", "epoch", "event", "reading")
                 }
         except BaseException:
             self._engine.dispose()
@@ -84,15 +84,6 @@ class ServerWriter(Connected):
                     self._make_months(connection, [float(row["frame_time"]) for row in rows])
                 connection.execute(_insert(self._tables[table]), ready)
             self._sent.update(keys[id_] for id_ in needed)
-
-    def write_frame(self, series: StoredSeries, number: int, name: str, data: bytes) -> None:
-        """Insert the file of one frame."""
-        row = {
-            "series": series_key(self.station, series), "number": number, "name": name, "data": data
-        }  # fmt: skip
-        sending = in_words(self.address, f"frame {name} was not sent")
-        with sending, self._engine.begin() as connection:
-            connection.execute(_insert(self._tables["frame"]), [row])
 
     def _row(self, table: str, row: Mapping[str, Any], keys: Mapping[int, UUID]) -> dict[str, Any]:
         columns = self._tables[table].columns

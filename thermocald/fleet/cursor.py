@@ -6,10 +6,10 @@ Losing it costs time and nothing else: rows that are sent again are passed over 
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Self
 
+from thermocald.atomic_file import write_text
 from thermocald.errors import StoreError
 from thermocald.store.database.changes import KEPT
 
@@ -53,13 +53,5 @@ class Cursor:
         return found if same and sound else fresh
 
     def write(self, path: Path) -> None:
-        """Replace the file, whole. Raises StoreError where it cannot be written."""
-        partial = path.with_name(f".{path.name}.partial")
-        try:
-            partial.write_text(json.dumps(asdict(self)), encoding="utf-8")
-            os.replace(partial, path)
-        except OSError as error:
-            partial.unlink(missing_ok=True)
-            raise StoreError(
-                f"{path}: how far was sent cannot be kept: {error.strerror}"
-            ) from error
+        """Replace the file, whole. Raises OutputError where it cannot be written."""
+        write_text(path, json.dumps(asdict(self)))

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from thermocald.atomic_file import new_file
 from thermocald.errors import RecordingError, UsageError
 from thermocald.store.recording.table import Chunk, Table
 
@@ -187,17 +188,12 @@ def parquet_to_csv(source: Path, target: Path, advance: Any = lambda _: None) ->
     import csv
 
     table = ParquetTable(source, ("epoch", "target", "x", "y", "sx", "sy"))
-    partial = target.with_name(f".{target.name}.partial")
-    try:
-        with partial.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(table.columns)
-            for chunk in table.chunks():
-                writer.writerows(zip(*(_texts(chunk, n) for n in table.columns), strict=True))
-                advance(len(chunk))
-        partial.replace(target)
-    finally:
-        partial.unlink(missing_ok=True)
+    with new_file(target) as partial, partial.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(table.columns)
+        for chunk in table.chunks():
+            writer.writerows(zip(*(_texts(chunk, n) for n in table.columns), strict=True))
+            advance(len(chunk))
 
 
 def _texts(chunk: ColumnChunk, name: str) -> Sequence[str]:

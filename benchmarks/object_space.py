@@ -5,9 +5,9 @@ Bound: mean error after correction ≤ 1/10 of the mean error without.
 
 A thermal model is fitted to M1 and applied to the *readings of the thermometer* of M2, another
 series with other noise. Nine image points are seen on the plane with the true interior orientation
-of each epoch, and with another one: that of the begin (uncorrected: a camera calibrated once),
+of each epoch, and with another one: that of the start (uncorrected: a camera calibrated once),
 that of the series' mean (which is how the reference counts), and the model's, whose level is that
-of a calibration at the begin. "Base" is the model with rates alone, "with effects" also has the
+of a calibration at the start. "Base" is the model with rates alone, "with effects" also has the
 effects that the preset contains, such as discovery names; their parameters are estimated.
 """
 

@@ -122,7 +122,7 @@ BAD = [
     (document(dashboard={"port": 70000}), "dashboard.port: is 70000"),
     (document(logging={"level": "loud"}), "logging.level: is 'loud'"),
     (document(cameras="none"), "cameras: is 'none'"),
-    (document(cameras=[{"name": "a", "driver": "m"}] * 2), "cameras: the name 'a' stands twice"),
+    (document(cameras=[{"name": "a", "driver": "m"}] * 2), "cameras: the name 'a' is duplicated"),
 ]
 
 

@@ -292,7 +292,7 @@ class Config(_Section):
             names = [device.name for device in getattr(self, kind)]
             for name in names:
                 if names.count(name) > 1:
-                    raise _wrong(f"{kind}: the name {name!r} stands twice")
+                    raise _wrong(f"{kind}: the name {name!r} is duplicated")
         there = [thermometer.name for thermometer in self.thermometers]
         for camera in self.cameras:
             for name in camera.thermometers:

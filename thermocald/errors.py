@@ -24,7 +24,7 @@
                ├── DeviceDenied (PermissionError)   permission, unauthorized, busy for good
                ├── WrongDevice                      identity, size or capability does not fit
                ├── DriverMissing                    an optional library is not installed
-               └── DeviceFinished                   nothing more will come, and that is no fault
+               └── DeviceFinished                   nothing more will come, and that is not a fault
 
 Leaves also are the built-in exception that they mean.
 """

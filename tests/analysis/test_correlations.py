@@ -21,7 +21,7 @@ def test_median_over_both_series_and_noise_within_each():
         series.append(matrices)
     found = median_correlations(series)
     assert found.median[0, 1] == pytest.approx(0.6, abs=0.02)
-    # The step from one series to the other is no noise.
+    # The step from one series to the other is not noise.
     assert found.noise[0, 1] == pytest.approx(0.03, rel=0.05)
     assert found.epochs == 8000
 

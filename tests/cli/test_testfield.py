@@ -181,8 +181,8 @@ def test_survey_with_a_known_camera_held(run, photographs, tmp_path):
     ("arguments", "error", "reason"),
     [
         (["PHOTOS"], UsageError, "the scale is missing"),
-        (["PHOTOS", "--scale", "R65", "R65", "100"], UsageError, "is no distance"),
-        (["PHOTOS", "--scale", "R65", "R71", "-3"], UsageError, "is no distance"),
+        (["PHOTOS", "--scale", "R65", "R65", "100"], UsageError, "is not a distance"),
+        (["PHOTOS", "--scale", "R65", "R71", "-3"], UsageError, "is not a distance"),
         (["NOWHERE", "--scale", "R65", "R71", "100"], UsageError, "no such file"),
         (["PHOTOS", "--scale", "R65", "X", "100"], GeometryError, "X"),
         (["PHOTOS", "--scale", "R65", "R71", "100", "--hold-camera"], UsageError, "needs --camera"),

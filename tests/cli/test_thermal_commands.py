@@ -129,7 +129,7 @@ def test_an_effect_that_needs_a_name(tmp_path, effect, option, keys):
     [
         ("thermal_lagg", "did you mean 'thermal_lag'?"),
         ("thermal_lag:taw=3", "thermal_lag has no parameter 'taw'; did you mean 'tau'?"),
-        ("thermal_lag:tau=fast", "tau=fast is no number"),
+        ("thermal_lag:tau=fast", "tau=fast is not a number"),
         ("thermal_lag:tau", "write tau=VALUE"),
         ("thermal_lag:tau=-3", "negative"),
         ("second_heat_source", "say which: --effect second_heat_source:channel="),
@@ -274,7 +274,7 @@ def test_far_outside_by_name_is_done_and_said(folder):
 
 
 def correct_images(folder, source, out, *more):
-    """Images at the begin and in the heat, as a camera of 8 × 8 binned pixels takes them."""
+    """Images at the start and in the heat, as a camera of 8 × 8 binned pixels takes them."""
     times = np.loadtxt(folder / "M1" / "epochs.csv", delimiter=",", skiprows=1, usecols=1)
     (source / "i.csv").write_text(f"time,image\n{times[0]:.2f},a.png\n{times[45]:.2f},b.png\n")
     return run("correct", source / "i.csv", "--model", folder / "cam.yaml", "--log",

@@ -187,7 +187,7 @@ def test_a_broken_configuration_at_reload_changes_nothing_a_good_one_does(daemon
     daemon.until(lambda: len(daemon.results()) > 3)
     daemon.config.write_text(good.replace("period_s", "perriod_s"))
     daemon.signal(signal.SIGHUP)
-    daemon.until(lambda: "was not read anew" in daemon.log())
+    daemon.until(lambda: "was not read again" in daemon.log())
     assert "is 'period_s' meant?" in daemon.log()
     count = len(daemon.results())
     daemon.until(lambda: len(daemon.results()) > count + 3)

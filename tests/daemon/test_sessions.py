@@ -219,7 +219,7 @@ def test_reload_leaves_a_session_alone(live, daemon):
     daemon.config.write_text(yaml.safe_dump(document))
     daemon.signal(signal.SIGHUP)
     daemon.until(lambda: daemon.session().get("state") == "done")
-    assert "the configuration was read anew" in daemon.log()
+    assert "the configuration was read again" in daemon.log()
     assert daemon.stop() == 0
     assert series_of(daemon.store)["M7"][1] == list(range(1, 13))
 

@@ -108,7 +108,7 @@ def test_impossible_networks(capacities, links, says):
 
 
 def test_unknown_source_and_missing_boundary():
-    with pytest.raises(ConfigurationError, match="'lamp', which is no body"):
+    with pytest.raises(ConfigurationError, match="'lamp', which is not a body"):
         two_bodies().solve(TIMES, 22.0, {"lamp": Course.constant(1.0)}, AIR)
     with pytest.raises(ConfigurationError, match="'ambient' is not given"):
         two_bodies().solve(TIMES, 22.0, {}, {})

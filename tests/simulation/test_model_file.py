@@ -207,7 +207,7 @@ def test_bad_programmes(tmp_path, path, value, says):
     [
         ("0,20\n300,21\n1300,22\n", "line 4: a gap of 1000 s"),
         ("0,20\n300,21\n200,22\n", "line 4: time runs backwards"),
-        ("0,20\n300,\n1300,22\n", "line 3: .* is no number"),
+        ("0,20\n300,\n1300,22\n", "line 3: .* is not a number"),
         ("0,20\n", "two rows"),
         ("0,20\n300,nan\n900,22\n", "not finite"),
     ],

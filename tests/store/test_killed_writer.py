@@ -1,4 +1,4 @@
-"""A killed writer loses at most the epoch in hand; a full disk loses nothing kept before."""
+"""A killed writer loses at most the current epoch; a full disk loses nothing kept before."""
 
 from __future__ import annotations
 

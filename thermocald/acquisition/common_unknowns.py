@@ -166,7 +166,7 @@ class CommonUnknowns:
         """An epoch's result given all epochs so far, this one included.
 
         apart: the epoch's adjustment by itself, whose rejected targets stay rejected; returned as
-        it is where it is no result. moved: the epoch contradicts the others in what the caller
+        it is where it is not a result. moved: the epoch contradicts the others in what the caller
         knows. With a common orientation such an epoch has no result; the second one in a row starts
         again.
         """

@@ -58,7 +58,7 @@ class DeviceLoop:
         self._thread.start()
 
     def stop(self) -> None:
-        """Ask the loop to end after the call in hand."""
+        """Ask the loop to end after the current call."""
         self._stop.set()
 
     def join(self, timeout_s: float) -> bool:

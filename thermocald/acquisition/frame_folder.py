@@ -102,7 +102,7 @@ class FrameFolder:
         return relative
 
     def delete(self, relative: Path) -> None:
-        """Delete one frame; not being there is no error."""
+        """Delete one frame; it is not an error if it is not there."""
         with contextlib.suppress(OSError):
             (self.root / relative).unlink()
 

@@ -1,7 +1,7 @@
 """The link to one device: opened when needed, re-opened after faults with growing pauses.
 
-A device that goes away is told once, and once when it is back. A fault that no retry can mend ends
-the link, until the configuration is read anew; only a device that was not found is looked for
+A device that goes away is told once, and once when it is back. A fault that is not recoverable ends
+the link, until the configuration is read again; only a device that was not found is looked for
 again, since it may be plugged in later.
 """
 
@@ -166,7 +166,7 @@ class Link:
         self.device.close()
         self.error = error
         self.why = str(error)
-        # a recording that has been played to its end is no failure
+        # a recording that has been played to its end is not a failure
         finished = isinstance(error, DeviceFinished)
         self.state = "finished" if finished else "failed"
         level = logging.INFO if finished else logging.ERROR

@@ -142,7 +142,7 @@ class LivePipeline:
             return self._changed.wait_for(lambda: not self._items and not self._amended, timeout_s)
 
     def stop(self, grace_s: float) -> bool:
-        """Finish the epoch in hand, keep the others as they are; False if that took too long."""
+        """Finish the current epoch, keep the others as they are; False if that took too long."""
         with self._changed:
             self._stopping = True
             self._changed.notify_all()

@@ -51,7 +51,7 @@ def make_epoch(number: int, frame: Frame, paired: PairedReadings) -> Epoch:
 
 
 def calibrate_frame(calibrator: Calibrator, epoch: Epoch, frame: Frame) -> CalibratedEpoch:
-    """Measure and adjust; a frame that is no picture gives the status `bad_frame`, no error."""
+    """Measure and adjust; a frame that is not an image gives the status `bad_frame`, no error."""
     try:
         if (lists := frame.metadata.get("observations")) is not None:
             seen = observations_from_lists(lists, calibrator.testfield)
@@ -95,7 +95,7 @@ class Pipeline:
     def run(self, epochs: int | None = None) -> Iterator[tuple[CalibratedEpoch, Frame]]:
         """Run until so many epochs are there (None: for ever); yields each after the sinks had it.
 
-        A recording that has been played ends the run; what else no retry can mend is raised, as a
+        A recording that has been played ends the run; what else is not recoverable is raised, as a
         PermanentDeviceError.
         """
         done = 0

@@ -178,7 +178,7 @@ def _images(
             source, written = path.parent / row["image"], out / Path(row["image"]).name
             image = cv2.imread(str(source), cv2.IMREAD_UNCHANGED)
             if image is None:
-                raise ImageError(f"{source}: is no image that can be read")
+                raise ImageError(f"{source}: is not a readable image")
             if written.exists() and written.samefile(source):
                 raise UsageError(f"{written}: would be overwritten; give another --out")
             if image.shape[:2] != (sensor.height, sensor.width):

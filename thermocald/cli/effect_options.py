@@ -87,7 +87,7 @@ def _number(text: str, key: str, value: str) -> float:
     try:
         return float(value)
     except ValueError:
-        raise UsageError(f"--effect {text}: {key}={value} is no number") from None
+        raise UsageError(f"--effect {text}: {key}={value} is not a number") from None
 
 
 def _nearest(name: str, known: Iterable[str]) -> str:

@@ -103,7 +103,7 @@ def read_camera(path: Path, pixel_pitch: float | None = None) -> CameraFile:
         return CameraFile(found.name, model.sensor, model.interior.c, model.interior)
     document = read_yaml(path, ConfigurationError)
     if not isinstance(document, dict):
-        raise ConfigurationError(f"{path}: is no camera file; it must hold `width: …` and so on")
+        raise ConfigurationError(f"{path}: is not a camera file; it must hold `width: …` and so on")
     camera = document.get("camera", document)
 
     def number(key: str, required: bool = True) -> float | None:

@@ -47,7 +47,7 @@ def survey(
     ] = None,
     camera: CameraFile = None,
     hold_camera: Annotated[
-        bool, typer.Option("--hold-camera", help="Trust --camera and do not calibrate it anew.")
+        bool, typer.Option("--hold-camera", help="Trust --camera and do not calibrate it again.")
     ] = False,
     pixel_pitch: PixelPitch = None,
     camera_out: Annotated[
@@ -137,7 +137,7 @@ def _distances(
         raise UsageError("the scale is missing: --scale A B MM, or --distances FILE")
     for d in found:
         if not (d.length > 0 and d.sigma > 0) or d.a == d.b:
-            raise UsageError(f"{d.a} to {d.b}, {d.length:g} ± {d.sigma:g} mm, is no distance")
+            raise UsageError(f"{d.a} to {d.b}, {d.length:g} ± {d.sigma:g} mm, is not a distance")
     return found
 
 

@@ -192,7 +192,7 @@ class CameraLine:
     def take(self, series: str | None, start: str = "", limit: int = 0) -> None:
         """Go over to another series, None for none; raises ConfigurationError and changes nothing.
 
-        The epochs in hand are finished first; frames that come meanwhile belong to the new one.
+        The current epochs are finished first; frames that come meanwhile belong to the new one.
         """
         run = None if series is None else SeriesRun(self, series, start, limit)
         self._replace(run, checking=False)

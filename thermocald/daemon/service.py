@@ -1,6 +1,6 @@
 """The process: signals, systemd, reload, status; the work is the station's.
 
-SIGTERM and SIGINT finish the epoch in hand; SIGHUP reads the configuration anew, or says why not
+SIGTERM and SIGINT finish the current epoch; SIGHUP reads the configuration again, or says why not
 and goes on with the old one.
 """
 
@@ -243,7 +243,7 @@ class Service:
             self._change_to(self._read_again())
         except ThermocaldError as error:
             log.error(
-                "the configuration was not read anew, the old one stays: %s", error,
+                "the configuration was not read again, the old one stays: %s", error,
                 extra={"event": "reload_failed"},
             )  # fmt: skip
             self._tell("reload_failed", str(error))
@@ -271,8 +271,8 @@ class Service:
         logging.getLogger().setLevel(config.logging.level.upper())
         self.config, self._station = config, new
         new.start()
-        log.info("the configuration was read anew", extra={"event": "reloaded"})
-        self._tell("reloaded", "the configuration was read anew")
+        log.info("the configuration was read again", extra={"event": "reloaded"})
+        self._tell("reloaded", "the configuration was read again")
 
     def _complain(self, stalled: list[str]) -> None:
         for text in stalled:

@@ -114,7 +114,7 @@ class Station:
         self._started = True
 
     def stop(self, grace_s: float) -> bool:
-        """Finish the epochs in hand; False if a device or an output does not let go."""
+        """Finish the current epochs; False if a device or an output does not let go."""
         deadline = time.monotonic() + grace_s
         self._stop.set()
         for loop in self._all_loops():

@@ -4,7 +4,7 @@ A camera on a tripod wanders. The amplitudes of cosines in the well-determined c
 camera's parameters are random, with a covariance Sigma / (corner² + k²) at the k-th half-wave: a
 random walk where the corner is zero, else one that is bounded. Sigma is found by restricted maximum
 likelihood (EM), both series together, beside each hypothesis by itself: what a hypothesis explains
-is no movement.
+is not a movement.
 
 Source: Patterson, Thompson (1971), Biometrika 58, 545-554 (restricted maximum likelihood);
 Dempster, Laird, Rubin (1977), J. Royal Statistical Society B 39, 1-38 (EM).

@@ -152,7 +152,8 @@ def _log(reader: QuantityReader, unit: str, folder: Path) -> Course:
                     rows.append((float(line[columns[0]]), float(line[columns[1]])))
                 except (TypeError, ValueError) as cause:
                     raise ConfigurationError(
-                        f"{path}, line {table.line_num}: {columns[0]} or {columns[1]} is no number"
+                        f"{path}, line {table.line_num}: {columns[0]} or {columns[1]} is not "
+                        "a number"
                     ) from cause
     except (OSError, UnicodeDecodeError) as cause:
         raise ConfigurationError(f"{path}: cannot be read: {cause}") from cause

@@ -13,7 +13,7 @@ The camera file:
     look: {paper: 200, ink: 30, blur: 0.8, noise: 2.0, vignetting: 0.15}    # DN, px, share
     heat:
       bodies: {lens: {capacity: 0.6}, board: {capacity: 15.0}}              # J/K
-      links:                                     # W/K; what is no body is a boundary
+      links:                                     # W/K; what is not a body is a boundary
       - {between: [lens, board], conductance: 0.01}
       - {between: [board, ambient], conductance: 0.05}
     thermometers:                                # the first is the reference

@@ -115,7 +115,7 @@ class HeatNetwork:
         for name in powers:
             if name not in self.capacities:
                 raise ConfigurationError(
-                    f"a source heats {name!r}, which is no body; bodies are "
+                    f"a source heats {name!r}, which is not a body; bodies are "
                     f"{', '.join(self.bodies)}"
                 )
         start = np.array(

@@ -48,7 +48,7 @@ _LONG = 20_000  # epochs from which one knot per interval has to do
 
 @dataclass(frozen=True)
 class Simulation:
-    """One series of one camera, simulated; everything random hangs on `seed`."""
+    """One series of one camera, simulated; everything random depends on `seed`."""
 
     model: ThermalModel
     device: CameraDevice
@@ -70,12 +70,12 @@ class Simulation:
 
     @cached_property
     def frame_times(self) -> Array:
-        """The frames' instants (E,), s from the begin."""
+        """The frames' instants (E,), s from the start."""
         return self.programme.frame_times(self._rng(0))
 
     @cached_property
     def reading_times(self) -> Array:
-        """The readings' instants (E,), s from the begin."""
+        """The readings' instants (E,), s from the start."""
         return self.programme.reading_times(self.frame_times, self._rng(1))
 
     @cached_property
@@ -148,7 +148,7 @@ class Simulation:
     def observations(self) -> Iterator[Observations]:
         """The measured image points, epoch by epoch; memory does not grow with their number.
 
-        Raises GeometryError where the camera sees fewer than 3 targets at the begin.
+        Raises GeometryError where the camera sees fewer than 3 targets at the start.
         """
         measuring, rng = self.device.measuring, self._rng(2)
         n = len(self.field)

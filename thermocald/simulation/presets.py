@@ -56,7 +56,7 @@ class Preset:
     interior at T0; drift_px, drift_c_mm: of principal point and principal distance over the whole
     warming; direction_deg: of the principal point's way, in the image (x right, y up); begin_degc,
     end_degc: temperature at power-on and in equilibrium; noise_ratio: σ0 at the highest temperature
-    over σ0 at the begin; set_share: share of the principal point's way that does not come back;
+    over σ0 at the start; set_share: share of the principal point's way that does not come back;
     lamp: heated from outside, then left to cool; distortion_drift: A1, B1, B2 over the warming.
     """
 

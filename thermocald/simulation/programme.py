@@ -8,7 +8,7 @@
     jitter: 0.0                                  # s, of the frames' cadence (sigma)
     reading: {offset: 0.0, spread: 1.0}          # s: thermometers are read ± spread about the frame
     begin: 1600000000.0                          # s UTC
-    initial: 22.0                                # °C, all bodies; default: ambient at the begin
+    initial: 22.0                                # °C, all bodies; default: ambient at the start
     ambient: 22.0                                # °C: a number, pieces, or a log (see `course`)
     sources:                                     # W into bodies of the camera file
       housing: [{from: 0, to: 60, value: 0}, {from: 60, to: 900, value: 6.0},
@@ -46,7 +46,7 @@ class Programme:
     """Epochs and what happens during them.
 
     epochs, interval s, jitter s, reading_offset, reading_spread s, begin s UTC; initial °C or None
-    (as the ambient at the begin); boundaries {name: Course °C}, sources {body: Course W}.
+    (as the ambient at the start); boundaries {name: Course °C}, sources {body: Course W}.
     """
 
     name: str
@@ -67,7 +67,7 @@ class Programme:
         return (self.epochs - 1) * self.interval
 
     def frame_times(self, rng: np.random.Generator) -> Array:
-        """When frames are taken, (E,) s from the begin, the first at 0, ascending."""
+        """When frames are taken, (E,) s from the start, the first at 0, ascending."""
         nominal = np.arange(self.epochs) * self.interval
         limit = 0.4 * self.interval
         shift = np.clip(self.jitter * rng.standard_normal(self.epochs), -limit, limit)
@@ -75,7 +75,7 @@ class Programme:
         return nominal + shift
 
     def reading_times(self, frames: Array, rng: np.random.Generator) -> Array:
-        """When thermometers are read, (E,) s from the begin, ascending."""
+        """When thermometers are read, (E,) s from the start, ascending."""
         spread = self.reading_spread * rng.uniform(-1.0, 1.0, len(frames))
         result: Array = np.maximum.accumulate(frames + self.reading_offset + spread)
         return result

@@ -454,7 +454,7 @@ def test_aicon_states_standard_deviations(tmp_path, plain):
         ("i.xml", "<calibration><projection>fisheye</projection></calibration>", "fisheye"),
         ("j.xml", "<!DOCTYPE x><calibration/>", "DOCTYPE"),
         ("k.xml", "<calibration><f>nan</f></calibration>", "finite"),
-        ("l.ior", "Ck -8\nCk -9\n", "line 2: Ck stands twice"),
+        ("l.ior", "Ck -8\nCk -9\n", "line 2: Ck is duplicated"),
         ("m.ior", "Ck\n", "no value"),
         ("n.ior", "Ck -8\nfoo 3\n", "foo"),
         ("s.ior", "1 1 -8 0 0 1e-3 0 0 0 0 0 0 0 8 6 2000 1500", "R0 is 0"),

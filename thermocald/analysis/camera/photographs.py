@@ -81,7 +81,7 @@ def calibrate_photographs(
     interior: InteriorOrientation | None = None,
     advance: Callable[[int], None] | None = None,
 ) -> Photographs:
-    """Measure and calibrate photographs; a file that is no image has a status and a reason."""
+    """Measure and calibrate photographs; a file that is not an image has a status and a reason."""
     measured: list[Observations | None] = []
     failures: dict[int, tuple[str, str]] = {}
     prior = Prior(sensor, interior=interior, principal_distance=nominal_c)

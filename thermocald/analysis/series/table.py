@@ -64,7 +64,7 @@ class SeriesTable:
     number, frame_time (E,); temperature (E,) °C of the reference at the frame's instant; values,
     sd (E, 16), NaN where there is none; sigma0, n_observations, n_rejected (E,); status, reasons:
     E words and sentences; exterior: `series` or `per_epoch`; level_sd (16,): what all epochs have
-    in common, NaN where it is not told apart; adjustment: the series', None epoch by epoch;
+    in common, NaN where it cannot be separated; adjustment: the series', None epoch by epoch;
     groups: {name: rows of the test field} of what belongs together; without: the table without some
     targets (rows), quickly or with all care; left_out: targets found to move by themselves.
     """

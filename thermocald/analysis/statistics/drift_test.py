@@ -6,7 +6,7 @@ with the noise's spectrum as variances. Noise is first-order autoregressive plus
 
 *Drift* asks whether the slow part (periods longer than two windows) is larger than the fast part,
 continued to low frequencies, allows: an F-test for each noise model. The size σ is taken from the
-fast part, so noise beyond the stated standard deviations is no drift. *Excess* asks whether the
+fast part, so noise beyond the stated standard deviations is not drift. *Excess* asks whether the
 series varies more than its stated standard deviations explain, whatever its memory.
 
 No noise model is chosen: the largest p-value over all models counts, each combined with how well

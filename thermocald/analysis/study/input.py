@@ -281,7 +281,7 @@ def _whole(
 ) -> NDArray[np.bool_]:
     """Of the epochs with a result, those with a number wherever others have one; counts the rest.
 
-    A covariance matrix at the edge of singularity can have negative variances, that is no sd.
+    A covariance matrix at the edge of singularity can have negative variances, that is not an sd.
     """
     whole = ok.copy()
     for k in range(values.shape[1]):

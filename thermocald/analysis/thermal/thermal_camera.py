@@ -333,7 +333,7 @@ class ThermalCamera:
         UsageError for a model that needs more than one thermometer.
         """
         if self._uses_channels:
-            raise UsageError("the model needs more than one thermometer: it is no function of T")
+            raise UsageError("the model needs more than one thermometer: it is not a function of T")
         return self._steady.p
 
     def steady_knees(self) -> tuple[tuple[float, ...], ...]:

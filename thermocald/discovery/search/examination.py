@@ -136,7 +136,7 @@ def _beside_mount(
 ) -> Examination | None:
     """The search beside a mount that moves; None where the movement is not one of a mount.
 
-    A smooth influence that nobody recorded is no wander of a mount.
+    A smooth influence that nobody recorded is not a wander of a mount.
     """
     fitter = HypothesisFitter([in_blocks(replace(e, correlation=1.0)) for e in calibrated])
     fitter = HypothesisFitter(steadied(fitter, fitter.fit(()), combinations(fitter.series)))
@@ -296,7 +296,7 @@ def _named(
         worst = max(range(len(tests)), key=lambda i: tests[i].p)
         if tests[worst].passed:
             return best, blocks, tuple(tests)
-        search.progress(f"{best.names[kept + worst]} is no more than noise may give")
+        search.progress(f"{best.names[kept + worst]} is not more than noise may give")
         best, blocks = _confirmed(search, base, _without(search, base, best, kept + worst))
     return best, blocks, ()
 

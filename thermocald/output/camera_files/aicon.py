@@ -160,7 +160,7 @@ def _typed(text: str, pitch: float | None) -> ImportedCamera:
         elif key not in (*_LINES, *_SIZES):
             raise ConfigurationError(f"line {i}: {key!r} is none of {', '.join(_LINES + _SIZES)}")
         elif key in found:
-            raise ConfigurationError(f"line {i}: {key} stands twice")
+            raise ConfigurationError(f"line {i}: {key} is duplicated")
         elif not rest:
             raise ConfigurationError(f"line {i}: {key} has no value")
         else:

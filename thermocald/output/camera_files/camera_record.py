@@ -109,7 +109,7 @@ def import_family(
     if not (0 < width <= 100_000 and 0 < height <= 100_000):
         raise ConfigurationError(f"image size {width} × {height} px is impossible")
     if not np.all(np.abs(values) < _LARGEST):
-        raise ConfigurationError("a camera parameter is no number, or beyond all measure")
+        raise ConfigurationError("a camera parameter is not a number, or far out of range")
     sensor = Sensor(width, height, _pitch(text, pitch))
     # a focal length of zero or less would only fail later, and in other words
     focal = values[0] / (sensor.pixel_pitch if family.parameters[0] == "c" else 1.0)

@@ -22,7 +22,7 @@ _LONGEST_SIDE_PX = 480
 def cut_clip(path: Path, centre: tuple[float, float], size: int) -> NDArray[np.uint8]:
     """A square of `size` px about `centre` (px), grey; black beyond the image's edge.
 
-    Raises ImageError for what is no image.
+    Raises ImageError for what is not an image.
     """
     import cv2
 
@@ -32,7 +32,7 @@ def cut_clip(path: Path, centre: tuple[float, float], size: int) -> NDArray[np.u
         raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
     image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
     if image is None:
-        raise ImageError(f"{path}: is no image")
+        raise ImageError(f"{path}: is not an image")
     left, top = (round(v - (size - 1) / 2) for v in centre)
     clip = np.zeros((size, size), dtype=np.uint8)
     height, width = image.shape

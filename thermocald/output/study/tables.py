@@ -223,7 +223,7 @@ def significance_table(camera: CameraStudy, settings: StudySettings) -> Table | 
         f"F-test at each epoch: variance of {settings.window} consecutive epochs against the "
         f"mean of their squared standard deviations, one-sided at α = {settings.alpha:g}. "
         f"Neighbouring windows have {settings.window - 1} of {settings.window} epochs in common, "
-        "so the success ratio is no probability; of a parameter that does not drift, about α of "
+        "so the success ratio is not a probability; of a parameter that does not drift, about α of "
         "the epochs succeed by chance, and more where its noise exceeds the stated standard "
         "deviations or has a memory. The p-values are for the whole series and corrected for the "
         "number of parameters (Holm). No drift: the slow changes are noise, of whatever size and "

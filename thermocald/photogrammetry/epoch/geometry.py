@@ -94,7 +94,7 @@ def weaknesses(
                 reasons.append(
                     f"one plane seen at {angle:.0f}° from frontal (at least "
                     f"{bounds.plane_obliqueness_deg:.0f}° are needed): principal distance and "
-                    "distance to the field cannot be told apart"
+                    "distance to the field cannot be separated"
                 )
     for name, column in (("x0", 1), ("y0", 2)):
         size = sd[column] / sensor.pixel_pitch

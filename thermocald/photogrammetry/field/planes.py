@@ -36,7 +36,7 @@ _LOCAL = 8
 
 @lru_cache(maxsize=16)
 def field_normals(testfield: TestField) -> Array:
-    """`target_normals` of a field's circles, by row; NaN for what is no circle."""
+    """`target_normals` of a field's circles, by row; NaN for what is not a circle."""
     circles = np.array([kind == "circle" for kind in testfield.kinds], dtype=bool)
     normals = np.full((len(testfield), 3), np.nan)
     # Marker corners lie on the sheets too and help where circles are few.

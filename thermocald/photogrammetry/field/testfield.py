@@ -46,7 +46,7 @@ class TestField:
             raise TestFieldError(f"a test field of {n} targets has columns of shapes {shapes}")
         if len(set(self.names)) != n:
             twice = next(name for name in self.names if self.names.count(name) > 1)
-            raise TestFieldError(f"target {twice!r} stands twice in the test field")
+            raise TestFieldError(f"target {twice!r} is duplicated in the test field")
         for array in (self.points, self.sigmas, self.diameters):
             array.setflags(write=False)
 

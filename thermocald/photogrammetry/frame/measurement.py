@@ -374,7 +374,7 @@ def _finish(
         status = FrameStatus(
             "nothing_found",
             "the test field has no coded target and the camera's orientation is not known: plain "
-            "circles alone cannot be told apart",
+            "circles alone cannot be separated",
         )
     elif n == 0:
         status = FrameStatus("nothing_found", _why_nothing(missed))

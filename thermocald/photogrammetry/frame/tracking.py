@@ -1,7 +1,7 @@
 """Tracking a static camera's targets from epoch to epoch.
 
     first frame ─► measure (full search) ─► weights
-    next frames ─► fixed weights in windows ─► moved or disturbed ones fitted anew ─► observations
+    next frames ─► fixed weights in windows ─► moved or disturbed ones fitted again ─► observations
                         └─► too many lost ─► full search, and the measurement says so
 
 A tracker is the only thing here with a state: what the last epoch knew. It holds no images.

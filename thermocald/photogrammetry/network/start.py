@@ -199,7 +199,7 @@ def _from_pair(start: _Start, pair: tuple[int, int]) -> bool:
     if E is None or E.shape != (3, 3):
         return False
     n, R, t, _ = cv2.recoverPose(E, first, second, focal=1.0, pp=(0.0, 0.0), mask=mask)
-    # a pair that disagrees in half of its targets is no pair, whatever its parallax promised
+    # a pair that disagrees in half of its targets is not a pair, whatever its parallax promised
     if n < max(_MIN_PAIR, len(ia) // 2):
         return False
     start.poses = {

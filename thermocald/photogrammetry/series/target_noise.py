@@ -36,7 +36,7 @@ _SIGNIFICANT = 4.0  # correlations of n pairs below 4/√n are noise: 6e-5 two-s
 _FEWEST_PAIRS = 40
 _LEAST_CORRELATION = 0.3
 _SMOOTH = 15  # epochs
-_CLIP = 60.0  # times the median square: beyond it is no scatter but a jump
+_CLIP = 60.0  # times the median square: beyond it is not scatter but a jump
 
 
 def noise_ratios(residuals: Array, weights: Array, used: Mask, redundancy_share: float) -> Array:

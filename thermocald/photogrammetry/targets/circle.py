@@ -283,7 +283,7 @@ def _gauss_newton(
 ) -> _Fit:
     """Iterate until the centres stand; value and residual are those after the last step.
 
-    work (2, m): memory for the partials; asking the system for it anew costs more than the sums.
+    work (2, m): memory for the partials; asking the system for it again costs more than the sums.
     """
     p = begin.copy()
     p[:, :2] -= w.origin

@@ -52,9 +52,9 @@ def decode_grey(source: Path | bytes) -> NDArray[Any]:
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
-        raise ImageError(f"{name}: is no image that can be decoded ({error.err})") from error
+        raise ImageError(f"{name}: is not an image that can be decoded ({error.err})") from error
     if image is None:
-        raise ImageError(f"{name}: is no image (JPEG, PNG and TIFF are read)")
+        raise ImageError(f"{name}: is not an image (JPEG, PNG and TIFF are read)")
     if image.dtype not in (np.uint8, np.uint16):
         raise ImageError(f"{name}: {image.dtype} grey values; 8 or 16 bit are read")
     return image

@@ -68,7 +68,8 @@ def parse_marker(code: str) -> tuple[str, int, int | None]:
     numbers = parts[1:]
     if len(parts) not in (2, 3) or not all(n.isascii() and n.isdigit() for n in numbers):
         raise TestFieldError(
-            f"{code!r} is no marker code: write DICT_APRILTAG_36h11:17:0 for corner 0 of marker 17"
+            f"{code!r} is not a marker code: write, for example, DICT_APRILTAG_36h11:17:0 for "
+            "corner 0 of marker 17"
         )
     known = len(dictionary(parts[0]).bytesList)
     marker = int(numbers[0][:9])
@@ -174,7 +175,7 @@ def marker_rows(testfield: TestField) -> dict[str, dict[tuple[int, int], int]]:
             corners = rows.setdefault(dictionary, {})
             if (marker, corner) in corners:
                 raise TestFieldError(
-                    f"code {code!r} stands twice in the test field, at targets "
+                    f"code {code!r} is duplicated in the test field, at targets "
                     f"{testfield.names[corners[marker, corner]]!r} and {testfield.names[row]!r}"
                 )
             corners[marker, corner] = row

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["NoiseModel", "estimate_noise"]
 
 _QUANTISATION = 1 / 12
-_CUT = 4.0  # robust standard deviations beyond which a residual is no noise
+_CUT = 4.0  # robust standard deviations beyond which a residual is not noise
 _CUT_LOSS = 0.9989  # variance left of a normal distribution cut at 4 sd
 _FEWEST = 200
 _ENOUGH = 8_000

@@ -53,7 +53,7 @@ def codes(bits: int) -> tuple[int, ...]:
     half = bits // 2
     return tuple(
         number
-        for number in range(1, 1 << (bits - 1), 2)  # begins with a 0: the closed ring is no code
+        for number in range(1, 1 << (bits - 1), 2)  # begins with a 0: the closed ring is not a code
         if number.bit_count() % 2 == 0
         and number & (number >> half) & ((1 << half) - 1)
         and number == smallest_rotation(number, bits)
@@ -76,7 +76,7 @@ def parse(code: str) -> tuple[int, int]:
     bits = {f"RING{n}": n for n in BITS}.get(family)
     if bits is None or not number.isascii() or not number.isdigit():
         raise TestFieldError(
-            f"{code!r} is no ring code: write RING12:<code> or RING14:<code>, such as RING12:"
+            f"{code!r} is not a ring code: write RING12:<code> or RING14:<code>, such as RING12:"
             f"{codes(12)[0]}"
         )
     value = int(number)

@@ -158,7 +158,7 @@ def build_all_chunks(connection: sqlite3.Connection) -> None:
 
 
 def rebuild_chunks(connection: sqlite3.Connection, series: int) -> None:
-    """Derive the chunks of a series anew from its rows; within the caller's transaction."""
+    """Derive the chunks of a series again from its rows; within the caller's transaction."""
     connection.execute("DELETE FROM column_chunk WHERE series_id = ?", (series,))
     connection.execute("DELETE FROM late_epoch WHERE series_id = ?", (series,))
     build_missing_chunks(connection, series)

@@ -74,7 +74,7 @@ def _advice(cause: sqlite3.Error) -> str:
     if name.startswith("SQLITE_BUSY"):
         return f"another process kept it locked for more than {_BUSY_S:g} s"
     if name.startswith(("SQLITE_NOTADB", "SQLITE_CORRUPT")):
-        return f"it is no store, or it is damaged ({cause})"
+        return f"it is not a store, or it is damaged ({cause})"
     return str(cause)
 
 

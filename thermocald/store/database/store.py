@@ -1,7 +1,7 @@
 """The store: everything of a daemon in one SQLite file.
 
 Several cameras, each with series of epochs. An epoch is one transaction: a killed writer loses at
-most the epoch in hand. Nothing is changed or deleted: a later calibration of an epoch is a further
+most the current epoch. Nothing is changed or deleted: a later calibration of an epoch is a further
 revision, and triggers in the file refuse everything else.
 """
 
@@ -245,7 +245,7 @@ class Store:
             yield from select_readings(self._db, thermometer, since_utc)
 
     def rebuild_columns(self, series: StoredSeries) -> None:
-        """Derive the column chunks anew: after many `amend`s reading is faster for it."""
+        """Derive the column chunks again: after many `amend`s reading is faster for it."""
         with self._transaction("the columns were not rebuilt"):
             column_chunks.rebuild_chunks(self._db, series.id)
 

@@ -72,7 +72,7 @@ def read_photograph(path: Path, source: str = "exif") -> Photograph:
 
     try:
         with warnings.catch_warnings():
-            # a large sensor is no attack: nothing is decoded here
+            # a large sensor is not an attack: nothing is decoded here
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with Image.open(path) as image:
                 width, height = image.size

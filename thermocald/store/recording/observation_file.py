@@ -193,7 +193,7 @@ class ObservationFile:
             name = self._field.names[block.targets[row]]
             number = self._numbers[block.epochs[row]]
             self._table.fail(
-                block.first + row, "target", f"target {name!r} stands twice in epoch {number}"
+                block.first + row, "target", f"target {name!r} is duplicated in epoch {number}"
             )
 
     def _numeric_extras(self) -> list[str]:

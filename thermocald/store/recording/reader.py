@@ -229,7 +229,7 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
     for chunk in table.chunks():
         numbers.append(chunk.integers("epoch"))
         repeated = _steps(numbers[-1], previous["epoch"]) <= 0
-        chunk.check("epoch", repeated, "stands twice or after a later one; numbers must increase")
+        chunk.check("epoch", repeated, "is duplicated or after a later one; numbers must increase")
         previous["epoch"] = float(numbers[-1][-1])
         for name, columns in times.items():
             if name not in table.columns:

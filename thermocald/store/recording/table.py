@@ -109,7 +109,7 @@ class Table:
             )
         for name in names:
             if name and names.count(name) > 1:
-                raise self._error(f"{self.path}, line 1: column {name!r} stands twice")
+                raise self._error(f"{self.path}, line 1: column {name!r} is duplicated")
         return names
 
     def _missing(self, name: str) -> str:
@@ -122,7 +122,7 @@ class Table:
         return f"{self.path}, line 1: column {name} is missing; found: {found[:200]}{hint}"
 
     def _line(self, row: int) -> int:
-        """The line of a row in the file: counted anew, since quoted fields may span lines."""
+        """The line of a row in the file: counted again, since quoted fields may span lines."""
         with self._open() as file:
             reader = csv.reader(file)
             for _ in islice(filter(None, reader), row + 2):

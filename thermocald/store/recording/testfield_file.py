@@ -37,7 +37,7 @@ def read_testfield(path: Path) -> TestField:
     """Read `testfield.csv`.
 
     Raises TestFieldError, naming file, line and column, where a column is missing, a number is
-    none, a target stands twice or the coordinates look like metres.
+    none, a target is duplicated or the coordinates look like metres.
     """
     field = _read(Table(path, _REQUIRED, TestFieldError))
     require_millimetres(field, str(path))
@@ -67,7 +67,7 @@ def _read(table: Table, *, may_be_empty: bool = False) -> TestField:
             if not " ".join(name.splitlines()).isprintable():
                 chunk.fail(row, "target", f"{name[:40]!r} must be printable")
             if name in lines:
-                chunk.fail(row, "target", f"target {name!r} stands twice")
+                chunk.fail(row, "target", f"target {name!r} is duplicated")
             lines[name] = row
             names.append(name)
         for column, values in columns.items():

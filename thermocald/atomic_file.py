@@ -1,6 +1,6 @@
 """Files that appear whole or not at all, and one sentence where that cannot be.
 
-What is written goes into `.<name>.partial` beside the file first, and is removed whatever ends the
+What is written goes into `.<name>.partial` next to the file first, and is removed whatever ends the
 writing: an error, an interrupt, a full disk, a folder that became read-only meanwhile.
 """
 

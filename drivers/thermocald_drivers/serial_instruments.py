@@ -1,6 +1,6 @@
 """Line protocols of serial thermometers: instruments by name, checksums, units.
 
-Source: the instruments' manuals, as named beside each.
+Source: the instruments' manuals, named with each.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Pairing: which readings belong to a frame.
 
 Frame and readings keep their own times; nothing is interpolated here. Who needs the temperature at
-the frame's instant interpolates between the readings of neighbouring epochs.
+the frame's time interpolates between the readings of neighbouring epochs.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class Readings:
             self._changed.notify_all()
 
     def nearest(self, name: str, monotonic: float) -> Reading | None:
-        """The reading nearest to an instant; None if all are more than 1.5 periods away."""
+        """The reading nearest to a time; None if all are more than 1.5 periods away."""
         with self._changed:
             found = min(self._kept[name], key=lambda r: abs(r.monotonic - monotonic), default=None)
         limit = _OLDEST_IN_PERIODS * self._periods_s[name]

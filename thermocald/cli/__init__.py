@@ -30,7 +30,7 @@ _INTERRUPTED = 130
 
 
 def application() -> typer.Typer:
-    """The application with every command of the modules beside this file."""
+    """The application with every command of the modules next to this file."""
     app = typer.Typer(
         help="Thermal calibration of low-cost cameras: live, with true standard deviations.",
         no_args_is_help=True,

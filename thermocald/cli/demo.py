@@ -1,7 +1,7 @@
 """`thermocald demo`: the main job without hardware, from a warming camera to a named effect.
 
 The daemon's own pipeline on a camera that is rendered: frames of a corner field, a thermometer,
-25 minutes of heating and cooling on a virtual clock. What was put in stands beside what was found.
+25 minutes of heating and cooling on a virtual clock. What was put in is shown with what was found.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def demo(
 @dataclass(frozen=True, eq=False)
 class _Run:
     table: SeriesTable
-    truth: Array  # (E, 16) at the frames' instants
+    truth: Array  # (E, 16) at the frames' times
     pitch: float
     targets: int
 

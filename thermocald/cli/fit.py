@@ -36,7 +36,7 @@ def fit(
         list[str] | None,
         typer.Option(
             "--effect",
-            help="NAME[:PARAMETER=VALUE,…] to fit beside the base model; repeatable.",
+            help="NAME[:PARAMETER=VALUE,…] to fit alongside the base model; repeatable.",
         ),
     ] = None,
     model: Annotated[

@@ -81,7 +81,7 @@ def study(
     free: FreeOption = DEFAULT_FREE_TEXT,
     reference: Annotated[
         bool,
-        typer.Option("--reference", help="Study the presets instead, beside the reference study."),
+        typer.Option("--reference", help="Study the presets instead, next to the reference study."),
     ] = False,
 ) -> None:
     """How the camera changes with its temperature, whether that is significant, what it does.
@@ -241,7 +241,7 @@ def _comparison(c: Comparison) -> dict[str, Any]:
 
 
 def _print_comparisons(comparisons: list[Comparison]) -> None:
-    """Reference beside ours, one line per figure."""
+    """Reference alongside ours, one line per figure."""
     typer.echo(f"{'camera':17}{'quantity':43}{'reference':>12}{'ours':>9}  met")
     for c in comparisons:
         unit = f" {c.unit}" if c.unit else ""

@@ -2,7 +2,7 @@
 
 `status.json` (format thermocald-status/1); per camera `<camera>.json`, the last epoch with image
 points and residuals, and `<camera>.jpg`, its frame made small. Under systemd the folder lies in
-memory (RUNTIME_DIRECTORY), otherwise beside the store.
+memory (RUNTIME_DIRECTORY), otherwise next to the store.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
     thermometer loops ─► readings ─┐
     camera loops ─► pipelines ─────┴─► keepers ─► store ─► outputs, live state
 
-Cameras and thermometers begin at one instant: with equal periods, frame and temperature are taken
+Cameras and thermometers begin at the same time: with equal periods, frame and temperature are taken
 together.
 """
 

@@ -81,7 +81,7 @@ class StoreFile:
 
     @property
     def wal_path(self) -> Path:
-        """Of the -wal file: beside the file that a link leads to."""
+        """Of the -wal file: next to the file that a link leads to."""
         resolved = self.path.resolve()
         return resolved.with_name(f"{resolved.name}-wal")
 

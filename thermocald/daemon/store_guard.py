@@ -279,7 +279,7 @@ class StoreGuard:
         return carried
 
     def _rescued(self) -> Path:
-        """A copy of the deleted file that is still open, beside where it was."""
+        """A copy of the deleted file that is still open, next to where it was."""
         stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
         copy = self.path.with_name(f"{self.path.stem}-rescued-{stamp}.db")
         self.path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""How far a store has been sent: a small file beside it, replaced whole.
+"""How far a store has been sent: a small file next to it, replaced whole.
 
 Losing it costs time and nothing else: rows that are sent again are passed over by the server.
 """

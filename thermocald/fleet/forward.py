@@ -51,7 +51,7 @@ class Progress:
 class Forwarder:
     """Sends one store to one server as one station.
 
-    cursor: the file that holds how far; by default beside the store.
+    cursor: the file that holds how far; by default next to the store.
     """
 
     def __init__(

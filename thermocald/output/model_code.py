@@ -31,7 +31,7 @@ _C = """\
    {id}_project(35.0, X, uv);           X in OpenCV's camera frame: x right, y down, z forward
 
    T is the temperature in degC of {reference}, of a camera that has long been there.
-   Fitted from {low} to {high} degC: {id}_valid(T) says whether T lies there (2 K beside).
+   Fitted from {low} to {high} degC: {id}_valid(T) says whether T lies there (2 K of margin).
    {exact} */
 #ifndef {guard}
 #define {guard}

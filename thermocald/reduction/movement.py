@@ -1,9 +1,9 @@
-"""The camera's movement on its mount, as variance components beside a hypothesis.
+"""The camera's movement on its mount, as variance components alongside a hypothesis.
 
 A camera on a tripod wanders. The amplitudes of cosines in the well-determined combinations of the
 camera's parameters are random, with a covariance Sigma / (corner² + k²) at the k-th half-wave: a
 random walk where the corner is zero, else one that is bounded. Sigma is found by restricted maximum
-likelihood (EM), both series together, beside each hypothesis by itself: what a hypothesis explains
+likelihood (EM), both series together, with each hypothesis by itself: what a hypothesis explains
 is not a movement.
 
 Source: Patterson, Thompson (1971), Biometrika 58, 545-554 (restricted maximum likelihood);
@@ -160,7 +160,7 @@ def estimated(
     start: Array | None = None,
     max_iterations: int = 8,
 ) -> tuple[HypothesisFitter, Fit, Mount]:
-    """The movement beside a hypothesis: a fitter that has it, the fit in it, the estimate.
+    """The movement alongside a hypothesis: a fitter that has it, the fit in it, the estimate.
 
     fitter: of the series, with or without a movement; mount: where the EM starts.
     """

@@ -69,11 +69,11 @@ class Course:
         return float(self.times[0]), float(self.times[-1])
 
     def after(self, t: ArrayLike) -> Array:
-        """The value right after each instant (a jump there has happened)."""
+        """The value right after each time (a jump there has happened)."""
         return self._at(np.asarray(t, dtype=float), "right")
 
     def before(self, t: ArrayLike) -> Array:
-        """The value right before each instant (a jump there has not happened)."""
+        """The value right before each time (a jump there has not happened)."""
         return self._at(np.asarray(t, dtype=float), "left")
 
     def _at(self, t: Array, side: Any) -> Array:
@@ -133,7 +133,7 @@ def _pieces(reader: QuantityReader, key: str, unit: str) -> Course:
 
 
 def _log(reader: QuantityReader, unit: str, folder: Path) -> Course:
-    """A CSV file with a header, one instant a row; time 0 is its first row."""
+    """A CSV file with a header, one time a row; time 0 is its first row."""
     import csv
 
     reader.only(("log", "time", "value", "largest_gap"))

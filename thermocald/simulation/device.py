@@ -75,7 +75,7 @@ class CameraDevice:
 
 
 def default_heat() -> tuple[HeatNetwork, dict[str, SimulatedThermometer]]:
-    """A camera module on a board in a housing, beside its test field; two thermometers.
+    """A camera module on a board in a housing, in front of its test field; two thermometers.
 
     Capacities and conductances are of the order of a Raspberry Pi in a plastic case: the module
     warms with a time constant of a few minutes.

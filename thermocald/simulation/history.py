@@ -73,7 +73,7 @@ class History:
 
     @classmethod
     def from_epochs(cls, epochs: Sequence[Epoch], reference: str, T0: float) -> Self:
-        """From a recording's epochs; time 0 is the first frame's instant."""
+        """From a recording's epochs; time 0 is the first frame's time."""
         frames = np.array([e.frame_time for e in epochs], dtype=float)
         stamped = [e for e in epochs if np.isfinite(e.temperature_time)]
         channels = dict.fromkeys(name for e in stamped for name in e.temperatures)

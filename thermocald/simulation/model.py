@@ -1,7 +1,7 @@
 """The thermal model of one camera: interior orientation as a function of the temperature history.
 
 The base model is linear: the interior orientation at the reference temperature T₀ plus rates times
-(T - T₀), T at the frame's instant. Effects of the catalogue are added to it; those of kind `drive`
+(T - T₀), T at the frame's time. Effects of the catalogue are added to it; those of kind `drive`
 replace the T of the linear terms, one after the other in the order of the list.
 """
 
@@ -58,7 +58,7 @@ class ModelEffect:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """What a model says of E instants.
+    """What a model says of E times.
 
     iop (E, 10), eop (E, 6) (zeros where the model has no exterior orientation), drive (E,) °C: the
     temperature behind the linear terms; scale (E, 3), displacements: of the object points;
@@ -143,7 +143,7 @@ class ThermalModel:
         return drive(history, self.drives)
 
     def predict(self, history: History, test_field: TestField | None = None) -> Prediction:
-        """Everything the model says of the history's instants.
+        """Everything the model says of the history's times.
 
         Raises DataError where a temperature column is missing, ConfigurationError where the test
         field lacks a target that an effect names.

@@ -2,8 +2,8 @@
 
 What is simulated in order: the heat network's temperatures on the true time axis; from the true
 temperature at the reference thermometer's place, through the model, orientation and object points
-at each frame's instant; the image points with their noise, targets that are missed, and gross
-errors; the thermometers' readings at their own instants. The image noise that is written beside
+at each frame's time; the image points with their noise, targets that are missed, and gross
+errors; the thermometers' readings at their own times. The image noise that is written alongside
 each point is the nominal one: where heat defocuses, the points scatter more than they say.
 
 Each kind of chance has its own stream of random numbers, so that changing one (more missing
@@ -70,12 +70,12 @@ class Simulation:
 
     @cached_property
     def frame_times(self) -> Array:
-        """The frames' instants (E,), s from the start."""
+        """The frames' times (E,), s from the start."""
         return self.programme.frame_times(self._rng(0))
 
     @cached_property
     def reading_times(self) -> Array:
-        """The readings' instants (E,), s from the start."""
+        """The readings' times (E,), s from the start."""
         return self.programme.reading_times(self.frame_times, self._rng(1))
 
     @cached_property
@@ -104,7 +104,7 @@ class Simulation:
 
     @cached_property
     def truth(self) -> Prediction:
-        """What the model says at the frames' instants."""
+        """What the model says at the frames' times."""
         from dataclasses import replace
 
         model = replace(self.model, exterior=self.exterior)

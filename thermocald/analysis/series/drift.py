@@ -1,7 +1,7 @@
 """Did the camera move in this series, and are its standard deviations true?
 
 A straight line in time per parameter, with the autocorrelation of its residuals taken into account,
-and the scatter of the epochs beside what the adjustment said of them. A drift is claimed only where
+and the scatter of the epochs, with what the adjustment said of them. A drift is claimed only where
 chance gives its like in less than one series of a hundred, all parameters together (Holm), and
 where it does not rest on a single marker or target: a board that gives way is not the camera.
 """

@@ -61,7 +61,7 @@ _MOST_TOGETHER = 50_000  # epochs: beyond, a series is adjusted epoch by epoch
 class SeriesTable:
     """Rows are epochs.
 
-    number, frame_time (E,); temperature (E,) °C of the reference at the frame's instant; values,
+    number, frame_time (E,); temperature (E,) °C of the reference at the frame's time; values,
     sd (E, 16), NaN where there is none; sigma0, n_observations, n_rejected (E,); status, reasons:
     E words and sentences; exterior: `series` or `per_epoch`; level_sd (16,): what all epochs have
     in common, NaN where it cannot be separated; adjustment: the series', None epoch by epoch;
@@ -100,7 +100,7 @@ def calibrate_epochs(
 ) -> tuple[SeriesTable, list[Observations | None]]:
     """Adjust epochs one by one; their table, and the observations for a series adjustment.
 
-    temperature: {epoch number: °C at the frame's instant}.
+    temperature: {epoch number: °C at the frame's time}.
     """
     rows, observations = [], []
     for epoch in epochs:
@@ -220,7 +220,7 @@ def settings_for_series(settings: AdjustmentSettings, exterior: str) -> SeriesSe
 def frame_temperatures(
     number: NDArray[np.int64], frame_time: Array, reading_time: Array, readings: Array
 ) -> dict[int, float]:
-    """{epoch number: °C at the frame's instant}, from readings at their own instants."""
+    """{epoch number: °C at the frame's time}, from readings at their own times."""
     values = interpolate_readings(frame_time, reading_time, readings)
     return dict(zip(number.tolist(), values.tolist(), strict=True))
 

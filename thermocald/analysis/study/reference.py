@@ -1,4 +1,4 @@
-"""The reference's figures beside ours: the presets, simulated, adjusted, and studied.
+"""The reference's figures alongside ours: the presets, simulated, adjusted, and studied.
 
 Numbers are quoted from section 4 of Elias, Eltner, Liebold and Maas (2020), Sensors 20, 643. The
 presets put in what the reference reports of the drift (principal point, principal distance, σ₀);
@@ -91,7 +91,7 @@ _CLOSE = 0.98
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """One figure of the reference beside ours; text is how the reference puts it.
+    """One figure of the reference alongside ours; text is how the reference puts it.
 
     low, high: what counts as reproduced.
     """

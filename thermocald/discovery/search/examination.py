@@ -134,7 +134,7 @@ def _beside_mount(
     say: Callable[[str], None],
     given: Sequence[tuple[str, dict[str, Any]]],
 ) -> Examination | None:
-    """The search beside a mount that moves; None where the movement is not one of a mount.
+    """The search alongside a mount that moves; None where the movement is not one of a mount.
 
     A smooth influence that nobody recorded is not a wander of a mount.
     """

@@ -1,9 +1,9 @@
-"""The search where the camera moves on its mount: each hypothesis beside the movement it leaves.
+"""The search where the camera moves on its mount: each hypothesis alongside the movement it leaves.
 
 What no effect explains is a wander of the mount with a size of its own for each hypothesis, so that
 a cause is held against what a moving mount would do by chance. Knocks of the mount, steps that a
 turn and a shift of the camera explain as well as a slip inside of it, are no effects: they are
-found, kept beside the base model, and reported with time and size.
+found, kept alongside the base model, and reported with time and size.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _WORSE = 0.25
 
 @dataclass(frozen=True, eq=False)
 class Beside:
-    """A solution and the movement of the mount beside it, in a fitter that has it."""
+    """A solution and the movement of the mount with it, in a fitter that has it."""
 
     solution: Solution
     fitter: HypothesisFitter
@@ -62,7 +62,7 @@ class Beside:
 class Mounted:
     """What the search found: base (knocks in it) and best in one fitter; knocks of the mount.
 
-    ranking: single effects by score; seen: every solution that was looked at, beside its movement.
+    ranking: single effects by score; seen: every solution that was looked at, with its movement.
     """
 
     fitter: HypothesisFitter
@@ -88,7 +88,7 @@ def search_beside_mount(
     plain = min(trials, key=lambda t: t.score)
     best, ranking, seen = plain, list[Solution](), list[Solution]()
     for level in range(_LEVELS):
-        say(f"beside the mount: {', '.join(best.solution.names) or 'the base'}")
+        say(f"alongside the mount: {', '.join(best.solution.names) or 'the base'}")
         search = Search(best.fitter)
         grown: list[Beside] = []
         for solution in search.expand(best.solution, 6)[:_WIDTH]:

@@ -25,7 +25,7 @@ def mount_of(x: Examination) -> dict[str, Any] | None:
     return {
         "movement_px": [x.mount.size_px(e) for e in x.fitter.series],
         "knocks": knocks,
-        "note": "movement of the mount is estimated beside the effects and is none of the camera's",
+        "note": "movement of the mount is estimated with the effects and is none of the camera's",
     }
 
 

@@ -65,7 +65,7 @@ class Discovery:
         return 1.0 - (after.chi2_reduced - after.floor) / (before.chi2_reduced - before.floor)
 
     def as_json(self, model: str | None) -> dict[str, Any]:
-        """CONVENTIONS §4; beside a mount that moves, what it did stands under `mount`."""
+        """CONVENTIONS §4; alongside a mount that moves, what it did stands under `mount`."""
         mount = mount_of(self.examination)
         first, last = self.stages[0], self.stages[-1]
         verify = None
@@ -167,7 +167,7 @@ def _entry(x: Examination, fit: Fit, k: int, before: Gap, after: Gap, first: boo
     statement = effect.sentence(estimates)
     if x.mount is not None and {"x0", "y0"} & set(term.parameters):
         statement += (
-            "; beside a mount that moves, its cause in time is told, while a shift of the "
+            "; alongside a mount that moves, its cause in time is named, while a shift of the "
             "principal point and a tilt of the camera are hardly separable"
         )
     others = [a["effect"] for a in _alternatives(x, term, first)]

@@ -133,7 +133,7 @@ class View:
         }
 
     def events(self, since: float) -> list[dict[str, Any]]:
-        """What happened since a UTC instant, newest first, at most 200."""
+        """What happened since a UTC time, newest first, at most 200."""
         with Store.open(self._store) as store:
             found = store.events(since_utc=since)[-200:]
         return [

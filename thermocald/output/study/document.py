@@ -1,4 +1,4 @@
-"""A study as one JSON document (CONVENTIONS §4): units of the model, `sd_<name>` beside a value."""
+"""A study as one JSON document (CONVENTIONS §4): units of the model, `sd_<name>` with a value."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ def summary(camera: CameraStudy) -> list[str]:
 
 
 def _trajectory(camera: CameraStudy, limit_mm: float) -> list[str]:
-    """The camera's own path beside the draws, and what the draws leave out."""
+    """The camera's own path alongside the draws, and what the draws leave out."""
     if not camera.trajectories:
         return []
     parts = [

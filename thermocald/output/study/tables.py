@@ -148,7 +148,7 @@ def deviation_table(camera: CameraStudy) -> Table:
             "sd over time",
         ),
         tuple(rows),
-        "The standard deviation beside a difference is that of the two adjustments (for "
+        "The standard deviation alongside a difference is that of the two adjustments (for "
         "temperatures: of the two readings). Largest is the greatest departure from the first "
         "epoch, range the largest minus the smallest value, noise included; sd over "
         "time is what the simulation below draws from.",

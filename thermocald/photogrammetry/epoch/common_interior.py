@@ -46,7 +46,7 @@ _ITERATIONS = 60
 _CONVERGED = 1e-3
 _ROUNDS = 10
 _UNTESTABLE = 1e-6  # of its variance: a ray whose residual its target takes up
-_LEAST_SIGMA_MM = 1e-6  # of a coordinate without sigma beside others with one
+_LEAST_SIGMA_MM = 1e-6  # of a coordinate without sigma alongside others with one
 _LARGEST_OBLIQUENESS_NEEDED_DEG = 20.0
 
 

@@ -2,7 +2,7 @@
 
 Two standard deviations come out of it. That of a difference within the series holds the noise of
 the epoch and the differences of visibility; the *level*, what all epochs have in common (the EOP's
-and the targets' uncertainty), is stated beside it and cancels in every drift.
+and the targets' uncertainty), is stated separately and cancels in every drift.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ _PHI = np.array([0.5, 0.7, 0.8, 0.88, 0.93, 0.96, 0.98])
 _LONG_PHI = np.append(_PHI, [0.99, 0.995, 0.998])  # where no drift can be mistaken for it
 _UPDATES = 150
 _WHITE_COST = 8.0  # log-likelihood that a tremble must gain, in the best of six directions
-_SLOW_COST = 2.0  # that a memory must gain beside it
+_SLOW_COST = 2.0  # that a memory must gain with it
 _NEGLIGIBLE = 0.02  # of the noise's variance
 _MOST_FREQUENCIES = 2000
 _LEAK_DEGREE = 6
@@ -178,7 +178,7 @@ class _Fit:
 
 
 def _fit(power: Array, count: Array, shapes: Array) -> _Fit:
-    """Most likely sizes of spectra (components, m) beside white noise of variance 1."""
+    """Most likely sizes of spectra (components, m) alongside white noise of variance 1."""
     weight = count[:, None]
     # Spectra are steep: start where each alone would give the power of its own frequencies.
     share = shapes * weight[:, 0] / np.maximum((shapes * weight[:, 0]).sum(axis=1), 1e-300)[:, None]

@@ -1,4 +1,4 @@
-"""Circles of a test field that a frame tells by themselves: by ring codes, or a marker beside them.
+"""Circles that are recognised by themselves: by ring codes, or by a marker next to them.
 
 Searched from the likely to the rare: dark on light in a reduced image first, light on dark at full
 size last, until enough are found for an orientation.

@@ -19,7 +19,7 @@ __all__ = ["Slip"]
 
 
 class Slip(OfTime):
-    """Adds a from one instant on: a step at `time` (s from the start of the series).
+    """Adds a from one time on: a step at `time` (s from the start of the series).
 
     Each series has its own slip: the time does not carry over, nor does the height.
     """

@@ -114,7 +114,7 @@ def archive_series(
             epoch = _with_frame(stored.epoch, kept)
             if len(shifts) > 1:
                 frame_time = epoch.frame_time + by_number[epoch.number]
-                # a reading beside a step of the clock may be stamped by the other of the two
+                # a reading next to a step of the clock may be stamped by the other of the two
                 at = min((epoch.temperature_time + s for s in shifts),
                          key=lambda t, f=frame_time: abs(t - f))  # type: ignore[misc]  # fmt: skip
                 epoch = replace(epoch, frame_time=frame_time, temperature_time=at)

@@ -1,4 +1,4 @@
-"""Columns of a series as arrays, fast: chunks of whole columns beside the rows.
+"""Columns of a series as arrays, fast: chunks of whole columns alongside the rows.
 
 SQLite hands out rows at some microseconds each; a million epochs would take seconds. So when
 CHUNK epochs of a series have accumulated, each of their columns is written once more as one blob

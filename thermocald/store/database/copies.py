@@ -1,7 +1,7 @@
 """Copies of a store's file: a verified one to keep, a private one where it cannot be opened.
 
 SQLite keeps what was committed last in the file `<store>-wal` until it is moved into the store. To
-read it, the helper file `-shm` must be there or be made beside it; a file opened with `immutable=1`
+read it, the helper file `-shm` must be there, or be made; a file opened with `immutable=1`
 is read without it, and lacks those epochs.
 """
 

@@ -35,7 +35,7 @@ __all__ = [
 ]
 
 _KEYS = ("id", "series_id")
-# columns over a series: what `Store.series_columns` offers, beside status, channels and extra ones
+# columns over a series: what `Store.series_columns` offers, with status, channels and extra ones
 COLUMN_NAMES = (
     "number",
     "frame_time",

@@ -1,4 +1,4 @@
-"""Epochs as rows of the store: one row each, covariance and observations beside it."""
+"""Epochs as rows of the store: one row each, covariance and observations with it."""
 
 from __future__ import annotations
 

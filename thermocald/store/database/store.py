@@ -351,7 +351,7 @@ class Store:
             columns["status"] = words[columns["status"].astype(np.int64)]
 
     def temperatures_at_frame(self, series: StoredSeries) -> dict[str, Array]:
-        """Every channel brought to the instants of the frames, {name: (E,) °C}."""
+        """Every channel brought to the times of the frames, {name: (E,) °C}."""
         names = ["frame_time", "temperature_time", *series.head.channels]
         columns = self.series_columns(series, names)
         return {

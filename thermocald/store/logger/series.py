@@ -1,7 +1,7 @@
 """Photographs and a log of temperatures put together as the epochs of a recording.
 
 Each photograph gets the reading next to it in time, with the reading's own time; the temperature
-at the photograph's instant is interpolated from them when the recording is read.
+at the photograph's time is interpolated from them when the recording is read.
 """
 
 from __future__ import annotations

@@ -79,7 +79,7 @@ class EpochColumns:
         return len(self.numbers)
 
     def at_frame(self, channel: str) -> Array:
-        """A channel's temperature at the frames' instants, (E,) °C."""
+        """A channel's temperature at the frames' times, (E,) °C."""
         readings = self.temperatures[channel]
         return interpolate_readings(self.frame_time, self.temperature_time, readings)
 

@@ -1,4 +1,4 @@
-"""The temperature at the instant of the frame, from readings taken at other instants."""
+"""The temperature at the time of the frame, from readings taken at other times."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def interpolate_readings(
     times, unique = np.unique(times[good], return_index=True)
     values = values[good][unique]
     if len(times) < 2:
-        # one reading tells the temperature of its own instant
+        # one reading tells the temperature of its own time
         only = float(values[0]) if len(values) else np.nan
         return np.where(np.isin(frames, times), only, np.nan)
     interval = float(np.median(np.diff(times)))
@@ -55,7 +55,7 @@ def interpolate_readings(
 
 
 def temperature_at_frame(epochs: Sequence[Epoch], channel: str | None = None) -> Array:
-    """One channel (the first, the reference, if None) at the instants of the frames, (E,) °C."""
+    """One channel (the first, the reference, if None) at the times of the frames, (E,) °C."""
     if channel is None:
         channel = next((name for epoch in epochs for name in epoch.temperatures), "")
     return interpolate_readings(
@@ -66,6 +66,6 @@ def temperature_at_frame(epochs: Sequence[Epoch], channel: str | None = None) ->
 
 
 def temperatures_at_frame(epochs: Sequence[Epoch]) -> dict[str, Array]:
-    """Every channel at the instants of the frames, {name: (E,) °C}, the reference first."""
+    """Every channel at the times of the frames, {name: (E,) °C}, the reference first."""
     names = dict.fromkeys(name for epoch in epochs for name in epoch.temperatures)
     return {name: temperature_at_frame(epochs, name) for name in names}

@@ -33,7 +33,7 @@ _RESERVED = {"epoch", "frame_time", "temperature_time", "frame"}
 class RecordingWriter:
     """Writes a recording as epochs come; memory does not grow with its length.
 
-    Use as a context manager. Everything goes into `.<name>.partial` beside `path`, which becomes
+    Use as a context manager. Everything goes into `.<name>.partial` next to `path`, which becomes
     `path` at the end, and is removed where an error ends the block. Image points are written to
     1e-5 px, times to 1e-6 s, temperatures and coordinates with all their digits. Raises
     RecordingError if `path` exists and is not an empty folder, or if the disk is full.

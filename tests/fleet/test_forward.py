@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import threading
 from pathlib import Path
 
@@ -45,7 +46,7 @@ def test_server_and_store_give_the_same(filled, server, make_result):
     store.add_event(Event(1.6e9, "knock", "a \0 knock", series.id, 3, {"px": 0.4}))
     store.add_readings([LoggedReading("logger", 1.6e9 + i, {"t": 20.0 + i}) for i in range(3)])
     done = Forwarder(store.path, address(server), "bank").send_waiting()
-    assert dict(done.sent) == {"epoch": 21, "event": 1, "reading": 3}
+    assert dict(done.sent) == {"epoch": 21, "event": 1, "reading": 3, "frame": 0}
     with ServerStore(address(server, "?station=bank&camera=rpi")) as there:
         (found,) = there.all_series()
         assert (found.head, found.start, found.settings) == (
@@ -180,6 +181,78 @@ def test_a_server_that_dies_and_comes_back_gets_everything_once(filled, server, 
     assert [bool(t) for t in troubles[:4]] == [False, True, True, False]
     assert "cannot be reached" in troubles[1]
     assert sum(sent) == count(server, "epoch") == 20 + 5 * 3
+
+
+def test_a_second_store_of_a_station_adds_what_it_says(server, tmp_path, head, field, make_epoch):
+    """Its ids begin at 1 again: after an SD card was replaced, or with two daemons on one host."""
+    for name in ("first", "second"):
+        path = tmp_path / f"{name}.db"
+        with Store.open(path, "append") as store:
+            series = store.create_series(head, field, created_utc=len(name))
+            store.append(series, make_epoch(1))
+            store.add_event(Event(1.6e9, "knock", name, series.id, 1))
+            store.add_readings([LoggedReading("air", 1.6e9 + len(name), {"t": 20.0})])
+        for _ in range(2):
+            Forwarder(path, address(server), "bank").send_waiting()
+            path.with_name(f"{path.name}.forwarded").unlink()
+    assert [count(server, table) for table in ("epoch", "event", "reading")] == [2, 2, 2]
+
+
+def test_a_new_store_in_the_place_of_the_old_is_sent_from_its_start(
+    server, tmp_path, head, field, make_epoch
+):
+    """Even where the file system gives it the inode of the old one."""
+    path = tmp_path / "k.db"
+    for created, epochs in ((1.0, 5), (2.0, 3)):
+        with Store.open(path, "append") as store:
+            series = store.create_series(head, field, created_utc=created)
+            for number in range(1, epochs + 1):
+                store.append(series, make_epoch(number))
+        cursor = path.with_name("k.db.forwarded")
+        if cursor.exists():
+            text = cursor.read_text()
+            cursor.write_text(re.sub(r'"inode": \d+', f'"inode": {path.stat().st_ino}', text))
+        Forwarder(path, address(server), "bank").send_waiting()
+        path.unlink()
+    assert count(server, "epoch") == 8
+
+
+def test_a_month_whose_first_batch_failed_is_made_by_the_next(server, filled):
+    store, _ = filled
+    with psycopg.connect(server.address(name="thermocald")) as connection:
+        connection.execute("ALTER TABLE epoch ADD CHECK (number <> 7)")
+    Forwarder(store.path, address(server), "bank").send_waiting()
+    with psycopg.connect(server.address(name="thermocald")) as connection:
+        found = connection.execute("SELECT DISTINCT tableoid::regclass::text FROM epoch")
+        assert found.fetchall() == [("epoch_2020_09",)]
+
+
+def test_an_older_database_is_brought_up_to_date_with_its_rows_and_roles(cluster, tmp_path, filled):
+    from thermocald.store.server.schema import create_tables
+
+    with psycopg.connect(cluster.address(), autocommit=True) as connection:
+        connection.execute("DROP DATABASE IF EXISTS thermocald WITH (FORCE)")
+        connection.execute("CREATE DATABASE thermocald")
+        connection.execute("DROP ROLE IF EXISTS reader")
+        connection.execute("CREATE ROLE reader LOGIN PASSWORD 'r'")
+    create_tables(address(cluster), "0001")
+    store, _ = filled
+    with psycopg.connect(cluster.address(name="thermocald")) as connection:
+        for table in ("epoch", "series", "testfield", "event", "reading", "alembic_version"):
+            connection.execute(f"GRANT SELECT ON {table} TO reader")
+        connection.execute("INSERT INTO event VALUES ('bank', 1, 5, 'knock', 'x', NULL, 1, '{}')")
+    with pytest.raises(StoreVersionError, match="run `thermocald server init` there"):
+        Forwarder(store.path, address(cluster), "bank").send_waiting()
+    try:
+        create_tables(address(cluster))
+        assert Forwarder(store.path, address(cluster), "bank").send_waiting().rows == 20
+        assert count(cluster, "event") == 1
+        with psycopg.connect(cluster.address(user="reader:r", name="thermocald")) as connection:
+            assert connection.execute("SELECT waiting FROM station").fetchone() == (0,)
+    finally:
+        with psycopg.connect(cluster.address(name="thermocald"), autocommit=True) as connection:
+            connection.execute("DROP OWNED BY reader")
+            connection.execute("DROP ROLE reader")
 
 
 def test_two_forwarders_at_once_do_no_harm(filled, server, tmp_path):

@@ -1,6 +1,6 @@
-"""How far a store has been sent: a small file next to it, replaced whole.
+"""How far a store has been sent: a small file next to it, replaced as a whole.
 
-Losing it costs time and nothing else: rows that are sent again are passed over by the server.
+Losing it costs time and nothing else: the server passes over rows that it has already.
 """
 
 from __future__ import annotations
@@ -16,42 +16,62 @@ from thermocald.store.database.changes import KEPT
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from thermocald.store.database.store import Store
+
 __all__ = ["Cursor"]
+
+_COUNTED = (*KEPT, "frame")
 
 
 @dataclass(slots=True)
 class Cursor:
-    """The last ids sent of each growing table, to one server and for one file.
+    """The last ids sent of each growing table, to one server and from one store.
 
-    inode: of the store, since a new file under the old name begins again; refused: rows that the
-    server will not take, {table: ids}, which a person should look at.
+    inode, started: of the store's file and its first series, since another store under the old
+    name is sent from its start; sent: {table: id}, `frame`: the last epoch whose frame was looked
+    at; refused: rows that the server does not take, {table: ids}, for a person to look at; day,
+    frame_bytes: what frames have taken on that day (UTC, days since 1970).
     """
 
     server: str
     station: str
     inode: int
-    sent: dict[str, int] = field(default_factory=lambda: dict.fromkeys(KEPT, 0))
+    started: float = 0.0
+    sent: dict[str, int] = field(default_factory=lambda: dict.fromkeys(_COUNTED, 0))
     refused: dict[str, list[int]] = field(default_factory=dict)
+    day: int = 0
+    frame_bytes: int = 0
 
     @classmethod
-    def read(cls, path: Path, store: Path, server: str, station: str) -> Self:
+    def read(cls, path: Path, store: Store, server: str, station: str) -> Self:
         """As left by an earlier run, or at the start if there is none, or it is of something else.
 
         Raises StoreError where the store is missing.
         """
         try:
-            inode = store.stat().st_ino
+            inode = store.path.stat().st_ino
         except OSError as error:
-            raise StoreError(f"{store}: cannot be read: {error.strerror}") from error
-        fresh = cls(server, station, inode)
+            raise StoreError(f"{store.path}: cannot be read: {error.strerror}") from error
+        started = next((one.created_utc for one in store.all_series()), 0.0)
+        fresh = cls(server, station, inode, started)
         try:
             found = cls(**json.loads(path.read_text(encoding="utf-8")))
-            same = (found.server, found.station, found.inode) == (server, station, inode)
-            sound = {*found.sent} == {*KEPT} and all(type(n) is int for n in found.sent.values())
+            same = (found.server, found.station, found.inode, found.started) == (
+                server, station, inode, started,
+            )  # fmt: skip
+            found.sent = {**fresh.sent, **found.sent}
+            sound = {*found.sent} == {*_COUNTED} and all(
+                type(n) is int for n in (*found.sent.values(), found.day, found.frame_bytes)
+            )
+            sound = sound and all(type(ids) is list for ids in found.refused.values())
         except (OSError, ValueError, TypeError, AttributeError):
             return fresh
         return found if same and sound else fresh
 
+    @property
+    def rows_refused(self) -> int:
+        return sum(map(len, self.refused.values()))
+
     def write(self, path: Path) -> None:
-        """Replace the file, whole. Raises OutputError where it cannot be written."""
+        """Replace the file as a whole. Raises OutputError where it cannot be written."""
         write_text(path, json.dumps(asdict(self)))

@@ -10,11 +10,14 @@ refuses for what it holds is found by halving, noted and passed over.
 from __future__ import annotations
 
 import logging
+import time
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from thermocald.errors import ServerError, ServerGone, StoreVersionError
 from thermocald.fleet.cursor import Cursor
+from thermocald.fleet.frames import FrameSender
 from thermocald.store.database.changes import KEPT
 from thermocald.store.database.store import Store
 from thermocald.store.server.writer import ServerWriter
@@ -23,6 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
+    from thermocald.fleet.frames import FrameRule
     from thermocald.store.database.row import StoredSeries
     from thermocald.store.server.address import ServerAddress
 
@@ -33,12 +37,14 @@ log = logging.getLogger(__name__)
 BATCH = 200
 """Rows of a transaction: about 1 MB of epochs with 150 targets."""
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 2.0, 300.0
-_IDLE_S = 5.0
+# a thousand stations that connect more often keep a server busy with that alone
+_IDLE_S = 30.0
+_REPORT_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """What one round sent: rows by table, and rows that the server refused."""
+    """What one round sent: rows by table and frames, and how many the server refused."""
 
     sent: Mapping[str, int]
     refused: int
@@ -51,7 +57,8 @@ class Progress:
 class Forwarder:
     """Sends one store to one server as one station.
 
-    cursor: the file that holds how far; by default next to the store.
+    cursor: the file that holds how far; by default next to it. frames: which frames are sent
+    too, None for none.
     """
 
     def __init__(
@@ -61,12 +68,16 @@ class Forwarder:
         station: str,
         cursor: Path | None = None,
         batch: int = BATCH,
+        frames: FrameRule | None = None,
     ) -> None:
         self.store = store
         self.address = address
         self.station = station
         self.batch = batch
         self._path = cursor or store.with_name(f"{store.name}.forwarded")
+        self._frames = FrameSender(frames) if frames is not None else None
+        self._reported = -_REPORT_S
+        self._waiting = 0  # as last reported
 
     def send_waiting(self, stop: Callable[[], bool] = lambda: False) -> Progress:
         """Send all that waits, batch by batch, until nothing waits or `stop()`.
@@ -74,26 +85,61 @@ class Forwarder:
         What was sent stays sent when it raises. Raises ServerGone (try again), ServerError,
         StoreError.
         """
-        cursor = Cursor.read(self._path, self.store, str(self.address), self.station)
-        count = dict.fromkeys(KEPT, 0)
-        refused = 0
-        with Store.open(self.store) as store, ServerWriter(self.address, self.station) as writer:
-            series = {one.id: one for one in store.all_series()}
-            for table in KEPT:
-                while not stop():
-                    rows = store.rows_after(table, cursor.sent[table], self.batch)
-                    if not rows:
-                        break
-                    if any(r.get("series_id") not in {None, *series} for r in rows):
-                        series = {one.id: one for one in store.all_series()}
-                    bad = self._send(writer, table, rows, series)
-                    cursor.sent[table] = rows[-1]["id"]
-                    if bad:
-                        cursor.refused.setdefault(table, []).extend(bad)
-                    cursor.write(self._path)
-                    count[table] += len(rows) - len(bad)
-                    refused += len(bad)
-        return Progress(count, refused)
+        with Store.open(self.store) as store:
+            cursor = Cursor.read(self._path, store, str(self.address), self.station)
+            before = cursor.rows_refused
+            count = {**dict.fromkeys(KEPT, 0), "frame": 0}
+            if self._waits(store, cursor):
+                with ServerWriter(self.address, self.station) as writer:
+                    self._send_all(store, writer, cursor, count, stop)
+            return Progress(count, cursor.rows_refused - before)
+
+    def _waits(self, store: Store, cursor: Cursor) -> bool:
+        """Whether there is a reason to connect."""
+        frames = self._frames is not None and store.frames_after(cursor.sent["frame"], 1)
+        reported = not self._report_is_due and not self._waiting
+        return not reported or bool(frames) or store.rows_waiting(cursor.sent) > 0
+
+    def _send_all(
+        self,
+        store: Store,
+        writer: ServerWriter,
+        cursor: Cursor,
+        count: dict[str, int],
+        stop: Callable[[], bool],
+    ) -> None:
+        series = {one.id: one for one in store.all_series()}
+        for table in KEPT:
+            while not stop():
+                if self._report_is_due:  # also while much waits
+                    self._report(store, writer, cursor)
+                rows = store.rows_after(table, cursor.sent[table], self.batch)
+                if not rows:
+                    break
+                if any(r.get("series_id") not in {None, *series} for r in rows):
+                    series = {one.id: one for one in store.all_series()}
+                bad = self._send(writer, table, rows, series)
+                cursor.sent[table] = rows[-1]["id"]
+                if bad:
+                    cursor.refused.setdefault(table, []).extend(bad)
+                cursor.write(self._path)
+                count[table] += len(rows) - len(bad)
+        if self._frames is not None:
+            keep = partial(cursor.write, self._path)
+            count["frame"] = self._frames.send(store, writer, series, cursor, keep, stop)
+        if self._waiting:
+            self._report(store, writer, cursor)
+
+    @property
+    def _report_is_due(self) -> bool:
+        return time.monotonic() - self._reported >= _REPORT_S
+
+    def _report(self, store: Store, writer: ServerWriter, cursor: Cursor) -> None:
+        """Tell the server how this station is."""
+        # before it is sent: where the answer is lost, the server may have it all the same
+        self._waiting = store.rows_waiting(cursor.sent)
+        writer.report(self._waiting, cursor.rows_refused, time.time())
+        self._reported = time.monotonic()
 
     def _send(
         self,

@@ -5,15 +5,21 @@ Rows are never changed or deleted, so the last id that was sent is all a sender 
 
 from __future__ import annotations
 
+import json
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from thermocald.errors import StoreError
 from thermocald.store.database.epoch_table import select_details
+from thermocald.store.database.row import NOT_CALIBRATED
+from thermocald.store.recording.paths import relative_path
 
 if TYPE_CHECKING:
     import sqlite3
     from collections.abc import Iterator
+    from pathlib import Path
 
-__all__ = ["KEPT", "rows_after"]
+__all__ = ["KEPT", "KeptFrame", "frames_after", "rows_after"]
 
 KEPT = ("epoch", "event", "reading")
 """The tables that grow while a daemon runs."""
@@ -42,3 +48,30 @@ def rows_after(
             covariance, observations = select_details(connection, row["id"])
             row |= {"covariance": covariance or None, "observations": observations or None}
         yield row
+
+
+@dataclass(frozen=True, slots=True)
+class KeptFrame:
+    """An epoch's row, and where its frame was kept: path relative to the frames' folder or None.
+
+    eventful: without a result, or something happened to the camera.
+    """
+
+    id: int
+    series: int
+    number: int
+    frame_time: float
+    path: Path | None
+    eventful: bool
+
+
+def frames_after(connection: sqlite3.Connection, after: int, limit: int) -> Iterator[KeptFrame]:
+    """Up to `limit` epochs with an id above `after`, with or without a frame."""
+    for id_, series, number, time, status, extra, frame in connection.execute(
+        "SELECT id, series_id, number, frame_time, status, extra, frame FROM epoch "
+        "WHERE id > ? ORDER BY id LIMIT ?",
+        (after, limit),
+    ):
+        path = relative_path(frame, f"epoch {number}: frame", StoreError) if frame else None
+        happened = status not in ("ok", NOT_CALIBRATED) or "event" in json.loads(extra)
+        yield KeptFrame(id_, series, number, time, path, happened)

@@ -17,7 +17,7 @@ import numpy as np
 
 from thermocald.errors import StoreError, StoreFullError
 from thermocald.store.database import columns as column_chunks
-from thermocald.store.database.changes import rows_after
+from thermocald.store.database.changes import KEPT, KeptFrame, frames_after, rows_after
 from thermocald.store.database.connection import Mode, connect, in_words
 from thermocald.store.database.copies import copy_database
 from thermocald.store.database.epoch_columns import COLUMN_NAMES, status_codes
@@ -35,6 +35,7 @@ from thermocald.store.database.row import (
     LoggedReading,
     StoredSeries,
 )
+from thermocald.store.database.series_reader import SeriesReader
 from thermocald.store.database.series_table import (
     insert_events,
     insert_readings,
@@ -45,7 +46,6 @@ from thermocald.store.database.series_table import (
 )
 from thermocald.store.database.wal import lost_commits
 from thermocald.store.recording.paths import file_name
-from thermocald.store.recording.readings import interpolate_readings
 
 if TYPE_CHECKING:
     import sqlite3
@@ -66,7 +66,7 @@ __all__ = ["Store"]
 log = logging.getLogger(__name__)
 
 
-class Store:
+class Store(SeriesReader):
     """An open store; use `Store.open` and a `with` block. Threads may share it."""
 
     def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
@@ -132,20 +132,6 @@ class Store:
     def all_series(self) -> list[StoredSeries]:
         """All series, in the order in which they were begun."""
         return self._select_series()
-
-    def find_series(self, camera: str | None = None, name: str | None = None) -> StoredSeries:
-        """The one series of a camera and a name, either of which may be left open.
-
-        Raises StoreError, listing what there is, if none or several fit.
-        """
-        found = self._select_series(camera, name)
-        if len(found) != 1:
-            there = ", ".join(f"{s.camera}/{s.name}" for s in self.all_series()) or "none"
-            raise StoreError(
-                f"{self.path}: {'several series fit' if found else 'there is no such series'}; "
-                f"camera/series in this store: {there}"
-            )
-        return found[0]
 
     def append(
         self,
@@ -350,21 +336,22 @@ class Store:
             words = np.array([codes.get(i, "") for i in range(max(codes, default=0) + 1)])
             columns["status"] = words[columns["status"].astype(np.int64)]
 
-    def temperatures_at_frame(self, series: StoredSeries) -> dict[str, Array]:
-        """Every channel brought to the times of the frames, {name: (E,) °C}."""
-        names = ["frame_time", "temperature_time", *series.head.channels]
-        columns = self.series_columns(series, names)
-        return {
-            name: interpolate_readings(
-                columns["frame_time"], columns["temperature_time"], columns[name]
-            )
-            for name in series.head.channels
-        }
-
     def rows_after(self, table: str, after: int, limit: int) -> list[dict[str, Any]]:
         """Rows of a growing table as they were kept, see `changes`: for a forwarder."""
         with self._lock, in_words(self.path, f"{table}s cannot be read", reading=True):
             return list(rows_after(self._db, table, after, limit))
+
+    def frames_after(self, after: int, limit: int) -> list[KeptFrame]:
+        """Epochs' frames as they were kept, see `changes`: for a forwarder."""
+        with self._lock, in_words(self.path, "frames cannot be listed", reading=True):
+            return list(frames_after(self._db, after, limit))
+
+    def rows_waiting(self, after: Mapping[str, int]) -> int:
+        """How many rows of the growing tables have ids above those given, by table."""
+        return sum(
+            int(self._query(f"SELECT count(*) FROM {table} WHERE id > ?", (after[table],))[0][0])
+            for table in KEPT
+        )
 
     def events(self, series: StoredSeries | None = None, since_utc: float = 0.0) -> list[Event]:
         """What happened, oldest first; of one series, or all."""

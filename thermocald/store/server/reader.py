@@ -19,8 +19,8 @@ from thermocald.store.database.blob import unpack_covariance, unpack_observation
 from thermocald.store.database.epoch_columns import COLUMN_NAMES, sql_name
 from thermocald.store.database.epoch_table import StoredEpoch, stored_epoch
 from thermocald.store.database.row import Event, LoggedReading, StoredSeries
+from thermocald.store.database.series_reader import SeriesReader
 from thermocald.store.recording.head import parse_head
-from thermocald.store.recording.readings import interpolate_readings
 from thermocald.store.recording.testfield_file import parse_testfield
 from thermocald.store.server.address import ServerAddress
 from thermocald.store.server.connection import Connected, connect, in_words, require_revision
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from uuid import UUID
 
     from numpy.typing import NDArray
-
 
     Array = NDArray[np.float64]
 
@@ -45,8 +44,10 @@ _LATEST = (
 )
 
 
-class ServerStore(Connected):
+class ServerStore(SeriesReader, Connected):
     """An open store on a server, narrowed to what its address selects; use it in a `with` block."""
+
+    _remedy = "; select with ?station=…&camera=…&series=… in the address"
 
     def __init__(self, address: ServerAddress) -> None:
         self.address = address
@@ -87,25 +88,6 @@ class ServerStore(Connected):
             for key, station, head, csv, start, identity, settings, created in rows
         ]
 
-    def find_series(self, camera: str | None = None, name: str | None = None) -> StoredSeries:
-        """The one series of a camera and a name, either of which may be left open.
-
-        Raises StoreError, listing what there is, if none or several fit.
-        """
-        every = self.all_series()
-        found = [s for s in every if camera in (None, s.camera) and name in (None, s.name)]
-        if len(found) != 1:
-            there = (
-                ", ".join(f"{s.identity['station']}: {s.camera}/{s.name}" for s in every[:20])
-                or "none"
-            )
-            raise StoreError(
-                f"{self.path}: {'several series fit' if found else 'there is no such series'}; "
-                f"station: camera/series there: {there}; "
-                "select with ?station=…&camera=…&series=… in the address"
-            )
-        return found[0]
-
     def last_epoch(self, series: StoredSeries) -> int | None:
         """The number of the last epoch, None if there is none."""
         key = self._keys[series.id]
@@ -123,17 +105,6 @@ class ServerStore(Connected):
             rows = self._query(f"SELECT status {_LATEST} ORDER BY number", (key,))
             columns["status"] = np.array([status for (status,) in rows], dtype=np.str_)
         return {name: columns[name] for name in names}
-
-    def temperatures_at_frame(self, series: StoredSeries) -> dict[str, Array]:
-        """Every channel at the times of the frames, {name: (E,) °C}."""
-        names = ["frame_time", "temperature_time", *series.head.channels]
-        columns = self.series_columns(series, names)
-        return {
-            name: interpolate_readings(
-                columns["frame_time"], columns["temperature_time"], columns[name]
-            )
-            for name in series.head.channels
-        }
 
     def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
         """(E, 16, 16) covariances of some epochs, NaN for those without a result."""
@@ -199,6 +170,9 @@ class ServerStore(Connected):
             (since_utc, thermometer, self.address.station),
         ):
             yield LoggedReading(name, utc, json.loads(values), trusted)
+
+    def _label(self, series: StoredSeries) -> str:
+        return f"{series.identity['station']}: {series.camera}/{series.name}"
 
     def _number(self, key: UUID) -> int:
         """The handle of a series in this process; `StoredSeries.id` is a number."""

@@ -14,6 +14,10 @@ if TYPE_CHECKING:
 __all__ = ["create_tables", "grant"]
 
 _TABLES = ("testfield", "series", "epoch", "event", "reading", "frame")
+_FUNCTIONS = (
+    "thermocald_month(float8)",
+    "thermocald_report(text, float8, bigint, bigint, text)",
+)
 
 
 def create_tables(address: ServerAddress, revision: str = REVISION) -> None:
@@ -44,13 +48,12 @@ def grant(address: ServerAddress, role: str, *, writes: bool) -> None:
     if not role or "\0" in role:
         raise UsageError("a role must have a name")
     name = '"' + role.replace('"', '""') + '"'
-    right = "INSERT" if writes else "SELECT"
-    statements = [
-        f"GRANT {right} ON {', '.join(_TABLES)} TO {name}",
-        f"GRANT SELECT ON alembic_version TO {name}",
-    ]
+    statements = [f"GRANT SELECT ON alembic_version TO {name}"]
     if writes:
-        statements.append(f"GRANT EXECUTE ON FUNCTION thermocald_month(float8) TO {name}")
+        statements.append(f"GRANT INSERT ON {', '.join(_TABLES)} TO {name}")
+        statements += [f"GRANT EXECUTE ON FUNCTION {one} TO {name}" for one in _FUNCTIONS]
+    else:
+        statements.append(f"GRANT SELECT ON {', '.join(_TABLES)}, station TO {name}")
     engine = connect(address)
     try:
         with in_words(address, f"role {role!r} was not granted"), engine.begin() as connection:

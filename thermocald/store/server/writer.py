@@ -11,6 +11,7 @@ import json
 from typing import TYPE_CHECKING, Any
 from uuid import UUID, uuid5
 
+from thermocald import __version__
 from thermocald.errors import StoreVersionError
 from thermocald.store.recording.head import head_document
 from thermocald.store.recording.testfield_file import testfield_csv
@@ -19,13 +20,15 @@ from thermocald.store.server.connection import Connected, connect, in_words, req
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from sqlalchemy import Table
+    from sqlalchemy import TableClause
 
+    from thermocald.store.database.changes import KeptFrame
     from thermocald.store.database.row import StoredSeries
     from thermocald.store.server.address import ServerAddress
 
 __all__ = ["ServerWriter", "series_key"]
 
+_DAY_S = 86400.0
 _NAMESPACE = UUID("c1b7b0de-6c1e-5f0e-9d0d-7468656d6f63")
 # Columns of a store's row that the server does not keep: they have a meaning in that file alone.
 _LOCAL = {"epoch": {"id", "series_id"}, "event": {"series_id"}, "reading": set[str]()}
@@ -44,24 +47,34 @@ class ServerWriter(Connected):
     """
 
     def __init__(self, address: ServerAddress, station: str) -> None:
-        from sqlalchemy import MetaData, Table
-
         self.address = address
         self.station = station
         super().__init__(connect(address))
         self._sent: set[UUID] = set()
-        self._months: set[int] = set()
+        self._days: set[int] = set()
         try:
             require_revision(self._engine, address)
-            with in_words(address, "its tables cannot be read"):
-                data = MetaData()
-                self._tables: dict[str, Table] = {
-                    name: Table(name, data, autoload_with=self._engine)
-                    for name in ("testfield", "series", "epoch", "event", "reading")
-                }
+            self._tables = self._described()
         except BaseException:
             self._engine.dispose()
             raise
+
+    def _described(self) -> dict[str, TableClause]:
+        """The tables with their columns there: one query, as every round of a station needs it."""
+        from sqlalchemy import column, table, text
+
+        columns_of = text(
+            "SELECT table_name, column_name FROM information_schema.columns "
+            "WHERE table_schema = 'public' ORDER BY ordinal_position"
+        )
+        with (
+            in_words(self.address, "its tables cannot be read"),
+            self._engine.connect() as connection,
+        ):
+            found: dict[str, list[str]] = {}
+            for name, one in connection.execute(columns_of):
+                found.setdefault(name, []).append(one)
+        return {name: table(name, *map(column, columns)) for name, columns in found.items()}
 
     def write(
         self, table: str, rows: Sequence[Mapping[str, Any]], series: Mapping[int, StoredSeries]
@@ -75,15 +88,51 @@ class ServerWriter(Connected):
         keys = {id_: series_key(self.station, one) for id_, one in series.items()}
         ready = [self._row(table, row, keys) for row in rows]
         needed = {row["series_id"] for row in rows if row.get("series_id") is not None}
+        days: set[int] = set()
+        if table == "epoch":
+            days = {int(row["frame_time"] // _DAY_S) for row in rows} - self._days
         with in_words(self.address, f"{len(rows)} {table}s were not sent"):
             with self._engine.begin() as connection:
                 for id_ in sorted(needed):
                     if keys[id_] not in self._sent:
                         self._insert_series(connection, keys[id_], series[id_])
-                if table == "epoch":
-                    self._make_months(connection, [float(row["frame_time"]) for row in rows])
+                self._make_months(connection, days)
                 connection.execute(_insert(self._tables[table]), ready)
+            # only what was committed counts as done
             self._sent.update(keys[id_] for id_ in needed)
+            self._days |= days
+
+    def write_frame(self, series: StoredSeries, frame: KeptFrame, data: bytes) -> None:
+        """Insert the file of one epoch's frame; the server checks it against its SHA-256."""
+        row = {
+            "series": series_key(self.station, series),
+            "number": frame.number,
+            "frame_time": frame.frame_time,
+            "name": str(frame.path),
+            "digest": hashlib.sha256(data).hexdigest(),
+            "data": data,
+        }
+        doing = in_words(self.address, f"the frame of epoch {frame.number} was not sent")
+        with doing, self._engine.begin() as connection:
+            connection.execute(_insert(self._tables["frame"]), [row])
+
+    def report(self, waiting: int, refused: int, clock: float) -> None:
+        """Say how this station is: rows that wait, rows refused, its own clock (s, UTC)."""
+        from sqlalchemy import text
+
+        values = {
+            "name": self.station,
+            "clock": clock,
+            "waiting": waiting,
+            "refused": refused,
+            "version": __version__,
+        }
+        doing = in_words(self.address, "the station's state was not sent")
+        with doing, self._engine.begin() as connection:
+            connection.execute(
+                text("SELECT thermocald_report(:name, :clock, :waiting, :refused, :version)"),
+                values,
+            )
 
     def _row(self, table: str, row: Mapping[str, Any], keys: Mapping[int, UUID]) -> dict[str, Any]:
         columns = self._tables[table].columns
@@ -124,16 +173,15 @@ class ServerWriter(Connected):
         }
         connection.execute(_insert(self._tables["series"]), [row])
 
-    def _make_months(self, connection: Any, times: Sequence[float]) -> None:
-        """Partitions for the months of these times; a month has at most 31 days of 86400 s."""
+    def _make_months(self, connection: Any, days: set[int]) -> None:
+        """Partitions for the months of these days since 1970; a month has at most 31 of them."""
         from sqlalchemy import text
 
-        for day in sorted({int(t // 86400) for t in times} - self._months):
-            connection.execute(text("SELECT thermocald_month(:at)"), {"at": day * 86400.0})
-            self._months.add(day)
+        for day in sorted(days):
+            connection.execute(text("SELECT thermocald_month(:at)"), {"at": day * _DAY_S})
 
 
-def _insert(table: Table) -> Any:
+def _insert(table: TableClause) -> Any:
     # no conflict target: naming one would ask for the right to read
     from sqlalchemy.dialects.postgresql import insert
 

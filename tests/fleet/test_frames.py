@@ -1,0 +1,151 @@
+"""Chosen frames at the server: bounded, resumable, checked; retention goes on as it did."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import psycopg
+import pytest
+
+from tests.fleet.test_forward import (  # noqa: F401
+    address,
+    count,
+    field,
+    head,
+    make_epoch,
+    make_result,
+    store_path,
+)
+from thermocald.errors import ServerError
+from thermocald.fleet.forward import Forwarder
+from thermocald.fleet.frames import FrameRule
+from thermocald.store.database.store import Store
+from thermocald.store.server.reader import ServerStore
+
+
+@pytest.fixture
+def station(tmp_path, store_path, head, field, make_epoch, make_result):  # noqa: F811
+    """A store of 20 epochs with frames of 1000 bytes; 7 and 13 have no result."""
+    folder = tmp_path / "frames"
+    with Store.open(store_path, "append", durable=False) as store:
+        series = store.create_series(head, field)
+        for n in range(1, 21):
+            frame = Path("rpi", "M1", f"{n:07d}.jpg")
+            (folder / frame).parent.mkdir(parents=True, exist_ok=True)
+            (folder / frame).write_bytes(bytes([n]) * 1000)
+            result = make_result(n, "no_targets" if n in (7, 13) else "ok")
+            store.append(series, replace(make_epoch(n), frame=frame), result)
+    return store_path, folder
+
+
+def there(server):
+    with psycopg.connect(server.address(name="thermocald")) as connection:
+        rows = connection.execute("SELECT number, name, digest, data FROM frame ORDER BY number")
+        return {number: (name, digest, data) for number, name, digest, data in rows}
+
+
+@pytest.mark.parametrize(
+    ("choose", "numbers"),
+    [("events", [7, 13]), ("every_n", [5, 10, 15, 20]), ("all", list(range(1, 21)))],
+)
+def test_the_chosen_frames_arrive_whole(server, station, choose, numbers):
+    store, folder = station
+    rule = FrameRule(folder, choose, every_n=5)
+    done = Forwarder(store, address(server), "bank", frames=rule).send_waiting()
+    assert done.sent["frame"] == len(numbers)
+    found = there(server)
+    assert [*found] == numbers
+    for number, (name, digest, data) in found.items():
+        assert name == f"rpi/M1/{number:07d}.jpg"
+        assert data == bytes([number]) * 1000
+        assert digest == hashlib.sha256(data).hexdigest()
+
+
+def test_a_day_has_a_limit_and_the_next_goes_on(server, station):
+    store, folder = station
+    rule = FrameRule(folder, "all", daily_bytes=3500)
+    forwarder = Forwarder(store, address(server), "bank", frames=rule)
+    day = [1.7e9]
+    forwarder._frames._clock = lambda: day[0]
+    assert forwarder.send_waiting().sent["frame"] == 3
+    assert forwarder.send_waiting().sent["frame"] == 0
+    day[0] += 86400
+    assert forwarder.send_waiting().sent["frame"] == 3
+    assert [*there(server)] == [1, 2, 3, 4, 5, 6]
+
+
+def test_it_goes_on_where_the_network_failed(server, station, monkeypatch):
+    from thermocald.errors import ServerGone
+    from thermocald.store.server.writer import ServerWriter
+
+    store, folder = station
+    send, calls = ServerWriter.write_frame, []
+
+    def fails_twice(self, series, frame, data):
+        calls.append(frame.number)
+        if len(calls) in (4, 9):
+            raise ServerGone("cut")
+        send(self, series, frame, data)
+
+    monkeypatch.setattr(ServerWriter, "write_frame", fails_twice)
+    forwarder = Forwarder(store, address(server), "bank", frames=FrameRule(folder, "all"))
+    for _ in range(2):
+        with pytest.raises(ServerGone):
+            forwarder.send_waiting()
+    forwarder.send_waiting()
+    assert [*there(server)] == list(range(1, 21))
+    assert len(calls) == 22  # each frame once, and the two that failed again
+
+
+def test_what_retention_has_deleted_is_passed_over(server, station):
+    store, folder = station
+    for number in (2, 3, 20):
+        (folder / f"rpi/M1/{number:07d}.jpg").unlink()
+    done = Forwarder(store, address(server), "b", frames=FrameRule(folder, "all")).send_waiting()
+    assert done.sent["frame"] == 17
+    assert len([*folder.rglob("*.jpg")]) == 17
+
+
+def test_a_frame_that_leads_out_of_its_folder_is_not_read(server, station, tmp_path):
+    store, folder = station
+    (tmp_path / "secret").write_text("key")
+    (folder / "rpi/M1/0000001.jpg").unlink()
+    (folder / "rpi/M1/0000001.jpg").symlink_to(tmp_path / "secret")
+    Forwarder(store, address(server), "b", frames=FrameRule(folder, "all")).send_waiting()
+    assert 1 not in there(server)
+
+
+def test_the_server_refuses_a_frame_that_is_not_what_was_read(server, station, monkeypatch):
+    store, folder = station
+    wrong = SimpleNamespace(sha256=hashlib.md5)
+    monkeypatch.setattr("thermocald.store.server.writer.hashlib", wrong)
+    forwarder = Forwarder(store, address(server), "bank", frames=FrameRule(folder, "events"))
+    done = forwarder.send_waiting()
+    assert (done.sent["frame"], done.refused) == (0, 2)
+    assert there(server) == {}
+
+
+def test_a_role_that_may_only_insert_sends_frames(server, station):
+    from thermocald.store.server.schema import grant
+
+    store, folder = station
+    with psycopg.connect(server.address(), autocommit=True) as connection:
+        connection.execute("DROP ROLE IF EXISTS pi")
+        connection.execute("CREATE ROLE pi LOGIN PASSWORD 'berry'")
+    try:
+        grant(address(server), "pi", writes=True)
+        pi = address(server, user="pi:berry")
+        Forwarder(store, pi, "bank", frames=FrameRule(folder, "events")).send_waiting()
+        assert count(server, "frame") == 2
+        with psycopg.connect(server.address(name="thermocald")) as connection:
+            name, waiting = connection.execute("SELECT name, waiting FROM station").fetchone()
+        assert (name, waiting) == ("bank", 0)
+        with pytest.raises(ServerError, match="may not"):
+            ServerStore(pi).all_series()
+    finally:
+        with psycopg.connect(server.address(name="thermocald"), autocommit=True) as connection:
+            connection.execute("DROP OWNED BY pi")
+            connection.execute("DROP ROLE pi")

@@ -5,6 +5,7 @@ Reads one JSON list of arguments per line, forks, and prints the child's process
 
 from __future__ import annotations
 
+import faulthandler
 import json
 import os
 import signal
@@ -30,6 +31,7 @@ def main() -> None:
             log = os.open("log.txt", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
             os.dup2(log, 1)
             os.dup2(log, 2)
+            faulthandler.enable()  # what ends a process without a word leaves its stack
             thermocald.cli.main()
             os._exit(0)
         print(pid, flush=True)

@@ -79,12 +79,11 @@ class Chaos:
         return {r["epoch"]: (r["c"], r["frame_time"]) for r in self.daemon.results() if r["stored"]}
 
     def compare(self, path: Path) -> tuple[int, bool]:
-        """(reported epochs that are absent or other in a store, whether `check` finds fault)."""
+        """(reported epochs that are absent or other in a store, whether `check` names them)."""
         told = self.told()
         try:
             with Store.open(path) as store:
                 found = store.examine()
-                named = bool(found.damaged or found.gaps)
                 series = store.find_series()
                 kept = {
                     s.epoch.number: (s.result.values[0], s.epoch.frame_time)
@@ -92,12 +91,15 @@ class Chaos:
                 }
         except ThermocaldError:
             return len(told), True
-        wrong = 0
+        wrong = []
         for number, (c, frame_time) in told.items():
             found_c, found_time = kept.get(number, (None, None))
             # what could not be calibrated in time may have been since
-            wrong += found_time != frame_time or (c is not None and found_c != c)
-        return wrong, named
+            if found_time != frame_time or (c is not None and found_c != c):
+                wrong.append(number)
+        # only the last write can have been cut off
+        unfinished = found.unfinished and wrong == [max(told)]
+        return len(wrong), bool(found.damaged or found.gaps or unfinished)
 
     def flip(self, rng: np.random.Generator, scratch: Path) -> None:
         """Flip bits in a copy of what a killed daemon left, and look at that."""

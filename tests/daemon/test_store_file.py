@@ -12,6 +12,7 @@ import sys
 import pytest
 
 from tests.daemon.conftest import ENVIRONMENT
+from thermocald.daemon.followed_store import FollowedStore
 from thermocald.daemon.store_guard import Row, StoreGuard
 from thermocald.epoch import Epoch
 from thermocald.errors import StoreError
@@ -39,9 +40,10 @@ def guard(path):
     series = guard.store.create_series(head, field, start="cold")
     guard.told = {}
 
-    def keep(number: int) -> None:
+    def keep(number: int, time_s: float = 1e9) -> None:
         values = EpochResult("ok", "", np.full(16, float(number)), np.eye(16), 1.0, 5, 9)
-        row = Row(series, Epoch(number, 1e9 + number, 1e9 + number, {"t": 20.0}), values, {}, True)
+        epoch = Epoch(number, time_s + number, time_s + number, {"t": 20.0})
+        row = Row(series, epoch, values, {}, True)
         row.told = lambda stored: guard.told.__setitem__(number, stored)
         guard.append(row)
 
@@ -71,7 +73,13 @@ def delete_wal(path) -> None:
     path.with_name("t.db-wal").unlink()
 
 
-@pytest.mark.parametrize("how", [lambda p: p.unlink(), delete_all, delete_folder, delete_wal])
+def delete_shm(path) -> None:
+    path.with_name("t.db-shm").unlink()
+
+
+@pytest.mark.parametrize(
+    "how", [lambda p: p.unlink(), delete_all, delete_folder, delete_wal, delete_shm]
+)
 def test_a_deleted_store_is_written_again_with_all_that_it_held(guard, path, how):
     how(path)
     for number in (4, 5):
@@ -82,6 +90,87 @@ def test_a_deleted_store_is_written_again_with_all_that_it_held(guard, path, how
     assert [e.kind for e in guard.store.events()] == ["store_followed"]
     assert guard.status()["state"] == "ok"
     assert list(path.parent.glob("*rescued*")) == []
+
+
+@pytest.mark.parametrize("how", [delete_wal, delete_shm, delete_all])
+def test_a_reader_in_the_middle_of_it_costs_nothing(guard, path, how):
+    """The -wal file cannot be emptied while it reads, so what it held is copied."""
+    guard.store._db.execute("PRAGMA busy_timeout = 50")  # else it is waited for
+    reader = sqlite3.connect(path, isolation_level=None)
+    reader.execute("BEGIN")
+    assert reader.execute("SELECT count(*) FROM epoch").fetchone() == (3,)
+    guard.keep(4)
+    how(path)
+    guard.keep(5)
+    assert numbers(path) == [1, 2, 3, 4, 5]
+    reader.close()
+    guard.keep(6)
+    guard.close()
+    assert numbers(path) == [1, 2, 3, 4, 5, 6]
+    assert all(guard.told.values())
+
+
+def test_a_row_that_was_committed_before_its_file_could_be_followed_is_kept_once(
+    guard, path, monkeypatch
+):
+    rescue = FollowedStore._rescued
+
+    def full_disk(store):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(FollowedStore, "_rescued", full_disk)
+    path.unlink()
+    guard.keep(4)
+    assert (guard.status()["state"], guard.told[4], guard.waiting) == ("out", False, 1)
+    monkeypatch.setattr(FollowedStore, "_rescued", rescue)
+    guard.flush()
+    assert (guard.status()["state"], guard.waiting, guard.lost) == ("ok", 0, 0)
+    assert numbers(path) == [1, 2, 3, 4]
+
+
+FOLLOWED_WHILE_READ = """
+import sys, threading, time
+from pathlib import Path
+from thermocald.daemon.store_guard import StoreGuard
+from thermocald.errors import StoreError
+
+sys.setswitchinterval(0.0005)
+path = Path(sys.argv[1])
+guard, end = StoreGuard(path, durable=False), time.monotonic() + 2.5
+series = guard.all_series()[0]
+
+def read(epochs):
+    while time.monotonic() < end:
+        try:
+            for _ in epochs(series, 1):
+                pass
+        except StoreError as error:
+            assert "closed" in str(error), error
+
+readers = [threading.Thread(target=read, args=[epochs]) for epochs in (
+    guard.epochs, lambda *a: guard.store.epochs(*a, details=False))]
+for reader in readers:
+    reader.start()
+while time.monotonic() < end:
+    time.sleep(0.003)
+    path.with_name("t.db-wal").unlink()
+    guard.flush()
+for reader in readers:
+    reader.join()
+guard.close()
+print(len(guard.notice) > 0)
+"""
+
+
+def test_the_file_is_followed_while_others_read(guard, path):
+    """SQLite's library ended the process: a connection was closed under a statement."""
+    for number in range(4, 200):
+        guard.keep(number)
+    guard.close()
+    command = [sys.executable, "-X", "faulthandler", "-c", FOLLOWED_WHILE_READ, str(path)]
+    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr.count("Error")) == (0, "True\n", 0), done
+    assert numbers(path) == list(range(1, 200))
 
 
 def test_a_store_that_was_moved_away_stays_whole_and_a_new_one_is_begun(guard, path):
@@ -120,7 +209,7 @@ def test_a_file_that_is_no_store_is_left_alone_and_results_wait(guard, path):
 
 
 def test_a_refused_row_is_not_called_stored(guard):
-    guard.keep(2)  # its number is taken
+    guard.keep(2, time_s=2e9)  # its number is taken
     guard.keep(4)
     assert (guard.told[2], guard.told[4], guard.lost) == (False, True, 1)
 

@@ -344,11 +344,15 @@ def test_checkpoint_empties_the_wal(filled, store_path, make_epoch):
     assert wal.stat().st_size == 0
     with Store.open(store_path) as reader:
         epochs = reader.epochs(series)
-        next(epochs)  # a reader in the middle of it
+        next(epochs)  # who takes long over the epochs holds no writer up
         store._db.execute("PRAGMA busy_timeout = 50")
         store.append(series, make_epoch(21))
+        assert store.checkpoint()
+        reader._db.execute("BEGIN")
+        reader.last_epoch(series)  # in the middle of a transaction
+        store.append(series, make_epoch(22))
         assert not store.checkpoint()
-        epochs.close()
+        reader._db.execute("COMMIT")
     assert store.checkpoint()
 
 

@@ -1,4 +1,4 @@
-"""A damaged -wal file is told from one that a crash cut off."""
+"""A damaged -wal file is reported as damaged; one that a crash cut off is not."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import shutil
 import numpy as np
 import pytest
 
+from thermocald.cli import application
 from thermocald.daemon.store_guard import StoreGuard
 from thermocald.store.database.store import Store
-from thermocald.store.database.wal import lost_commits
+from thermocald.store.database.wal import WalTail, read_wal_tail
 
 
 @pytest.fixture
@@ -34,24 +35,68 @@ def epochs(path) -> list[int]:
 def test_what_a_crash_cut_off_is_no_damage(crashed):
     wal = crashed.with_name(f"{crashed.name}-wal")
     whole = wal.read_bytes()
-    assert lost_commits(wal) == 0
+    assert read_wal_tail(wal) == WalTail()
     for size in (0, 20, 32, 33, len(whole) // 2, len(whole) - 1):
         wal.write_bytes(whole[:size])
-        assert lost_commits(wal) == 0
+        assert read_wal_tail(wal) == WalTail()
 
 
 def test_every_flip_that_loses_epochs_is_reported(crashed):
     wal = crashed.with_name(f"{crashed.name}-wal")
     whole, database = wal.read_bytes(), crashed.read_bytes()
     rng = np.random.default_rng(3)
-    for _ in range(25):
+    for _ in range(40):
         data = bytearray(whole)
         data[int(rng.integers(len(data)))] ^= 1 << int(rng.integers(8))
         crashed.write_bytes(database)
         wal.write_bytes(data)
         crashed.with_name(f"{crashed.name}-shm").unlink(missing_ok=True)
-        lost = lost_commits(wal)
-        assert (epochs(crashed) == list(range(1, 10))) == (lost == 0)
+        tail = read_wal_tail(wal)
+        kept = epochs(crashed)
+        assert (kept == list(range(1, 10))) == (tail == WalTail())
+        assert not tail.unfinished or kept == list(range(1, 9))
+
+
+def frames(wal) -> tuple[bytearray, int]:
+    """(the file's bytes, the length of a frame)."""
+    data = bytearray(wal.read_bytes())
+    return data, 24 + int.from_bytes(data[8:12], "big")
+
+
+def test_a_write_that_a_kill_cut_off_is_no_damage(crashed, capsys):
+    """In a -wal file that is written again, the frame's end is of an earlier run."""
+    wal = crashed.with_name(f"{crashed.name}-wal")
+    data, step = frames(wal)
+    data[-step // 2 :] = bytes(step // 2)
+    wal.write_bytes(data)
+    assert read_wal_tail(wal) == WalTail(unfinished=True)
+    with Store.open(crashed) as store:
+        found = store.examine()
+        store.check()
+    assert (found.damaged, found.unfinished) == ((), True)
+    application()(["check", str(crashed)], standalone_mode=False)
+    assert "the last write was cut off" in capsys.readouterr().out
+    guard = StoreGuard(crashed)
+    guard.flush()
+    assert guard.notice == ""
+    assert [e.kind for e in guard.store.events()] == ["wal_unfinished"]
+    guard.close()
+    assert epochs(crashed) == list(range(1, 9))
+
+
+def test_the_last_write_is_damaged_where_the_index_counts_it(store_path, head, field, make_epoch):
+    """The -shm file that a killed writer leaves says what was committed."""
+    wal = store_path.with_name(f"{store_path.name}-wal")
+    with Store.open(store_path, "append", durable=False) as store:
+        series = store.create_series(head, field)
+        for i in range(1, 4):
+            store.append(series, make_epoch(i))
+        data, _ = frames(wal)
+        data[-5] ^= 1
+        wal.write_bytes(data)
+        assert read_wal_tail(wal) == WalTail(lost=1)
+        wal.with_name(f"{store_path.name}-shm").unlink()
+        assert read_wal_tail(wal) == WalTail(unfinished=True)
 
 
 def test_the_daemon_says_so_and_keeps_a_copy(crashed):

@@ -169,6 +169,11 @@ def _store(path: Path) -> dict[str, Any]:
     if len(found.gaps) > _SHOWN:
         lines.append(f"  and {len(found.gaps) - _SHOWN} more gaps")
     lines += [f"  damaged: {text}" for text in found.damaged[:_SHOWN]]
+    if found.unfinished:
+        lines.append(
+            "  the last write was cut off, as when its writer is killed: it had not been "
+            "committed, and the store is used without it"
+        )
     if found.unchecked:
         lines.append(
             f"  {found.unchecked} epochs are of an older version and have no checksum: they were "
@@ -183,5 +188,6 @@ def _store(path: Path) -> dict[str, Any]:
         "damaged": list(found.damaged),
         "gaps": [asdict(gap) for gap in found.gaps],
         "unchecked": found.unchecked,
+        "unfinished": found.unfinished,
         "lines": lines,
     }

@@ -64,7 +64,7 @@ class EpochKeeper:
     def _existing(self) -> StoredSeries | None:
         found = [
             s
-            for s in self._guard.store.all_series()
+            for s in self._guard.all_series()
             if (s.camera, s.name) == (self.plan.name, self.plan.series)
         ]
         if not found:
@@ -86,7 +86,7 @@ class EpochKeeper:
     def first_number(self) -> int:
         """The number with which acquisition goes on."""
         series = self.series
-        return 1 if series is None else (self._guard.store.last_epoch(series) or 0) + 1
+        return 1 if series is None else self._guard.last_epoch(series) + 1
 
     def recent(self, count: int) -> Iterator[tuple[Observations, bool]]:
         """The last epochs with a result: observations, and whether the camera changed then."""
@@ -108,7 +108,7 @@ class EpochKeeper:
         rows: list[dict[str, Any]] = []
         if series is not None and self.first_number > 1:
             try:
-                for stored in self._guard.store.epochs(series, 1, 20 * count):
+                for stored in self._guard.epochs(series, 1, 20 * count):
                     if stored.result.status == "ok" and len(rows) < count:
                         rows.append(result_row(self.plan, stored.epoch, stored.result, {}))
             except StoreError as error:
@@ -194,7 +194,7 @@ class EpochKeeper:
         first = self._searched_to + 1
         if series is None or first >= below:
             return False
-        end = min(below - 1, self._guard.store.last_epoch(series) or 0)
+        end = min(below - 1, self._guard.last_epoch(series))
         if end < first:
             return False
         last = min(end, first + _CATCH_UP_BATCH - 1)

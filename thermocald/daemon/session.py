@@ -95,7 +95,7 @@ class Sessions:
         self._clock = clock
         self._active: dict[str, _Progress] = {}
         self._ended: dict[str, _Progress] = {}
-        for event in guard.store.events():
+        for event in guard.stored_events():
             self._remember(event)
 
     def _remember(self, event: Event) -> None:
@@ -259,7 +259,7 @@ class Sessions:
         self._guard.event(Event(self._clock.utc(), kind, about, data=data))
 
     def _look_into_the_store(self, session: Session) -> None:
-        for one in self._guard.store.all_series():
+        for one in self._guard.all_series():
             if (one.camera, one.name) != (session.camera, session.series):
                 continue
             if session.start not in ("", one.start):
@@ -267,7 +267,7 @@ class Sessions:
                     f"series {one.name!r} was begun with --start {one.start!r}; choose another "
                     "--series, or go on with that"
                 )
-            taken = self._guard.store.last_epoch(one) or 0
+            taken = self._guard.last_epoch(one)
             if taken >= session.epochs:
                 raise DataError(
                     f"series {one.name!r} has {taken} epochs already; choose another --series"

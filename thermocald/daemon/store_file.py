@@ -1,8 +1,6 @@
-"""The store's file on disk: locked for one writer, and watched, since it may go away underneath.
+"""The store's file on disk: locked for one writer, and compared with what is at its path now.
 
-The lock is on the file itself, whatever name it was opened by. A deleted file lives on in the
-process that has it open, and everything written to it is lost with that: so file and -wal file are
-compared with what stands at their paths.
+The lock is on the file itself, whatever name it was opened by.
 """
 
 from __future__ import annotations
@@ -33,6 +31,7 @@ class StoreFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._wal: tuple[int, int] | None = None
+        self._shm: tuple[int, int] | None = None
         found = _identity(path)
         if found in _CLAIMED:
             raise _taken(path)
@@ -69,10 +68,18 @@ class StoreFile:
         """Whether the path still leads to this file."""
         return _identity(self.path) == self.identity
 
-    def remember_wal(self) -> None:
-        """Note which -wal file the open database uses, as soon as there is one."""
+    def remember_helpers(self) -> None:
+        """Note which -wal and -shm files the open database uses, as soon as they are there."""
         if self._wal is None:
             self._wal = _identity(self.wal_path)
+        if self._shm is None:
+            self._shm = _identity(self.shm_path)
+
+    @property
+    def helpers_there(self) -> bool:
+        """Whether the -wal and the -shm file are still those that were noted."""
+        shm_there = self._shm is None or _identity(self.shm_path) == self._shm
+        return self.wal_there and shm_there
 
     @property
     def wal_there(self) -> bool:
@@ -84,6 +91,11 @@ class StoreFile:
         """Of the -wal file: next to the file that a link leads to."""
         resolved = self.path.resolve()
         return resolved.with_name(f"{resolved.name}-wal")
+
+    @property
+    def shm_path(self) -> Path:
+        """Of the -shm file, the index of the -wal file."""
+        return self.wal_path.with_name(f"{self.wal_path.name.removesuffix('-wal')}-shm")
 
 
 def _taken(path: Path) -> StoreError:

@@ -1,12 +1,10 @@
-"""The store under hard conditions: a full disk loses observations before results, results wait in
-memory for a store that cannot be written, and a file that was deleted or replaced is noticed.
+"""The store under hard conditions: a full disk loses observations before results, and results wait
+in memory for a store that cannot be written.
 """
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import os
 import shutil
 import threading
 import time
@@ -14,11 +12,9 @@ from collections import deque
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-from thermocald.daemon.store_file import StoreFile
+from thermocald.daemon.followed_store import FollowedStore
 from thermocald.errors import StoreError, StoreFullError
 from thermocald.store.database.row import Event
-from thermocald.store.database.store import Store
-from thermocald.store.database.wal import lost_commits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -28,6 +24,7 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import Observations
     from thermocald.store.database.epoch_table import StoredEpoch
     from thermocald.store.database.row import EpochResult, LoggedReading, StoredSeries
+    from thermocald.store.database.store import Store
 
 __all__ = ["Row", "StoreGuard"]
 
@@ -78,43 +75,29 @@ class StoreGuard:
         self.path = path
         self.lost = 0
         self.away = ""  # why the store cannot be written, empty while it can
-        self.notice = ""  # what happened to the file while it was open, empty if nothing
         self.thin = False
-        self._durable = durable
         self._waiting: deque[Row] = deque()
         self._events: deque[Event] = deque(maxlen=1000)
         self._readings: deque[LoggedReading] = deque(maxlen=_MOST_WAITING)
         self._lock = threading.RLock()
         self._series: dict[tuple[str, str], StoredSeries] = {}
-        self._open()
+        self._known: Store | None = None  # whose series are in `_series`
+        self._file = FollowedStore(path, durable=durable)
+        self._note_events()
 
-    def _open(self) -> None:
-        self._file = StoreFile(self.path)
-        lost = lost_commits(self._file.wal_path)
-        kept = self._keep_damaged_wal() if lost else ""
-        try:
-            self.store = Store.open(self.path, "append", durable=self._durable)
-        except BaseException:
-            self._file.discard_empty()
-            self._file.release()
-            raise
-        self._file.remember_wal()
-        self._series.clear()
-        if lost:
-            many = "all transactions" if lost < 0 else f"{lost} transactions"
-            self.notice = f"its -wal file was damaged, {many} in it were lost; a copy is in {kept}"
-            log.error("%s: %s", self.path, self.notice, extra={"event": "wal_damaged"})
-            self._events.append(Event(time.time(), "wal_damaged", self.notice))
+    @property
+    def store(self) -> Store:
+        """The open store; another one after its file was followed, so read through the guard."""
+        return self._file.store
 
-    def _keep_damaged_wal(self) -> str:
-        """A copy of the -wal file for who wants to look into it."""
-        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
-        copy = self.path.with_name(f"{self.path.stem}-wal-damaged-{stamp}")
-        try:
-            shutil.copyfile(self._file.wal_path, copy)
-        except OSError as error:
-            return f"nowhere: {error.strerror}"
-        return str(copy)
+    @property
+    def notice(self) -> str:
+        """What happened to the file while it was open, empty if nothing."""
+        return self._file.notice
+
+    def _note_events(self) -> None:
+        self._events.extend(self._file.events)
+        self._file.events.clear()
 
     @property
     def waiting(self) -> int:
@@ -127,29 +110,15 @@ class StoreGuard:
             self.flush()
             if self._waiting:
                 log.error("%s: %d epochs could not be kept", self.path, len(self._waiting))
-            self._close()
-
-    def _close(self) -> None:
-        """Close the file; its -wal file goes too, or it would be taken for another database's.
-
-        SQLite leaves it where it was when the file is not at its path any more.
-        """
-        stale = not self._file.there and self._file.wal_there
-        try:
-            self.store.close()
-        except StoreError as error:
-            log.error("%s", error)
-        if stale:
-            wal = self._file.wal_path
-            for name in (wal, wal.with_name(wal.name.removesuffix("-wal") + "-shm")):
-                with contextlib.suppress(OSError):
-                    name.unlink(missing_ok=True)
-        self._file.release()
+            self._file.close()
 
     def series(self, wanted: StoredSeries) -> StoredSeries:
         """The series of that camera and name in the file that is open now; begun if need be."""
         key = (wanted.camera, wanted.name)
         with self._lock:
+            if self._known is not self.store:
+                self._known = self.store
+                self._series.clear()
             if key not in self._series:
                 found = {(s.camera, s.name): s for s in self.store.all_series()}
                 self._series[key] = found.get(key) or self.store.create_series(
@@ -168,6 +137,21 @@ class StoreGuard:
         """Some epochs, read at once: the file must not be followed to another one meanwhile."""
         with self._lock:
             return list(self.store.epochs(series, first, last, details=details))
+
+    def last_epoch(self, series: StoredSeries) -> int:
+        """The number of the last epoch kept, 0 if there is none."""
+        with self._lock:
+            return self.store.last_epoch(series) or 0
+
+    def all_series(self) -> list[StoredSeries]:
+        """All series, in the order in which they were begun."""
+        with self._lock:
+            return self.store.all_series()
+
+    def stored_events(self) -> list[Event]:
+        """All events in the store, oldest first."""
+        with self._lock:
+            return self.store.events()
 
     def append(self, row: Row) -> None:
         """Keep an epoch, now or when the store can be written again."""
@@ -212,8 +196,10 @@ class StoreGuard:
             while self._waiting:
                 row = self._waiting[0]
                 error = self._write(row)
-                if error is None:
-                    if not self._in_place and self._watch() != "carried over":
+                if error is None or self._holds(row):
+                    if not self._file.in_place and not self._watch():
+                        if self.away:
+                            return
                         continue  # it was written to a file that is gone: once more
                     self._waiting.popleft()
                     row.stored = True
@@ -228,63 +214,15 @@ class StoreGuard:
             self._flush_events()
             self._flush_readings()
 
-    @property
-    def _in_place(self) -> bool:
-        return self._file.there and self._file.wal_there
-
-    def _watch(self) -> str:
-        """Look whether the file is still where it was, and go on with the one that is there.
-
-        Returns `carried over` where a deleted file was written again with all that it held.
-        """
-        if self.store.closed:
-            return self._try(self._open)
-        self._file.remember_wal()
-        return "" if self._in_place else self._try(self._follow)
-
-    def _try(self, action: Callable[[], str | None]) -> str:
+    def _watch(self) -> bool:
+        """Follow the file if it went away; whether what was committed is in the one at the path."""
         try:
-            return action() or ""
+            return self._file.watch()
         except StoreError as error:
             self._out(error, time.time())
-            return ""
-
-    def _follow(self) -> str:
-        """The file, or its -wal file, is gone or another: open what is there now."""
-        file, copy = self._file, None
-        carried = ""
-        if not file.deleted:
-            self.store.checkpoint()
-        if file.there:
-            text = "its -wal file was deleted; what it held was moved into the store"
-            carried = "carried over"
-        elif file.deleted:
-            copy = self._rescued()
-            if self.path.exists():
-                text = f"was replaced by another file, which is used now; what it held is in {copy}"
-            else:
-                text = "was deleted; it was written again with all that it held"
-                carried = "carried over"
-        elif self.path.exists():
-            text = "was moved away, and another file is in its place, which is used now"
-        else:
-            text = "was moved away; a new store was begun"
-        self._close()
-        if carried and copy is not None:
-            os.replace(copy, self.path)
-        self._open()
-        self.notice = text
-        log.error("%s: %s", self.path, text, extra={"event": "store_followed"})
-        self._events.append(Event(time.time(), "store_followed", f"{self.path.name} {text}"))
-        return carried
-
-    def _rescued(self) -> Path:
-        """A copy of the deleted file that is still open, next to where it was."""
-        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
-        copy = self.path.with_name(f"{self.path.stem}-rescued-{stamp}.db")
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self.store.copy_to(copy)
-        return copy
+            return False
+        finally:
+            self._note_events()
 
     def _write(self, row: Row) -> StoreError | None:
         self._look_at_the_disk(row)
@@ -320,6 +258,15 @@ class StoreGuard:
             text = f"{free / 1e6:.0f} MB are free: observations are kept again"
             log.info(text, extra={"event": "observations_resumed"})
             self._events.append(Event(row.epoch.frame_time, "observations_resumed", text))
+
+    def _holds(self, row: Row) -> bool:
+        """Whether a row was committed before its file could be followed."""
+        number = row.epoch.number
+        try:
+            found = self.epochs(self.series(row.series), number, number, details=False)
+        except StoreError:
+            return False
+        return any(stored.epoch.frame_time == row.epoch.frame_time for stored in found)
 
     def _takes_all_but(self, error: StoreError) -> bool:
         """Whether the store is well and it is this row that it does not take.

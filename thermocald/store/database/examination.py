@@ -43,12 +43,15 @@ class Gap:
 
 @dataclass(frozen=True, slots=True)
 class Examination:
-    """damaged: a sentence each; unchecked: epochs of an older version, which have no checksum."""
+    """damaged: a sentence each; unchecked: epochs of an older version, which have no checksum;
+    unfinished: the last write to the -wal file was cut off, see `wal`.
+    """
 
     damaged: tuple[str, ...]
     gaps: tuple[Gap, ...]
     epochs: int
     unchecked: int
+    unfinished: bool = False
 
 
 def examine(connection: sqlite3.Connection) -> Examination:

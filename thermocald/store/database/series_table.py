@@ -16,7 +16,7 @@ from thermocald.store.recording.testfield_file import parse_testfield, testfield
 
 if TYPE_CHECKING:
     import sqlite3
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
     from typing import Any
 
@@ -149,20 +149,28 @@ def insert_readings(connection: sqlite3.Connection, readings: Iterable[LoggedRea
 
 
 def select_readings(
-    connection: sqlite3.Connection, thermometer: str | None, since_utc: float
-) -> Iterator[LoggedReading]:
+    connection: sqlite3.Connection,
+    thermometer: str | None,
+    since_utc: float,
+    after: int,
+    limit: int,
+) -> tuple[int, list[LoggedReading]]:
     """Readings of a thermometer, None for all, from a time on, in the order they were kept.
 
+    after: the row that the ones before ended with; returns that of these, 0 if there are no more.
     One that is damaged is left out, with a warning.
     """
-    for kept, id_, utc, trusted, name, values in connection.execute(
+    rows = connection.execute(
         "SELECT checksum, id, utc, clock_trusted, thermometer, temperatures FROM reading "
-        "WHERE utc >= ? AND thermometer = ifnull(?, thermometer) ORDER BY id",
-        (since_utc, thermometer),
-    ):
+        "WHERE id > ? AND utc >= ? AND thermometer = ifnull(?, thermometer) ORDER BY id LIMIT ?",
+        (after, since_utc, thermometer, limit),
+    ).fetchall()
+    readings = []
+    for kept, id_, utc, trusted, name, values in rows:
         if _sound(kept, f"reading {id_}", (utc, trusted), (name, values)):
             file_name(name, "thermometer", StoreError)
-            yield LoggedReading(name, utc, json.loads(values), bool(trusted))
+            readings.append(LoggedReading(name, utc, json.loads(values), bool(trusted)))
+    return (rows[-1][1] if len(rows) == limit else 0), readings
 
 
 def _sound(kept: int | None, what: str, numbers: Sequence[Any], texts: Sequence[str]) -> bool:

@@ -11,6 +11,7 @@ import logging
 import threading
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -44,7 +45,7 @@ from thermocald.store.database.series_table import (
     select_readings,
     select_series,
 )
-from thermocald.store.database.wal import lost_commits
+from thermocald.store.database.wal import read_wal_tail
 from thermocald.store.recording.paths import file_name
 
 if TYPE_CHECKING:
@@ -64,6 +65,9 @@ if TYPE_CHECKING:
 __all__ = ["Store"]
 
 log = logging.getLogger(__name__)
+
+_EPOCHS_AT_ONCE = 100
+_READINGS_AT_ONCE = 1000
 
 
 class Store(SeriesReader):
@@ -227,8 +231,15 @@ class Store(SeriesReader):
         self, thermometer: str | None = None, since_utc: float = 0.0
     ) -> Iterator[LoggedReading]:
         """Readings apart from epochs, in the order they were kept."""
-        with in_words(self.path, "readings cannot be read", reading=True):
-            yield from select_readings(self._db, thermometer, since_utc)
+        after = 0
+        while True:
+            with self._lock, in_words(self.path, "readings cannot be read", reading=True):
+                after, page = select_readings(
+                    self._db, thermometer, since_utc, after, _READINGS_AT_ONCE
+                )
+            yield from page
+            if not after:
+                return
 
     def rebuild_columns(self, series: StoredSeries) -> None:
         """Derive the column chunks again: after many `amend`s reading is faster for it."""
@@ -253,11 +264,10 @@ class Store(SeriesReader):
         details: False leaves out observations and covariances, and is faster.
         """
         missing, before = 0, first or 1
-        with in_words(self.path, "epochs cannot be read", reading=True):
-            for stored in select_epochs(self._db, series.id, first, last, details=details):
-                missing += max(0, stored.epoch.number - before)
-                before = stored.epoch.number + 1
-                yield stored
+        for stored in self._epochs(series, first, last, details):
+            missing += max(0, stored.epoch.number - before)
+            before = stored.epoch.number + 1
+            yield stored
         if not first and last is None:
             missing += max(0, (self.last_epoch(series) or 0) + 1 - before)
             if missing:
@@ -265,6 +275,30 @@ class Store(SeriesReader):
                     "%s: %d epochs of series %s are missing; `thermocald check` says which",
                     self.path, missing, series.name,
                 )  # fmt: skip
+
+    def _epochs(
+        self, series: StoredSeries, first: int, last: int | None, details: bool
+    ) -> Iterator[StoredEpoch]:
+        """The epochs page by page: no statement is open while another thread may close the file.
+
+        SQLite's library ends the process where a connection is closed under a statement.
+        """
+        while True:
+            page: list[StoredEpoch] = []
+            failed: StoreError | None = None
+            try:
+                with self._lock, in_words(self.path, "epochs cannot be read", reading=True):
+                    found = select_epochs(self._db, series.id, first, last, details=details)
+                    page.extend(islice(found, _EPOCHS_AT_ONCE))
+                    del found
+            except StoreError as error:
+                failed = error
+            yield from page
+            if failed is not None:
+                raise failed
+            if len(page) < _EPOCHS_AT_ONCE:
+                return
+            first = page[-1].epoch.number + 1
 
     def observations(
         self, series: StoredSeries, numbers: Iterable[int]
@@ -379,11 +413,13 @@ class Store(SeriesReader):
         """
         with self._lock, in_words(self.path, "the store cannot be read", reading=True):
             found = examine(self._db)
-        if lost := lost_commits(self.path.resolve().with_name(f"{self.path.resolve().name}-wal")):
-            many = "all transactions" if lost < 0 else f"{lost} transaction{'s'[:lost != 1]}"
-            why = "damage, or cut off when a writer was killed"
-            damaged = (f"the -wal file: {many} in it cannot be read ({why})", *found.damaged)
+        tail = read_wal_tail(self.path.resolve().with_name(f"{self.path.resolve().name}-wal"))
+        if tail.lost:
+            many = f"{tail.lost} transaction{'s'[: tail.lost != 1]}"
+            many = "all transactions" if tail.lost < 0 else many
+            damaged = (f"the -wal file: {many} in it cannot be read", *found.damaged)
             found = replace(found, damaged=damaged)
+        found = replace(found, unfinished=tail.unfinished)
         if not found.damaged:
             for series in self.all_series():
                 self.series_columns(series, self.column_names(series))

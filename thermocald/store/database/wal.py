@@ -1,61 +1,95 @@
-"""A look at a -wal file: whether transactions that were committed to it cannot be read any more.
+"""The end of a -wal file: whether transactions that were committed to it can no longer be read.
 
 SQLite reads the frames of the file up to the first whose checksum does not match, and takes what
-follows for what a crash cut off. Where whole transactions of the same run follow, it is damage.
-Format: https://www.sqlite.org/fileformat2.html#the_write_ahead_log
+follows for what a crash cut off. That is right for the last transaction, which may not have been
+committed; one that another follows, or that the index in the -shm file counts, was committed, and
+what does not match is damage.
+Formats: https://www.sqlite.org/fileformat2.html#the_write_ahead_log,
+https://www.sqlite.org/walformat.html#the_wal_index_file_format
 """
 
 from __future__ import annotations
 
 import struct
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = ["lost_commits"]
+__all__ = ["WalTail", "read_wal_tail"]
 
 _HEADER = struct.Struct(">8I")  # magic, version, page size, sequence, two salts, two checksums
 _FRAME = struct.Struct(">6I")  # page, size of the database after a commit, two salts, checksums
 _MAGIC = 0x377F0682
+_INDEX_BYTES = 48
+_DAMAGED_SALT_BITS = 3  # salts of another run differ in about half of their 64 bits
 
 
-def lost_commits(path: Path) -> int:
-    """How many transactions follow the first damaged frame of a -wal file; 0 if there is none.
-
-    -1 where the file's own header is damaged: all of it is lost. Nobody must write the file.
+@dataclass(frozen=True, slots=True)
+class WalTail:
+    """lost: committed transactions that cannot be read, -1 for all of them; unfinished: the last
+    transaction cannot be read, and nothing says that it was committed.
     """
+
+    lost: int = 0
+    unfinished: bool = False
+
+
+def read_wal_tail(path: Path) -> WalTail:
+    """Look at a -wal file, and at the -shm file beside it; nobody must write the file meanwhile."""
     try:
         data = path.read_bytes()
     except OSError:
-        return 0
+        return WalTail()
     if len(data) < _HEADER.size:
-        return 0
+        return WalTail()
     magic, _, page_size, _, *salts, first, second = _HEADER.unpack_from(data)
     order = ">" if magic & 1 else "<"
     sums = _checksum(order, data[:24], (0, 0))
-    if magic & ~1 != _MAGIC or sums != (first, second):
-        return -1
-    broken, lost = False, 0
+    if magic & ~1 != _MAGIC or sums != (first, second) or page_size % 512:
+        return WalTail(lost=-1)
+    broken = False
+    commits: list[int] = []  # numbers of the frames that end a transaction, from the broken one on
     step = _FRAME.size + page_size
-    for at in range(_HEADER.size, len(data) - step + 1, step):
-        _, commit, salt1, salt2, first, second = _FRAME.unpack_from(data, at)
-        if [salt1, salt2] != salts:
-            if not broken and _next_is_ours(data, at + step, salts):
-                broken = True  # it is the salt that is damaged
-                continue
-            break  # of an earlier run
+    for number, at in enumerate(range(_HEADER.size, len(data) - step + 1, step), 1):
+        _, commit, *frame_salts, first, second = _FRAME.unpack_from(data, at)
+        if frame_salts != salts:
+            if not _nearly(frame_salts, salts):
+                break  # of an earlier run
+            broken = True
         if not broken:
             head, page = data[at : at + 8], data[at + _FRAME.size : at + step]
             sums = _checksum(order, page, _checksum(order, head, sums))
             broken = sums != (first, second)
         if broken and commit:
-            lost += 1
-    return lost
+            commits.append(number)
+    if not broken:
+        return WalTail()
+    committed = _committed_frames(path, data[16:24])
+    lost = len([n for n in commits if n != commits[-1] or n <= committed])
+    return WalTail(lost, unfinished=not lost)
 
 
-def _next_is_ours(data: bytes, at: int, salts: list[int]) -> bool:
-    return len(data) >= at + _FRAME.size and list(_FRAME.unpack_from(data, at)[2:4]) == salts
+def _nearly(some: list[int], salts: list[int]) -> bool:
+    """Whether some salts are ours with a few bits changed."""
+    bits = sum((one ^ two).bit_count() for one, two in zip(some, salts, strict=True))
+    return bits <= _DAMAGED_SALT_BITS
+
+
+def _committed_frames(wal: Path, salts: bytes) -> int:
+    """How many frames the index beside a -wal file counts as committed; 0 where it is unknown."""
+    try:
+        with wal.with_name(f"{wal.name.removesuffix('-wal')}-shm").open("rb") as file:
+            one, two = file.read(_INDEX_BYTES), file.read(_INDEX_BYTES)
+    except OSError:
+        return 0
+    if len(one) < _INDEX_BYTES or one != two or one[32:40] != salts:
+        return 0
+    order = "<" if struct.pack("=I", 1)[0] else ">"
+    if _checksum(order, one[:40], (0, 0)) != struct.unpack("=2I", one[40:]):
+        return 0
+    return int(struct.unpack_from("=I", one, 16)[0])
 
 
 def _checksum(order: str, data: bytes, start: tuple[int, int]) -> tuple[int, int]:

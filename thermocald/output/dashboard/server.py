@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import logging
 import socket
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
@@ -16,7 +17,7 @@ import uvicorn
 from starlette.responses import JSONResponse
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from thermocald.errors import ConfigurationError
+from thermocald.errors import ConfigurationError, ThermocaldError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
     from starlette.types import ASGIApp, Receive, Scope, Send
 
 __all__ = ["Limits", "bind", "run_server"]
+
+log = logging.getLogger(__name__)
 
 _CONNECTIONS = 100
 _LOOK_EVERY_S = 2.0
@@ -124,7 +127,13 @@ class Limits:
             await busy(scope, receive, send)
             return
         async with self._slot(path):
-            await self._app(scope, receive, send)
+            try:
+                await self._app(scope, receive, send)
+            except RuntimeError as error:
+                if not isinstance(error.__cause__, ThermocaldError):
+                    raise
+                # half of the answer is sent: all that can be done is to end it there
+                log.warning("%s: %s", path, error.__cause__)
 
     @asynccontextmanager
     async def _slot(self, path: str) -> AsyncIterator[None]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Protocol, Self
 
 import numpy as np
 
+from thermocald.errors import ImageError
 from thermocald.photogrammetry.epoch.adjustment import (
     Adjustment,
     AdjustmentSettings,
@@ -21,7 +22,7 @@ from thermocald.photogrammetry.epoch.cold_start import cold_start, pose_only
 from thermocald.photogrammetry.frame.focus import frame_figures
 from thermocald.photogrammetry.frame.measurement import Prior
 from thermocald.photogrammetry.frame.tracking import Tracker
-from thermocald.photogrammetry.targets.image_file import decode_grey
+from thermocald.photogrammetry.targets.image_file import EncodedImage
 
 if TYPE_CHECKING:
     from typing import Any
@@ -117,25 +118,28 @@ class Calibrator:
         self._last = None
         self._tracker.reset()
 
-    def calibrate(self, epoch: Epoch, image: NDArray[Any] | None = None) -> CalibratedEpoch:
+    def calibrate(
+        self, epoch: Epoch, image: NDArray[Any] | EncodedImage | None = None
+    ) -> CalibratedEpoch:
         """Measure the epoch's frame where that is still to be done, and adjust.
 
-        image: the frame as grey values; by default the file that the epoch names. Never raises for
-        data: an epoch without a result has a status and a reason.
+        image: the frame as grey values or encoded; by default the file that the epoch names. Never
+        raises for data: an epoch without a result has a status and a reason.
         """
         extra: dict[str, float] = {}
         searched = ""
         observations = epoch.observations
         if observations is None:
-            if image is None:
-                if epoch.frame is None:
-                    why = epoch.note or "neither a frame nor observations"
-                    return CalibratedEpoch(epoch, failed("no_frame", why), extra)
-                try:
-                    image = decode_grey(epoch.frame)
-                except ValueError as error:
-                    return CalibratedEpoch(epoch, failed("bad_frame", str(error)), extra)
-            measured = self._tracker.measure(image)
+            if image is None and epoch.frame is None:
+                why = epoch.note or "neither a frame nor observations"
+                return CalibratedEpoch(epoch, failed("no_frame", why), extra)
+            try:
+                if image is None:
+                    assert epoch.frame is not None
+                    image = EncodedImage(epoch.frame)
+                measured = self._tracker.measure(image)
+            except ImageError as error:
+                return CalibratedEpoch(epoch, failed("bad_frame", str(error)), extra)
             searched = measured.searched
             observations = measured.observations
             epoch = replace(epoch, observations=observations)

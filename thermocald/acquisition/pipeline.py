@@ -31,7 +31,7 @@ from thermocald.epoch import Epoch
 from thermocald.errors import DataError
 from thermocald.photogrammetry.epoch.adjustment import failed
 from thermocald.photogrammetry.field.exchange import observations_from_lists
-from thermocald.photogrammetry.targets.image_file import decode_grey
+from thermocald.photogrammetry.targets.image_file import EncodedImage
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -56,7 +56,7 @@ def calibrate_frame(calibrator: Calibrator, epoch: Epoch, frame: Frame) -> Calib
         if (lists := frame.metadata.get("observations")) is not None:
             seen = observations_from_lists(lists, calibrator.testfield)
             return calibrator.calibrate(replace(epoch, observations=seen))
-        image = decode_grey(frame.encoded or b"") if frame.image is None else frame.image
+        image = EncodedImage(frame.encoded or b"") if frame.image is None else frame.image
     except DataError as error:
         return CalibratedEpoch(epoch, failed("bad_frame", str(error)), {})
     return calibrator.calibrate(epoch, image)

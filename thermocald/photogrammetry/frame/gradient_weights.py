@@ -51,17 +51,19 @@ class _Part:
     value: Single
     weight: Single
     weighted_partials: Single
-    inverse: Array
-    freedom: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GradientWeights:
-    """Weights for n targets, made from their parameters (n, 10)."""
+    """Weights for n targets, made from their parameters (n, 10).
+
+    inverse (n, 10, 10): of the normal matrices; freedom (n,): pixels beyond the parameters.
+    """
 
     parameters: Array
     parts: tuple[_Part, ...]
-    size: int
+    inverse: Array
+    freedom: Array
 
     @classmethod
     def build(
@@ -74,6 +76,8 @@ class GradientWeights:
     ) -> Self:
         """From fitted parameters (n, 10); of the image only the size counts."""
         parts = []
+        inverse = np.zeros((len(parameters), 10, 10))
+        freedom = np.ones(len(parameters))
         placed = maps.at(parameters[:, :2])
         blur = float(np.median(parameters[:, 5])) if len(parameters) else 0.9
         for w in windows(image, placed, coded, blur):
@@ -85,31 +89,25 @@ class GradientWeights:
             N = (jw @ np.swapaxes(j, 1, 2)).astype(float)
             scale = np.sqrt(np.maximum(np.einsum("nii->ni", N), 1e-12))
             scaled = N / (scale[:, :, None] * scale[:, None, :]) + 1e-10 * np.eye(10)
-            inverse = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
-            freedom = np.maximum(w.weight.sum(axis=1) - 10, 1)
-            parts.append(
-                _Part(w.rows, w.pixel.astype(np.int64), value, weight, jw, inverse, freedom)
-            )
-        return cls(parameters, tuple(parts), image.size)
+            inverse[w.rows] = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
+            freedom[w.rows] = np.maximum(w.weight.sum(axis=1) - 10, 1)
+            parts.append(_Part(w.rows, w.pixel.astype(np.int64), value, weight, jw))
+        return cls(parameters, tuple(parts), inverse, freedom)
 
     def apply(self, image: Image) -> LinearStep:
         """The step from the weights' own epoch to this image, which must be of the same size."""
         n = len(self.parameters)
-        delta = np.zeros((n, 10))
-        square, freedom = np.zeros(n), np.ones(n)
-        covariances = np.zeros((n, 2, 2))
+        rhs, square = np.zeros((n, 10)), np.zeros(n)
         flat = image.ravel()
         for part in self.parts:
             r = flat.take(part.pixel, mode="clip").astype(np.float32)
             r -= part.value
-            rhs = (part.weighted_partials @ r[..., None])[..., 0].astype(float)
-            d = (part.inverse @ rhs[..., None])[..., 0]
-            delta[part.rows] = d
+            rhs[part.rows] = (part.weighted_partials @ r[..., None])[..., 0]
             r *= r
             r *= part.weight
-            square[part.rows] = r.sum(axis=1) - np.sum(rhs * d, axis=1)
-            freedom[part.rows] = part.freedom
-            covariances[part.rows] = part.inverse[:, :2, :2]
+            square[part.rows] = r.sum(axis=1)
+        delta = (self.inverse @ rhs[..., None])[..., 0]
+        square -= np.sum(rhs * delta, axis=1)
         contrast = self.parameters[:, 7]
         # Position, shape and blur act in proportion to the contrast there is now.
         gain = contrast / np.where(np.abs(contrast + delta[:, 7]) > 0.1 * np.abs(contrast),
@@ -118,6 +116,6 @@ class GradientWeights:
         return LinearStep(
             self.parameters + delta,
             np.abs(delta[:, :2]).max(axis=1, initial=0.0),
-            covariances * (gain**2)[:, None, None],
-            np.sqrt(np.maximum(square, 0.0) / freedom),
+            self.inverse[:, :2, :2] * (gain**2)[:, None, None],
+            np.sqrt(np.maximum(square, 0.0) / self.freedom),
         )

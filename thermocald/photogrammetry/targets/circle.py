@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     Single = NDArray[np.float32]
     Image = NDArray[np.uint8] | NDArray[np.uint16]
 
-__all__ = ["CircleFit", "Windows", "fit_circles", "windows"]
+__all__ = ["CircleFit", "Windows", "fit_circles", "window_reach", "windows"]
 
 REACH_PX = 4.0
 """Pixels farther from the outline carry nothing about the centre."""
@@ -108,6 +108,11 @@ class Windows:
         return replace(self, x=x, y=y, grey=grey, weight=weight)
 
 
+def window_reach(blur: float, reach: float = REACH_PX) -> float:
+    """How far from the outline pixels are used, px, at a blur of so many px."""
+    return max(reach, 4.0 * blur)
+
+
 def windows(
     image: Image,
     maps: LocalMap,
@@ -121,7 +126,7 @@ def windows(
     coded (n,): targets with a code ring, which is kept out at `blur` px.
     """
     height, width = image.shape
-    reach_px = max(reach, 4.0 * blur)
+    reach_px = window_reach(blur, reach)
     half = np.ceil(maps.half_extent + reach_px).astype(int)
     # Targets of like size and like shape share a window.
     order = np.lexsort((half[:, 0], half.max(axis=1) // 3))

@@ -31,7 +31,10 @@ if TYPE_CHECKING:
     Single = NDArray[np.float32]
     Image = NDArray[np.uint8] | NDArray[np.uint16]
 
-__all__ = ["CornerFit", "fit_corners"]
+__all__ = ["REACH_PX", "CornerFit", "fit_corners"]
+
+REACH_PX = 10.0
+"""Farther along the edges no pixels are used."""
 
 _SERIES_TERMS = 9
 _ITERATIONS = 20
@@ -66,7 +69,7 @@ def fit_corners(
     before: Array,
     after: Array,
     cell: Array,
-    reach: float = 10.0,
+    reach: float = REACH_PX,
     chunk: int = 256,
 ) -> CornerFit:
     """Fit corners (n, 2) px whose neighbours along the outline are `before` and `after` (n, 2) px.

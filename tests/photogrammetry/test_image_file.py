@@ -1,0 +1,154 @@
+"""JPEGs decoded whole and in parts: the same grey values, and the same centres."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import simplejpeg
+
+from tests.photogrammetry.exact_rendering import noisy
+from tests.photogrammetry.fields import SMALL_CAMERA, SMALL_SENSOR, draw, small_field, station
+from thermocald.errors import ImageError
+from thermocald.photogrammetry.frame.measurement import Prior
+from thermocald.photogrammetry.frame.tracking import Tracker
+from thermocald.photogrammetry.targets import image_file, jpeg_parts
+from thermocald.photogrammetry.targets.image_file import EncodedImage, decode_grey
+from thermocald.photogrammetry.targets.jpeg_parts import decode_parts
+
+WIDTH, HEIGHT = 331, 247  # of units cut off at both edges
+BOXES = np.array([[40, 30, 60, 50], [200, 100, 231, 117], [320, 200, 400, 230], [-9, -9, 3, 3]])
+
+
+def _colours(seed: int = 4) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    coarse = rng.integers(0, 256, (HEIGHT // 9 + 1, WIDTH // 9 + 1, 3), dtype=np.uint8)
+    return cv2.resize(coarse, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
+
+
+def _cv2_jpeg(image: np.ndarray, *options: int) -> bytes:
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 90, *options])[1].tobytes()
+
+
+def _opencv(data: bytes) -> np.ndarray:
+    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+
+
+def _inside(boxes: np.ndarray) -> np.ndarray:
+    mask = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    for left, top, right, bottom in np.maximum(boxes, 0):
+        mask[top:bottom, left:right] = True
+    return mask
+
+
+@pytest.mark.parametrize("subsampling", ["444", "422", "420", "440", "Gray"])
+def test_grey_values_are_opencv_s(subsampling):
+    data = simplejpeg.encode_jpeg(_colours(), 90, "BGR", subsampling)
+    assert np.array_equal(decode_grey(data), _opencv(data))
+
+
+def test_what_simplejpeg_refuses_is_read_by_opencv(monkeypatch):
+    damaged = bytearray(_cv2_jpeg(_colours()))
+    damaged[len(damaged) // 2 : len(damaged) // 2 + 2] = b"\xff\xc0"
+    with pytest.raises(ValueError):
+        simplejpeg.decode_jpeg(bytes(damaged), "GRAY")
+    assert np.array_equal(decode_grey(bytes(damaged)), _opencv(bytes(damaged)))
+
+
+@pytest.mark.parametrize("units", [1, 7, 21, 42, 84, 336])
+@pytest.mark.parametrize("grey", [True, False])
+def test_segments_give_the_same_grey_values(units, grey, monkeypatch):
+    """Segments that divide a row of 8 or 16 px, are a row, or hold several and the last fewer."""
+    image = _colours()
+    data = _cv2_jpeg(image[..., 0] if grey else image, cv2.IMWRITE_JPEG_RST_INTERVAL, units)
+    decoded = []
+    original = simplejpeg.decode_jpeg
+
+    def decode(part, **options):
+        decoded.append(len(part))
+        return original(part, **options)
+
+    monkeypatch.setattr(jpeg_parts.simplejpeg, "decode_jpeg", decode)
+    found = decode_parts(data, BOXES)
+    whole = _opencv(data)
+    assert found is not None
+    assert found.shape == whole.shape
+    inside = _inside(BOXES)
+    assert np.array_equal(found[inside], whole[inside])
+    if units < 84:
+        assert decoded[0] < 0.7 * len(data), "the file was decoded as a whole"
+
+
+def test_without_restart_markers_decoding_ends_with_the_last_row():
+    data = _cv2_jpeg(_colours())
+    found = decode_parts(data, BOXES[:2])
+    assert found is not None
+    assert np.array_equal(found[:117], _opencv(data)[:117])
+    assert decode_parts(data, np.array([[0, 0, 9, HEIGHT]])) is None, "nothing would be saved"
+
+
+@pytest.mark.parametrize("progressive", [True, False])
+def test_others_are_decoded_whole(progressive):
+    """A progressive file, and one with a restart marker that is lost."""
+    if progressive:
+        data = _cv2_jpeg(_colours(), cv2.IMWRITE_JPEG_PROGRESSIVE, 1)
+    else:
+        data = _cv2_jpeg(_colours(), cv2.IMWRITE_JPEG_RST_INTERVAL, 21)
+        at = data.index(b"\xff\xd3")
+        data = data[:at] + data[at + 2 :]
+    found = decode_parts(data, np.array([[0, 200, 9, HEIGHT]]))
+    assert found is None
+
+
+def test_a_cut_off_jpeg_is_named():
+    with pytest.raises(ImageError, match="its end is missing"):
+        EncodedImage(_cv2_jpeg(_colours())[:-200])
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[np.ndarray]:
+    field, normals = small_field()
+    high = station(1000.0, target=(180.0, 180.0, 100.0))  # no target in the lowest rows
+    clean = draw(field, normals).render(SMALL_CAMERA, high)
+    rng = np.random.default_rng(3)
+    return [noisy(clean, rng) for _ in range(3)]
+
+
+@pytest.mark.parametrize("restart", [0, 41, 410])
+def test_tracked_centres_are_the_same_to_the_last_bit(frames, restart, monkeypatch):
+    """Of a frame decoded in parts and as a whole; only the first is decoded whole."""
+    options = [cv2.IMWRITE_JPEG_RST_INTERVAL, restart] if restart else []
+    encoded = [_cv2_jpeg(frame, *options) for frame in frames]
+    field, _ = small_field()
+    parts, wholes = (Tracker(field, Prior(SMALL_SENSOR)) for _ in range(2))
+    parts.measure(EncodedImage(encoded[0]))
+    wholes.measure(_opencv(encoded[0]))
+    monkeypatch.setattr(image_file.simplejpeg, "decode_jpeg", _forbidden(restart))
+    for data in encoded[1:]:
+        found, expected = parts.measure(EncodedImage(data)), wholes.measure(_opencv(data))
+        assert not found.searched
+        assert np.array_equal(found.observations.points, expected.observations.points)
+        assert np.array_equal(found.observations.sigmas, expected.observations.sigmas)
+
+
+def _forbidden(restart: int):
+    original = simplejpeg.decode_jpeg
+
+    def decode(data, **options):
+        assert "buffer" in options, "the whole frame was decoded"
+        assert options.get("strict", True) == bool(restart)
+        return original(data, **options)
+
+    return decode
+
+
+def test_luminance_is_the_grey_of_the_colours():
+    """Colours converted to grey give JPEG's luminance again where no channel is clipped: the
+    rounding of three channels, with their weights, stays below half a grey value.
+    """
+    data = simplejpeg.encode_jpeg(_colours() // 2 + 64, 95, "BGR", "420")
+    colours = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    converted = cv2.cvtColor(colours, cv2.COLOR_BGR2GRAY)
+    assert np.ptp(colours.astype(int), axis=2).mean() > 20, "there is no colour in it"
+    assert 0 < colours.min() <= colours.max() < 255
+    assert np.array_equal(converted, decode_grey(data))

@@ -7,7 +7,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from thermocald.cli.testfield_options import Json
+from thermocald.cli.testfield_options import (
+    AprilGrid,
+    Charuco,
+    Chessboard,
+    Dictionary,
+    Json,
+    Legacy,
+    MarkerSide,
+    Spacing,
+    Square,
+    board_of,
+)
 from thermocald.errors import UsageError
 
 if TYPE_CHECKING:
@@ -26,34 +37,18 @@ def import_(
     out: Annotated[Path, typer.Option("--out", "-o", help="The testfield.csv to write.")] = Path(
         "testfield.csv"
     ),
-    charuco: Annotated[
-        str | None, typer.Option("--charuco", help="A ChArUco board: 11x8 squares.")
-    ] = None,
-    chessboard: Annotated[
-        str | None, typer.Option("--chessboard", help="A chessboard: 9x6 inner corners.")
-    ] = None,
-    aprilgrid: Annotated[
-        str | None, typer.Option("--aprilgrid", help="Kalibr's AprilGrid: 6x6 tags.")
-    ] = None,
+    charuco: Charuco = None,
+    chessboard: Chessboard = None,
+    aprilgrid: AprilGrid = None,
     rings: Annotated[
         int | None,
         typer.Option("--rings", help="FILE lists targets with ring codes of 12 or 14 bits."),
     ] = None,
-    square: Annotated[
-        float | None, typer.Option("--square", min=0.1, help="Side of a square, mm.")
-    ] = None,
-    marker: Annotated[
-        float | None, typer.Option("--marker", min=0.1, help="Side of a marker or tag, mm.")
-    ] = None,
-    spacing: Annotated[
-        float, typer.Option("--spacing", help="Of an AprilGrid, over the side of a tag.")
-    ] = 0.3,
-    dictionary: Annotated[
-        str, typer.Option("--dictionary", help="OpenCV's name of the dictionary.")
-    ] = "DICT_5X5_1000",
-    legacy: Annotated[
-        bool, typer.Option("--legacy", help="ChArUco as OpenCV drew it before 4.6.")
-    ] = False,
+    square: Square = None,
+    marker: MarkerSide = None,
+    spacing: Spacing = 0.3,
+    dictionary: Dictionary = "DICT_5X5_1000",
+    legacy: Legacy = False,
     diameter: Annotated[
         float | None, typer.Option("--diameter", min=0.1, help="Of ring-coded discs, mm.")
     ] = None,
@@ -73,12 +68,11 @@ def import_(
     DICT_5X5_250 --out charuco.csv
     """
     from thermocald.cli.common import write_json
-    from thermocald.photogrammetry.targets import boards
     from thermocald.store.recording.board_file import read_board, read_rings
     from thermocald.store.recording.testfield_file import write_testfield
 
-    given = [charuco, chessboard, aprilgrid]
-    if (source is None) == (sum(g is not None for g in given) == 0) or sum(map(bool, given)) > 1:
+    board = board_of(charuco, chessboard, aprilgrid, square, marker, spacing, dictionary, legacy)
+    if (source is None) == (board is None):
         raise UsageError(
             "give a file, or one of --charuco, --chessboard, --aprilgrid with its sizes"
         )
@@ -93,19 +87,13 @@ def import_(
         field, said = read_rings(source, rings, diameter, sigma), f"rings of {rings} bits"
     elif source is not None:
         field, said = read_board(source, sigma)
-    elif charuco is not None:
-        columns, rows = _counts("--charuco", charuco)
-        sides = _needed(square, "--square"), _needed(marker, "--marker")
-        field = boards.charuco(columns, rows, *sides, dictionary, legacy=legacy, sigma=sigma)
-        said = f"a ChArUco board of {columns} × {rows} squares"
-    elif chessboard is not None:
-        columns, rows = _counts("--chessboard", chessboard)
-        field = boards.chessboard(columns, rows, _needed(square, "--square"), sigma=sigma)
-        said = f"a chessboard of {columns} × {rows} inner corners"
     else:
-        columns, rows = _counts("--aprilgrid", aprilgrid or "")
-        field = boards.aprilgrid(columns, rows, _needed(marker, "--marker"), spacing, sigma=sigma)
-        said = f"an AprilGrid of {columns} × {rows} tags"
+        assert board is not None
+        if board.kind != "aprilgrid":
+            _needed(square, "--square")
+        if board.kind != "chessboard":
+            _needed(marker, "--marker")
+        field, said = board.field(sigma), board.name
     out.absolute().parent.mkdir(parents=True, exist_ok=True)
     write_testfield(out, field)
     extent = [float(v) for v in field.points.max(axis=0) - field.points.min(axis=0)]
@@ -121,16 +109,6 @@ def import_(
         typer.echo(f"{out}: {said}, {len(field)} targets, {extent[0]:.1f} × {extent[1]:.1f} mm")
 
 
-def _needed(value: float | None, option: str) -> float:
+def _needed(value: float | None, option: str) -> None:
     if value is None:
         raise UsageError(f"{option} is missing (mm)")
-    return value
-
-
-def _counts(option: str, text: str) -> tuple[int, int]:
-    columns, _, rows = text.lower().replace("×", "x").partition("x")
-    if not (columns.isascii() and columns.isdigit() and rows.isascii() and rows.isdigit()):
-        raise UsageError(f"{option} {text}: write COLUMNSxROWS, such as 9x6")
-    if not 0 < int(columns[:6]) <= 1000 or not 0 < int(rows[:6]) <= 1000:
-        raise UsageError(f"{option} {text}: counts up to 1000 are possible")
-    return int(columns), int(rows)

@@ -9,12 +9,35 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from thermocald.cli.common import say
-from thermocald.cli.testfield_options import Diameter, Flat, Json, Landscape, Paper, design_of
+from thermocald.cli.testfield_options import (
+    AprilGrid,
+    Charuco,
+    Chessboard,
+    Diameter,
+    Dictionary,
+    Flat,
+    Json,
+    Landscape,
+    Legacy,
+    MarkerSide,
+    Paper,
+    Spacing,
+    Square,
+    board_of,
+    design_of,
+)
 
 if TYPE_CHECKING:
+    from thermocald.output.testfield.board import Board
     from thermocald.output.testfield.print import Printed
 
-__all__ = ["print_"]
+__all__ = ["ONE_PLANE", "print_"]
+
+ONE_PLANE = (
+    "one flat sheet calibrates a camera from photographs in several poses (thermocald calibrate); "
+    "a camera that stands still before it gets no result: for series print the corner, or put up "
+    "two or three sheets at an angle and survey them"
+)
 
 
 def print_(
@@ -43,6 +66,14 @@ def print_(
     pitch: Annotated[
         float | None, typer.Option("--pitch", help="Distance of the coded targets, mm.")
     ] = None,
+    charuco: Charuco = None,
+    chessboard: Chessboard = None,
+    aprilgrid: AprilGrid = None,
+    square: Square = None,
+    marker: MarkerSide = None,
+    spacing: Spacing = 0.3,
+    dictionary: Dictionary = "DICT_5X5_1000",
+    legacy: Legacy = False,
     force: Annotated[
         bool, typer.Option("--force", help="Replace a test field that was printed before.")
     ] = False,
@@ -53,10 +84,19 @@ def print_(
     By default it is a corner of three sheets; the last page of the PDF shows how to put it up.
     Print without scaling ("actual size"), measure the rulers, then survey what you have built.
 
+    With --charuco, --chessboard or --aprilgrid it is one board of that kind, as large as the paper
+    allows unless sizes are given.
+
     Example: thermocald testfield print --paper A3 --out field
+    Example: thermocald testfield print --aprilgrid 6x6 --paper A2 --out board
     """
     from thermocald.cli.common import write_json
     from thermocald.output.testfield.print import print_testfield
+
+    board = board_of(charuco, chessboard, aprilgrid, square, marker, spacing, dictionary, legacy)
+    if board is not None:
+        _print_board(board, paper, landscape, out, force, json)
+        return
 
     design = replace(
         design_of(paper, flat, landscape, diameter),
@@ -81,11 +121,39 @@ def print_(
             f"{bar['nominal']:.2f} mm) for --scale {bar['a']} {bar['b']} MM"
         )
     if flat:
-        say(
-            "one flat sheet calibrates a camera from photographs in several poses (thermocald "
-            "calibrate, testfield survey); a camera that stands still before it gets no result: "
-            "print the corner for series, and ask `thermocald testfield check` before you glue"
-        )
+        say(ONE_PLANE)
+
+
+def _print_board(
+    board: Board, paper: str, landscape: bool | None, out: Path, force: bool, json: str | None
+) -> None:
+    """The board on one page, which lies as the board does unless it is said how."""
+    from thermocald.cli.common import write_json
+    from thermocald.output.testfield.layout import PAPERS, paper_size
+    from thermocald.output.testfield.print import print_board
+
+    wide = board.columns > board.rows and paper.strip().upper() in PAPERS
+    page = paper_size(paper, landscape=wide if landscape is None else landscape)
+    board = board.filled(page)
+    printed = print_board(board, page, out, replace_printed=force)
+    document = {
+        "format": "thermocald-testfield-print/1",
+        "files": [str(path) for path in printed.files],
+        "sheets": 1,
+        "board": board.kind,
+        "square": board.square,
+        "marker": board.marker,
+        "targets": len(printed.field),
+    }
+    if json is not None:
+        write_json(document, json)
+    if json == "-":
+        return
+    typer.echo(
+        f"{out}: {board.name} ({board.measures}) on {page[0]:g} × {page[1]:g} mm, "
+        f"{len(printed.field)} targets"
+    )
+    say(ONE_PLANE)
 
 
 def _print_document(printed: Printed) -> dict[str, Any]:

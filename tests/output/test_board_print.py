@@ -1,0 +1,157 @@
+"""Printed boards of other programs: found in the PDF by OpenCV, and by us in photographs of it."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from tests.photogrammetry.network_cases import looking_at
+from tests.photogrammetry.printed_sheets import Sheet, photograph, put_up, rasterised
+from thermocald.cli import application
+from thermocald.errors import ThermocaldError
+from thermocald.output.testfield.board import Board
+from thermocald.output.testfield.layout import TRIM
+from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
+from thermocald.photogrammetry.frame.measurement import measure
+from thermocald.photogrammetry.targets import ring_code
+from thermocald.photogrammetry.targets.dictionary import corner_shift
+from thermocald.store.recording.testfield_file import read_testfield
+
+CAMERA = CameraModel(Sensor(1640, 1232, 0.00224), InteriorOrientation(3.05, 0.02, -0.01, A1=-2e-3))
+DPI = 200.0
+BOARDS = {
+    "charuco": ("--charuco", "11x8", "--dictionary", "DICT_5X5_250", "--paper", "A4"),
+    "old charuco": ("--charuco", "9x6", "--dictionary", "DICT_4X4_50", "--legacy"),
+    "chessboard": ("--chessboard", "9x6", "--square", 22.0, "--paper", "A4"),
+    "aprilgrid": ("--aprilgrid", "4x5", "--marker", 28.0, "--paper", "A4", "--spacing", 0.3),
+}
+
+
+def found_by_opencv(kind, image, document):
+    """{name of the target: place px}, as OpenCV has it in the page itself."""
+    if kind == "chessboard":
+        done, corners = cv2.findChessboardCornersSB(image, (9, 6))
+        assert done
+        upright = sorted(corners.reshape(6, 9, 2).tolist(), key=lambda row: row[0][1])
+        return {f"C{i}": p for i, p in enumerate(q for row in upright for q in sorted(row))}
+    if kind == "aprilgrid":
+        parameters = cv2.aruco.DetectorParameters()
+        parameters.markerBorderBits = 2
+        family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+        corners, ids, _ = cv2.aruco.ArucoDetector(family, parameters).detectMarkers(image)
+        shift = corner_shift("DICT_APRILTAG_36h11")
+        return {
+            f"{number}.{k}": quad[0, (k - shift) % 4]
+            for number, quad in zip(ids.ravel().tolist(), corners, strict=True)
+            for k in range(4)
+        }
+    columns, rows, name = (11, 8, "DICT_5X5_250") if kind == "charuco" else (9, 6, "DICT_4X4_50")
+    family = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+    sides = document["square"], document["marker"]
+    board = cv2.aruco.CharucoBoard((columns, rows), *sides, family)
+    board.setLegacyPattern(kind == "old charuco")
+    corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(image)
+    numbers = ids.ravel().tolist()
+    return {f"C{i}": p for i, p in zip(numbers, corners.reshape(-1, 2), strict=True)}
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param("old charuco", marks=pytest.mark.slow), "charuco", "chessboard", "aprilgrid"],
+)
+def test_a_printed_board_is_found_where_its_csv_says(tmp_path, kind):
+    arguments = ["testfield", "print", *map(str, BOARDS[kind]), "--out", str(tmp_path)]
+    result = CliRunner().invoke(application(), [*arguments, "--json", "-"])
+    assert result.exit_code == 0, result.output
+    document = json.loads(result.stdout)
+    field = read_testfield(tmp_path / "testfield.csv")
+    image = rasterised(tmp_path / "testfield.pdf", 0, DPI)
+
+    theirs = found_by_opencv(kind, image, document)
+    expected = [n for n, k in zip(field.names, field.kinds, strict=True) if k == "chess_corner"]
+    assert set(theirs) == set(expected or field.names)
+    rows = [field.index[name] for name in theirs]
+    plane = np.column_stack([field.points[rows, :2], np.ones(len(rows))])
+    placed = np.linalg.lstsq(plane, np.array(list(theirs.values())), rcond=None)[0]
+    # the page's own scale, y down: only where the board lies on it is free
+    assert placed[:2] == pytest.approx(np.diag([1, -1]) * DPI / 25.4, rel=2e-3, abs=0.01)
+    off = np.linalg.norm(plane @ placed - np.array(list(theirs.values())), axis=1)
+    # tags are not refined by OpenCV, and good to a pixel or two
+    assert off.max() < (2.5 if kind == "aprilgrid" else 0.5)
+
+    mm = DPI / 25.4
+    size = (image.shape[1] / mm, image.shape[0] / mm)
+    sheet = Sheet(image, size, np.zeros(3), np.eye(3)[:2])
+    middle = np.array([*size, 0.0]) / 2
+    stand = middle + 1.1 * max(size) * np.array([0.45, -0.3, 1.0]) / 1.14
+    found = measure(photograph([sheet], CAMERA, looking_at(stand, middle, 0.3)), field)
+    assert found.status.ok
+    assert len(found.observations) == len(field)
+    rays = CAMERA.rays(found.observations.points)
+    ideal = rays[:, :2] / rays[:, 2:] * np.array([1, -1])
+    points = field.points[found.observations.targets]
+    _, turn, shift = cv2.solvePnP(points, ideal, np.eye(3), None)
+    again, _ = cv2.projectPoints(points, turn, shift, np.eye(3), None)
+    residual_mm = (again.reshape(-1, 2) - ideal) * np.linalg.norm(stand - middle)
+    # the rasteriser sets the sides of squares at whole pixels of the page
+    assert np.sqrt(np.mean(residual_mm**2)) < 0.6 / mm
+
+
+@pytest.mark.slow
+def test_printed_rings_are_found_by_the_numbers_of_other_programs(tmp_path):
+    """Printed here, listed as Metashape lists them, imported, detected in a photograph."""
+    arguments = ["testfield", "print", "--flat", "--paper", "A4", "--bits", "12", "--no-plain"]
+    assert CliRunner().invoke(application(), [*arguments, "--out", str(tmp_path)]).exit_code == 0
+    printed = read_testfield(tmp_path / "testfield.csv")
+    numbers = [ring_code.codes(12).index(ring_code.parse(c)[1]) + 1 for c in printed.codes]
+    lines = [
+        f"target {n}, {x}, {y}, {z}" for n, (x, y, z) in zip(numbers, printed.points, strict=True)
+    ]
+    (tmp_path / "markers.txt").write_text("\n".join(lines))
+    out = tmp_path / "rings.csv"
+    source = ["testfield", "import", str(tmp_path / "markers.txt"), "--rings", "12"]
+    arguments = [*source, "--diameter", str(printed.diameters[0]), "--out", str(out)]
+    result = CliRunner().invoke(application(), arguments)
+    assert result.exit_code == 0, result.output
+    field = read_testfield(out)
+    (sheet,) = put_up(tmp_path / "testfield.pdf", (210.0, 297.0), TRIM)
+    middle = field.points.mean(axis=0)
+    station = looking_at(middle + np.array([120.0, -80.0, 300.0]), middle, 1.6)
+    found = measure(photograph([sheet], CAMERA, station), field)
+    truth = CAMERA.project(station, field.points)
+    assert found.status.ok
+    assert len(found.observations) == CAMERA.sensor.contains(truth, 25.0).sum() == len(field)
+    assert np.abs(found.observations.points - truth[found.observations.targets]).max() < 0.05
+
+
+def test_a_board_is_as_large_as_the_paper_allows():
+    for kind, counts in (("charuco", (11, 8)), ("chessboard", (9, 6)), ("aprilgrid", (6, 6))):
+        for page in ((297.0, 420.0), (210.0, 297.0), (841.0, 1189.0)):
+            board = Board(kind, *counts).filled(page)
+            board.check_fits(page)
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (("--charuco", "11x8", "--square", 60), "larger paper"),
+        (("--chessboard", "8x6"), "looks the same"),
+        (("--chessboard", "9by6"), "COLUMNSxROWS"),
+        (("--chessboard", "9x6", "--aprilgrid", "6x6"), "one board at a time"),
+        (("--charuco", "11x8", "--dictionary", "DICT_4X4_50", "--paper", "A0", "--marker", 99),
+         "smaller than squares"),
+        (("--charuco", "12x12", "--dictionary", "DICT_4X4_50", "--paper", "A0"), "50 markers"),
+        (("--aprilgrid", "900x900"), "at most 5000"),
+        (("--chessboard", "999x998"), "3 to 100"),
+    ],
+)  # fmt: skip
+def test_boards_that_cannot_be_are_refused(tmp_path, options, reason):
+    arguments = [str(a) for a in ("testfield", "print", *options, "--out", tmp_path / "new")]
+    result = CliRunner().invoke(application(), arguments)
+    assert isinstance(result.exception, ThermocaldError), result.output
+    assert reason in str(result.exception)
+    assert not (tmp_path / "new").exists()

@@ -64,8 +64,9 @@ def test_slope_is_unbiased_and_its_sd_true(thermometer_sd):
         sds.append(result.sd_slope)
         ordinary.append(np.polyfit(temperature, values, 1)[0])
     assert np.mean(slopes) == pytest.approx(truth, abs=4 * np.std(slopes) / np.sqrt(600))
-    # Counting possible autocorrelation makes the sd cautious, by some per cent for white noise.
-    assert 0.85 <= np.std(slopes) / np.sqrt(np.mean(np.square(sds))) <= 1.05
+    # Counting possible autocorrelation makes the sd cautious, by 10 to 20 % for white noise.
+    off = (np.array(slopes) - truth) / sds
+    assert 0.75 <= np.sqrt(np.mean(off**2)) <= 1.05
     if thermometer_sd > 1:
         assert np.mean(ordinary) < 0.9 * truth
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.statistics.autocorrelation import noise_autocorrelation
+from thermocald.analysis.statistics.autocorrelation import slope_noise
 from thermocald.analysis.statistics.dependence import holm, pearson_p_value
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.photogrammetry.series.target_noise import slow_errors
@@ -133,7 +133,7 @@ def _with_temperature(temperature: Array, columns: list[Array]) -> list[tuple[fl
     slopes, ps = [], []
     for y in columns:
         slopes.append(float(y[have] @ t / (t @ t)))
-        n = noise_autocorrelation(y[have], t).n_effective
+        n = slope_noise(y[have], t, slopes[-1]).n_effective
         ps.append(pearson_p_value(float(np.corrcoef(y[have], t)[0, 1]), n))
     return list(zip(slopes, holm(ps), strict=True)) if columns else []
 
@@ -188,10 +188,10 @@ def _line(t: Array, y: Array, tilt_sd: float) -> tuple[float, float, float]:
 
     x = t - t.mean()
     slope = float(x @ y / (x @ x))
-    n = noise_autocorrelation(y, x).n_effective
-    residual = y - y.mean() - slope * x
-    freedom = max(n - 2.0, 1.0)
+    noise = slope_noise(y, x, slope)
+    freedom = max(noise.n_effective - 2.0, 1.0)
     span = float(np.ptp(t))
+    residual = y - y.mean() - slope * x
     own = float(np.sqrt(np.mean(residual**2) / freedom)) / float(x.std()) * span
-    sd = float(np.hypot(own, tilt_sd))
-    return slope * span, sd, float(2 * student.sf(abs(slope) * span / sd, freedom))
+    p = 2 * student.sf(abs(slope) * span / float(np.hypot(own, tilt_sd)), freedom)
+    return slope * span, float(np.hypot(noise.sd * span, tilt_sd)), float(p)

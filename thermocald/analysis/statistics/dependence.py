@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.statistics.autocorrelation import noise_autocorrelation
+from thermocald.analysis.statistics.autocorrelation import slope_noise
 from thermocald.analysis.statistics.noise_models import MODELS, largest_p_value, pooled, spectra
 from thermocald.analysis.statistics.straight_line import fit_straight_line
 
@@ -35,7 +35,8 @@ __all__ = [
 
 _LEAST_EFFECTIVE = 3.0
 _CHANCE = 0.01
-_NOISY = 0.01
+_UNUSUAL = 3.0  # times the median sd of an epoch
+_FEW = 30  # epochs: fewer do not show their own noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +46,8 @@ class Dependence:
     p_naive counts all n epochs as independent; p_value holds whatever the autocorrelation of the
     noise; n_effective: independent values that the epochs are worth; sd_slope holds thermometer
     noise, the adjustments' sds, scatter beyond both and autocorrelation; misfit: scatter over what
-    the two noises explain.
+    the two noises explain; too_short: the noise remembers so much of the series that sd_slope is an
+    order of magnitude only.
     """
 
     n: int
@@ -57,6 +59,7 @@ class Dependence:
     slope: float
     sd_slope: float
     misfit: float
+    too_short: bool = False
 
 
 def pearson_p_value(r: float, n: float) -> float:
@@ -117,13 +120,12 @@ def dependence(values: Array, sds: Array, temperature: Array, temperature_sd: fl
         line = fit_straight_line(
             temperature, values, temperature_sd, sds, float(np.sqrt(unexplained))
         )
-    if temperature_sd**2 < _NOISY * float(np.var(temperature)):
-        noise = noise_autocorrelation(values, temperature)
-    else:
-        # The line fitted with each model of the noise would be flattened by the thermometer's, and
-        # what it leaves of the dependence would look like slow noise.
-        residual = values - line.slope * temperature
-        noise = noise_autocorrelation(residual, temperature, fitted=True)
+    # An epoch with few targets left is no part of the noise of the others.
+    usual = sds <= _UNUSUAL * float(np.median(sds))
+    if not np.ptp(temperature[usual]) > 0:
+        usual = np.ones(n, dtype=bool)
+    noise = slope_noise(values[usual], temperature[usual], line.slope, temperature_sd)
+    sd_slope = noise.sd if n >= _FEW else max(noise.sd, line.sd_slope)
     return Dependence(
         n,
         r,
@@ -132,8 +134,9 @@ def dependence(values: Array, sds: Array, temperature: Array, temperature_sd: fl
         noise.lag_one,
         slope_p_value(values, temperature),
         line.slope,
-        line.sd_slope * float(np.sqrt(n / noise.n_effective)),
+        sd_slope,
         misfit,
+        noise.too_short,
     )
 
 

@@ -169,6 +169,7 @@ def _channel(channel: ChannelStudy) -> dict[str, Any]:
                 "p_holm": channel.p_holm[name],
                 "slope": d.slope,
                 "sd_slope": d.sd_slope,
+                "too_short": d.too_short,
                 "scatter_over_noise": d.misfit,
             }
             for name, d in channel.dependences.items()

@@ -9,8 +9,8 @@ about the slope that is stated: it holds what each model says and how much the m
 A short series does not decide between models, so their weights beforehand matter. They were chosen
 by simulation such that errors over standard deviations are 0.9 to 1.1 (white, autoregressive with
 phi 0.5 to 0.97, slow noise on white noise; warm-up, and heating and cooling, of 150 and 400
-epochs). No weights make that exact for noise whose memory is more than a seventh of the series; then
-`too_short` is set.
+epochs). No weights make that exact for noise whose memory is more than a seventh of the series;
+then `too_short` is set.
 
 Sources: Whittle (1953), Estimation and information in stationary time series; Harville (1974),
 Biometrika 61, 383-385, for the restricted likelihood; Pyper & Peterman (1998), Can. J. Fish. Aquat.

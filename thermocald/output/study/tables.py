@@ -287,8 +287,8 @@ def _dependence_table(study: SeriesStudy, channel: ChannelStudy) -> Table:
         f"r: Pearson's correlation. p naive counts every epoch as independent; p holds whatever "
         "the memory of the noise; both are corrected for the number of parameters (Holm). n "
         "effective: independent epochs that the series is worth. The slope counts the "
-        f"thermometer's noise of {plain(t.sd, 'K', 2)}, its sd the memory of the noise. Scatter / noise above 1: the "
-        "straight line does not explain all.",
+        f"thermometer's noise of {plain(t.sd, 'K', 2)}, its sd the memory of the noise. "
+        "Scatter / noise above 1: the straight line does not explain all.",
     )
 
 

@@ -1,11 +1,19 @@
-"""Where analyses read series from: a store in a file, or one on a server; both answer alike."""
+"""Where analyses read series from: a store in a file, or one on a server; both answer alike.
+
+Analyses read times that are corrected where the clock was wrong; the store has them as stamped.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
+import numpy as np
+
 from thermocald.errors import StoreError
+from thermocald.store.database.series_reader import SeriesReader
 from thermocald.store.server.address import is_server
+from thermocald.store.times import SeriesTimes, series_times
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -14,11 +22,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.store.database.epoch_table import StoredEpoch
-    from thermocald.store.database.row import StoredSeries
+    from thermocald.store.database.row import Event, StoredSeries
 
     Array = NDArray[Any]
 
-__all__ = ["SeriesSource", "open_source", "require_source"]
+__all__ = ["CorrectedSource", "SeriesSource", "open_source", "require_source"]
 
 
 class SeriesSource(Protocol):
@@ -43,6 +51,74 @@ class SeriesSource(Protocol):
     ) -> Iterator[StoredEpoch]: ...
 
 
+class StampedSource(SeriesSource, Protocol):
+    """One that also has the steps of the clock that the daemon noted, as events."""
+
+    def clock_steps(self) -> list[Event]: ...
+
+
+class CorrectedSource(SeriesReader):
+    """An open store whose times are corrected, `store.times`; else as it is."""
+
+    def __init__(self, stamped: StampedSource) -> None:
+        self.path = stamped.path
+        self._stamped = stamped
+        self._times: dict[int, SeriesTimes | None] = {}
+
+    def __enter__(self) -> Self:
+        self._stamped.__enter__()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._stamped.__exit__(*error)
+
+    def all_series(self) -> list[StoredSeries]:
+        """As the store's."""
+        return self._stamped.all_series()
+
+    def find_series(self, camera: str | None = None, name: str | None = None) -> StoredSeries:
+        """As the store's."""
+        return self._stamped.find_series(camera, name)
+
+    def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
+        """As the store's."""
+        return self._stamped.covariances(series, numbers)
+
+    def series_columns(self, series: StoredSeries, names: Sequence[str]) -> dict[str, Array]:
+        """As the store's, with corrected times."""
+        columns = self._stamped.series_columns(series, names)
+        timed = {"frame_time", "temperature_time"} & set(names)
+        if timed and (times := self._corrected(series)) is not None:
+            corrected = {"frame_time": times.frame, "temperature_time": times.reading}
+            columns |= {name: corrected[name] for name in timed}
+        return columns
+
+    def epochs(
+        self,
+        series: StoredSeries,
+        first: int = 0,
+        last: int | None = None,
+        *,
+        details: bool = True,
+    ) -> Iterator[StoredEpoch]:
+        """As the store's, with corrected times."""
+        times = self._corrected(series)
+        for stored in self._stamped.epochs(series, first, last, details=details):
+            if times is None:
+                yield stored
+                continue
+            frame_time, temperature_time = times.of(stored.epoch.number)
+            epoch = replace(stored.epoch, frame_time=frame_time, temperature_time=temperature_time)
+            yield replace(stored, epoch=epoch)
+
+    def _corrected(self, series: StoredSeries) -> SeriesTimes | None:
+        """The times of a series; None where they are as they were stamped."""
+        if series.id not in self._times:
+            times = series_times(self._stamped, series)
+            self._times[series.id] = times if np.any(times.corrections) else None
+        return self._times[series.id]
+
+
 def open_source(source: Path) -> SeriesSource:
     """Open a store for reading: a file, or `postgresql://…?camera=…&series=…`.
 
@@ -51,10 +127,10 @@ def open_source(source: Path) -> SeriesSource:
     if is_server(source):
         from thermocald.store.server.reader import ServerStore
 
-        return ServerStore.open(source)
+        return CorrectedSource(ServerStore.open(source))
     from thermocald.store.database.store import Store
 
-    return Store.open(source)
+    return CorrectedSource(Store.open(source))
 
 
 def require_source(source: Path) -> Path:

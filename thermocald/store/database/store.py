@@ -392,6 +392,10 @@ class Store(SeriesReader):
         with self._lock, in_words(self.path, "events cannot be read", reading=True):
             return select_events(self._db, None if series is None else series.id, since_utc)
 
+    def clock_steps(self) -> list[Event]:
+        """The steps of the clock that the daemon noted, oldest first."""
+        return [event for event in self.events() if event.kind == "clock_step"]
+
     def checkpoint(self) -> bool:
         """Move what is in the -wal file into the store; False if a reader or the disk forbids."""
         try:

@@ -159,6 +159,15 @@ class ServerStore(SeriesReader, Connected):
             for utc, kind, text, key, epoch, data in rows
         ]
 
+    def clock_steps(self) -> list[Event]:
+        """The steps of the clocks of the address's stations, oldest first."""
+        rows = self._query(
+            "SELECT utc, kind, text, data FROM event WHERE kind = 'clock_step' "
+            "AND station = coalesce(%s, station) ORDER BY utc, id",
+            (self.address.station,),
+        )
+        return [Event(utc, kind, text, data=json.loads(d)) for utc, kind, text, d in rows]
+
     def readings(
         self, thermometer: str | None = None, since_utc: float = 0.0
     ) -> Iterator[LoggedReading]:

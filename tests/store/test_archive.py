@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from thermocald.store.database.archive import archive_series
+from thermocald.store.database.times import clock_corrections
 from thermocald.store.recording.reader import read_recording
-from thermocald.store.times import clock_corrections
 
 
 def test_a_series_becomes_a_recording(filled, tmp_path, make_epoch):

@@ -12,8 +12,8 @@ import numpy as np
 
 from thermocald.errors import StoreError
 from thermocald.store.database.series_reader import SeriesReader
+from thermocald.store.database.times import SeriesTimes, series_times
 from thermocald.store.server.address import is_server
-from thermocald.store.times import SeriesTimes, series_times
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -58,7 +58,7 @@ class StampedSource(SeriesSource, Protocol):
 
 
 class CorrectedSource(SeriesReader):
-    """An open store whose times are corrected, `store.times`; else as it is."""
+    """An open store whose times are corrected, `database.times`; else as it is."""
 
     def __init__(self, stamped: StampedSource) -> None:
         self.path = stamped.path

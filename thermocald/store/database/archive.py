@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.atomic_file import new_file
+from thermocald.store.database.times import series_times
 from thermocald.store.recording.paths import FileFolder
 from thermocald.store.recording.writer import RecordingWriter
-from thermocald.store.times import series_times
 
 if TYPE_CHECKING:
 
@@ -34,7 +34,7 @@ def archive_series(
 
     frames: the folder that relative paths of frames refer to; a frame that was not kept is left
     out. The head also holds what the store knows of the series: `start`, `device`, `calibration`.
-    Times are corrected (`store.times`), the head then holds `clock_set_back`
+    Times are corrected (`database.times`), the head then holds `clock_set_back`
     [{epoch, seconds}]. Raises RecordingError, StoreError.
     """
     times = series_times(store, series)

@@ -36,6 +36,7 @@ COMMANDS: dict[str, list[str] | None] = {
     "export": ["{M1}", "--format", "csv", "--output", "{to}/x.csv"],
     "import": None,
     "reprocess": None,
+    "server dashboard": ["--output", "{to}/x.json"],
     "session start": None,
     "simulate": ["--preset", "rpi-v2.1-heating", "--out", "{to}/M1"],
     "testfield import": None,

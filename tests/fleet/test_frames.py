@@ -143,8 +143,8 @@ def test_a_role_that_may_only_insert_sends_frames(server, station):
         with psycopg.connect(server.address(name="thermocald")) as connection:
             name, waiting = connection.execute("SELECT name, waiting FROM station").fetchone()
         assert (name, waiting) == ("bank", 0)
-        with pytest.raises(ServerError, match="may not"):
-            ServerStore(pi).all_series()
+        with ServerStore(pi) as store_there, pytest.raises(ServerError, match="may not"):
+            store_there.all_series()
     finally:
         with psycopg.connect(server.address(name="thermocald"), autocommit=True) as connection:
             connection.execute("DROP OWNED BY pi")

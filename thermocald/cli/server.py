@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from importlib.resources import files
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from thermocald.cli.common import say
+from thermocald.cli.common import say, write_text
 
 __all__ = ["register"]
 
@@ -26,6 +28,7 @@ def register(app: typer.Typer) -> None:
     group = typer.Typer(no_args_is_help=True, help=_HELP)
     group.command("init")(init)
     group.command("grant")(grant)
+    group.command("dashboard")(dashboard)
     app.add_typer(group, name="server")
 
 
@@ -59,3 +62,17 @@ def grant(
     parsed = ServerAddress.parse(address)
     give(parsed, role, writes=forward)
     say(f"{parsed}: {role} may {'insert' if forward else 'read'}")
+
+
+def dashboard(
+    output: Annotated[
+        str, typer.Option("-o", "--output", help="The file to write; - for standard output.")
+    ] = "-",
+) -> None:
+    """Write a dashboard for Grafana (import it; its source is the server, PostgreSQL).
+
+    Example: thermocald server dashboard -o fleet.json
+    """
+    path = Path(output) if output != "-" else output
+    text = (files("thermocald.output.fleet") / "grafana.json").read_text(encoding="utf-8")
+    write_text(text, path)

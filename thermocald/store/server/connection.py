@@ -15,7 +15,7 @@ from thermocald.errors import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from sqlalchemy import Engine
 
@@ -115,10 +115,19 @@ def _told(address: ServerAddress | str, doing: str, cause: Any) -> StoreError:
 
 
 class Connected:
-    """What holds an engine: it is disposed of at the end of a `with` block."""
+    """A server whose tables are of this program's version; use it in a `with` block.
 
-    def __init__(self, engine: Engine) -> None:
-        self._engine = engine
+    Raises ServerGone, ServerError, StoreVersionError.
+    """
+
+    def __init__(self, address: ServerAddress) -> None:
+        self.address = address
+        self._engine = connect(address)
+        try:
+            require_revision(self._engine, address)
+        except BaseException:
+            self._engine.dispose()
+            raise
 
     def close(self) -> None:
         """Close all connections; may be called twice."""
@@ -129,6 +138,13 @@ class Connected:
 
     def __exit__(self, *error: object) -> None:
         self.close()
+
+    def _query(self, statement: str, values: Sequence[Any]) -> list[tuple[Any, ...]]:
+        """All rows that psycopg gives for a statement with %s."""
+        with in_words(self.address, "it cannot be read"), self._engine.connect() as connection:
+            cursor = connection.connection.cursor()
+            cursor.execute(statement, values)
+            return list(cursor.fetchall())
 
 
 def require_revision(engine: Engine, address: ServerAddress) -> None:

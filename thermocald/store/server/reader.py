@@ -23,7 +23,7 @@ from thermocald.store.database.series_reader import SeriesReader
 from thermocald.store.recording.head import parse_head
 from thermocald.store.recording.testfield_file import parse_testfield
 from thermocald.store.server.address import ServerAddress
-from thermocald.store.server.connection import Connected, connect, in_words, require_revision
+from thermocald.store.server.connection import Connected, in_words
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -50,15 +50,9 @@ class ServerStore(SeriesReader, Connected):
     _remedy = "; select with ?station=…&camera=…&series=… in the address"
 
     def __init__(self, address: ServerAddress) -> None:
-        self.address = address
         self.path = Path(str(address))
         self._keys: list[UUID] = []
-        super().__init__(connect(address))
-        try:
-            require_revision(self._engine, address)
-        except BaseException:
-            self._engine.dispose()
-            raise
+        super().__init__(address)
 
     @classmethod
     def open(cls, source: Path | str) -> Self:
@@ -188,12 +182,6 @@ class ServerStore(SeriesReader, Connected):
         if key not in self._keys:
             self._keys.append(key)
         return self._keys.index(key)
-
-    def _query(self, statement: str, values: Sequence[Any]) -> list[tuple[Any, ...]]:
-        with in_words(self.address, "it cannot be read"), self._engine.connect() as connection:
-            cursor = connection.connection.cursor()
-            cursor.execute(statement, values)
-            return list(cursor.fetchall())
 
     def _stream(self, statement: str, values: Sequence[Any]) -> Iterator[tuple[Any, ...]]:
         """Rows by a server-side cursor: a year of epochs in constant memory."""

@@ -15,7 +15,7 @@ from thermocald import __version__
 from thermocald.errors import StoreVersionError
 from thermocald.store.recording.head import head_document
 from thermocald.store.recording.testfield_file import testfield_csv
-from thermocald.store.server.connection import Connected, connect, in_words, require_revision
+from thermocald.store.server.connection import Connected, in_words
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -47,13 +47,11 @@ class ServerWriter(Connected):
     """
 
     def __init__(self, address: ServerAddress, station: str) -> None:
-        self.address = address
+        super().__init__(address)
         self.station = station
-        super().__init__(connect(address))
         self._sent: set[UUID] = set()
         self._days: set[int] = set()
         try:
-            require_revision(self._engine, address)
             self._tables = self._described()
         except BaseException:
             self._engine.dispose()

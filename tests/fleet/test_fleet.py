@@ -1,0 +1,120 @@
+"""`thermocald fleet`: what is wrong with a fleet is named, and nothing else."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import replace
+
+import psycopg
+import pytest
+from typer.testing import CliRunner
+
+from benchmarks.generated_fleet import GeneratedCamera, add_camera
+from thermocald.cli import application
+from thermocald.store.server.address import ServerAddress
+from thermocald.store.server.writer import ServerWriter
+
+# an epoch a minute for two days: temperatures of 16 K
+BASE = GeneratedCamera("", epochs=2880, interval=60.0)
+RATES = [(3.0e-4 + 2e-5 * (i % 5 - 2), -4.0e-4 + 3e-5 * (i % 4 - 1.5), 2.0e-4 + 1e-5 * (i % 3))
+         for i in range(10)]  # fmt: skip
+
+
+def run(*arguments):
+    result = CliRunner().invoke(application(), [str(a) for a in arguments])
+    assert result.exit_code == 0, (result.exception, result.output)
+    return result.stdout
+
+
+@pytest.fixture
+def fleet(server):
+    """Ten sound cameras of one type, and cameras with a fault each, by its name."""
+    now = time.time()
+    base = replace(BASE, end=now - 20)
+    cameras = [replace(base, station=f"gauge{i}", rates=rate) for i, rate in enumerate(RATES)]
+    after = f"t > {now - 3 * 3600}"
+    faults = {
+        "odd": {"rates": (9.0e-4, -4.0e-4, 2.0e-4)},
+        "late": {"end": now - 7200},
+        "dead": {"sql": {"temperature": f"CASE WHEN {after} THEN NULL ELSE read END"}},
+        "stuck": {"sql": {"temperature": f"CASE WHEN t > {now - 36000} THEN 21.5 ELSE read END"}},
+        "cold": {"sql": {"temperature": f"CASE WHEN {after} THEN read - 20 ELSE read END",
+                         "status": f"CASE WHEN {after} THEN 'no_targets' ELSE 'ok' END"}},
+        "moved": {"sql": {"x0": f"0.01 - 4e-4 * (warm - 20) + 3e-4 * noise2 "
+                          f"+ CASE WHEN t > {now - 8 * 3600} THEN 0.01 ELSE 0 END"}},
+        "narrow": {"epochs": 20},
+    }  # fmt: skip
+    cameras += [replace(base, station=name, **fault) for name, fault in faults.items()]
+    with psycopg.connect(server.address(name="thermocald")) as connection:
+        for camera in cameras:
+            add_camera(connection, camera)
+    address = ServerAddress.parse(server.address(name="thermocald"))
+    for camera in cameras:
+        with ServerWriter(address, camera.station) as writer:
+            late = camera.station == "late"
+            writer.report(25 if late else 0, 0, time.time() + (90 if camera == cameras[3] else 0))
+    return server.address(name="thermocald")
+
+
+def test_faults_are_named_and_sound_cameras_are_not(fleet, tmp_path):
+    page = tmp_path / "fleet.html"
+    document = json.loads(run("fleet", fleet, "--json", "-", "--report", page))
+    found = {c["station"]: {f["kind"] for f in c["findings"]} for c in document["cameras"]}
+    assert found.pop("odd") == {"odd"}
+    assert found.pop("late") == {"late"}
+    assert found.pop("dead") == {"sensor"}
+    assert found.pop("stuck") >= {"sensor"}
+    assert found.pop("cold") == {"calibrate"}
+    assert found.pop("moved") >= {"calibrate"}
+    assert found.pop("narrow") == {"calibrate"}
+    assert found.pop("gauge3") == {"clock"}
+    assert {*found} == {f"gauge{i}" for i in range(10) if i != 3}
+    assert all(kinds == set() for kinds in found.values()), found
+    summary = document["summary"]
+    assert (summary["cameras"], summary["stations"], summary["sound"]) == (17, 17, 9)
+    texts = {c["station"]: " ".join(f["text"] for f in c["findings"]) for c in document["cameras"]}
+    assert "c moves by +0.9" in texts["odd"]
+    assert "25 rows wait" in texts["late"]
+    assert "21.5 °C for" in texts["stuck"]
+    assert "90 s ahead of" in texts["gauge3"]
+    assert "no_targets" in texts["cold"]
+    assert "outside of" in texts["cold"]
+    html = page.read_text()
+    assert html.count("<circle") >= 3 * 14
+    assert "secret" not in html
+    rates = {c["station"]: c["rates"] for c in document["cameras"]}
+    for i, true in enumerate(RATES):
+        for name, value in zip(("c", "x0", "y0"), true, strict=True):
+            rate = rates[f"gauge{i}"][name]
+            assert abs(rate["value"] - value) < 4.5 * rate["sd"]
+    (kind,) = document["types"]
+    assert kind["type"] == "imx219 3280×2464"
+
+
+def test_the_table_fits_a_terminal_and_an_address_narrows_it(fleet):
+    lines = run("fleet", fleet).splitlines()
+    assert max(map(len, lines)) <= 80
+    assert lines[0].startswith("17 cameras at 17 stations: 9 sound, 1 late")
+    assert any(line.startswith("odd/cam") for line in lines)
+    document = json.loads(run("fleet", f"{fleet}?station=gauge3", "--json", "-"))
+    assert [c["station"] for c in document["cameras"]] == ["gauge3"]
+    assert document["types"] == []
+
+
+def test_an_empty_server_is_said(server):
+    assert "no epochs there yet" in run("fleet", server.address(name="thermocald"))
+
+
+def test_a_clock_that_was_years_ahead_hides_nothing(server):
+    now = time.time()
+    camera = replace(BASE, station="a", end=now - 30, epochs=300)
+    with psycopg.connect(server.address(name="thermocald")) as connection:
+        add_camera(connection, camera)
+        connection.execute(
+            "CREATE TEMP TABLE copied AS SELECT * FROM epoch ORDER BY number DESC LIMIT 1"
+        )
+        connection.execute("UPDATE copied SET frame_time = frame_time + 3e8, number = number + 1")
+        connection.execute("INSERT INTO epoch SELECT * FROM copied")
+    document = json.loads(run("fleet", server.address(name="thermocald"), "--json", "-"))
+    assert 0 < document["cameras"][0]["lag_s"] < 600

@@ -11,7 +11,6 @@ import pytest
 
 from thermocald.acquisition.link import Link
 from thermocald.acquisition.live_pipeline import AcquiredEpoch
-from thermocald.cli.status import _warnings
 from thermocald.config import parse_config
 from thermocald.daemon.camera_line import link_status
 from thermocald.daemon.epoch_keeper import EpochKeeper
@@ -19,6 +18,7 @@ from thermocald.daemon.plan import plan_cameras
 from thermocald.epoch import Epoch
 from thermocald.errors import ConfigurationError
 from thermocald.hal import Camera, Frame, VirtualClock
+from thermocald.output.status_text import status_warnings
 from thermocald.store.database.row import EpochResult
 from thermocald.store.database.store import Store
 
@@ -66,7 +66,8 @@ def test_a_setting_that_harms_is_in_the_status():
         "clock": {"trusted": True}, "thermometers": {}, "outputs": {},
         "cameras": {"river": {**status, "put_off": 0, "caught_up": 0}},
     }  # fmt: skip
-    assert _warnings(document) == ["camera river: focus: auto lets the camera focus by itself"]
+    (said,) = status_warnings(document)
+    assert said == "camera river: focus: auto lets the camera focus by itself"
 
 
 def test_a_sensor_of_another_size_than_the_driver_is_refused():

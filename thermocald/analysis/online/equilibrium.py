@@ -79,11 +79,20 @@ class Equilibrium:
         if self.state == "unknown":
             return "not known yet"
         if self.state == "ready":
-            return f"ready: {self.drift:.3f} ± {self.sd_drift:.3f} px/min"
-        text = f"drifting {self.drift:.2f} ± {self.sd_drift:.2f} px/min"
+            return f"ready: {_two_digits(self.drift, self.sd_drift)} px/min"
+        text = f"drifting {_two_digits(self.drift, self.sd_drift)} px/min"
         if np.isfinite(self.ready_in):
-            text += f", ready in about {self.ready_in / 60:.0f} ± {self.sd_ready_in / 60:.0f} min"
+            minutes = _two_digits(self.ready_in / 60, self.sd_ready_in / 60)
+            text += f", ready in about {minutes} min"
         return text
+
+
+def _two_digits(value: float, sd: float) -> str:
+    """`1.1085 ± 0.0015`: to the second digit of the standard deviation."""
+    if not (np.isfinite(sd) and sd > 0):
+        return f"{value:.3g}"
+    decimals = int(np.clip(1 - np.floor(np.log10(sd)), 0, 6))
+    return f"{value:.{decimals}f} ± {sd:.{decimals}f}"
 
 
 def slope(times: Array, values: Array, sds: Array) -> tuple[Array, Array]:

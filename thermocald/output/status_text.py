@@ -101,7 +101,7 @@ def _device(device: dict[str, Any]) -> str:
         if value is not None
     ]
     last = ", ".join(shown)
-    text = device["device"] + (f", {last}" if last else "")
+    text: str = device["device"] + (f", {last}" if last else "")
     if device["faults"]:
         text += f", {device['faults']} fault{'' if device['faults'] == 1 else 's'}"
     return text + (f": {device['why']}" if device["why"] else "")

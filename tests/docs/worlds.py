@@ -170,6 +170,12 @@ def how_to_daemon(shelf: Path, folder: Path) -> None:
     put_recordings(shelf, folder, "M1")
 
 
+def how_to_export(shelf: Path, folder: Path) -> None:
+    """A recording, and a store that it was calibrated into."""
+    put_recordings(shelf, folder, "M1")
+    run("replay", folder / "M1", "--store", folder / "thermocald.db")
+
+
 def how_to_thermal_model(shelf: Path, folder: Path) -> None:
     put_recordings(shelf, folder, "M1", "M2")
     put_model(shelf, folder, "what-discover-wrote.yaml")
@@ -217,6 +223,7 @@ WORLDS: dict[str, World] = {
     "docs/how-to/calibrate.md": how_to_calibrate,
     "docs/how-to/daemon.md": how_to_daemon,
     "docs/how-to/dashboard.md": store,
+    "docs/how-to/export.md": how_to_export,
     "docs/how-to/make-a-recording.md": photographs_with_times,
     "docs/how-to/session.md": lambda _, f: put_config(f, "phone-1"),
     "docs/how-to/study.md": how_to_study,

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import json
+import shutil
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from thermocald.errors import UsageError
 from thermocald.output.series_export import style_of
 from thermocald.simulation.presets import preset_simulation
 from thermocald.simulation.testfields import corner_field
+from thermocald.store.database.store import Store
 from thermocald.store.logger.temperatures import read_log
 from thermocald.store.recording.reader import read_recording
 
@@ -79,6 +82,41 @@ def test_parquet_is_bit_for_bit(recording, tmp_path):
         assert table[name].to_pylist() == [float(row[name]) for row in plain]
     channels = read_recording(recording).columns.temperatures
     assert {f"temperature {n}" for n in channels} <= set(table.column_names)
+
+
+def test_extra_columns_of_a_store_are_exported_and_imported_the_same(recording, tmp_path):
+    """What the camera reported of itself, by epoch; an epoch without it stays empty."""
+    opened = read_recording(recording)
+    settings = {"camera_exposure_s": 0.01999, "camera_gain": 1.5, "camera_focus": -0.25}
+    with Store.open(tmp_path / "t.db", "append") as store:
+        series = store.create_series(opened.head, opened.testfield)
+        for k, epoch in enumerate(opened.iter_epochs()):
+            store.append(series, epoch, extra=settings if k != 3 else None)
+    source = ("export", tmp_path / "t.db", "--extra")
+    rows = rows_of(run(*source).stdout)
+    assert [r["camera_gain"] for r in rows] == ["1.5"] * 3 + [""] + ["1.5"] * 6
+    channels = opened.columns.temperatures
+    assert {f"temperature {n}" for n in channels} <= set(rows[0])
+    by_json = json.loads(run(*source, "--format", "json").stdout)
+    assert [r["camera_focus"] for r in by_json] == [-0.25] * 3 + [None] + [-0.25] * 6
+
+    out = tmp_path / "german.csv"
+    run(*source, "--time", "iso", "--separator", ";", "--decimal", ",", "-o", out)
+    log = read_log(out)
+    assert log.times == pytest.approx(opened.columns.frame_time, abs=2e-6)
+    for name in channels:
+        read, stored = log.channels[f"temperature {name}"], opened.columns.at_frame(name)
+        assert read.tolist() == stored.tolist()
+
+
+def test_unknown_columns_of_a_recording_are_extra(recording, tmp_path):
+    shutil.copytree(recording, tmp_path / "M1")
+    epochs = tmp_path / "M1" / "epochs.csv"
+    head, *lines = epochs.read_text().splitlines()
+    noted = [f"{line},{'lamp on' if k > 4 else ''}" for k, line in enumerate(lines)]
+    epochs.write_text("\n".join([f"{head},remark", *noted]) + "\n")
+    rows = rows_of(run("export", tmp_path / "M1", "--extra", "--exterior", "series").stdout)
+    assert [r["remark"] for r in rows] == [""] * 5 + ["lamp on"] * 5
 
 
 @pytest.mark.parametrize(

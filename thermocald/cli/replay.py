@@ -104,11 +104,19 @@ def export(
     ] = "seconds",
     separator: Annotated[str, typer.Option("--separator", help="Of the columns: , ; | tab")] = ",",
     decimal: Annotated[str, typer.Option("--decimal", help="The decimal mark: . or ,")] = ".",
+    extra: Annotated[
+        bool,
+        typer.Option(
+            "--extra",
+            help="All thermometers and all else that is stored of an epoch: camera_… settings as "
+            "the camera reported them, light, blur, the online filter.",
+        ),
+    ] = False,
 ) -> None:
     """One row per epoch: parameters, standard deviations, sigma0, status.
 
-    With one of --units, --time, --separator, --decimal, and as Parquet, the temperatures of all
-    thermometers follow.
+    With one of --units, --time, --separator, --decimal, --extra, and as Parquet, the temperatures
+    of all thermometers follow.
 
     Example: thermocald export rpi-heating-M1 --format csv > M1.csv
     Example: thermocald export M1 --units px,deg --time iso --separator ';' --decimal ',' -o M1.csv
@@ -136,11 +144,13 @@ def export(
 
         table = stored_table(source, series, settings, exterior)
     table, _ = settled(table)
-    if format_ == "parquet" or not style.is_plain:
-        known = series_export.camera_and_thermometers(source, series, table.number)
-        columns = series_export.columns_of(table, style, *known)
+    if format_ == "parquet" or extra or not style.is_plain:
+        known = series_export.besides(source, series, table.number, extra=extra)
+        columns = series_export.columns_of(table, style, known)
         if format_ == "parquet":
             series_export.write_parquet(columns, Path(output))
+        elif format_ == "json":
+            write_json(series_export.as_rows(columns), output)
         else:
             write_text(series_export.as_csv(columns, style), output)
     elif format_ == "csv":

@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import importlib.util
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
@@ -21,20 +21,23 @@ from thermocald.store.recording.reader import open_recording
 from thermocald.store.sources import open_source
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from thermocald.analysis.series.table import SeriesTable
+    from thermocald.store.database.epoch_table import StoredEpoch
 
     Array = NDArray[np.float64]
     Columns = dict[str, NDArray[np.int64] | Array | tuple[str, ...]]
 
 __all__ = [
+    "Besides",
     "ExportStyle",
     "as_csv",
-    "camera_and_thermometers",
+    "as_rows",
+    "besides",
     "columns_of",
     "style_of",
     "write_parquet",
@@ -78,18 +81,35 @@ def style_of(units: str, time: str, separator: str, decimal: str) -> ExportStyle
     return ExportStyle(frozenset(wanted), time, mark, decimal)
 
 
-def camera_and_thermometers(
-    source: Path, series: str | None, numbers: NDArray[np.int64]
-) -> tuple[float, dict[str, Array]]:
-    """The size of a pixel mm, and {channel: (E,) °C at the frames} of epochs `numbers` (E,).
+@dataclass(frozen=True, slots=True)
+class Besides:
+    """What a source knows of its epochs besides the adjustment.
 
-    source: a recording (folder) or a store; series: `CAMERA/SERIES` or `SERIES` of a store.
+    pixel_pitch mm; thermometers {channel: (E,) °C at the frames}; extra {name: (E,) numbers, or E
+    texts}: what the camera reported, light, blur, the filter's state, unknown columns of a file.
     """
+
+    pixel_pitch: float | None = None
+    thermometers: dict[str, Array] = field(default_factory=dict)
+    extra: Columns = field(default_factory=dict)
+
+
+def besides(
+    source: Path, series: str | None, numbers: NDArray[np.int64], *, extra: bool = False
+) -> Besides:
+    """What is known besides of epochs `numbers` (E,).
+
+    source: a recording (folder) or a store; series: `CAMERA/SERIES` or `SERIES` of a store; extra:
+    False leaves the extra columns unread.
+    """
+    texts: dict[str, tuple[str, ...]] = {}
+    values: dict[str, Array] = {}
     if source.is_dir():
         recording = open_recording(source)
         known = recording.columns.numbers
         readings = {name: recording.columns.at_frame(name) for name in recording.channels}
         pitch = recording.camera.sensor.pixel_pitch
+        texts = dict(recording.columns.extra) if extra else {}
     else:
         with open_source(source) as store:
             camera, _, name = (series or "").rpartition("/")
@@ -97,23 +117,44 @@ def camera_and_thermometers(
             known = store.series_columns(stored, ["epoch"])["epoch"].astype(np.int64)
             readings = store.temperatures_at_frame(stored)
             pitch = stored.head.camera.sensor.pixel_pitch
+            if extra:
+                values = _extra_of(store.epochs(stored, details=False), known)
     row = {int(n): i for i, n in enumerate(known)}
     rows = [row.get(int(n), -1) for n in numbers]
-    padded = {name: np.append(values, np.nan)[rows] for name, values in readings.items()}
-    return pitch, padded
+
+    def placed(columns: dict[str, Array]) -> dict[str, Array]:
+        return {name: np.append(column, np.nan)[rows] for name, column in columns.items()}
+
+    others: Columns = {**placed(values)}
+    for name, column in texts.items():
+        others[name] = tuple("" if i < 0 else column[i] for i in rows)
+    return Besides(pitch, placed(readings), others)
+
+
+def _extra_of(epochs: Iterable[StoredEpoch], known: NDArray[np.int64]) -> dict[str, Array]:
+    """The extra columns of stored epochs by name, in the order of `known` (E,)."""
+    place = {int(n): i for i, n in enumerate(known)}
+    found: dict[str, Array] = {}
+    for stored in epochs:
+        row = place.get(stored.epoch.number)
+        if row is None:
+            continue
+        for name, value in stored.extra.items():
+            found.setdefault(name, np.full(len(known), np.nan))[row] = value
+    return {name: found[name] for name in sorted(found)}
 
 
 def columns_of(
     table: SeriesTable,
     style: ExportStyle,
-    pixel_pitch: float | None = None,
-    thermometers: Mapping[str, Array] | None = None,
+    others: Besides | None = None,
 ) -> Columns:
-    """The columns of a series in some style.
+    """The columns of a series in some style, then thermometers and extra columns, as they are.
 
-    pixel_pitch: mm, for px; thermometers {name: (E,) °C at the frames}, NaN where not known.
     UsageError where px are wanted and the pixel's size is not known.
     """
+    others = others or Besides()
+    pixel_pitch = others.pixel_pitch
     if "px" in style.units and pixel_pitch is None:
         raise UsageError("--units px: the size of the pixels is not known here")
     moments: Array | tuple[str, ...] = table.frame_time
@@ -131,8 +172,10 @@ def columns_of(
             columns["n_observations"] = table.n_observations
             columns["n_rejected"] = table.n_rejected
             columns["status"] = table.status
-    for name, readings in (thermometers or {}).items():
+    for name, readings in others.thermometers.items():
         columns[f"temperature {name}"] = readings
+    for name, column in others.extra.items():
+        columns[name if name not in columns else f"extra {name}"] = column
     return columns
 
 
@@ -160,6 +203,15 @@ def as_csv(columns: Columns, style: ExportStyle) -> str:
     cells = [_cells(name, values, style) for name, values in columns.items()]
     writer.writerows(zip(*cells, strict=True))
     return text.getvalue()
+
+
+def as_rows(columns: Columns) -> list[dict[str, float | int | str | None]]:
+    """The columns as a row per epoch for JSON; what is not known is null."""
+    lists = [
+        [None if isinstance(v, float) and not np.isfinite(v) else v for v in column]
+        for column in (c if isinstance(c, tuple) else c.tolist() for c in columns.values())
+    ]
+    return [dict(zip(columns, row, strict=True)) for row in zip(*lists, strict=True)]
 
 
 def _cells(

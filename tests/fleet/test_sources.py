@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from thermocald.cli import application
+from thermocald.discovery.evidence.pair import load_pair
 from thermocald.fleet.forward import Forwarder
 from thermocald.simulation.presets import preset_simulation
+from thermocald.store.database.store import Store
+from thermocald.store.recording.reader import open_recording
 from thermocald.store.server.address import ServerAddress
 
 
@@ -43,6 +48,50 @@ def test_a_server_gives_what_the_file_gives(places):
     assert len(set(sources)) == 2
     assert "secret" not in str(sources)
     assert here == there
+
+
+@pytest.mark.slow
+def test_discover_and_correct_read_a_server_too(places, tmp_path):
+    file, server = places
+    # what is discovered follows from these
+    (here,), (there,) = (load_pair(Path(place), None, lambda _: None) for place in places)
+    assert "secret" not in there.name
+    assert np.array_equal(here.frame_times, there.frame_times)
+    assert np.array_equal(here.grid.points, there.grid.points, equal_nan=True)
+    assert np.array_equal(here.grid.weights, there.grid.weights)
+    assert here.readings.keys() == there.readings.keys()
+    run("fit", file, "-o", tmp_path / "m.yaml")
+    with Store.open(file) as store:
+        times = store.series_columns(store.find_series(), ["frame_time"])["frame_time"]
+    points = tmp_path / "points.csv"
+    points.write_text("time,x,y\n" + "".join(f"{t!r},1000,{100 + i}\n" for i, t in
+                                              enumerate(times[5:40].tolist())))  # fmt: skip
+    logs = (tmp_path / "M1" / "epochs.csv", file, server)
+    corrected = [run("correct", points, "--model", tmp_path / "m.yaml", "--log", log)
+                 for log in logs]  # fmt: skip
+    assert corrected[1] == corrected[2]
+    first, second = (np.genfromtxt(c.splitlines(), delimiter=",")[1:, 1:3] for c in corrected[:2])
+    assert np.allclose(first, second, atol=2e-3)
+
+
+def test_several_series_at_an_address_are_said(server, tmp_path):
+    for name in ("M1", "M2"):
+        preset_simulation("rpi-v2.1-heating", 3, name).write(tmp_path / name)
+        recording = open_recording(tmp_path / name)
+        with Store.open(tmp_path / "k.db", "append") as store:
+            series = store.create_series(recording.head, recording.testfield)
+            store.append(series, next(iter(recording.iter_epochs())))
+    Forwarder(
+        tmp_path / "k.db", ServerAddress.parse(server.address(name="thermocald")), "bank"
+    ).send_waiting()
+    for place, words in (
+        (server.address(name="thermocald"), "in the address"),
+        (tmp_path / "k.db", "thermocald archive"),
+    ):
+        result = CliRunner().invoke(application(), ["discover", str(place)])
+        assert "several series (rpi-v2.1/M1, rpi-v2.1/M2)" in str(result.exception)
+        assert words in str(result.exception)
+        assert "secret" not in str(result.exception)
 
 
 def test_a_wrong_address_is_one_line():

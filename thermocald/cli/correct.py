@@ -32,7 +32,7 @@ def correct(
     ],
     model: Annotated[Path, typer.Option("--model", help="The thermal model.")],
     log: Annotated[
-        Path, typer.Option("--log", help="CSV of times and temperatures, or an epochs.csv.")
+        Path, typer.Option("--log", help="CSV of temperatures, epochs.csv, or a store.")
     ],
     out: Annotated[
         Path | None, typer.Option("--out", help="CSV to write (points), or folder (images).")

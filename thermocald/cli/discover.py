@@ -24,7 +24,8 @@ def register(app: typer.Typer) -> None:
 
 def discover(
     recording: Annotated[
-        Path | None, typer.Argument(metavar="M1", help="The recording to explain.")
+        Path | None,
+        typer.Argument(metavar="M1", help="What to explain: a recording, a store, postgresql://…"),
     ] = None,
     verify: Annotated[
         Path | None,
@@ -81,8 +82,9 @@ def discover(
         written = str(model_out)
     if report is not None:
         from thermocald.output.discovery.report import report_html
+        from thermocald.store.sources import source_name
 
-        write_text(report_html(found, recording.name), report)
+        write_text(report_html(found, source_name(recording).rsplit("/", 1)[-1]), report)
     if json is not None:
         write_json(found.as_json(written), json)
     if json != "-":

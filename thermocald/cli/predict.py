@@ -59,7 +59,7 @@ def predict(
         float | None, typer.Option("--temperature", help="°C: a camera that has long been there.")
     ] = None,
     log: Annotated[
-        Path | None, typer.Option("--log", help="CSV of times and temperatures, or an epochs.csv.")
+        Path | None, typer.Option("--log", help="CSV of temperatures, epochs.csv, or a store.")
     ] = None,
     timezone: TimezoneOption = None,
     test: Annotated[
@@ -172,6 +172,10 @@ def read_log(
     """
     from thermocald.analysis.thermal.correction import read_temperature_log
     from thermocald.store.recording.head import read_head
+    from thermocald.store.sources import is_store
+
+    if is_store(path):
+        return _stored_log(thermal, path, column)
 
     if path.name == "epochs.csv" and (path.parent / "recording.yaml").is_file():
         camera = read_head(path.parent).camera
@@ -181,6 +185,17 @@ def read_log(
     reference = next(iter(thermal.model.validity), None)
     if column is None and reference in table.channels:
         return read_temperature_log(path, reference, clock)
+    return table
+
+
+def _stored_log(thermal: ThermalCamera, path: Path, column: str | None) -> TemperatureLog:
+    from thermocald.analysis.thermal.stored_log import stored_temperature_log
+
+    table, camera = stored_temperature_log(require_source(path), column)
+    thermal.for_images(camera.sensor.width, camera.sensor.height, camera.name)
+    reference = next(iter(thermal.model.validity), None)
+    if column is None and reference in table.channels:
+        table, _ = stored_temperature_log(path, reference)
     return table
 
 

@@ -80,15 +80,15 @@ def load_series(path: Path, advance: Callable[[int], None] | None = None) -> lis
         from thermocald.store.recording.reader import open_recording
 
         return [series_input(open_recording(path), advance=advance)]
-    from thermocald.store.sources import open_source
+    from thermocald.store.sources import open_source, source_name
 
     with open_source(path) as store:
         found = [
             epochs_input(
-                s.head, s.testfield, [e.epoch for e in store.epochs(s)], f"{path}: {s.name}"
+                s.head, s.testfield, [e.epoch for e in store.epochs(s)], f"{store.path}: {s.name}"
             )
             for s in store.all_series()
         ]
     if not found:
-        raise DataError(f"{path}: the store holds no series")
+        raise DataError(f"{source_name(path)}: the store holds no series")
     return found

@@ -13,7 +13,7 @@ import numpy as np
 from thermocald.errors import StoreError
 from thermocald.store.database.series_reader import SeriesReader
 from thermocald.store.database.times import SeriesTimes, series_times
-from thermocald.store.server.address import is_server
+from thermocald.store.server.address import ServerAddress, is_server
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -26,7 +26,16 @@ if TYPE_CHECKING:
 
     Array = NDArray[Any]
 
-__all__ = ["CorrectedSource", "SeriesSource", "open_source", "require_source"]
+__all__ = [
+    "CorrectedSource",
+    "SeriesSource",
+    "is_store",
+    "open_source",
+    "require_source",
+    "source_name",
+]
+
+_SQLITE = b"SQLite format 3\0"
 
 
 class SeriesSource(Protocol):
@@ -54,7 +63,7 @@ class SeriesSource(Protocol):
 class StampedSource(SeriesSource, Protocol):
     """One that also has the steps of the clock that the daemon noted, as events."""
 
-    def clock_steps(self) -> list[Event]: ...
+    def clock_steps(self, series: StoredSeries) -> list[Event]: ...
 
 
 class CorrectedSource(SeriesReader):
@@ -131,6 +140,26 @@ def open_source(source: Path) -> SeriesSource:
     from thermocald.store.database.store import Store
 
     return CorrectedSource(Store.open(source))
+
+
+def is_store(source: Path) -> bool:
+    """Whether a source is a store: a server's address, or a file that SQLite wrote."""
+    if is_server(source):
+        return True
+    try:
+        with source.open("rb") as file:
+            return file.read(len(_SQLITE)) == _SQLITE
+    except OSError:
+        return False
+
+
+def source_name(source: Path) -> str:
+    """A source as messages and results name it: an address without its password."""
+    if not is_server(source):
+        return str(source)
+    parsed = ServerAddress.parse(source)
+    chosen = (parsed.station, parsed.camera, parsed.series)
+    return " ".join([str(parsed), "/".join(part for part in chosen if part)]).strip()
 
 
 def require_source(source: Path) -> Path:

@@ -1,11 +1,14 @@
-"""Two recordings of one camera: M1 to discover on, M2 to prove it on."""
+"""Two series of one camera: M1 to discover on, M2 to prove it on; recordings or in stores."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 from thermocald.errors import DataError, UsageError
-from thermocald.reduction.source import series_input
+from thermocald.reduction.source import load_series, series_input
+from thermocald.store.recording.reader import read_recording
+from thermocald.store.server.address import is_server
+from thermocald.store.sources import require_source, source_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -18,9 +21,7 @@ __all__ = ["load_pair"]
 
 def load_pair(first: Path, second: Path | None, say: Callable[[str], None]) -> list[SeriesInput]:
     """Read M1, and M2 where it is given; refuses an M2 of another camera or thermometer."""
-    from thermocald.store.recording.reader import read_recording
-
-    if second is not None and first.resolve() == second.resolve():
+    if second is not None and _place(first) == _place(second):
         raise UsageError(
             f"{second} is the recording to explain itself; --verify needs another recording of the "
             "same camera, made at another time"
@@ -29,11 +30,31 @@ def load_pair(first: Path, second: Path | None, say: Callable[[str], None]) -> l
     for path in (first, second):
         if path is None:
             continue
-        say(f"reading {path}")
-        out.append(series_input(read_recording(path), say))
+        say(f"reading {source_name(path)}")
+        out.append(_read(path, say))
     if len(out) == 2:
         _same_camera(*out)
     return out
+
+
+def _read(path: Path, say: Callable[[str], None]) -> SeriesInput:
+    """One series: a recording's, or the only one of a store or of what an address selects."""
+    if path.is_dir():
+        return series_input(read_recording(path), say)
+    found = load_series(require_source(path))
+    if len(found) > 1:
+        there = ", ".join(f"{s.camera}/{s.series}" for s in found)
+        remedy = (
+            "select one with ?station=…&camera=…&series=… in the address"
+            if is_server(path)
+            else "make recordings of them with `thermocald archive`"
+        )
+        raise DataError(f"{source_name(path)}: holds several series ({there}); {remedy}")
+    return found[0]
+
+
+def _place(source: Path) -> str:
+    return str(source) if is_server(source) else str(source.resolve())
 
 
 def _same_camera(a: SeriesInput, b: SeriesInput) -> None:

@@ -30,7 +30,7 @@ class _Source(Protocol):
     """What is read here of a store in a file or on a server."""
 
     def series_columns(self, series: StoredSeries, names: Sequence[str]) -> dict[str, Array]: ...
-    def clock_steps(self) -> list[Event]: ...
+    def clock_steps(self, series: StoredSeries) -> list[Event]: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +58,7 @@ def series_times(source: _Source, series: StoredSeries) -> SeriesTimes:
     columns = source.series_columns(series, names)
     steps = [
         float(event.data["seconds"])
-        for event in source.clock_steps()
+        for event in source.clock_steps(series)
         if event.data.get("adopted") is True
     ]
     stamped, reading = columns["frame_time"], columns["temperature_time"]

@@ -153,12 +153,12 @@ class ServerStore(SeriesReader, Connected):
             for utc, kind, text, key, epoch, data in rows
         ]
 
-    def clock_steps(self) -> list[Event]:
-        """The steps of the clocks of the address's stations, oldest first."""
+    def clock_steps(self, series: StoredSeries) -> list[Event]:
+        """The steps of the clock of the station that a series is of, oldest first."""
         rows = self._query(
             "SELECT utc, kind, text, data FROM event WHERE kind = 'clock_step' "
-            "AND station = coalesce(%s, station) ORDER BY utc, id",
-            (self.address.station,),
+            "AND station = %s ORDER BY utc, id",
+            (series.identity["station"],),
         )
         return [Event(utc, kind, text, data=json.loads(d)) for utc, kind, text, d in rows]
 

@@ -5,48 +5,68 @@ Every registered command with an option that names an output is here: a new one 
 
 from __future__ import annotations
 
-import contextlib
+import ctypes
 import shutil
 import subprocess
 import sys
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
+from string import Formatter
 
+import cv2
 import pytest
 import typer
 
+from tests.cli.test_import import photograph
+from tests.photogrammetry.network_cases import convergent_stations
 from thermocald.atomic_file import new_file
 from thermocald.cli import application, main
 from thermocald.errors import OutputError
 from thermocald.output import camera_files
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 from thermocald.simulation.presets import preset_simulation
+from thermocald.simulation.scene import Scene
+from thermocald.store.recording.reader import open_recording
+from thermocald.store.recording.testfield_file import read_testfield
 
-# command → its arguments; {M1}, {M2}: recordings, {camera}: a camera file, {to}: the place that
-# cannot be written. None: it needs hardware, a daemon or a server, and its writer is one of these.
-COMMANDS: dict[str, list[str] | None] = {
-    "archive": None,
-    "backup": None,
-    "calibrate": None,
+_OVERRIDE_PERMISSIONS = 1 << 1  # CAP_DAC_OVERRIDE
+
+# command → its arguments; {to}: the place that cannot be written, the others are made by `World`.
+COMMANDS: dict[str, list[str]] = {
+    "archive": ["{store}", "--to", "{to}/archive"],
+    "backup": ["{store}", "{to}/b.db"],
+    "calibrate": [
+        "{photos}", "--testfield", "{field}", "--pixel-pitch", "0.00224", "--camera-out",
+        "{to}/c.json",
+    ],
     "camera convert": ["{camera}", "--to", "ros", "--pixel-pitch", "0.001", "--out", "{to}/x"],
     "check": ["{M1}", "--json", "{to}/x.json"],
-    "correct": None,
+    "correct": ["{points}", "--model", "{model}", "--log", "{M1}/epochs.csv", "--out", "{to}/c.csv"],
     "demo": ["--out", "{to}/demo", "--epochs", "12"],
     "discover": ["{M1}", "--json", "{to}/x.json"],
     "export": ["{M1}", "--format", "csv", "--output", "{to}/x.csv"],
-    "import": None,
-    "reprocess": None,
+    "import": [
+        "{snapshots}", "--log", "{log}", "--testfield", "{field}", "--timezone", "UTC",
+        "--pixel-pitch", "0.00112", "--out", "{to}/M1",
+    ],
+    "reprocess": ["{archive}", "--out", "{to}/again"],
     "server dashboard": ["--output", "{to}/x.json"],
-    "session start": None,
+    "session start": [
+        "--mock", "--epochs", "2", "--no-check", "--no-report", "--output", "{to}/session",
+    ],
     "simulate": ["--preset", "rpi-v2.1-heating", "--out", "{to}/M1"],
-    "testfield import": None,
-    "testfield survey": None,
+    "testfield import": ["--chessboard", "9x6", "--square", "30", "--out", "{to}/t.csv"],
+    "testfield survey": [
+        "{photos}", "--field", "{field}", "--pixel-pitch", "0.00224", "--out", "{to}/t.csv",
+    ],
     "fit": ["{M1}", "--output", "{to}/m.yaml"],
-    "predict": None,
+    "predict": ["--model", "{model}", "--temperature", "30", "--json", "{to}/x.json"],
     "replay": ["{M1}", "--json", "{to}/x.json"],
     "study": ["{M1}", "--figures", "{to}/figures"],
     "testfield print": ["--out", "{to}/field"],
-}
+}  # fmt: skip
 
 
 def leaves(command, name=()):
@@ -56,38 +76,128 @@ def leaves(command, name=()):
         yield " ".join(name), {opt for p in command.params for opt in p.opts}
 
 
+class World:
+    """What commands read, made when a command first asks for it: world["M1"] is a path."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def __getitem__(self, name: str) -> Path:
+        path: Path = getattr(self, name)
+        return path
+
+    @cached_property
+    def archive(self) -> Path:
+        simulation = preset_simulation("rpi-v2.1-heating", 1, "M1", None)
+        short = replace(simulation, programme=replace(simulation.programme, epochs=24))
+        short.write(self.folder / "archive/M1")
+        return self.folder / "archive"
+
+    @cached_property
+    def M1(self) -> Path:
+        return self.archive / "M1"
+
+    @cached_property
+    def camera(self) -> Path:
+        model = CameraModel(Sensor(640, 480, 0.001), InteriorOrientation(c=3.0, x0=0.01))
+        camera_files.write(model, self.folder / "camera.yaml", "opencv")
+        return self.folder / "camera.yaml"
+
+    @cached_property
+    def store(self) -> Path:
+        return self._made("replay", str(self.M1), "--store", "{}", name="k.db")
+
+    @cached_property
+    def model(self) -> Path:
+        return self._made("fit", str(self.M1), "--output", "{}", name="model.yaml")
+
+    @cached_property
+    def points(self) -> Path:
+        time_s = open_recording(self.M1).columns.frame_time[3]
+        (self.folder / "points.csv").write_text(f"time,x,y\n{time_s},100,200\n")
+        return self.folder / "points.csv"
+
+    @cached_property
+    def field(self) -> Path:
+        printed = ["print", "--paper", "A3", "--flat", "--landscape", "--diameter", "12", "--out"]
+        return self._made("testfield", *printed, "{}", name="field") / "testfield.csv"
+
+    @cached_property
+    def photos(self) -> Path:
+        field, folder = read_testfield(self.field), self.folder / "photos"
+        interior = InteriorOrientation(3.05, 0.02, -0.01, -2e-3).as_array()
+        scene = Scene(Sensor(1640, 1232, 0.00224), field)
+        folder.mkdir()
+        for i, station in enumerate(convergent_stations(field.points, 8, distance=440.0)):
+            frame = scene.render(interior, station.as_array(), seed=i)
+            cv2.imwrite(str(folder / f"{i}.jpg"), frame, [cv2.IMWRITE_JPEG_QUALITY, 95])
+        return folder
+
+    @cached_property
+    def snapshots(self) -> Path:
+        folder = self.folder / "snapshots"
+        folder.mkdir()
+        for i in range(3):
+            photograph(folder / f"{i}.jpg", f"2026:06:14 12:00:{10 * i:02d}")
+        return folder
+
+    @cached_property
+    def log(self) -> Path:
+        rows = [f"2026-06-14 12:00:{10 * i:02d},{20 + i}" for i in range(3)]
+        (self.folder / "log.csv").write_text("\n".join(["time,temperature", *rows, ""]))
+        return self.folder / "log.csv"
+
+    def _made(self, *arguments: str, name: str) -> Path:
+        path = self.folder / name
+        command = [part.format(path) for part in arguments]
+        application()(command, standalone_mode=False)
+        return path
+
+
 @pytest.fixture(scope="module")
 def world(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("world")
-    simulation = preset_simulation("rpi-v2.1-heating", 1, "M1", None)
-    short = replace(simulation, programme=replace(simulation.programme, epochs=24))
-    short.write(folder / "M1")
-    interior = InteriorOrientation(c=3.0, x0=0.01)
-    model = CameraModel(Sensor(640, 480, 0.001), interior)
-    camera_files.write(model, folder / "camera.yaml", "opencv")
-    return {"M1": folder / "M1", "camera": folder / "camera.yaml"}
+    return World(tmp_path_factory.mktemp("world"))
+
+
+@contextmanager
+def capabilities(dropped: int):
+    """Without some of the superuser's capabilities, as other users are."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    header, data = (ctypes.c_uint32 * 2)(0x20080522, 0), (ctypes.c_uint32 * 6)()
+    libc.capget(header, data)
+    before = data[0]
+    data[0] &= ~dropped
+    libc.capset(header, data)
+    yield
+    data[0] = before
+    libc.capset(header, data)
 
 
 @pytest.fixture
-def mounted(tmp_path):
-    """(option, …) → a folder that cannot be written: mounted read-only, or full."""
+def refusing(tmp_path):
+    """kind → a folder that cannot be written: mounted read-only, full, or another user's."""
     tool = shutil.which("mount")
-    folders = []
+    with ExitStack() as undo:
 
-    def mount(kind: str) -> Path:
-        folder = tmp_path / kind
-        folder.mkdir()
-        options = ["ro"] if kind == "read-only" else ["size=4k"]
-        command = [tool or "mount", "-t", "tmpfs", "-o", *options, "tmpfs", str(folder)]
-        done = subprocess.run(command, capture_output=True, check=False) if tool else None
-        if done is None or done.returncode:
-            pytest.skip("nothing can be mounted here: needs root")
-        folders.append(folder)
-        return folder
+        def make(kind: str) -> Path:
+            folder = tmp_path / kind
+            folder.mkdir()
+            if kind == "denied":
+                folder.chmod(0o555)
+                undo.enter_context(capabilities(_OVERRIDE_PERMISSIONS))
+                return folder
+            options = ["ro"] if kind == "read-only" else ["size=4k"]
+            command = [tool or "mount", "-t", "tmpfs", "-o", *options, "tmpfs", str(folder)]
+            done = subprocess.run(command, capture_output=True, check=False) if tool else None
+            if done is None or done.returncode:
+                pytest.skip("nothing can be mounted here: needs root")
+            undo.callback(subprocess.run, ["umount", "-l", str(folder)], check=False)
+            if kind == "full":
+                with suppress(OSError):
+                    (folder / "filler").write_bytes(b"x" * 100_000)
+            return folder
 
-    yield mount
-    for folder in folders:
-        subprocess.run(["umount", "-l", str(folder)], check=False)
+        yield make
 
 
 def run(monkeypatch, capsys, *arguments: str) -> tuple[int, str]:
@@ -103,33 +213,32 @@ def test_every_command_that_writes_is_tried():
     assert {name for name, options in found.items() if options & outputs} <= set(COMMANDS)
 
 
-QUICK = ["camera convert", "check", "testfield print"]
-SLOW = [name for name, given in COMMANDS.items() if given is not None and name not in QUICK]
+QUICK = ["camera convert", "check", "testfield print", "testfield import", "import"]
+SLOW = [name for name in COMMANDS if name not in QUICK]
 
 
-@pytest.mark.parametrize("kind", ["read-only", "full"])
+@pytest.mark.parametrize("kind", ["read-only", "full", "denied"])
 @pytest.mark.parametrize(
     "name", [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)]
 )
 def test_a_place_that_cannot_be_written_is_one_sentence(
-    world, mounted, monkeypatch, capsys, name, kind
+    world, refusing, monkeypatch, capsys, tmp_path, name, kind
 ):
-    folder = mounted(kind)
-    before = sorted(world["M1"].rglob("*"))
-    values = {**{k: str(v) for k, v in world.items()}, "to": str(folder)}
-    arguments = [part.format(**values) for part in COMMANDS[name]]
-    if kind == "full":
-        filler = folder / "filler"
-        with contextlib.suppress(OSError):
-            filler.write_bytes(b"x" * 100_000)
+    fields = {field for part in COMMANDS[name] for _, field, _, _ in Formatter().parse(part)}
+    values = {field: str(world[field]) for field in fields - {None, "to"}}
+    capsys.readouterr()
+    folder = refusing(kind)
+    monkeypatch.chdir(tmp_path)
+    before = sorted(world.folder.rglob("*"))
+    arguments = [part.format(**values, to=folder) for part in COMMANDS[name]]
     code, said = run(monkeypatch, capsys, *name.split(), *arguments)
-    assert code == (2 if kind == "read-only" else 3), said
+    assert code == (3 if kind == "full" else 2), said
     errors = [line for line in said.splitlines() if line.startswith("error:")]
     assert len(errors) == 1
     assert "cannot be written" in errors[0] or "the disk is full" in errors[0]
     assert "Traceback" not in said
     assert not [p for p in folder.rglob("*") if "partial" in p.name or ".part" in p.name]
-    assert sorted(world["M1"].rglob("*")) == before
+    assert sorted(world.folder.rglob("*")) == before
 
 
 ENDINGS = [OSError(28, "No space left"), KeyboardInterrupt(), SystemExit()]

@@ -16,6 +16,7 @@ from pathlib import Path
 from string import Formatter
 
 import cv2
+import numpy as np
 import pytest
 import typer
 
@@ -43,7 +44,9 @@ COMMANDS: dict[str, list[str]] = {
     ],
     "camera convert": ["{camera}", "--to", "ros", "--pixel-pitch", "0.001", "--out", "{to}/x"],
     "check": ["{M1}", "--json", "{to}/x.json"],
-    "correct": ["{points}", "--model", "{model}", "--log", "{M1}/epochs.csv", "--out", "{to}/c.csv"],
+    "correct": [
+        "{points}", "--model", "{model}", "--log", "{M1}/epochs.csv", "--out", "{to}/c.csv",
+    ],
     "demo": ["--out", "{to}/demo", "--epochs", "12"],
     "discover": ["{M1}", "--json", "{to}/x.json"],
     "export": ["{M1}", "--format", "csv", "--output", "{to}/x.csv"],
@@ -59,7 +62,8 @@ COMMANDS: dict[str, list[str]] = {
     "simulate": ["--preset", "rpi-v2.1-heating", "--out", "{to}/M1"],
     "testfield import": ["--chessboard", "9x6", "--square", "30", "--out", "{to}/t.csv"],
     "testfield survey": [
-        "{photos}", "--field", "{field}", "--pixel-pitch", "0.00224", "--out", "{to}/t.csv",
+        "{photos}", "--field", "{field}", "--pixel-pitch", "0.00224", "--distances",
+        "{distances}", "--out", "{to}/t.csv",
     ],
     "fit": ["{M1}", "--output", "{to}/m.yaml"],
     "predict": ["--model", "{model}", "--temperature", "30", "--json", "{to}/x.json"],
@@ -134,6 +138,15 @@ class World:
         return folder
 
     @cached_property
+    def distances(self) -> Path:
+        field, path = read_testfield(self.field), self.folder / "distances.csv"
+        a, b = 0, len(field) - 1
+        length = np.linalg.norm(field.points[a] - field.points[b])
+        row = f"{field.names[a]},{field.names[b]},{length},0.1"
+        path.write_text(f"a,b,length,sigma\n{row}\n")
+        return path
+
+    @cached_property
     def snapshots(self) -> Path:
         folder = self.folder / "snapshots"
         folder.mkdir()
@@ -146,6 +159,10 @@ class World:
         rows = [f"2026-06-14 12:00:{10 * i:02d},{20 + i}" for i in range(3)]
         (self.folder / "log.csv").write_text("\n".join(["time,temperature", *rows, ""]))
         return self.folder / "log.csv"
+
+    def files(self) -> list[Path]:
+        """All that is there, but what SQLite keeps next to a store that was read."""
+        return sorted(p for p in self.folder.rglob("*") if not p.match("*.db-*"))
 
     def _made(self, *arguments: str, name: str) -> Path:
         path = self.folder / name
@@ -229,7 +246,7 @@ def test_a_place_that_cannot_be_written_is_one_sentence(
     capsys.readouterr()
     folder = refusing(kind)
     monkeypatch.chdir(tmp_path)
-    before = sorted(world.folder.rglob("*"))
+    before = world.files()
     arguments = [part.format(**values, to=folder) for part in COMMANDS[name]]
     code, said = run(monkeypatch, capsys, *name.split(), *arguments)
     assert code == (3 if kind == "full" else 2), said
@@ -238,7 +255,7 @@ def test_a_place_that_cannot_be_written_is_one_sentence(
     assert "cannot be written" in errors[0] or "the disk is full" in errors[0]
     assert "Traceback" not in said
     assert not [p for p in folder.rglob("*") if "partial" in p.name or ".part" in p.name]
-    assert sorted(world.folder.rglob("*")) == before
+    assert world.files() == before
 
 
 ENDINGS = [OSError(28, "No space left"), KeyboardInterrupt(), SystemExit()]

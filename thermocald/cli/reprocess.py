@@ -9,7 +9,7 @@ import typer
 
 from thermocald.cli.common import progress, say, write_json
 from thermocald.cli.options import DEFAULT_FREE_TEXT, FreeOption, JsonOption
-from thermocald.errors import DataError
+from thermocald.errors import DataError, OutputError
 
 __all__ = ["register"]
 
@@ -65,6 +65,8 @@ def reprocess(
         )
     if failed:
         first = failed[0]
+        if first.not_written:
+            raise OutputError(first.error, first.not_written)
         raise DataError(
             f"{len(failed)} of {len(outcomes)} blocks failed; {first.block.recording}, epoch "
             f"{first.block.first + 1} on: {first.error}"

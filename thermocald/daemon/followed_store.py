@@ -15,7 +15,7 @@ import time
 from typing import TYPE_CHECKING
 
 from thermocald.daemon.store_file import StoreFile
-from thermocald.errors import StoreError
+from thermocald.errors import OutputError, StoreError
 from thermocald.store.database.row import Event
 from thermocald.store.database.store import Store
 from thermocald.store.database.wal import read_wal_tail
@@ -95,6 +95,8 @@ class FollowedStore:
             return self.in_place or self._follow()
         except OSError as error:
             raise StoreError(f"{self.path}: cannot be written: {error.strerror}") from error
+        except OutputError as error:
+            raise StoreError(str(error)) from error
 
     def _follow(self) -> bool:
         file, copy = self._file, None

@@ -23,7 +23,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.acquisition.calibrator import Calibrator
-from thermocald.errors import DataError, ServerGone, ThermocaldError, UsageError
+from thermocald.atomic_file import cannot_write, make_folder
+from thermocald.errors import DataError, OutputError, ServerGone, ThermocaldError, UsageError
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.store.database.row import EpochResult
@@ -55,12 +56,16 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of a block: epochs, how many have a result; `error` is empty where it is done."""
+    """What became of a block: epochs, how many have a result; `error` is empty where it is done.
+
+    not_written: the exit status where it is the file of results that could not be written, else 0.
+    """
 
     block: Block
     epochs: int
     calibrated: int
     error: str = ""
+    not_written: int = 0
 
 
 def find_blocks(
@@ -96,10 +101,16 @@ def calibrate_block(block: Block) -> Outcome:
     """Calibrate one block and write its file, whole or not at all; never raises for its data."""
     try:
         columns, calibrated = _columns(block)
-        block.target.parent.mkdir(parents=True, exist_ok=True)
-        write_parquet(block.target, columns)
     except (ThermocaldError, OSError) as error:
         return Outcome(block, 0, 0, str(error))
+    try:
+        make_folder(block.target.parent)
+        try:
+            write_parquet(block.target, columns)
+        except OSError as error:
+            raise cannot_write(block.target, error) from error
+    except OutputError as error:
+        return Outcome(block, 0, 0, str(error), error.exit_status)
     return Outcome(block, block.stop - block.first, calibrated)
 
 

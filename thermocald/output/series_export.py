@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.errors import DataError, DriverMissing, UsageError
+from thermocald.atomic_file import make_folder, new_file
+from thermocald.errors import DriverMissing, UsageError
 from thermocald.photogrammetry.parameters import PARAMETER_NAMES
 from thermocald.store.recording.reader import open_recording
 from thermocald.store.sources import open_source
@@ -237,11 +238,6 @@ def write_parquet(columns: Columns, path: Path) -> None:
 
     table = pa.table({name: pa.array(list(v) if isinstance(v, tuple) else v)
                          for name, v in columns.items()})  # fmt: skip
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        path.absolute().parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.absolute().parent)
+    with new_file(path) as partial:
         parquet.write_table(table, partial)
-        partial.replace(path)
-    except OSError as cause:
-        partial.unlink(missing_ok=True)
-        raise DataError(f"{path}: cannot be written: {cause.strerror or cause}") from cause

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from thermocald.atomic_file import cannot_write
 from thermocald.errors import StoreError, StoreFullError
 from thermocald.store.database import columns as column_chunks
 from thermocald.store.database.changes import KEPT, KeptFrame, frames_after, rows_after
@@ -434,13 +435,13 @@ class Store(SeriesReader):
     def copy_to(self, target: Path) -> None:
         """Copy the store to another file, whole or not at all, while it may be written.
 
-        Raises StoreError where that cannot be written.
+        Raises StoreError; OutputError where that cannot be written.
         """
         with in_words(self.path, f"the copy {target} cannot be made"):
             try:
                 copy_database(self._db, target)
             except OSError as error:
-                raise StoreError(f"{target}: cannot be written: {error.strerror}") from error
+                raise cannot_write(target, error) from error
 
     def _select_series(
         self, camera: str | None = None, name: str | None = None

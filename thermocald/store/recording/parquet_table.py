@@ -7,6 +7,7 @@ that what is checked of one is checked of the other.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -146,7 +147,8 @@ class _Writer:
             if kind is None and self._writer is not None:
                 self._partial.replace(self._path)
         finally:
-            self._partial.unlink(missing_ok=True)
+            with suppress(OSError):
+                self._partial.unlink(missing_ok=True)
 
 
 def write_parquet(path: Path, columns: Mapping[str, Any]) -> None:

@@ -24,5 +24,5 @@ def series_input(series: Series) -> SeriesInput:
         TestField.build([str(i + 1) for i in range(n)], series.field_nominal, 0.02), c,
         series.frame_time, series.temperature_time, series.temperatures,
         dict.fromkeys(series.temperatures, 0.0625), ObservationGrid(points, weights),
-        series.epoch,
+        series.epoch, columns=series.columns,
     )  # fmt: skip

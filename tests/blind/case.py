@@ -36,3 +36,5 @@ class Case:
     camera: str | None = None
     programmes: tuple[str, str] | None = None
     with_m2: bool = True
+    influence: str = ""  # of `outside`, where the effect is OUTSIDE
+    record_humidity: bool = False

@@ -18,6 +18,7 @@ import numpy as np
 
 from tests.blind.case import CAMERAS, PROGRAMMES, Case
 from tests.blind.hidden import fresh, hide, left_over, make_camera, true_parameters
+from tests.blind.outside import trajectories
 from tests.blind.world import climate, corner_field, image, smooth_unknown
 
 _PARAMETERS = (
@@ -43,6 +44,7 @@ class Series:
     field_nominal: np.ndarray
     interval: float
     missed: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    columns: dict[str, np.ndarray] = field(default_factory=dict)  # what else was recorded
 
 
 def generate(case: Case) -> tuple[list[Series], dict]:
@@ -57,7 +59,12 @@ def generate(case: Case) -> tuple[list[Series], dict]:
         others = [p for p in PROGRAMMES if p != first] if case.hard else list(PROGRAMMES)
         programmes = (first, str(rng.choice(others)))
     climates = [climate(rng, p, seconds) for p in programmes]
-    unknowns = [smooth_unknown(rng, seconds) for _ in programmes]
+    humidity: list[np.ndarray] = []
+    if case.influence:
+        own = np.random.default_rng([case.seed, 78])
+        unknowns, humidity = trajectories(own, case.influence, climates, seconds)
+    else:
+        unknowns = [smooth_unknown(rng, seconds) for _ in programmes]
     T1 = climates[0]["temperature"]
     pool = {
         "T_quantile": lambda q: float(T1.min() + q * (T1.max() - T1.min())),
@@ -135,6 +142,10 @@ def generate(case: Case) -> tuple[list[Series], dict]:
         built.append(
             _measure(rng, case, camera_name, f"M{s + 1}", frames, uv, noise, climates[s], nominal)
         )
+    if case.record_humidity:
+        for series, values in zip(built, humidity, strict=False):
+            at = series.frame_time - 1_600_000_000.0
+            series.columns = {"humidity": np.interp(at, np.arange(seconds), values)}
     truth = {
         "case": dict(case.__dict__.items()),
         "camera": camera_name,

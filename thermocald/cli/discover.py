@@ -40,6 +40,10 @@ def discover(
     model_out: Annotated[
         Path | None, typer.Option("--model-out", help="Write the model with what was found.")
     ] = None,
+    effect_out: Annotated[
+        Path | None,
+        typer.Option("--effect-out", help="Write what was found as an effect file (YAML)."),
+    ] = None,
     report: Annotated[
         Path | None, typer.Option("--report", help="Write a report, one HTML file.")
     ] = None,
@@ -80,6 +84,8 @@ def discover(
 
         write_model(model_out, model_of(found, read_model(model) if model else None))
         written = str(model_out)
+    if effect_out is not None:
+        _write_effects(effect_out, found)
     if report is not None:
         from thermocald.output.discovery.report import report_html
         from thermocald.store.sources import source_name
@@ -94,7 +100,7 @@ def discover(
 
 def _examined(recording: Path, verify: Path | None, model: Path | None) -> Discovery:
     from thermocald.discovery.evidence.pair import load_pair
-    from thermocald.discovery.verdict.model import terms_of
+    from thermocald.discovery.verdict.found import terms_of
     from thermocald.discovery.verdict.result import discover_series
     from thermocald.reduction.reduce import reduce_together
     from thermocald.simulation.model_file import read_model
@@ -104,6 +110,23 @@ def _examined(recording: Path, verify: Path | None, model: Path | None) -> Disco
     say("reducing the epochs to normal equations")
     evidence = reduce_together(inputs, old.T0 if old else None)
     return discover_series(evidence, say, terms_of(old) if old else ())
+
+
+def _write_effects(path: Path, found: Discovery) -> None:
+    from thermocald.discovery.verdict.found import effects_of
+    from thermocald.simulation.effect_file import write_effects
+
+    effects = [one for entry in found.effects for one in effects_of(entry)]
+    if not effects:
+        say(f"{path} is not written: nothing was found that another recording would show too")
+        return
+    document = found.as_json(None)
+    write_effects(
+        path,
+        effects,
+        "; ".join(e.statement for e in found.effects),
+        {"verdict": found.verdict, "gap": document["gap"]},
+    )
 
 
 def _lines(found: Discovery) -> list[str]:

@@ -44,6 +44,10 @@ def simulate(
     frames: Annotated[
         bool, typer.Option("--frames", help="Render frames instead of measured image points.")
     ] = False,
+    effect: Annotated[
+        list[Path] | None,
+        typer.Option("--effect", help="An effect file (YAML) to add, such as a proposal."),
+    ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of all random numbers.")] = 0,
     series: Annotated[str, typer.Option("--series", help="Name of the series (preset).")] = "M1",
     model_out: Annotated[
@@ -66,6 +70,8 @@ def simulate(
     if out is None:
         raise UsageError("--out is missing: the folder of the recording to write")
     simulation = _simulation(preset, model, camera, testfield, programme, seed, series)
+    for path in effect or ():
+        simulation = _with_effects(simulation, path)
     with progress(simulation.programme.epochs, "simulating") as advance:
         simulation.write(out, with_frames=frames, advance=advance)
     if model_out is not None:
@@ -125,6 +131,15 @@ def _simulation(
     if field is None:
         field = load_field("circles")
     return Simulation(thermal, device, field, read_programme(programme), seed)
+
+
+def _with_effects(simulation: Simulation, path: Path) -> Simulation:
+    from thermocald.simulation.effect_file import read_effects
+
+    model = simulation.model
+    for one in read_effects(path):
+        model = model.with_effect(one)
+    return replace(simulation, model=model)
 
 
 def _summary(simulation: Simulation, out: Path) -> dict[str, Any]:

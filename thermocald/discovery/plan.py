@@ -16,7 +16,7 @@ import numpy as np
 
 from thermocald.discovery.search.candidates import candidates
 from thermocald.discovery.search.examination import examine_series
-from thermocald.discovery.verdict.model import terms_of
+from thermocald.discovery.verdict.found import terms_of
 from thermocald.errors import UsageError
 from thermocald.reduction.fit import HypothesisFitter
 from thermocald.reduction.hypothesis import Term
@@ -24,7 +24,6 @@ from thermocald.reduction.reduce import reduce_series
 from thermocald.reduction.series import COLUMNS, ReducedSeries, SeriesInput
 from thermocald.reduction.source import series_input
 from thermocald.simulation import effects as catalogue
-from thermocald.simulation.history import History
 from thermocald.simulation.model import ModelEffect
 
 if TYPE_CHECKING:
@@ -33,6 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.reduction.candidate import Candidate
+    from thermocald.simulation.history import History
     from thermocald.simulation.observations import Simulation
 
     Array = NDArray[np.float64]
@@ -233,7 +233,7 @@ def _as_read(evidence: ReducedSeries) -> History:
     """The readings themselves, where the evidence has them smoothed: a camera feels every kink."""
     h = evidence.history
     readings = {n: h.readings[n] + c.deviation for n, c in evidence.thermometers.items()}
-    return History(h.times, h.reading_times, readings, h.reference, h.T0)
+    return replace(h, readings=readings)
 
 
 def _with_drive(

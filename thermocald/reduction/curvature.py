@@ -28,13 +28,20 @@ __all__ = ["curved", "relinearised"]
 _WORTH_PX = 0.0005
 
 
-def relinearised(fitter: HypothesisFitter, fit: Fit, series: int) -> ReducedSeries | None:
-    """One series with the curvature taken off its observations; None where it does not matter."""
+def relinearised(
+    fitter: HypothesisFitter, fit: Fit, series: int, beyond: Array | None = None
+) -> ReducedSeries | None:
+    """One series with the curvature taken off its observations; None where it does not matter.
+
+    beyond (E, P): trajectories that the hypothesis leaves, px-scaled.
+    """
     e = fitter.series[series]
     if e.blocks is not None:
         return None
     C, V, index = fit.designs[series]
     moved = (C * fit.coefficients[index]) @ V.T
+    if beyond is not None:
+        moved = moved + beyond
     rest = np.einsum("epq,eq->p", e.N, e.values - moved)
     # levels along combinations that the field cannot determine stay where they were
     level = np.linalg.lstsq(e.N.sum(axis=0), rest, rcond=1e-6)[0]

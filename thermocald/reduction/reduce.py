@@ -96,6 +96,7 @@ def reduce_series(
         {name: c.trajectory for name, c in instruments.items()},
         reference,
         float(np.mean(trajectory)) if T0 is None else T0,
+        source.polygons(),
     )
     if strict:
         require_change(source, reference, instruments[reference])

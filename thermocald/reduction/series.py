@@ -41,7 +41,8 @@ class SeriesInput:
 
     frame_times (E,) s; reading_times (R,) s; readings {channel: (R,)} °C, the first the reference;
     resolutions {channel: K or None}; grid: image points on epochs × targets; numbers (E,): the
-    epochs' own numbers; series: its name; interior: what is known of the camera, for a start.
+    epochs' own numbers; series: its name; interior: what is known of the camera, for a start;
+    columns {name: (E,)}: what else was recorded with each frame, NaN where it is missing.
     """
 
     name: str
@@ -57,6 +58,17 @@ class SeriesInput:
     numbers: NDArray[np.int64]
     series: str = ""
     interior: InteriorOrientation | None = None
+    columns: Mapping[str, Array] | None = None
+
+    def polygons(self) -> dict[str, tuple[Array, Array]]:
+        """Times s from the start and values of each column that was recorded often enough."""
+        t = self.frame_times - self.frame_times[0]
+        out = {}
+        for name, values in (self.columns or {}).items():
+            there = np.isfinite(values)
+            if there.mean() > 0.5:
+                out[name] = (t[there], values[there])
+        return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +147,8 @@ class ReducedSeries:
         readings = {n: np.asarray(r, dtype=float)[there] for n, r in s.readings.items()}
         times = s.reading_times[there] - s.frame_times[0]
         frames = s.frame_times - s.frame_times[0]
-        return History(frames, times, readings, self.history.reference, self.T0)
+        columns = self.history.columns
+        return History(frames, times, readings, self.history.reference, self.T0, columns)
 
     def rescaled(self, scale: Array) -> ReducedSeries:
         """The same in other px per unit of each column (19,)."""

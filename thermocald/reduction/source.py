@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,6 +15,8 @@ from thermocald.reduction.series import SeriesInput
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
+
+    from numpy.typing import NDArray
 
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.field.testfield import TestField
@@ -71,7 +74,20 @@ def series_input(
     if not recording.has_observations and say is not None:
         say(f"measuring the {len(recording.columns)} frames of {recording.path}")
     epochs = measured_epochs(recording, advance)
-    return epochs_input(recording.head, recording.testfield, epochs, f"{recording.path}")
+    source = epochs_input(recording.head, recording.testfield, epochs, f"{recording.path}")
+    return replace(source, columns=_columns(recording))
+
+
+def _columns(recording: Recording) -> dict[str, NDArray[np.float64]]:
+    """The further columns of epochs.csv that hold numbers, such as a humidity."""
+    out = {}
+    for name, texts in recording.columns.extra.items():
+        try:
+            values = np.array([float(t) if t.strip() else np.nan for t in texts])
+        except ValueError:
+            continue  # text: a note
+        out[name] = np.where(np.isfinite(values), values, np.nan)
+    return out
 
 
 def load_series(path: Path, advance: Callable[[int], None] | None = None) -> list[SeriesInput]:

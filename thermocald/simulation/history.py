@@ -10,7 +10,7 @@ always been the one of time 0.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Self
 
@@ -55,7 +55,8 @@ class History:
 
     times (E,): s since the series' start, ascending: the frames; reading_times (R,): s on the same
     axis; readings: {channel: (R,)} °C, NaN where missing; reference: the channel that is T;
-    T0: the model's reference temperature °C, one value for all series of a camera.
+    T0: the model's reference temperature °C, one value for all series of a camera; columns: {name:
+    (times (N,) s, values (N,))} of what else was recorded, such as a humidity.
     """
 
     times: Array
@@ -63,6 +64,7 @@ class History:
     readings: Mapping[str, Array]
     reference: str
     T0: float
+    columns: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.reference not in self.readings:
@@ -120,6 +122,12 @@ class History:
     def temperature(self, channel: str | None = None) -> Array:
         """The temperature (E,) °C of a channel at the frames' times."""
         return self.polygon(channel).at(self.times)
+
+    def column(self, name: str, at: ArrayLike) -> Array:
+        """Another recorded column at some times (...,), held beyond its ends."""
+        times, values = self.columns[name]
+        result: Array = np.interp(np.asarray(at, dtype=float), times, values)
+        return result
 
     def temperature_matrix(self, channel: str | None = None) -> csr_array:
         """∂ temperature / ∂ readings (E, R)."""

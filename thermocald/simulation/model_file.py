@@ -26,7 +26,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.atomic_file import write_text
-from thermocald.errors import ConfigurationError
 from thermocald.photogrammetry.camera.camera_model import (
     EOP_NAMES,
     IOP_NAMES,
@@ -34,9 +33,9 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     Sensor,
 )
-from thermocald.simulation import effects
+from thermocald.simulation.effect_file import effect_document, effect_of
 from thermocald.simulation.effects.parameter import PARAMETER_UNITS
-from thermocald.simulation.model import RATED, ModelEffect, ThermalModel
+from thermocald.simulation.model import RATED, ThermalModel
 from thermocald.simulation.quantities import QuantityReader, written
 from thermocald.yaml_file import dump_yaml, read_yaml
 
@@ -105,7 +104,7 @@ def parse_model(document: Mapping[str, Any], path: Path | str = "model") -> Ther
         T0=top.number("reference_temperature", "degC", low=-273.15),
         interior=InteriorOrientation.from_mapping({"c": 0.0, **interior}),
         rates=rates,
-        effects=tuple(_effect(reader) for reader in top.items("effects")),
+        effects=tuple(effect_of(reader) for reader in top.items("effects")),
         exterior=_exterior(top, exterior),
         image_sigma=top.number("image_sigma", "px", 0.04, above=0.0),
         sds=sds,
@@ -134,34 +133,6 @@ def _exterior(top: QuantityReader, values: dict[str, float]) -> ExteriorOrientat
     if missing:
         raise top.fail(f"exterior.{missing[0]}", "is missing")
     return ExteriorOrientation.from_mapping(values)
-
-
-def _effect(reader: QuantityReader) -> ModelEffect:
-    reader.only(("effect", "parameters", "evidence"))
-    name = reader.text("effect")
-    try:
-        effect = effects.get(name)
-    except ConfigurationError as error:
-        raise reader.fail("effect", str(error)) from error
-    parameters = reader.inner("parameters")
-    units = effect.units()
-    parameters.only(units)
-    values: dict[str, Any] = {}
-    own: dict[str, float] = {}
-    for key, raw in parameters.mapping.items():
-        if key in effect.nonlinear and effect.nonlinear[key].text:
-            plain = raw.get("value") if isinstance(raw, dict) else raw
-            values[key] = tuple(plain) if isinstance(plain, list) else str(plain)
-            continue
-        quantity = parameters.quantity(key, units[key])
-        values[key] = quantity.value
-        if quantity.sd is not None:
-            own[key] = quantity.sd
-    try:
-        effect.check(values)
-    except ConfigurationError as error:
-        raise reader.fail("parameters", str(error)) from error
-    return ModelEffect(name, values, own)
 
 
 def _covariance(
@@ -220,7 +191,7 @@ def model_document(model: ThermalModel) -> dict[str, Any]:
             for n in RATED
             if n in model.rates
         },
-        "effects": [_effect_document(effect) for effect in model.effects],
+        "effects": [effect_document(effect) for effect in model.effects],
     }
     if model.exterior is not None:
         document["exterior"] = {
@@ -240,14 +211,3 @@ def model_document(model: ThermalModel) -> dict[str, Any]:
             "matrix": [list(row) for row in model.covariance],
         }
     return document
-
-
-def _effect_document(effect: ModelEffect) -> dict[str, Any]:
-    units = effects.get(effect.name).units()
-    parameters: dict[str, Any] = {}
-    for key, value in effect.values.items():
-        if isinstance(value, str | tuple | list):
-            parameters[key] = list(value) if not isinstance(value, str) else value
-        else:
-            parameters[key] = written(value, units[key], effect.sds.get(key))
-    return {"effect": effect.name, "parameters": parameters}

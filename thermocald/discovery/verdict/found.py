@@ -1,15 +1,19 @@
-"""One effect that was found: sentence, numbers, evidence, alternatives."""
+"""One effect that was found: sentence, numbers, evidence, alternatives; and effects of models."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from thermocald.discovery.verdict.estimates import model_values
+from thermocald.simulation import effects as catalogue
+from thermocald.simulation.model import ModelEffect, ThermalModel
+
 if TYPE_CHECKING:
     from thermocald.discovery.verdict.gap import Gap
     from thermocald.reduction.hypothesis import Term
 
-__all__ = ["EffectFound"]
+__all__ = ["EffectFound", "effects_of", "terms_of"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,3 +47,30 @@ class EffectFound:
             "gap_before": self.gap_before.as_json(),
             "gap_after": self.gap_after.as_json(),
         }
+
+
+def effects_of(found: EffectFound) -> list[ModelEffect]:
+    """What was found as effects of a model; none where it has no name and no formula."""
+    if found.term is None and found.effect not in catalogue.names():
+        return []
+    name = found.effect if found.effect in catalogue.names() or not found.term else (
+        found.term.effect
+    )  # fmt: skip
+    numbers, sds = model_values(found.estimates, found.term.parameters if found.term else ())
+    known = catalogue.get(name).units()
+    return [
+        ModelEffect(
+            name,
+            {k: v for k, v in numbers.items() if k in known},
+            {k: v for k, v in sds.items() if k in known},
+        )
+    ]
+
+
+def terms_of(model: ThermalModel) -> list[tuple[str, dict[str, Any]]]:
+    """The effects of a model that act on trajectories of parameters, with their values."""
+    return [
+        (e.name, dict(e.values))
+        for e in model.effects
+        if catalogue.get(e.name).seen_in == "trajectory"
+    ]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.discovery.verdict.estimates import model_values
+from thermocald.discovery.verdict.found import effects_of
 from thermocald.photogrammetry.camera.camera_model import (
     EOP_NAMES,
     IOP_NAMES,
@@ -17,8 +17,7 @@ from thermocald.photogrammetry.camera.camera_model import (
 )
 from thermocald.reduction.hypothesis import BASE
 from thermocald.reduction.series import COLUMNS
-from thermocald.simulation import effects as catalogue
-from thermocald.simulation.model import ModelEffect, ThermalModel
+from thermocald.simulation.model import ThermalModel
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -27,7 +26,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["model_of", "terms_of"]
+__all__ = ["model_of"]
 
 
 def model_of(discovery: Discovery, old: ThermalModel | None = None) -> ThermalModel:
@@ -48,20 +47,7 @@ def model_of(discovery: Discovery, old: ThermalModel | None = None) -> ThermalMo
         rates[name] = float(fit.coefficients[block.start + j] / unit)
         rate_sds[f"rates.{name}"] = float(np.sqrt(fit.covariance[j, j]) / unit)
     T = e.history.temperature()
-    effects = []
-    for found in discovery.effects:
-        if found.effect == "unnamed":
-            continue
-        parameters = found.term.parameters if found.term else ()
-        numbers, own_sds = model_values(found.estimates, parameters)
-        known = catalogue.get(found.effect).units()
-        effects.append(
-            ModelEffect(
-                found.effect,
-                {k: v for k, v in numbers.items() if k in known},
-                {k: v for k, v in own_sds.items() if k in known},
-            )
-        )
+    effects = [one for found in discovery.effects for one in effects_of(found)]
     weights = e.weights[..., :2]
     model = ThermalModel(
         camera=e.source.camera,
@@ -96,7 +82,7 @@ def _evidence(discovery: Discovery) -> dict[str, Any]:
             "evidence": entry["evidence"],
             "alternatives": entry["alternatives"],
         }
-        if entry["effect"] == "unnamed":
+        if "bridge" in entry["evidence"]:
             out["unnamed"]["note"] = "bridged by a smooth term in M1 alone; not transferable"
     plain: dict[str, Any] = _plain(out)
     return plain
@@ -137,12 +123,3 @@ def _level(discovery: Discovery) -> tuple[Array, Array]:
         means += [m for m in trajectory.mean(axis=0) for _ in block.parameters]
     level = level - (V @ (np.array(means) * x))[:16]
     return level, np.sqrt(np.diag(inverse))
-
-
-def terms_of(model: ThermalModel) -> list[tuple[str, dict[str, Any]]]:
-    """The effects of a model that act on trajectories of parameters, with their values."""
-    return [
-        (e.name, dict(e.values))
-        for e in model.effects
-        if catalogue.get(e.name).seen_in == "trajectory"
-    ]

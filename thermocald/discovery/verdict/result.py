@@ -19,6 +19,7 @@ from thermocald.discovery.verdict.gap import Gap, fit_first, gap_of
 from thermocald.discovery.verdict.image_effects import image_effects, image_places
 from thermocald.discovery.verdict.misfit import resolve
 from thermocald.discovery.verdict.mount import mount_of
+from thermocald.discovery.verdict.proposed import NO_PROPOSAL, proposed
 from thermocald.discovery.verdict.unnamed import describe_unnamed
 from thermocald.simulation import effects as catalogue
 
@@ -101,10 +102,10 @@ def discover_series(
 ) -> Discovery:
     """Examine M1, or M1 and M2, and put what was found into words and numbers."""
     x = examine_series(series, progress, given)
-    return conclude(x)
+    return conclude(x, progress)
 
 
-def conclude(x: Examination) -> Discovery:
+def conclude(x: Examination, progress: Callable[[str], None] | None = None) -> Discovery:
     """Words and numbers for an examination."""
     terms = x.best.terms if x.adequate else x.base.terms
     known = len(x.base.terms)
@@ -117,7 +118,7 @@ def conclude(x: Examination) -> Discovery:
         found[k] = entry
     n = len(found)
     if not x.adequate:
-        return _unexplained(x, fits[0], stages, n)
+        return _unexplained(x, fits[0], stages, n, progress)
     for k in range(known, len(terms)):
         fit = fits[k + 1 - known]
         stages.append(Stage(terms[k].effect, _gap(x, fit, 0, n), _verify(x, fit, n)))
@@ -255,13 +256,17 @@ def _alternative(
     }
 
 
-def _unexplained(x: Examination, base: Fit, stages: list[Stage], known: int) -> Discovery:
-    """What the catalogue does not explain: described, bridged, not named."""
+def _unexplained(
+    x: Examination,
+    base: Fit,
+    stages: list[Stage],
+    known: int,
+    progress: Callable[[str], None] | None,
+) -> Discovery:
+    """What the catalogue does not explain: a formula where the data allow one, else described and
+    bridged, not named.
+    """
     description = describe_unnamed(x)
-    bridge = sum(a.excess for a in x.base_adequacy[:1])
-    before = _gap(x, base, 0, known)
-    after = _gap(x, base, 0, known, bridge)
-    stages.append(Stage("unnamed", after, _verify(x, base, known)))
     resembling = [
         {
             "effect": s.names[0],
@@ -271,10 +276,28 @@ def _unexplained(x: Examination, base: Fit, stages: list[Stage], known: int) -> 
         }
         for s in x.ranking[:4]
     ]
+    nan = float("nan")
+    found = proposed(x, description, progress)
+    if found is not None:
+        y = found.examination
+        fits = (found.base_fit, found.final_fit)
+        both = [(_gap(y, f, 0, known), _verify(y, f, known)) for f in fits]
+        stages[-1:] = [Stage(stages[-1].added, *both[0]), Stage("unnamed", *both[1])]
+        entry = EffectFound(
+            "unnamed", found.statement, found.where, found.estimates, found.evidence,
+            [*found.alternatives, *resembling], stages[-2].fit, stages[-1].fit, found.term,
+        )  # fmt: skip
+        return Discovery("unexplained", (entry,), tuple(stages), y, *fits, (nan, nan))
+    bridge = sum(a.excess for a in x.base_adequacy[:1])
+    before = _gap(x, base, 0, known)
+    after = _gap(x, base, 0, known, bridge)
+    stages.append(Stage("unnamed", after, _verify(x, base, known)))
     entry = EffectFound(
-        "unnamed", description.statement, description.where, description.estimates,
+        "unnamed", f"{description.statement}; {NO_PROPOSAL[len(x.fitter.series) > 1]}",
+        description.where, description.estimates,
         {
             **description.evidence,
+            "proposal": None,
             "absolute_test_of_best_combination": {
                 "effects": list(x.best.names),
                 "sigmas": [float(a.significance) for a in x.adequacy],
@@ -284,6 +307,4 @@ def _unexplained(x: Examination, base: Fit, stages: list[Stage], known: int) -> 
         },
         resembling, before, after,
     )  # fmt: skip
-    return Discovery(
-        "unexplained", (entry,), tuple(stages), x, base, base, (float("nan"), float("nan"))
-    )
+    return Discovery("unexplained", (entry,), tuple(stages), x, base, base, (nan, nan))

@@ -1,7 +1,8 @@
 """The catalogue of effects: one physical cause, one class, one file.
 
 The registry is the entry point `thermocald.effects`, for the built-in effects of this folder (in
-`pyproject.toml`) and for those of other distributions alike; an entry's name is the effect's.
+`pyproject.toml`) and for those of other distributions alike; an entry's name is the effect's. A
+formula (`simulation.formula`) is an effect too, whose name is its text.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from thermocald.errors import ConfigurationError
 from thermocald.simulation.effects.base import Effect
+from thermocald.simulation.effects.formula import formula_effect, is_formula
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -39,7 +41,12 @@ def names() -> tuple[str, ...]:
 
 @cache
 def get(name: str) -> Effect:
-    """An effect by its name; ConfigurationError where there is none, or where it is not one."""
+    """An effect by its name, or by the formula that it is.
+
+    ConfigurationError where there is none, or where it is not one.
+    """
+    if is_formula(name):
+        return formula_effect(name)
     if name not in names():
         near = get_close_matches(name, names(), 1)
         hint = f"did you mean {near[0]!r}?" if near else f"known are: {', '.join(names())}"

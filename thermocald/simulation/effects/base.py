@@ -18,7 +18,7 @@ are linear: for a `signal` they bear the names of the parameters they act on.
 from __future__ import annotations
 
 from abc import ABC
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
@@ -26,7 +26,6 @@ import numpy as np
 from thermocald.errors import ConfigurationError, DataError
 from thermocald.simulation.effects.influence import Influence
 from thermocald.simulation.effects.parameter import EXPERIMENTS, Parameter, spoken
-from thermocald.simulation.history import History
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -35,6 +34,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
     from thermocald.photogrammetry.field.testfield import TestField
+    from thermocald.simulation.history import History
 
     Array = NDArray[np.float64]
 
@@ -142,13 +142,7 @@ class Effect(ABC):
             for sign in (1.0, -1.0):
                 moved = readings.copy()
                 moved[i] += sign * step
-                other = History(
-                    history.times,
-                    history.reading_times,
-                    {**history.readings, name: moved},
-                    history.reference,
-                    history.T0,
-                )
+                other = replace(history, readings={**history.readings, name: moved})
                 sides.append(self._course(other, **nonlinear))
             columns[:, i] = (sides[0] - sides[1]) / (2 * step)
         return csr_array(columns)

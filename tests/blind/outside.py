@@ -1,0 +1,98 @@
+"""Influences that the catalogue has no name for; shares no code with thermocald.
+
+Everything on an axis of one second. RECORDED follow something that was recorded, through operators
+of their own; UNRECORDED have a cause that nobody recorded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from tests.blind.world import backlash, lagged, smooth_unknown
+
+Climate = dict[str, np.ndarray]
+
+
+def _leaking(x: np.ndarray, tau: float) -> np.ndarray:
+    out, state = np.empty_like(x), x[0]
+    for i, v in enumerate(x):
+        state = v if v > state else v + (state - v) * np.exp(-1.0 / tau)
+        out[i] = state
+    return out
+
+
+def _humidity(rng: np.random.Generator, seconds: int) -> np.ndarray:
+    """A room's humidity, %: wanders with a time constant of a quarter of an hour."""
+    wander = np.cumsum(rng.normal(size=seconds))
+    slow = lagged(wander - np.linspace(0, wander[-1], seconds), 200.0)
+    return 50.0 + 8.0 * slow / np.std(slow)
+
+
+def _recorded(rng: np.random.Generator, ranges: list[tuple[float, float]]) -> dict[str, Callable]:
+    low, high = max(r[0] for r in ranges), min(r[1] for r in ranges)
+    bottom = min(r[0] for r in ranges)
+    k = low + rng.uniform(0.35, 0.65) * (high - low)
+    w = rng.uniform(0.12, 0.3) * (high - low)
+    tau, second, r = rng.uniform(50, 120), rng.uniform(80, 250), rng.uniform(0.6, 2.0)
+    return {
+        "tanh": lambda T, B, t: np.tanh((T - k) / w),
+        "sign_rate_square": lambda T, B, t: np.sign(np.gradient(T)) * np.gradient(T) ** 2,
+        "integral_above": lambda T, B, t: np.cumsum(np.clip(T - k, 0, None)),
+        "abs_rate": lambda T, B, t: np.abs(np.gradient(T)),
+        "two_lags": lambda T, B, t: lagged(lagged(T, tau), second),
+        "product": lambda T, B, t: T * B,
+        "switch": lambda T, B, t: (k < T).astype(float),
+        "play_of_lag": lambda T, B, t: backlash(lagged(T, tau), r),
+        "fading_peak": lambda T, B, t: _leaking(T, 2 * second),
+        "root": lambda T, B, t: np.sqrt(np.clip(T - bottom, 0, None)),
+        "time_times_T": lambda T, B, t: t * T,
+        "exponential": lambda T, B, t: np.exp(T / 9.0),
+        "board_square": lambda T, B, t: (B - B[0]) ** 2,
+        "lag_of_board": lambda T, B, t: lagged(B, second),
+        "lag_of_threshold": lambda T, B, t: lagged(np.clip(T - k, 0, None), second),
+        "minimum": lambda T, B, t: np.minimum.accumulate(T),
+        "difference_square": lambda T, B, t: (T - lagged(T, second)) ** 2,
+        "arrhenius": lambda T, B, t: np.cumsum(np.exp((T - 30.0) / 6.0)),
+        "ratio": lambda T, B, t: B / T,
+        "rate_times_T": lambda T, B, t: np.gradient(T) * T,
+    }
+
+
+RECORDED = tuple(_recorded(np.random.default_rng(0), [(0.0, 1.0)]))
+HUMID = ("lag_of_humidity", "humidity_times_T")
+UNRECORDED = ("smooth", "random_walk", "humidity", "cosine", "bumps")
+
+
+def trajectories(
+    rng: np.random.Generator, kind: str, climates: list[Climate], seconds: int
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """The influence in each series (seconds,), and the humidity that was recorded there."""
+    ranges = [(float(c["temperature"].min()), float(c["temperature"].max())) for c in climates]
+    known = _recorded(rng, ranges)
+    humid = [_humidity(rng, seconds) for _ in climates]
+    t = np.arange(seconds, dtype=float)
+    out = []
+    for c, h in zip(climates, humid, strict=True):
+        T, B = c["temperature"], c["board_temperature"]
+        if kind in known:
+            out.append(known[kind](T, B, t))
+        elif kind == "lag_of_humidity":
+            out.append(lagged(h, 120.0))
+        elif kind == "humidity_times_T":
+            out.append(h * T)
+        elif kind == "smooth":
+            out.append(smooth_unknown(rng, seconds))
+        elif kind == "random_walk":
+            out.append(lagged(np.cumsum(rng.normal(size=seconds)), 20.0))
+        elif kind == "humidity":
+            out.append(_humidity(rng, seconds))
+        elif kind == "cosine":
+            out.append(np.cos(2 * np.pi * t / rng.uniform(500, 1500) + rng.uniform(0, 6.3)))
+        elif kind == "bumps":
+            at = rng.uniform(0.1, 0.9, 3) * seconds
+            out.append(np.sum(np.exp(-0.5 * ((t[:, None] - at) / 90.0) ** 2), axis=1))
+        else:
+            raise SystemExit(f"no such influence: {kind}")
+    return out, humid

@@ -1,0 +1,77 @@
+"""Scoring of the proposals on influences that the catalogue has no name for.
+
+    python -m tests.blind.outside_score [--first 0] [--seeds 1] [--kind tanh …] [--px 0.3]
+
+Runs in memory through `discover_series`, the same function the command calls.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from dataclasses import dataclass
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+from tests.blind.case import OUTSIDE, Case
+from tests.blind.outside import HUMID, RECORDED, UNRECORDED
+from tests.blind.score import examine_case
+
+
+@dataclass
+class Described:
+    """statement: what was said; proposed: a formula; closed: share of the gap on M2."""
+
+    kind: str
+    seed: int
+    statement: str
+    proposed: bool
+    named: bool
+    closed: float
+    seconds: float
+
+    @property
+    def transferable(self) -> bool:
+        """Whether something that holds on M2 was said: a formula, or names of the catalogue."""
+        return (self.proposed or self.named) and self.closed >= 0.8
+
+
+def describe(kind: str, seed: int, px: float = 0.3) -> Described:
+    """One recorded or unrecorded influence, hidden and looked for."""
+    case = Case((OUTSIDE,), px, seed, influence=kind, record_humidity=kind in HUMID)
+    found, _, seconds = examine_case(case)
+    first = found.effects[0] if found.effects else None
+    proposed = first is not None and first.effect == "unnamed" and first.term is not None
+    return Described(
+        kind, seed, first.statement if proposed else found.headline, proposed,
+        found.verdict == "effects_found", found.excess_closed() or 0.0, seconds,
+    )  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--px", type=float, default=0.3)
+    parser.add_argument("--kind", action="append")
+    a = parser.parse_args()
+    done = []
+    for kind in a.kind or (*RECORDED, *HUMID, *UNRECORDED):
+        for seed in range(a.first, a.first + a.seeds):
+            d = describe(kind, seed, a.px)
+            done.append(d)
+            print(f"{kind:18s} {seed} closed {d.closed:6.3f} {d.seconds:4.1f} s  "
+                  f"{d.statement[:150]}", flush=True)  # fmt: skip
+    told = [d for d in done if d.kind not in UNRECORDED]
+    if told:
+        print(f"recorded: {sum(d.proposed and d.transferable for d in told)} formulas and "
+              f"{sum(d.named and d.transferable for d in told)} of the catalogue close 80 % on M2, "
+              f"of {len(told)}")  # fmt: skip
+    left = [d for d in done if d.kind in UNRECORDED]
+    if left:
+        print(f"unrecorded: {sum(d.proposed for d in left)} formulas of {len(left)}, "
+              f"{sum(d.named for d in left)} names of the catalogue")  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,147 @@
+"""Formulas: read as text, evaluated against plain numpy, errors carried through, never executed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermocald.errors import ConfigurationError, DataError
+from thermocald.simulation import effects
+from thermocald.simulation.effect_file import read_effects, write_effects
+from thermocald.simulation.effects.base import Effect
+from thermocald.simulation.formula.expression import parse
+from thermocald.simulation.formula.operators import OPERATORS
+from thermocald.simulation.history import History
+from thermocald.simulation.model import ModelEffect
+
+SECONDS = np.arange(1200.0)
+T = 25.0 + 8.0 * np.sin(SECONDS / 190.0) + 3.0 * np.sin(SECONDS / 47.0)
+B = 31.0 + 6.0 * np.cos(SECONDS / 120.0)
+
+
+@pytest.fixture
+def history():
+    """Read every second, asked for every ten; a humidity was recorded beside it."""
+    frames = SECONDS[::10]
+    return History(
+        frames, SECONDS, {"temperature": T, "board": B}, "temperature", 25.0,
+        {"humidity": (frames, 50.0 + frames / 100.0)},
+    )  # fmt: skip
+
+
+def stepped(x, tau, fading=False):
+    """A lag, or a peak that fades, second by second."""
+    out, state = [], x[0]
+    for v in x:
+        state = v if fading and v > state else v + (state - v) * np.exp(-1.0 / tau)
+        out.append(state)
+    return np.array(out)
+
+
+CASES = {
+    "integral(above(temperature, k))": ({"k": 27.0}, np.cumsum(np.clip(T - 27.0, 0, None))),
+    "signed_square(rate(temperature))": ({}, np.gradient(T) * np.abs(np.gradient(T))),
+    "magnitude(rate(temperature))": ({}, np.abs(np.gradient(T))),
+    "lag(lag(temperature, tau), tau_2)": (
+        {"tau": 40.0, "tau_2": 90.0}, stepped(stepped(T, 40.0), 90.0)),
+    "product(offset(temperature, a), board)": ({"a": 20.0}, (T - 20.0) * B),
+    "product(time, temperature)": ({}, SECONDS * T),
+    "saturation(temperature, k, w)": ({"k": 26.0, "w": 3.0}, np.tanh((T - 26.0) / 3.0)),
+    "power(above(temperature, k), p)": ({"k": 22.0, "p": 0.5}, np.clip(T - 22.0, 0, None) ** 0.5),
+    "peak(temperature, tau)": ({"tau": 150.0}, stepped(T, 150.0, fading=True)),
+    "maximum(lag(board, tau))": ({"tau": 30.0}, np.maximum.accumulate(stepped(B, 30.0))),
+    "minimum(temperature)": ({}, np.minimum.accumulate(T)),
+    "cube(offset(temperature, a))": ({"a": 25.0}, (T - 25.0) ** 3),
+    "square(wave(temperature, P, phi))": (
+        {"P": 7.0, "phi": 0.4}, np.sin(2 * np.pi * T / 7.0 + 0.4) ** 2),
+    "exponential(temperature, w)": ({"w": 9.0}, np.exp(T / 9.0)),
+    'product(column("humidity"), temperature)': ({}, (50.0 + SECONDS / 100.0) * T),
+    "play(temperature, r)": ({"r": 1.5}, None),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("text", CASES)
+def test_a_formula_is_what_numpy_makes_of_it(history, text):
+    values, expected = CASES[text]
+    effect = effects.get(text)
+    found = effect.signal(history, **values)[:, 0]
+    if expected is None:  # a backlash: never further away than its half-width, and it moves
+        assert np.max(np.abs(found - T[::10])) == pytest.approx(1.5, abs=1e-6)
+        return
+    size = np.ptp(expected)
+    # the polygon's rates are those of parabolas, at the ends one-sided
+    assert found[1:-1] == pytest.approx(expected[::10][1:-1], abs=0.012 * size)
+
+
+@pytest.mark.parametrize("text", CASES)
+def test_errors_of_readings_are_carried_as_differences_say(history, text):
+    values, _ = CASES[text]
+    effect = effects.get(text)
+    short = History(
+        history.times[:20], SECONDS[:190:10] + 3.0,
+        {n: r[:190:10] for n, r in history.readings.items()}, "temperature", 25.0, history.columns,
+    )  # fmt: skip
+    mine = effect.sensitivity(short, **values).toarray()
+    by_differences = Effect.sensitivity(effect, short, **values).toarray()
+    assert mine == pytest.approx(by_differences, abs=0.07 * np.abs(by_differences).max())
+
+
+def test_every_operator_is_tried():
+    named = {name for text in CASES for name in OPERATORS if f"{name}(" in text}
+    assert named == set(OPERATORS)
+
+
+def test_text_and_tree_are_the_same():
+    for text in CASES:
+        assert parse(text).text() == text
+        bound = parse(text).bound(CASES[text][0])
+        assert parse(bound.text()) == bound
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("__import__('os').system('x')", "not a recorded quantity"),
+        ("integral(1 + 1)", "not a recorded quantity"),
+        ("eval(temperature)", "no operator 'eval'"),
+        ("lag(temperature)", "takes 2 arguments, not 1"),
+        ("lag(temperature, [1])", "neither a number nor a name"),
+        ("product(above(temperature, k), above(board, k))", "a name of its own"),
+        ("square(" * 20 + "temperature" + ")" * 20, "more than 8 operators"),
+        ("square(" * 200, "at most 300 characters"),
+        ("lag(", "cannot be read"),
+    ],
+)
+def test_what_is_no_formula_is_refused(text, said):
+    with pytest.raises(ConfigurationError, match=said):
+        effects.get(text)
+
+
+def test_units_and_words():
+    effect = effects.get("integral(above(temperature, k))")
+    assert effect.units()["k"] == "degC"
+    assert effect.units()["x0"] == "mm/(K s)"
+    estimates = {"k": {"value": 30.0, "sd": 0.1, "unit": "degC"}, "a_c": {}}
+    assert effect.sentence(estimates) == "c follows ∫ (T − 30.00 ± 0.10 °C)₊ dt"
+    assert effects.get("signed_square(rate(temperature))").units()["c"] == "mm/(K2/s2)"
+
+
+def test_a_column_that_was_not_recorded_is_named(history):
+    effect = effects.get('lag(column("pressure"), tau)')
+    with pytest.raises(DataError, match=r"no recorded column 'pressure'.*humidity"):
+        effect.signal(history, tau=30.0)
+
+
+def test_an_effect_file_is_read_as_it_was_written(tmp_path):
+    path = tmp_path / "proposal.yaml"
+    effect = ModelEffect(
+        "lag(above(temperature, k), tau)", {"k": 31.5, "tau": 80.0, "x0": 1e-4}, {"tau": 2.0}
+    )
+    write_effects(path, [effect], "x0 follows it", {"verdict": "unexplained"})
+    (found,) = read_effects(path)
+    assert (found.name, dict(found.values), dict(found.sds)) == (
+        effect.name, dict(effect.values), dict(effect.sds)
+    )  # fmt: skip
+    path.write_text(path.read_text().replace("tau: ", "tua: "))
+    with pytest.raises(ConfigurationError, match="tua"):
+        read_effects(path)

@@ -1,0 +1,1 @@
+"""Beyond the catalogue: formulas over what was recorded, searched as its effects are."""

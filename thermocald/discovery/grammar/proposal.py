@@ -1,0 +1,231 @@
+"""A proposal: a formula that takes the place of a name, where the data allow one.
+
+Searched on both series together under the likelihood of the catalogue, it has to pass what a
+name has to pass, and more: surrogates whose cause was not recorded reach its share of the misfit
+in less than one of a hundred, and constants from either series alone close the gap of the other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.discovery.grammar.condensed import condensed
+from thermocald.discovery.grammar.search import FormulaSearch
+from thermocald.discovery.search.search import MARGIN, Solution
+from thermocald.discovery.search.surrogates import SurrogateTest
+from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
+from thermocald.reduction.curvature import relinearised
+from thermocald.reduction.fit import HypothesisFitter
+from thermocald.reduction.hypothesis import Term
+from thermocald.reduction.series import COLUMNS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from thermocald.discovery.grammar.search import Found
+    from thermocald.discovery.search.examination import Examination
+    from thermocald.reduction.hypothesis import Fit
+    from thermocald.reduction.series import ReducedSeries
+
+    Array = NDArray[np.float64]
+
+__all__ = ["Proposal", "propose"]
+
+_FITTED = 5  # formulas of a pass that are fitted in full
+_TURNS = 3
+_SECOND = 0.02  # share of the base's misfit that one formula leaves and a second is asked for
+_COUNT = 199
+_SEED = 16
+# of the base's misfit on the other series that constants of one alone have to explain: of M2 by M1,
+# and the other way round, where M2 may hold less than M1
+_CLOSED, _CLOSED_BACK = 0.8, 0.5
+_LEFT = 0.25  # of the base's misfit in px that a smooth trajectory may still have
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """What was found.
+
+    fitter: the series it was found on; base, best: solutions in it; closed: share of the misfit of
+    M2 that constants of M1 explain, and of M1 by constants of M2; surrogates: shares of
+    surrogates; rivals: other formulas and by how much they score worse.
+    """
+
+    fitter: HypothesisFitter
+    base: Solution
+    best: Solution
+    closed: tuple[float, float]
+    surrogates: SurrogateTest
+    rivals: tuple[tuple[Term, float], ...]
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """The formulas, without what the base model has already."""
+        return self.best.terms[len(self.base.terms) :]
+
+
+def propose(
+    x: Examination, parameters: Sequence[str], progress: Callable[[str], None] | None = None
+) -> Proposal | None:
+    """A formula for what an examination leaves without a name; None where the data allow none.
+
+    parameters: columns in which the image moves. One series alone allows none.
+    """
+    moving = [p for p in parameters if p in PARAMETER_NAMES]
+    if len(x.fitter.series) < 2 or not moving:
+        return None
+    (progress or (lambda _: None))("beyond the catalogue")
+    fitter, base = _straightened(x)
+    first = FormulaSearch(condensed(fitter, base.fit, moving), MARGIN)
+    test = _surrogate_test(first)
+    if not test.passed:
+        return None
+    tried: dict[str, Solution] = {}
+    best = base
+    for turn in range(_TURNS):
+        before = best
+        if turn:
+            here = condensed(fitter, base.fit, moving, best.fit.weightings)
+            first = FormulaSearch(here, MARGIN, first.tried)
+        for found in first.best(further=turn > 0)[:_FITTED]:
+            solution = _fitted(fitter, base, moving, found)
+            if solution is None:
+                continue
+            text = solution.terms[-1].effect
+            if text not in tried or solution.score < tried[text].score:
+                tried[text] = solution
+        best = min([base, *tried.values()], key=lambda s: s.score)
+        if best.score > before.score - MARGIN:
+            break
+    if best is base:
+        return None
+    best = _parameters_chosen(fitter, base, best)
+    closed = _closed(fitter, base, best)
+    if closed[0] < _CLOSED or closed[1] < _CLOSED_BACK:
+        return None
+    rivals = sorted(
+        ((s.terms[-1], float(s.score - best.score)) for s in tried.values()
+         if s.terms[-1].effect != best.terms[-1].effect), key=lambda r: r[1],
+    )  # fmt: skip
+    return Proposal(fitter, base, best, closed, test, tuple(rivals))
+
+
+def _straightened(x: Examination) -> tuple[HypothesisFitter, Solution]:
+    """The series without the curvature of the projection along everything that moves, and the base
+    model in them.
+    """
+    series: list[ReducedSeries] = []
+    for s, (e, a) in enumerate(zip(x.fitter.series, x.base_adequacy, strict=True)):
+        bridge = a.trajectories.T @ a.amplitudes
+        series.append(relinearised(x.fitter, x.base.fit, s, bridge) or e)
+    fitter = HypothesisFitter(series)
+    return fitter, replace(x.base, fit=fitter.fit(x.base.terms, x.base.fit.coefficients))
+
+
+def _surrogate_test(search: FormulaSearch) -> SurrogateTest:
+    own, shares = search.surrogates(_COUNT, np.random.default_rng(_SEED))
+    return SurrogateTest(own, shares)
+
+
+def _fitted(
+    fitter: HypothesisFitter, base: Solution, parameters: Sequence[str], found: Found
+) -> Solution | None:
+    """A formula in the full likelihood, its own reading errors carried through it; None where they
+    are beyond all bounds.
+    """
+    structure, values = found.node.named()
+    term = Term(structure.text(), tuple(parameters), tuple(values.items()))
+    try:
+        fit = fitter.refine(fitter.fit((*base.terms, term)), max_iterations=3)
+    except np.linalg.LinAlgError:
+        return None
+    if not np.isfinite(fit.objective):
+        return None
+    operators = sum(not n.is_leaf for n in structure.walk())
+    return Solution(fit, (*base.penalties, found.penalty + MARGIN * operators))
+
+
+def _parameters_chosen(fitter: HypothesisFitter, base: Solution, best: Solution) -> Solution:
+    """The same formula in the parameters that it is needed in, found one after the other."""
+    term = best.terms[-1]
+    A, c = _all_parameters(fitter, base, best, term)
+    n = float(np.log(sum(int((e.n > 0).sum()) for e in fitter.series)))
+    chosen = [PARAMETER_NAMES.index(p) for p in term.parameters]
+
+    def gain(some: Sequence[int]) -> float:
+        ix = np.ix_(list(some), list(some))
+        d = np.sqrt(np.diag(A)[list(some)])
+        own = A[ix] / np.outer(d, d) + 1e-9 * np.eye(len(d))
+        right = c[list(some)] / d
+        return float(right @ np.linalg.solve(own, right)) - n * len(some)
+
+    while len(chosen) > 1:
+        fewer = max(([j for j in chosen if j != i] for i in chosen), key=gain)
+        if gain(fewer) < gain(chosen):
+            break
+        chosen = fewer
+    while True:
+        more = [[*chosen, j] for j in range(len(c)) if j not in chosen and A[j, j] > 1e-6]
+        wider = max(more, key=gain, default=chosen)
+        if gain(wider) < gain(chosen) + MARGIN:
+            break
+        chosen = wider
+    names = tuple(PARAMETER_NAMES[i] for i in sorted(chosen))
+    if names == term.parameters:
+        return best
+    terms = (*best.terms[:-1], replace(term, parameters=names))
+    fit = fitter.refine(fitter.fit(terms), max_iterations=3)
+    change = n * (len(names) - len(term.parameters))
+    return Solution(fit, (*best.penalties[:-1], best.penalties[-1] + change))
+
+
+def _all_parameters(
+    fitter: HypothesisFitter, base: Solution, best: Solution, term: Term
+) -> tuple[Array, Array]:
+    """Normal equations A (16, 16), c (16,) of a trajectory in each parameter of the camera, beside
+    the base model.
+    """
+    count, K = len(PARAMETER_NAMES), len(base.fit.coefficients)
+    directions = np.eye(len(COLUMNS))[:, :count]
+    A, c, B = np.zeros((count, count)), np.zeros(count), np.zeros((count, K))
+    own, right = np.zeros((K, K)), np.zeros(K)
+    for s in range(len(fitter.series)):
+        C, V, index = base.fit.designs[s]
+        trajectory = fitter.trajectories(term, s, operators=False)[0]
+        w = best.fit.weightings[s]
+        a, b, cross = w.scan((trajectory - trajectory.mean())[None], directions, (C, V))
+        A, c = A + a[0], c + b[0]
+        B[:, index] += cross[0]
+        reduced = w.reduce(C, V)
+        own[np.ix_(index, index)] += reduced.A
+        right[index] += reduced.c
+    X = np.linalg.solve(own, np.column_stack([right, B.T]))
+    return A - B @ X[:, 1:], c - B @ X[:, 0]
+
+
+def _closed(fitter: HypothesisFitter, base: Solution, best: Solution) -> tuple[float, float]:
+    """Share of the misfit of M2 that constants of M1 alone explain, and the other way round."""
+    shares = []
+    for here, there in ((0, 1), (1, 0)):
+        without = fitter.fit(base.terms, only=[here])
+        whole = fitter.refine(fitter.fit(best.terms, only=[here]), 4, only=[here])
+        left, before = (_misfit_px(fitter, f, there) for f in (whole, without))
+        shares.append(1.0 - (left / max(before, 1e-9)) ** 2)
+    return shares[0], shares[1]
+
+
+def _misfit_px(fitter: HypothesisFitter, fit: Fit, series: int) -> float:
+    """RMS px that constants leave in one series, beyond the noise of its free cameras."""
+    e = fitter.series[series]
+    C, V, index = fit.designs[series]
+    r = e.values - (C * fit.coefficients[index]) @ V.T
+    level = np.linalg.lstsq(e.N.sum(axis=0), np.einsum("epq,eq->p", e.N, r), rcond=1e-12)[0]
+    r = r - level
+    chi2 = float(np.einsum("ep,epq,eq->", r, e.N, r)) - e.rank * float((e.n > 0).sum() - 1)
+    coordinates = 2.0 * float(e.n.sum())
+    return e.sigma_px * float(np.sqrt(max(chi2, 0.0) * e.correlation / coordinates))

@@ -1,0 +1,1 @@
+"""Formulas: a recorded quantity through operators, as text that is read and never executed."""

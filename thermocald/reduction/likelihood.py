@@ -327,7 +327,9 @@ def _effects(evidence: ReducedSeries) -> _Effects:
     return _factored(states, slice(start, start + len(sums.right)), sums)
 
 
-def _factored(states: list[tuple[Array, Array, slice]], hidden_at: slice, sums: _Sums) -> _Effects:
+def _factored(
+    states: list[tuple[Array, Array, slice]], hidden_at: slice, sums: _Sums
+) -> _Effects:
     from scipy.linalg import cholesky
 
     M = np.eye(hidden_at.stop)

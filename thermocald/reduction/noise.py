@@ -149,7 +149,9 @@ def with_jumps(evidence: ReducedSeries, factors: Array, W: Array) -> ReducedSeri
     N = 0.5 * (N + N.swapaxes(1, 2))
     b = np.einsum("epq,eq->ep", N, evidence.values)
     hidden = evidence.hidden.turned(T, evidence.values) if evidence.hidden else None
-    return replace(evidence, N=N, b=b, yy=np.einsum("ep,ep->e", evidence.values, b), hidden=hidden)
+    return replace(
+        evidence, N=N, b=b, yy=np.einsum("ep,ep->e", evidence.values, b), hidden=hidden
+    )
 
 
 def trembling(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries]:

@@ -192,7 +192,9 @@ def convincing(fitter: HypothesisFitter, base: Solution, best: Solution) -> bool
     for a, b in ((0, 1), (1, 0)):
         without = fitter.fit(base.terms, only=[a])
         whole = fitter.refine(fitter.fit(best.terms, only=[a]), only=[a])
-        gains.append((without.chi2_of(a) - whole.chi2_of(a), without.chi2_of(b) - whole.chi2_of(b)))
+        gains.append(
+            (without.chi2_of(a) - whole.chi2_of(a), without.chi2_of(b) - whole.chi2_of(b))
+        )
     least = _WORSE * max(own for own, _ in gains)
     there = [other for _, other in gains]
     return min(there) > -least and sum(there) > least

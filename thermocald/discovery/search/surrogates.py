@@ -163,11 +163,7 @@ def _explained(A: Array, c: Array) -> Array:
 
 
 def _right_hand_sides(
-    w: Weighting,
-    stack: Array,
-    directions: Array,
-    base: tuple[Array, Array],
-    b: Array,
+    w: Weighting, stack: Array, directions: Array, base: tuple[Array, Array], b: Array,
     hidden: Array,
 ) -> tuple[Array, Array]:
     """Right-hand sides of many data: of the candidates (G, mk, count), of the base (R, count)."""

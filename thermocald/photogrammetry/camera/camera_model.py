@@ -17,7 +17,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Self
+from operator import attrgetter
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from thermocald.errors import GeometryError
 from thermocald.photogrammetry.parameters import EOP_NAMES, IOP_NAMES, PARAMETER_NAMES
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from numpy.typing import ArrayLike, NDArray
 
@@ -85,10 +86,11 @@ class _Parameters:
     """Named values that are also a vector, in the order of their fields."""
 
     __slots__ = ()
+    _in_order: ClassVar[Callable[..., tuple[float, ...]]]
 
     def as_array(self) -> Array:
         """The values as a vector in the order of the names."""
-        return np.array([getattr(self, f.name) for f in fields(self)], dtype=float)  # type: ignore[arg-type]
+        return np.array(self._in_order(self), dtype=np.float64)
 
     @classmethod
     def from_array(cls, values: ArrayLike) -> Self:
@@ -109,6 +111,8 @@ class _Parameters:
 class InteriorOrientation(_Parameters):
     """IOP: c, x0, y0 mm; A1 mm⁻², A2 mm⁻⁴, A3 mm⁻⁶; B1, B2 mm⁻¹; C1, C2 without unit."""
 
+    _in_order = attrgetter(*IOP_NAMES)
+
     c: float
     x0: float = 0.0
     y0: float = 0.0
@@ -124,6 +128,8 @@ class InteriorOrientation(_Parameters):
 @dataclass(frozen=True, slots=True)
 class ExteriorOrientation(_Parameters):
     """EOP: omega, phi, kappa rad; X0, Y0, Z0 mm."""
+
+    _in_order = attrgetter(*EOP_NAMES)
 
     omega: float
     phi: float
@@ -172,8 +178,9 @@ def rotation(angles: ArrayLike) -> Array:
     """Angles (..., 3) omega, phi, kappa → R (..., 3, 3), camera to object."""
     a = np.asarray(angles, dtype=float)
     if a.ndim == 1:  # one camera: plain numbers take a quarter of the time
-        so, sp, sk = (math.sin(angle) for angle in a.tolist())
-        co, cp, ck = (math.cos(angle) for angle in a.tolist())
+        omega, phi, kappa = a.tolist()
+        so, sp, sk = math.sin(omega), math.sin(phi), math.sin(kappa)
+        co, cp, ck = math.cos(omega), math.cos(phi), math.cos(kappa)
     else:
         so, sp, sk = np.moveaxis(np.sin(a), -1, 0)
         co, cp, ck = np.moveaxis(np.cos(a), -1, 0)

@@ -109,6 +109,12 @@ def _positions(free: tuple[str, ...], exterior_free: bool) -> NDArray[np.int64]:
     return rows
 
 
+@lru_cache(maxsize=64)
+def _estimated(free: tuple[str, ...]) -> tuple[str, ...]:
+    """The IOP among these names, in their order."""
+    return tuple(n for n in IOP_NAMES if n in free)
+
+
 _USUAL = AdjustmentSettings()
 
 
@@ -257,13 +263,14 @@ def _result(
         factor = max(1.0, factor)  # a handful of residuals may be small by luck
     covariance = np.zeros((16, 16))
     covariance[u[:, None], u] = solution.root @ solution.root.T * factor
+    values = solution.values.tolist()
     result = Adjustment(
         "ok",
         "",
-        InteriorOrientation.from_array(solution.values[IOP]),
-        ExteriorOrientation.from_array(solution.values[EOP]),
+        InteriorOrientation(*values[IOP]),
+        ExteriorOrientation(*values[EOP]),
         covariance,
-        tuple(n for n in IOP_NAMES if n in s.free),
+        _estimated(tuple(s.free)),
         sigma0,
         redundancy,
         problem.observations.targets,
@@ -272,7 +279,8 @@ def _result(
         test,
         rejected,
     )
-    if s.snooping_alpha > 0 and fails_global_test(sigma0**2, redundancy):
+    few = redundancy < TRUSTED_REDUNDANCY
+    if few and s.snooping_alpha > 0 and fails_global_test(sigma0**2, redundancy):
         why = (
             f"the residuals are {sigma0:.1f} times as large as their sigmas say, and a redundancy "
             f"of {redundancy} does not show which target is wrong: show more targets, or state "

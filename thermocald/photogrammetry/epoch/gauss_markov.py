@@ -89,12 +89,14 @@ class Problem:
             if PARAMETER_NAMES[parameter] in priors:
                 value[row], sd = priors[PARAMETER_NAMES[parameter]]
                 weight[row] = sd**-2
-        variances = field.sigmas[observations.targets] ** 2 if target_sigmas else None
+        variances = None
+        if target_sigmas and field.sigmas.any():
+            variances = field.sigmas[observations.targets] ** 2
         return cls(
             sensor,
             field.points[observations.targets],
             observations,
-            variances if variances is not None and variances.any() else None,
+            variances,
             unknowns,
             weight,
             value,
@@ -117,8 +119,10 @@ class Problem:
     def cost(self, v: Array, values: Array) -> float:
         """Weighted sum of squared residuals, the priors' included."""
         flat = v.ravel()
-        prior = self.prior_weight @ (values[self.unknowns] - self.prior_value) ** 2
-        return float(flat @ flat + prior)
+        square = float(flat @ flat)
+        if self.prior_weight.any():
+            square += float(self.prior_weight @ (values[self.unknowns] - self.prior_value) ** 2)
+        return square
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,18 +258,17 @@ def solve(problem: Problem, start: Array, use: Mask) -> Solution:
         N, gradient, squares = problem.sums(whitened, use, values)
         if not np.isfinite(squares):
             raise NoConvergenceError("targets came to lie behind the camera during the iteration")
-        root = cofactor_root(N, u)
-        half = root.T @ gradient
-        size = float(np.sqrt(half @ half))  # of the whole step, in standard deviations
+        whole, size = _whole_step(N, gradient, u)
         if size < _SMALL:
-            return _moved(Solution(values, whitened, covariance, root), u, root @ half)
+            solution = Solution(values, whitened, covariance, cofactor_root(N, u))
+            return _moved(solution, u, whole)
         near, last = size < _LINEAR and size < 0.5 * last, size
         if near:
             values = values.copy()
-            values[u] += root @ half
+            values[u] += whole
             continue
         cost = problem.cost(whitened[-1][:, use], values)
-        for step in _trial_steps(N, u, root, gradient):
+        for step in _trial_steps(N, u, gradient):
             trial = values.copy()
             trial[u] += step
             residuals = observed - project(sensor, trial[IOP], trial[EOP], problem.points).T
@@ -278,12 +281,33 @@ def solve(problem: Problem, start: Array, use: Mask) -> Solution:
     raise NoConvergenceError(f"the adjustment did not converge in {_ITERATIONS} iterations")
 
 
-def _trial_steps(N: Array, u: NDArray[np.int64], root: Array, gradient: Array) -> Iterator[Array]:
+def _whole_step(N: Array, gradient: Array, u: NDArray[np.int64]) -> tuple[Array, float]:
+    """The step (u,) of a normal matrix, and its size in standard deviations.
+
+    Without the inverse, which only the last iteration needs. Raises GeometryError.
+    """
+    diagonal = N.diagonal()
+    if (diagonal > 0).all():
+        scale = 1.0 / np.sqrt(diagonal)
+        try:
+            step = scale * np.linalg.solve(N * scale * scale[:, None], scale * gradient)
+        except np.linalg.LinAlgError:
+            step = np.full(len(u), np.nan)
+        square = float(gradient @ step)
+        if 0.0 <= square < _LINEAR**2:
+            return step, square**0.5
+    root = cofactor_root(N, u)
+    half = root.T @ gradient
+    return root @ half, float(np.sqrt(half @ half))
+
+
+def _trial_steps(N: Array, u: NDArray[np.int64], gradient: Array) -> Iterator[Array]:
     """Steps to try in turn.
 
     First along its direction, which follows the narrow valleys of correlated parameters, then
     damped (Levenberg-Marquardt).
     """
+    root = cofactor_root(N, u)
     whole = root @ (root.T @ gradient)
     yield whole
     for shortened in (0.5, 0.25, 0.1, 0.03):
@@ -337,15 +361,15 @@ class Rejections:
     """
 
     def __init__(self, used: Mask) -> None:
-        self._back = np.zeros_like(used)
-        self._barred = np.zeros_like(used)
+        self._back = np.zeros(used.shape, dtype=bool)
+        self._barred = np.zeros(used.shape, dtype=bool)
 
     def settle(self, use: Mask, keep: Mask, part: slice | NDArray[np.int64] = slice(None)) -> Mask:
         """Which of those that a round would keep do stay, `use` itself where nothing changes.
 
         part: the rows that the round looked at.
         """
-        if np.array_equal(keep, use):
+        if keep is use or np.array_equal(keep, use):
             return use
         keep = keep & ~self._barred[part]
         self._barred[part] |= self._back[part] & use & ~keep
@@ -368,8 +392,11 @@ def snoop(test: Array, use: Mask, unknowns: int, alpha: float) -> Mask:
     if few:
         variance = 1.0  # one gross error reaches every residual: the stated sigmas are the scale
     limit = chi2_2d(alpha) * max(variance, 1e-12)
-    keep: Mask = use | (test <= limit)
-    suspicious = use & (test > limit)
+    fits = test <= limit
+    if np.array_equal(fits, use):
+        return use
+    keep: Mask = use | fits
+    suspicious = use & ~fits
     if suspicious.any():
         # One gross error lifts its neighbours: only those near the worst go at once.
         near = 1.0 if few else 0.5

@@ -174,7 +174,14 @@ def devices(small_camera):
     return make
 
 
-def make_recording(path: Path, epochs: int, per_side: int = 3, interval: float = 0.05) -> Path:
+def warming(k: int) -> float:
+    """°C of epoch k, from 25 to 35."""
+    return 25.0 + 10.0 * (1 - np.exp(-k / 60.0))
+
+
+def make_recording(
+    path: Path, epochs: int, per_side: int = 3, interval: float = 0.05, temperature_of=warming
+) -> Path:
     """Measurements of a camera that warms up, `per_side`² targets on each of three planes."""
     field = corner_field("plain", per_side=per_side, pitch_mm=660.0 / (per_side + 0.3))
     model = demonstration_model(field)
@@ -183,7 +190,7 @@ def make_recording(path: Path, epochs: int, per_side: int = 3, interval: float =
 
     def generate():
         for k in range(epochs):
-            temperature = 25.0 + 10.0 * (1 - np.exp(-k / 60.0))
+            temperature = temperature_of(k)
             now = iop.copy()
             now[:3] += np.array([2.0e-4, -4.5e-4, -3.0e-4]) * (temperature - 25.0)
             points = project(model.sensor, now, eop, field.points)

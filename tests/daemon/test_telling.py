@@ -132,12 +132,12 @@ def test_the_daemon_tells_the_journal_what_a_device_did(daemon, devices, monkeyp
     assert found["device_out"]["THERMOCALD_THREAD"] == "camera one"
 
 
-def in_a_terminal(daemon, seconds: float, *options: str) -> tuple[str, int]:
-    """What a command draws in a terminal of 200 columns until it is interrupted."""
+def in_a_terminal(daemon, seconds: float, *options: str, key: bytes = b"") -> tuple[str, int]:
+    """What a command draws in a terminal of 80 columns until a key, or else Ctrl-C, ends it."""
     terminal, inner = pty.openpty()
     process = subprocess.Popen(
         [sys.executable, "-m", "thermocald", *options], cwd=daemon.folder,
-        env={**ENVIRONMENT, "COLUMNS": "200", "LINES": "50", "TERM": "xterm"},
+        env={**ENVIRONMENT, "COLUMNS": "80", "LINES": "40", "TERM": "xterm"},
         stdin=inner, stdout=inner, stderr=inner,
     )  # fmt: skip
     os.close(inner)
@@ -149,11 +149,14 @@ def in_a_terminal(daemon, seconds: float, *options: str) -> tuple[str, int]:
                 seen += os.read(terminal, 65536)
             except OSError:
                 break
-        if until == end and b"sigma0" in seen:
+        if until == end and "σ₀".encode() in seen:
             until = time.monotonic() + seconds
         if not interrupted and time.monotonic() > until:
             interrupted = True
-            process.send_signal(signal.SIGINT)
+            if key:
+                os.write(terminal, key)
+            else:
+                process.send_signal(signal.SIGINT)
     if process.poll() is None:
         process.kill()
     status = process.wait(30)
@@ -162,15 +165,16 @@ def in_a_terminal(daemon, seconds: float, *options: str) -> tuple[str, int]:
 
 
 @pytest.mark.slow
-def test_top_is_always_up_to_date(daemon, devices):
+@pytest.mark.parametrize("key", [b"q", b""], ids=["q", "Ctrl-C"])
+def test_top_is_always_up_to_date(daemon, devices, key):
     daemon.configure(**devices())
     daemon.start()
     daemon.until(lambda: len(daemon.results()) > 2)
     seen, status = in_a_terminal(daemon, 5.0, "top", "--store", str(daemon.store),
-                                 "--interval", "0.3")  # fmt: skip
+                                 "--interval", "0.3", key=key)  # fmt: skip
     assert daemon.stop() == 0
     plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", seen)
-    epochs = [int(n) for n in re.findall(r"one/watch\s+(?:open|hung|out)\s+(\d+)", plain)]
+    epochs = [int(n) for n in re.findall(r"one/watch: (?:open|hung|out), epoch (\d+)", plain)]
     assert epochs == sorted(epochs)
     assert epochs[-1] > epochs[0]
     assert "housing" in plain

@@ -27,6 +27,8 @@ from thermocald.photogrammetry.series.jumps import Perspective, jumps
 from thermocald.photogrammetry.series.variance_components import components, mean_variance
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     Array = NDArray[np.float64]
@@ -40,6 +42,7 @@ __all__ = [
     "Movement",
     "drift_period",
     "estimate_movement",
+    "together",
 ]
 
 FEWEST_EPOCHS = 20
@@ -118,9 +121,10 @@ class Movement:
             return white
         # w'Rw for R = φ^|i-j| in one pass
         phi, carried, total = float(np.exp(-1.0 / self.memory)), 0.0, 0.0
-        for w in weights.tolist():
-            total += w * (w + 2.0 * carried)
-            carried = phi * (carried + w)
+        for first in range(0, len(weights), 1 << 16):
+            for w in weights[first : first + (1 << 16)].tolist():
+                total += w * (w + 2.0 * carried)
+                carried = phi * (carried + w)
         about_mean = 1.0 - mean_variance(phi, int(np.count_nonzero(weights)))
         return white + self.slow * (total / max(about_mean, 1e-6))
 
@@ -194,6 +198,20 @@ def estimate_movement(
         (axes * parts.white) @ axes.T, slow, memory, back @ back.T,
         tuple(int(rows[k]) for k in found.rows),
     )  # fmt: skip
+
+
+def together(movements: Sequence[Movement], starts: Sequence[int]) -> Movement:
+    """The mean of the movements of parts of a series, which start at some epochs.
+
+    The memory is the longest; jumps count as those of the series.
+    """
+    return Movement(
+        np.mean([m.white for m in movements], axis=0),
+        np.mean([m.slow for m in movements], axis=0),
+        max(m.memory for m in movements),
+        np.mean([m.noise for m in movements], axis=0),
+        tuple(start + row for m, start in zip(movements, starts, strict=True) for row in m.jumps),
+    )
 
 
 def _perspective(N: Array, b: Array, own: Columns, root: Array, whiten: Array) -> Perspective:

@@ -65,32 +65,56 @@ class ObservationGrid:
         cls, field: TestField, epochs: Sequence[Observations | None]
     ) -> ObservationGrid:
         """Lay the epochs' observations out; an epoch that is None stays empty."""
-        points = planes(2, len(epochs), len(field))
-        points[...] = np.nan
-        weights = planes(3, len(epochs), len(field))
-        weights[...] = 0.0
         present = [(e, obs) for e, obs in enumerate(epochs) if obs is not None and len(obs)]
-        if present:
-            counts = [len(obs) for _, obs in present]
-            rows = np.repeat([e for e, _ in present], counts)
-            columns = np.concatenate([obs.targets for _, obs in present])
-            variance = np.concatenate([obs.sigmas for _, obs in present]) ** 2
-            points[rows, columns] = np.concatenate([obs.points for _, obs in present])
-            inverse = np.zeros((len(rows), 3))
-            if all(obs.covariances is None for _, obs in present):
-                np.divide(1.0, variance, out=inverse[:, :2])
-            else:
-                xy = np.concatenate(
-                    [
-                        np.zeros(len(o)) if o.covariances is None else o.covariances
-                        for _, o in present
-                    ]
-                )
-                determinant = variance[:, 0] * variance[:, 1] - xy**2
-                inverse[:, :2] = variance[:, ::-1] / determinant[:, None]
-                inverse[:, 2] = -xy / determinant
-            weights[rows, columns] = inverse
+        shape = (len(epochs), len(field))
+        if not present:
+            none = np.empty(0, dtype=np.int64)
+            return cls.from_rows(shape, none, none, np.empty((0, 2)), np.empty((0, 2)))
+        xy = None
+        if any(obs.covariances is not None for _, obs in present):
+            xy = np.concatenate(
+                [np.zeros(len(o)) if o.covariances is None else o.covariances for _, o in present]
+            )
+        return cls.from_rows(
+            shape,
+            np.repeat([e for e, _ in present], [len(obs) for _, obs in present]),
+            np.concatenate([obs.targets for _, obs in present]),
+            np.concatenate([obs.points for _, obs in present]),
+            np.concatenate([obs.sigmas for _, obs in present]),
+            xy,
+        )
+
+    @classmethod
+    def from_rows(
+        cls,
+        shape: tuple[int, int],
+        epochs: NDArray[np.int64],
+        targets: NDArray[np.int64],
+        measured: Array,
+        sigmas: Array,
+        covariances: Array | None = None,
+    ) -> ObservationGrid:
+        """The grid of n image points: their epochs, targets (n,), measured, sigmas (n, 2) px.
+
+        shape: epochs and targets of the grid; covariances (n,) px² of x with y.
+        """
+        points, weights = planes(2, *shape), planes(3, *shape)
+        points[...] = np.nan
+        weights[...] = 0.0
+        variance = sigmas**2
+        inverse = np.zeros((len(epochs), 3))
+        if covariances is None:
+            np.divide(1.0, variance, out=inverse[:, :2])
+        else:
+            determinant = variance[:, 0] * variance[:, 1] - covariances**2
+            inverse[:, :2] = variance[:, ::-1] / determinant[:, None]
+            inverse[:, 2] = -covariances / determinant
+        points[epochs, targets] = measured
+        weights[epochs, targets] = inverse
         return cls(points, weights)
+
+    def __len__(self) -> int:
+        return len(self.points)
 
     @property
     def observed(self) -> NDArray[np.bool_]:

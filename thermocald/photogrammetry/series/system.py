@@ -104,6 +104,23 @@ class SeriesSystem:
         own_prior: Array | None = None,
     ) -> SeriesSystem:
         """Form, invert, and reduce the normal equations."""
+        system = cls.formed(at, weights, use, own, common, prior, own_prior)
+        if len(common) == 0 and prior is None:
+            return system
+        return replace(system, Q_common=inverse_of_determined(system.common_normals()))
+
+    @classmethod
+    def formed(
+        cls,
+        at: Partials,
+        weights: Array,
+        use: Mask,
+        own: Columns,
+        common: Columns,
+        prior: Array | None,
+        own_prior: Array | None = None,
+    ) -> SeriesSystem:
+        """The same without the cofactors of the common unknowns."""
         drawn = np.zeros((len(own), len(own))) if own_prior is None else own_prior
         first, of = alike(weights, use)
         w = _used(weights[first], use[first])
@@ -113,18 +130,19 @@ class SeriesSystem:
         good &= use[first].any(axis=1)
         if len(first) < len(of):
             Q, good = Q[of], good[of]
-        if apart:
-            none = np.empty((0, 0))
-            same = (first, of)
-            return cls(at, weights, use, own, common, N[:0], Q, good, none, None, same, drawn)
-        N = N[of]
-        full = _common_matrix(at.A, N[good], _used(weights, use)[good], common, prior)
-        system = cls(at, weights, use, own, common, N, Q, good, full, prior, (first, of), drawn)
-        for part, C in system.couplings():
-            half = np.swapaxes(np.linalg.cholesky(Q[part]), 1, 2) @ C
+        N = N[:0] if apart else N[of]
+        none = np.empty((0, 0))
+        return cls(at, weights, use, own, common, N, Q, good, none, prior, (first, of), drawn)
+
+    def common_normals(self) -> Array:
+        """Normal matrix of the common unknowns, the own parameters of all epochs reduced."""
+        w = _used(self.weights, self.use)[self.good]
+        full = _common_matrix(self.at.A, self.N[self.good], w, self.common, self.prior)
+        for part, C in self.couplings():
+            half = np.swapaxes(np.linalg.cholesky(self.Q[part]), 1, 2) @ C
             half = half.reshape(-1, half.shape[-1])
             full -= half.T @ half
-        return replace(system, Q_common=inverse_of_determined(full))
+        return full
 
     def couplings(self) -> Iterator[tuple[NDArray[np.int64], Array]]:
         """Chunks of good epochs and their blocks (e, p, q + 2T) of own with common unknowns."""

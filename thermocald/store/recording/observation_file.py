@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.store.recording.parquet_table import ParquetTable
 from thermocald.store.recording.table import Chunk, Table
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ObservationFile", "ObservationTable"]
 
+_GRID_POINTS = 300_000  # cells of a grid: 12 MB
 _REQUIRED = ("epoch", "target", "x", "y", "sx", "sy")
 
 
@@ -109,10 +111,63 @@ class ObservationFile:
 
         Raises RecordingError where the rows are not in the order of their epochs.
         """
+        for block, first, stop in self._whole_epochs(self._table.chunks()):
+            yield from self._emit(block, first, stop)
+
+    def grids(
+        self, windows: Sequence[slice] | None = None
+    ) -> Iterator[tuple[int, ObservationGrid]]:
+        """The same as grids of consecutive epochs, each with its first epoch (from 0).
+
+        windows: only epochs of these slices, ascending; of a Parquet file only they are read.
+        """
+        wanted = [slice(0, len(self._numbers))] if windows is None else list(windows)
+        columns = [*_REQUIRED, *(["sxy"] if self._has_covariances else [])]
+        if windows is None or not isinstance(self._table, ParquetTable):
+            chunks: Iterator[Chunk] = self._table.chunks()
+            if isinstance(self._table, ParquetTable):
+                chunks = self._table.chunks(columns=columns)
+            yield from self._within(wanted, chunks)
+            return
+        for window in wanted:
+            low, high = self._numbers[window][[0, -1]]
+            chunks = self._table.chunks(columns=columns, epochs=(int(low), int(high)))
+            yield from self._within([window], chunks)
+
+    def _within(
+        self, windows: Sequence[slice], chunks: Iterator[Chunk]
+    ) -> Iterator[tuple[int, ObservationGrid]]:
+        """The grids of some windows from the chunks that hold them."""
+        for block, first, stop in self._whole_epochs(chunks, False):
+            for window in windows:
+                if stop > window.start and first < window.stop:
+                    yield from self._grids(block, max(first, window.start), min(stop, window.stop))
+            if stop >= windows[-1].stop:
+                break
+
+    def _grids(self, block: _Block, first: int, stop: int) -> Iterator[tuple[int, ObservationGrid]]:
+        size = max(_GRID_POINTS // len(self._field), 1)
+        for begin in range(first, stop, size):
+            end = min(begin + size, stop)
+            low, high = np.searchsorted(block.epochs, [begin, end])
+            part = block.rows(slice(int(low), int(high)))
+            grid = ObservationGrid.from_rows(
+                (end - begin, len(self._field)), part.epochs - begin, part.targets,
+                part.values[:, 0:2], part.values[:, 2:4],
+                part.values[:, 4] if self._has_covariances else None,
+            )  # fmt: skip
+            if np.count_nonzero(grid.observed) < len(part.epochs):
+                self._refuse_duplicates(part)
+            yield begin, grid
+
+    def _whole_epochs(
+        self, chunks: Iterator[Chunk], quality: bool = True
+    ) -> Iterator[tuple[_Block, int, int]]:
+        """Blocks of whole epochs, in order, with the first epoch of each and the one after it."""
         done = 0
         pending: _Block | None = None
-        for chunk in self._table.chunks():
-            block = self._block(chunk)
+        for chunk in chunks:
+            block = self._block(chunk, quality)
             if pending is not None:
                 block = _join([pending, block])
             back = np.diff(block.epochs) < 0
@@ -124,9 +179,9 @@ class ObservationFile:
             last = int(block.epochs[-1])
             whole = block.rows(slice(0, int(np.searchsorted(block.epochs, last))))
             pending = block.rows(slice(len(whole.epochs), len(block.epochs)))
-            yield from self._emit(whole, done, last)
+            yield whole, done, last
             done = last
-        yield from self._emit(pending or self._empty(), done, len(self._numbers))
+        yield pending or self._empty(), done, len(self._numbers)
 
     def _emit(self, block: _Block, first: int, stop: int) -> Iterator[Observations]:
         if stop > first:
@@ -153,16 +208,20 @@ class ObservationFile:
         none = np.empty(0, dtype=np.int64)
         return _Block(0, none, none, np.empty((0, width)))
 
-    def _block(self, chunk: Chunk) -> _Block:
+    def _block(self, chunk: Chunk, quality: bool = True) -> _Block:
         numbers = chunk.integers("epoch")
-        epochs = np.searchsorted(self._numbers, numbers)
-        found = np.minimum(epochs, len(self._numbers) - 1)
+        # rows of one epoch follow one another: look each run of them up once
+        runs = np.flatnonzero(np.diff(numbers, prepend=-1))
+        found = np.searchsorted(self._numbers, numbers[runs])
+        epochs = np.repeat(found, np.diff(runs, append=len(numbers)))
+        near = np.minimum(epochs, len(self._numbers) - 1)
         chunk.check(
             "epoch",
-            self._numbers[found] != numbers,
+            self._numbers[near] != numbers,
             lambda row: f"epoch {numbers[row]} does not stand in epochs.csv",
         )
-        values = np.empty((len(chunk), 4 + self._has_covariances + len(self._quality)))
+        names = self._quality if quality else []
+        values = np.empty((len(chunk), 4 + self._has_covariances + len(names)))
         for column, name in enumerate(("x", "y", "sx", "sy")):
             values[:, column] = chunk.numbers(name)
             if column >= 2:
@@ -171,7 +230,7 @@ class ObservationFile:
             values[:, 4] = chunk.numbers("sxy")
             too_large = np.abs(values[:, 4]) >= values[:, 2] * values[:, 3]
             chunk.check("sxy", too_large, "a covariance must be below sx·sy")
-        for i, name in enumerate(self._quality, start=4 + self._has_covariances):
+        for i, name in enumerate(names, start=4 + self._has_covariances):
             values[:, i] = chunk.numbers(name, empty_is_nan=True)
         return _Block(chunk.first, epochs, self._targets(chunk), values)
 

@@ -55,13 +55,24 @@ class ParquetTable:
                     f"{path}: column {name} is missing; found: {', '.join(self.columns)[:200]}"
                 )
 
-    def chunks(self, rows: int = _ROWS) -> Iterator[ColumnChunk]:
-        """The rows, at most `rows` at a time."""
+    def chunks(
+        self,
+        rows: int = _ROWS,
+        columns: Sequence[str] | None = None,
+        epochs: tuple[int, int] | None = None,
+    ) -> Iterator[ColumnChunk]:
+        """The rows, at most `rows` at a time.
+
+        columns: only these; epochs: only parts of the file that may hold epochs of this range.
+        """
         pyarrow = _pyarrow()
         first = 0
         try:
             with pyarrow.parquet.ParquetFile(self.path, memory_map=True) as file:
-                for batch in file.iter_batches(batch_size=rows):
+                groups = range(file.num_row_groups)
+                if epochs is not None:
+                    groups, first = _holding(file.metadata, self.columns.index("epoch"), epochs)
+                for batch in file.iter_batches(rows, list(groups), columns):
                     if len(batch):
                         yield ColumnChunk(self, first, batch)
                         first += len(batch)
@@ -209,6 +220,26 @@ def _texts(chunk: ColumnChunk, name: str) -> Sequence[str]:
         text = "" if value != value else form % value
         texts.append(text if not text or float(text) == value else repr(value))
     return texts
+
+
+def _holding(metadata: Any, column: int, epochs: tuple[int, int]) -> tuple[range, int]:
+    """The row groups that may hold epochs of a range, and how many rows come before them.
+
+    Files whose groups say nothing of their epochs, or are not in order, are read whole.
+    """
+    whole = range(metadata.num_row_groups), 0
+    low, high = [], []
+    for group in range(metadata.num_row_groups):
+        known = metadata.row_group(group).column(column).statistics
+        if known is None or not known.has_min_max:
+            return whole
+        low.append(known.min)
+        high.append(known.max)
+    if any(a > b for a, b in zip(high[:-1], low[1:], strict=True)):
+        return whole
+    first = next((i for i, top in enumerate(high) if top >= epochs[0]), len(high))
+    stop = next((i for i, bottom in enumerate(low) if bottom > epochs[1]), len(low))
+    return range(first, stop), sum(metadata.row_group(i).num_rows for i in range(first))
 
 
 def _numeric(chunk: Chunk, name: str) -> bool:

@@ -1,0 +1,309 @@
+"""The estimator of a series: Gauss-Newton with reduced common unknowns, and data snooping.
+
+Works on arrays of all epochs at hand: a whole series, or one block of a long one, whose common
+unknowns are then held at what is known of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.photogrammetry.camera.camera_model import project
+from thermocald.photogrammetry.epoch.gauss_markov import Rejections
+from thermocald.photogrammetry.parameters import EOP, IOP
+from thermocald.photogrammetry.series.mount import STILL, Movement
+from thermocald.photogrammetry.series.normals import (
+    ObservationGrid,
+    linearise,
+    planes,
+    series_residuals,
+    sums_of_squares,
+)
+from thermocald.photogrammetry.series.snooping import (
+    point_tests,
+    snoop_series,
+    typical_variance,
+)
+from thermocald.photogrammetry.series.system import SeriesSystem
+from thermocald.photogrammetry.series.target_noise import (
+    CorrelatedPairs,
+    correlated_pairs,
+    noise_ratios,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from thermocald.photogrammetry.camera.camera_model import Sensor
+    from thermocald.photogrammetry.field.testfield import TestField
+    from thermocald.photogrammetry.series.normals import Partials
+    from thermocald.photogrammetry.series.result import SeriesSettings
+
+    Array = NDArray[np.float64]
+    Mask = NDArray[np.bool_]
+
+__all__ = ["ENOUGH_FOR_NOISE", "Estimate", "SeriesEstimator", "Start", "pooled_variance"]
+
+ENOUGH_FOR_NOISE = 20
+"""Epochs that show the noise of single targets."""
+
+_ITERATIONS = 15
+_SMALL = 0.1  # standard deviations: a last step that the partials carry to 1e-3
+_NEAR = 10.0  # standard deviations: by what the residuals follow a step by the partials
+_ROUNDS = 8  # of data snooping
+_RELINEARISE_PX = 1.0  # movement of the mean that changes the partials by more than about 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """values (E, 16), offsets (T, 2) px and the common pose (6,)."""
+
+    values: Array
+    offsets: Array
+    pose: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate(Start):
+    """The same estimated, the residuals (E, T, 2) px that they leave, the system, and which epochs
+    converged (E,).
+    """
+
+    residuals: Array
+    system: SeriesSystem
+    converged: Mask
+
+
+@dataclass(frozen=True, eq=False)
+class SeriesEstimator:
+    """A series as it is adjusted.
+
+    grid: the observations with the weights in use; stated (E, T, 3): their weights as stated;
+    bound (6, 6): inverse covariance of the movements of the mount; movement: what that rests on;
+    held: the linearisation at which common unknowns are known, None where they are estimated; unit:
+    variance of unit weight that the priors start with; windows: runs of consecutive epochs, where
+    the series is a sample of a longer one; typical: variance of unit weight for epochs too poor to
+    tell their own, None: that of these epochs.
+    """
+
+    sensor: Sensor
+    testfield: TestField
+    grid: ObservationGrid
+    stated: Array
+    s: SeriesSettings
+    bound: Array | None = None
+    movement: Movement = STILL
+    held: Partials | None = None
+    unit: float = 1.0
+    windows: tuple[slice, ...] = ()
+    typical: float | None = None
+
+    def adjusted(self, start: Start, use: Mask) -> tuple[SeriesEstimator, Estimate, Mask]:
+        """Solve, find the gross errors and the targets' own noise; the series with that noise."""
+        series, s = self, self.s
+        estimate = series.solve(start, use, self.unit)
+        if not estimate.converged.all():
+            # A gross error among few targets: such an epoch must not spoil what all share.
+            use = use & estimate.converged[:, None]
+            estimate = series.solve(start, use, self.unit)
+        if s.snooping_alpha > 0:
+            estimate, use = series.snoop(estimate, use)
+            first_look = self.grid.weights is self.stated
+            if s.target_noise and len(use) >= ENOUGH_FOR_NOISE and first_look:
+                series = series.with_target_noise(estimate, use)
+                estimate = series.solve(estimate, use, 1.0)
+                estimate, use = series.snoop(estimate, use)
+        return series, estimate, use
+
+    @property
+    def has_offsets(self) -> bool:
+        """Whether the targets' offsets are unknowns: only where the field has sigmas."""
+        known = self.held is not None or not self.s.target_offsets
+        return not known and bool((self.testfield.sigmas > 0).any())
+
+    @property
+    def common(self) -> NDArray[np.int64]:
+        """Positions of the parameters that are estimated once."""
+        return self.s.common if self.held is None else self.s.common[:0]
+
+    def solve(self, start: Start, use: Mask, variance: float) -> Estimate:
+        """Gauss-Newton with one linearisation at the series' mean, renewed while that moves.
+
+        variance: of unit weight, by which the offsets' prior is weighted against image points.
+        """
+        values, offsets, pose = start.values, start.offsets, start.pose
+        system = self._linearised(values, use, variance)
+        residuals = self._residuals(values, offsets, planes(2, *use.shape))
+        for _ in range(_ITERATIONS):
+            step = system.step(residuals, offsets, self._deviations(values, pose))
+            values = values.copy()
+            values[:, system.own] += step.d_own
+            values[:, system.common] += step.d_common
+            if len(system.common):
+                pose = pose + step.d_common
+            offsets = offsets + step.d_offsets
+            if step.size < _SMALL:
+                system.move(residuals, step)
+                break
+            residuals = self._residuals(values, offsets, residuals)
+            moved = np.zeros(16)
+            moved[system.common] = step.d_common
+            if system.good.any():
+                moved[system.own] += np.median(step.d_own[system.good], axis=0)
+            far = self.held is None and np.abs(system.at.A @ moved).max(initial=0.0)
+            if far > _RELINEARISE_PX:
+                system = self._linearised(values, use, variance)
+        return Estimate(values, offsets, pose, residuals, system, step.sizes < _NEAR)
+
+    def _deviations(self, values: Array, pose: Array) -> Array | None:
+        """How far the own parameters (E, p) are from what their prior draws them to."""
+        if self.bound is None:
+            return None
+        deviations = np.zeros((len(values), len(self.s.per_epoch)))
+        deviations[:, -len(pose) :] = values[:, EOP] - pose
+        return deviations
+
+    def snoop(self, estimate: Estimate, use: Mask) -> tuple[Estimate, Mask]:
+        """Find the gross errors; the estimate without them and what takes part."""
+        shared = len(self.common) > 0 or self.has_offsets
+        return (self._snoop_together if shared else self._snoop_apart)(estimate, use)
+
+    def with_target_noise(self, estimate: Estimate, use: Mask) -> SeriesEstimator:
+        """The series with every target's weights from the scatter of its own residuals."""
+        ratios = noise_ratios(
+            estimate.residuals, self.grid.weights, use, self.redundancy_share(use)
+        )
+        weights = self.grid.weights.copy(order="K")
+        weights[..., :2] /= ratios
+        weights[..., 2] /= np.sqrt(ratios.prod(axis=1))
+        return replace(self, grid=ObservationGrid(self.grid.points, weights))
+
+    def pairs(self, estimate: Estimate, use: Mask) -> CorrelatedPairs:
+        return correlated_pairs(
+            estimate.residuals, use, self.testfield.groups, self.redundancy_share(use)
+        )
+
+    def redundancy_share(self, use: Mask) -> float:
+        """Redundancy over observations: what the parameters have left of the residuals."""
+        n = 2 * int(use.sum())
+        own = len(self.s.per_epoch) * int(use.any(axis=1).sum())
+        return max((n - own) / max(n, 1), 0.05)
+
+    def _snoop_together(self, estimate: Estimate, use: Mask) -> tuple[Estimate, Mask]:
+        """Data snooping where all epochs share unknowns: every round solves the series again."""
+        variance, offered = 1.0, use
+        rejections = Rejections(use)
+        typical = None
+        for _ in range(_ROUNDS):
+            tests = point_tests(estimate.system, estimate.residuals)
+            typical = typical or typical_variance(tests, use)
+            keep = snoop_series(
+                tests, offered, use, self.s.unknowns, self.s.snooping_alpha, typical
+            )
+            keep = rejections.settle(use, keep)
+            previous, variance = variance, self.variance(estimate)
+            settled = not self.has_offsets or abs(variance / previous - 1) < 0.02
+            if settled and np.array_equal(keep, use):
+                break
+            use = keep
+            estimate = self.solve(estimate, use, variance)
+        return estimate, use
+
+    def _snoop_apart(self, estimate: Estimate, use: Mask) -> tuple[Estimate, Mask]:
+        """Data snooping where epochs share nothing: only those that changed are solved again."""
+        values, residuals = estimate.values, estimate.residuals
+        system = whole = replace(estimate.system, use=use.copy())
+        offered, use, rows = use, whole.use, np.arange(len(use))
+        rejections = Rejections(use)
+        part: slice | NDArray[np.int64] = slice(None)  # without a copy
+        typical = self.typical
+        for _ in range(_ROUNDS):
+            tests = point_tests(system, residuals[part])
+            typical = typical or typical_variance(tests, use)
+            keep = snoop_series(
+                tests, offered[part], use[part], self.s.unknowns, self.s.snooping_alpha, typical
+            )
+            keep = rejections.settle(use[part], keep, part)
+            changed = (keep != use[part]).any(axis=1)
+            part = rows = rows[changed]
+            if len(rows) == 0:
+                break
+            system = SeriesSystem.build(
+                whole.at, self.grid.weights[rows], keep[changed], whole.own, whole.common, None,
+                whole.own_prior,
+            )  # fmt: skip
+            some = replace(self, grid=ObservationGrid(self.grid.points[rows], system.weights))
+            values[rows], residuals[rows] = some._without(
+                system, values[rows], residuals[rows], estimate.pose
+            )
+            whole.replace(rows, system)
+        return replace(estimate, values=values, residuals=residuals, system=whole), use
+
+    def _without(
+        self, system: SeriesSystem, values: Array, left: Array, pose: Array
+    ) -> tuple[Array, Array]:
+        """Values (E, 16) and residuals (E, T, 2) of epochs of which points were taken out."""
+        offsets = np.zeros((left.shape[1], 2))
+        for _ in range(_ITERATIONS):
+            step = system.step(left, offsets, self._deviations(values, pose))
+            values[:, system.own] += step.d_own
+            if step.size < _NEAR:
+                system.move(left, step)
+                break
+            left = self._residuals(values, offsets, left)
+        return values, left
+
+    def _linearised(self, values: Array, use: Mask, variance: float) -> SeriesSystem:
+        at = self.held
+        if at is None:
+            used = use.any(axis=1)
+            mean = np.median(values[used] if used.any() else values, axis=0)
+            at = linearise(self.sensor, self.testfield, mean[IOP], mean[EOP])
+        prior = self.offset_prior(at) * variance if self.has_offsets else None
+        own = self.s.per_epoch
+        bound = None
+        if self.bound is not None:
+            bound = np.zeros((len(own), len(own)))
+            bound[-6:, -6:] = self.bound * variance
+        return SeriesSystem.build(at, self.grid.weights, use, own, self.common, prior, bound)
+
+    def _residuals(self, values: Array, offsets: Array, out: Array) -> Array:
+        if (values == values[:1]).all():
+            first = project(self.sensor, values[0, IOP], values[0, EOP], self.testfield.points)
+            np.subtract(self.grid.points, first, out=out)
+        else:
+            series_residuals(self.sensor, self.grid, self.testfield.points, values, out)
+        if self.has_offsets:
+            out -= offsets
+        return out
+
+    def offset_prior(self, at: Partials) -> Array:
+        """Inverse covariance (T, 3) px⁻² of the offsets, from that of the object coordinates."""
+        variance = self.testfield.sigmas**2
+        tiny = 1e-12  # px²: a target without sigma has no offset
+        xx = (at.B[:, 0] ** 2 * variance).sum(axis=1) + tiny
+        yy = (at.B[:, 1] ** 2 * variance).sum(axis=1) + tiny
+        xy = (at.B[:, 0] * at.B[:, 1] * variance).sum(axis=1)
+        prior: Array = np.stack([yy, xx, -xy], axis=1) / (xx * yy - xy**2)[:, None]
+        return prior
+
+    def sums(self, estimate: Estimate) -> tuple[Array, Array]:
+        """Weighted sum of squares (E,) and redundancy (E,) of every epoch."""
+        use = estimate.system.use
+        vPv = sums_of_squares(self.grid.weights, estimate.residuals, use)
+        n = use.sum(axis=1) * estimate.system.good
+        share = estimate.system.common_share() * n / max(int(n.sum()), 1)
+        return vPv, 2 * n - estimate.system.own_count() - share
+
+    def variance(self, estimate: Estimate) -> float:
+        """Variance of unit weight of the series, the median over its epochs."""
+        return pooled_variance(*self.sums(estimate), estimate.system.good)
+
+
+def pooled_variance(vPv: Array, redundancy: Array, good: Mask) -> float:
+    """The median over epochs of the variance of unit weight; 1 where none has any redundancy."""
+    good = good & (redundancy > 0)
+    return float(np.median(vPv[good] / redundancy[good])) if good.any() else 1.0

@@ -1,0 +1,36 @@
+"""Arrays of a long series on disk: what a year of epochs gives is larger than memory should be."""
+
+from __future__ import annotations
+
+import mmap
+import tempfile
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+__all__ = ["ColumnSpool"]
+
+
+class ColumnSpool:
+    """An array (rows, columns), column by column in a file without a name.
+
+    array: NaN at first, to be written and read like any other; it ends with its last reference.
+    The system may drop what is not in use from memory, and does on `release`.
+    """
+
+    def __init__(self, rows: int, columns: int) -> None:
+        size = max(rows * columns, 1) * 8
+        with tempfile.TemporaryFile() as file:
+            file.truncate(size)
+            self._map = mmap.mmap(file.fileno(), size)
+        flat = np.frombuffer(self._map, dtype=np.float64)[: rows * columns]
+        self.array: Array = flat.reshape(columns, rows).T
+
+    def release(self) -> None:
+        """Take what was written or read out of memory."""
+        self._map.madvise(mmap.MADV_DONTNEED)

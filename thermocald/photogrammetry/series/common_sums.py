@@ -28,10 +28,11 @@ if TYPE_CHECKING:
     Mask = NDArray[np.bool_]
     Columns = NDArray[np.int64]
 
-__all__ = ["Alike", "CommonSums", "Shared"]
+__all__ = ["Alike", "CommonSums", "Shared", "kinds_of", "level_of"]
 
 _FEW = 0.02  # share of a block's epochs that is worth a matrix of its own
 _MOST = 12  # kinds of epochs in a block
+_MOST_KEPT = 40  # kinds of which the last change is checked
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +115,8 @@ class CommonSums:
             self.tilt += t.sum() * kind.G
             self.epochs, self.times = self.epochs + n, self.times + float(t.sum())
             self.squares += float(t @ t)
-            if all(not np.allclose(kind.G, G, rtol=0.02, atol=1e-12) for G, _ in self.kinds[-50:]):
+            new = all(not np.allclose(kind.G, G, rtol=0.02, atol=1e-12) for G, _ in self.kinds)
+            if new and len(self.kinds) < _MOST_KEPT:
                 self.kinds.append((kind.G, np.sqrt(np.diag(kind.system.Q[0]))))
 
     def solved(self, known: Shared, prior: Array | None) -> tuple[Shared, Array, float]:
@@ -162,9 +164,7 @@ class CommonSums:
         return out
 
 
-def kinds_of(
-    system: SeriesSystem, common: Columns, targets: bool, at: Partials
-) -> list[Alike]:
+def kinds_of(system: SeriesSystem, common: Columns, targets: bool, at: Partials) -> list[Alike]:
     """The kinds of epochs of a block: the frequent ones by what they see, the others together.
 
     system: of the block, its common unknowns held; targets: whether offsets are common unknowns.
@@ -185,9 +185,7 @@ def kinds_of(
     out = []
     for rows in groups:
         w = np.where(system.use[rows][..., None], system.weights[rows], 0.0).mean(axis=0)[None]
-        one = SeriesSystem.formed(
-            at, w, w[..., 0] > 0, system.own, common, zero, system.own_prior
-        )
+        one = SeriesSystem.formed(at, w, w[..., 0] > 0, system.own, common, zero, system.own_prior)
         if not one.good[0]:
             continue
         coupling = [C for _, C in one.couplings()]
@@ -197,7 +195,7 @@ def kinds_of(
     return out
 
 
-def level_of(sums: CommonSums, known: Shared, own: Columns, common: Columns) -> Array:
+def level_of(known: Shared, own: Columns, common: Columns) -> Array:
     """Cofactors (16, 16) of what all epochs have in common."""
     width = len(known.cofactors)
     out = np.zeros((16, 16))

@@ -138,7 +138,7 @@ class SeriesEstimator:
         system = self._linearised(values, use, variance)
         residuals = self._residuals(values, offsets, planes(2, *use.shape))
         for _ in range(_ITERATIONS):
-            step = system.step(residuals, offsets, self._deviations(values, pose))
+            step = system.step(residuals, offsets, self.deviations(values, pose))
             values = values.copy()
             values[:, system.own] += step.d_own
             values[:, system.common] += step.d_common
@@ -158,7 +158,7 @@ class SeriesEstimator:
                 system = self._linearised(values, use, variance)
         return Estimate(values, offsets, pose, residuals, system, step.sizes < _NEAR)
 
-    def _deviations(self, values: Array, pose: Array) -> Array | None:
+    def deviations(self, values: Array, pose: Array) -> Array | None:
         """How far the own parameters (E, p) are from what their prior draws them to."""
         if self.bound is None:
             return None
@@ -248,7 +248,7 @@ class SeriesEstimator:
         """Values (E, 16) and residuals (E, T, 2) of epochs of which points were taken out."""
         offsets = np.zeros((left.shape[1], 2))
         for _ in range(_ITERATIONS):
-            step = system.step(left, offsets, self._deviations(values, pose))
+            step = system.step(left, offsets, self.deviations(values, pose))
             values[:, system.own] += step.d_own
             if step.size < _NEAR:
                 system.move(left, step)

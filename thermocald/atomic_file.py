@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING
 from thermocald.errors import OutputError, ThermocaldError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
     from pathlib import Path
 
-__all__ = ["cannot_write", "make_folder", "new_file", "write_text"]
+__all__ = ["cannot_write", "make_folder", "new_file", "write_parts", "write_text"]
 
 # the disk's fault, not the user's: exit status 3
 _DISK = {errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG, errno.ENXIO}
@@ -64,8 +64,13 @@ def new_file(path: Path) -> Iterator[Path]:
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file, whole or not at all; raises OutputError."""
-    with new_file(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+    write_parts(path, (text,))
+
+
+def write_parts(path: Path, parts: Iterable[str]) -> None:
+    """Write a text file that comes in parts, whole or not at all; raises OutputError."""
+    with new_file(path) as partial, partial.open("w", encoding="utf-8") as file:
+        file.writelines(parts)
 
 
 def make_folder(path: Path) -> None:

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from thermocald.acquisition.calibrator import Calibrator
+from thermocald.analysis.series.adjusted import table_of_series
 from thermocald.analysis.series.drift import courses, settled
 from thermocald.analysis.series.stored import stored_table
-from thermocald.analysis.series.table import SeriesTable, table_of_series
+from thermocald.analysis.series.table import SeriesTable
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings

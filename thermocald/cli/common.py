@@ -16,7 +16,7 @@ from thermocald import atomic_file
 from thermocald.errors import UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
 __all__ = [
     "default_config",
@@ -26,6 +26,7 @@ __all__ = [
     "progress",
     "say",
     "write_json",
+    "write_parts",
     "write_text",
 ]
 
@@ -122,11 +123,16 @@ def write_json(document: Any, destination: str) -> None:
 
 def write_text(text: str, destination: str | Path) -> None:
     """Write text to a file, whole or not at all, or to standard output for `-`."""
+    write_parts((text,), destination)
+
+
+def write_parts(parts: Iterable[str], destination: str | Path) -> None:
+    """Write a text that comes in parts, as `write_text` does."""
     if str(destination) == "-":
-        sys.stdout.write(text)
+        sys.stdout.writelines(parts)
         sys.stdout.flush()
         return
     path = Path(destination)
     if not path.absolute().parent.is_dir():
         raise UsageError(f"{path}: the folder {path.absolute().parent} does not exist")
-    atomic_file.write_text(path, text)
+    atomic_file.write_parts(path, parts)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
 
-from thermocald.cli.common import progress, say, write_json, write_text
+from thermocald.cli.common import progress, say, write_json, write_parts
 from thermocald.cli.options import (
     DEFAULT_FREE_TEXT,
     ExteriorOption,
@@ -122,7 +123,7 @@ def export(
     Example: thermocald export M1 --units px,deg --time iso --separator ';' --decimal ',' -o M1.csv
     """
     from thermocald.analysis.series.drift import settled
-    from thermocald.analysis.series.table import CSV_COLUMNS, csv_text
+    from thermocald.analysis.series.table import csv_text
     from thermocald.output import series_export
 
     folder = source.is_dir()
@@ -144,29 +145,22 @@ def export(
 
         table = stored_table(source, series, settings, exterior)
     table, _ = settled(table)
-    if format_ == "parquet" or extra or not style.is_plain:
-        known = series_export.besides(source, series, table.number, extra=extra)
-        columns = series_export.columns_of(table, style, known)
-        if format_ == "parquet":
-            series_export.write_parquet(columns, Path(output))
-        elif format_ == "json":
-            write_json(series_export.as_rows(columns), output)
-        else:
-            write_text(series_export.as_csv(columns, style), output)
-    elif format_ == "csv":
-        write_text("".join(csv_text(table)), output)
+    if format_ == "csv" and style.is_plain and not extra:
+        write_parts(csv_text(table), output)
+    elif format_ == "json" and not extra:
+        write_parts(series_export.as_json(series_export.plain_rows(table)), output)
     else:
-        lines = [line.rstrip("\n").split(",") for line in csv_text(table)][1:]
-        rows = [dict(zip(CSV_COLUMNS, line, strict=True)) for line in lines]
-        write_json([{k: _value(k, v) for k, v in row.items()} for row in rows], output)
-    for sentence in sorted({r for r in table.reasons if r}):
-        say(f"{table.reasons.count(sentence)} epochs without a result: {sentence}")
-
-
-def _value(name: str, text: str) -> Any:
-    if name == "status":
-        return text
-    return float(text) if text else None
+        known = series_export.besides(source, series, table.number, extra=extra)
+        parts = series_export.column_parts(table, style, known)
+        if format_ == "parquet":
+            series_export.write_parquet(parts, Path(output))
+        elif format_ == "json":
+            write_parts(series_export.as_json(series_export.as_rows(parts)), output)
+        else:
+            write_parts(series_export.as_csv(parts, style), output)
+    counted = Counter(r for r in table.reasons if r)
+    for sentence, count in sorted(counted.items()):
+        say(f"{count} epochs without a result: {sentence}")
 
 
 def _check_exterior(exterior: str) -> None:
@@ -177,34 +171,13 @@ def _check_exterior(exterior: str) -> None:
 
 
 def _recording_table(path: Path, settings: AdjustmentSettings, exterior: str) -> SeriesTable:
-    """Calibrate a recording in memory: its epochs one by one, then the series."""
-    from thermocald.acquisition.calibrator import Calibrator
-    from thermocald.analysis.series.table import (
-        calibrate_epochs,
-        frame_temperatures,
-        settings_for_series,
-        table_of_series,
-    )
+    """Calibrate a recording without a store."""
+    from thermocald.analysis.series.recorded import recorded_table
     from thermocald.store.recording.reader import open_recording
 
     recording = open_recording(path)
-    columns = recording.columns
-    calibrator = Calibrator.of_recording(recording, settings)
-    reference = columns.temperatures[next(iter(recording.channels))]
-    temperature = frame_temperatures(
-        columns.numbers, columns.frame_time, columns.temperature_time, reference
-    )
-    with progress(len(columns), "calibrating") as advance:
-        apart, observations = calibrate_epochs(
-            recording.iter_epochs(), calibrator, temperature, advance
-        )
-    return table_of_series(
-        recording.head,
-        recording.testfield,
-        apart,
-        observations,
-        settings_for_series(settings, exterior),
-    )
+    with progress(len(recording), "calibrating") as advance:
+        return recorded_table(recording, settings, exterior, advance)[0]
 
 
 def _summary(
@@ -249,9 +222,8 @@ def _summary(
             if word != "ok"
         ],
     }
-    result = table.adjustment
-    if result is not None and table.exterior == "series":
-        document["stood_still"] = _stood_still(result.stillness)
+    if table.adjustment is not None and table.exterior == "series":
+        document["stood_still"] = _stood_still(table.stillness)
     return document
 
 

@@ -9,12 +9,15 @@ from __future__ import annotations
 import csv
 import importlib.util
 import io
+import json
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.analysis.series.table import CSV_COLUMNS, csv_text
 from thermocald.atomic_file import make_folder, new_file
 from thermocald.errors import DriverMissing, UsageError
 from thermocald.photogrammetry.parameters import PARAMETER_NAMES
@@ -22,7 +25,7 @@ from thermocald.store.recording.reader import open_recording
 from thermocald.store.sources import open_source
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -32,14 +35,18 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
     Columns = dict[str, NDArray[np.int64] | Array | tuple[str, ...]]
+    Row = dict[str, float | int | str | None]
 
 __all__ = [
     "Besides",
     "ExportStyle",
     "as_csv",
+    "as_json",
     "as_rows",
     "besides",
+    "column_parts",
     "columns_of",
+    "plain_rows",
     "style_of",
     "write_parquet",
 ]
@@ -120,8 +127,9 @@ def besides(
             pitch = stored.head.camera.sensor.pixel_pitch
             if extra:
                 values = _extra_of(store.epochs(stored, details=False), known)
-    row = {int(n): i for i, n in enumerate(known)}
-    rows = [row.get(int(n), -1) for n in numbers]
+    rows = np.searchsorted(known, numbers)
+    there = np.append(known, -1)[rows] == numbers
+    rows = np.where(there, rows, -1)
 
     def placed(columns: dict[str, Array]) -> dict[str, Array]:
         return {name: np.append(column, np.nan)[rows] for name, column in columns.items()}
@@ -130,6 +138,19 @@ def besides(
     for name, column in texts.items():
         others[name] = tuple("" if i < 0 else column[i] for i in rows)
     return Besides(pitch, placed(readings), others)
+
+
+def column_parts(
+    table: SeriesTable, style: ExportStyle, others: Besides | None = None
+) -> Iterator[Columns]:
+    """The columns of `columns_of`, some thousand rows at a time: a year has to fit into memory."""
+    others, done = others or Besides(), 0
+    for part in table.parts():
+        rows = slice(done, done + len(part.number))
+        extra: Columns = {name: values[rows] for name, values in others.extra.items()}
+        readings = {name: values[rows] for name, values in others.thermometers.items()}
+        yield columns_of(part, style, Besides(others.pixel_pitch, readings, extra))
+        done = rows.stop
 
 
 def _extra_of(epochs: Iterable[StoredEpoch], known: NDArray[np.int64]) -> dict[str, Array]:
@@ -196,23 +217,43 @@ def _iso(seconds: float) -> str:
     return moment.isoformat(timespec="microseconds").replace("+00:00", "Z")
 
 
-def as_csv(columns: Columns, style: ExportStyle) -> str:
+def as_csv(parts: Iterable[Columns], style: ExportStyle) -> Iterator[str]:
     """The columns as text; numbers keep every digit, what is not known stays empty."""
-    text = io.StringIO()
-    writer = csv.writer(text, delimiter=style.separator, lineterminator="\n")
-    writer.writerow(columns)
-    cells = [_cells(name, values, style) for name, values in columns.items()]
-    writer.writerows(zip(*cells, strict=True))
-    return text.getvalue()
+    for number, columns in enumerate(parts):
+        text = io.StringIO()
+        writer = csv.writer(text, delimiter=style.separator, lineterminator="\n")
+        if not number:
+            writer.writerow(columns)
+        cells = [_cells(name, values, style) for name, values in columns.items()]
+        writer.writerows(zip(*cells, strict=True))
+        yield text.getvalue()
 
 
-def as_rows(columns: Columns) -> list[dict[str, float | int | str | None]]:
+def as_rows(parts: Iterable[Columns]) -> Iterator[Row]:
     """The columns as a row per epoch for JSON; what is not known is null."""
-    lists = [
-        [None if isinstance(v, float) and not np.isfinite(v) else v for v in column]
-        for column in (c if isinstance(c, tuple) else c.tolist() for c in columns.values())
-    ]
-    return [dict(zip(columns, row, strict=True)) for row in zip(*lists, strict=True)]
+    for columns in parts:
+        lists = [
+            [None if isinstance(v, float) and not np.isfinite(v) else v for v in column]
+            for column in (c if isinstance(c, tuple) else c.tolist() for c in columns.values())
+        ]
+        for row in zip(*lists, strict=True):
+            yield dict(zip(columns, row, strict=True))
+
+
+def plain_rows(table: SeriesTable) -> Iterator[Row]:
+    """The rows of CONVENTIONS §4; what is not known is null."""
+    for line in islice(csv_text(table), 1, None):
+        cells = zip(CSV_COLUMNS, line.rstrip("\n").split(","), strict=True)
+        yield {n: v if n == "status" else float(v) if v else None for n, v in cells}
+
+
+def as_json(rows: Iterable[Row]) -> Iterator[str]:
+    """Rows as one JSON list, row by row."""
+    start = "[\n"
+    for row in rows:
+        yield start + " " + json.dumps(row, indent=1).replace("\n", "\n ")
+        start = ",\n"
+    yield "\n]\n" if start != "[\n" else "[]\n"
 
 
 def _cells(
@@ -229,15 +270,20 @@ def _cells(
     return [d.replace(".", style.decimal) for d in digits] if style.decimal != "." else digits
 
 
-def write_parquet(columns: Columns, path: Path) -> None:
+def write_parquet(parts: Iterable[Columns], path: Path) -> None:
     """The columns as a Parquet file, whole or not at all; numbers bit for bit."""
     if importlib.util.find_spec("pyarrow") is None:
         raise DriverMissing("writing Parquet needs pyarrow: pip install 'thermocald[parquet]'")
     import pyarrow as pa
     from pyarrow import parquet
 
-    table = pa.table({name: pa.array(list(v) if isinstance(v, tuple) else v)
-                         for name, v in columns.items()})  # fmt: skip
     make_folder(path.absolute().parent)
     with new_file(path) as partial:
-        parquet.write_table(table, partial)
+        writer = None
+        for columns in parts:
+            table = pa.table({name: pa.array(list(v) if isinstance(v, tuple) else v)
+                              for name, v in columns.items()})  # fmt: skip
+            writer = writer or parquet.ParquetWriter(partial, table.schema)
+            writer.write_table(table)
+        if writer is not None:
+            writer.close()

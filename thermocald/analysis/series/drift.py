@@ -88,8 +88,7 @@ def _lines(table: SeriesTable, names: tuple[str, ...]) -> dict[str, _Line]:
         y, sd = table.values[ok, column], table.sd[ok, column]
         if len(y) < _FEWEST or not np.isfinite(sd).all() or np.ptp(t) == 0:
             continue
-        tilt = table.adjustment.trend_sd[column] if table.adjustment is not None else 0.0
-        found.append(_Line(name, y, sd, *_line(t, y, float(tilt))))
+        found.append(_Line(name, y, sd, *_line(t, y, float(table.trend_sd[column]))))
     corrected = holm([line.p for line in found])
     return {line.name: replace(line, p=p) for line, p in zip(found, corrected, strict=True)}
 

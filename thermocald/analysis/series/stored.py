@@ -3,26 +3,37 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermocald.acquisition.calibrator import Calibrator
-from thermocald.analysis.series.table import SeriesTable, settings_for_series, table_of_series
+from thermocald.analysis.series.adjusted import settings_for_series, table_of_series
+from thermocald.analysis.series.table import SeriesTable
 from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
+from thermocald.photogrammetry.series.normals import ObservationGrid
+from thermocald.photogrammetry.series.spool import ColumnSpool
 from thermocald.store.database.row import EpochResult
 from thermocald.store.database.store import Store
 from thermocald.store.sources import open_source
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
+    from numpy.typing import NDArray
+
     from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
+    from thermocald.photogrammetry.field.testfield import Observations
     from thermocald.store.database.row import StoredSeries
     from thermocald.store.recording.reader import Recording
     from thermocald.store.sources import SeriesSource
+
+    Array = NDArray[np.float64]
+
+_GRID_POINTS = 300_000  # cells of a block
 
 __all__ = ["replay_into", "stored_table", "table_of_stored"]
 
@@ -95,41 +106,76 @@ def table_of_stored(
 ) -> SeriesTable:
     """The table of a series in an open store. Raises DataError where it has no epochs."""
     names = ["epoch", "frame_time", "sigma0", "n_observations", "n_rejected", "status"]
-    names += [*PARAMETER_NAMES, *(f"sd_{name}" for name in PARAMETER_NAMES)]
     columns = store.series_columns(series, names)
-    at_frame = store.temperatures_at_frame(series)
     size = len(columns["epoch"])
     if size == 0:
         raise DataError(f"{store.path}: series {series.name!r} has no epochs")
     ok = columns["status"] == "ok"
     reasons = [""] * size
     if not ok.all():
-        rows = {int(n): i for i, n in enumerate(columns["epoch"])}
+        rows = {int(n): i for i, n in enumerate(columns["epoch"]) if not ok[i]}
         for stored in store.epochs(series, details=False):
-            reasons[rows[stored.epoch.number]] = stored.result.reason
-    values = np.column_stack([columns[name] for name in PARAMETER_NAMES])
-    sd = np.column_stack([columns[f"sd_{name}"] for name in PARAMETER_NAMES])
-    values[~ok], sd[~ok] = np.nan, np.nan
+            if stored.epoch.number in rows:
+                reasons[rows[stored.epoch.number]] = stored.result.reason
     apart = SeriesTable(
         columns["epoch"].astype(np.int64),
         columns["frame_time"],
-        next(iter(at_frame.values()), np.full(size, np.nan)),
-        values,
-        sd,
+        next(iter(store.temperatures_at_frame(series).values()), np.full(size, np.nan)),
+        _parameters(store, series, "", ok),
+        _parameters(store, series, "sd_", ok),
         np.where(ok, columns["sigma0"], np.nan),
         columns["n_observations"].astype(np.int64),
         columns["n_rejected"].astype(np.int64),
-        tuple(str(word) for word in columns["status"]),
+        tuple(columns["status"].tolist()),
         tuple(reasons),
         "per_epoch",
     )
     if not ok.any() or exterior == "stored":
         return apart
-    observations = [stored.epoch.observations for stored in store.epochs(series)]
     return table_of_series(
         series.head,
         series.testfield,
         apart,
-        observations,
+        _StoredBlocks(store, series, apart.number),
         settings_for_series(settings, exterior),
     )
+
+
+def _parameters(
+    store: SeriesSource, series: StoredSeries, prefix: str, ok: NDArray[np.bool_]
+) -> Array:
+    """Columns (E, 16) of all parameters, one after the other, for a year of epochs must fit."""
+    spool = ColumnSpool(len(ok), 16)
+    for k, name in enumerate(PARAMETER_NAMES):
+        column = store.series_columns(series, [f"{prefix}{name}"])[f"{prefix}{name}"]
+        spool.array[:, k] = np.where(ok, column[: len(ok)], np.nan)
+        spool.release()
+    return spool.array
+
+
+@dataclass(frozen=True, eq=False)
+class _StoredBlocks:
+    """The observations of a series in a store; numbers (E,): of its epochs."""
+
+    store: SeriesSource
+    series: StoredSeries
+    numbers: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def blocks(
+        self, windows: Sequence[slice] | None = None
+    ) -> Iterator[tuple[int, ObservationGrid]]:
+        field = self.series.testfield
+        size = max(_GRID_POINTS // len(field), 1)
+        for window in windows or (slice(0, len(self)),):
+            for first in range(window.start, window.stop, size):
+                numbers = self.numbers[first : min(first + size, window.stop)]
+                part: list[Observations | None] = [None] * len(numbers)
+                found = self.store.epochs(self.series, int(numbers[0]), int(numbers[-1]))
+                for stored in found:
+                    row = int(np.searchsorted(numbers, stored.epoch.number))
+                    if row < len(numbers) and numbers[row] == stored.epoch.number:
+                        part[row] = stored.epoch.observations
+                yield first, ObservationGrid.from_observations(field, part)

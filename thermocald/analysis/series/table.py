@@ -1,46 +1,33 @@
 """The table of a series: one row per epoch with its parameters, as exports and summaries need it.
 
-Comes from a recording or a store. With `exterior="per_epoch"` a store's rows are taken as they
-were stored; with `exterior="series"` all epochs are adjusted together from their observations.
+Comes from a recording or a store: epochs one by one as they were calibrated or stored, or all
+adjusted together from their observations (`adjusted`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.errors import DataError
-from thermocald.photogrammetry.camera.camera_model import (
-    PARAMETER_NAMES,
-    ExteriorOrientation,
-    InteriorOrientation,
-)
-from thermocald.photogrammetry.parameters import EOP, IOP
-from thermocald.photogrammetry.series.adjustment import (
-    SeriesAdjustment,
-    SeriesSettings,
-    adjust_series,
-)
-from thermocald.photogrammetry.series.mount import drift_period
+from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
+from thermocald.photogrammetry.series.spool import released
 from thermocald.store.recording.reader import interpolate_readings
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from numpy.typing import NDArray
 
     from thermocald.acquisition.calibrator import Calibrator
     from thermocald.epoch import Epoch
-    from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
-    from thermocald.photogrammetry.field.testfield import Observations, TestField
-    from thermocald.photogrammetry.series.result import Exterior
-    from thermocald.store.recording.head import Head
+    from thermocald.photogrammetry.field.testfield import Observations
+    from thermocald.photogrammetry.series.adjustment import SeriesAdjustment
 
     Array = NDArray[np.float64]
 
-__all__ = ["CSV_COLUMNS", "SeriesTable", "calibrate_epochs", "csv_text", "table_of_series"]
+__all__ = ["BY_EPOCH", "CSV_COLUMNS", "SeriesTable", "calibrate_epochs", "csv_text"]
 
 CSV_COLUMNS = (
     "epoch",
@@ -54,7 +41,13 @@ CSV_COLUMNS = (
     *(f"sd_{name}" for name in PARAMETER_NAMES),
 )
 
-_MOST_TOGETHER = 50_000  # epochs: beyond, a series is adjusted epoch by epoch
+_ROWS = 20_000  # of a table that are worked on at a time
+
+
+BY_EPOCH = (
+    "number", "frame_time", "temperature", "values", "sd", "sigma0", "n_observations",
+    "n_rejected", "status", "reasons", "redundancy", "stillness",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +78,25 @@ class SeriesTable:
     groups: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
     without: Callable[[NDArray[np.int64], bool], SeriesTable] | None = None
     left_out: tuple[str, ...] = ()
+    trend_sd: Array = field(default_factory=lambda: np.zeros(16))
+    redundancy: Array = field(default_factory=lambda: np.zeros(0))
+    stillness: Array = field(default_factory=lambda: np.zeros(0))
+    sampled: NDArray[np.int64] | None = None
+
+    def part(self, rows: slice) -> SeriesTable:
+        """Some rows, without what belongs to the series as a whole."""
+        return replace(
+            self,
+            **{name: getattr(self, name)[rows] for name in BY_EPOCH},
+            adjustment=None, sampled=None, without=None,
+        )  # fmt: skip
+
+    def parts(self) -> Iterator[SeriesTable]:
+        """All rows, some thousand at a time; what was used of a long series leaves memory."""
+        for first in range(0, len(self.number), _ROWS):
+            yield self.part(slice(first, first + _ROWS))
+            released(self.values)
+            released(self.sd)
 
     @property
     def ok(self) -> NDArray[np.bool_]:
@@ -126,97 +138,6 @@ def calibrate_epochs(
     return table, observations
 
 
-def table_of_series(
-    head: Head,
-    testfield: TestField,
-    apart: SeriesTable,
-    observations: Sequence[Observations | None],
-    settings: SeriesSettings,
-) -> SeriesTable:
-    """The series adjusted together, from the table of its epochs one by one.
-
-    Raises DataError where no epoch has a result to start from.
-    """
-    ok = apart.ok
-    if not ok.any():
-        reasons = sorted({r for r in apart.reasons if r}, key=apart.reasons.count)
-        raise DataError(
-            f"{head.name}: no epoch has a result; most often: {reasons[-1] if reasons else '-'}"
-        )
-    if len(observations) > _MOST_TOGETHER:
-        raise DataError(
-            f"{head.name}: {len(observations)} epochs are too many to be adjusted together (at "
-            f"most {_MOST_TOGETHER}); use --exterior per_epoch"
-        )
-    start = np.median(apart.values[ok], axis=0)
-    settings = replace(settings, drift_period=drift_period(apart.frame_time, apart.temperature))
-
-    def without(rows: NDArray[np.int64], quick: bool) -> SeriesTable:
-        left = [None if o is None else o.select(~np.isin(o.targets, rows)) for o in observations]
-        if quick:
-            used = result.observed
-            left = [None if o is None else o.select(used[e, o.targets]) for e, o in enumerate(left)]
-        rough = replace(settings, exterior=result.exterior)
-        if quick:
-            rough = replace(rough, snooping_alpha=0.0, target_noise=False)
-        return table_of_series(head, testfield, apart, left, rough)
-
-    result = adjust_series(
-        head.camera.sensor,
-        testfield,
-        observations,
-        InteriorOrientation.from_array(start[IOP]),
-        ExteriorOrientation.from_array(start[EOP]),
-        settings,
-    )
-    observed, rejected = result.observed.sum(axis=1), result.rejected.sum(axis=1)
-    # What the epoch itself said of a frame without a result says more than "no observations".
-    pairs = [
-        (mine, why) if word == "no_observations" and mine != "ok" else (word, reason)
-        for word, reason, mine, why in zip(
-            result.status, result.reasons, apart.status, apart.reasons, strict=True
-        )
-    ]
-    good = result.ok
-    return SeriesTable(
-        apart.number,
-        apart.frame_time,
-        apart.temperature,
-        result.values,
-        result.sd,
-        np.where(good, result.sigma0, np.nan),
-        observed + rejected,
-        rejected,
-        tuple(word for word, _ in pairs),
-        tuple(reason for _, reason in pairs),
-        result.exterior,
-        result.level_sd,
-        result,
-        _groups(testfield, result),
-        without,
-    )
-
-
-def _groups(testfield: TestField, result: SeriesAdjustment) -> dict[str, NDArray[np.int64]]:
-    """The groups of targets that take part, by the name of their first."""
-    seen = result.observed.any(axis=0)
-    rows: dict[int, list[int]] = {}
-    for row in np.flatnonzero(seen):
-        rows.setdefault(int(testfield.groups[row]), []).append(int(row))
-    return {testfield.names[members[0]]: np.array(members) for members in rows.values()}
-
-
-def settings_for_series(settings: AdjustmentSettings, exterior: str) -> SeriesSettings:
-    """The series' settings that go with those of single epochs."""
-    return SeriesSettings(
-        exterior=cast("Exterior", exterior),
-        free=settings.free,
-        scale=settings.scale,
-        bounds=settings.bounds,
-        max_rejected=settings.max_rejected,
-    )
-
-
 def frame_temperatures(
     number: NDArray[np.int64], frame_time: Array, reading_time: Array, readings: Array
 ) -> dict[int, float]:
@@ -230,11 +151,13 @@ def csv_text(table: SeriesTable) -> Iterable[str]:
     yield ",".join(CSV_COLUMNS) + "\n"
 
     def cell(value: float) -> str:
-        return repr(float(value)) if np.isfinite(value) else ""
+        return repr(value) if np.isfinite(value) else ""
 
-    for i, number in enumerate(table.number):
-        row = [str(int(number)), f"{table.frame_time[i]:.6f}", cell(table.temperature[i])]
-        row += [cell(v) for v in table.values[i]]
-        row += [cell(table.sigma0[i]), str(table.n_observations[i]), str(table.n_rejected[i])]
-        row += [table.status[i], *(cell(v) for v in table.sd[i])]
-        yield ",".join(row) + "\n"
+    for part in table.parts():
+        for i, number in enumerate(part.number.tolist()):
+            row = [str(number), f"{part.frame_time[i]:.6f}", cell(float(part.temperature[i]))]
+            row += [cell(v) for v in part.values[i].tolist()]
+            row += [cell(float(part.sigma0[i])), str(part.n_observations[i])]
+            row += [str(part.n_rejected[i]), part.status[i]]
+            row += [cell(v) for v in part.sd[i].tolist()]
+            yield ",".join(row) + "\n"

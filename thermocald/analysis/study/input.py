@@ -1,9 +1,9 @@
 """Measured series for the study, from recordings and stores.
 
 Unless `exterior="per_epoch"` all epochs are adjusted together from their observations: one exterior
-orientation for a camera that stood still, movements of its mount, or what the data show. A series
-too long for that, or `exterior="per_epoch"` from a store, is read as it was stored, column by
-column, with a sample of its covariance matrices.
+orientation for a camera that stood still, movements of its mount, or what the data show. With
+`exterior="per_epoch"` a store's series is read as it was stored, column by column, with a sample of
+its covariance matrices.
 """
 
 from __future__ import annotations
@@ -12,18 +12,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.acquisition.calibrator import Calibrator
+from thermocald.analysis.series.recorded import recorded_table
 from thermocald.analysis.series.stored import table_of_stored
-from thermocald.analysis.series.table import (
-    calibrate_epochs,
-    settings_for_series,
-    table_of_series,
-)
 from thermocald.analysis.statistics.correlations import correlations_of
 from thermocald.analysis.study.measured import Clip, MeasuredSeries, Thermometer
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
+from thermocald.photogrammetry.series.spool import released
 from thermocald.reduction.thermometer import reading_noise
 from thermocald.store.recording.reader import open_recording
 from thermocald.store.recording.readings import interpolate_readings
@@ -47,7 +43,6 @@ if TYPE_CHECKING:
 __all__ = ["from_recording", "from_store", "load_series"]
 
 _MOST_MATRICES = 5000
-_MOST_TOGETHER = 50_000  # epochs
 
 
 def load_series(
@@ -88,15 +83,7 @@ def from_recording(
     """A recording, its frames measured where they are not, adjusted as one series."""
     columns, camera = recording.columns, recording.camera
     settings = AdjustmentSettings(free=tuple(free))
-    calibrator = Calibrator.of_recording(recording, settings)
-    apart, observations = calibrate_epochs(recording.iter_epochs(), calibrator, {}, advance)
-    table = table_of_series(
-        recording.head,
-        recording.testfield,
-        apart,
-        observations,
-        settings_for_series(settings, exterior),
-    )
+    table, observations = recorded_table(recording, settings, exterior, advance)
     thermometers = [
         _thermometer(
             name,
@@ -115,7 +102,7 @@ def from_recording(
         clip = _clip(
             (recording.path / columns.frames[first], recording.path / columns.frames[last]),
             (int(columns.numbers[first]), int(columns.numbers[last])),
-            (observations[first], observations[last]),
+            (observations(first), observations(last)),
             recording.testfield.names,
             camera.sensor.centre,
         )
@@ -135,7 +122,7 @@ def from_store(
     start = f"-{series.start}" if series.start else ""
     label = label or series.camera + start
     count = len(store.series_columns(series, ["epoch"])["epoch"])
-    if exterior != "per_epoch" and 0 < count <= _MOST_TOGETHER:
+    if exterior != "per_epoch" and count:
         free = tuple(series.settings.get("free", DEFAULT_FREE))
         table = table_of_stored(store, series, AdjustmentSettings(free=free), exterior)
         thermometers = _stored_thermometers(store, series, table.frame_time, thermometer_sd)
@@ -209,11 +196,16 @@ def _from_table(
     assert adjustment is not None  # table_of_series always has one
     ok, lost = _assessed(np.array(table.status))
     ok = _whole(ok, table.values[:, :10], table.sd[:, :10], lost)
+    released(table.values)
+    released(table.sd)
     if not ok.any():
         why = next((reason for reason in table.reasons if reason), _in_words(lost))
         raise DataError(f"{source}: no epoch has a result: {why}")
-    rows = _spread(int(ok.sum()), _MOST_MATRICES)
-    covariances = adjustment.covariance[np.flatnonzero(ok)[rows]][:, :10, :10]
+    of = np.arange(len(ok)) if table.sampled is None else table.sampled
+    have = np.flatnonzero(ok[of] & adjustment.ok)
+    some = have[_spread(len(have), _MOST_MATRICES)]
+    covariances = adjustment.covariance[some][:, :10, :10]
+    rows = (np.cumsum(ok) - 1)[of[some]]
     time_s = table.frame_time[ok]
     return MeasuredSeries(
         label,
@@ -224,10 +216,10 @@ def _from_table(
         table.number[ok],
         time_s - time_s[0],
         tuple(Thermometer(t.name, t.values[ok], t.sd) for t in thermometers),
-        np.asfortranarray(table.values[ok, :10]),
-        np.asfortranarray(table.sd[ok, :10]),
+        _columns(table.values, ok),
+        _columns(table.sd, ok),
         table.sigma0[ok],
-        adjustment.redundancy[ok],
+        table.redundancy[ok],
         correlations_of(covariances),
         rows,
         table.exterior,
@@ -237,6 +229,15 @@ def _from_table(
         adjustment.choice,
         adjustment.noise_ratio,
     )
+
+
+def _columns(values: Array, ok: NDArray[np.bool_]) -> Array:
+    """The interior orientation (n, 10) of the epochs with a result, column by column."""
+    out = np.empty((int(ok.sum()), 10), order="F")
+    for k in range(10):
+        out[:, k] = values[ok, k]
+        released(values)
+    return out
 
 
 def _thermometer(

@@ -7,14 +7,23 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from thermocald.photogrammetry.series.normals import ObservationGrid
+from thermocald.photogrammetry.series.normals import ObservationGrid, planes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
-__all__ = ["GridBlocks", "ObservationBlocks", "WithoutTargets", "gathered", "spread_windows"]
+    from thermocald.photogrammetry.field.testfield import Observations, TestField
+
+__all__ = [
+    "GridBlocks",
+    "ObservationBlocks",
+    "ObservedBlocks",
+    "WithoutTargets",
+    "gathered",
+    "spread_windows",
+]
 
 
 class ObservationBlocks(Protocol):
@@ -53,6 +62,27 @@ class GridBlocks:
 
 
 @dataclass(frozen=True, eq=False)
+class ObservedBlocks:
+    """Observations of epochs in memory, None for an epoch without, laid out `size` at a time."""
+
+    field: TestField
+    observations: Sequence[Observations | None]
+    size: int = 1000
+
+    def __len__(self) -> int:
+        return len(self.observations)
+
+    def blocks(
+        self, windows: Sequence[slice] | None = None
+    ) -> Iterator[tuple[int, ObservationGrid]]:
+        """The blocks; of windows, each begins one."""
+        for window in windows or (slice(0, len(self)),):
+            for first in range(window.start, window.stop, self.size):
+                part = self.observations[first : min(first + self.size, window.stop)]
+                yield first, ObservationGrid.from_observations(self.field, part)
+
+
+@dataclass(frozen=True, eq=False)
 class WithoutTargets:
     """The same as if some targets (rows of the field) had never been observed."""
 
@@ -86,7 +116,15 @@ def spread_windows(epochs: int, most: int, count: int = 12) -> tuple[slice, ...]
 
 def gathered(source: ObservationBlocks, windows: Sequence[slice]) -> ObservationGrid:
     """The epochs of some windows on one grid."""
-    parts = [grid for _, grid in source.blocks(windows)]
-    return ObservationGrid(
-        np.concatenate([p.points for p in parts]), np.concatenate([p.weights for p in parts])
-    )
+    if isinstance(source, GridBlocks) and len(windows) == 1 and len(source) == windows[0].stop:
+        return source.grid
+    whole: ObservationGrid | None = None
+    done = 0
+    for _, grid in source.blocks(windows):
+        if whole is None:
+            size = sum(w.stop - w.start for w in windows), grid.points.shape[1]
+            whole = ObservationGrid(planes(2, *size), planes(3, *size))
+        rows = slice(done, done + len(grid))
+        whole.points[rows], whole.weights[rows] = grid.points, grid.weights
+        done += len(grid)
+    return whole or ObservationGrid(planes(2, 0, 0), planes(3, 0, 0))

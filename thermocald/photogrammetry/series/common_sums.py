@@ -1,9 +1,9 @@
 """The common unknowns of a long series, summed over its blocks of epochs.
 
 Each block adds its normal equations with the own parameters of its epochs reduced. At the epochs'
-own solution the reduced right-hand side is the plain gradient, which is summed epoch by epoch; the
-matrix is that of the mean weights of epochs that see the same targets, which differs from the sum
-by the square of how much weights vary, and takes a hundredth of the time.
+own solution the reduced right-hand side is the plain gradient, which is summed epoch by epoch. The
+matrix is that of the mean weights of all epochs that see the same targets; it differs from the sum
+by the square of how much their weights vary, and costs one reduction per kind of epoch.
 
 Source: Helmert blocking, Wolf, H. (1978): The Helmert block method.
 """
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
     Mask = NDArray[np.bool_]
     Columns = NDArray[np.int64]
 
-__all__ = ["Alike", "CommonSums", "Shared", "kinds_of", "level_of"]
+__all__ = ["Alike", "CommonSums", "Shared", "Solved", "kinds_of", "level_of"]
 
 _FEW = 0.02  # share of a block's epochs that is worth a matrix of its own
 _MOST = 12  # kinds of epochs in a block
-_MOST_KEPT = 40  # kinds of which the last change is checked
+_MOST_PATTERNS = 300  # of targets seen, over the series; the epochs of others count together
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,34 +59,47 @@ class Alike:
 
 
 @dataclass(eq=False)
+class _Pattern:
+    """Epochs that see the same targets: how many, sums of their weights (T, 3), of their numbers,
+    and of the gradients (p,) of their own parameters.
+    """
+
+    epochs: int
+    weights: Array
+    times: float
+    right: Array
+
+
+@dataclass(eq=False)
 class CommonSums:
     """The sums over the blocks so far.
 
-    q: common parameters beside the offsets; normal (q + 2T, q + 2T), gradient (q + 2T,); mean, tilt
-    (p, q + 2T): sums of G and of G times the epoch; epochs, times, squares: how many, sums of the
-    epochs' numbers and their squares; kinds: G of each kind of epoch that was seen.
+    at: linearisation; own (p,), common (q,): columns; own_prior (p, p) as in `SeriesSystem`; prior
+    (T, 3) px⁻²: of the offsets, None without; gradient (q + 2T,); epochs, times, squares: how many,
+    sums of their numbers and of the squares; ends: the first and the last.
     """
 
-    q: int
-    width: int
-    own: int
-    normal: Array = field(init=False)
+    at: Partials
+    own: Columns
+    common: Columns
+    own_prior: Array
+    prior: Array | None
     gradient: Array = field(init=False)
-    mean: Array = field(init=False)
-    tilt: Array = field(init=False)
     epochs: int = 0
     times: float = 0.0
     squares: float = 0.0
     ends: tuple[int, int] | None = None
-    kinds: list[tuple[Array, Array]] = field(default_factory=list)
+    patterns: dict[bytes, _Pattern] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.normal = np.zeros((self.width, self.width))
         self.gradient = np.zeros(self.width)
-        self.mean, self.tilt = np.zeros((self.own, self.width)), np.zeros((self.own, self.width))
 
-    def add(self, first: int, kinds: list[Alike], system: SeriesSystem, left: Array,
-            right: Array) -> None:  # fmt: skip
+    @property
+    def width(self) -> int:
+        """How many common unknowns there are."""
+        return len(self.common) + (0 if self.prior is None else 2 * len(self.at.A))
+
+    def add(self, first: int, system: SeriesSystem, left: Array, right: Array) -> None:
         """Add a block that begins at epoch `first`.
 
         system: of the block, its common unknowns held; left (E, T, 2) px: residuals; right (E, p):
@@ -95,79 +108,110 @@ class CommonSums:
         good = np.flatnonzero(system.good)
         if not len(good):
             return
-        self.ends = (self.ends[0] if self.ends else first + int(good[0]), first + int(good[-1]))
+        t = (first + good).astype(np.float64)
+        self.ends = (self.ends[0] if self.ends else int(t[0]), int(t[-1]))
+        self.epochs += len(good)
+        self.times += float(t.sum())
+        self.squares += float(t @ t)
         if not self.width:
             return
-        common = kinds[0].system.common
         w = np.where(system.use[..., None], system.weights, 0.0)[good]
         v = np.nan_to_num(left[good])
-        b = right_hand_sides(w, v, system.at.A[..., common]).sum(axis=0)
-        total = [b]
-        if self.width > self.q:
+        total = [right_hand_sides(w, v, self.at.A[..., self.common]).sum(axis=0)]
+        if self.prior is not None:
             total.append((w[..., 0] * v[..., 0] + w[..., 2] * v[..., 1]).sum(axis=0))
             total.append((w[..., 2] * v[..., 0] + w[..., 1] * v[..., 1]).sum(axis=0))
         self.gradient += np.concatenate(total)
-        for kind in kinds:
-            n, t = len(kind.rows), (first + kind.rows).astype(np.float64)
-            self.normal += n * kind.system.common_normals()
-            self.gradient -= kind.G.T @ right[kind.rows].sum(axis=0)
-            self.mean += n * kind.G
-            self.tilt += t.sum() * kind.G
-            self.epochs, self.times = self.epochs + n, self.times + float(t.sum())
-            self.squares += float(t @ t)
-            new = all(not np.allclose(kind.G, G, rtol=0.02, atol=1e-12) for G, _ in self.kinds)
-            if new and len(self.kinds) < _MOST_KEPT:
-                self.kinds.append((kind.G, np.sqrt(np.diag(kind.system.Q[0]))))
+        seen, of = np.unique(np.packbits(system.use[good], axis=1), axis=0, return_inverse=True)
+        for k, bits in enumerate(seen):
+            rows = np.flatnonzero(of.ravel() == k)
+            key = bits.tobytes()
+            if key not in self.patterns and len(self.patterns) >= _MOST_PATTERNS:
+                key = b""
+            if key not in self.patterns:
+                empty = np.zeros((len(self.at.A), 3)), np.zeros(len(self.own))
+                self.patterns[key] = _Pattern(0, empty[0], 0.0, empty[1])
+            found = self.patterns[key]
+            found.epochs += len(rows)
+            found.weights += w[rows].sum(axis=0)
+            found.times += float(t[rows].sum())
+            found.right += right[good[rows]].sum(axis=0)
 
-    def solved(self, known: Shared, prior: Array | None) -> tuple[Shared, Array, float]:
-        """What is known with these sums, the mean change (p,) of own parameters that goes with it,
-        and by how many of their standard deviations single epochs change otherwise.
-
-        prior (T, 3) px⁻²: of the offsets, in the units of the weights.
-        """
-        if not self.width or not self.epochs:
-            return known, np.zeros(self.own), 0.0
-        normal, gradient, q = self.normal.copy(), self.gradient.copy(), self.q
-        if prior is not None:
-            T = len(prior)
+    def solved(self, known: Shared) -> Solved:
+        """What is known with these sums."""
+        p, q, n = len(self.own), len(self.common), max(self.epochs, 1)
+        normal, gradient = np.zeros((self.width, self.width)), self.gradient.copy()
+        mean, tilt = np.zeros((2, p, self.width))
+        kinds = []
+        for pattern in self.patterns.values() if self.width else ():
+            one = _typical(self, pattern.weights / pattern.epochs)
+            if not one.good[0]:
+                continue
+            G = _sensitivity(one)
+            normal += pattern.epochs * one.common_normals()
+            gradient -= G.T @ pattern.right
+            mean += pattern.epochs * G
+            tilt += pattern.times * G
+            kinds.append((G, np.sqrt(np.diag(one.Q[0]))))
+        mean /= n
+        if self.prior is not None:
+            T, o, w = len(self.prior), known.offsets, self.prior
             x, y = np.arange(q, q + T), np.arange(q + T, q + 2 * T)
-            normal[x, x] += prior[:, 0]
-            normal[y, y] += prior[:, 1]
-            normal[x, y] += prior[:, 2]
-            normal[y, x] += prior[:, 2]
-            o = known.offsets
-            gradient[x] -= prior[:, 0] * o[:, 0] + prior[:, 2] * o[:, 1]
-            gradient[y] -= prior[:, 2] * o[:, 0] + prior[:, 1] * o[:, 1]
+            normal[x, x] += w[:, 0]
+            normal[y, y] += w[:, 1]
+            normal[x, y] += w[:, 2]
+            normal[y, x] += w[:, 2]
+            gradient[x] -= w[:, 0] * o[:, 0] + w[:, 2] * o[:, 1]
+            gradient[y] -= w[:, 2] * o[:, 0] + w[:, 1] * o[:, 1]
         cofactors = inverse_of_determined(normal)
         change = cofactors @ gradient
-        mean = self.mean / self.epochs
         offsets = known.offsets
-        if prior is not None:
+        if self.prior is not None:
             offsets = offsets + change[q:].reshape(2, -1).T
-        new = Shared(offsets, known.pose + (change[:6] if q else 0.0), cofactors, mean)
-        rest = max(
-            (float(np.max(np.abs((G - mean) @ change) / sd)) for G, sd in self.kinds), default=0.0
-        )
-        return new, -mean @ change, rest
-
-    def line(self) -> Array:
-        """Covariance root (p, q + 2T) of a straight line from the first to the last epoch: what
-        common unknowns with unit errors do to it.
-        """
-        if not self.epochs or self.ends is None:
-            return np.zeros((self.own, self.width))
-        middle = self.times / self.epochs
-        spread = self.squares - self.epochs * middle**2
-        if spread <= 0:
-            return np.zeros((self.own, self.width))
-        out: Array = (self.tilt - middle * self.mean) / spread * (self.ends[1] - self.ends[0])
-        return out
+        rest = max((float(np.max(np.abs((G - mean) @ change) / sd)) for G, sd in kinds), default=0)
+        middle = self.times / n
+        spread = self.squares - n * middle**2
+        line = np.zeros((p, self.width))
+        if spread > 0 and self.ends is not None:
+            line = (tilt - middle * n * mean) / spread * (self.ends[1] - self.ends[0])
+        pose = known.pose + change[:q] if q else known.pose
+        return Solved(Shared(offsets, pose, cofactors, mean), -mean @ change, line, rest)
 
 
-def kinds_of(system: SeriesSystem, common: Columns, targets: bool, at: Partials) -> list[Alike]:
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """The common unknowns from all sums: shared; own (p,): the mean change of own parameters that
+    goes with them; line (p, q + 2T): what they do to a straight line from the first to the last
+    epoch; rest: by how many of their standard deviations single kinds of epochs change otherwise.
+    """
+
+    shared: Shared
+    own: Array
+    line: Array
+    rest: float
+
+
+def _typical(sums: CommonSums, weights: Array) -> SeriesSystem:
+    """The system of one epoch with some weights (T, 3)."""
+    w = weights[None]
+    zero = None if sums.prior is None else np.zeros((len(weights), 3))
+    return SeriesSystem.formed(
+        sums.at, w, w[..., 0] > 0, sums.own, sums.common, zero, sums.own_prior
+    )
+
+
+def _sensitivity(one: SeriesSystem) -> Array:
+    """G (p, q + 2T): by how much own parameters of an epoch follow the common unknowns."""
+    coupling = next((C for _, C in one.couplings()), None)
+    width = len(one.common) + (0 if one.prior is None else 2 * len(one.at.A))
+    out: Array = np.zeros((len(one.own), width)) if coupling is None else one.Q[0] @ coupling[0]
+    return out
+
+
+def kinds_of(sums: CommonSums, system: SeriesSystem) -> list[Alike]:
     """The kinds of epochs of a block: the frequent ones by what they see, the others together.
 
-    system: of the block, its common unknowns held; targets: whether offsets are common unknowns.
+    system: of the block, its common unknowns held.
     """
     good = np.flatnonzero(system.good)
     if not len(good):
@@ -181,17 +225,12 @@ def kinds_of(system: SeriesSystem, common: Columns, targets: bool, at: Partials)
     rest = good[~np.isin(of, often)]
     if len(rest):
         groups.append(rest)
-    zero = np.zeros((len(at.A), 3)) if targets else None
     out = []
     for rows in groups:
-        w = np.where(system.use[rows][..., None], system.weights[rows], 0.0).mean(axis=0)[None]
-        one = SeriesSystem.formed(at, w, w[..., 0] > 0, system.own, common, zero, system.own_prior)
-        if not one.good[0]:
-            continue
-        coupling = [C for _, C in one.couplings()]
-        width = len(common) + (2 * len(at.A) if targets else 0)
-        G = one.Q[0] @ coupling[0][0] if coupling else np.zeros((len(system.own), width))
-        out.append(Alike(rows, one, G))
+        w = np.where(system.use[rows][..., None], system.weights[rows], 0.0)
+        one = _typical(sums, w.mean(axis=0))
+        if one.good[0]:
+            out.append(Alike(rows, one, _sensitivity(one)))
     return out
 
 

@@ -52,6 +52,7 @@ ENOUGH_FOR_NOISE = 20
 
 _ITERATIONS = 15
 _SMALL = 0.1  # standard deviations: a last step that the partials carry to 1e-3
+_SMALLER = 1e-4  # of one block among many: the result must not depend on the blocks
 _NEAR = 10.0  # standard deviations: by what the residuals follow a step by the partials
 _ROUNDS = 8  # of data snooping
 _RELINEARISE_PX = 1.0  # movement of the mean that changes the partials by more than about 1e-3
@@ -145,7 +146,7 @@ class SeriesEstimator:
             if len(system.common):
                 pose = pose + step.d_common
             offsets = offsets + step.d_offsets
-            if step.size < _SMALL:
+            if step.size < (_SMALL if self.held is None else _SMALLER):
                 system.move(residuals, step)
                 break
             residuals = self._residuals(values, offsets, residuals)
@@ -250,7 +251,7 @@ class SeriesEstimator:
         for _ in range(_ITERATIONS):
             step = system.step(left, offsets, self.deviations(values, pose))
             values[:, system.own] += step.d_own
-            if step.size < _NEAR:
+            if step.size < (_NEAR if self.held is None else _SMALLER):
                 system.move(left, step)
                 break
             left = self._residuals(values, offsets, left)

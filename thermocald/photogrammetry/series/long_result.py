@@ -52,7 +52,7 @@ class RowWriter:
         self._spools = ColumnSpool(epochs, 16), ColumnSpool(epochs, 16)
         self.values, self.sd = (spool.array for spool in self._spools)
         self.sigma0, self.redundancy, self.stillness = np.full((3, epochs), np.nan)
-        self.observed, self.rejected = np.zeros((2, epochs), dtype=np.int32)
+        self.observed, self.rejected = np.zeros((2, epochs), dtype=np.int64)
         self._ok = np.zeros(epochs, dtype=bool)
         self._word, self._reason = np.zeros((2, epochs), dtype=np.uint16)
         self._words: dict[str, int] = {"": 0}

@@ -27,7 +27,13 @@ from thermocald.photogrammetry.series.adjustment import (
     result,
 )
 from thermocald.photogrammetry.series.blocks import gathered, spread_windows
-from thermocald.photogrammetry.series.common_sums import CommonSums, Shared, kinds_of, level_of
+from thermocald.photogrammetry.series.common_sums import (
+    CommonSums,
+    Shared,
+    Solved,
+    kinds_of,
+    level_of,
+)
 from thermocald.photogrammetry.series.estimator import ENOUGH_FOR_NOISE, SeriesEstimator, Start
 from thermocald.photogrammetry.series.long_result import LongAdjustment, RowWriter
 from thermocald.photogrammetry.series.normals import (
@@ -60,14 +66,15 @@ if TYPE_CHECKING:
 __all__ = ["adjust_long_series", "together_at_most"]
 
 _TOGETHER_POINTS = 1_300_000  # a day of 150 targets: 200 MB
-_FEWEST_TOGETHER = 2_000
+_FEWEST_TOGETHER, _MOST_TOGETHER = 2_000, 10_000  # epochs
 _PASSES = 3
 _SAME = 0.05  # standard deviations that the last pass may leave an epoch without
 
 
 def together_at_most(targets: int) -> int:
     """How many epochs of so many targets are adjusted at once."""
-    return max(_TOGETHER_POINTS // max(targets, 1), _FEWEST_TOGETHER)
+    wanted = _TOGETHER_POINTS // max(targets, 1)
+    return min(max(wanted, _FEWEST_TOGETHER), _MOST_TOGETHER)
 
 
 def adjust_long_series(
@@ -121,11 +128,10 @@ class _Blocks:
         """What a sample of a series of so many epochs says."""
         series, estimate = found.series, found.estimate
         system = estimate.system
-        kinds = kinds_of(system, series.common, series.has_offsets, system.at)
-        n = max(sum(len(k.rows) for k in kinds), 1)
-        mean = np.zeros((len(system.own), len(system.Q_common)))
-        for kind in kinds:
-            mean += len(kind.rows) / n * kind.G
+        sums = _sums(series, estimate.system, series.variance(estimate))
+        sums.add(0, system, estimate.residuals, np.zeros((len(found.use), len(system.own))))
+        known = Shared(estimate.offsets, estimate.pose, system.Q_common, np.zeros((0, 0)))
+        known = replace(known, mean=sums.solved(known).shared.mean)
         slow, pairs = np.zeros((16, 16)), None
         if series.s.target_noise and len(found.use) >= ENOUGH_FOR_NOISE:
             pairs = series.pairs(estimate, found.use)
@@ -135,18 +141,10 @@ class _Blocks:
         if len(series.common):
             middle[EOP] = estimate.pose
         return cls(
-            found, epochs, Shared(estimate.offsets, estimate.pose, system.Q_common, mean),
+            found, epochs, known,
             series.variance(estimate), sample.excess_sd**2, slow, _ratios(series), middle,
             pairs if pairs is not None and len(pairs) else None, sample.movement,
         )  # fmt: skip
-
-    @property
-    def prior(self) -> Array | None:
-        """Weights (T, 3) px⁻² of the offsets' prior."""
-        series = self.found.series
-        if not series.has_offsets:
-            return None
-        return series.offset_prior(self.found.estimate.system.at) * self.unit
 
     def adjust(
         self, source: ObservationBlocks, sample: SeriesAdjustment, sampled: NDArray[np.int64]
@@ -155,17 +153,15 @@ class _Blocks:
         out, blocks = RowWriter(self.epochs), self
         for turn in range(1, _PASSES + 1):
             sums = blocks.walk(source, out)
-            known, change, rest = sums.solved(blocks.shared, blocks.prior)
-            if rest <= _SAME or turn == _PASSES:
+            solved = sums.solved(blocks.shared)
+            if solved.rest <= _SAME or turn == _PASSES:
                 break
-            blocks = replace(blocks, shared=known)
-        return blocks.finished(sums, known, change, out, sample, sampled, turn)
+            blocks = replace(blocks, shared=solved.shared)
+        return blocks.finished(solved, out, sample, sampled, turn)
 
     def walk(self, source: ObservationBlocks, out: RowWriter) -> CommonSums:
         """One pass: every block's epochs into `out`, and the sums."""
-        series = self.found.series
-        width = len(self.shared.cofactors)
-        sums = CommonSums(len(series.common), width, len(series.s.per_epoch))
+        sums = _sums(self.found.series, self.found.estimate.system, self.unit)
         for first, grid in source.blocks():
             self._block(first, grid, sums, out)
             out.release()
@@ -185,11 +181,11 @@ class _Blocks:
         use = grid.observed & enough_targets(grid, s)[:, None]
         held, estimate, use = held.adjusted(start, use)
         system, values, residuals = estimate.system, estimate.values, estimate.residuals
-        kinds = kinds_of(system, series.common, series.has_offsets, at)
+        kinds = kinds_of(sums, system)
         right = system.gradient(residuals)[:, system.own]
         if (drawn := held.deviations(values, estimate.pose)) is not None:
             right = right - drawn @ system.own_prior
-        sums.add(first, kinds, system, residuals, right)
+        sums.add(first, system, residuals, right)
         vPv, redundancy = held.sums(estimate)
         redundancy = redundancy - sums.width / self.epochs
         positive = redundancy > 0
@@ -245,23 +241,22 @@ class _Blocks:
         return relative
 
     def finished(
-        self, sums: CommonSums, known: Shared, change: Array, out: RowWriter,
-        sample: SeriesAdjustment, sampled: NDArray[np.int64], passes: int,
+        self, solved: Solved, out: RowWriter, sample: SeriesAdjustment,
+        sampled: NDArray[np.int64], passes: int,
     ) -> LongAdjustment:  # fmt: skip
         """The last change of the common unknowns on all epochs, and what is of the whole series."""
-        series = self.found.series
+        series, shared = self.found.series, solved.shared
         own, common = series.s.per_epoch, series.common
-        shared = replace(known, mean=sums.mean / max(sums.epochs, 1))
         level = level_of(shared, own, common) * self.unit
         total = np.zeros(16)
-        total[own] += change
-        total[common] += (known.pose - self.shared.pose)[: len(common)]
+        total[own] += solved.own
+        total[common] += (shared.pose - self.shared.pose)[: len(common)]
         moved = np.flatnonzero(total)
         out.shift(moved, total[moved])
         out.widen(common, np.diag(level)[common])
         trend = np.zeros((16, 16))
-        tilt = sums.line() @ root_of(known.cofactors) if len(known.cofactors) else np.zeros((1, 1))
-        if len(known.cofactors):
+        if len(shared.cofactors):
+            tilt = solved.line @ root_of(shared.cofactors)
             trend[own[:, None], own] = tilt @ tilt.T * self.unit
         trend += self.slow
         if self.movement.covariance.any() and len(common):
@@ -272,6 +267,16 @@ class _Blocks:
             out, np.sqrt(np.clip(np.diag(level), 0.0, None)), np.sqrt(np.diag(trend)), sample,
             sampled, passes,
         )  # fmt: skip
+
+
+def _sums(series: SeriesEstimator, system: SeriesSystem, unit: float) -> CommonSums:
+    """Empty sums for the blocks of a series; unit: variance of unit weight."""
+    prior = series.offset_prior(system.at) * unit if series.has_offsets else None
+    own = series.s.per_epoch
+    drawn = np.zeros((len(own), len(own)))
+    if series.bound is not None:
+        drawn[-6:, -6:] = series.bound * unit
+    return CommonSums(system.at, own, series.common, drawn, prior)
 
 
 def _ratios(series: SeriesEstimator) -> Array:

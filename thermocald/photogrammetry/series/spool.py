@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["ColumnSpool"]
+__all__ = ["ColumnSpool", "released"]
 
 
 class ColumnSpool:
@@ -34,3 +34,12 @@ class ColumnSpool:
     def release(self) -> None:
         """Take what was written or read out of memory."""
         self._map.madvise(mmap.MADV_DONTNEED)
+
+
+def released(array: Array) -> None:
+    """Take an array of a spool, or a view of it, out of memory; others stay as they are."""
+    owner: object = array.base
+    while owner is not None and not isinstance(owner, mmap.mmap):
+        owner = owner.obj if isinstance(owner, memoryview) else getattr(owner, "base", None)
+    if isinstance(owner, mmap.mmap):
+        owner.madvise(mmap.MADV_DONTNEED)

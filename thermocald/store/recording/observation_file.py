@@ -114,6 +114,19 @@ class ObservationFile:
         for block, first, stop in self._whole_epochs(self._table.chunks()):
             yield from self._emit(block, first, stop)
 
+    def some(self, window: slice) -> Iterator[Observations]:
+        """The observations of some consecutive epochs; of a Parquet file only they are read."""
+        low, high = self._numbers[window][[0, -1]]
+        chunks: Iterator[Chunk] = (
+            self._table.chunks(epochs=(int(low), int(high)))
+            if isinstance(self._table, ParquetTable)
+            else self._table.chunks()
+        )
+        for block, first, stop in self._whole_epochs(chunks):
+            yield from self._emit(block, max(first, window.start), min(stop, window.stop))
+            if stop >= window.stop:
+                break
+
     def grids(
         self, windows: Sequence[slice] | None = None
     ) -> Iterator[tuple[int, ObservationGrid]]:

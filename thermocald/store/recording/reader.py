@@ -33,7 +33,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from thermocald.photogrammetry.field.testfield import TestField
+    from thermocald.photogrammetry.field.testfield import Observations, TestField
+    from thermocald.photogrammetry.series.normals import ObservationGrid
 
     Array = NDArray[np.float64]
 
@@ -128,12 +129,38 @@ class Recording:
 
         Then the rows of the observations must be in the order of the epochs.
         """
-        size = self._observation_path.stat().st_size if self.has_observations else 0
-        if "epochs" in self.__dict__ or size < _STREAMED_ABOVE_BYTES:
+        if "epochs" in self.__dict__ or not self.is_long:
             yield from self.epochs
             return
         for i, observations in enumerate(self._observation_file.stream()):
             yield _epoch(self, i, observations)
+
+    def __len__(self) -> int:
+        return len(self.columns)
+
+    def blocks(
+        self, windows: Sequence[slice] | None = None
+    ) -> Iterator[tuple[int, ObservationGrid]]:
+        """The observations as grids of consecutive epochs, each with its first epoch (from 0).
+
+        windows: only the epochs of these slices. Raises RecordingError, also where the rows are not
+        in the order of their epochs.
+        """
+        return self._observation_file.grids(windows)
+
+    def observations(self, row: int) -> Observations | None:
+        """What one epoch (from 0) shows, of a recording that holds observations."""
+        if not self.has_observations:
+            return None
+        if "epochs" in self.__dict__ or not self.is_long:
+            return self.epochs[row].observations
+        return next(self._observation_file.some(slice(row, row + 1)))
+
+    @property
+    def is_long(self) -> bool:
+        """Whether its observations are read in parts, as they are too many for memory."""
+        size = self._observation_path.stat().st_size if self.has_observations else 0
+        return size >= _STREAMED_ABOVE_BYTES
 
     @property
     def _observation_path(self) -> Path:

@@ -1,0 +1,115 @@
+"""A series adjusted in blocks: the same numbers whatever the blocks, and true standard deviations."""
+
+from __future__ import annotations
+
+import corner_camera as scene
+import numpy as np
+import pytest
+
+from thermocald.photogrammetry.camera.camera_model import project
+from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.photogrammetry.series.adjustment import SeriesSettings, adjust_series
+from thermocald.photogrammetry.series.blocks import GridBlocks, spread_windows
+from thermocald.photogrammetry.series.long_series import adjust_long_series
+from thermocald.photogrammetry.series.normals import ObservationGrid
+
+OWN = np.arange(8)
+EPOCHS = 480
+
+
+def scenery(epochs=EPOCHS):
+    """A drifting camera before every third target of the corner, a board hidden for a while."""
+    rng = np.random.default_rng(40)
+    whole = scene.corner_field(0.02)
+    known = whole.subset(np.arange(0, len(whole), 3))
+    true = TestField.build(known.names, known.points + rng.normal(0, 0.02, known.points.shape))
+    truth = np.tile(
+        np.concatenate([scene.INTERIOR.as_array(), scene.EXTERIOR.as_array()]), (epochs, 1)
+    )
+    warm = 20 * np.sin(np.arange(epochs) / epochs * 9.0)
+    truth[:, 0] += warm * 1e-4
+    truth[:, 1] += warm * 5e-4
+    truth[:, 2] -= warm * 4e-4
+    shape = (epochs, len(known))
+    points = project(scene.SENSOR, truth[:, :10], truth[:, 10:], true.points)
+    points += rng.normal(0, scene.SIGMA_PX, points.shape)
+    see = np.ones(shape, dtype=bool)
+    see[epochs // 3 : epochs // 2, : len(known) // 5] = False
+    points[200, 20] += 40.0  # a gross error outside the sample
+    rows, targets = np.nonzero(see)
+    sigmas = np.full((len(rows), 2), scene.SIGMA_PX)
+    return known, truth, ObservationGrid.from_rows(shape, rows, targets, points[see], sigmas)
+
+
+@pytest.fixture(scope="module")
+def case():
+    return scenery()
+
+
+def blocked(case, size, exterior="series", **other):
+    field, _, grid = case
+    return adjust_long_series(
+        scene.SENSOR, field, GridBlocks(grid, size), scene.INTERIOR, scene.EXTERIOR,
+        SeriesSettings(exterior=exterior, **other), together=120,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("exterior", ["series", "mount"])
+def test_the_blocks_do_not_matter(case, exterior):
+    one, many = blocked(case, EPOCHS, exterior), blocked(case, 37, exterior)
+    apart = (many.rows.values - one.rows.values)[:, OWN]
+    assert np.abs(apart / one.rows.sd[:, OWN]).max() < 1e-5
+    assert np.abs(apart[:, 0] / one.rows.values[:, 0]).max() < 1e-9
+    # how offsets reach rare kinds of epochs is taken from the mean of a block's
+    np.testing.assert_allclose(many.rows.sd[:, OWN], one.rows.sd[:, OWN], rtol=2e-3)
+    np.testing.assert_allclose(many.rows.sigma0, one.rows.sigma0, rtol=1e-7)
+    np.testing.assert_allclose(many.level_sd, one.level_sd, rtol=1e-5)
+    assert many.rows.status == one.rows.status
+
+
+def test_it_is_the_adjustment_of_all_at_once(case):
+    """But for what a sample of 120 epochs knows less of the noise than all 480."""
+    field, truth, grid = case
+    whole = adjust_series(
+        scene.SENSOR, field, grid, scene.INTERIOR, scene.EXTERIOR,
+        SeriesSettings(exterior="series", target_noise=False),
+    )  # fmt: skip
+    parts = blocked(case, 50, target_noise=False)
+    apart = (parts.rows.values - whole.values)[:, OWN]
+    level = apart.mean(axis=0)
+    assert np.abs(level / whole.level_sd[OWN]).max() < 0.05
+    # a borderline point that one of the two rejects moves its epoch by half a standard deviation
+    assert np.quantile(np.abs(apart - level) / whole.sd[:, OWN], 0.95) < 0.1
+    np.testing.assert_allclose(parts.rows.sd[:, OWN], whole.sd[:, OWN], rtol=0.05)
+    np.testing.assert_allclose(parts.level_sd[OWN], whole.level_sd[OWN], rtol=0.05)
+    assert parts.rows.rejected[200] == 1
+    error = (parts.rows.values - truth)[:, OWN]
+    ratio = np.sqrt(np.mean(((error - error.mean(axis=0)) / parts.rows.sd[:, OWN]) ** 2, axis=0))
+    # 480 epochs know a standard deviation to 3.2 %: four of them, for eight parameters
+    assert ratio.min() > 0.87
+    assert ratio.max() < 1.13
+
+
+def test_what_the_sample_never_saw_is_still_adjusted(case):
+    """A board that is there only between two windows of the sample: its offsets from the sums."""
+    field, truth, grid = case
+    windows = spread_windows(EPOCHS, 120)
+    hidden = np.zeros(grid.observed.shape, dtype=bool)
+    for window in windows:
+        hidden[window, :6] = True
+    r = blocked((field, truth, grid.reject(hidden)), 60)
+    assert r.passes > 1
+    seen = np.flatnonzero(~hidden[:, 0] & r.rows.ok)
+    z = (r.rows.values - truth)[:, OWN]
+    z = (z - z.mean(axis=0)) / r.rows.sd[:, OWN]
+    assert np.sqrt(np.mean(z[seen] ** 2)) < 1.15
+
+
+def test_an_epoch_without_targets_has_a_reason(case):
+    field, truth, grid = case
+    gone = np.zeros(grid.observed.shape, dtype=bool)
+    gone[77] = True
+    r = blocked((field, truth, grid.reject(gone)), 60)
+    assert r.rows.status[77] == "no_observations"
+    assert r.rows.reasons[77] == "no target was measured"
+    assert np.isnan(r.rows.values[77]).all()

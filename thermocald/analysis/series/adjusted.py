@@ -1,0 +1,218 @@
+"""A series adjusted together, as a table: at once, or in blocks where it is long."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from thermocald.errors import DataError
+from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation, InteriorOrientation
+from thermocald.photogrammetry.parameters import EOP, IOP
+from thermocald.photogrammetry.series.adjustment import (
+    SeriesAdjustment,
+    SeriesSettings,
+    adjust_series,
+)
+from thermocald.photogrammetry.series.blocks import (
+    GridBlocks,
+    ObservedBlocks,
+    WithoutTargets,
+    gathered,
+    spread_windows,
+)
+from thermocald.photogrammetry.series.long_series import adjust_long_series, together_at_most
+from thermocald.photogrammetry.series.mount import drift_period
+from thermocald.photogrammetry.series.spool import released
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from thermocald.analysis.series.table import SeriesTable
+    from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
+    from thermocald.photogrammetry.field.testfield import Observations, TestField
+    from thermocald.photogrammetry.series.blocks import ObservationBlocks
+    from thermocald.photogrammetry.series.normals import ObservationGrid
+    from thermocald.photogrammetry.series.result import Exterior
+    from thermocald.store.recording.head import Head
+
+    Array = NDArray[np.float64]
+
+__all__ = ["settings_for_series", "table_of_series"]
+
+_SOME = 20_000  # epochs that tell the start values
+_AS_READ = ("number", "frame_time", "temperature")
+
+
+def table_of_series(
+    head: Head,
+    testfield: TestField,
+    apart: SeriesTable,
+    observations: Sequence[Observations | None] | ObservationBlocks,
+    settings: SeriesSettings,
+    start: Array | None = None,
+) -> SeriesTable:
+    """The series adjusted together, from the table of its epochs one by one.
+
+    start (16,): where the adjustment begins, by default the medians of the epochs one by one. A
+    series of more epochs than are adjusted at once goes in blocks. Raises DataError where no epoch
+    has a result to start from.
+    """
+    ok = apart.ok
+    if start is None and not ok.any():
+        reasons = sorted({r for r in apart.reasons if r}, key=apart.reasons.count)
+        raise DataError(
+            f"{head.name}: no epoch has a result; most often: {reasons[-1] if reasons else '-'}"
+        )
+    if start is None:
+        start = _middle(apart.values, ok)
+    settings = replace(settings, drift_period=drift_period(apart.frame_time, apart.temperature))
+    source = (
+        observations if hasattr(observations, "blocks") else ObservedBlocks(testfield, observations)
+    )
+    adjust = _together if len(source) <= together_at_most(len(testfield)) else _in_blocks
+    return adjust(head, testfield, apart, start, source, settings)
+
+
+def _middle(values: Array, ok: NDArray[np.bool_]) -> Array:
+    """Medians (16,) over the epochs with a result, of many epochs over some thousand."""
+    rows = np.flatnonzero(ok)
+    rows = rows[:: max(len(rows) // _SOME, 1)]
+    middle: Array = np.median(values[rows], axis=0)
+    released(values)
+    return middle
+
+
+def _together(
+    head: Head, testfield: TestField, apart: SeriesTable, start: Array,
+    source: ObservationBlocks, settings: SeriesSettings,
+) -> SeriesTable:  # fmt: skip
+    """The table of a series that is adjusted as one."""
+    grid = gathered(source, [slice(0, len(source))])
+    result = adjust_series(
+        head.camera.sensor, testfield, grid, InteriorOrientation.from_array(start[IOP]),
+        ExteriorOrientation.from_array(start[EOP]), settings,
+    )  # fmt: skip
+
+    def without(rows: NDArray[np.int64], quick: bool) -> SeriesTable:
+        rough = replace(settings, exterior=result.exterior)
+        mask = np.zeros(result.observed.shape, dtype=bool)
+        if quick:
+            mask = ~result.observed
+            rough = replace(rough, snooping_alpha=0.0, target_noise=False)
+        mask[:, rows] = True
+        return _together(head, testfield, apart, start, _grid(grid.reject(mask)), rough)
+
+    observed, rejected = result.observed.sum(axis=1), result.rejected.sum(axis=1)
+    status, reasons = _said(result.status, result.reasons, apart)
+    return replace(
+        apart,
+        values=result.values,
+        sd=result.sd,
+        sigma0=np.where(result.ok, result.sigma0, np.nan),
+        n_observations=observed + rejected,
+        n_rejected=rejected,
+        status=status,
+        reasons=reasons,
+        exterior=result.exterior,
+        level_sd=result.level_sd,
+        adjustment=result,
+        groups=_groups(testfield, result),
+        without=without,
+        trend_sd=result.trend_sd,
+        redundancy=result.redundancy,
+        stillness=result.stillness,
+    )
+
+
+def _in_blocks(
+    head: Head, testfield: TestField, apart: SeriesTable, start: Array,
+    source: ObservationBlocks, settings: SeriesSettings,
+) -> SeriesTable:  # fmt: skip
+    """The table of a long series."""
+    found = adjust_long_series(
+        head.camera.sensor, testfield, source, InteriorOrientation.from_array(start[IOP]),
+        ExteriorOrientation.from_array(start[EOP]), settings,
+    )  # fmt: skip
+    rows, sample = found.rows, found.sample
+
+    def without(targets: NDArray[np.int64], quick: bool) -> SeriesTable:
+        rough = replace(settings, exterior=sample.exterior)
+        fewer = WithoutTargets(source, targets)
+        if not quick:
+            return _in_blocks(head, testfield, apart, start, fewer, rough)
+        rough = replace(rough, snooping_alpha=0.0, target_noise=False)
+        grid = gathered(fewer, spread_windows(len(source), len(found.sampled)))
+        used = grid.reject(~sample.observed)
+        some = replace(
+            apart.part(slice(0, 0)),
+            **{n: getattr(apart, n)[found.sampled] for n in _AS_READ},
+            status=tuple(apart.status[i] for i in found.sampled),
+            reasons=tuple(apart.reasons[i] for i in found.sampled),
+        )
+        return _together(head, testfield, some, start, _grid(used), rough)
+
+    status, reasons = _said(rows.status, rows.reasons, apart)
+    return replace(
+        apart,
+        values=rows.values,
+        sd=rows.sd,
+        sigma0=rows.sigma0,
+        n_observations=rows.observed + rows.rejected,
+        n_rejected=rows.rejected,
+        status=status,
+        reasons=reasons,
+        exterior=sample.exterior,
+        level_sd=found.level_sd,
+        adjustment=sample,
+        groups=_groups(testfield, sample),
+        without=without,
+        trend_sd=found.trend_sd,
+        redundancy=rows.redundancy,
+        stillness=rows.stillness,
+        sampled=found.sampled,
+    )
+
+
+def _grid(grid: ObservationGrid) -> GridBlocks:
+    return GridBlocks(grid, max(len(grid), 1))
+
+
+def _said(
+    status: tuple[str, ...], reasons: tuple[str, ...], apart: SeriesTable
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Words and sentences of the epochs; what the epoch itself said of a frame without a result
+    says more than "no observations".
+    """
+    if "no_observations" not in status:
+        return status, reasons
+    pairs = [
+        (mine, why) if word == "no_observations" and mine != "ok" else (word, reason)
+        for word, reason, mine, why in zip(
+            status, reasons, apart.status, apart.reasons, strict=True
+        )
+    ]
+    return tuple(word for word, _ in pairs), tuple(reason for _, reason in pairs)
+
+
+def _groups(testfield: TestField, result: SeriesAdjustment) -> dict[str, NDArray[np.int64]]:
+    """The groups of targets that take part, by the name of their first."""
+    seen = result.observed.any(axis=0)
+    rows: dict[int, list[int]] = {}
+    for row in np.flatnonzero(seen):
+        rows.setdefault(int(testfield.groups[row]), []).append(int(row))
+    return {testfield.names[members[0]]: np.array(members) for members in rows.values()}
+
+
+def settings_for_series(settings: AdjustmentSettings, exterior: str) -> SeriesSettings:
+    """The series' settings that go with those of single epochs."""
+    return SeriesSettings(
+        exterior=cast("Exterior", exterior),
+        free=settings.free,
+        scale=settings.scale,
+        bounds=settings.bounds,
+        max_rejected=settings.max_rejected,
+    )

@@ -1,4 +1,4 @@
-"""A series adjusted in blocks: the same numbers whatever the blocks, and true standard deviations."""
+"""A series adjusted in blocks: the same numbers for any blocks, true standard deviations."""
 
 from __future__ import annotations
 

@@ -87,7 +87,10 @@ def reduce_series(
     reference = next(iter(source.readings))
     if reference not in present:
         raise DataError(no_temperature(source, reference))
-    knots, instruments = thermometers(reading_times, present, source.resolutions)
+    noises = None
+    if source.noises is not None:
+        noises = {name: source.noises[name][usable] for name in present}
+    knots, instruments = thermometers(reading_times, present, source.resolutions, noises)
     trajectory = instruments[reference].trajectory
     trajectory = trajectory[np.isfinite(trajectory)]
     history = History(

@@ -42,7 +42,9 @@ class SeriesInput:
     frame_times (E,) s; reading_times (R,) s; readings {channel: (R,)} °C, the first the reference;
     resolutions {channel: K or None}; grid: image points on epochs × targets; numbers (E,): the
     epochs' own numbers; series: its name; interior: what is known of the camera, for a start;
-    columns {name: (E,)}: what else was recorded with each frame, NaN where it is missing.
+    columns {name: (E,)}: what else was recorded with each frame, NaN where it is missing; counts
+    (E,): of how many epochs each row is the mean, None where rows are epochs; noises {channel:
+    (R,)} K: standard deviations of readings that are means, None where they are not.
     """
 
     name: str
@@ -59,6 +61,8 @@ class SeriesInput:
     series: str = ""
     interior: InteriorOrientation | None = None
     columns: Mapping[str, Array] | None = None
+    counts: NDArray[np.int64] | None = None
+    noises: Mapping[str, Array] | None = None
 
     def polygons(self) -> dict[str, tuple[Array, Array]]:
         """Times s from the start and values of each column that was recorded often enough."""
@@ -69,6 +73,11 @@ class SeriesInput:
             if there.mean() > 0.5:
                 out[name] = (t[there], values[there])
         return out
+
+    @property
+    def epochs(self) -> int:
+        """How many epochs were recorded."""
+        return len(self.frame_times) if self.counts is None else int(self.counts.sum())
 
 
 @dataclass(frozen=True, eq=False)

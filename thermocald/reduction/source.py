@@ -10,18 +10,25 @@ import numpy as np
 from thermocald.acquisition.calibrator import Calibrator
 from thermocald.errors import DataError
 from thermocald.photogrammetry.series.normals import ObservationGrid
+from thermocald.reduction.condense import condensed, rows_at_most
 from thermocald.reduction.series import SeriesInput
+from thermocald.store.sources import open_source, source_name
+from thermocald.store.stored_blocks import StoredBlocks
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.field.testfield import TestField
+    from thermocald.store.database.row import StoredSeries
     from thermocald.store.recording.head import Head
     from thermocald.store.recording.reader import Recording
+    from thermocald.store.sources import SeriesSource
+
+    Array = NDArray[np.float64]
 
 __all__ = ["epochs_input", "load_series", "measured_epochs", "series_input"]
 
@@ -70,7 +77,13 @@ def series_input(
     say: Callable[[str], None] | None = None,
     advance: Callable[[int], None] | None = None,
 ) -> SeriesInput:
-    """The arrays of one recording; its frames are measured where they have not been."""
+    """The arrays of one recording; its frames are measured where they have not been.
+
+    A long one with observations is condensed while it is read.
+    """
+    if recording.has_observations and len(recording) > rows_at_most(len(recording.testfield)):
+        whole = replace(_all_epochs(recording), columns=_columns(recording))
+        return condensed(whole, recording)
     if not recording.has_observations and say is not None:
         say(f"measuring the {len(recording.columns)} frames of {recording.path}")
     epochs = measured_epochs(recording, advance)
@@ -90,21 +103,61 @@ def _columns(recording: Recording) -> dict[str, NDArray[np.float64]]:
     return out
 
 
+def _all_epochs(recording: Recording) -> SeriesInput:
+    """A recording's epochs without their image points."""
+    columns = recording.columns
+    return _without_points(
+        recording.head, recording.testfield, f"{recording.path}", columns.numbers,
+        columns.frame_time, columns.temperature_time, columns.temperatures,
+    )  # fmt: skip
+
+
+def _stored(store: SeriesSource, series: StoredSeries, name: str) -> SeriesInput:
+    """The arrays of a series in a store; a long one is condensed while it is read."""
+    numbers = store.series_columns(series, ["epoch"])["epoch"].astype(np.int64)
+    if len(numbers) <= rows_at_most(len(series.testfield)):
+        epochs = [e.epoch for e in store.epochs(series)]
+        return epochs_input(series.head, series.testfield, epochs, name)
+    names = ["frame_time", "temperature_time", *series.head.channels]
+    columns = store.series_columns(series, names)
+    whole = _without_points(
+        series.head, series.testfield, name, numbers, columns["frame_time"],
+        columns["temperature_time"], {n: columns[n] for n in series.head.channels},
+    )  # fmt: skip
+    return condensed(whole, StoredBlocks(store, series, numbers))
+
+
+def _without_points(
+    head: Head, field: TestField, name: str, numbers: NDArray[np.int64], frame_times: Array,
+    reading_times: Array, readings: Mapping[str, Array],
+) -> SeriesInput:  # fmt: skip
+    camera = head.camera
+    nothing = np.empty((0, len(field), 3))
+    return SeriesInput(
+        name=name,
+        camera=camera.name,
+        sensor=camera.sensor,
+        field=field,
+        principal_distance=camera.principal_distance,
+        frame_times=frame_times,
+        reading_times=reading_times,
+        readings=readings,
+        resolutions={channel: c.resolution for channel, c in head.channels.items()},
+        grid=ObservationGrid(nothing[..., :2], nothing),
+        numbers=numbers,
+        series=head.series,
+        interior=camera.interior,
+    )
+
+
 def load_series(path: Path, advance: Callable[[int], None] | None = None) -> list[SeriesInput]:
     """The series of a recording (a folder) or of a store (a file); advance: frames measured."""
     if path.is_dir():
         from thermocald.store.recording.reader import open_recording
 
         return [series_input(open_recording(path), advance=advance)]
-    from thermocald.store.sources import open_source, source_name
-
     with open_source(path) as store:
-        found = [
-            epochs_input(
-                s.head, s.testfield, [e.epoch for e in store.epochs(s)], f"{store.path}: {s.name}"
-            )
-            for s in store.all_series()
-        ]
+        found = [_stored(store, s, f"{store.path}: {s.name}") for s in store.all_series()]
     if not found:
         raise DataError(f"{source_name(path)}: the store holds no series")
     return found

@@ -136,14 +136,18 @@ def _bends(t: Array, y: Array, noise: float) -> tuple[Array, float]:
 
 
 def smooth_channel(
-    times: Array, readings: Array, latent: NDArray[np.bool_], resolution: float | None
+    times: Array,
+    readings: Array,
+    latent: NDArray[np.bool_],
+    resolution: float | None,
+    noises: Array | None = None,
 ) -> Thermometer:
     """One temperature column on knots: its times, those of others (NaN), and its latent ones.
 
     times (K,) s ascending, readings (K,) °C with NaN where missing; latent (K,): True where a knot
-    is a latent time of this column, or of another.
+    is a latent time of this column, or of another; noises (K,) K: where readings are means of many.
     """
-    noise = reading_noise(times, readings, resolution)
+    noise = reading_noise(times, readings, resolution) if noises is None else _usual(noises)
     valid = np.isfinite(readings)
     own = ~latent
     t, y = times[own], readings[own]
@@ -153,7 +157,7 @@ def smooth_channel(
         smooth = _whittaker(filled, np.isfinite(y).astype(float), noise)
     trajectory = np.full(len(times), np.nan)
     trajectory[own] = smooth
-    sd = np.full(len(times), noise)
+    sd = np.full(len(times), noise) if noises is None else noises.copy()
     if not np.isfinite(y).all():
         # what may happen between two readings: a share of the step across the gap
         missing = np.flatnonzero(own)[~np.isfinite(y)]
@@ -251,11 +255,24 @@ def _whittaker(values: Array, weights: Array, noise: float) -> Array:
     return np.asarray(chosen, dtype=float)
 
 
+def _usual(noises: Array) -> float:
+    return float(np.median(noises))
+
+
 def thermometers(
-    times: Array, readings: Mapping[str, Array], resolutions: Mapping[str, float | None]
+    times: Array,
+    readings: Mapping[str, Array],
+    resolutions: Mapping[str, float | None],
+    noises: Mapping[str, Array] | None = None,
 ) -> tuple[Array, dict[str, Thermometer]]:
-    """All columns on common knots: the readings' times and the latent ones of each column."""
-    latent = {name: latent_times(times, r, resolutions.get(name)) for name, r in readings.items()}
+    """All columns on common knots: the readings' times and the latent ones of each column.
+
+    noises {column: (R,)} K: of readings that are means of many; between those nothing is latent.
+    """
+    latent = {
+        name: latent_times(times, r, resolutions.get(name)) if noises is None else np.zeros(0)
+        for name, r in readings.items()
+    }
     knots, first = np.unique(np.concatenate([times, *latent.values()]), return_index=True)
     from_reading = first < len(times)
     channels = {}
@@ -264,7 +281,8 @@ def thermometers(
         on_knots[from_reading] = r[first[from_reading]]
         own = np.isin(knots, latent[name])
         here = from_reading | own
-        part = smooth_channel(knots[here], on_knots[here], own[here], resolutions.get(name))
+        known = None if noises is None else noises[name][first[here]]
+        part = smooth_channel(knots[here], on_knots[here], own[here], resolutions.get(name), known)
         channels[name] = extend(_spread(part, knots, here))
     return next(iter(channels.values())).times, channels
 

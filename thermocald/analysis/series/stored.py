@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,27 +12,24 @@ from thermocald.analysis.series.adjusted import settings_for_series, table_of_se
 from thermocald.analysis.series.table import SeriesTable
 from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
-from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.photogrammetry.series.spool import ColumnSpool
 from thermocald.store.database.row import EpochResult
 from thermocald.store.database.store import Store
 from thermocald.store.sources import open_source
+from thermocald.store.stored_blocks import StoredBlocks
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
-    from thermocald.photogrammetry.field.testfield import Observations
     from thermocald.store.database.row import StoredSeries
     from thermocald.store.recording.reader import Recording
     from thermocald.store.sources import SeriesSource
 
     Array = NDArray[np.float64]
-
-_GRID_POINTS = 300_000  # cells of a block
 
 __all__ = ["replay_into", "stored_table", "table_of_stored"]
 
@@ -136,7 +132,7 @@ def table_of_stored(
         series.head,
         series.testfield,
         apart,
-        _StoredBlocks(store, series, apart.number),
+        StoredBlocks(store, series, apart.number),
         settings_for_series(settings, exterior),
     )
 
@@ -151,31 +147,3 @@ def _parameters(
         spool.array[:, k] = np.where(ok, column[: len(ok)], np.nan)
         spool.release()
     return spool.array
-
-
-@dataclass(frozen=True, eq=False)
-class _StoredBlocks:
-    """The observations of a series in a store; numbers (E,): of its epochs."""
-
-    store: SeriesSource
-    series: StoredSeries
-    numbers: NDArray[np.int64]
-
-    def __len__(self) -> int:
-        return len(self.numbers)
-
-    def blocks(
-        self, windows: Sequence[slice] | None = None
-    ) -> Iterator[tuple[int, ObservationGrid]]:
-        field = self.series.testfield
-        size = max(_GRID_POINTS // len(field), 1)
-        for window in windows or (slice(0, len(self)),):
-            for first in range(window.start, window.stop, size):
-                numbers = self.numbers[first : min(first + size, window.stop)]
-                part: list[Observations | None] = [None] * len(numbers)
-                found = self.store.epochs(self.series, int(numbers[0]), int(numbers[-1]))
-                for stored in found:
-                    row = int(np.searchsorted(numbers, stored.epoch.number))
-                    if row < len(numbers) and numbers[row] == stored.epoch.number:
-                        part[row] = stored.epoch.observations
-                yield first, ObservationGrid.from_observations(field, part)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from thermocald.errors import DataError, UsageError
 from thermocald.reduction.source import load_series, series_input
-from thermocald.store.recording.reader import read_recording
+from thermocald.store.recording.reader import open_recording
 from thermocald.store.server.address import is_server
 from thermocald.store.sources import require_source, source_name
 
@@ -40,7 +40,7 @@ def load_pair(first: Path, second: Path | None, say: Callable[[str], None]) -> l
 def _read(path: Path, say: Callable[[str], None]) -> SeriesInput:
     """One series: a recording's, or the only one of a store or of what an address selects."""
     if path.is_dir():
-        return series_input(read_recording(path), say)
+        return series_input(open_recording(path), say)
     found = load_series(require_source(path))
     if len(found) > 1:
         there = ", ".join(f"{s.camera}/{s.series}" for s in found)

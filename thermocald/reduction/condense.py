@@ -1,0 +1,283 @@
+"""A long series condensed while it is read: means of epochs, short where something is fast.
+
+Heat is slow. Over a year the camera's trajectories are carried by means over an hour or so; what is
+faster is looked for in the image itself: its shift and scale, epoch by epoch, less what follows the
+temperature in a straight line. The few windows (a day each, say) in which most is left, or in which
+the temperature itself changes fastest, keep short means. A mean of image points that a camera moves
+alike has the sum of their weights: for the normal equations of a camera that stands still within a
+row nothing is lost.
+
+Does not hold: what is faster than a row outside these windows is averaged over.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.photogrammetry.linalg import MAD_TO_SD
+from thermocald.photogrammetry.series.normals import ObservationGrid
+from thermocald.reduction.thermometer import reading_noise
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from numpy.typing import NDArray
+
+    from thermocald.photogrammetry.series.blocks import ObservationBlocks
+    from thermocald.reduction.series import SeriesInput
+
+    Array = NDArray[np.float64]
+    Index = NDArray[np.int64]
+
+__all__ = ["condensed", "rows_at_most"]
+
+_POINTS = 1_300_000  # image points of all rows: 300 MB while they are reduced
+_FEWEST, _MOST = 2_000, 10_000  # rows
+_COARSE = 0.8  # of the rows are long means
+_A_WINDOW = 24  # long means
+_FINER = 12  # short means in a long one
+_GROSS = 6.0  # standard deviations from the median of a short mean
+
+
+def rows_at_most(targets: int) -> int:
+    """How many epochs of so many targets are reduced one by one."""
+    return min(max(_POINTS // max(targets, 1), _FEWEST), _MOST)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Rows of a condensed series: their first epochs (R,), of how many each is, and the grid."""
+
+    first: Index
+    count: Index
+    grid: ObservationGrid
+
+    def without(self, windows: Sequence[slice]) -> _Rows:
+        """The rows outside some windows of epochs."""
+        keep = np.ones(len(self.first), dtype=bool)
+        for window in windows:
+            keep &= (self.first < window.start) | (self.first >= window.stop)
+        grid = ObservationGrid(self.grid.points[keep], self.grid.weights[keep])
+        return _Rows(self.first[keep], self.count[keep], grid)
+
+    def beside(self, others: Sequence[_Rows]) -> _Rows:
+        """These rows and others in the order of time."""
+        parts = [self, *others]
+        first = np.concatenate([p.first for p in parts])
+        order = np.argsort(first, kind="stable")
+        return _Rows(
+            first[order],
+            np.concatenate([p.count for p in parts])[order],
+            ObservationGrid(
+                np.concatenate([p.grid.points for p in parts])[order],
+                np.concatenate([p.grid.weights for p in parts])[order],
+            ),
+        )
+
+
+def condensed(
+    series: SeriesInput, source: ObservationBlocks, most: int | None = None
+) -> SeriesInput:
+    """A series of all epochs on at most `most` rows.
+
+    series: all epochs, its grid not looked at; source: their observations. Memory is that of the
+    rows and a block.
+    """
+    E, T = len(source), len(series.field)
+    most = most or rows_at_most(T)
+    size = int(np.ceil(E / (_COARSE * most)))
+    fine = max(size // _FINER, 1)
+    size = fine * int(np.ceil(size / fine))
+    coarse, course = _coarse(source, E, T, size, fine)
+    rows = coarse
+    if size > 1:
+        length = _A_WINDOW * size
+        count = max(int((1.0 - _COARSE) * most * fine / length), 1)
+        chosen = _fast_windows(course, _means(_temperature(series), fine), length // fine, count)
+        windows = [slice(k * length, min((k + 1) * length, E)) for k in chosen]
+        rows = coarse.without(windows).beside(
+            [_averaged(source.blocks([w]), w.start, w.stop - w.start, T, fine)[0] for w in windows]
+        )
+    seen = rows.grid.observed.any(axis=1) | (rows.count > 0)
+    keep = np.flatnonzero(seen)
+    return _on_rows(series, rows.first[keep], rows.count[keep],
+                    ObservationGrid(rows.grid.points[keep], rows.grid.weights[keep]))  # fmt: skip
+
+
+def _on_rows(series: SeriesInput, first: Index, count: Index, grid: ObservationGrid) -> SeriesInput:
+    """The series with times and readings as means over rows, their noise as it is of means."""
+
+    def mean(values: Array) -> Array:
+        there = np.isfinite(values)
+        n = np.add.reduceat(there.astype(float), first)
+        total = np.add.reduceat(np.where(there, values, 0.0), first)
+        return np.asarray(np.where(n > 0, total / np.maximum(n, 1.0), np.nan))
+
+    noises = {}
+    for name, readings in series.readings.items():
+        values = np.asarray(readings, dtype=float)
+        resolution = series.resolutions.get(name)
+        one = reading_noise(series.reading_times, values, resolution)
+        n = np.add.reduceat(np.isfinite(values).astype(float), first)
+        # errors of the step of a display do not average out
+        floor = (resolution or 0.0) / np.sqrt(12.0) / 3.0
+        noises[name] = np.maximum(one / np.sqrt(np.maximum(n, 1.0)), floor)
+    return replace(
+        series,
+        frame_times=mean(series.frame_times),
+        reading_times=mean(series.reading_times),
+        readings={n: mean(np.asarray(r, dtype=float)) for n, r in series.readings.items()},
+        grid=grid,
+        numbers=series.numbers[first],
+        columns={n: mean(c) for n, c in (series.columns or {}).items()},
+        counts=count,
+        noises=noises,
+    )
+
+
+def _temperature(series: SeriesInput) -> Array:
+    """The reference temperature (E,) of the epochs, gaps closed by straight lines."""
+    if not series.readings:
+        return np.zeros(len(series.frame_times))
+    values = np.asarray(next(iter(series.readings.values())), dtype=float)
+    there = np.isfinite(values)
+    if not there.any():
+        return np.zeros(len(values))
+    out: Array = np.interp(np.arange(len(values)), np.flatnonzero(there), values[there])
+    return out
+
+
+def _means(values: Array, size: int) -> Array:
+    """Means (⌈E / size⌉, …) of neighbours."""
+    starts = np.arange(0, len(values), size)
+    count = np.diff(np.append(starts, len(values)))
+    total = np.add.reduceat(values, starts, axis=0)
+    return np.asarray(total / count.reshape(-1, *(1,) * (values.ndim - 1)))
+
+
+def _coarse(
+    source: ObservationBlocks, epochs: int, targets: int, size: int, fine: int
+) -> tuple[_Rows, Array]:
+    """Long means of the whole series, and shift and scale (⌈E / fine⌉, 3) px of short ones."""
+    return _averaged(source.blocks(), 0, epochs, targets, size, fine)
+
+
+def _averaged(
+    blocks: Iterable[tuple[int, ObservationGrid]], start: int, epochs: int, targets: int,
+    size: int, fine: int = 0,
+) -> tuple[_Rows, Array]:  # fmt: skip
+    """Means over `size` epochs each, from epoch `start` on; gross errors are left out."""
+    R = -(-epochs // size)
+    normal, right = np.zeros((R, targets, 3)), np.zeros((R, targets, 2))
+    short = fine or size
+    sums = np.zeros((-(-epochs // short), 4))
+    middle: Array | None = None
+    for first, grid in blocks:
+        w = grid.weights
+        if middle is None:
+            with np.errstate(invalid="ignore"):
+                middle = _seen_mean(grid)
+        p = np.nan_to_num(grid.points - middle)
+        w = np.where(_gross(p, w[..., 0] > 0, short)[..., None], 0.0, w)
+        at = np.arange(len(grid)) + first - start
+        runs = np.flatnonzero(np.diff(at // size, prepend=-1))
+        rows = at[runs] // size
+        normal[rows] += np.add.reduceat(w, runs, axis=0)
+        weighted = np.stack(
+            [w[..., 0] * p[..., 0] + w[..., 2] * p[..., 1],
+             w[..., 2] * p[..., 0] + w[..., 1] * p[..., 1]], axis=-1,
+        )  # fmt: skip
+        right[rows] += np.add.reduceat(weighted, runs, axis=0)
+        if fine:
+            runs = np.flatnonzero(np.diff(at // fine, prepend=-1))
+            sums[at[runs] // fine] += np.add.reduceat(_shift_and_scale(p, w, middle), runs, axis=0)
+    if middle is None:
+        middle = np.full((targets, 2), np.nan)
+    determinant = normal[..., 0] * normal[..., 1] - normal[..., 2] ** 2
+    there = determinant > 0
+    d = np.where(there, determinant, 1.0)
+    points = np.stack(
+        [(normal[..., 1] * right[..., 0] - normal[..., 2] * right[..., 1]) / d,
+         (normal[..., 0] * right[..., 1] - normal[..., 2] * right[..., 0]) / d], axis=-1,
+    )  # fmt: skip
+    points = np.where(there[..., None], points + middle, np.nan)
+    begin = start + np.arange(R) * size
+    count = np.minimum(begin + size, start + epochs) - begin
+    rows_ = _Rows(begin, count, ObservationGrid(points, np.where(there[..., None], normal, 0.0)))
+    return rows_, sums[:, :3] / np.maximum(sums[:, 3:], 1e-300)
+
+
+def _seen_mean(grid: ObservationGrid) -> Array:
+    """Where each target (T, 2) is; the image's middle for those that were not seen."""
+    there = grid.observed[..., None]
+    n = there.sum(axis=0)
+    total = np.where(there, grid.points, 0.0).sum(axis=0)
+    middle = total / np.maximum(n, 1)
+    seen = n[:, 0] > 0
+    middle[~seen] = middle[seen].mean(axis=0) if seen.any() else 0.0
+    return np.asarray(middle)
+
+
+def _gross(p: Array, seen: NDArray[np.bool_], short: int) -> NDArray[np.bool_]:
+    """Points (E, T) far from the median of their short mean."""
+    n = len(p) // short * short
+    out = np.zeros(seen.shape, dtype=bool)
+    if short < 5 or not n:
+        return out
+    values = np.where(seen[..., None], p, np.nan)[:n]
+    runs = values.reshape(-1, short, *p.shape[1:])
+    ordered = np.sort(runs, axis=1)  # NaN go to the end
+    count = np.isfinite(ordered).sum(axis=1)
+    pick = np.maximum(count - 1, 0) // 2
+    median = np.take_along_axis(ordered, pick[:, None], axis=1)
+    off = np.abs(runs - median).reshape(n, *p.shape[1:])
+    known = np.isfinite(off)
+    scale = MAD_TO_SD * float(np.median(off[known])) if known.any() else 0.0
+    out[:n] = (np.where(known, off, 0.0) > _GROSS * max(scale, 1e-6)).any(axis=-1)
+    return out
+
+
+def _shift_and_scale(p: Array, w: Array, middle: Array) -> Array:
+    """Of each epoch (E, 4): weighted sums of shift in x, y, of stretch px, and of weights."""
+    centre = middle.mean(axis=0)
+    arm = middle - centre
+    arm = arm / max(float(np.sqrt((arm**2).sum(axis=1).mean())), 1e-9)
+    u = w[..., 0]
+    x, y = u * p[..., 0], u * p[..., 1]
+    return np.stack([x.sum(1), y.sum(1), x @ arm[:, 0] + y @ arm[:, 1], u.sum(1)], axis=1)
+
+
+def _fast_windows(course: Array, temperature: Array, length: int, count: int) -> list[int]:
+    """Which windows of `length` short means hold most of what is fast; in the order of time.
+
+    course (F, 3) px, temperature (F,) °C, of short means. Half of them for what does not follow the
+    temperature, half for what the temperature does.
+    """
+    n = min(len(course), len(temperature))
+    T = temperature[:n] - temperature[:n].mean()
+    z = course[:n] - course[:n].mean(axis=0)
+    if (T @ T) > 0:
+        z = z - np.outer(T, T @ z / (T @ T))
+    windows = -(-n // length)
+    odd, warm = np.zeros(windows), np.zeros(windows)
+    for k in range(windows):
+        part = slice(k * length, min((k + 1) * length, n))
+        odd[k] = _roughness(z[part])
+        warm[k] = _roughness(temperature[part, None])
+    first = np.argsort(-odd, kind="stable")[: -(-count // 2)].tolist()
+    rest = [int(k) for k in np.argsort(-warm, kind="stable") if k not in first]
+    return sorted({int(k) for k in first} | set(rest[: count - len(first)]))
+
+
+def _roughness(values: Array) -> float:
+    """Sum of squares about a straight line, less that of neighbours' differences: their noise."""
+    if len(values) < 8:
+        return 0.0
+    t = np.linspace(-1.0, 1.0, len(values))
+    z = values - values.mean(axis=0)
+    z = z - np.outer(t, t @ z / (t @ t))
+    noise = 0.5 * np.sum(np.diff(values, axis=0) ** 2) * len(values) / (len(values) - 1)
+    return float(np.sum(z**2) - noise)

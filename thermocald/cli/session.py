@@ -15,6 +15,7 @@ from thermocald.cli.options import JsonOption
 from thermocald.errors import ConfigurationError, DataError, UsageError
 
 if TYPE_CHECKING:
+    from thermocald.cli.session_separate import Watch
     from thermocald.config import Config
     from thermocald.daemon.session import Session
 
@@ -64,6 +65,31 @@ def start(
     wait: Annotated[
         bool, typer.Option("--wait/--no-wait", help="Wait for a daemon to take all epochs.")
     ] = True,
+    until_separated: Annotated[
+        str | None,
+        typer.Option(
+            "--until-separated",
+            metavar="A,B",
+            help="Heat so that two effects separate, and stop when they are.",
+        ),
+    ] = None,
+    evidence: Annotated[
+        Path | None, typer.Option("--evidence", help="A recording that could not separate them.")
+    ] = None,
+    max_temperature: Annotated[
+        float | None,
+        typer.Option("--max-temperature", help="Highest °C of a planned programme [the output's]."),
+    ] = None,
+    max_rate: Annotated[
+        float, typer.Option("--max-rate", min=0.1, max=60.0, help="Fastest planned rise, K/min.")
+    ] = 3.0,
+    max_duty: Annotated[
+        float,
+        typer.Option("--max-duty", min=0.05, max=1.0, help="Share of time with heat."),
+    ] = 0.8,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Print the planned programme and end.")
+    ] = False,
 ) -> None:
     """Take a series of epochs with progress, then write its recording and its report.
 
@@ -76,18 +102,33 @@ def start(
 
     read = _configuration(config, mock)
     session = _session(read, camera, series, condition, epochs, programme, check)
+    watch: Watch | None = None
+    if until_separated is not None:
+        from thermocald.cli.session_separate import Heating, separating
+
+        heating = Heating(max_temperature, max_rate, max_duty)
+        planned = separating(read, session, until_separated, evidence, heating, dry_run)
+        if planned is None:
+            return
+        session, watch = planned
+    elif dry_run or evidence is not None:
+        raise UsageError("--dry-run and --evidence are for --until-separated A,B")
     path = output / f"{session.camera}-{series}"
     if path.exists():
         raise DataError(f"{path}: the recording exists already; choose another --series")
     folder = _daemon(read)
-    if folder is None:
-        make_folder(output)
-        read = take_on_the_desk(read, session)
-    else:
-        _take_in_the_daemon(folder, session, wait)
-        if not wait:
-            return
-        make_folder(output)
+    try:
+        if folder is None:
+            make_folder(output)
+            read = take_on_the_desk(read, session, watch)
+        else:
+            _take_in_the_daemon(folder, session, wait or watch is not None, watch)
+            if not wait and watch is None:
+                return
+            make_folder(output)
+    finally:
+        if watch is not None:
+            watch.close()
     _finish(read, session, path, report)
 
 
@@ -200,7 +241,9 @@ def _ask(config: Path | None, do: str, **values: Any) -> dict[str, Any]:
     return told
 
 
-def _take_in_the_daemon(folder: Path, session: Session, wait: bool) -> None:
+def _take_in_the_daemon(
+    folder: Path, session: Session, wait: bool, watch: Watch | None = None
+) -> None:
     """Have a running daemon take the session, and look on."""
     from thermocald.cli.session_progress import Progress
     from thermocald.daemon.control import DaemonBusy, ask
@@ -233,6 +276,9 @@ def _take_in_the_daemon(folder: Path, session: Session, wait: bool) -> None:
             say(sentence)
         seen = max(seen, len(one["found"]))
         progress.show(one.get("last", {}), one["why"] if one["state"] == "paused" else "")
+        if watch is not None and watch.look(one["taken"]):
+            ask(folder, "session stop", camera=session.camera)
+            return
         if one["state"] == "done":
             return
         if one["state"] in ("refused", "stopped"):

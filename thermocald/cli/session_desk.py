@@ -10,6 +10,7 @@ from thermocald.cli.session_progress import Progress
 from thermocald.errors import ConfigurationError, DataError, DeviceError
 
 if TYPE_CHECKING:
+    from thermocald.cli.session_separate import Watch
     from thermocald.config import Config
     from thermocald.daemon.session import Session
     from thermocald.daemon.station import Station
@@ -17,8 +18,11 @@ if TYPE_CHECKING:
 __all__ = ["take_on_the_desk"]
 
 
-def take_on_the_desk(config: Config, session: Session) -> Config:
-    """Check, then take the epochs that are missing; returns the configuration that was used."""
+def take_on_the_desk(config: Config, session: Session, watch: Watch | None = None) -> Config:
+    """Check, then take the epochs that are missing; returns the configuration that was used.
+
+    watch: ends the session when it has seen enough.
+    """
     from thermocald.daemon.journal import set_up_logging
     from thermocald.daemon.service import Service
 
@@ -36,11 +40,11 @@ def take_on_the_desk(config: Config, session: Session) -> Config:
             epochs=epochs - done,
             until_finished=True,
             start_condition=session.start,
-            on_turn=lambda station: _turn(station, progress),
+            on_turn=lambda station: _turn(station, progress, watch),
         )
         service.run()
         done = _stored(config, session)
-    if done < epochs:
+    if done < epochs and not (watch and watch.ended):
         raise DataError(
             f"series {session.series} has {done} of {epochs} epochs; the same command goes on "
             "from there"
@@ -48,12 +52,13 @@ def take_on_the_desk(config: Config, session: Session) -> Config:
     return read
 
 
-def _turn(station: Station, progress: Progress) -> None:
+def _turn(station: Station, progress: Progress, watch: Watch | None) -> bool:
     camera = station.cameras[0]
     if camera.link.error is not None and camera.link.state == "failed":
         raise DeviceError(f"camera {camera.plan.name}: {camera.link.why}")
     last = {} if camera.run is None else camera.run.last
     progress.show(last, camera.link.why if camera.link.state == "out" else "")
+    return watch is not None and watch.look(last.get("epoch", 0))
 
 
 def _prepare(config: Config, session: Session, done: int) -> Config:

@@ -58,8 +58,8 @@ class Service:
     """One daemon in this process.
 
     path: of the configuration, which SIGHUP reads again; until_finished: end when all recordings
-    have been played or all epochs taken; else it takes requests at its control socket. Other
-    arguments as `Station`.
+    have been played or all epochs taken; else it takes requests at its control socket; on_turn:
+    called in every turn, True ends the service. Other arguments as `Station`.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Service:
         until_finished: bool = False,
         hang_after_s: float = 60.0,
         start_condition: str = "",
-        on_turn: Callable[[Station], None] | None = None,
+        on_turn: Callable[[Station], bool] | None = None,
     ) -> None:
         self.config = config
         self.clock = SteadyClock()
@@ -161,8 +161,8 @@ class Service:
                 self._guard.flush()
                 self.live.write_status(self.status())
                 notify(f"STATUS={self._line()}")
-            if self._on_turn is not None:
-                self._on_turn(self._station)
+            if self._on_turn is not None and self._on_turn(self._station):
+                break
             if self._until_finished and self._station.finished:
                 break
 

@@ -1,0 +1,291 @@
+"""The experiment: which heating programme separates two effects best, within limits.
+
+Programmes of some kinds (a long hold, two cycles, a staircase, slow and fast, pulses) are run on a
+body with one time constant, as a relay with a thermostat would heat it. Each effect is then what
+the other, with any of its constants, and the base model leave of it, over the noise of an epoch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.errors import DataError
+from thermocald.simulation import effects as catalogue
+from thermocald.simulation.history import History
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from thermocald.simulation.effects import Effect
+    from thermocald.simulation.effects.parameter import Parameter
+
+    Array = NDArray[np.float64]
+
+__all__ = ["Body", "Experiment", "Limits", "body_of", "experiments"]
+
+_STEP_S = 60.0  # of a ramp, which a thermostat follows as a staircase
+_FINE_S = 2.0
+_NOISE_PX = 0.01  # of an epoch: its image points, and a thermometer of 0.02 K
+_HYSTERESIS_K = 0.5
+_LEAST_S = 900.0
+_LEAST_K = 5.0  # of warming, for anything to be seen
+_KINDS: dict[str, tuple[tuple[float, float], ...]] = {
+    "one long hold": ((0.08, 0.0), (0.09, 1.0), (0.62, 1.0), (0.63, 0.0), (1.0, 0.0)),
+    "two equal cycles": (
+        (0.06, 0.0), (0.07, 1.0), (0.3, 1.0), (0.31, 0.0), (0.53, 0.0), (0.54, 1.0), (0.77, 1.0),
+        (0.78, 0.0), (1.0, 0.0)),
+    "a staircase up and down": (
+        (0.06, 0.0), (0.07, 0.35), (0.2, 0.35), (0.21, 0.7), (0.35, 0.7), (0.36, 1.0), (0.5, 1.0),
+        (0.51, 0.6), (0.68, 0.6), (0.69, 0.3), (0.84, 0.3), (0.85, 0.0), (1.0, 0.0)),
+    "once slowly, once fast": (
+        (0.05, 0.0), (0.5, 1.0), (0.51, 0.0), (0.72, 0.0), (0.73, 1.0), (0.85, 1.0), (0.86, 0.0),
+        (1.0, 0.0)),
+    "three short pulses": (
+        (0.06, 0.0), (0.07, 1.0), (0.17, 1.0), (0.18, 0.0), (0.38, 0.0), (0.39, 1.0), (0.49, 1.0),
+        (0.5, 0.0), (0.7, 0.0), (0.71, 1.0), (0.81, 1.0), (0.82, 0.0), (1.0, 0.0)),
+    "a small loop, then a large one": (
+        (0.05, 0.0), (0.06, 0.5), (0.22, 0.5), (0.23, 0.0), (0.43, 0.0), (0.44, 1.0), (0.7, 1.0),
+        (0.71, 0.0), (1.0, 0.0)),
+}  # fmt: skip
+"""What is done: (share of the time, share of the highest warming) along straight lines."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What heating must not exceed: the highest temperature °C, its rise K/min, the share of time
+    that the heater is on.
+    """
+
+    max_c: float
+    max_rate: float = 3.0
+    max_duty: float = 0.8
+
+
+@dataclass(frozen=True)
+class Body:
+    """How the camera warms: ambient °C, by how much it warms at last K, time constant s."""
+
+    ambient: float = 22.0
+    rise: float = 35.0
+    tau: float = 500.0
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """A programme: what is done, steps (seconds, hold °C or None) of the heating output, expected
+    temperature at the epochs, share of time with heat, by how many sd it separates.
+    """
+
+    name: str
+    steps: tuple[tuple[float, float | None], ...]
+    times: Array
+    temperature: Array
+    duty: float
+    sigmas: float
+
+    def programme(self) -> list[dict[str, Any]]:
+        """The steps as a session takes them."""
+        return [{"seconds": s, "hold_c": h} for s, h in self.steps]
+
+
+def body_of(times: Array, temperature: Array) -> Body:
+    """How a camera warmed and cooled in a recording; the usual where it hardly did.
+
+    times (R,) s, temperature (R,) °C.
+    """
+    usual = Body(ambient=float(np.min(temperature)))
+    rate = np.gradient(temperature, times)
+    falling = (rate < 0.3 * rate.min()) if rate.min() < 0 else np.zeros(len(rate), dtype=bool)
+    falling[1:] &= falling[:-1]  # not the reading at which the heat was switched off
+    if np.ptp(temperature) < _LEAST_K or falling.sum() < 8:
+        return usual
+    slope, _ = np.polyfit(temperature[falling], rate[falling], 1)
+    tau = float(np.clip(-1.0 / slope if slope < 0 else usual.tau, 60.0, 5000.0))
+    fastest = float(np.quantile(rate, 0.97))
+    return Body(usual.ambient, max(fastest * tau, float(np.ptp(temperature))), tau)
+
+
+def experiments(
+    first: str,
+    second: str,
+    limits: Limits,
+    body: Body,
+    epochs: int,
+    interval: float,
+    strength_px: float = 0.1,
+) -> list[Experiment]:
+    """All programmes within the limits, the one that separates best first.
+
+    strength_px: what each effect leaves of itself to the base model under two equal cycles. Raises
+    DataError where the limits allow no heating worth it.
+    """
+    highest = min(limits.max_c - _HYSTERESIS_K, body.ambient + 0.9 * body.rise)
+    if highest - body.ambient < _LEAST_K:
+        raise DataError(
+            f"the limits allow {max(highest - body.ambient, 0.0):.1f} K of warming above "
+            f"{body.ambient:.1f} °C; {_LEAST_K:g} K are needed to separate effects"
+        )
+    if epochs * interval < _LEAST_S:
+        raise DataError(
+            f"{epochs} epochs of {interval:g} s are {epochs * interval / 60:.0f} min; heat needs "
+            f"{_LEAST_S / 60:.0f} min or more to separate effects: take more epochs"
+        )
+    times = interval * np.arange(epochs, dtype=np.float64)
+    runs = {name: _within(name, limits, body, times, highest) for name in _KINDS}
+    usual = runs["two equal cycles"]
+    sizes = {
+        n: _size(n, _history(times, usual[1], body)) / strength_px for n in (first, second)
+    }  # fmt: skip
+    out = []
+    for name, (steps, temperature, duty) in runs.items():
+        history = _history(times, temperature, body)
+        sigmas = min(
+            _left(a, b, history) / max(sizes[a], 1e-300)
+            for a, b in ((first, second), (second, first))
+        )
+        sigmas *= np.sqrt(epochs) / _NOISE_PX
+        out.append(Experiment(name, steps, times, temperature, duty, float(sigmas)))
+    return sorted(out, key=lambda e: -e.sigmas)
+
+
+# -- heating -----------------------------------------------------------------------------------
+
+
+def _within(
+    name: str, limits: Limits, body: Body, times: Array, highest: float
+) -> tuple[tuple[tuple[float, float | None], ...], Array, float]:
+    """The programme of one kind, as hot as duty allows: steps, temperature (E,), duty."""
+    while True:
+        steps = tuple(_steps(name, limits, body, float(times[-1]), highest))
+        temperature, duty = _run(steps, body, times)
+        if duty <= limits.max_duty or highest - body.ambient < _LEAST_K + 1.0:
+            return steps, temperature, duty
+        highest -= 1.0
+
+
+def _steps(
+    name: str, limits: Limits, body: Body, duration: float, highest: float
+) -> Iterator[tuple[float, float | None]]:
+    """The kind's profile as steps of a thermostat, none rising faster than the limit."""
+    shares, levels = np.array(((0.0, 0.0), *_KINDS[name])).T
+    at = np.arange(0.0, duration + _STEP_S, _STEP_S)
+    wanted = np.interp(at, shares * duration, body.ambient + levels * (highest - body.ambient))
+    held: list[float] = [float(body.ambient)]
+    for value in wanted[1:]:
+        held.append(min(float(value), held[-1] + limits.max_rate * _STEP_S / 60.0))
+    seconds, current = 0.0, _hold(held[0], body)
+    for value in held:
+        hold = _hold(value, body)
+        if hold != current and seconds:
+            yield seconds, current
+            seconds = 0.0
+        current, seconds = hold, seconds + _STEP_S
+    yield seconds, current
+
+
+def _hold(value: float, body: Body) -> float | None:
+    """A step's temperature, 0.1 °C; None where there is nothing to heat."""
+    return round(value, 1) if value > body.ambient + 0.5 else None
+
+
+def _run(
+    steps: tuple[tuple[float, float | None], ...], body: Body, times: Array
+) -> tuple[Array, float]:
+    """Temperature (E,) at some times and share of time with heat, under a thermostat."""
+    fine = np.arange(0.0, times[-1] + _FINE_S, _FINE_S)
+    ends = np.cumsum([s for s, _ in steps])
+    which = np.minimum(np.searchsorted(ends, fine, side="right"), len(steps) - 1)
+    holds = [h for _, h in steps]
+    T, on, heated, out = body.ambient, False, 0, []
+    decay = 1.0 - np.exp(-_FINE_S / body.tau)
+    for i in which.tolist():
+        hold = holds[i]
+        if hold is None or hold + _HYSTERESIS_K / 2 <= T:
+            on = False
+        elif hold - _HYSTERESIS_K / 2 >= T:
+            on = True
+        heated += on
+        T += (body.ambient + body.rise * on - T) * decay
+        out.append(T)
+    return np.interp(times, fine, out), heated / len(fine)
+
+
+# -- what the effects make of it -----------------------------------------------------------------
+
+
+def _history(times: Array, temperature: Array, body: Body) -> History:
+    other = body.ambient + 8.0 + 4.0 * np.sin(times / 211.0)
+    readings = {"temperature": temperature, "other": other}
+    return History(times, times, readings, "temperature", body.ambient)
+
+
+def _trajectories(name: str, history: History) -> list[Array]:
+    """What an effect looks like (E, m) at each of its trial constants."""
+    effect = catalogue.get(name)
+    trials: list[dict[str, Any]] = [{}]
+    for key, parameter in effect.nonlinear.items():
+        if parameter.text:
+            trials = [{**t, key: "other"} for t in trials]
+        elif parameter.role != "phase":
+            trials = [{**t, key: float(v)} for t in trials for v in _values(parameter, history)]
+    return [_trajectory(effect, history, t) for t in trials]
+
+
+def _trajectory(effect: Effect, history: History, values: dict[str, Any]) -> Array:
+    if effect.is_drive:
+        return (effect.drive(history, **values) - history.temperature())[:, None]
+    if effect.kind == "signal":
+        return effect.signal(history, **values)
+    return (history.temperature() - history.T0)[:, None]
+
+
+def _values(parameter: Parameter, history: History) -> Array:
+    duration, T = float(history.times[-1]), history.temperature()
+    low, high = float(T.min()), float(T.max())
+    match parameter.role:
+        case "threshold":
+            return np.linspace(low, high, 14)[2:-2]
+        case "width":
+            return np.geomspace(0.2, 0.4 * (high - low), 12)
+        case "time_constant":
+            return np.geomspace(10.0, duration, 24)
+        case "delay":
+            return np.linspace(5.0, 0.2 * duration, 24)
+        case "event":
+            return np.linspace(0.1, 0.9, 17) * duration
+        case "period":
+            return np.geomspace(duration / 40, duration / 2, 60)
+    return np.linspace(parameter.low, parameter.high, 20)
+
+
+def _residual(columns: Array, y: Array) -> Array:
+    columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
+    out: Array = y - columns @ np.linalg.lstsq(columns, y, rcond=1e-9)[0]
+    return out
+
+
+def _base(history: History) -> Array:
+    return np.column_stack([np.ones(len(history.times)), history.temperature()])
+
+
+def _typical(name: str, history: History) -> Array:
+    """One trajectory (E,) in the middle of an effect's trial constants."""
+    every = _trajectories(name, history)
+    return every[len(every) // 3][:, 0]
+
+
+def _size(name: str, history: History) -> float:
+    """RMS that the base model leaves of an effect."""
+    return float(np.std(_residual(_base(history), _typical(name, history))))
+
+
+def _left(name: str, other: str, history: History) -> float:
+    """RMS that the base model with another effect leaves of an effect, at its best constants."""
+    y, base = _typical(name, history), _base(history)
+    left = [_residual(np.hstack([base, t]), y) for t in _trajectories(other, history)]
+    return min(float(np.std(r)) for r in left)

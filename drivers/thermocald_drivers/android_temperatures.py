@@ -1,12 +1,13 @@
 """What phones print about their temperatures, as pure functions of the text.
 
 `dumpsys battery`: tenths of a degree, but whole degrees on boards that also give whole volts. It is
-refused where the phone has no battery (`present: false`, or 0 °C at 0 V) and where its values are
-frozen or forged (`UPDATES STOPPED`, after `dumpsys battery unplug` or `set`).
+refused where the phone has no battery (`present: false`, or 0 °C at a voltage that no cell has) and
+where its values are frozen or forged (`UPDATES STOPPED`, after `dumpsys battery unplug` or `set`).
 
 `dumpsys thermalservice`: only the live section "Current temperatures from HAL" is used; the cache
 before it may be hours old. The section also lists volts, currents and percent (types 6 to 8), and
-differences or flags in any unit (type −1); 0.0 is a sensor that is not fitted.
+differences or flags in any unit (type −1); 0.0 is a sensor that is not fitted, and `lmh-dcvs` is a
+limit of the processor.
 Source: android.hardware.thermal TemperatureType, AOSP BatteryService; dumps of eleven phones.
 """
 
@@ -15,7 +16,7 @@ from __future__ import annotations
 import re
 
 from thermocald_drivers import support
-from thermocald_drivers.android_zones import UNITS
+from thermocald_drivers.android_zones import UNITS, is_limit
 
 __all__ = ["TYPES", "battery", "thermalservice"]
 
@@ -28,6 +29,7 @@ TYPES = {
 NOT_TEMPERATURES = {6, 7, 8}
 LIVE_SECTION = "Current temperatures from HAL:"
 WHOLE_VOLTS = range(1, 100)
+CELL_MV = range(2500, 4600)
 HOTTEST_BATTERY_C = 70.0
 
 _FIELD = re.compile(
@@ -53,10 +55,12 @@ def battery(text: str, unit: str = "") -> float | None:
     for name, value in _FIELD.findall(text):
         fields.setdefault(name, value)  # the first is current; log lines may repeat the word
     raw, volts = _whole(fields.get("temperature")), _whole(fields.get("voltage"))
-    if raw is None or fields.get("present") == "false" or (raw == 0 and volts == 0):
+    if raw is None or fields.get("present") == "false" or (raw == 0 and not volts):
         return None
     if unit:
         return raw * UNITS[unit]
+    if raw == 0 and volts not in CELL_MV:  # a board that runs from the mains
+        return None
     if volts in WHOLE_VOLTS:
         return _of_whole_volts(raw)
     return raw / 10.0 if abs(raw) <= HOTTEST_BATTERY_C * 10 else None
@@ -92,7 +96,8 @@ def thermalservice(text: str) -> dict[str, float]:
         except ValueError:
             continue  # NaN
         name = " ".join(record["name"].split())
-        if value == 0.0:  # the HAL's way to say "not fitted"
+        # 0.0 is the HAL's way to say "not fitted"
+        if value == 0.0 or is_limit(name):
             continue
         if values.setdefault(name, value) != value:
             ambiguous.add(name)

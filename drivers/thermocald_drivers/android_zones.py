@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-__all__ = ["UNITS", "is_temperature", "raw_zones", "zone_scales"]
+__all__ = ["UNITS", "is_limit", "is_temperature", "raw_zones", "zone_scales"]
 
 UNITS = {"degC": 1.0, "tenths": 0.1, "thousandths": 0.001}
 """The option's words: what a zone's number is multiplied by to be °C."""
@@ -33,6 +33,7 @@ _OTHER_QUANTITIES = re.compile(
     r"|lvl[0-9]*|mv|ma|uv|ua|mw)(?:[-_ ].*)?|batoilo[0-9]*|vdroop[0-9]*|smpl_gm",
     re.IGNORECASE,
 )
+_LIMIT = re.compile(r"lmh[-_]dcvs.*", re.IGNORECASE)  # always 75 or 95 °C
 
 
 @dataclass(frozen=True)
@@ -65,8 +66,13 @@ _ANY = _Family(r".*", 105.0, HIGHEST_C, 500)
 
 
 def is_temperature(zone: str) -> bool:
-    """Whether a zone of that name holds a temperature, not percent, mA or mV."""
-    return _OTHER_QUANTITIES.fullmatch(zone) is None
+    """Whether a zone of that name holds a temperature, not percent, mA, mV or a limit."""
+    return _OTHER_QUANTITIES.fullmatch(zone) is None and not is_limit(zone)
+
+
+def is_limit(name: str) -> bool:
+    """Whether a zone or sensor of that name holds a limit of the hardware, not a temperature."""
+    return _LIMIT.fullmatch(name) is not None
 
 
 def raw_zones(text: str) -> dict[str, int]:

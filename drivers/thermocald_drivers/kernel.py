@@ -11,7 +11,10 @@ without it every temperature input is read, a single one as `temperature`. `mini
 `maximum_c` bound what is accepted (a broken diode reads 127 °C); `sysfs` (/sys) is where the files
 are. The kernel renumbers its devices at every plug: they are looked up by name at each open, and
 the name is checked at each read. A zone of −40 °C is one that is not fitted, and the hwmon entry of
-a 1-wire sensor is refused at its power-on value: use the driver ds18b20, which sees the CRC.
+a 1-wire sensor is refused at its power-on value: use the driver ds18b20, which sees the CRC. Inputs
+that are not connected, and chips that have not converted yet, read 0: it is accepted only if a
+recent reading lay within 5 K. A zone of a vendor's kernel may be in °C or tenths: a number up to
+1250 is refused until one above has shown that it is in thousandths, or `unit` states it.
 Source: Documentation/hwmon/sysfs-interface, ABI/testing/sysfs-bus-iio, driver-api/thermal.
 """
 
@@ -35,6 +38,7 @@ __all__ = ["HwmonThermometer", "IioThermometer", "ThermalZoneThermometer"]
 
 ONE_WIRE_POWER_ON_C = 85.0
 NOT_FITTED_C = -40.0
+LARGEST_OF_TENTHS = 1250  # 125 °C; what is larger can only be thousandths
 
 
 class _KernelThermometer(Thermometer):
@@ -65,6 +69,7 @@ class _KernelThermometer(Thermometer):
             )
         self.sysfs = Path(support.text("sysfs", sysfs))
         self._seen = False
+        self._neighbours: dict[str, support.Neighbour] = {}
         self._device: Path | None = None
         self._channels: dict[str, str] = {}
         self._name = ""
@@ -111,6 +116,7 @@ class _KernelThermometer(Thermometer):
 
     def close(self) -> None:
         self._device = None
+        self._neighbours.clear()
 
     def identity(self) -> Mapping[str, str]:
         return {"chip": self.chip, "path": str(self._device or "")}
@@ -120,7 +126,12 @@ class _KernelThermometer(Thermometer):
         if not self.wanted:
             if len(inputs) == 1:
                 return {"temperature": next(iter(inputs))}
-            return {label or key: key for key, label in inputs.items()}
+            # two inputs of one label would be one channel
+            given = list(inputs.values())
+            return {
+                label if label and given.count(label) == 1 else key: key
+                for key, label in inputs.items()
+            }
         by_label = {label: key for key, label in inputs.items() if label}
         chosen = {}
         for channel, key in self.wanted.items():
@@ -140,7 +151,8 @@ class _KernelThermometer(Thermometer):
             where = f"{self._device.name} ({self.chip}) {key}"
             try:
                 value = self._convert(self._device, key)
-                values[channel] = support.believable(value, self.minimum_c, self.maximum_c, where)
+                value = support.believable(value, self.minimum_c, self.maximum_c, where)
+                values[channel] = self._connected(key, value, where)
             except BadReading as error:
                 missing[channel] = str(error)
             except ValueError as error:
@@ -156,6 +168,17 @@ class _KernelThermometer(Thermometer):
         return support.middle_reading(
             self.clock, values, start, {"missing": missing} if missing else {}
         )
+
+    def _connected(self, key: str, value: float, where: str) -> float:
+        neighbour = self._neighbours.setdefault(key, support.Neighbour(self.clock))
+        if value != 0.0:
+            neighbour.measured(value)
+        elif not neighbour.supports(value):
+            raise BadReading(
+                f"{where}: 0 °C is what an input reads that is not connected, and no recent "
+                "reading was near it"
+            )
+        return value
 
     def _same_device(self) -> None:
         """A kernel name is handed on: hwmon3 may be another chip after a re-plug."""
@@ -226,6 +249,9 @@ class IioThermometer(_KernelThermometer):
         return {key: _label(folder, key) for key in sorted(keys)}
 
     def _convert(self, folder: Path, key: str) -> float:
+        for fault in sorted(folder.glob("fault_*")):  # of thermocouples and PT100: an open wire
+            if _number(fault) != 0:
+                raise BadReading(f"{folder.name} {key}: the chip reports a fault ({fault.name})")
         processed = folder / f"{key}_input"
         if processed.exists():
             return _number(processed) / 1000.0
@@ -263,6 +289,7 @@ class ThermalZoneThermometer(_KernelThermometer):
         sysfs: str = "/sys",
     ) -> None:
         self.scale = UNITS[support.choice("unit", unit or "thousandths", list(UNITS))]
+        self._certain = self._stated = unit is not None
         if unit is None and not is_temperature(zone):
             raise ConfigurationError(
                 f"zone: {zone!r} holds percent, mA or mV on the machines that have it; if yours "
@@ -276,6 +303,10 @@ class ThermalZoneThermometer(_KernelThermometer):
             maximum_c=maximum_c,
             sysfs=sysfs,
         )
+
+    def close(self) -> None:
+        super().close()
+        self._certain = self._stated
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:
@@ -292,11 +323,19 @@ class ThermalZoneThermometer(_KernelThermometer):
 
     def _convert(self, folder: Path, key: str) -> float:
         try:
-            value = round(_number(folder / key) * self.scale, 6)
+            number = _number(folder / key)
         except OSError as error:
             if error.errno in (errno.EAGAIN, errno.ENODATA, errno.EINVAL):
                 raise BadReading(f"{folder.name}: the zone is disabled or asleep") from error
             raise
+        value = round(number * self.scale, 6)
+        larger = abs(number) > LARGEST_OF_TENTHS
+        self._certain |= larger and abs(value) <= LARGEST_OF_TENTHS / 10
+        if not self._certain and not larger and number != 0:
+            raise BadReading(
+                f"{folder.name}: the unit of {number:g} is not known; write unit: degC, tenths or "
+                "thousandths"
+            )
         if value == NOT_FITTED_C:
             raise BadReading(f"{folder.name}: {value:g} °C, as of a sensor that is not fitted")
         return value

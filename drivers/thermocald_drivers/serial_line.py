@@ -137,6 +137,7 @@ class SerialThermometer(Thermometer):
             raise ConfigurationError("pattern: a checksum needs a group (?P<checksum>…)")
         self._serial: Any = None
         self._seen = False
+        self._neighbours: dict[str, support.Neighbour] = {}
         self._line = b""
         self._synchronous = False
 
@@ -182,6 +183,7 @@ class SerialThermometer(Thermometer):
             raise support.fault(error, self.where, seen=self._seen, hint=hint) from error
         self._seen = True
         self._line, self._synchronous = b"", False
+        self._neighbours.clear()
 
     def close(self) -> None:
         port, self._serial = self._serial, None
@@ -312,6 +314,14 @@ class SerialThermometer(Thermometer):
             raise BadReading(
                 f"{where}: {celsius:g} °C is what firmware prints without a sensor; if it is a "
                 "temperature, write refuse_c: []"
+            )
+        neighbour = self._neighbours.setdefault(channel, support.Neighbour(self.clock))
+        if value != 0.0 or not self.refuse_c:
+            neighbour.measured(celsius)
+        elif not neighbour.supports(celsius):
+            raise BadReading(
+                f"{where}: 0 is what firmware prints without a sensor, and no recent reading was "
+                "near it; if it is a temperature, write refuse_c: []"
             )
         return celsius
 

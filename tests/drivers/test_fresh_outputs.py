@@ -1,7 +1,7 @@
 """Further outputs of devices, by family: what they must be read as, or that they must not.
 
-Through the drivers as they are, like `test_device_outputs`. Sources: drivers of the kernel, Android's
-BatteryService and thermal HAL, C. Petrich's survey of DS18B20 clones, firmware libraries.
+Through the drivers as they are, like `test_device_outputs`. Sources: drivers of the kernel, the
+BatteryService and thermal HAL of Android, C. Petrich's survey of DS18B20 clones, Arduino libraries.
 """
 
 from __future__ import annotations

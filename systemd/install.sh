@@ -4,12 +4,13 @@ set -eu
 here=$(cd "$(dirname "$0")" && pwd)
 root=${DESTDIR:-}
 units="thermocald.service thermocald@.service thermocald-dashboard.service thermocald-dashboard@.service
+    thermocald-forward.service thermocald-forward@.service
     thermocald-archive.service thermocald-archive.timer thermocald-backup.service thermocald-backup.timer"
 
 place() { install -D -m "$1" "$2" "$root$3"; echo "  $root$3"; }
 
 if [ "${1:-}" = --uninstall ]; then
-    [ -n "$root" ] || systemctl disable --now thermocald.service thermocald-dashboard.service \
+    [ -n "$root" ] || systemctl disable --now thermocald.service thermocald-dashboard.service thermocald-forward.service \
         thermocald-archive.timer thermocald-backup.timer || true
     for unit in $units; do rm -f "$root/etc/systemd/system/$unit"; done
     rm -f "$root/usr/lib/sysusers.d/thermocald.conf" "$root/usr/lib/tmpfiles.d/thermocald.conf" \

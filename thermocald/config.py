@@ -13,6 +13,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
+from urllib.parse import urlsplit
 
 from pydantic import (
     BaseModel,
@@ -35,6 +36,7 @@ __all__ = [
     "Config",
     "DashboardConfig",
     "DeviceConfig",
+    "ForwardConfig",
     "FramesConfig",
     "LoggingConfig",
     "OutputConfig",
@@ -257,6 +259,29 @@ class DashboardConfig(_Section):
         return self
 
 
+class ForwardConfig(_Section):
+    """Where the store's rows are sent, by a process of its own: `thermocald forward`."""
+
+    to: Annotated[str, Field(pattern=r"^postgres(ql)?://")] | None = None
+    """The server, postgresql://USER@HOST/DATABASE; null: nothing is sent."""
+    station: Name | None = None
+    """This station's name there; null: the host's."""
+    frames: Literal["none", "events", "every_n", "all"] = "none"
+    """Which of the kept frames are sent too; events: epochs without a result, and movements."""
+    every_n: Annotated[int, Field(ge=1, le=1_000_000)] = 360
+    """With frames: every_n, those whose number it divides."""
+    frames_mb_per_day: Positive = 200.0
+    """Frames beyond it wait for the next day."""
+
+    @field_validator("to")
+    @classmethod
+    def _without_password(cls, value: str | None) -> str | None:
+        parts = urlsplit(value or "")
+        if parts.password is not None or "password=" in parts.query:
+            raise _wrong("holds a password; write it to the service's ~/.pgpass, or use passfile=")
+        return value
+
+
 class LoggingConfig(_Section):
     """What goes to the journal."""
 
@@ -281,6 +306,8 @@ class Config(_Section):
     """How epochs are adjusted."""
     dashboard: DashboardConfig = DashboardConfig()
     """The web page."""
+    forward: ForwardConfig = ForwardConfig()
+    """A server that gets every row."""
     logging: LoggingConfig = LoggingConfig()
     """The log."""
 

@@ -55,7 +55,7 @@ def test_the_daemon_is_in_every_group_that_its_devices_belong_to():
     assert groups == set(made)
 
 
-@pytest.mark.parametrize("name", ["thermocald", "thermocald-dashboard"])
+@pytest.mark.parametrize("name", ["thermocald", "thermocald-dashboard", "thermocald-forward"])
 def test_the_template_is_the_plain_unit_with_a_name(name):
     plain = (UNITS / f"{name}.service").read_text().splitlines()[1:]
     template = (UNITS / f"{name}@.service").read_text().splitlines()[1:]
@@ -87,6 +87,8 @@ def test_everything_is_installed_where_it_belongs(tmp_path):
         "etc/systemd/system/thermocald-backup.timer",
         "etc/systemd/system/thermocald-dashboard.service",
         "etc/systemd/system/thermocald-dashboard@.service",
+        "etc/systemd/system/thermocald-forward.service",
+        "etc/systemd/system/thermocald-forward@.service",
         "etc/thermocald/config.yaml",
         "etc/udev/rules.d/60-thermocald.rules",
         "usr/lib/sysusers.d/thermocald.conf",
@@ -104,8 +106,8 @@ def test_the_page_shares_neither_memory_nor_processor_with_the_daemon():
         lines = (UNITS / unit).read_text().splitlines()
         return dict(line.split("=", 1) for line in lines if re.match(r"\w+=", line))
 
-    for at in ("", "@"):
-        page = values(f"thermocald-dashboard{at}.service")
+    for at, what in [(at, what) for at in ("", "@") for what in ("dashboard", "forward")]:
+        page = values(f"thermocald-{what}{at}.service")
         daemon = values(f"thermocald{at}.service")
         assert int(page["OOMScoreAdjust"]) > 0 > int(daemon["OOMScoreAdjust"])
         assert int(page["MemoryMax"].removesuffix("M")) <= 200

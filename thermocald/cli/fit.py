@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from thermocald.analysis.thermal.prediction_test import PredictedError
     from thermocald.analysis.thermal.result import FittedModel
     from thermocald.reduction.series import ReducedSeries
-    from thermocald.simulation.model import ModelEffect
+    from thermocald.simulation.model import ModelEffect, ThermalModel
 
 __all__ = ["register"]
 
@@ -48,7 +48,12 @@ def fit(
     ] = None,
     type_name: Annotated[
         str | None,
-        typer.Option("--type", help="Several cameras of one type: fit each, write the type."),
+        typer.Option(
+            "--type",
+            metavar="NAME|MODEL",
+            help="Several cameras: fit each, write the type NAME. One: its type's MODEL file helps "
+            "where it was measured at few temperatures.",
+        ),
     ] = None,
     code: Annotated[
         Path | None,
@@ -62,15 +67,23 @@ def fit(
 
     Example: thermocald fit M1 M2 -o camera.thermal.yaml --effect thermal_lag
     """
+    from thermocald.analysis.thermal.type_model import fit_with_type
     from thermocald.cli.common import progress, write_json
     from thermocald.cli.effect_options import check_names
     from thermocald.simulation.model_file import write_model
 
+    known = _known_type(type_name)
+    if known is not None and (effect or model or reference_temperature is not None):
+        raise UsageError(f"--type {type_name}: effects and T0 are the type's; give no others")
     listed, T0 = _structure(effect or [], model, reference_temperature)
     with progress(None, "reading and measuring") as advance:
         series = _read(inputs, advance)
     check_names(listed, series)
-    if type_name is not None:
+    if known is not None:
+        fitted = fit_with_type(series, known)
+        fitted_model, document = fitted.model, _document(fitted, [])
+        document["type"] = {"name": known.camera, "cameras": len(known.fitted_on)}
+    elif type_name is not None:
         fitted_model, document = _type(series, listed, T0, type_name)
     else:
         fitted, held = _one(series, listed, T0)
@@ -86,6 +99,23 @@ def fit(
         write_json(document, json)
     if json != "-":
         _say(document)
+
+
+def _known_type(text: str | None) -> ThermalModel | None:
+    """The type's model where a file is named; None for a name that is to be given."""
+    from thermocald.analysis.thermal.type_model import require_type
+    from thermocald.simulation.model_file import read_model
+
+    if text is None:
+        return None
+    path = Path(text)
+    if not path.is_file():
+        if path.suffix in (".yaml", ".yml") or "/" in text:
+            raise UsageError(f"--type {text}: there is no such file")
+        return None
+    found = read_model(path)
+    require_type(found)
+    return found
 
 
 def _read(inputs: list[Path], advance: Callable[[int], None]) -> list[ReducedSeries]:
@@ -202,6 +232,9 @@ def _say(document: dict[str, Any]) -> None:
         )
     else:
         typer.echo(f"  valid from {low:g} to {high:g} °C, {T0}")
+    if "type" in document:
+        kind = document["type"]
+        typer.echo(f"  with what {kind['cameras']} cameras of the type {kind['name']} say of it")
     from thermocald.output.figures.numbers import with_sd
 
     for name, rate in document["rates"].items():

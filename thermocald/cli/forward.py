@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from thermocald.cli.common import log_to_stderr, say, write_json
 from thermocald.cli.options import JsonOption
+from thermocald.config import Config, load_config
+from thermocald.errors import UsageError
+
+if TYPE_CHECKING:
+    from thermocald.fleet.frames import FrameRule
 
 __all__ = ["register"]
 
@@ -19,13 +24,31 @@ def register(app: typer.Typer) -> None:
 
 
 def forward(
-    store: Annotated[Path, typer.Argument(help="The store; may be in use by a daemon.")],
+    store: Annotated[
+        Path | None, typer.Argument(help="The store; may be in use by a daemon.")
+    ] = None,
     to: Annotated[
-        str, typer.Option("--to", metavar="ADDRESS", help="postgresql://USER@HOST/DATABASE?…")
-    ],
+        str | None,
+        typer.Option("--to", metavar="ADDRESS", help="postgresql://USER@HOST/DATABASE?…"),
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option("--config", "-c", help="Store and `forward:` of this file.")
+    ] = None,
     station: Annotated[
         str | None, typer.Option("--station", help="This station's name; default: the host's.")
     ] = None,
+    frames: Annotated[
+        Path | None, typer.Option("--frames", help="Send frames from this folder too.")
+    ] = None,
+    choose: Annotated[
+        str, typer.Option("--choose", help="Which of them: events, every_n, all.")
+    ] = "events",
+    every_n: Annotated[
+        int, typer.Option("--every-n", min=1, help="With every_n: one of so many.")
+    ] = 360,
+    frames_mb: Annotated[
+        float, typer.Option("--frames-mb", min=0.001, help="Frames beyond it wait for tomorrow.")
+    ] = 200.0,
     once: Annotated[
         bool, typer.Option("--once", help="Send what waits, then end; else go on for ever.")
     ] = False,
@@ -34,7 +57,7 @@ def forward(
     ] = None,
     json: JsonOption = None,
 ) -> None:
-    """Send epochs, events and readings to a PostgreSQL server, each of them once.
+    """Send epochs, events, readings and chosen frames to a PostgreSQL server, each of them once.
 
     The store is only read. Without a network rows wait in it, for as long as it takes.
 
@@ -47,7 +70,21 @@ def forward(
     from thermocald.fleet.forward import Forwarder, forward_forever
     from thermocald.store.server.address import ServerAddress
 
-    forwarder = Forwarder(store, ServerAddress.parse(to), station or socket.gethostname(), cursor)
+    rule: FrameRule | None = None
+    if config is not None:
+        read = load_config(config)
+        store, to = store or read.store.path, to or read.forward.to
+        station = station or read.forward.station
+        rule = _configured(read)
+        if to is None:
+            say(f"{config}: forward.to is null: nothing is sent")
+            return
+    if frames is not None:
+        rule = _rule(frames, choose, every_n, frames_mb)
+    if store is None or to is None:
+        raise UsageError("give STORE and --to ADDRESS, or --config FILE")
+    address = ServerAddress.parse(to)
+    forwarder = Forwarder(store, address, station or socket.gethostname(), cursor, frames=rule)
     if once:
         done = forwarder.send_waiting()
         if json is not None:
@@ -61,3 +98,20 @@ def forward(
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
     forward_forever(forwarder, ended.wait)
+
+
+def _configured(config: Config) -> FrameRule | None:
+    section = config.forward
+    if section.frames == "none":
+        return None
+    folder = config.frames.folder
+    return _rule(folder, section.frames, section.every_n, section.frames_mb_per_day)
+
+
+def _rule(folder: Path, choose: str, every_n: int, mb: float) -> FrameRule:
+    from thermocald.fleet.frames import FrameRule
+
+    for name in ("events", "every_n", "all"):
+        if choose == name:
+            return FrameRule(folder, name, every_n, int(mb * 1e6))
+    raise UsageError(f"--choose {choose}: there are events, every_n, all")

@@ -46,6 +46,7 @@ class HypothesisFitter:
         self.series = tuple(series)
         self.thermometer_factor = 1.0
         self.held: frozenset[str] = frozenset()  # non-linear parameters, such as `effect.tau`
+        self.priors: dict[str, tuple[float, float]] = {}  # of these: value known beforehand, sd
         self._trajectories: dict[Any, tuple[Array, Array | None, str]] = {}
         self._drives: dict[Any, tuple[Array, Array]] = {}
 
@@ -334,7 +335,22 @@ class HypothesisFitter:
             at[: C.shape[1]] = fit.coefficients[index]
             A += T.T @ joint.A @ T
             g += T.T @ (joint.c - joint.A @ at)
+        for row, (left, information) in enumerate(self.prior_terms(fit), K):
+            A[row, row] += information
+            g[row] += information * left
         return A, g, searched
+
+    def prior_terms(self, fit: Fit) -> list[tuple[float, float]]:
+        """Of each searched parameter: prior minus value, and the prior's information (0: none)."""
+        found = []
+        for i, name in self.searched(fit.terms):
+            term = fit.terms[i]
+            value, sd = self.priors.get(f"{term.effect}.{name}", (0.0, np.inf))
+            found.append((value - float(dict(term.nonlinear)[name]), 1.0 / sd**2))
+        return found
+
+    def _with_prior(self, fit: Fit) -> float:
+        return fit.objective + sum(w * left**2 for left, w in self.prior_terms(fit) if w)
 
     def refine(self, fit: Fit, max_iterations: int = 6, only: Sequence[int] | None = None) -> Fit:
         """Gauss-Newton on the non-linear parameters; never makes the objective worse."""
@@ -353,8 +369,9 @@ class HypothesisFitter:
                             terms[i].kind.nonlinear[name].bounded(old, old + float(d), slack=0.1),
                         )
                     trial = self.fit(terms, fit.coefficients, 2, only)
-                    if trial.objective < fit.objective:
-                        gain, fit, improved = fit.objective - trial.objective, trial, True
+                    gain = self._with_prior(fit) - self._with_prior(trial)
+                    if gain > 0:
+                        fit, improved = trial, True
                         break
                 if not improved or gain < 0.05:
                     break

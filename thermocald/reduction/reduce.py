@@ -136,8 +136,9 @@ def _linearised(source: SeriesInput, affinity: bool) -> Partials:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         mean = np.nanmedian(source.grid.points, axis=0)
-    # targets seen in half of the epochs carry the orientation
-    often = source.grid.observed.sum(axis=0) >= 0.5 * len(source.frame_times)
+    # targets seen in half of the epochs that show any carry the orientation
+    looked = np.count_nonzero(source.grid.observed.any(axis=1))
+    often = source.grid.observed.sum(axis=0) >= 0.5 * max(looked, 1)
     rows = np.flatnonzero(np.isfinite(mean[:, 0]) & often)
     seen = Observations(rows, mean[rows], np.full((len(rows), 2), 0.1))
     found = cold_start(

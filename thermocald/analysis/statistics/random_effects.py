@@ -87,23 +87,27 @@ class Population:
         covariance: Array = self.between + self.mean_covariance
         return covariance
 
-    def posterior(self, values: Array, information: Array) -> Shrunk:
+    def posterior(
+        self, values: Array, information: Array, gradient: Array | None = None
+    ) -> Shrunk:
         """A new specimen from its own estimate and what little it knows.
 
         values (k,): its estimate, any number where it knows nothing; information (k, k): the
-        inverse of its covariance, zero where it knows nothing.
+        inverse of its covariance, zero where it knows nothing; gradient (k,): of its own
+        observations at `values`, where these are not their optimum.
         """
         known = np.where(np.diag(information) > 0, values, 0.0)
-        found, covariance = self._update(self.between, known, information)
+        push = information @ (known - self.mean) + (0.0 if gradient is None else gradient)
+        found, covariance = self._update(self.between, push, information)
         return Shrunk(
-            found, covariance + self._weights_error(found, known, information), self, information
+            found, covariance + self._weights_error(found, push, information), self, information
         )
 
-    def _update(self, between: Array, known: Array, information: Array) -> tuple[Array, Array]:
+    def _update(self, between: Array, push: Array, information: Array) -> tuple[Array, Array]:
         covariance = _posterior(between + self.mean_covariance, information)
-        return self.mean + covariance @ (information @ (known - self.mean)), covariance
+        return self.mean + covariance @ push, covariance
 
-    def _weights_error(self, found: Array, known: Array, information: Array) -> Array:
+    def _weights_error(self, found: Array, push: Array, information: Array) -> Array:
         """What Σ's own errors do to the values, (k, k); after Kackar and Harville (1984)."""
         size = len(found)
         sd = np.sqrt(np.diag(self.between))
@@ -112,12 +116,12 @@ class Population:
             factors = np.ones(size)
             factors[j] = 1 + _STEP / 2
             other = self.between * np.outer(factors, factors)
-            move = (self._update(other, known, information)[0] - found) / _STEP
+            move = (self._update(other, push, information)[0] - found) / _STEP
             total += np.outer(move, move) * 2.0 / self.freedom
             for k in range(j):
                 other = self.between.copy()
                 other[[j, k], [k, j]] += _STEP * sd[j] * sd[k]
-                move = (self._update(other, known, information)[0] - found) / _STEP
+                move = (self._update(other, push, information)[0] - found) / _STEP
                 total += np.outer(move, move) * self.correlation_variance[j, k]
         return total
 

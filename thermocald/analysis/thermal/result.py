@@ -182,10 +182,11 @@ class _Parts:
         """The noise of an image coordinate at T₀, px."""
         total, count = 0.0, 0
         for k, s in enumerate(self.series):
-            w = s.weights[..., :2].mean(axis=(1, 2), where=s.weights[..., :2] > 0)
-            rise = self.growth.noise[k] if self.growth else np.ones(len(w))
             ok = s.n > 0
-            total += float(np.sum(s.n[ok] / w[ok] / rise[ok] ** 2))
+            weights = s.weights[ok, :, :2]
+            w = weights.mean(axis=(1, 2), where=weights > 0)
+            rise = self.growth.noise[k][ok] if self.growth else np.ones(len(w))
+            total += float(np.sum(s.n[ok] / w / rise**2))
             count += int(s.n[ok].sum())
         return float(np.sqrt(total / count))
 
@@ -259,6 +260,8 @@ def _joint_normal(fitter: HypothesisFitter, fit: Fit) -> Array:
         T[R + np.array(_EXTERIOR), n + size + 6 * s + np.arange(6)] = 1.0
         own = np.block([[A, coupling.T], [coupling, fit.weightings[s].level_normal]])
         M += T.T @ own @ T
+    for row, (_, information) in enumerate(fitter.prior_terms(fit), n + K):
+        M[row, row] += information
     empty = np.diag(M) <= 0
     M[empty, empty] = 1e12  # a coefficient of a series that takes no part
     return M

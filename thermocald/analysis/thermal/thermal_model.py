@@ -31,7 +31,7 @@ from thermocald.reduction.reduce import reweighted, without_targets
 from thermocald.simulation import effects
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from thermocald.reduction.hypothesis import Fit
     from thermocald.reduction.series import ReducedSeries
@@ -46,12 +46,14 @@ def fit_thermal_model(
     T0: float | None = None,
     search: bool = True,
     fixed: Sequence[str] = (),
+    priors: Mapping[str, tuple[float, float]] | None = None,
 ) -> FittedModel:
     """Fit the base model and some effects to all series together.
 
     listed: effects with start values; with `search` their non-linear parameters are looked for over
     their whole range first (an event always is); fixed: names such as `thermal_lag.tau` that keep
-    their start values; T0 °C: by default the mean temperature. Raises DataError for series of
+    their start values; priors: {such a name: (value, sd) known beforehand}; T0 °C: by default the
+    mean temperature. Raises DataError for series of
     different cameras, or of one temperature.
     """
     checked = _checked(series, listed)
@@ -68,7 +70,7 @@ def fit_thermal_model(
     if any(effects.get(e.name).seen_in == "noise" for e in listed):
         growth = noise_slope(others)
         others = [reweighted(s, n) for s, n in zip(others, growth.noise, strict=True)]
-    fitter, fit = _fitted(others, listed, search, frozenset(fixed))
+    fitter, fit = _fitted(others, listed, search, frozenset(fixed), dict(priors or {}))
     moved = [moved_targets(s, np.array(rows)) for s in others] if rows else []
     return fitted_model(fitter, fit, others, listed, growth, moved)
 
@@ -87,11 +89,12 @@ def _fitted(
     listed: Sequence[ModelEffect],
     search: bool,
     held: frozenset[str],
+    priors: dict[str, tuple[float, float]],
 ) -> tuple[HypothesisFitter, Fit]:
     """The hypothesis of all effects that act on trajectories, fitted."""
     ready = [in_blocks(with_correlated_noise(s)) for s in calibrated_thermometers(series)]
     fitter = HypothesisFitter(ready)
-    fitter.held = held
+    fitter.held, fitter.priors = held, priors
     fit = fitter.fit(())
     for effect in listed:
         if effects.get(effect.name).seen_in == "trajectory":
@@ -104,7 +107,7 @@ def _fitted(
         better = again(fitter, fit)
         if better is not None:
             fitter = HypothesisFitter(better)
-            fitter.held = held
+            fitter.held, fitter.priors = held, priors
             fit = fitter.refine(fitter.fit(fit.terms, fit.coefficients), max_iterations=20)
     return fitter, fit
 

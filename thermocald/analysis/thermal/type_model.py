@@ -17,6 +17,7 @@ from thermocald.analysis.statistics.random_effects import (
     odd_specimens,
     population,
 )
+from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, InteriorOrientation
 from thermocald.photogrammetry.linalg import scaled_inverse
@@ -24,13 +25,16 @@ from thermocald.simulation import effects
 from thermocald.simulation.model import RATED, ModelEffect, ThermalModel
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
+    from thermocald.analysis.thermal.result import FittedModel
+    from thermocald.reduction.series import ReducedSeries
+
     Array = NDArray[np.float64]
 
-__all__ = ["odd_cameras", "shrunk_to_type", "type_model"]
+__all__ = ["fit_with_type", "odd_cameras", "shrunk_to_type", "type_model"]
 
 _FEWEST_TO_COMPARE = 3
 _NORMAL_95 = 1.959964
@@ -92,15 +96,51 @@ def odd_cameras(models: Sequence[ThermalModel]) -> dict[str, float]:
     return {m.camera: float(p) for m, p in zip(models, found, strict=True)}
 
 
-def shrunk_to_type(model: ThermalModel, kind: ThermalModel) -> ThermalModel:
+def fit_with_type(series: Sequence[ReducedSeries], kind: ThermalModel) -> FittedModel:
+    """A camera that was measured at few temperatures, fitted with what its type says of the rest.
+
+    Non-linear parameters, which few temperatures may not show at all, have the type's as a prior
+    within the adjustment; all others are shrunk afterwards. Raises DataError.
+    """
+    require_type(kind)
+    sd = {e.name: e.sds for e in kind.effects}
+    priors = {
+        f"{e.name}.{key}": (float(value), float(sd[e.name][key]))
+        for e in kind.effects
+        for key, value in e.values.items()
+        if key in effects.get(e.name).nonlinear and sd[e.name].get(key, 0.0) > 0
+    }
+    fixed = [
+        f"{e.name}.{key}"
+        for e in kind.effects
+        for key in effects.get(e.name).nonlinear
+        if f"{e.name}.{key}" not in priors
+    ]
+    fitted = fit_thermal_model(series, kind.effects, kind.T0, False, fixed, priors)
+    return replace(fitted, model=shrunk_to_type(fitted.model, kind, priors))
+
+
+def require_type(kind: ThermalModel) -> None:
+    """DataError where a model is not that of a type."""
+    if kind.covariance is None or len(kind.fitted_on) < 2 or not all(
+        "camera" in one for one in kind.fitted_on
+    ):  # fmt: skip
+        raise DataError(f"{kind.name or kind.camera} is not a type model (`fit --type` writes one)")
+
+
+def shrunk_to_type(
+    model: ThermalModel,
+    kind: ThermalModel,
+    priors: Mapping[str, tuple[float, float]] | None = None,
+) -> ThermalModel:
     """A camera that was measured at few temperatures, with what its type says of the rest.
 
-    model: its own fit; kind: of `type_model`, with the same T₀ and effects. The standard
-    deviations are such that 95 % lie within 1.96 of them, few specimens or not.
+    model: its own fit; kind: of `type_model`, with the same T₀ and effects; priors: what its fit
+    has already of the type, {name: (value, sd)}. The standard deviations are such that 95 % lie
+    within 1.96 of them, few specimens or not.
     """
     names = _names(kind)
-    if kind.covariance is None or not kind.fitted_on:
-        raise DataError(f"{kind.name or kind.camera} is not a type model (`fit --type` writes one)")
+    require_type(kind)
     if model.sensor != kind.sensor or model.T0 != kind.T0 or _names(model) != names:
         raise DataError(
             f"the model of {model.camera} and the type {kind.camera} are not alike: sensor, "
@@ -121,7 +161,16 @@ def shrunk_to_type(model: ThermalModel, kind: ThermalModel) -> ThermalModel:
     free = (np.diag(own) > 0) & (np.diag(prior) > 0)
     information = np.zeros_like(prior)
     information[np.ix_(free, free)] = scaled_inverse(own[np.ix_(free, free)])
-    new = people.posterior(np.array([_value(model, name) for name in names]), information)
+    values = np.array([_value(model, name) for name in names])
+    gradient = np.zeros(len(names))
+    for name, (value, prior_sd) in (priors or {}).items():
+        # the type counts once: what the fit knew of it is taken out again
+        at = names.index(name)
+        information[at, at] -= 1.0 / prior_sd**2
+        gradient[at] = (values[at] - value) / prior_sd**2
+        if information[at, at] <= 0:
+            information[at], information[:, at], gradient[at] = 0.0, 0.0, 0.0
+    new = people.posterior(values, information, gradient)
     sd = np.sqrt(np.maximum(np.diag(new.covariance), 0.0))
     wider = np.ones(len(names))
     for i in np.flatnonzero(sd > 0):

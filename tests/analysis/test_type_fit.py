@@ -1,0 +1,137 @@
+"""A new camera from three temperatures and its type, against its own full cycle."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from thermocald.analysis.thermal.prediction_test import predicted_error
+from thermocald.analysis.thermal.thermal_model import fit_thermal_model
+from thermocald.analysis.thermal.type_model import fit_with_type, type_model
+from thermocald.cli import application
+from thermocald.photogrammetry.camera.camera_model import InteriorOrientation
+from thermocald.reduction.reduce import reduce_series
+from thermocald.reduction.source import epochs_input, series_input
+from thermocald.simulation.course import Course
+from thermocald.simulation.model import ModelEffect, ThermalModel
+from thermocald.simulation.model_file import read_model, write_model
+from thermocald.simulation.presets import preset_simulation
+from thermocald.store.recording.reader import open_recording
+
+RATES = {"c": (3.0e-4, 5e-5), "x0": (-4.0e-4, 8e-5), "y0": (2.0e-4, 5e-5)}  # mean, scatter
+TAU = (80.0, 10.0)
+T0 = 30.0
+NAMES = ("interior.c", *(f"rates.{n}" for n in RATES), "thermal_lag.tau")
+
+
+def specimen(rng, sensor, name):
+    """The model of a full cycle of one camera: true values, and what such a fit does not know."""
+    true = np.array([3.04, *(m + s * rng.standard_normal() for m, s in RATES.values()),
+                     TAU[0] + TAU[1] * rng.standard_normal()])  # fmt: skip
+    sd = np.array([2e-4, 2e-7, 1e-6, 1e-6, 0.1])
+    seen = true + sd * rng.standard_normal(5)
+    return ThermalModel(
+        name, sensor, T0, InteriorOrientation(c=float(seen[0])),
+        dict(zip(RATES, seen[1:4].tolist(), strict=True)),
+        (ModelEffect("thermal_lag", {"tau": float(seen[4])}, {"tau": 0.1}),),
+        covariance_names=NAMES, covariance=tuple(map(tuple, np.diag(sd**2).tolist())),
+        validity={"temperature": (20.0, 50.0)}, fitted_on=({"series": "M1"},),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def world():
+    """The type of ten cameras, and an eleventh: simulation of its full cycle, true rates, lag."""
+    rng = np.random.default_rng(11)
+    cycle = preset_simulation("rpi-v2.1-heating", 3)
+    sensor = cycle.model.sensor
+    kind = type_model([specimen(rng, sensor, f"cam{i}") for i in range(10)], "rpi-v2.1")
+    new = specimen(rng, sensor, "new")
+    rates, lag = dict(new.rates), new.effects[0]
+    model = replace(cycle.model, camera="new", rates=rates, effects=(lag,))
+    return kind, replace(cycle, model=model)
+
+
+def at_three_temperatures(cycle, interval, epochs):
+    """The camera in a chamber at 22, 32 and 44 °C; the chamber needs minutes for a step."""
+    steps = Course.steps([0.0, 1500.0, 3000.0, 9000.0], [22.0, 32.0, 44.0])
+    programme = replace(cycle.programme, epochs=epochs, interval=interval, initial=22.0,
+                        boundaries={"ambient": steps}, sources={})  # fmt: skip
+    return replace(cycle, programme=programme, seed=5)
+
+
+def reduced(simulation):
+    epochs = list(simulation.epochs())
+    found = epochs_input(simulation.head, simulation.field, epochs, "M1")
+    return reduce_series(found, affinity=False, strict=False)
+
+
+@pytest.mark.slow
+def test_three_temperatures_predict_nearly_as_the_full_cycle_does(world):
+    """With the way between the temperatures, which shows the lag: 90 epochs, one in 50 s."""
+    kind, cycle = world
+    full = reduced(cycle)
+    own = fit_thermal_model([full], [ModelEffect("thermal_lag", {"tau": 80.0})], T0)
+    few = fit_with_type([reduced(at_three_temperatures(cycle, 50.0, 90))], kind)
+    of_own, of_few = (predicted_error(f.model, full, 0.05) for f in (own, few))
+    assert of_few.rms_px <= 1.2 * of_own.rms_px
+    assert of_few.coverage == pytest.approx(0.95, abs=0.04)
+
+
+@pytest.mark.slow
+def test_three_states_of_rest_say_nothing_of_a_lag_and_the_bands_know_it(world):
+    kind, cycle = world
+    rows = {*range(26, 30), *range(56, 60), *range(116, 120)}
+    simulation = at_three_temperatures(cycle, 50.0, 120)
+    # the thermometer runs all the time
+    epochs = [e if i in rows else replace(e, observations=None)
+              for i, e in enumerate(simulation.epochs())]  # fmt: skip
+    found = epochs_input(cycle.head, cycle.field, epochs, "M1")
+    few = fit_with_type([reduce_series(found, affinity=False, strict=False)], kind).model
+    true = cycle.model
+    for name in RATES:
+        assert abs(few.rates[name] - true.rates[name]) < 4 * few.sds[f"rates.{name}"]
+        assert few.sds[f"rates.{name}"] < 0.2 * RATES[name][1]
+    (lag,) = few.effects
+    assert lag.sds["tau"] > 0.8 * TAU[1]
+    assert abs(lag.values["tau"] - true.effects[0].values["tau"]) < 2.5 * lag.sds["tau"]
+    # at rest it is as good as the camera's own full cycle: a hundredth of a pixel at 44 °C
+    pitch = cycle.model.sensor.pixel_pitch
+    assert abs(few.rates["x0"] - true.rates["x0"]) * 14 / pitch < 0.1
+
+
+@pytest.mark.slow
+def test_the_command_takes_the_type(world, tmp_path):
+    kind, cycle = world
+    write_model(tmp_path / "type.yaml", kind)
+    at_three_temperatures(cycle, 100.0, 45).write(tmp_path / "M1")
+    arguments = ["fit", tmp_path / "M1", "-o", tmp_path / "m.yaml", "--type",
+                 tmp_path / "type.yaml", "--json", tmp_path / "r.json"]  # fmt: skip
+    result = CliRunner().invoke(application(), [str(a) for a in arguments])
+    assert result.exit_code == 0, result.exception
+    assert "with what 10 cameras of the type rpi-v2.1 say of it" in result.stdout
+    assert json.loads((tmp_path / "r.json").read_text())["type"] == {
+        "name": "rpi-v2.1", "cameras": 10,
+    }  # fmt: skip
+    found = read_model(tmp_path / "m.yaml")
+    assert found.evidence["shrunk_to_type"] == "rpi-v2.1"
+    assert [e.name for e in found.effects] == ["thermal_lag"]
+    assert series_input(open_recording(tmp_path / "M1")).camera == found.camera
+
+
+def test_a_type_that_is_none_is_said(tmp_path):
+    def error(*arguments):
+        return CliRunner().invoke(application(), ["fit", "M1", "-o", "m", *map(str, arguments)])
+
+    assert "no such file" in str(error("--type", tmp_path / "type.yaml").exception)
+    rng = np.random.default_rng(1)
+    sensor = preset_simulation("rpi-v2.1-heating", 3).model.sensor
+    write_model(tmp_path / "one.yaml", specimen(rng, sensor, "one"))
+    assert "not a type model" in str(error("--type", tmp_path / "one.yaml").exception)
+    write_model(tmp_path / "type.yaml", type_model([specimen(rng, sensor, n) for n in "ab"], "rpi"))
+    refused = error("--type", tmp_path / "type.yaml", "--t0", "20")
+    assert "give no others" in str(refused.exception)

@@ -137,7 +137,7 @@ def _linearised(source: SeriesInput, affinity: bool) -> Partials:
         warnings.simplefilter("ignore", RuntimeWarning)
         mean = np.nanmedian(source.grid.points, axis=0)
     # targets seen in half of the epochs that show any carry the orientation
-    looked = np.count_nonzero(source.grid.observed.any(axis=1))
+    looked = int(source.grid.observed.any(axis=1).sum())
     often = source.grid.observed.sum(axis=0) >= 0.5 * max(looked, 1)
     rows = np.flatnonzero(np.isfinite(mean[:, 0]) & often)
     seen = Observations(rows, mean[rows], np.full((len(rows), 2), 0.1))

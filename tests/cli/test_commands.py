@@ -12,15 +12,13 @@ from dataclasses import replace
 import cv2
 import pytest
 
+from tests.commands import call
 from thermocald.simulation.presets import preset_simulation
 from thermocald.store.database.store import Store
 
 
 def run(*arguments):
-    done = subprocess.run(
-        [sys.executable, "-m", "thermocald", *map(str, arguments)],
-        capture_output=True, text=True, timeout=300, check=False,
-    )  # fmt: skip
+    done = call(*arguments)
     assert "Traceback" not in done.stderr, done.stderr
     return done
 
@@ -36,7 +34,11 @@ def recording(tmp_path_factory):
 
 
 def test_replay_writes_one_json_document_and_nothing_else(recording):
-    done = run("replay", recording, "--json", "-")
+    """In a process of its own, as all commands are called."""
+    done = subprocess.run(
+        [sys.executable, "-m", "thermocald", "replay", recording, "--json", "-"],
+        capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
     assert done.returncode == 0
     document = json.loads(done.stdout)
     assert document["ok"] == 40
@@ -212,24 +214,17 @@ def test_every_command_has_help_with_an_example():
 
 
 def test_without_a_configuration_run_says_where_it_looked(tmp_path):
-    done = run_in(tmp_path, "run")
+    done = call("run", folder=tmp_path)
     assert done.returncode == 2
     assert "./config.yaml" in done.stderr
     (tmp_path / "config.yaml").write_text("cameras: 3\n")
-    assert "config.yaml: cameras" in run_in(tmp_path, "run").stderr  # it is read
+    assert "config.yaml: cameras" in call("run", folder=tmp_path).stderr  # it is read
 
 
 def test_a_page_of_no_store_is_an_error(tmp_path):
-    done = run_in(tmp_path, "dashboard", "--store", "no.db")
+    done = call("dashboard", "--store", "no.db", folder=tmp_path)
     assert done.returncode == 1
     assert "does not exist" in done.stderr
-
-
-def run_in(folder, *arguments):
-    return subprocess.run(
-        [sys.executable, "-m", "thermocald", *arguments], cwd=folder,
-        capture_output=True, text=True, timeout=60, check=False,
-    )  # fmt: skip
 
 
 def resident_mb(imports):

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import csv
 import json
-import subprocess
-import sys
 
 import cv2
 import numpy as np
 import pytest
 
+from tests.commands import call
 from thermocald.analysis.camera.photographs import calibrate_observations
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
@@ -19,10 +18,7 @@ from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 def run(*arguments):
     """The command as a user calls it: exit status, standard output, standard error."""
-    done = subprocess.run(
-        [sys.executable, "-m", "thermocald", *map(str, arguments)],
-        capture_output=True, text=True, timeout=560, check=False,
-    )  # fmt: skip
+    done = call(*arguments)
     assert "Traceback" not in done.stderr
     return done
 

@@ -1,0 +1,34 @@
+"""Commands called as `thermocald` is, in the tests' own process: no second is spent on imports."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import subprocess
+import sys
+from pathlib import Path
+from unittest import mock
+
+from thermocald.cli import main
+
+
+def call(*arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Exit status, standard output and standard error; folder: where the command is called."""
+    command = ["thermocald", *map(str, arguments)]
+    out, err = io.StringIO(), io.StringIO()
+    before = Path.cwd()
+    try:
+        os.chdir(folder or before)
+        with (
+            mock.patch.object(sys, "argv", command),
+            contextlib.redirect_stdout(out),
+            contextlib.redirect_stderr(err),
+        ):
+            main()
+        status = 0
+    except SystemExit as ended:
+        status = int(ended.code or 0)
+    finally:
+        os.chdir(before)
+    return subprocess.CompletedProcess(command, status, out.getvalue(), err.getvalue())

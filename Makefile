@@ -7,7 +7,7 @@ STAMP  := $(VENV)/.installed
 LOCK   ?= packaging/lock/development.txt
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help setup demo test lint test-slow test-lowest bench hil docs lock deb release clean
+.PHONY: help setup demo test quick lint test-slow test-lowest bench hil docs lock deb release clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
@@ -31,14 +31,18 @@ demo: $(STAMP) ## the main job on a rendered camera, ending with a hidden effect
 lint: $(STAMP) ## ruff, mypy --strict, layers
 	@echo "== ruff"
 	$(BIN)/ruff check .
-	@echo "== mypy --strict"
-	$(BIN)/mypy
 	@echo "== layers"
 	$(BIN)/lint-imports
+	@echo "== mypy --strict"
+	$(BIN)/mypy
 
-test: lint ## lint, then the quick tests
+# One process more than there are cores: tests of the daemon wait for it more than they work.
+test: $(STAMP) ## lint and the quick tests, at the same time
+	@$(MAKE) --no-print-directory --jobs=2 lint quick
+
+quick: $(STAMP)
 	@echo "== pytest"
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile
+	$(BIN)/python -m pytest -q -n 3 --dist loadfile
 
 test-slow: $(STAMP) ## long statistics and browser tests
 	$(BIN)/python -m pytest -q -m slow -n 2 --dist loadfile

@@ -49,7 +49,8 @@ def test_no_effect_no_name(evidence_of):
     assert (found.verdict, found.effects) == ("adequate", ())
 
 
-@pytest.mark.parametrize("seed", [24, pytest.param(26, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [24, 26])
 def test_an_outside_influence_gets_no_name(evidence_of, seed):
     """Its size is what it moves the image by, its parameters are those that moved."""
     evidence, truth = evidence_of("outside", px=0.3, seed=seed, with_m2=False)

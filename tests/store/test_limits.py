@@ -11,11 +11,20 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.cli.test_import import photograph
 from thermocald.cli.common import printable
 from thermocald.cli.options import read_camera
-from thermocald.errors import ConfigurationError, ImageError, RecordingError, TestFieldError
+from thermocald.errors import (
+    ConfigurationError,
+    ImageError,
+    RecordingError,
+    TestFieldError,
+    ThermocaldError,
+)
+from thermocald.output.camera_files.camera_record import number
 from thermocald.photogrammetry.targets.image_file import decode_grey
 from thermocald.photogrammetry.targets.image_header import image_size
+from thermocald.store.logger.photographs import read_photograph
 from thermocald.store.recording.reader import read_recording
 from thermocald.store.recording.table import Table
 from thermocald.store.recording.testfield_file import read_testfield
@@ -145,3 +154,29 @@ def test_names_that_a_terminal_would_obey_are_refused_or_shown_as_codes(recordin
         read_recording(recording)
     assert "\x1b" not in str(refused.value)
     assert printable("a\x1b[31mb\x9b°\nc") == "a\\x1b[31mb\\x9b°\nc"
+
+
+def test_a_coordinate_of_ten_to_the_308_is_refused(tmp_path):
+    path = tmp_path / "testfield.csv"
+    path.write_text("target,X,Y,Z,diameter,sX,sY,sZ\na,0,0,0,,0,0,0\nb,1e308,0,0,,0,0,0\n")
+    with pytest.raises(TestFieldError, match="line 3, column X: must be within 1e"):
+        read_testfield(path)
+
+
+def test_a_cameras_number_of_ten_to_the_400_is_refused():
+    with pytest.raises(ConfigurationError, match="too large"):
+        number(10**400, "fx")
+
+
+def test_damaged_exif_is_no_warning(tmp_path):
+    """Warnings are errors here."""
+    photograph(tmp_path / "p.jpg", "2026:06:14 12:00:01", "250", "+02:00")
+    whole = (tmp_path / "p.jpg").read_bytes()
+    at, refused = whole.index(b"Exif"), 0
+    for cut in range(at + 10, at + 120, 5):
+        (tmp_path / "p.jpg").write_bytes(whole[:cut] + bytes(4) + whole[cut + 4 :])
+        try:
+            read_photograph(tmp_path / "p.jpg")
+        except ThermocaldError:
+            refused += 1
+    assert refused

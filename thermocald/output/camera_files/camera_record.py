@@ -131,6 +131,8 @@ def number(value: Any, what: str) -> float:
         result = float(value)
     except (TypeError, ValueError):
         raise ConfigurationError(f"{what} is {value!r}, not a number") from None
+    except OverflowError:
+        raise ConfigurationError(f"{what} is too large a number") from None
     if not math.isfinite(result):
         raise ConfigurationError(f"{what} is {value!r}, not a finite number")
     return result

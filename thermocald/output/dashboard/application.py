@@ -282,7 +282,8 @@ def _number(request: Request, key: str, low: float, high: float) -> float | None
     if text is None:
         return None
     try:
-        value = float(text[:40])
+        # float() also takes 1_0 and digits of any script
+        value = float(text[:40]) if text.isascii() and "_" not in text else math.nan
     except ValueError:
         value = math.nan
     if not low <= value <= high:

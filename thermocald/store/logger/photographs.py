@@ -74,6 +74,8 @@ def read_photograph(path: Path, source: str = "exif") -> Photograph:
         with warnings.catch_warnings():
             # a large sensor is not an attack: nothing is decoded here
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            # of damaged EXIF: what is needed of it is tested
+            warnings.simplefilter("ignore", UserWarning)
             with Image.open(path) as image:
                 width, height = image.size
                 exif = image.getexif()

@@ -25,6 +25,7 @@ __all__ = [
 ]
 
 _MOST_TARGETS = 4000
+_LARGEST_MM = 1e9  # a thousand kilometres
 _REQUIRED = ("target", "X", "Y", "Z", "diameter", "sX", "sY", "sZ")
 
 # No camera of ours can look at a field smaller than this; one in metres is (a room: 6 "mm").
@@ -72,6 +73,7 @@ def _read(table: Table, *, may_be_empty: bool = False) -> TestField:
             names.append(name)
         for column, values in columns.items():
             numbers = chunk.numbers(column, empty_is_nan=column == "diameter")
+            chunk.check(column, abs(numbers) > _LARGEST_MM, f"must be within {_LARGEST_MM:g} mm")
             if column == "diameter":
                 chunk.check(column, numbers <= 0, "a diameter must be above 0 mm, or left empty")
             if column.startswith("s"):

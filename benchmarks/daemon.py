@@ -57,7 +57,7 @@ def scheduled(ticks: int, work_s: float) -> tuple[list[float], float, int]:
         time.sleep(work_s)
     assert last is not None
     drift = last.due - (schedule.begin + last.index * PERIOD_S)
-    return late, drift, schedule.rhythm().skipped
+    return late, drift, schedule.stats().skipped
 
 
 def sleeping(ticks: int, work_s: float) -> tuple[list[float], float, int]:
@@ -104,7 +104,7 @@ def virtual_day() -> None:
     print(
         f"virtual day: 8640 ticks of 10 s with up to 9 s of work: late max {max(late):g} s, drift "
         f"{tick.due - 8639 * 10.0:g} s, "
-        f"skipped {schedule.rhythm().skipped}"
+        f"skipped {schedule.stats().skipped}"
     )
 
 

@@ -21,8 +21,8 @@ def test_a_day_of_ticks_has_no_drift():
         starts.append(clock.monotonic())
         clock.advance(work_s)
     assert starts == [1234.567 + 10.0 * k for k in range(8640)]
-    rhythm = schedule.rhythm()
-    assert (rhythm.ticks, rhythm.skipped, rhythm.late_max_s) == (8640, 0, 0.0)
+    stats = schedule.stats()
+    assert (stats.ticks, stats.skipped, stats.late_max_s) == (8640, 0, 0.0)
 
 
 def test_a_late_tick_is_skipped_and_counted_and_the_rhythm_stays():
@@ -39,7 +39,7 @@ def test_a_late_tick_is_skipped_and_counted_and_the_rhythm_stays():
     assert indices == [0, 1, 4, 5, 6, 7]
     assert skipped == [0, 0, 2, 0, 0, 0]
     assert schedule.wait().index == 9
-    assert schedule.rhythm().skipped == 3
+    assert schedule.stats().skipped == 3
 
 
 def test_a_device_that_joins_late_has_missed_nothing():

@@ -157,7 +157,7 @@ for _ in range(400):
     late.append(schedule.wait().late_s)
     time.sleep(0.01)
 stop.set(); thread.join()
-print(json.dumps([late, schedule.rhythm().skipped]))
+print(json.dumps([late, schedule.stats().skipped]))
 """
     bare = """
 import json, time

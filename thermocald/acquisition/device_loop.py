@@ -1,4 +1,4 @@
-"""A device in its own thread and its own rhythm: slow or dead, it delays no other."""
+"""A device in its own thread and with its own schedule: slow or dead, it delays no other."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class DeviceLoop:
     """Calls `action` at every tick while the device is there.
 
     `action` is called with the device open and raises what the device raises. `lost` counts ticks
-    in which the device gave nothing. free_running: without a rhythm, as fast as `action` returns.
+    in which the device gave nothing. free_running: without a schedule, as fast as `action` returns.
     idle: asked at every tick; while it says so, the device is closed and left alone.
     """
 

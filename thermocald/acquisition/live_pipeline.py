@@ -93,7 +93,7 @@ class LivePipeline:
     ) -> None:
         self.name = name
         self.calibrator = calibrator
-        self.dropped = 0  # epochs whose calibration was put off
+        self.dropped = 0  # epochs whose calibration was deferred
         self.caught_up = 0
         self.lost = 0  # frames that could not even be kept: the disk is slower than the camera
         self.next_number = first
@@ -132,7 +132,7 @@ class LivePipeline:
             self._changed.notify_all()
 
     def wait_for_room(self, timeout_s: float) -> bool:
-        """Wait until nothing need be put off for one more epoch: for what can be replayed."""
+        """Wait until nothing need be deferred for one more epoch: for what can be replayed."""
         with self._changed:
             return self._changed.wait_for(lambda: len(self._items) < self._depth, timeout_s)
 
@@ -174,7 +174,7 @@ class LivePipeline:
             self._busy_since.pop("calibrate", None)
 
     def _next_to_calibrate(self) -> AcquiredEpoch | Epoch | None:
-        """The oldest that waits; if there is none, one that was put off; None at the end."""
+        """The oldest that waits; if there is none, one that was deferred; None at the end."""
         while True:
             with self._changed:
                 if self._stopping:
@@ -250,9 +250,9 @@ class LivePipeline:
                     return self._amended.popleft()
                 if self._items:
                     first = self._items[0]
-                    put_off = len(self._items) > self._depth
-                    put_off |= self._stopping and first.state == "waiting"
-                    if put_off and first.state != "done":
+                    deferred = len(self._items) > self._depth
+                    deferred |= self._stopping and first.state == "waiting"
+                    if deferred and first.state != "done":
                         first.state = "dropped"
                         self.dropped += 1
                     if first.state in ("done", "dropped"):

@@ -1,4 +1,4 @@
-"""The rhythm: absolute deadlines on the monotonic clock: nothing drifts, nothing piles up.
+"""The schedule: absolute deadlines on the monotonic clock: nothing drifts, nothing piles up.
 
 Tick k is due at begin + k·period. Who asks for the next tick too late for it gets the one after:
 what was missed is counted, never made up for.
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from thermocald.hal import Clock
 
-__all__ = ["Rhythm", "Schedule", "Tick"]
+__all__ = ["Schedule", "ScheduleStats", "Tick"]
 
 _LATEST_START = 0.1  # of a period: a tick that would begin later is skipped
 _REMEMBERED = 1000
@@ -35,7 +35,7 @@ class Tick:
 
 
 @dataclass(frozen=True, slots=True)
-class Rhythm:
+class ScheduleStats:
     """What a schedule has to say about itself; lateness of the last ticks in s."""
 
     ticks: int
@@ -45,7 +45,7 @@ class Rhythm:
 
 
 class Schedule:
-    """The ticks of one device; one thread waits on it, others may ask for its rhythm."""
+    """The ticks of one device; one thread waits on it, others may ask for its statistics."""
 
     def __init__(self, clock: Clock, period_s: float, begin: float | None = None) -> None:
         self.clock = clock
@@ -64,7 +64,7 @@ class Schedule:
         """Wait for the next tick that is not too late already; None if `wake` was set first."""
         behind = (self.clock.monotonic() - self.begin) / self.period_s - _LATEST_START
         index = max(self._next, math.ceil(behind))
-        # before the first tick nothing was missed: a device may join a running rhythm
+        # before the first tick nothing was missed: a device may join a running schedule
         skipped = index - self._next if self._ticks else 0
         if not self.clock.sleep_until(self.due(index), wake):
             return None
@@ -75,10 +75,10 @@ class Schedule:
         self._late.append(late)
         return Tick(index, self.due(index), late, skipped)
 
-    def rhythm(self) -> Rhythm:
+    def stats(self) -> ScheduleStats:
         """Counts so far, and the lateness of the last 1000 ticks."""
         late = sorted(self._late.copy())
         if not late:
-            return Rhythm(0, 0, 0.0, 0.0)
+            return ScheduleStats(0, 0, 0.0, 0.0)
         p99 = late[min(len(late) - 1, math.ceil(0.99 * len(late)) - 1)]
-        return Rhythm(self._ticks, self._skipped, p99, late[-1])
+        return ScheduleStats(self._ticks, self._skipped, p99, late[-1])

@@ -185,7 +185,8 @@ def _document(fitted: FittedModel, held: list[PredictedError]) -> dict[str, Any]
         "sigma0": fitted.sigma0,
         **fitted.missing.as_mapping(),
         "series": [asdict(s) for s in fitted.series],
-        "held_out": [asdict(h) for h in held],
+        "prediction_test": [asdict(h) for h in held],
+        "held_out": [asdict(h) for h in held],  # its name until the next version
     }
 
 
@@ -214,6 +215,7 @@ def _type(
         "reference_temperature": T0,
         **{k: written[k] for k in ("interior", "rates", "effects", "validity")},
         "series": [],
+        "prediction_test": [],
         "held_out": [],
     }
 
@@ -252,7 +254,7 @@ def _say(document: dict[str, Any]) -> None:
             f"  {s['name']}: {s['epochs']} epochs, {s['rms_px']:.4f} px, "
             f"thermometer ± {s['thermometer_sd']:.3f} K"
         )
-    for h in document["held_out"]:
+    for h in document["prediction_test"]:
         typer.echo(
             f"  {h['name']} left out: predicted to {h['rms_px']:.4f} px (noise alone "
             f"{h['floor_px']:.4f}), {h['object_mm']:.2f} mm at 10 m"

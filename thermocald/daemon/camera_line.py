@@ -256,20 +256,22 @@ class CameraLine:
 
     def status(self) -> dict[str, Any]:
         """For `thermocald status`."""
-        rhythm = self.loop.schedule.rhythm()
+        stats = self.loop.schedule.stats()
         run = self.run
         pipeline = None if run is None else run.pipeline
+        deferred = 0 if pipeline is None else pipeline.dropped
         return {
             "series": "" if run is None else run.plan.series,
             "period_s": self.plan.config.period_s,
             **link_status(self.link, self.loop.busy_s(), self.station.hang_after_s),
-            "ticks": rhythm.ticks,
-            "skipped": rhythm.skipped,
-            "late_p99_s": rhythm.late_p99_s,
-            "late_max_s": rhythm.late_max_s,
+            "ticks": stats.ticks,
+            "skipped": stats.skipped,
+            "late_p99_s": stats.late_p99_s,
+            "late_max_s": stats.late_max_s,
             "lost": self.loop.lost + (0 if pipeline is None else pipeline.lost),
             "waiting": self.waiting(),
-            "put_off": 0 if pipeline is None else pipeline.dropped,
+            "deferred": deferred,
+            "put_off": deferred,  # its name until the next version
             "caught_up": 0 if pipeline is None else pipeline.caught_up,
             "stored": 0 if run is None else run.keeper.stored,
             "frames_kept": 0 if run is None else run.keeper.kept_frames,

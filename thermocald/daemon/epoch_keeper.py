@@ -116,26 +116,26 @@ class EpochKeeper:
         return rows
 
     def keep(self, acquired: AcquiredEpoch) -> None:
-        """Keep an epoch; a calibration that was put off is made up for later from its frame."""
+        """Keep an epoch; a deferred calibration is made up for later from its frame."""
         assert acquired.epoch is not None
         calibrated = acquired.calibrated
         series = self._begin_series(acquired)
         epoch = acquired.epoch if calibrated is None else calibrated.epoch
-        put_off = calibrated is None and self.plan.calibrator is not None
+        deferred = calibrated is None and self.plan.calibrator is not None
         eventful = calibrated is not None and (
             not calibrated.adjustment.ok or "event" in calibrated.extra
         )
         result = None
         extra = {f"camera_{name}": value for name, value in acquired.frame.settings.items()}
         path = None
-        if self._frames.wanted(epoch.number, eventful) or put_off:
+        if self._frames.wanted(epoch.number, eventful) or deferred:
             path = self._frames.keep(self.plan.name, self.plan.series, epoch.number, acquired.frame)
             self.kept_frames += path is not None
         if calibrated is not None:
             result = EpochResult.from_adjustment(calibrated.adjustment)
             extra |= calibrated.extra
-        elif put_off and path is None:
-            result = EpochResult("frame_not_kept", "calibration was put off and the frame not kept")
+        elif deferred and path is None:
+            result = EpochResult("frame_not_kept", "calibration deferred, the frame not kept")
         epoch = replace(epoch, frame=path)
         values = result_row(self.plan, epoch, result, extra)
 

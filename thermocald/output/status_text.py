@@ -136,9 +136,9 @@ def status_warnings(document: dict[str, Any]) -> list[str]:
     for name, camera in document["cameras"].items():
         if camera["why"]:
             found.append(f"camera {name}: {camera['why']}")
-        if camera["put_off"] > camera["caught_up"]:
+        if camera["deferred"] > camera["caught_up"]:
             found.append(
-                f"camera {name}: {camera['put_off'] - camera['caught_up']} epochs are still to be "
+                f"camera {name}: {camera['deferred'] - camera['caught_up']} epochs are still to be "
                 "calibrated"
             )
     return found

@@ -73,7 +73,8 @@ def _noise_growth(e: ReducedSeries, growth: NoiseGrowth, gap: Gap) -> EffectFoun
     }
     evidence = {
         "log_likelihood_gain": growth.gain,
-        "next_best_course": growth.other,
+        "next_best": growth.other,
+        "next_best_course": growth.other,  # its name until the next version
         "next_best_gain": growth.other_gain,
     }
     statement = effect.sentence(estimates)

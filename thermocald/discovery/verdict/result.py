@@ -148,13 +148,15 @@ def _entry(x: Examination, fit: Fit, k: int, before: Gap, after: Gap, first: boo
     effect = catalogue.get(term.effect)
     estimates = _undecided(x, fit, k, term_estimates(fit, k, e))
     without = _score_without(x, k)
+    blocks = [float(g) for g in x.cross_validation[k - len(x.base.terms)]]
     evidence: dict[str, Any] = {
         "score_gain": without,
         "penalty": x.best.penalties[k],
         "absolute_test": [
             {"sigmas": float(a.significance), "misfit_px": float(a.misfit_px)} for a in x.adequacy
         ],
-        "left_out_blocks_gain": [float(g) for g in x.cross_validation[k - len(x.base.terms)]],
+        "cross_validation": blocks,
+        "left_out_blocks_gain": blocks,  # its name until the next version
         "inflation_for_correlated_noise": e.correlation,
     }
     if x.surrogates:

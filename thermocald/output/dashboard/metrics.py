@@ -13,12 +13,13 @@ if TYPE_CHECKING:
 __all__ = ["metrics_text"]
 
 _CAMERA = {
-    "ticks": "Ticks of the camera's rhythm.",
+    "ticks": "Ticks of the camera's schedule.",
     "skipped": "Ticks skipped because they came too late.",
     "late_p99_s": "Lateness of ticks, 99th percentile of the last 1000, s.",
     "lost": "Ticks in which the camera gave no frame.",
     "waiting": "Epochs on their way to the store.",
-    "put_off": "Epochs whose calibration was put off.",
+    "deferred": "Epochs whose calibration was deferred.",
+    "put_off": "The same as deferred: its name until the next version.",
     "caught_up": "Epochs that were calibrated later.",
     "stored": "Epochs stored by this process.",
 }

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Codes", "codes_in", "known_codes", "targets_in"]
 
-# Scale and ink (-1 dark on light) in which codes are looked for, until so many are found.
+# Scale and polarity (-1 dark on light) in which codes are looked for, until so many are found.
 _SEARCHES = ((2, -1), (2, 1), (1, -1), (1, 1))
 _ENOUGH_CODES = 12
 _LARGEST_TILT_COSINE = 0.2
@@ -75,8 +75,8 @@ def codes_in(image: Image, codes: Codes) -> tuple[Observations, dict[int, float]
     """The ring-coded targets of an image, measured as ellipses, and their semi-major axes in px."""
     grey = to_8_bit(image)
     best = None
-    for scale, ink in _SEARCHES if codes.grows or codes.rows else ():
-        candidates = find_circles(grey, scale, ink)
+    for scale, polarity in _SEARCHES if codes.grows or codes.rows else ():
+        candidates = find_circles(grey, scale, polarity)
         found = read_codes(grey, candidates, codes.known)
         if best is None or len(found) > len(best[1]):
             best = candidates.maps, found

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 __all__ = ["find_coded"]
 
-_SEARCHES = ((2, -1), (2, 1), (1, -1), (1, 1))  # scale, ink
+_SEARCHES = ((2, -1), (2, 1), (1, -1), (1, 1))  # scale, polarity
 _ENOUGH_CODES = 0.5
 _LARGE_WIDTH = 1200
 _MARKER_NEIGHBOURHOOD = 2.0  # sides of the marker that names a circle
@@ -62,8 +62,8 @@ def find_coded(
     best: tuple[NDArray[np.int64], Array, LocalMap] | None = None
     foreign = False
     searches = _SEARCHES if image.shape[1] > _LARGE_WIDTH else _SEARCHES[2:]
-    for scale, ink in searches:
-        candidates = find_circles(grey, scale, ink)
+    for scale, polarity in searches:
+        candidates = find_circles(grey, scale, polarity)
         codes = read_codes(grey, candidates)
         keys = list(zip(codes.bits.tolist(), codes.numbers.tolist(), strict=True))
         ours = [i for i, key in enumerate(keys) if key in row_of]

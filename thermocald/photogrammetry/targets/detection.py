@@ -36,16 +36,16 @@ _LARGEST_AXIS_RATIO = 3.2  # 60° obliqueness and then some perspective
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidates:
-    """n ellipses: maps (centre good to some 0.1 px), and ink (n,): -1 dark on light, 1 reverse."""
+    """n ellipses: maps (centre to some 0.1 px), and polarity (n,): -1 dark on light, 1 reverse."""
 
     maps: LocalMap
-    ink: NDArray[np.int64]
+    polarity: NDArray[np.int64]
 
     def __len__(self) -> int:
-        return len(self.ink)
+        return len(self.polarity)
 
 
-def find_circles(image: NDArray[np.uint8], scale: int = 1, ink: int = -1) -> Candidates:
+def find_circles(image: NDArray[np.uint8], scale: int = 1, polarity: int = -1) -> Candidates:
     """Ellipses of one kind (dark on light -1, light on dark 1) in an image (H, W).
 
     scale: the image is searched at 1/scale of its size; ellipses with less than some six px across
@@ -59,7 +59,7 @@ def find_circles(image: NDArray[np.uint8], scale: int = 1, ink: int = -1) -> Can
     block = max(int(image.shape[1] * _BLOCK_SHARE / scale), _SMALLEST_BLOCK) | 1
     mask = scratch("mask", small.shape, np.uint8)
     cv2.blur(small, (block, block), dst=mask, borderType=cv2.BORDER_REPLICATE)
-    first, second = (mask, small) if ink < 0 else (small, mask)
+    first, second = (mask, small) if polarity < 0 else (small, mask)
     cv2.subtract(first, second, dst=mask)
     cv2.threshold(mask, _OFFSET_DN, 255, cv2.THRESH_BINARY, dst=mask)
     contours, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
@@ -89,7 +89,7 @@ def find_circles(image: NDArray[np.uint8], scale: int = 1, ink: int = -1) -> Can
     # A contour runs through pixel centres, half a pixel inside of the outline.
     return Candidates(
         from_ellipses(centre, scale * (e[:, 2:4] + 0.5), e[:, 4]),
-        np.full(len(e), ink, dtype=np.int64),
+        np.full(len(e), polarity, dtype=np.int64),
     )
 
 

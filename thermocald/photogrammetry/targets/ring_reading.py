@@ -134,7 +134,7 @@ def _disc_and_gap(
     grey = _sample(image, candidates.maps.select(rows), _COARSE_RADII, _COARSE_ANGLES)
     ink, gap = grey[:, 0].mean(axis=1), grey[:, 1].mean(axis=1)
     contrast = ink - gap
-    enough = contrast * candidates.ink[rows] >= _LEAST_CONTRAST_DN
+    enough = contrast * candidates.polarity[rows] >= _LEAST_CONTRAST_DN
     level = (grey - gap[:, None, None]) / np.where(enough, contrast, 1.0)[:, None, None]
     passed = (
         enough

@@ -30,7 +30,7 @@ def camera(**changes):
     }  # fmt: skip
     return {
         "series": "watch", "device": "open", "last": last, "lost": 0, "skipped": 2,
-        "late_p99_s": 0.0431, "why": "", "put_off": 0, "caught_up": 0,
+        "late_p99_s": 0.0431, "why": "", "deferred": 0, "caught_up": 0,
     }  # fmt: skip
 
 

@@ -186,7 +186,7 @@ def test_survey_with_a_known_camera_held(run, photographs, tmp_path):
         (["NOWHERE", "--scale", "R65", "R71", "100"], UsageError, "no such file"),
         (["PHOTOS", "--scale", "R65", "X", "100"], GeometryError, "X"),
         (["PHOTOS", "--scale", "R65", "R71", "100", "--hold-camera"], UsageError, "needs --camera"),
-        (["CSV", "--scale", "R65", "R71", "100"], ThermocaldError, "no image"),
+        (["CSV", "--scale", "R65", "R71", "100"], ThermocaldError, "is not an image"),
     ],
 )
 def test_wrong_surveys_are_refused_and_write_nothing(

@@ -33,7 +33,9 @@ def plan_of(**changes):
 
 def test_every_epoch_keeps_its_settings_also_when_it_is_calibrated_later(tmp_path):
     with Store.open(tmp_path / "k.db", "append") as store:
-        guard = SimpleNamespace(store=store, event=lambda event: None, thin=False, away=False)
+        guard = SimpleNamespace(
+            store=store, event=lambda event: None, thin=False, away=False, all_series=store.all_series
+        )
 
         def begun(one):
             there = [s for s in store.all_series() if s.name == one.name]
@@ -64,7 +66,7 @@ def test_a_setting_that_harms_is_in_the_status():
     document = {
         "stalled": [], "store": {"state": "ok"}, "frames": {"paused": ""},
         "clock": {"trusted": True}, "thermometers": {}, "outputs": {},
-        "cameras": {"river": {**status, "put_off": 0, "caught_up": 0}},
+        "cameras": {"river": {**status, "deferred": 0, "caught_up": 0}},
     }  # fmt: skip
     (said,) = status_warnings(document)
     assert said == "camera river: focus: auto lets the camera focus by itself"

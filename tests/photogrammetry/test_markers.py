@@ -136,7 +136,7 @@ def test_a_code_stands_once_in_a_field():
     field = TestField.build(
         ["a", "b"], np.zeros((2, 3)), kinds="marker_corner", codes="DICT_4X4_50:1:0"
     )
-    with pytest.raises(TestFieldError, match="twice"):
+    with pytest.raises(TestFieldError, match="is duplicated"):
         marker_rows(field)
 
 

@@ -217,5 +217,5 @@ def test_a_recording_of_nothing(recording_path):
 
 
 def test_a_file_instead_of_a_folder(recording_path):
-    with pytest.raises(RecordingError, match="is no folder"):
+    with pytest.raises(RecordingError, match="is not a folder"):
         read_recording(recording_path / "epochs.csv")

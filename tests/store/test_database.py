@@ -272,7 +272,7 @@ def test_no_store(tmp_path):
 def test_not_ours(tmp_path, mode):
     text = tmp_path / "notes.txt"
     text.write_text("not a database, " * 100)
-    with pytest.raises(StoreError, match="it is no store"):
+    with pytest.raises(StoreError, match="it is not a store"):
         Store.open(text, mode)
     assert text.read_text() == "not a database, " * 100
     other = tmp_path / "other.db"

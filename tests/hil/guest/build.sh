@@ -3,7 +3,7 @@
 #
 # A Debian 12 of the size that systemd, Python and the drivers' libraries need, with v4l2loopback
 # built for its kernel. thermocald itself is not in it: it is copied in at each run, so that a
-# change of the program does not build the guest anew. Needs root, apt and a Python package index.
+# change of the program does not build the guest again. Needs root, apt and a Python package index.
 set -euo pipefail
 out=$1
 here=$(cd "$(dirname "$0")" && pwd)

@@ -122,7 +122,7 @@ function showDevices() {
       state.append(element("span", device.device, good ? "ready" : "failed"), " " + (device.why || ""));
       const rhythm = kind === "cameras" ?
         `every ${device.period_s} s, late ${fixed(1000 * device.late_p99_s, 1)} ms (p99), ` +
-        `${device.skipped} skipped, ${device.lost} lost, ${device.put_off - device.caught_up} to catch up` : "";
+        `${device.skipped} skipped, ${device.lost} lost, ${device.deferred - device.caught_up} to catch up` : "";
       const first = element("th", name);
       first.scope = "row";
       row.append(first, state, element("td", rhythm));

@@ -34,7 +34,8 @@ def plan_of(**changes):
 def test_every_epoch_keeps_its_settings_also_when_it_is_calibrated_later(tmp_path):
     with Store.open(tmp_path / "k.db", "append") as store:
         guard = SimpleNamespace(
-            store=store, event=lambda event: None, thin=False, away=False, all_series=store.all_series
+            store=store, all_series=store.all_series, event=lambda event: None,
+            thin=False, away=False,
         )
 
         def begun(one):

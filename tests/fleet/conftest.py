@@ -7,6 +7,7 @@ import shutil
 import socket
 import subprocess
 import tempfile
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,7 @@ class Server:
 
     def __init__(self, programs: Path, folder: Path) -> None:
         self.programs, self.folder = programs, folder
+        self.options = ""
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             self.port = probe.getsockname()[1]
@@ -44,7 +46,7 @@ class Server:
     def start(self) -> None:
         options = (
             f"-p {self.port} -c listen_addresses=127.0.0.1 -c fsync=off "
-            f"-c unix_socket_directories={self.folder}"
+            f"-c unix_socket_directories={self.folder} {self.options}"
         )
         self.run("pg_ctl", "-D", str(self.folder / "data"), "-w", "-o", options,
                  "-l", str(self.folder / "log"), "start")  # fmt: skip
@@ -58,6 +60,13 @@ class Server:
 
 @pytest.fixture(scope="session")
 def cluster():
+    with new_cluster() as server:
+        yield server
+
+
+@contextmanager
+def new_cluster(prepare=lambda server: None):
+    """A cluster of its own; prepare(server) is called before it is started."""
     programs = _programs()
     if programs is None:
         pytest.skip("PostgreSQL is not installed (apt install postgresql)")
@@ -66,10 +75,13 @@ def cluster():
     folder = Path(tempfile.mkdtemp(prefix="thermocald-postgres-"))
     folder.chmod(0o755)
     server = Server(programs, folder)
+    prepare(server)
     server.start()
-    yield server
-    server.stop()
-    shutil.rmtree(folder)
+    try:
+        yield server
+    finally:
+        server.stop()
+        shutil.rmtree(folder)
 
 
 @pytest.fixture

@@ -18,6 +18,14 @@ from thermocald.fleet.reprocess import find_blocks, run_blocks
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE
 from thermocald.simulation.presets import preset_simulation
 
+RUN_BLOCKS = (
+    "import sys; from pathlib import Path;"
+    "from thermocald.fleet.reprocess import find_blocks, run_blocks;"
+    "from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE;"
+    "b = find_blocks([Path(sys.argv[1])], Path(sys.argv[2]), tuple(DEFAULT_FREE), 10);"
+    "print([o.error for o in run_blocks(b, sys.argv[3]) if o.error])"
+)
+
 parquet = pytest.importorskip("pyarrow.parquet", reason="pip install thermocald[parquet]")
 
 
@@ -80,6 +88,9 @@ def cluster(tmp_path):
     pytest.importorskip("distributed", reason="pip install thermocald[dask]")
     known = tmp_path / "scheduler.json"
 
+    def start_worker():
+        return start("dask_worker", "--nthreads", "1", "--no-dashboard", "--no-nanny")
+
     def start(program, *options):
         command = [sys.executable, "-m", f"distributed.cli.{program}", "--scheduler-file", known]
         return subprocess.Popen(
@@ -94,29 +105,19 @@ def cluster(tmp_path):
         while not known.exists():
             assert time.monotonic() < deadline
             time.sleep(0.1)
-        workers = [start("dask_worker", "--nthreads", "1", "--no-dashboard", "--no-nanny")
-                   for _ in range(2)]  # fmt: skip
-        for worker in workers:
-            stack.callback(worker.wait)
-            stack.callback(worker.kill)
-        yield json.loads(known.read_text())["address"], workers
+        workers = [start_worker() for _ in range(2)]
+        stack.callback(lambda: [(w.kill(), w.wait()) for w in workers])
+        yield json.loads(known.read_text())["address"], workers, start_worker
 
 
 @pytest.mark.slow
 def test_a_cluster_gives_the_bits_of_one_process(archive, tmp_path, cluster):
     """Two workers; one of them is killed while it works."""
-    address, workers = cluster
+    address, workers, _ = cluster
     run_blocks(blocks_of(archive, tmp_path / "one", 10))
     out = tmp_path / "again"
-    program = (
-        "import sys; from pathlib import Path;"
-        "from thermocald.fleet.reprocess import find_blocks, run_blocks;"
-        "from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE;"
-        "b = find_blocks([Path(sys.argv[1])], Path(sys.argv[2]), tuple(DEFAULT_FREE), 10);"
-        "print([o.error for o in run_blocks(b, sys.argv[3]) if o.error])"
-    )
     client = subprocess.Popen(
-        [sys.executable, "-c", program, archive, out, address], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", RUN_BLOCKS, archive, out, address], stdout=subprocess.PIPE, text=True
     )
     deadline = time.monotonic() + 120
     while len(list(out.rglob("*.parquet"))) < 4:
@@ -126,6 +127,64 @@ def test_a_cluster_gives_the_bits_of_one_process(archive, tmp_path, cluster):
     errors, _ = client.communicate(timeout=180)
     assert errors.splitlines()[-1] == "[]"
     assert files(tmp_path / "one") == files(out)
+
+
+@pytest.mark.slow
+def test_workers_that_are_killed_again_and_again_finish_with_equal_results(
+    archive, tmp_path, cluster
+):
+    """One every few seconds, and another takes its place, as on machines that are lent."""
+    address, workers, start_worker = cluster
+    single = [tmp_path / "one", tmp_path / "many"]
+    run_blocks(blocks_of(archive, single[0], 10))
+    command = [sys.executable, "-m", "thermocald", "reprocess", archive, "--out"]
+    whole = [*command, tmp_path / "cluster", "--engine", address, "--do", "study", "--sets", "2000"]
+    client = subprocess.Popen(
+        [sys.executable, "-c", RUN_BLOCKS, archive, single[1], address],
+        stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    killed = 0
+    deadline = time.monotonic() + 200
+    while client.poll() is None:
+        assert time.monotonic() < deadline
+        time.sleep(3)
+        workers[killed % 2].kill()
+        workers[killed % 2].wait()
+        workers[killed % 2] = start_worker()
+        killed += 1
+    errors, _ = client.communicate()
+    assert errors.splitlines()[-1] == "[]"
+    assert files(single[0]) == files(single[1])
+    assert killed >= 2
+    # Monte-Carlo over the fleet, on the same cluster and here
+    subprocess.run(whole, check=True, capture_output=True, timeout=200)
+    local = [*command, tmp_path / "local", "--do", "study", "--sets", "2000"]
+    subprocess.run(local, check=True, capture_output=True, timeout=200)
+    assert {p.name: p.read_bytes() for p in (tmp_path / "cluster").iterdir()} == {
+        p.name: p.read_bytes() for p in (tmp_path / "local").iterdir()
+    }
+    assert len([*(tmp_path / "local").iterdir()]) == 2
+
+
+def test_series_are_analysed_one_by_one_and_done_ones_are_left(archive, tmp_path):
+    run = [sys.executable, "-m", "thermocald", "reprocess", archive, "--out", tmp_path / "o",
+           "--do", "study", "--sets", "500", "--json", "-"]  # fmt: skip
+    done = subprocess.run(run, check=True, capture_output=True, text=True, timeout=120)
+    assert json.loads(done.stdout) == {"series": 2, "failed": []}
+    names = sorted(p.name for p in (tmp_path / "o").iterdir())
+    assert names == ["rpi-v2.1-M1.json", "rpi-v2.1-M2.json"]
+    (tmp_path / "o" / names[0]).unlink()
+    again = subprocess.run(run, check=True, capture_output=True, text=True, timeout=120)
+    assert json.loads(again.stdout)["series"] == 1
+
+
+def test_an_unknown_analysis_and_a_server_to_calibrate_are_said(archive, tmp_path):
+    from thermocald.cli.series_task import find_series_tasks
+
+    with pytest.raises(UsageError, match="there are calibrate, discover, study"):
+        find_series_tasks([archive], tmp_path, "dream", 100)
+    with pytest.raises(DataError, match="no series is there"):
+        find_series_tasks([tmp_path], tmp_path, "study", 100)
 
 
 @pytest.mark.slow

@@ -12,19 +12,16 @@ from __future__ import annotations
 
 import logging
 import os
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from importlib import import_module
 from itertools import islice
-from multiprocessing import get_context
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermocald.acquisition.calibrator import Calibrator
 from thermocald.atomic_file import cannot_write, make_folder
-from thermocald.errors import DataError, OutputError, ServerGone, ThermocaldError, UsageError
+from thermocald.errors import DataError, OutputError, ThermocaldError
+from thermocald.fleet.tasks import run_tasks
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.store.database.row import EpochResult
@@ -32,7 +29,7 @@ from thermocald.store.recording.parquet_table import write_parquet
 from thermocald.store.recording.reader import open_recording
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
 __all__ = ["Block", "Outcome", "calibrate_block", "find_blocks", "run_blocks"]
@@ -125,63 +122,15 @@ def run_blocks(
     engine: `local`, or the address of a scheduler, `tcp://host:8786`, whose workers see the same
     folders. report: told of each block as it is done. Raises UsageError, ServerGone.
     """
-    if engine == "local":
-        run = _alone(blocks) if jobs == 1 else _processes(blocks, jobs)
-    elif "://" in engine:
-        run = _cluster(blocks, engine)
-    else:
-        raise UsageError(f"--engine {engine}: there is `local`, or a scheduler's tcp://HOST:PORT")
     outcomes = []
-    for outcome in run:
+    for outcome in run_tasks(calibrate_block, blocks, _lost, engine, jobs):
         outcomes.append(outcome)
         report(outcome)
     return outcomes
 
 
-def _alone(blocks: Sequence[Block]) -> Iterator[Outcome]:
-    return map(calibrate_block, blocks)
-
-
-def _processes(blocks: Sequence[Block], jobs: int) -> Iterator[Outcome]:
-    """On processes of this machine; where one dies, its blocks are tried again one by one."""
-    lost: list[Block] = []
-    # not forked: OpenCV's and BLAS's threads do not survive that
-    fresh = get_context("spawn")
-    with ProcessPoolExecutor(jobs, fresh) as pool:
-        futures = {pool.submit(calibrate_block, block): block for block in blocks}
-        for future in as_completed(futures):
-            try:
-                yield future.result()
-            except BrokenProcessPool:
-                lost.append(futures[future])
-    for block in lost:
-        with ProcessPoolExecutor(1, fresh) as pool:
-            try:
-                yield pool.submit(calibrate_block, block).result()
-            except BrokenProcessPool:
-                yield Outcome(block, 0, 0, "its process died twice")
-
-
-def _cluster(blocks: Sequence[Block], address: str) -> Iterator[Outcome]:
-    try:
-        distributed: Any = import_module("distributed")
-    except ImportError as error:
-        raise UsageError(
-            f"--engine {address} needs Dask: pip install 'thermocald[dask]'"
-        ) from error
-    try:
-        client = distributed.Client(address, timeout="20s", set_as_default=False)
-    except (OSError, TimeoutError) as error:
-        raise ServerGone(f"{address}: the scheduler cannot be reached ({error})") from error
-    with client:
-        futures = client.map(calibrate_block, blocks, pure=False, retries=1)
-        which = {future.key: block for future, block in zip(futures, blocks, strict=True)}
-        for future in distributed.as_completed(futures, loop=client.loop):
-            if future.status == "finished":
-                yield future.result()
-            else:
-                yield Outcome(which[future.key], 0, 0, str(future.exception()).splitlines()[0])
-            future.release()
+def _lost(block: Block, why: str) -> Outcome:
+    return Outcome(block, 0, 0, why)
 
 
 def _columns(block: Block) -> tuple[dict[str, Any], int]:

@@ -54,6 +54,17 @@ class ServerAddress:
         url = urlunsplit(("postgresql+psycopg", parts.netloc, parts.path, rest, ""))
         return cls(url, **selection)
 
+    @staticmethod
+    def narrowed(source: Path, station: str, camera: str, series: str) -> Path:
+        """The same address, selecting one series, as a path in the place of the given one."""
+        from pathlib import Path
+
+        parts = urlsplit(_SCHEME.sub("postgresql://", str(source)))
+        rest = [(n, v) for n, v in parse_qsl(parts.query) if n not in _OURS]
+        chosen = [("station", station), ("camera", camera), ("series", series)]
+        query = urlencode([*rest, *chosen], quote_via=quote, safe="")
+        return Path(urlunsplit((parts.scheme, parts.netloc, parts.path, query, "")))
+
     def __str__(self) -> str:
         """The address for messages: without a password."""
         parts = urlsplit(self.url)

@@ -1,0 +1,195 @@
+"""A fleet: what a server costs and how fast it answers; what a second worker brings.
+
+    python -m benchmarks.fleet server [--full] [--keep]    # 5 million epochs; --full: 50 million
+    python -m benchmarks.fleet workers                     # reprocess on Dask: 1 and 2 workers
+    python -m benchmarks.fleet forward                     # rows a second, bytes an epoch
+
+`server` needs PostgreSQL (a cluster of its own is made, and removed) and about 0.7 kB of disk an
+epoch: the rows are generated without covariances and observations, which no figure here reads, but
+of one camera, whose year is copied from a store. Measure on a quiet machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+import psycopg
+
+from benchmarks.generated_fleet import GeneratedCamera, add_camera
+from tests.fleet.conftest import new_cluster
+from thermocald.analysis.study.input import load_series
+from thermocald.epoch import Epoch
+from thermocald.fleet.document import fleet_document
+from thermocald.fleet.forward import Forwarder
+from thermocald.fleet.reprocess import find_blocks, run_blocks
+from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE
+from thermocald.simulation.presets import preset_simulation
+from thermocald.store.database.row import EpochResult
+from thermocald.store.database.store import Store
+from thermocald.store.server.address import ServerAddress
+from thermocald.store.server.reader import ServerStore
+from thermocald.store.server.schema import create_tables
+
+CAMERAS = 50
+YEAR_S = 365 * 86400.0
+NAMES = ["epoch", "frame_time", "c", "x0", "y0", "sd_c", "sigma0", "temperature"]
+
+
+def timed(call):
+    begin = time.perf_counter()
+    result = call()
+    return time.perf_counter() - begin, result
+
+
+def server(full: bool) -> dict[str, float]:
+    """Overview of a fleet, and one camera's year, at the server and from a store."""
+    epochs = 1_000_000 if full else 100_000
+    found: dict[str, float] = {"epochs": CAMERAS * epochs}
+    with new_cluster() as cluster, tempfile.TemporaryDirectory() as folder:
+        with psycopg.connect(cluster.address(), autocommit=True) as connection:
+            for setting in ("checkpoint_timeout = '1h'", "max_wal_size = '8GB'",
+                            "synchronous_commit = off", "maintenance_work_mem = '256MB'"):  # fmt: skip
+                connection.execute(f"ALTER SYSTEM SET {setting}")
+            connection.execute("SELECT pg_reload_conf()")
+            connection.execute("CREATE DATABASE thermocald")
+        address = ServerAddress.parse(cluster.address(name="thermocald"))
+        create_tables(address)
+        base = GeneratedCamera("", epochs=epochs, interval=YEAR_S / epochs, end=time.time() - 30)
+        rng = np.random.default_rng(1)
+        begin = time.perf_counter()
+        with psycopg.connect(cluster.address(name="thermocald"), autocommit=True) as connection:
+            for i in range(CAMERAS):
+                rates = tuple(np.array(base.rates) * (1 + 0.1 * rng.standard_normal(3)))
+                add_camera(connection, replace(base, station=f"gauge{i:02d}", rates=rates))
+            found["generated_s"] = time.perf_counter() - begin
+            connection.execute("VACUUM (ANALYZE) epoch")
+            found["bytes_an_epoch"] = connection.execute(
+                "SELECT sum(pg_total_relation_size(inhrelid)) FROM pg_inherits "
+                "WHERE inhparent = 'epoch'::regclass"
+            ).fetchone()[0] / found["epochs"]  # fmt: skip
+        whole = Path(cluster.address(name="thermocald"))
+        found["overview_s"], document = timed(lambda: fleet_document([whole]))
+        found["sound"] = document["summary"]["sound"]
+        one = Path(f"{whole}?station=gauge07")
+        path = Path(folder) / "year.db"
+        _copy_to_store(one, path)
+        for name, source in (("server", one), ("store", path)):
+            with ServerStore.open(source) if name == "server" else Store.open(source) as opened:
+                series = opened.find_series()
+                seconds = min(timed(lambda: opened.series_columns(series, NAMES))[0]  # noqa: B023
+                              for _ in range(3))  # fmt: skip
+                found[f"columns_from_{name}_s"] = seconds
+            if epochs <= 200_000:
+                found[f"study_input_from_{name}_s"] = timed(
+                    lambda: load_series(source, exterior="stored")  # noqa: B023
+                )[0]
+    return found
+
+
+def _copy_to_store(address: Path, path: Path) -> None:
+    """One camera's series from the server in a store: its rows, without covariances."""
+    with ServerStore.open(address) as there, Store.open(path, "append", durable=False) as store:
+        found = there.find_series()
+        series = store.create_series(found.head, found.testfield, identity={}, created_utc=1.0)
+        for stored in there.epochs(found, details=False):
+            store.append(series, stored.epoch, stored.result)
+
+
+def workers() -> dict[str, float]:
+    """Epochs a second of `reprocess` here, with one and with two Dask workers."""
+    found: dict[str, float] = {}
+    with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
+        folder = Path(name)
+        for i in range(4):
+            preset_simulation("rpi-v2.1-heating", i, f"M{i}").write(folder / "archive" / f"M{i}")
+
+        def blocks(out):
+            return find_blocks([folder / "archive"], folder / out, tuple(DEFAULT_FREE), 50)
+
+        epochs = sum(b.stop - b.first for b in blocks("none"))
+        run_blocks(blocks("warm")[:1])
+        found["alone_s"], _ = timed(lambda: run_blocks(blocks("alone")))
+        known = folder / "scheduler.json"
+
+        def start(program, *options):
+            command = [sys.executable, "-m", f"distributed.cli.{program}", "--scheduler-file",
+                       known, "--no-dashboard", *options]  # fmt: skip
+            process = subprocess.Popen([str(c) for c in command], stdout=subprocess.DEVNULL,
+                                       stderr=subprocess.DEVNULL)  # fmt: skip
+            stack.callback(process.wait)
+            stack.callback(process.kill)
+
+        start("dask_scheduler", "--host", "127.0.0.1", "--port", "0")
+        while not known.exists():
+            time.sleep(0.1)
+        scheduler = json.loads(known.read_text())["address"]
+        for count in (1, 2):
+            start("dask_worker", "--nthreads", "1", "--no-nanny")
+            time.sleep(3)
+            run_blocks(blocks(f"warm{count}")[:4], scheduler)  # each worker has imported all
+            found[f"dask_{count}_s"], _ = timed(
+                lambda: run_blocks(blocks(f"dask{count}"), scheduler)  # noqa: B023
+            )
+    found["overhead_per_frame"] = found["dask_1_s"] / found["alone_s"] - 1
+    found["second_worker"] = found["dask_1_s"] / found["dask_2_s"]
+    found["epochs_a_second_alone"] = epochs / found["alone_s"]
+    return found
+
+
+def forward() -> dict[str, float]:
+    """Rows a second of one forwarder, and bytes of an epoch with 147 targets: sent and stored."""
+    found: dict[str, float] = {}
+    with new_cluster() as cluster, tempfile.TemporaryDirectory() as name:
+        with psycopg.connect(cluster.address(), autocommit=True) as connection:
+            connection.execute("CREATE DATABASE thermocald")
+        address = ServerAddress.parse(cluster.address(name="thermocald"))
+        create_tables(address)
+        simulation = preset_simulation("rpi-v2.1-heating", 1)
+        rng = np.random.default_rng(1)
+        path = Path(name) / "k.db"
+        count = 5000
+        with Store.open(path, "append", durable=False) as store:
+            series = store.create_series(simulation.head, simulation.field)
+            seen = [epoch for epoch, _ in zip(simulation.epochs(), range(20), strict=False)]
+            for number in range(1, count + 1):
+                like = seen[number % len(seen)]
+                a = rng.normal(size=(40, 16))
+                result = EpochResult("ok", "", rng.normal(size=16), a.T @ a * 1e-6, 1.0, 280, 294)
+                epoch = Epoch(number, 1.7e9 + 10 * number, 1.7e9 + 10 * number,
+                              like.temperatures, observations=like.observations)  # fmt: skip
+                store.append(series, epoch, result)
+        found["bytes_in_store"] = path.stat().st_size / count
+        seconds, progress = timed(Forwarder(path, address, "bank").send_waiting)
+        found["rows_a_second"] = progress.rows / seconds
+        with psycopg.connect(cluster.address(name="thermocald"), autocommit=True) as connection:
+            connection.execute("VACUUM (ANALYZE) epoch")
+            found["bytes_at_server"] = connection.execute(
+                "SELECT sum(pg_total_relation_size(inhrelid)) FROM pg_inherits "
+                "WHERE inhparent = 'epoch'::regclass"
+            ).fetchone()[0] / count  # fmt: skip
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("what", choices=["server", "workers", "forward"])
+    parser.add_argument("--full", action="store_true", help="50 million epochs in place of 5")
+    given = parser.parse_args()
+    calls = {"server": lambda: server(given.full), "workers": workers, "forward": forward}
+    print(json.dumps({k: round(float(v), 4) for k, v in calls[given.what]().items()}, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,218 @@
+"""What goes wrong between stations and a server: a clear word each, and nothing is lost."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import psycopg
+import pytest
+
+from tests.fleet.conftest import new_cluster
+from tests.fleet.test_forward import (  # noqa: F401  # noqa: F401
+    address,
+    count,
+    field,
+    filled,
+    head,
+    make_epoch,
+    make_result,
+    store_path,
+)
+from thermocald.cli.series_task import find_series_tasks
+from thermocald.errors import ServerError, ServerGone, StoreError, StoreVersionError
+from thermocald.fleet.forward import Forwarder
+from thermocald.store.database.store import Store
+from thermocald.store.server.address import ServerAddress
+from thermocald.store.server.fleet_reader import FleetReader
+from thermocald.store.server.reader import ServerStore
+from thermocald.store.server.schema import create_tables, grant
+
+HOSTILE = ["x'); DROP TABLE epoch; --", 'a"b', "%s", "{0}", "$1", "; SELECT pg_sleep(9)", "é\\'"]
+
+
+@pytest.mark.parametrize("evil", HOSTILE)
+def test_names_are_values_and_never_statements(server, tmp_path, head, field, make_epoch, evil):  # noqa: F811
+    """Of a station, camera, series, channel and extra column; read back by them, and narrowed."""
+    channel = evil.replace("/", "")
+    camera = replace(head.camera, name=evil)
+    hostile = replace(head, series=evil, camera=camera,
+                      channels={channel: head.channels["temperature"]})  # fmt: skip
+    with Store.open(tmp_path / "k.db", "append") as store:
+        series = store.create_series(hostile, field)
+        epoch = replace(make_epoch(1), temperatures={channel: 21.5})
+        store.append(series, epoch, extra={f"x{evil}": 2.0})
+    Forwarder(tmp_path / "k.db", address(server), evil).send_waiting()
+    base = Path(server.address(name="thermocald"))
+    narrowed = ServerAddress.narrowed(base, evil, evil, evil)
+    with ServerStore.open(narrowed) as there:
+        (found,) = there.all_series()
+        columns = there.series_columns(found, [channel, f"x{evil}", "epoch"])
+        assert [float(c[0]) for c in columns.values()] == [21.5, 2.0, 1.0]
+        assert len([*there.epochs(found)]) == 1
+    with FleetReader(ServerAddress.parse(narrowed)) as fleet:
+        (record,) = fleet.cameras(2e9, base)
+        assert (record.station, record.camera) == (evil, evil)
+    grant_refused = pytest.raises(ServerError, match="was not granted")
+    with grant_refused:
+        grant(address(server), evil, writes=True)
+    assert count(server, "epoch") == 1
+    if "/" not in evil:
+        (task,) = find_series_tasks([base], tmp_path / "out", "discover", 100)
+        assert task.target.parent == tmp_path / "out"
+
+
+def test_a_newer_server_is_told_from_an_older_one(filled, server):  # noqa: F811
+    store, _ = filled
+    with psycopg.connect(server.address(name="thermocald")) as connection:
+        connection.execute("UPDATE alembic_version SET version_num = '9999'")
+    there = address(server)
+    forwarder = Forwarder(store.path, there, "b")
+    for use in (forwarder.send_waiting, lambda: ServerStore(there), lambda: FleetReader(there)):
+        with pytest.raises(StoreVersionError, match="update thermocald here"):
+            use()
+    with psycopg.connect(server.address(name="thermocald")) as connection:
+        connection.execute("UPDATE alembic_version SET version_num = '0002'")
+    assert Forwarder(store.path, address(server), "b").send_waiting().rows == 20
+
+
+def test_a_clock_that_jumps_loses_nothing(server, tmp_path, head, field, make_epoch):  # noqa: F811
+    """Before 1970, in the far future, back again: every epoch arrives, in its own month or none."""
+    times = [-5.0, 0.0, 3.0e3, 1.7e9, 1.7e9 + 10, 9.0e11, 1.7e9 + 20, 1.69e9]
+    with Store.open(tmp_path / "k.db", "append") as store:
+        series = store.create_series(head, field)
+        for number, time in enumerate(times, 1):
+            store.append(series, replace(make_epoch(number), frame_time=time), clock_trusted=False)
+        Forwarder(store.path, address(server), "bank").send_waiting()
+        with ServerStore(address(server)) as there:
+            found = there.find_series()
+            columns = there.series_columns(found, ["frame_time", "clock_trusted"])
+        assert columns["frame_time"].tolist() == times
+        assert not columns["clock_trusted"].any()
+
+
+@pytest.fixture
+def small_disk():
+    """A disk of 16 MB of PostgreSQL's user's own."""
+    if os.geteuid() != 0 or shutil.which("mount") is None:
+        pytest.skip("nothing can be mounted here: needs root")
+    folder = tempfile.mkdtemp(prefix="thermocald-disk-")
+    command = ["mount", "-t", "tmpfs", "-o", "size=16m", "tmpfs", folder]
+    if subprocess.run(command, check=False, capture_output=True).returncode:
+        pytest.skip("nothing can be mounted here")
+    Path(folder).chmod(0o755)
+    (Path(folder) / "space").mkdir()
+    shutil.chown(Path(folder) / "space", "postgres")
+    yield Path(folder)
+    subprocess.run(["umount", "-l", folder], check=False)
+    Path(folder).rmdir()
+
+
+@pytest.mark.slow
+def test_a_full_disk_of_the_server_is_said_and_made_up_for(small_disk, filled):  # noqa: F811
+    store, series = filled
+    with new_cluster() as server:
+        with psycopg.connect(server.address(), autocommit=True) as connection:
+            connection.execute(f"CREATE TABLESPACE small LOCATION '{small_disk / 'space'}'")
+            connection.execute("CREATE DATABASE thermocald TABLESPACE small")
+        create_tables(address(server))
+        free = shutil.disk_usage(small_disk).free
+        (small_disk / "ballast").write_bytes(b"x" * (free - 300_000))
+        again = next(store.epochs(series, 20, 20)).epoch
+        for number in range(1001, 1801):
+            store.append(series, replace(again, number=number))
+        forwarder = Forwarder(store.path, address(server), "bank", batch=20)
+        with pytest.raises(ServerGone, match=r"disk is full; .*nothing is lost here"):
+            forwarder.send_waiting()
+        assert 0 < count(server, "epoch") < 820
+        (small_disk / "ballast").unlink()
+        forwarder.send_waiting()
+        with ServerStore(address(server)) as there:
+            numbers = there.series_columns(there.find_series(), ["epoch"])["epoch"].tolist()
+        assert numbers == [*range(1, 21), *range(1001, 1801)]
+
+
+def openssl(folder, *arguments):
+    subprocess.run(["openssl", *arguments], cwd=folder, check=True, capture_output=True)
+
+
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory):
+    """An authority; a server and the station `pi` with a valid and an expired certificate each."""
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl is not installed")
+    folder = tmp_path_factory.mktemp("certificates")
+    for authority in ("ca", "other"):
+        openssl(folder, "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj",
+                f"/CN={authority}", "-keyout", f"{authority}.key",
+                "-out", f"{authority}.crt")  # fmt: skip
+    for name, common, days in (("server", "localhost", "2"), ("stale", "localhost", "-1"),
+                               ("pi", "pi", "2"), ("late", "pi", "-1")):  # fmt: skip
+        openssl(folder, "req", "-newkey", "rsa:2048", "-nodes", "-subj", f"/CN={common}",
+                "-keyout", f"{name}.key", "-out", f"{name}.csr")  # fmt: skip
+        openssl(folder, "x509", "-req", "-in", f"{name}.csr", "-CA", "ca.crt", "-CAkey", "ca.key",
+                "-CAcreateserial", "-days", days, "-out", f"{name}.crt")  # fmt: skip
+    return folder
+
+
+@pytest.mark.slow
+def test_certificates(certificates, filled):  # noqa: F811
+    """A client certificate is enough; an expired one, on either side, or a foreign one, is said."""
+    store, _ = filled
+
+    def prepare(server):
+        for name in ("ca.crt", "server.crt", "server.key", "stale.crt", "stale.key"):
+            target = server.folder / "data" / name
+            shutil.copy(certificates / name, target)
+            target.chmod(0o600)
+            if server.user:
+                shutil.chown(target, "postgres")
+        (server.folder / "data" / "pg_hba.conf").write_text(
+            "hostssl all pi 127.0.0.1/32 cert\nhost all all 127.0.0.1/32 scram-sha-256\n"
+        )
+        server.options = (
+            "-c ssl=on -c ssl_ca_file=ca.crt -c ssl_cert_file=server.crt -c ssl_key_file=server.key"
+        )
+
+    def pi(server, certificate="pi", root="ca"):
+        for key in certificates.glob("*.key"):
+            key.chmod(0o600)
+        query = (
+            f"?sslmode=verify-full&sslrootcert={certificates}/{root}.crt"
+            f"&sslcert={certificates}/{certificate}.crt&sslkey={certificates}/{certificate}.key"
+        )
+        place = f"postgresql://pi@localhost:{server.port}/thermocald{query}&hostaddr=127.0.0.1"
+        return ServerAddress.parse(place)
+
+    with new_cluster(prepare) as server:
+        with psycopg.connect(server.address(), autocommit=True) as connection:
+            connection.execute("CREATE DATABASE thermocald")
+            connection.execute("CREATE ROLE pi LOGIN")
+        create_tables(address(server))
+        grant(address(server), "pi", writes=True)
+        with pytest.raises(ServerError, match="certificate") as late:
+            Forwarder(store.path, pi(server, "late"), "bank").send_waiting()
+        with pytest.raises(ServerError, match="certificate is not accepted"):
+            Forwarder(store.path, pi(server, root="other"), "bank").send_waiting()
+        server.stop("fast")
+        server.options = server.options.replace("server.crt", "stale.crt")
+        server.options = server.options.replace("server.key", "stale.key")
+        server.start()
+        with pytest.raises(ServerError, match="certificate is not accepted; is it expired") as old:
+            Forwarder(store.path, pi(server), "bank").send_waiting()
+        for told in (late, old):
+            assert not isinstance(told.value, ServerGone)
+        server.stop("fast")
+        server.options = server.options.replace("stale.crt", "server.crt")
+        server.options = server.options.replace("stale.key", "server.key")
+        server.start()
+        assert Forwarder(store.path, pi(server), "bank").send_waiting().rows == 20
+
+
+def test_a_path_that_is_not_there_is_said(tmp_path):
+    with pytest.raises(StoreError):
+        Forwarder(tmp_path / "none.db", ServerAddress.parse("postgresql://h/d"), "b").send_waiting()

@@ -1,6 +1,6 @@
 """A fleet: what a server costs and how fast it answers; what a second worker brings.
 
-    python -m benchmarks.fleet server [--full] [--keep]    # 5 million epochs; --full: 50 million
+    python -m benchmarks.fleet server [--full]             # 5 million epochs; --full: 50 million
     python -m benchmarks.fleet workers                     # reprocess on Dask: 1 and 2 workers
     python -m benchmarks.fleet forward                     # rows a second, bytes an epoch
 
@@ -59,8 +59,7 @@ def server(full: bool) -> dict[str, float]:
     found: dict[str, float] = {"epochs": CAMERAS * epochs}
     with new_cluster() as cluster, tempfile.TemporaryDirectory() as folder:
         with psycopg.connect(cluster.address(), autocommit=True) as connection:
-            for setting in ("checkpoint_timeout = '1h'", "max_wal_size = '8GB'",
-                            "synchronous_commit = off", "maintenance_work_mem = '256MB'"):  # fmt: skip
+            for setting in ("checkpoint_timeout = '1h'", "max_wal_size = '8GB'"):
                 connection.execute(f"ALTER SYSTEM SET {setting}")
             connection.execute("SELECT pg_reload_conf()")
             connection.execute("CREATE DATABASE thermocald")
@@ -71,7 +70,7 @@ def server(full: bool) -> dict[str, float]:
         begin = time.perf_counter()
         with psycopg.connect(cluster.address(name="thermocald"), autocommit=True) as connection:
             for i in range(CAMERAS):
-                rates = tuple(np.array(base.rates) * (1 + 0.1 * rng.standard_normal(3)))
+                rates = tuple((np.array(base.rates) * (1 + 0.1 * rng.standard_normal(3))).tolist())
                 add_camera(connection, replace(base, station=f"gauge{i:02d}", rates=rates))
             found["generated_s"] = time.perf_counter() - begin
             connection.execute("VACUUM (ANALYZE) epoch")

@@ -133,7 +133,7 @@ def test_a_cluster_gives_the_bits_of_one_process(archive, tmp_path, cluster):
 def test_workers_that_are_killed_again_and_again_finish_with_equal_results(
     archive, tmp_path, cluster
 ):
-    """One every few seconds, and another takes its place, as on machines that are lent."""
+    """One after every few blocks, and another takes its place, as on machines that are lent."""
     address, workers, start_worker = cluster
     single = [tmp_path / "one", tmp_path / "many"]
     run_blocks(blocks_of(archive, single[0], 10))
@@ -143,11 +143,14 @@ def test_workers_that_are_killed_again_and_again_finish_with_equal_results(
         [sys.executable, "-c", RUN_BLOCKS, archive, single[1], address],
         stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
-    killed = 0
-    deadline = time.monotonic() + 200
+    killed = done = 0
+    deadline = time.monotonic() + 400
     while client.poll() is None:
         assert time.monotonic() < deadline
-        time.sleep(3)
+        time.sleep(0.1)
+        if (now := len(files(single[1]))) < done + 6:
+            continue
+        done = now
         workers[killed % 2].kill()
         workers[killed % 2].wait()
         workers[killed % 2] = start_worker()

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from thermocald.errors import UsageError
 from thermocald.store.server.connection import REVISION, connect, in_words
+from thermocald.store.server.timescale import use_timescale
 
 if TYPE_CHECKING:
     from thermocald.store.server.address import ServerAddress
@@ -36,6 +37,8 @@ def create_tables(address: ServerAddress, revision: str = REVISION) -> None:
             config.set_main_option("script_location", str(folder).replace("%", "%%"))
             config.attributes["connection"] = connection
             command.upgrade(config, revision)
+        if revision == REVISION:
+            use_timescale(engine)
     finally:
         engine.dispose()
 

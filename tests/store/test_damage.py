@@ -7,7 +7,7 @@ import sqlite3
 import numpy as np
 import pytest
 
-from thermocald.errors import ThermocaldError
+from thermocald.errors import StoreError, ThermocaldError
 from thermocald.store.database import columns
 from thermocald.store.database.row import Event
 from thermocald.store.database.store import Store
@@ -94,6 +94,31 @@ def test_a_damaged_row_does_not_stop_new_ones(whole, store_path, make_epoch, mak
         assert store.last_epoch(series) == EPOCHS + 19
         found = store.examine()
     assert found.damaged == ("rpi/M1, epoch 36",)
+
+
+def test_a_later_calibration_that_the_columns_forgot_is_named(whole, store_path):
+    """Found with a page of the file that was another page's: integrity_check was content."""
+    database = sqlite3.connect(store_path)
+    assert database.execute("DELETE FROM late_epoch").rowcount == 1
+    database.commit()
+    database.close()
+    with Store.open(store_path) as store:
+        assert store.examine().damaged == ("the columns of rpi/M1 lack 1 later calibrations",)
+    with Store.open(store_path, "append", durable=False) as store:
+        store.rebuild_columns(store.find_series())
+        assert store.examine().damaged == ()
+
+
+@pytest.mark.parametrize("table", ["series", "testfield"])
+def test_a_store_whose_series_are_gone_is_not_empty(whole, store_path, table):
+    database = sqlite3.connect(store_path)
+    for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'"):
+        database.execute(f"DROP TRIGGER {name}")
+    database.execute(f"DELETE FROM {table}")
+    database.commit()
+    database.close()
+    with Store.open(store_path) as store, pytest.raises(StoreError, match="is damaged"):
+        store.all_series()
 
 
 def test_missing_epochs_are_named(whole, store_path):

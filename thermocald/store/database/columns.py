@@ -33,6 +33,7 @@ __all__ = [
     "build_all_chunks",
     "build_missing_chunks",
     "checked_chunks",
+    "forgotten_calibrations",
     "loose_rows",
     "note_amended",
     "read_columns",
@@ -109,6 +110,31 @@ def checked_chunks(connection: sqlite3.Connection) -> Iterator[str]:
             _require(*row)
         except (_ChunkError, TypeError, ValueError):
             yield f"a chunk of column {row[2]} (its epochs are read one by one instead)"
+
+
+def forgotten_calibrations(connection: sqlite3.Connection) -> Iterator[str]:
+    """A sentence for every series whose columns lack calibrations that were made later.
+
+    Which rows these are is remembered in a table of its own, which may be damaged too.
+    """
+    compared = ("c", "sigma0", "n_observations")
+    listed = connection.execute("SELECT id, camera, name FROM series ORDER BY id").fetchall()
+    for series, camera, name in listed:
+        later = connection.execute(
+            f"SELECT number, {', '.join(compared)} FROM epoch e WHERE series_id = ?1 "
+            "AND revision > 0 AND revision = (SELECT max(revision) FROM epoch "
+            "WHERE series_id = ?1 AND number = e.number) ORDER BY number",
+            (series,),
+        ).fetchall()
+        if not later:
+            continue
+        columns = read_columns(connection, series, ["number", *compared])
+        wanted = np.array(later, dtype=np.float64).reshape(-1, 1 + len(compared))
+        rows = np.searchsorted(columns["number"], wanted[:, 0])
+        found = np.column_stack([np.append(columns[n], np.nan)[rows] for n in compared])
+        same = (found == wanted[:, 1:]) | (np.isnan(found) & np.isnan(wanted[:, 1:]))
+        if count := int((~same.all(axis=1)).sum()):
+            yield f"the columns of {camera}/{name} lack {count} later calibrations"
 
 
 def loose_rows(connection: sqlite3.Connection, series: int) -> int:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from thermocald.errors import StoreError
 from thermocald.store.database.checksum import require_checksum
-from thermocald.store.database.columns import checked_chunks
+from thermocald.store.database.columns import checked_chunks, forgotten_calibrations
 from thermocald.store.database.epoch_columns import all_rows
 from thermocald.store.database.epoch_table import check_details
 
@@ -70,6 +70,8 @@ def examine(connection: sqlite3.Connection) -> Examination:
         unchecked += row["checksum"] is None
         damaged += _failure(check_details, connection, row)
     damaged += checked_chunks(connection)
+    if not damaged:
+        damaged += forgotten_calibrations(connection)
     damaged += _orphans(connection)
     damaged += _events_and_readings(connection)
     return Examination(tuple(damaged), tuple(_gaps(connection)), epochs, unchecked)

@@ -74,6 +74,10 @@ def select_series(
         "WHERE camera = ifnull(?, camera) AND name = ifnull(?, name) ORDER BY s.id",
         (camera, name),
     ).fetchall()
+    if not rows and connection.execute("SELECT 1 FROM epoch LIMIT 1").fetchone():
+        known = connection.execute("SELECT 1 FROM series JOIN testfield LIMIT 1").fetchone()
+        if known is None:
+            raise StoreError(f"{path}: is damaged: its series or test fields are gone")
     return [_series(path, *row) for row in rows]
 
 

@@ -44,8 +44,9 @@ def cannot_write(path: Path | str, cause: OSError) -> OutputError:
 def new_file(path: Path) -> Iterator[Path]:
     """Yield the path to write to; afterwards it stands at `path`, or nothing is left of it.
 
-    Raises OutputError for every OSError within.
+    The folders above it are made. Raises OutputError for every OSError within.
     """
+    make_folder(path.absolute().parent)
     partial = path.with_name(f".{path.name}.partial")
     try:
         yield partial

@@ -103,7 +103,7 @@ def test_check_says_what_a_recording_is(recording):
         (("export", "{recording}", "--format", "xlsx"), 2, "csv, json and parquet"),
         (("replay", "{recording}", "--free", "c,zoom"), 2, "'zoom' is no IOP"),
         (("replay", "{recording}", "--exterior", "both"), 2, "per_epoch, series, mount, auto"),
-        (("export", "{recording}", "-o", "/no/such/folder/x.csv"), 2, "does not exist"),
+        (("export", "{recording}", "-o", "{image}/new/x.csv"), 2, "cannot be written"),
         (("calibrate", "{image}", "--testfield", "{field}"), 1, "is not an image"),
         (("calibrate", "{empty}", "--testfield", "{field}"), 1, "0 bytes"),
     ],

@@ -1,21 +1,27 @@
 """The first hour of new users, command by command, on what the commands themselves print.
 
 The corner is photographed from its own PDF (`printed_sheets`), the camera drifts by a known amount,
-the logger writes as a German one does; ChArUco and AprilGrid are as their programs draw them. At
-the end stands the drift with its standard deviation, held against the truth.
+the logger writes as a German one does, or the camera is a phone's on an adb server; ChArUco and
+AprilGrid are as their programs draw them. At the end stands the drift with its standard deviation,
+held against the truth.
 """
 
 from __future__ import annotations
 
+import io
 import json
 import re
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import yaml
 from typer.testing import CliRunner
 
+from tests.docs.blocks import blocks
+from tests.drivers.fakes.adb_server import AdbServer, FakePhone
 from tests.photogrammetry import board_images
 from tests.photogrammetry.network_cases import looking_at
 from tests.photogrammetry.printed_sheets import photograph, put_up
@@ -31,7 +37,7 @@ SENSOR = Sensor(1640, 1232, 0.00224)
 COLD = InteriorOrientation(3.05, 0.02, -0.01, A1=-2e-3)
 RATE_C, RATE_X0 = 0.2e-3, -0.4e-3
 """What the camera does, mm/K."""
-EPOCHS = 16
+EPOCHS = 12
 START = datetime(2026, 6, 14, 12, 0, 0)
 
 
@@ -54,13 +60,15 @@ def temperature_of(epoch):
     return 20.0 + 15.0 * np.sin(np.pi * epoch / (EPOCHS - 1))
 
 
-def write_photograph(path, grey, moment):
+def write_photograph(file, grey, moment, model="imx219", **tags):
+    """A JPEG with EXIF into a path or a buffer; tags: further ones of the inner directory."""
     exif = Image.Exif()
-    exif[0x0110] = "imx219"
+    exif[0x0110] = model
     inner = exif.get_ifd(0x8769)
     inner[0x9003] = moment.strftime("%Y:%m:%d %H:%M:%S")
     inner[0x920A] = 3.04
-    Image.fromarray(grey).save(path, exif=exif, quality=95)
+    inner.update({int(number, 16): value for number, value in tags.items()})
+    Image.fromarray(grey).save(file, format="JPEG", exif=exif, quality=95)
 
 
 def write_log(path):
@@ -91,7 +99,7 @@ def corner(tmp_path_factory):
         direction = np.ones(3) + rng.uniform(-0.45, 0.45, 3)
         where = middle + 680.0 * direction / np.linalg.norm(direction)
         station = looking_at(where, middle, (i % 4) * np.pi / 2)
-        frame = photograph(sheets, camera_at(20.0), station, seed=i)
+        frame = photograph(sheets, camera_at(20.0), station, seed=i, finer=2)
         cv2.imwrite(str(place / "survey" / f"{i}.jpg"), frame, [cv2.IMWRITE_JPEG_QUALITY, 95])
     run(
         "testfield", "survey", place / "survey", "--field", place / "field" / "testfield.csv",
@@ -107,7 +115,7 @@ def test_imported_photographs_of_the_printed_corner_show_the_drift(corner):
     stand = middle + 660.0 * np.array([1.0, 0.95, 0.85]) / np.linalg.norm([1.0, 0.95, 0.85])
     station = looking_at(stand, middle, np.pi / 2 + 0.3)
     for k in range(EPOCHS):
-        frame = photograph(sheets, camera_at(temperature_of(k)), station, seed=100 + k)
+        frame = photograph(sheets, camera_at(temperature_of(k)), station, seed=100 + k, finer=2)
         moment = START + timedelta(seconds=10 * k)
         write_photograph(place / "photos" / f"IMG_{k:03d}.jpg", frame, moment)
     write_log(place / "logger.csv")
@@ -136,6 +144,89 @@ def test_imported_photographs_of_the_printed_corner_show_the_drift(corner):
         assert drift == pytest.approx(rate * warm, abs=max(5 * sd, 2e-5)), (name, drift, sd)
     run("study", place / "M1", "--report", place / "study.html")
     assert (place / "study.html").stat().st_size > 50_000
+
+
+class Handset(FakePhone):
+    """A phone before the corner: its camera app delivers what its warming camera sees."""
+
+    def __init__(self, frames):
+        super().__init__(shoot=Handset.take)
+        self.frames, self.taken, self.course = frames, 0, {}
+        self.warm(0)
+
+    def warm(self, k):
+        tenths = round(10 * temperature_of(k))
+        self.battery = f"  voltage: 4100\n  temperature: {tenths}\n"
+        self.thermal = (
+            "Current temperatures from HAL:\n"
+            f"\tTemperature{{mValue={tenths / 10 + 4}, mType=3, mName=skin, mStatus=0}}\n"
+        )
+
+    def take(self):
+        k = min(self.taken, len(self.frames) - 1)
+        now = self.now()
+        moment, fraction = datetime.fromtimestamp(int(now), UTC), f"{int(now % 1 * 1000):03d}"
+        data = io.BytesIO()
+        write_photograph(data, self.frames[k], moment, "Phone 4a",
+                         **{"0x829A": 1 / 60, "0x8827": 100, "0x9206": 0.7, "0x9291": fraction,
+                            "0x9011": "+00:00"})  # fmt: skip
+        self.add(f"IMG_{len(self.course):04d}.jpg", data.getvalue())
+        self.course[now] = k
+        self.taken += 1
+        self.warm(self.taken)
+
+
+def test_a_phone_before_the_printed_corner_shows_the_drift(corner, monkeypatch):
+    """The commands and the configuration of the tutorial, with a phone on an adb server of ours."""
+    place, sheets, middle = corner
+    stand = middle + 660.0 * np.array([1.0, 0.9, 0.9]) / np.linalg.norm([1.0, 0.9, 0.9])
+    station = looking_at(stand, middle, np.pi / 2 - 0.2)
+    frames = [
+        photograph(sheets, camera_at(temperature_of(k)), station, seed=200 + k, finer=2)
+        for k in range(EPOCHS)
+    ]
+    server = AdbServer()
+    try:
+        page = Path(__file__).parents[2] / "docs/tutorial/phone.md"
+        (text,) = [b.text for b in blocks(page) if b.language == "yaml"]
+        config = yaml.safe_load(text)
+        camera, thermometer = config["cameras"][0], config["thermometers"][0]
+        phone = server.phones[camera["serial"]] = Handset(frames)
+        mine = {"port": server.port, "start_server": False}
+        camera |= {"width": SENSOR.width, "height": SENSOR.height, "period_s": 4.0, **mine,
+                   "principal_distance_mm": 3.04,
+                   "sensor": {"width_px": SENSOR.width, "height_px": SENSOR.height,
+                              "pixel_pitch_mm": SENSOR.pixel_pitch}}  # fmt: skip
+        thermometer |= mine
+        (place / "config.yaml").write_text(yaml.safe_dump(config))
+        monkeypatch.chdir(place)
+        run("check", "config.yaml", "--probe")
+        phone.taken = 0
+        phone.warm(0)
+        run("session", "start", "--camera", "phone-1", "--series", "M1", "--start", "cold",
+            "--epochs", EPOCHS)  # fmt: skip
+    finally:
+        server.close()
+    assert (place / "phone-1-M1.html").stat().st_size > 50_000
+    said = run("export", "phone-1-M1", "--exterior", "series").stdout.splitlines()
+    header = said[0].split(",")
+    rows = [dict(zip(header, line.split(","), strict=True)) for line in said[1:]]
+    assert len(rows) == EPOCHS
+    assert sum(r["status"] == "ok" for r in rows) >= EPOCHS - 1
+    # which frame it was: the one that was taken last before the phone's own time of exposure
+    taken = np.array(sorted(phone.course))
+    known = [phone.course[taken[np.abs(taken - float(r["frame_time"])).argmin()]] for r in rows]
+    hot = max(range(len(rows)), key=lambda i: temperature_of(known[i]))
+    warm = temperature_of(known[hot]) - temperature_of(known[0])
+    assert warm > 10
+    assert abs(float(rows[hot]["temperature"]) - temperature_of(known[hot])) < 4
+    for name, rate in (("c", RATE_C), ("x0", RATE_X0), ("y0", 0.0)):
+        drift = float(rows[hot][name]) - float(rows[0][name])
+        sd = float(np.hypot(float(rows[hot][f"sd_{name}"]), float(rows[0][f"sd_{name}"])))
+        assert 0 < sd < 0.2 * abs(RATE_C * 15)
+        assert drift == pytest.approx(rate * warm, abs=max(5 * sd, 2e-5)), (name, drift, sd)
+    told = run("study", "cold=phone-1-M1", "--report", "phone.html")
+    assert "principal point moved" in " ".join(told.stdout.split())
 
 
 def board_photographs(place, sheet, field, name, temperatures):

@@ -9,7 +9,7 @@ import typer
 from typer.testing import CliRunner
 
 from thermocald.cli import study as command
-from thermocald.errors import DataError, ThermocaldError, UsageError
+from thermocald.errors import DataError, OutputError, ThermocaldError, UsageError
 from thermocald.simulation.presets import preset_simulation
 
 
@@ -104,14 +104,14 @@ def test_a_store_gives_the_same_as_its_recording(run, recording, tmp_path):
         (["nowhere"], DataError, "nowhere: does not exist"),
         (["--reference", "x"], UsageError, "give no recordings with it"),
         (["RECORDING", "--window", "30"], UsageError, "must be odd"),
-        (["RECORDING", "--report", "nowhere/r.html"], UsageError, "does not exist"),
+        (["RECORDING", "--report", "RECORDING/epochs.csv/r.html"], OutputError, "written"),
         (["RECORDING", "--exterior", "both"], UsageError, "one of per_epoch, series"),
         (["RECORDING", "--free", "c,z0"], UsageError, "'z0' is no IOP"),
     ],
 )
 def test_wrong_usage_is_one_error(run, recording, arguments, error, words):
     with pytest.raises(error, match=words):
-        run(*[recording if a == "RECORDING" else a for a in arguments])
+        run(*[a.replace("RECORDING", str(recording)) for a in arguments])
 
 
 def test_the_same_series_twice_is_refused(run, recording, tmp_path):

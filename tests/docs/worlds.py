@@ -131,7 +131,7 @@ def put_photographs(folder: Path) -> None:
         direction = np.ones(3) + rng.uniform(-0.45, 0.45, 3)
         where = middle + 680.0 * direction / np.linalg.norm(direction)
         station = network_cases.looking_at(where, middle, (i % 4) * np.pi / 2)
-        frame = photograph(sheets, camera, station, seed=i)
+        frame = photograph(sheets, camera, station, seed=i, finer=2)
         path = str(folder / "photos" / f"{i}.jpg")
         cv2.imwrite(path, frame, [cv2.IMWRITE_JPEG_QUALITY, 95])
 

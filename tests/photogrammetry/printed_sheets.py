@@ -17,7 +17,6 @@ import pytest
 
 from thermocald.photogrammetry.camera.camera_model import CameraModel, ExteriorOrientation
 
-FINER = 3
 GRID_PX = 8
 BEYOND = 120.0
 
@@ -65,26 +64,33 @@ def photograph(
     seed: int = 0,
     paper: float = 205.0,
     ink: float = 35.0,
+    finer: int = 3,
 ) -> np.ndarray:
-    """A frame (H, W), 8 bit, from a place that sees no sheet through another."""
+    """A frame (H, W), 8 bit, from a place that sees no sheet through another.
+
+    finer: rays along a pixel; two will do for circles.
+    """
     w, h = camera.sensor.width, camera.sensor.height
-    image = np.full((h * FINER, w * FINER), BEYOND, np.float32)
+    image = np.full((h * finer, w * finer), BEYOND, np.float32)
     for sheet in sheets:
         if (exterior.centre - sheet.origin) @ np.cross(*sheet.axes) > 0:
-            u, v = _places(sheet, camera, exterior)
+            part, u, v = _places(sheet, camera, exterior, finer)
             rows, columns = sheet.image.shape
             hit = (u >= -0.5) & (v >= -0.5) & (u <= columns - 0.5) & (v <= rows - 0.5)
-            fine = _smoothed(sheet, camera, exterior)
+            fine = _smoothed(sheet, camera, exterior, finer)
             page = cv2.remap(fine, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            np.copyto(image, page * np.float32((paper - ink) / 255) + np.float32(ink), where=hit)
-    image = cv2.GaussianBlur(image, (0, 0), blur * FINER)
+            page *= np.float32((paper - ink) / 255)
+            np.copyto(image[part], page + np.float32(ink), where=hit)
+    image = cv2.GaussianBlur(image, (0, 0), blur * finer)
     small = cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA)
     if noise:
         small += np.random.default_rng(seed).standard_normal(small.shape, np.float32) * noise
     return np.clip(np.rint(small), 0, 255).astype(np.uint8)
 
 
-def _smoothed(sheet: Sheet, camera: CameraModel, exterior: ExteriorOrientation) -> np.ndarray:
+def _smoothed(
+    sheet: Sheet, camera: CameraModel, exterior: ExteriorOrientation, finer: int
+) -> np.ndarray:
     """The sheet's image without what is finer than the rays are apart where it is seen smallest:
     they would skip it, and corners would be off by a hundredth of a pixel.
     """
@@ -92,15 +98,16 @@ def _smoothed(sheet: Sheet, camera: CameraModel, exterior: ExteriorOrientation) 
     view = exterior.centre - corners
     distance = np.linalg.norm(view, axis=1)
     cosine = view @ np.cross(*sheet.axes) / distance
-    rays_mm = FINER * camera.interior.c / camera.sensor.pixel_pitch * (cosine / distance).min()
+    rays_mm = finer * camera.interior.c / camera.sensor.pixel_pitch * (cosine / distance).min()
     apart = sheet.image.shape[1] / sheet.size[0] / rays_mm
     return cv2.GaussianBlur(sheet.image.astype(np.float32), (0, 0), max(0.35 * apart, 0.3))
 
 
 def _places(
-    sheet: Sheet, camera: CameraModel, exterior: ExteriorOrientation
-) -> tuple[np.ndarray, np.ndarray]:
-    """Where on the sheet's image (px) every ray arrives.
+    sheet: Sheet, camera: CameraModel, exterior: ExteriorOrientation, finer: int
+) -> tuple[tuple[slice, slice], np.ndarray, np.ndarray]:
+    """The part of the fine image in which the sheet is seen, and where on the sheet's image (px)
+    every ray of that part arrives.
 
     Only the rays are interpolated between those of a grid of pixels (distortion is smooth: to
     3e-4 px); a place interpolated on the sheet would be 0.01 px off where it is seen obliquely.
@@ -110,37 +117,56 @@ def _places(
     u, v = np.meshgrid(*at)
     coarse = camera.rays(np.column_stack([u.ravel(), v.ravel()]))
     coarse = (coarse[:, :2] / coarse[:, 2:]).reshape(len(at[1]), len(at[0]), 2)
-    step = GRID_PX * FINER
-    size = (coarse.shape[1] * step, coarse.shape[0] * step)
-    x, y = (
-        cv2.resize(np.ascontiguousarray(coarse[..., i]), size, interpolation=cv2.INTER_LINEAR)[
-            step : step + h * FINER, step : step + w * FINER
-        ]
-        for i in (0, 1)
-    )
-    # the place on the sheet is a quotient of linear forms of the ray (x, y, 1)
-    normal = np.cross(*sheet.axes)
-    rotation = exterior.rotation
-    from_origin = exterior.centre - sheet.origin
-    below = rotation.T @ normal
+    x, y = _on_sheet(sheet, exterior, coarse[..., 0], coarse[..., 1])
     rows, columns = sheet.image.shape
+    hit = (x > -0.1 * columns) & (y > -0.1 * rows) & (x < 1.1 * columns) & (y < 1.1 * rows)
+    block, part = [], []
+    for axis, size in ((1, h), (0, w)):
+        seen = np.flatnonzero(hit.any(axis=axis))
+        low, high = (seen[0] - 2, seen[-1] + 3) if len(seen) else (0, 1)
+        block.append(slice(max(low, 0), high))
+        first = max((block[-1].start - 1) * GRID_PX * finer, 0)
+        part.append(slice(first, size * finer))
+    step = GRID_PX * finer
     fine = []
+    for i in (0, 1):
+        small = np.ascontiguousarray(coarse[block[0], block[1], i])
+        whole = cv2.resize(small, None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)
+        cut = [max(step - block[k].start * step, 0) for k in (0, 1)]
+        fine.append(whole[cut[0] :, cut[1] :])
+    height, width = fine[0].shape
+    part = [
+        slice(p.start, min(p.start + n, p.stop)) for p, n in zip(part, (height, width), strict=True)
+    ]
+    size = [p.stop - p.start for p in part]
+    places = _on_sheet(sheet, exterior, *(f[: size[0], : size[1]] for f in fine))
+    return (part[0], part[1]), *(np.float32(np.clip(p, -1e6, 1e6)) for p in places)
+
+
+def _on_sheet(
+    sheet: Sheet, exterior: ExteriorOrientation, x: np.ndarray, y: np.ndarray
+) -> list[np.ndarray]:
+    """Places on the sheet's image (px) of rays (x, y, 1) in the camera: a quotient of linear forms.
+
+    Rays go along -z; one that meets the plane behind the camera gets a place far away.
+    """
+    rotation, from_origin = exterior.rotation, exterior.centre - sheet.origin
+    normal = np.cross(*sheet.axes)
+    below = rotation.T @ normal
+    denominator = below[0] * x + below[1] * y + below[2]
+    rows, columns = sheet.image.shape
+    found = []
     for axis, scale, offset in (
         (sheet.axes[0], columns / sheet.size[0], -0.5),
         (-sheet.axes[1], rows / sheet.size[1], rows - 0.5),
     ):
-        above = scale * (
-            (axis @ from_origin) * below - (from_origin @ normal) * (rotation.T @ axis)
-        )
-        above = above + offset * below
+        form = (axis @ from_origin) * below - (from_origin @ normal) * (rotation.T @ axis)
+        above = scale * form + offset * below
         with np.errstate(divide="ignore", invalid="ignore"):
-            place = (above[0] * x + above[1] * y + above[2]) / (
-                below[0] * x + below[1] * y + below[2]
-            )
-        fine.append(place)
-    reach = -(from_origin @ normal) / (below[0] * x + below[1] * y + below[2])
-    away = ~(reach < 0) | ~np.isfinite(fine[0]) | ~np.isfinite(fine[1])  # rays go along -z
-    return tuple(np.where(away, -1e6, np.clip(p, -1e6, 1e6)).astype(np.float32) for p in fine)
+            place = (above[0] * x + above[1] * y + above[2]) / denominator
+        away = ~(denominator * (from_origin @ normal) > 0) | ~np.isfinite(place)
+        found.append(np.where(away, -1e6, place))
+    return found
 
 
 def put_up(pdf: Path, page_mm: tuple[float, float], trim: float, dpi: float = 150.0) -> list[Sheet]:

@@ -35,7 +35,7 @@ def frame_from(sheet, stand, noise=0.0):
     middle = field.points.mean(axis=0)
     station = looking_at(middle + np.array(STANDS[stand]), middle, 0.4)
     seen = CAMERA.sensor.contains(CAMERA.project(station, field.points), 30.0).sum()
-    return photograph(sheets, CAMERA, station, noise=noise, blur=0.4), int(seen)
+    return photograph(sheets, CAMERA, station, noise=noise, blur=0.4, finer=2), int(seen)
 
 
 def found_at(frame, field, scale):
@@ -73,7 +73,7 @@ def test_the_photographs_of_the_sheet_are_true(sheet):
     field, sheets = sheet
     middle = field.points.mean(axis=0)
     station = looking_at(middle + np.array(STANDS["straight"]), middle, 0.4)
-    found = measure(photograph(sheets, CAMERA, station, noise=1.0), field).observations
+    found = measure(photograph(sheets, CAMERA, station, noise=1.0, finer=2), field).observations
     truth = CAMERA.project(station, field.points[found.targets])
     off = found.points - truth
     # the page's raster is not the printer's: up to half a pixel of 150 dpi at its edges

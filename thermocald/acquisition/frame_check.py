@@ -51,7 +51,7 @@ def check_frame(name: str, calibrator: Calibrator, frame: Frame) -> FrameCheck:
     if not result.ok:
         return FrameCheck(tuple(found), f"{result.status}: {result.reason}")
     c, sd = result.values[0], result.sd[0]
-    found.append(f"{name}: sigma0 {result.sigma0:.2f}, c {c:.4f} ± {sd:.4f} mm")
+    found.append(f"{name}: sigma0 {result.sigma0:.2f}, c {c:.5f} ± {sd:.5f} mm")
     return FrameCheck(tuple(found))
 
 

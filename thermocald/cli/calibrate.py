@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from thermocald.atomic_file import write_text
+from thermocald.atomic_file import make_folder, write_text
 from thermocald.cli.common import progress, write_json
 from thermocald.cli.options import (
     DEFAULT_FREE_TEXT,
@@ -84,8 +84,8 @@ def calibrate(
 
     images = _photographs(images)
     for out in (camera_out, report):
-        if out is not None and not out.resolve().parent.is_dir():
-            raise UsageError(f"{out}: the folder {out.resolve().parent} does not exist")
+        if out is not None:  # what cannot be made is refused before the work
+            make_folder(out.absolute().parent)
     if camera_out is not None and camera_out.suffix.lower() not in (".json", ".yaml", ".yml"):
         raise UsageError(
             f"{camera_out}: --camera-out writes .json or .yaml; for another program convert it "
@@ -265,10 +265,9 @@ def _print(document: dict[str, Any]) -> None:
     console = Console()
     interior = document["interior"]
     if document["status"] == "ok":
-        console.print(
+        typer.echo(
             f"calibrated from {document['n_photographs']} photographs: sigma0 "
-            f"{document['sigma0']:.2f}, redundancy {document['redundancy']}",
-            highlight=False,
+            f"{document['sigma0']:.2f}, redundancy {document['redundancy']}"
         )
         table = Table(box=None, pad_edge=False)
         for title in ("", "value ± sd", "in px"):
@@ -283,14 +282,13 @@ def _print(document: dict[str, Any]) -> None:
             table.add_row(name, with_sd(interior[name], sd, UNITS[name]), px)
         console.print(table, highlight=False)
         if document["camera"]["pixel_pitch_assumed"]:
-            console.print(
+            typer.echo(
                 "the pixel pitch is not known and taken as 1 µm: c, x0, y0 in mm are thousandths "
-                "of px; give --pixel-pitch or --camera",
-                highlight=False,
+                "of px; give --pixel-pitch or --camera"
             )
     else:
-        console.print(
-            f"not calibrated: {document['status']}: {document['reason']}", highlight=False
+        typer.echo(
+            f"not calibrated: {document['status']}: {document['reason']}"
         )
     for p in document["photographs"]:
         line = f"{p['image']}: {p['status']}, {p['n_targets']} targets"
@@ -302,4 +300,4 @@ def _print(document: dict[str, Any]) -> None:
             line += " mm"
         if p["reason"]:
             line += f": {p['reason']}"
-        console.print(line, highlight=False)
+        typer.echo(line)

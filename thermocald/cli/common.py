@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald import atomic_file
-from thermocald.errors import UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
 __all__ = [
+    "CONFIG_PLACES",
     "default_config",
     "jsonable",
     "log_to_stderr",
@@ -30,6 +30,7 @@ __all__ = [
     "write_text",
 ]
 
+CONFIG_PLACES = (Path("config.yaml"), Path("/etc/thermocald/config.yaml"))
 _LINES = 10  # progress lines where there is no terminal
 
 
@@ -112,8 +113,7 @@ def jsonable(value: Any) -> Any:
 
 def default_config() -> Path | None:
     """The configuration where none is named: ./config.yaml, else the system's, None without."""
-    places = (Path("config.yaml"), Path("/etc/thermocald/config.yaml"))
-    return next((path for path in places if path.exists()), None)
+    return next((path for path in CONFIG_PLACES if path.exists()), None)
 
 
 def write_json(document: Any, destination: str) -> None:
@@ -122,7 +122,10 @@ def write_json(document: Any, destination: str) -> None:
 
 
 def write_text(text: str, destination: str | Path) -> None:
-    """Write text to a file, whole or not at all, or to standard output for `-`."""
+    """Write text to a file, whole or not at all, or to standard output for `-`.
+
+    Folders that do not exist are made.
+    """
     write_parts((text,), destination)
 
 
@@ -132,7 +135,4 @@ def write_parts(parts: Iterable[str], destination: str | Path) -> None:
         sys.stdout.writelines(parts)
         sys.stdout.flush()
         return
-    path = Path(destination)
-    if not path.absolute().parent.is_dir():
-        raise UsageError(f"{path}: the folder {path.absolute().parent} does not exist")
-    atomic_file.write_parts(path, parts)
+    atomic_file.write_parts(Path(destination), parts)

@@ -172,10 +172,9 @@ def _tell(document: dict[str, Any]) -> None:
 
     console = Console()
     low, high = document["temperature"]
-    console.print(
+    typer.echo(
         f"{document['ok']} of {document['epochs']} epochs calibrated, {document['targets']} "
-        f"targets, {low:.1f} to {high:.1f} °C, sigma0 {document['sigma0']:.2f}",
-        highlight=False,
+        f"targets, {low:.1f} to {high:.1f} °C, sigma0 {document['sigma0']:.2f}"
     )
     table = Table(title="Drift from the first epoch to the hottest, px", box=None, pad_edge=False)
     for title in ("", "put in", "found", "sd", "scatter / sd"):
@@ -189,8 +188,8 @@ def _tell(document: dict[str, Any]) -> None:
             f"{row['scatter_over_sd']:.2f}",
         )
     console.print(table, highlight=False)
-    console.print(f"store:     {document['store']}", highlight=False)
-    console.print(f"recording: {document['recording']}", highlight=False)
+    typer.echo(f"store:     {document['store']}")
+    typer.echo(f"recording: {document['recording']}")
 
 
 def _discover(out: Path, seed: int, quiet: bool) -> dict[str, Any]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+import typer
+
 from thermocald.atomic_file import make_folder
 from thermocald.cli.common import say
 
@@ -50,20 +52,16 @@ def discover_hidden_effect(out: Path, seed: int, quiet: bool) -> dict[str, Any]:
 
 
 def _tell(document: dict[str, Any]) -> None:
-    from rich.console import Console
-
-    console = Console()
     hidden = document["hidden"]
-    console.print(f"\nhidden:    {hidden['effect']}, tau {hidden['tau_s']:.0f} s", highlight=False)
+    typer.echo(f"\nhidden:    {hidden['effect']}, tau {hidden['tau_s']:.0f} s")
     for effect in document["effects"]:
-        console.print(f"found:     {effect['effect']}: {effect['statement']}", highlight=False)
+        typer.echo(f"found:     {effect['effect']}: {effect['statement']}")
     for label, key in (("on M1", "fit"), ("on M2", "verify")):
         gap = document["gap"][key]
         if gap is not None:
-            console.print(
+            typer.echo(
                 f"gap {label}: {gap['before']['rms_px']:.3f} → {gap['after']['rms_px']:.3f} px, "
                 f"reduced χ² {gap['before']['chi2_reduced']:.2f} → "
-                f"{gap['after']['chi2_reduced']:.2f}",
-                highlight=False,
+                f"{gap['after']['chi2_reduced']:.2f}"
             )
-    console.print(f"model:     {document['model']}", highlight=False)
+    typer.echo(f"model:     {document['model']}")

@@ -240,8 +240,8 @@ def _say(document: dict[str, Any]) -> None:
     from thermocald.output.figures.numbers import with_sd
 
     for name, rate in document["rates"].items():
-        sd = f" ± {rate['sd'] * 1e3:.5f}" if "sd" in rate else ""
-        typer.echo(f"  {name:>4}: {rate['value'] * 1e3:+.5f}{sd} µm/K")
+        shown = with_sd(1e3 * rate["value"], 1e3 * rate.get("sd", math.nan), "µm/K")
+        typer.echo(f"  {name:>4}: {shown}")
     for effect in document["effects"]:
         parts = [
             f"{k} = {with_sd(v['value'], v.get('sd', math.nan), v['unit'])}"

@@ -260,23 +260,21 @@ def _tell(document: dict[str, Any]) -> None:
     from rich.table import Table
 
     console = Console()
-    console.print(
+    typer.echo(
         f"{document['ok']} of {document['epochs']} epochs calibrated, exterior orientation "
-        f"{_EXTERIOR_WORDS[document['exterior']]}, {document['rejected']} gross errors",
-        highlight=False,
+        f"{_EXTERIOR_WORDS[document['exterior']]}, {document['rejected']} gross errors"
     )
     if document["sigma0"] is not None:
-        console.print(
-            f"sigma0 {document['sigma0']:.2f}: the noise found is that many times the stated one",
-            highlight=False,
+        typer.echo(
+            f"sigma0 {document['sigma0']:.2f}: the noise found is that many times the stated one"
         )
     if document["exterior_choice"]:
-        console.print(
-            f"--exterior {document['exterior']}: {document['exterior_choice']}", highlight=False
+        typer.echo(
+            f"--exterior {document['exterior']}: {document['exterior_choice']}"
         )
     for name in document["left_out"]:
-        console.print(
-            f"left out: target {name} and what belongs to it moves by itself", highlight=False
+        typer.echo(
+            f"left out: target {name} and what belongs to it moves by itself"
         )
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
     titles = ("", "mean mm", "scatter", "sd", "ratio", "line µm", "last - first", "drift")
@@ -297,11 +295,10 @@ def _tell(document: dict[str, Any]) -> None:
         console.print(table, highlight=False)
     reasons = [f"{w['status']}: {w['reason']}" for w in document["without_result"]]
     for text in sorted(set(reasons)):
-        console.print(f"{reasons.count(text)} × {text}", highlight=False)
+        typer.echo(f"{reasons.count(text)} × {text}")
     still = document.get("stood_still")
     if still and still["epochs_that_moved"]:
-        console.print(
+        typer.echo(
             f"the camera did not stand still in {still['epochs_that_moved']} epochs (chi-square "
-            f"{still['largest_chi2']:.0f}, bound {still['bound']:.0f}): use --exterior per_epoch",
-            highlight=False,
+            f"{still['largest_chi2']:.0f}, bound {still['bound']:.0f}): use --exterior per_epoch"
         )

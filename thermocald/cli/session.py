@@ -10,7 +10,7 @@ import numpy as np
 import typer
 
 from thermocald.atomic_file import make_folder
-from thermocald.cli.common import say, write_json
+from thermocald.cli.common import default_config, say, write_json
 from thermocald.cli.options import JsonOption
 from thermocald.errors import ConfigurationError, DataError, UsageError
 
@@ -25,7 +25,10 @@ _LOOK_EVERY_S = 0.5
 _WAIT_FOR_DAEMON_S = 300.0
 
 ConfigOption = Annotated[
-    Path | None, typer.Option("--config", "-c", help="The configuration [config.yaml].")
+    Path | None,
+    typer.Option(
+        "--config", "-c", help="The configuration [./config.yaml, /etc/thermocald/config.yaml]."
+    ),
 ]
 CameraOption = Annotated[
     str | None, typer.Option("--camera", help="Which of the configuration's cameras.")
@@ -171,9 +174,11 @@ def _configuration(config: Path | None, mock: bool) -> Config:
         if config is not None:
             raise UsageError("give --config or --mock, not both")
         return mock_config()
-    path = config or Path("config.yaml")
-    if not path.exists():
-        raise UsageError(f"{path}: there is no configuration; give --config FILE, or --mock")
+    path = config or default_config()
+    if path is None or not path.exists():
+        raise UsageError(
+            f"{path or 'config.yaml'}: there is no configuration; give --config FILE, or --mock"
+        )
     return load_config(path, option_names)
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 import time
 from collections.abc import Mapping
 from typing import Any
 
 from thermocald.cli.common import say
+from thermocald.output.figures.numbers import with_sd
 
 __all__ = ["Progress"]
 
@@ -37,13 +39,15 @@ class Progress:
         line = f"epoch {last['epoch']} of {self._total}: "
         line += "" if temperature is None else f"{temperature:.2f} °C, "
         if last["status"] == "ok":
-            line += f"c {last['c']:.4f} ± {last['sd_c']:.4f} mm, sigma0 {last['sigma0']:.2f}"
+            line += f"c {with_sd(last['c'], last['sd_c'], 'mm')}, sigma0 {last['sigma0']:.2f}"
             line += f", {last['online'].get('sentence', '')}"
         else:
             line += f"{last['status']}: {last['reason']}"
         now = time.monotonic()
         if sys.stderr.isatty():
-            sys.stderr.write(f"\r\x1b[K{line}")
+            # a longer line would leave its beginning on the screen
+            room = shutil.get_terminal_size().columns - 1
+            sys.stderr.write(f"\r\x1b[K{line[:room]}")
             sys.stderr.flush()
         elif now - self._told >= _LINE_EVERY_S or self._shown == self._total:
             self._told = now

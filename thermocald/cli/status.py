@@ -136,7 +136,10 @@ def _store(config: Path | None, store: Path | None) -> Path:
         return store
     config = config or default_config()
     if config is None:
-        raise DataError("which daemon? give --config FILE or --store FILE")
+        raise DataError(
+            "which daemon? there is neither ./config.yaml nor /etc/thermocald/config.yaml; give "
+            "--config FILE or --store FILE"
+        )
     from thermocald.config import load_config
 
     return load_config(config).store.path

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
+from thermocald.atomic_file import make_folder
 from thermocald.cli.common import progress, write_json
 from thermocald.cli.options import DEFAULT_FREE_TEXT, ExteriorOption, FreeOption, free_names
 from thermocald.errors import DataError, UsageError
@@ -116,8 +117,8 @@ def study(
         raise UsageError(f"--exterior {exterior}: must be one of {', '.join(EXTERIOR_CHOICES)}")
     # Refused before the work, not after it.
     for path in (report, figures):
-        if path is not None and not path.resolve().parent.is_dir():
-            raise UsageError(f"{path}: the folder {path.resolve().parent} does not exist")
+        if path is not None:
+            make_folder(path.absolute().parent)
     comparisons: list[Comparison] = []
     if reference:
         result, comparisons = _reference(settings)

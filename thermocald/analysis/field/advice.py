@@ -28,7 +28,10 @@ _FLAT = 0.02  # depth of a field over its distance below which it is a plane
 def advise(
     camera: CameraModel, field: TestField, check: FieldCheck, sigma_px: float = 0.03
 ) -> list[str]:
-    """Sentences, the most helpful first; none if nothing would help by a seventh."""
+    """Sentences, the most helpful first; none if nothing would help by a seventh.
+
+    That a field is one plane comes before all else: more targets in front of it are no print.
+    """
     points, sigmas = field.points[check.visible], field.sigmas[check.visible]
     typical = np.broadcast_to(np.median(sigmas, axis=0), (1, 3))
     now = check.precision.epoch
@@ -65,7 +68,7 @@ def advise(
     if len(points) < _FEW:
         propose(points, f"twice as many targets ({len(points)} are visible)")
     sentences = [text for _, text in sorted(proposals)]
-    return sentences + _remarks(check)
+    return [*_of_a_plane(check), *sentences, *_remarks(check)]
 
 
 def _compare(now: Array, then: Array) -> Array:
@@ -77,15 +80,22 @@ def _compare(now: Array, then: Array) -> Array:
     return gain
 
 
+def _of_a_plane(check: FieldCheck) -> list[str]:
+    """What one flat sheet is good for."""
+    if check.flatness >= _FLAT:
+        return []
+    text = (
+        "the field is one plane: no single image separates c, x0 and y0 from where the camera "
+        "stands. For a series of a fixed camera print the corner (thermocald testfield print). A "
+        "flat sheet gives a drift too: photograph it in ten poses with the cold camera and in ten "
+        "with the warm one, run `thermocald calibrate` on each, and take the difference"
+    )
+    return [text]
+
+
 def _remarks(check: FieldCheck) -> list[str]:
     """What is wrong with the targets themselves."""
     notes = []
-    if check.flatness < _FLAT:
-        notes.append(
-            "the field is one plane: no single image separates c, x0 and y0 from where the camera "
-            "stands; print the corner (thermocald testfield print), or photograph the sheet from "
-            "several sides and use `thermocald calibrate`"
-        )
     too_small = sum("smaller" in reason for reason in check.hidden.values())
     if too_small:
         notes.append(

@@ -80,10 +80,9 @@ def weaknesses(
     free = set(free)
     if "c" in free:
         if sd[0] > bounds.relative_sd_c * values[0]:
-            reasons.append(
-                f"the principal distance is known to {sd[0] / values[0]:.1%} only "
-                f"(bound {bounds.relative_sd_c:.1%})"
-            )
+            share = sd[0] / values[0]
+            known = f"is known to {share:.1%} only" if share < 1 else "is not determined"
+            reasons.append(f"the principal distance {known} (bound {bounds.relative_sd_c:.1%})")
         if _has_depth(points):
             flat = False
         else:
@@ -99,9 +98,9 @@ def weaknesses(
     for name, column in (("x0", 1), ("y0", 2)):
         size = sd[column] / sensor.pixel_pitch
         if name in free and size > bounds.sd_point_px:
-            reasons.append(
-                f"{name} is known to {size:.0f} px only (bound {bounds.sd_point_px:.0f} px)"
-            )
+            inside = size < max(sensor.width, sensor.height)
+            known = f"is known to {size:.0f} px only" if inside else "is not determined"
+            reasons.append(f"{name} {known} (bound {bounds.sd_point_px:.0f} px)")
     if free & {"x0", "y0", "A1", "A2", "A3", "B1", "B2"}:
         coverage = image_coverage(sensor, image_points)
         if coverage < bounds.coverage:

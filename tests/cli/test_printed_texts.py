@@ -1,0 +1,138 @@
+"""What a new user reads: durations, standard deviations, paths, where files are looked for."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from thermocald.cli import application, common
+from thermocald.cli.session_progress import Progress
+from thermocald.errors import ThermocaldError
+from thermocald.output.figures.numbers import duration, with_sd
+from thermocald.simulation.presets import preset_simulation
+from thermocald.simulation.testfields import corner_field
+
+
+def run(*arguments, **environment):
+    result = CliRunner().invoke(application(), [str(a) for a in arguments], env=environment)
+    if isinstance(result.exception, ThermocaldError):
+        raise result.exception
+    assert result.exit_code == 0, (result.output, result.exception)
+    return result
+
+
+@pytest.fixture(scope="module")
+def minute(tmp_path_factory):
+    """Seven epochs: a minute. In a folder whose name is longer than a terminal is wide."""
+    place = tmp_path_factory.mktemp("texts") / ("a-long-name-of-a-folder-" * 4)
+    place.mkdir()
+    s = preset_simulation("rpi-v2.1-heating", seed=1, field=corner_field("circles", 4, 150.0))
+    replace(s, programme=replace(s.programme, epochs=7)).write(place / "M1")
+    return place / "M1"
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0, "0 seconds"), (1, "1 second"), (42, "42 seconds"), (60, "1 minute"), (89, "1 minute"),
+     (1500, "25 minutes"), (7200, "2.0 hours"), (86400 * 12, "12 days")],
+)  # fmt: skip
+def test_durations_are_as_a_person_says_them(seconds, text):
+    """They were `in 1 minutes` and `for 0.0 h`."""
+    assert duration(seconds) == text
+
+
+def test_a_standard_deviation_is_never_shown_as_nothing():
+    """It was `± 0 mm`, and `-7.91883e-07 ± 3.4e-08`."""
+    assert with_sd(-7.91883e-07, 3.4e-08, "mm⁻²") == "(−7.92 ± 0.34)·10⁻⁷ mm⁻²"
+    rng = np.random.default_rng(0)
+    for _ in range(500):
+        value, sd = rng.normal() * 10 ** rng.uniform(-9, 5), 10 ** rng.uniform(-10, 3)
+        text = with_sd(value, sd, "mm")
+        shown = text.partition("±")[2].partition("·")[0]
+        assert re.search(r"[1-9]", shown), text
+        assert "e-" not in text
+
+
+def test_a_study_of_a_minute_and_a_path_in_one_piece(minute):
+    report = minute.parent / "new folder" / "study.html"
+    told = run("study", minute, "--report", report, COLUMNS="60")
+    assert "in 1 minute the principal point" in " ".join(told.stdout.split())
+    assert "1 minutes" not in told.output
+    assert str(report) in told.output
+    assert report.exists()
+
+
+def test_folders_that_do_not_exist_are_made(minute):
+    out = minute.parent / "exports" / "2026" / "M1.csv"
+    run("export", minute, "--exterior", "series", "-o", out)
+    assert out.read_text().startswith("epoch,frame_time")
+
+
+def test_a_prediction_has_no_sd_of_nothing(minute, tmp_path):
+    run("fit", minute, "-o", tmp_path / "m.yaml")
+    said = run("predict", "--model", tmp_path / "m.yaml", "--temperature", 25.0).stdout
+    assert not re.search(r"± 0(?![.\d])", said)
+    assert not re.search(r"± 0\.0+(?!\d)", said)
+    assert not re.search(r"e-0\d", said)
+
+
+class Wide:
+    def __init__(self):
+        self.text = ""
+
+    def isatty(self):
+        return True
+
+    def write(self, text):
+        self.text += text
+
+    def flush(self):
+        pass
+
+
+def test_the_line_of_a_session_stays_one_line(monkeypatch):
+    monkeypatch.setattr("sys.stderr", Wide())
+    monkeypatch.setenv("COLUMNS", "80")
+    sentence = "drifting 1.1085 ± 0.0015 px/min, ready in about 12.5667 ± 0.0067 min"
+    Progress(150).show({
+        "epoch": 1, "temperature": 25.0, "status": "ok", "c": 3.04, "sd_c": 0.000031,
+        "sigma0": 1.0, "online": {"sentence": sentence},
+    }, "")  # fmt: skip
+    import sys
+
+    line = sys.stderr.text.removeprefix("\r\x1b[K")
+    assert len(line) == 79
+    assert "c 3.040000 ± 0.000031 mm" in line
+
+
+def test_the_configuration_is_looked_for_here_then_in_etc(monkeypatch, tmp_path):
+    places = (tmp_path / "config.yaml", tmp_path / "etc.yaml")
+    monkeypatch.setattr(common, "CONFIG_PLACES", places)
+    assert common.default_config() is None
+    with pytest.raises(ThermocaldError, match=r"neither ./config.yaml nor /etc/thermocald"):
+        run("status")
+    with pytest.raises(ThermocaldError, match=r"neither ./config.yaml nor /etc/thermocald"):
+        run("run")
+    places[1].write_text("store: {path: there.db}\nthermometers: [{name: h, driver: mock}]\n")
+    assert common.default_config() == places[1]
+    places[0].write_text("store: {path: here.db}\nthermometers: [{name: h, driver: mock}]\n")
+    assert common.default_config() == places[0]
+    with pytest.raises(ThermocaldError, match=r"no daemon runs for .*here\.db"):
+        run("status")
+
+
+def test_a_dashboard_of_no_store_is_an_error(tmp_path):
+    with pytest.raises(ThermocaldError, match="does not exist"):
+        run("dashboard", "--store", tmp_path / "none.db")
+
+
+def test_a_flat_field_says_what_it_is_good_for():
+    told = " ".join(run("testfield", "check", "--flat").stdout.split())
+    assert told.startswith("NOT ENOUGH: a series of a fixed camera gets no result")
+    assert "A flat sheet gives a drift too: photograph it in ten poses" in told
+    assert "719" not in told
+    assert "the principal distance is not determined" in told

@@ -47,7 +47,7 @@ def test_movement_is_the_dense_covariance():
     size, U = np.linalg.eigh(e.N.mean(axis=0))
     keep = U[:, size > 1e-3 * np.median(size)]
     directions = keep[:, -2:]
-    movement = Movement(directions, waves(e.times, 4), np.full((2, 4), 0.05))
+    movement = Movement(directions, waves(e.times, 4), np.full((2, 4), 0.5))
     fit = HypothesisFitter([replace(e, movement=movement)]).fit(())
 
     N = np.einsum("pi,epq,qj->eij", keep, e.N, keep)
@@ -56,10 +56,10 @@ def test_movement_is_the_dense_covariance():
     for i in range(E):
         S[i * k : (i + 1) * k, i * k : (i + 1) * k] = np.linalg.inv(N[i])
     J = [
-        np.einsum("e,k->ek", movement.operator(j)[:, w], keep.T @ directions[:, j]).ravel()
-        for j in range(2)
-        for w in range(4)
+        np.einsum("e,k->ek", movement.operator[:, s], keep.T @ directions[:, j]).ravel()
+        for s, j in enumerate(movement.states[0])
     ]
+    assert len(J) == 8
     own = HypothesisFitter([e]).drive((), 0)[1] * e.state_sd("temperature")
     d = keep.T @ fit.direction(fit.blocks[0])[0]
     J += [np.einsum("e,k->ek", own[:, i], d).ravel() for i in range(own.shape[1])]

@@ -85,3 +85,13 @@ def test_a_reading_without_a_time_is_no_reading():
     y = np.random.default_rng(0).normal(20, 0.05, 400)
     t[7] = np.nan
     assert reading_noise(t, y, None) == pytest.approx(0.05, rel=0.2)
+
+
+def test_kinks_between_sparse_readings_are_found():
+    """At 30 s every interval after a lamp bends more than its noise; the switches stand out."""
+    rng = np.random.default_rng(2)
+    t = 30.0 * np.arange(60)
+    latent = latent_times(t, trajectory(t) + rng.normal(0, 0.04, 60), None)
+    assert np.min(np.abs(latent - 200)) < 20
+    assert np.min(np.abs(latent - 805)) < 20
+    assert len(latent) < 8

@@ -23,6 +23,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.reduction.sums import Sums, sums_of
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -63,7 +65,9 @@ def with_error_term(terms: list[ReadingErrorTerm], new: ReadingErrorTerm) -> lis
 class Weighting:
     """One series with a fixed covariance S: inner products of hypotheses under S⁻¹.
 
-    b (E, P), yy: data with the readings' own deviations put in; logdet: log |C| + log |M|.
+    b (E, P), yy: data with the readings' own deviations put in; logdet: log |C| + log |M|. effects
+    (F, E, P): couplings of the random effects with the epochs' parameters; they are the first F
+    states, of which the mount's movement has the first `moving`; those of the readings follow.
     """
 
     N: Array
@@ -75,9 +79,8 @@ class Weighting:
     places: tuple[slice, ...]  # of their states
     directions: tuple[Array, ...]  # d_k (P,)
     dN: tuple[Array, ...]  # d_kᵀN_e (E, P)
-    moving: int  # how many of the operators are the mount's movement: the first
-    hidden: Array  # (S, E, P) of the hidden targets' offsets
-    hidden_at: slice
+    moving: int
+    effects: Array
     factor: Array | None
     data: Array  # L⁻¹ Jᵀ b (R,)
     level: Array  # L⁻¹ Jᵀ constants (R, P)
@@ -93,9 +96,9 @@ class Weighting:
         total = np.zeros((len(self.factor), trajectories.shape[1]))
         for operator, at, dN in zip(self.operators, self.places, self.dN, strict=True):
             total[at] += operator.T @ ((dN @ directions) * trajectories)
-        if len(self.hidden):
+        if len(self.effects):
             X = trajectories[:, None, :] * directions
-            total[self.hidden_at] = np.tensordot(self.hidden, X, axes=([1, 2], [0, 1]))
+            total[: len(self.effects)] = np.tensordot(self.effects, X, axes=([1, 2], [0, 1]))
         out: Array = solve_triangular(self.factor, total, lower=True, check_finite=False)
         return out
 
@@ -110,9 +113,9 @@ class Weighting:
             h = dN @ directions
             for a in range(k):
                 total[at, :, a] += operator.T @ (s * h[:, a : a + 1])
-        if len(self.hidden):
-            seen = np.swapaxes(self.hidden, 1, 2) @ s  # (S, P, G)
-            total[self.hidden_at] = np.swapaxes(seen, 1, 2) @ directions
+        if len(self.effects):
+            for a in range(k):
+                total[: len(self.effects), :, a] = (self.effects @ directions[:, a]) @ s
         out: Array = solve_triangular(
             self.factor, total.reshape(len(total), -1), lower=True, check_finite=False
         )
@@ -213,17 +216,18 @@ def prepare(
     """
     from scipy.linalg import cholesky, solve_triangular
 
-    sums, own = _sums(evidence), _effects(evidence)
+    sums = sums_of(evidence)
     P = sums.N.shape[1]
-    if not carried and not own.states and not len(sums.right):
+    fixed = len(sums.right)
+    if not carried and not fixed:
         k0, N0 = sums.b.sum(axis=0), sums.N.sum(axis=0)
         return Weighting(
-            sums.N, sums.b, sums.yy, 0.0, (), (), (), (), 0, sums.cross, slice(0, 0), None,
+            sums.N, sums.b, sums.yy, sums.logdet, (), (), (), (), 0, sums.cross, None,
             np.zeros(0), np.zeros((0, P)), N0, k0, _level_factor(N0),
         )  # fmt: skip
     places: dict[str, slice] = {}
     sds, deviations = [], {}
-    fixed = start = own.hidden_at.stop
+    start = fixed
     for name in dict.fromkeys(c.channel for c in carried):
         sd = evidence.state_sd(name) * thermometer_factor
         places[name] = slice(start, start + len(sd))
@@ -236,39 +240,32 @@ def prepare(
     for item in carried:
         shift += np.outer(item.operator @ deviations[item.channel], item.direction)
         if item.unresolved is not None and item.unresolved.any():
-            sums, blurred = sums.blurred(item.direction, item.unresolved**2), True
+            bent = np.flatnonzero(item.unresolved)
+            D = item.unresolved[bent, None, None] * item.direction[:, None]
+            sums, blurred = sums.blurred(D, bent), True
     sums = sums.shifted(shift)
-    if blurred:
-        own = own.beside(sums)
-    states = [*own.states, *((c.direction, c.operator, places[c.channel]) for c in carried)]
-    moving = len(own.states)
-    dN = [*own.dN, *(sums.N @ c.direction for c in carried)]
-    cross = sums.cross
+    own = _factored(sums) if blurred else _own_factor(evidence)
+    states = [(c.direction, c.operator, places[c.channel]) for c in carried]
+    dN = [sums.N @ c.direction for c in carried]
     factor = np.zeros((start, start))
-    factor[:fixed, :fixed] = own.factor
-    logdet = sums.logdet + own.logdet
+    factor[:fixed, :fixed] = own
+    logdet = sums.logdet + 2 * float(np.sum(np.log(np.diag(own))))
     if carried:
         whole = np.concatenate(sds)
-        beside = np.zeros((fixed, start - fixed))
         M = np.diag(1.0 / whole**2)
-        for i, (_, Oi, at) in enumerate(states):
-            for j in range(max(i, moving), len(states)):
-                dj, Oj, to = states[j]
-                part = Oi.T @ ((dN[i] @ dj)[:, None] * Oj)
-                here = slice(to.start - fixed, to.stop - fixed)
-                if i < moving:
-                    beside[at, here] += part
-                    continue
-                there = slice(at.start - fixed, at.stop - fixed)
-                M[there, here] += part
-                if i != j:
-                    M[here, there] += part.T
-        for item in carried:
-            at = places[item.channel]
+        beside = np.zeros((fixed, start - fixed))
+        for i, (d, Oi, at) in enumerate(states):
             here = slice(at.start - fixed, at.stop - fixed)
-            beside[own.hidden_at, here] += (cross @ item.direction) @ item.operator
+            beside[:, here] += (sums.cross @ d) @ Oi
+            for j in range(i, len(states)):
+                dj, Oj, to = states[j]
+                there = slice(to.start - fixed, to.stop - fixed)
+                part = Oi.T @ ((dN[i] @ dj)[:, None] * Oj)
+                M[here, there] += part
+                if i != j:
+                    M[there, here] += part.T
         if fixed:
-            low = solve_triangular(own.factor, beside, lower=True, check_finite=False)
+            low = solve_triangular(own, beside, lower=True, check_finite=False)
             M = M - low.T @ low
             factor[fixed:, :fixed] = low.T
         last = cholesky(M, lower=True, check_finite=False)
@@ -278,128 +275,37 @@ def prepare(
     for (d, operator, at), w in zip(states, dN, strict=True):
         right[at, :P] += operator.T @ w
         right[at, P] += operator.T @ (sums.b @ d)
-    right[own.hidden_at, :P] = cross.sum(axis=1)
-    right[own.hidden_at, P] = sums.right
+    right[:fixed, :P] = sums.cross.sum(axis=1)
+    right[:fixed, P] = sums.right
     right = solve_triangular(factor, right, lower=True, check_finite=False)
     level, data = right[:, :P], right[:, P]
     N0 = sums.N.sum(axis=0) - level.T @ level
     k0 = sums.b.sum(axis=0) - level.T @ data
     held = _level_factor(N0)
+    moving = len(evidence.movement) if evidence.movement is not None else 0
     if moving:  # the movement's size is estimated: the levels' share counts (restricted)
         logdet += 2 * float(np.sum(np.log(np.diag(held))))
     return Weighting(
         sums.N, sums.b, sums.yy - float(data @ data), logdet, tuple(o for _, o, _ in states),
         tuple(at for _, _, at in states), tuple(d for d, _, _ in states), tuple(dN),
-        moving, cross, own.hidden_at, factor, data, level, N0, k0, held,
+        moving, sums.cross, factor, data, level, N0, k0, held,
     )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class _Effects:
-    """The random effects of a series that no hypothesis changes: movement, then hidden targets.
-
-    states: direction (P,), operator (E, K), place of each mode; factor: Cholesky factor of their
-    normal matrix.
-    """
-
-    states: list[tuple[Array, Array, slice]]
-    dN: list[Array]
-    hidden_at: slice
-    factor: Array
-    logdet: float
-
-    def beside(self, sums: _Sums) -> _Effects:
-        """The same beside other sums."""
-        return _factored(self.states, self.hidden_at, sums)
-
-
 @lru_cache(maxsize=4)
-def _effects(evidence: ReducedSeries) -> _Effects:
-    sums = _sums(evidence)
-    states: list[tuple[Array, Array, slice]] = []
-    start = 0
-    if evidence.movement is not None:
-        m, K = evidence.movement.sd.shape
-        for j in range(m):
-            direction = evidence.movement.directions[:, j]
-            states.append((direction, evidence.movement.operator(j), slice(start, start + K)))
-            start += K
-    return _factored(states, slice(start, start + len(sums.right)), sums)
+def _own_factor(evidence: ReducedSeries) -> Array:
+    """Of the random effects, which no hypothesis changes."""
+    return _factored(sums_of(evidence))
 
 
-def _factored(
-    states: list[tuple[Array, Array, slice]], hidden_at: slice, sums: _Sums
-) -> _Effects:
+def _factored(sums: Sums) -> Array:
+    """Cholesky factor (F, F) of the normal matrix of the random effects."""
     from scipy.linalg import cholesky
 
-    M = np.eye(hidden_at.stop)
-    dN = [sums.N @ d for d, _, _ in states]
-    for i, (_, Oi, at) in enumerate(states):
-        for j in range(i, len(states)):
-            dj, Oj, to = states[j]
-            part = Oi.T @ ((dN[i] @ dj)[:, None] * Oj)
-            M[at, to] += part
-            if i != j:
-                M[to, at] += part.T
-    M[hidden_at, hidden_at] = sums.normal
-    for d, operator, at in states:
-        M[at, hidden_at] = operator.T @ (sums.cross @ d).T
-        M[hidden_at, at] = M[at, hidden_at].T
-    factor = cholesky(M, lower=True, check_finite=False) if len(M) else M
-    logdet = 2 * float(np.sum(np.log(np.diag(factor))))
-    return _Effects(states, dN, hidden_at, factor, logdet)
-
-
-@dataclass(frozen=True, eq=False)
-class _Sums:
-    """The sums of a series before anything is integrated out, those of hidden targets included."""
-
-    N: Array  # (E, P, P)
-    b: Array  # (E, P)
-    yy: float
-    logdet: float
-    cross: Array  # (S, E, P)
-    normal: Array  # (S, S)
-    right: Array  # (S,)
-
-    def blurred(self, d: Array, variance: Array) -> _Sums:
-        """With a variance (E,) of the parameters along d, per epoch (Sherman-Morrison)."""
-        Nd = self.N @ d
-        gain = variance / (1.0 + variance * (Nd @ d))
-        db = self.b @ d
-        dc = self.cross @ d
-        return _Sums(
-            self.N - gain[:, None, None] * Nd[:, :, None] * Nd[:, None, :],
-            self.b - (gain * db)[:, None] * Nd,
-            self.yy - float(np.sum(gain * db**2)),
-            self.logdet + float(np.sum(np.log1p(variance * (Nd @ d)))),
-            self.cross - (gain * dc)[:, :, None] * Nd,
-            self.normal - (gain * dc) @ dc.T,
-            self.right - dc @ (gain * db),
-        )
-
-    def shifted(self, shift: Array) -> _Sums:
-        """With shifts (E, P) of the parameters taken off the data."""
-        moved = np.einsum("epq,eq->ep", self.N, shift)
-        yy = self.yy - 2 * float(np.sum(shift * self.b)) + float(np.sum(shift * moved))
-        right = self.right - np.einsum("sep,ep->s", self.cross, shift)
-        return _Sums(self.N, self.b - moved, yy, self.logdet, self.cross, self.normal, right)
-
-
-@lru_cache(maxsize=4)
-def _sums(evidence: ReducedSeries) -> _Sums:
-    hidden = evidence.hidden
-    yy = float(evidence.yy.sum())
-    if hidden is None:
-        none = np.zeros((0, *evidence.b.shape))
-        sums = _Sums(evidence.N, evidence.b, yy, 0.0, none, np.zeros((0, 0)), np.zeros(0))
-    else:
-        normal, right = np.diag(hidden.normal), hidden.right.sum(axis=1)
-        sums = _Sums(evidence.N, evidence.b, yy, 0.0, hidden.cross, normal, right)
-    if evidence.tremble is not None:
-        for direction in evidence.tremble.T:
-            sums = sums.blurred(direction, np.ones(len(evidence.N)))
-    return sums
+    if not len(sums.right):
+        return sums.normal
+    factor: Array = cholesky(sums.normal, lower=True, check_finite=False)
+    return factor
 
 
 def _level_factor(N0: Array) -> Array:

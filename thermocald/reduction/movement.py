@@ -30,12 +30,13 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["CORNERS", "Mount", "combinations", "estimated", "first_guess", "steadied"]
+__all__ = ["Mount", "combinations", "estimated", "first_guess", "steadied"]
 
 WAVES = 24
-CORNERS = (0.0, 2.0, 5.0, 12.0)
 _LEAST = 0.2  # variance of a half-wave, in units of the image noise, that is worth a state
 _TINY = 1e-6
+_FLOOR = 3.0
+_LITTLE = 1e-3  # of what is known of the best known direction
 _LEAP = 10.0  # times the usual deviation of an epoch from its neighbours
 
 
@@ -76,9 +77,13 @@ class Mount:
         slow, fast = 0.0, 0.0
         for e, (mean, covariance) in zip(fitter.series, _amplitudes(fit), strict=True):
             assert e.movement is not None
-            m, K = e.movement.sd.shape
-            power = (mean**2 + np.diag(covariance)).reshape(m, K)
-            power = power[-1] * e.movement.sd[-1] ** 2 * np.arange(1, K + 1) ** 2
+            K = e.movement.sd.shape[1]
+            mode, wave = e.movement.states
+            power = np.zeros(K)
+            own = mode == mode.max()  # the strongest
+            k = wave[own]
+            power[k] = (mean[own] ** 2 + np.diag(covariance)[own]) * e.movement.sd[-1, k] ** 2
+            power *= np.arange(1, K + 1) ** 2
             slow += float(np.mean(power[: K // 4]))
             fast += float(np.mean(power[K // 2 :]))
         return slow / max(fast, 1e-12)
@@ -116,7 +121,8 @@ def first_guess(fitter: HypothesisFitter, fit: Fit, W: Array) -> Array:
         total += np.einsum("k,ki,kj->ij", k**2, A, A) - float(np.sum(k**2)) * np.eye(len(total))
         count += len(A)
     size, U = np.linalg.eigh(total / count)
-    out: Array = (U * np.maximum(size, 0.0)) @ U.T
+    # what starts at zero stays there: a slow drift hides in the moments among rough half-waves
+    out: Array = (U * np.maximum(size, _FLOOR)) @ U.T
     return out
 
 
@@ -162,7 +168,7 @@ def estimated(
 ) -> tuple[HypothesisFitter, Fit, Mount]:
     """The movement alongside a hypothesis: a fitter that has it, the fit in it, the estimate.
 
-    fitter: of the series, with or without a movement; mount: where the EM starts.
+    fitter: of the series, with or without a movement; mount: where the iteration starts.
     """
     for turn in range(max_iterations + 1):
         own = HypothesisFitter(mount.on(fitter.series))
@@ -176,20 +182,22 @@ def estimated(
 
 
 def _step(fitter: HypothesisFitter, fit: Fit, mount: Mount) -> Mount:
-    """One step of the EM: the second moments of the amplitudes given the data."""
+    """One step: the covariance whose moments the amplitudes have, given the data."""
     size, directions = mount.modes()
-    root = np.sqrt(size)
-    total = np.zeros((len(size), len(size)))
-    count = 0
+    power = np.zeros((len(size), len(size)))
+    known = np.zeros((len(size), len(size)))
     for e, (mean, covariance) in zip(fitter.series, _amplitudes(fit), strict=True):
         assert e.movement is not None
-        m, K = e.movement.sd.shape
-        a = mean.reshape(m, K)
-        total += a @ a.T + np.einsum("ikjk->ij", covariance.reshape(m, K, m, K))
-        count += K
+        a, k = e.movement.moments(mean, covariance)
+        power += a
+        known += k
+    # of each amplitude the data determine 1 - its variance: so many count (MacKay)
+    value, V = np.linalg.eigh(known)
+    root = (V / np.sqrt(np.maximum(value, _LITTLE * value[-1]))) @ V.T
+    change = root @ power @ root
     # directions = W U: the covariance in W's coordinates again
-    U = np.linalg.lstsq(mount.combinations, directions, rcond=None)[0]
-    new = U @ (np.outer(root, root) * total / count) @ U.T
+    U = np.linalg.lstsq(mount.combinations, directions * np.sqrt(size), rcond=None)[0]
+    new = U @ change @ U.T
     return replace(mount, covariance=0.5 * (new + new.T))
 
 
@@ -210,7 +218,6 @@ def _amplitudes(fit: Fit) -> list[tuple[Array, Array]]:
     out = []
     for w, (C, V, index) in zip(fit.weightings, fit.designs, strict=True):
         assert w.factor is not None
-        states = sum(o.shape[1] for o in w.operators[: w.moving])
         x = fit.coefficients[index]
         U = w.carried(C, V)
         K = np.einsum("epq,qi,ei->pi", w.N, V, C, optimize=True) - w.level.T @ U
@@ -220,7 +227,7 @@ def _amplitudes(fit: Fit) -> list[tuple[Array, Array]]:
         level = solve_triangular(F.T, right, lower=False)
         data = w.data - U @ x - w.level @ level
         Q = solve_triangular(F, w.level.T, lower=True).T
-        inverse = solve_triangular(w.factor, np.eye(len(w.factor)), lower=True)[:, :states]
+        inverse = solve_triangular(w.factor, np.eye(len(w.factor)), lower=True)[:, : w.moving]
         by_level = inverse.T @ Q
         by_x = inverse.T @ (U - Q @ B)
         covariance = inverse.T @ inverse + by_level @ by_level.T

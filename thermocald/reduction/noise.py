@@ -18,12 +18,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.reduction.adequacy import ORDERS, cosines
+from thermocald.reduction.random_effects import waves
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.reduction.fit import HypothesisFitter
-    from thermocald.reduction.hypothesis import Fit
+    from thermocald.reduction.hypothesis import Block, Fit
     from thermocald.reduction.series import ReducedSeries
 
     Array = NDArray[np.float64]
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 __all__ = ["jumps", "noisier", "slow_together", "trembling", "with_correlated_noise", "with_jumps"]
 
 _FEWEST = 60  # epochs that tell how much the series jumps
+_BEYOND = 1.15  # times the largest eigenvalue that noise shows (Marchenko, Pastur)
 _UNUSUAL = 1.7  # a variance from 170 second differences has 13 % of standard deviation
 
 
@@ -125,13 +127,9 @@ def _thermometer_jumps(fitter: HypothesisFitter, fit: Fit, series: int, W: Array
     for block in fit.blocks:
         if block.trajectories > 1 or block.series not in (None, series):
             continue
-        if block.term < 0:
-            operator, channel = fitter.drive(fit.terms, series)[1], e.history.reference
-        else:
-            _, found, channel = fitter.trajectories(fit.terms[block.term], series, fit.terms)
-            if found is None:
-                continue
-            operator = found
+        operator, channel = _reading_operator(fitter, fit, block, series)
+        if operator is None:
+            continue
         jump = (second @ operator) * e.state_sd(channel)
         share = W.T @ e.N.mean(axis=0) @ fit.direction(block)[0]
         total += np.mean(np.sum(jump**2, axis=1)) * share**2
@@ -149,20 +147,64 @@ def with_jumps(evidence: ReducedSeries, factors: Array, W: Array) -> ReducedSeri
     N = 0.5 * (N + N.swapaxes(1, 2))
     b = np.einsum("epq,eq->ep", N, evidence.values)
     hidden = evidence.hidden.turned(T, evidence.values) if evidence.hidden else None
-    return replace(
-        evidence, N=N, b=b, yy=np.einsum("ep,ep->e", evidence.values, b), hidden=hidden
-    )
+    return replace(evidence, N=N, b=b, yy=np.einsum("ep,ep->e", evidence.values, b), hidden=hidden)
 
 
-def trembling(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries]:
-    """All series with what jumps from epoch to epoch as a movement of each epoch by itself."""
+def trembling(fitter: HypothesisFitter, fit: Fit, slower: int) -> list[ReducedSeries]:
+    """All series with what moves from epoch to epoch as a movement of each epoch by itself.
+
+    slower: how many of the slowest half-waves are accounted for otherwise.
+    """
     out = []
     for s, e in enumerate(fitter.series):
-        factors, W = jumps(fitter, fit, s)
-        unusual = factors > _UNUSUAL
-        directions = W[:, unusual] * np.sqrt(factors[unusual] - 1.0)
-        out.append(replace(e, tremble=directions) if unusual.any() else e)
+        M, W = _fast_power(fitter, fit, s, slower)
+        edge = (1.0 + np.sqrt(len(M) / max(len(e.times) - slower, 1))) ** 2
+        factors, U = np.linalg.eigh(M)
+        clear = factors > _BEYOND * edge  # what so few half-waves cannot show by chance
+        D = W @ (U[:, clear] * np.sqrt(factors[clear] - 1.0))
+        rest = np.diag(M - (U[:, clear] * (factors[clear] - 1.0)) @ U[:, clear].T)
+        more = rest > _UNUSUAL
+        D = np.column_stack([D, W[:, more] * np.sqrt(rest[more] - 1.0)])
+        out.append(replace(e, tremble=D) if D.shape[1] else e)
     return out
+
+
+def _fast_power(
+    fitter: HypothesisFitter, fit: Fit, series: int, slower: int
+) -> tuple[Array, Array]:
+    """Mean power (m, m) of the fast half-waves that a fit leaves in the determined combinations
+    W (P, m) of the parameters: the unit matrix where the image noise is all. What the
+    thermometers' noise makes is taken off.
+    """
+    e = fitter.series[series]
+    size, U = np.linalg.eigh(e.N.mean(axis=0))
+    good = size > 1e-6 * np.median(size)
+    W = U[:, good] / np.sqrt(size[good])
+    C, V, index = fit.designs[series]
+    rest = e.b - np.einsum("epq,eq->ep", e.N, (C * fit.coefficients[index]) @ V.T)
+    level = np.linalg.lstsq(e.N.sum(axis=0), rest.sum(axis=0), rcond=1e-12)[0]
+    fast = waves(e.times, len(e.times) - 1)[:, slower:].T
+    z = fast @ ((rest - e.N @ level) @ W)
+    power: Array = z.T @ z / len(fast)
+    for block in fit.blocks:
+        if block.trajectories > 1 or block.series not in (None, series):
+            continue
+        operator, channel = _reading_operator(fitter, fit, block, series)
+        if operator is not None:
+            noise = np.mean(np.sum((fast @ operator * e.state_sd(channel)) ** 2, axis=1))
+            along = W.T @ e.N.mean(axis=0) @ fit.direction(block)[0]
+            power -= noise * np.outer(along, along)
+    return power, W
+
+
+def _reading_operator(
+    fitter: HypothesisFitter, fit: Fit, block: Block, series: int
+) -> tuple[Array | None, str]:
+    """How the readings' errors reach the trajectory of a block, and their channel."""
+    if block.term < 0:
+        return fitter.drive(fit.terms, series)[1], fitter.series[series].history.reference
+    _, operator, channel = fitter.trajectories(fit.terms[block.term], series, fit.terms)
+    return operator, channel
 
 
 def noisier(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries] | None:

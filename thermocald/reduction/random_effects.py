@@ -11,6 +11,7 @@ Williams (2006), Gaussian Processes for Machine Learning, section 2.7.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 __all__ = ["HiddenTargets", "Movement", "hidden_targets", "waves"]
 
 _OFTEN = 0.9  # share of the epochs that show a target whose offset needs no unknown of its own
+_SEEN = 0.05  # variance of an amplitude, in units of the image noise, that is worth an unknown
 _LOOSE = 1e-4  # px⁻², of an offset a priori
 
 
@@ -115,17 +117,62 @@ class Movement:
     """Slow movement of the epochs' parameters that no hypothesis explains.
 
     directions (P, m) in px-scaled columns; trajectories (E, K): orthonormal cosines; sd (m, K): of
-    their amplitudes.
+    their amplitudes in units of the image noise. Those that the noise hides are left out.
     """
 
     directions: Array
     trajectories: Array
     sd: Array
 
-    def operator(self, mode: int) -> Array:
-        """Trajectories (E, K) of one direction for amplitudes of unit variance."""
-        out: Array = self.trajectories * self.sd[mode]
+    @cached_property
+    def states(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Direction and cosine of each amplitude that counts."""
+        seen = self.sd**2 > _SEEN
+        if not seen.any():
+            seen[-1, 0] = True
+        mode, wave = np.nonzero(seen)
+        return mode, wave
+
+    def __len__(self) -> int:
+        return len(self.states[0])
+
+    @cached_property
+    def operator(self) -> Array:
+        """Trajectories (E, F) of the amplitudes for unit variance."""
+        mode, wave = self.states
+        out: Array = self.trajectories[:, wave] * self.sd[mode, wave]
         return out
+
+    def cross(self, N: Array) -> Array:
+        """Couplings (F, E, P) with the parameters of epochs with normal matrices N (E, P, P)."""
+        by_mode = np.moveaxis(N @ self.directions, 2, 0)
+        out: Array = by_mode[self.states[0]] * self.operator.T[:, :, None]
+        return out
+
+    def onto(self, cross: Array) -> Array:
+        """Sums (n, F) of data or couplings (n, E, P) over what each amplitude moves."""
+        along = np.moveaxis(cross @ self.directions, 2, 0)  # (m, n, E)
+        mode = self.states[0]
+        out = np.zeros((len(cross), len(self)))
+        for m in np.unique(mode):
+            out[:, mode == m] = along[m] @ self.operator[:, mode == m]
+        return out
+
+    def moments(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
+        """Σ over the cosines of products of amplitudes, and of their gain in precision, (m, m).
+
+        mean (F,), covariance (F, F) given the data; 0 and 1 of those left out.
+        """
+        mode, wave = self.states
+        m, K = self.sd.shape
+        amplitudes = np.zeros((m, K))
+        amplitudes[mode, wave] = mean
+        known = np.zeros((m, m))
+        for k in np.unique(wave):
+            own = np.flatnonzero(wave == k)
+            part = np.eye(len(own)) - covariance[np.ix_(own, own)]
+            known[np.ix_(mode[own], mode[own])] += part
+        return amplitudes @ amplitudes.T, known
 
 
 def waves(times: Array, count: int) -> Array:

@@ -46,10 +46,11 @@ class Scan:
 class Scanner:
     """The trajectories of candidates over their grids, computed once."""
 
-    def __init__(self, fitter: HypothesisFitter) -> None:
+    def __init__(self, fitter: HypothesisFitter, like: Scanner | None = None) -> None:
+        """like: a scanner of the same histories under other noise."""
         self.fitter = fitter
-        self._stacks: dict[tuple[int, int], Array] = {}
-        self._kept: list[Candidate] = []  # keeps their identities alive
+        self._stacks: dict[tuple[int, int], Array] = like._stacks if like else {}
+        self._kept: list[Candidate] = like._kept if like else []  # keeps their identities alive
 
     def stack(self, candidate: Candidate, series: int, fit: Fit) -> Array:
         """Trajectories (G, E, m) of a candidate over its grid in one series."""

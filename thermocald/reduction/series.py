@@ -120,7 +120,8 @@ class ReducedSeries:
     variance of slow trajectories is than that of white noise; gross: rejected points; excluded:
     rows of targets left out; blocks: the epochs behind each row of a long series, or None; hidden,
     movement: what the likelihood integrates out (`random_effects`), or None; tremble (P, t):
-    directions in which each epoch moves by itself, of unit variance.
+    directions in which each epoch moves by itself, of unit variance; bend (E, T, 2) px: curvature
+    of the projection that was taken off the observations, or None.
     """
 
     source: SeriesInput
@@ -147,6 +148,7 @@ class ReducedSeries:
     hidden: HiddenTargets | None = None
     movement: Movement | None = None
     tremble: Array | None = None
+    bend: Array | None = None
 
     @property
     def readings_history(self) -> History:

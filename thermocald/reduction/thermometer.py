@@ -33,6 +33,8 @@ __all__ = [
 ]
 
 _SMOOTHING = np.logspace(-1, 5, 19)
+_OFTEN_SHARP = 0.2  # share of the intervals from which on bends are no kinks by themselves
+_KINK = 1.5  # times the usual bend that a kink then has
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,9 +119,14 @@ def latent_times(times: Array, readings: Array, resolution: float | None) -> Arr
     valid = np.isfinite(readings)
     t, y = times[valid], readings[valid]
     bend, limit = _bends(t, y, reading_noise(t, y, resolution))
-    sharp = np.abs(bend) > limit
-    if sharp.mean() > 0.2 if len(sharp) else True:
-        return np.zeros(0)  # not a trajectory with a few kinks: nothing is sharper than the rest
+    size = np.abs(bend)
+    sharp = size > limit
+    if not len(sharp):
+        return np.zeros(0)
+    if sharp.mean() > _OFTEN_SHARP:  # it bends everywhere: a kink is where it bends most
+        padded = np.pad(size, 2)
+        sharp &= size >= np.max([padded[k : k + len(size)] for k in range(5)], axis=0)
+        sharp &= size > _KINK * np.median(size[size > limit])
     return 0.5 * (t[:-1] + t[1:])[sharp]
 
 

@@ -5,19 +5,23 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from thermocald.discovery.evidence.image_space import Displaced, displaced_targets
 from thermocald.discovery.search.cross_validation import confirmed, gains
 from thermocald.discovery.search.mounted import convincing, search_beside_mount, without_slips
 from thermocald.discovery.search.search import Search, Solution
+from thermocald.discovery.search.standing import (
+    BAND,
+    SWAP_BAND,
+    adequacies,
+    adequate,
+    search_standing,
+)
 from thermocald.discovery.search.surrogates import SurrogateTest, surrogate_test
-from thermocald.reduction.adequacy import Adequacy, examine
 from thermocald.reduction.blocks import in_blocks
 from thermocald.reduction.calibrated import calibrated_thermometers
 from thermocald.reduction.curvature import curved
 from thermocald.reduction.fit import HypothesisFitter
-from thermocald.reduction.movement import combinations, steadied
+from thermocald.reduction.movement import WAVES, combinations, steadied
 from thermocald.reduction.noise import noisier, trembling, with_correlated_noise
 from thermocald.reduction.noise_growth import NoiseGrowth, noise_growth
 from thermocald.reduction.reduce import reweighted
@@ -25,8 +29,10 @@ from thermocald.reduction.reduce import reweighted
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    import numpy as np
     from numpy.typing import NDArray
 
+    from thermocald.reduction.adequacy import Adequacy
     from thermocald.reduction.hypothesis import Term
     from thermocald.reduction.movement import Mount
     from thermocald.reduction.series import ReducedSeries
@@ -35,22 +41,14 @@ if TYPE_CHECKING:
 
 __all__ = ["Examination", "examine_series"]
 
-MAX_EFFECTS = 3
 # variance of slow trajectories over that of white noise from which on a mount is asked for
 _MEMORY = 1.9
+# effects of which one says how far the image moves
+_GUIDES = 3
 # how much more a movement has in its slowest half-waves than a random walk has
 _SMOOTH = 30.0
-# how much worse a solution may score and still not be excluded
-BAND = 14.0
-# a model that leaves less than this share of what the base left has the cause
-_LEFT = 0.03
-# by how much worse (χ²) another way of following the temperature may fit and not be excluded
-_SWAP_BAND = 120.0
 # slow variances over those of white noise: beyond, what one series shows has to be seen in another
 _WANDERING = 3.0
-# a second effect alongside an adequate one has to explain as much, in px RMS and as a share of the
-# first: below that, it is the first one's finer points
-_LEFT_PX, _LEFT_SHARE = 0.005, 0.15
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,16 +115,44 @@ def _still(
     given: Sequence[tuple[str, dict[str, Any]]],
 ) -> Examination:
     """The search where the mount stands still."""
-    found = _searched(HypothesisFitter(ready), say, given)
-    bent = curved(found.fitter, found.best.fit)
-    if bent is not None:
-        say("curvature of the projection: once more")
-        found = _searched(HypothesisFitter(bent), say, given)
+    fitter = HypothesisFitter(ready)
+    search = Search(fitter)
+    base = search.base(given)
+    # one effect moves the image by most of what it moves at all
+    guide = min([base, *search.expand(base, _GUIDES)], key=lambda s: s.score).fit
+    bent = curved(fitter, guide)
+    found = _searched(HypothesisFitter(bent) if bent else fitter, say, given)
+    if not found.adequate:
+        again = curved(found.fitter, found.best.fit)
+        if again is not None:
+            say("curvature of the projection: once more")
+            found = _searched(HypothesisFitter(again), say, given)
     noisy = noisier(found.fitter, found.best.fit)
     if noisy is not None:
         say("noise that targets share: once more")
         found = _searched(HypothesisFitter(noisy), say, given)
     return found
+
+
+def _searched(
+    fitter: HypothesisFitter,
+    say: Callable[[str], None],
+    given: Sequence[tuple[str, dict[str, Any]]],
+) -> Examination:
+    found = search_standing(fitter, say, given)
+    base, best = found.base, found.best
+    blocks: list[Array] = []
+    tests: tuple[SurrogateTest, ...] = ()
+    if found.adequate(best):
+        best, blocks, tests = _named(found.search, base, best)
+    adequacy = adequacies(fitter, best)
+    complete = adequate(adequacy, found.base_adequacy)
+    if len(best.terms) > len(base.terms) and _unverified(fitter.series):
+        complete = False
+    return Examination(
+        fitter, base, best, found.ranking, found.rivals(best), found.base_adequacy, adequacy,
+        complete, tuple(blocks), surrogates=tests,
+    )  # fmt: skip
 
 
 def _beside_mount(
@@ -140,11 +166,11 @@ def _beside_mount(
     """
     fitter = HypothesisFitter([in_blocks(replace(e, correlation=1.0)) for e in calibrated])
     fitter = HypothesisFitter(steadied(fitter, fitter.fit(()), combinations(fitter.series)))
-    shaken = trembling(fitter, fitter.fit(()))
+    shaken = trembling(fitter, fitter.fit(()), WAVES)
     found = search_beside_mount(HypothesisFitter(shaken), say, given)
     if found.mount.smoothness(found.fitter, found.best.fit) > _SMOOTH:
         return None
-    search = Search(found.fitter, say)
+    search = Search(found.fitter, say, found.like)
     best, blocks, tests = _named(search, found.base, found.best)
     if any(t.kind.is_event and t not in best.terms for t in found.best.terms):
         found = without_slips(found, len(given))  # steps that cannot be named are still there
@@ -152,128 +178,21 @@ def _beside_mount(
     base = found.base
     if not convincing(found.fitter, base, best):
         best, blocks, tests = base, [], ()
-    adequacy = _adequacies(found.fitter, best)
+    adequacy = adequacies(found.fitter, best)
     rivals: list[Solution] = []
     for s in sorted(found.seen, key=lambda s: s.score):
         names = [t.effect for t in s.terms if t not in found.knocks]
         own = [t.effect for t in best.terms if t not in found.knocks]
         # between two readings nobody knows the temperature: a delay and its rate look alike
         differ = [t for t in (*s.terms, *best.terms) if (t in s.terms) != (t in best.terms)]
-        band = _SWAP_BAND if any(t.kind.delay for t in differ) else BAND
+        band = SWAP_BAND if any(t.kind.delay for t in differ) else BAND
         close = s.score < best.score + band and len(names) <= len(own)
         if close and sorted(names) != sorted(own) and s.names not in [r.names for r in rivals]:
             rivals.append(s)
     return Examination(
-        found.fitter, base, best, found.ranking, tuple(rivals), _adequacies(found.fitter, base),
+        found.fitter, base, best, found.ranking, tuple(rivals), adequacies(found.fitter, base),
         adequacy, True, tuple(blocks), surrogates=tests, mount=found.mount, knocks=found.knocks,
     )  # fmt: skip
-
-
-def _searched(
-    fitter: HypothesisFitter,
-    say: Callable[[str], None],
-    given: Sequence[tuple[str, dict[str, Any]]],
-) -> Examination:
-    """The search itself, in the trajectories of the parameters."""
-    say("base model")
-    search = Search(fitter, say)
-    base = search.base(given)
-    base_adequacy = _adequacies(fitter, base)
-    best, ranking = base, []
-    frontier = [base]
-    seen: list[Solution] = []
-    adequate = False
-    for level in range(1, MAX_EFFECTS + 1):
-        grown: list[Solution] = []
-        for solution in frontier:
-            say(f"effect {level}: alongside {', '.join(solution.names) or 'the base'}")
-            wide = 6 if level == 1 else 4
-            kept = len(base.terms)
-            grown += [search.shrink(s, kept) for s in search.expand(solution, wide)]
-        if level == 1:
-            ranking = sorted(grown, key=lambda s: s.score)
-        seen += grown
-        if not grown:
-            break
-        champion = min(grown, key=lambda s: s.score)
-        if champion.score >= best.score:
-            break
-        if level > 1 and adequate:
-            least = max(_LEFT_PX, _LEFT_SHARE * _size_px(fitter, base, best))
-            if _size_px(fitter, best, champion) < least:
-                break
-        best = champion
-        adequate = _adequate(_adequacies(fitter, best), base_adequacy)
-        # what is adequate may still lack something too fast for the absolute test
-        frontier = [best] if adequate or level > 1 else _frontier(grown)
-    # larger combinations that were not accepted are no rivals
-    seen = [s for s in seen if len(s.terms) <= len(best.terms)]
-    if len(best.terms) > len(base.terms):
-        best, seen = _contest(search, best, seen)
-        best, seen = _lag_or_delay(search, best, seen)
-    best, blocks = _confirmed(search, base, best)
-    tests: tuple[SurrogateTest, ...] = ()
-    if _adequate(_adequacies(fitter, best), base_adequacy):
-        best, blocks, tests = _named(search, base, best)
-    adequacy = _adequacies(fitter, best)
-    adequate = _adequate(adequacy, base_adequacy)
-    if len(best.terms) > len(base.terms) and _unverified(fitter.series):
-        adequate = False
-    rivals: list[Solution] = []
-    for s in sorted(seen, key=lambda s: s.score):
-        different = sorted(s.names) != sorted(best.names)
-        close = s.score < best.score + BAND
-        if _swapped(best, s):
-            close = s.fit.chi2 < best.fit.chi2 + _SWAP_BAND
-        if different and close and s.names not in [r.names for r in rivals]:
-            rivals.append(s)
-    return Examination(
-        fitter, base, best, tuple(ranking), tuple(rivals), base_adequacy, adequacy, adequate,
-        tuple(blocks), surrogates=tests,
-    )  # fmt: skip
-
-
-def _lag_or_delay(
-    search: Search, best: Solution, seen: list[Solution]
-) -> tuple[Solution, list[Solution]]:
-    """Of a lag and a delay the one that fits better, and both among the solutions seen.
-
-    The likelihood holds every trajectory of the temperature for equally probable. A lag smooths the
-    thermometer's noise, a delay does not; so a smooth image, which all temperatures give, would
-    speak for a lag whatever the cause. Between these two the fit alone decides.
-    """
-    other = _with_the_other(search, best)
-    if other is None:
-        return best, seen
-    if other.fit.chi2 < best.fit.chi2 - 0.5 * _SWAP_BAND:
-        return other, [*seen, other]
-    return best, [*seen, other]
-
-
-def _with_the_other(search: Search, solution: Solution) -> Solution | None:
-    """The solution with another effect that delays the temperature in place of the one it has."""
-    delays = [c for c in search.candidates if c.kind.delay]
-    for i, term in enumerate(solution.terms):
-        if not term.kind.delay:
-            continue
-        seconds = float(dict(term.nonlinear)[term.kind.delay])
-        others = [c for c in delays if c.effect not in solution.names]
-        if seconds <= 0 or not others:
-            return None
-        found = []
-        for candidate in others:
-            swapped = candidate.term(seconds, len(search.fitter.series))
-            terms = (*solution.terms[:i], swapped, *solution.terms[i + 1 :])
-            found.append(search.refine(terms, solution.penalties))
-        return min(found, key=lambda s: s.fit.chi2)
-    return None
-
-
-def _swapped(one: Solution, other: Solution) -> bool:
-    """Whether the two differ in one way of following the temperature for another only."""
-    mine = [t for t in one.terms if t.effect not in other.names]
-    theirs = [t for t in other.terms if t.effect not in one.names]
-    return len(mine) == len(theirs) == 1 and mine[0].is_drive and theirs[0].is_drive
 
 
 def _unverified(series: Sequence[ReducedSeries]) -> bool:
@@ -322,47 +241,3 @@ def _confirmed(search: Search, base: Solution, best: Solution) -> tuple[Solution
         search.progress(f"{best.names[worst]} does not predict the blocks left out")
         best = _without(search, base, best, worst)
     return best, []
-
-
-def _contest(
-    search: Search, best: Solution, seen: list[Solution]
-) -> tuple[Solution, list[Solution]]:
-    """Near ties again, each under the thermometer noise that suits it best."""
-    close = {s.terms: s for s in seen if s.score < best.score + 60.0}
-    if len({s.names for s in close.values()}) < 2:
-        return best, seen
-    fitter = search.fitter
-    again: list[Solution] = []
-    for s in sorted(close.values(), key=lambda s: s.score)[:6]:
-        _, objective = fitter.thermometer_scale(s.fit)
-        again.append(replace(s, fit=replace(s.fit, logdet=objective - s.fit.chi2)))
-    again.sort(key=lambda s: s.score)
-    others = [s for s in seen if s.terms not in close]
-    return again[0], [*again, *others]
-
-
-def _size_px(fitter: HypothesisFitter, without: Solution, with_it: Solution) -> float:
-    """RMS px that one more effect explains."""
-    gain = max(without.score - with_it.score, 0.0)
-    coordinates = 2.0 * sum(float(e.n.sum()) for e in fitter.series)
-    weights = np.concatenate([e.weights[..., 0].ravel() for e in fitter.series])
-    return float(np.sqrt(gain / coordinates / np.mean(weights[weights > 0])))
-
-
-def _frontier(grown: list[Solution], width: int = 4) -> list[Solution]:
-    """The best solutions of a level, one per set of names."""
-    out: list[Solution] = []
-    for s in sorted(grown, key=lambda s: s.score):
-        if all(sorted(s.names) != sorted(o.names) for o in out):
-            out.append(s)
-    return out[:width]
-
-
-def _adequacies(fitter: HypothesisFitter, solution: Solution) -> tuple[Adequacy, ...]:
-    return tuple(examine(fitter, solution.fit, s) for s in range(len(fitter.series)))
-
-
-def _adequate(now: Sequence[Adequacy], base: Sequence[Adequacy]) -> bool:
-    return all(
-        a.adequate or a.misfit_px < _LEFT * b.misfit_px for a, b in zip(now, base, strict=True)
-    )

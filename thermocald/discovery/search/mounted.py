@@ -31,12 +31,10 @@ _KNOCKS = 3
 _SLIP_NOT_KNOCK = 20.0
 # beyond the penalty, for each effect after the first: a mount is not quite a random walk
 _FURTHER = 40.0
+_PROMISE = 0.3  # of which a scan has to promise, in the noise before
 _SHARE = 0.25  # of what the first effect gains that a further one has to gain
 _CORNERS = (0.0, 3.0)
 _REST = 0.05
-# penalised gain, in the noise that the effects leave, below which a wander may feign an effect:
-# its size is estimated from some twenty half-waves, and tests against it have heavy tails
-_CLEAR = 150.0
 # share of its own gain in one series by which an effect may worsen the other
 _WORSE = 0.25
 
@@ -62,7 +60,8 @@ class Beside:
 class Mounted:
     """What the search found: base (knocks in it) and best in one fitter; knocks of the mount.
 
-    ranking: single effects by score; seen: every solution that was looked at, with its movement.
+    ranking: single effects by score; seen: every solution that was looked at, with its movement;
+    like: the search, for its trajectories.
     """
 
     fitter: HypothesisFitter
@@ -72,6 +71,7 @@ class Mounted:
     knocks: tuple[Term, ...]
     ranking: tuple[Solution, ...]
     seen: tuple[Solution, ...]
+    like: Search
 
 
 def search_beside_mount(
@@ -80,7 +80,8 @@ def search_beside_mount(
     given: Sequence[tuple[str, dict[str, Any]]] = (),
 ) -> Mounted:
     """Effects, one after the other, and knocks, while the penalised likelihood improves."""
-    start = Search(fitter).base(given)
+    first = Search(fitter)
+    start = first.base(given)
     W = combinations(fitter.series)
     guess = first_guess(fitter, start.fit, W)
     say("movement of the mount")
@@ -89,9 +90,12 @@ def search_beside_mount(
     best, ranking, seen = plain, list[Solution](), list[Solution]()
     for level in range(_LEVELS):
         say(f"alongside the mount: {', '.join(best.solution.names) or 'the base'}")
-        search = Search(best.fitter)
+        search = Search(best.fitter, like=first)
         grown: list[Beside] = []
-        for solution in search.expand(best.solution, 6)[:_WIDTH]:
+        # a scan is right to some percent, and a further effect has to be worth much
+        further = any(not t.kind.is_event for t in best.terms[len(start.terms) :])
+        least = _PROMISE * _least_further(plain, best) if further else 0.0
+        for solution in search.expand(best.solution, 6, least)[:_WIDTH]:
             trial = _profiled(best, solution)
             knock = _as_knock(best, trial)
             grown.append(knock or trial)
@@ -102,7 +106,7 @@ def search_beside_mount(
         if not allowed:
             break
         best = min(allowed, key=lambda g: g.score)
-    return _concluded(best, len(start.terms), ranking, seen, False)
+    return _concluded(best, len(start.terms), ranking, seen, first, False)
 
 
 def _beside(fitter: HypothesisFitter, solution: Solution, mount: Mount, turns: int) -> Beside:
@@ -148,18 +152,27 @@ def _allowed(grown: Beside, best: Beside, plain: Beside, given: int) -> bool:
         return False
     if grown.terms[-1].kind.is_event or len(own) == 1:
         return True
-    whole = plain.score - best.score
-    return gain > max(_FURTHER, _SHARE * whole)
+    return gain > _least_further(plain, best)
+
+
+def _least_further(plain: Beside, best: Beside) -> float:
+    """What an effect after the first has to gain."""
+    return max(_FURTHER, _SHARE * (plain.score - best.score))
 
 
 def without_slips(found: Mounted, given: int) -> Mounted:
     """The same with steps inside the camera taken for nuisances as knocks are."""
     best = Beside(found.best, found.fitter, found.mount)
-    return _concluded(best, given, found.ranking, found.seen, True)
+    return _concluded(best, given, found.ranking, found.seen, found.like, True)
 
 
 def _concluded(
-    best: Beside, given: int, ranking: Sequence[Solution], seen: Sequence[Solution], all_steps: bool
+    best: Beside,
+    given: int,
+    ranking: Sequence[Solution],
+    seen: Sequence[Solution],
+    like: Search,
+    all_steps: bool,
 ) -> Mounted:
     """Base and best in the fitter of the best, knocks with the base; all_steps: slips too."""
     terms, penalties = best.terms, best.solution.penalties
@@ -175,16 +188,15 @@ def _concluded(
     base = solution(first + knocks)
     whole = solution(first + knocks + effects) if effects else base
     own = tuple(t for t, _ in knocks)
-    return Mounted(best.fitter, best.mount, base, whole, own, tuple(ranking), tuple(seen))
+    return Mounted(best.fitter, best.mount, base, whole, own, tuple(ranking), tuple(seen), like)
 
 
 def convincing(fitter: HypothesisFitter, base: Solution, best: Solution) -> bool:
-    """Whether the effects of `best` are more than a wander feigns, and hold from one series to the
-    other.
+    """Whether the effects of `best` are worth their penalties, and hold in both series.
 
     Constants from one series are held against the other, both ways; events are new each time.
     """
-    if base.score - best.score < _CLEAR:
+    if base.score <= best.score:
         return False
     if len(fitter.series) < 2 or all(t.is_separate for t in best.terms[len(base.terms) :]):
         return True
@@ -192,9 +204,7 @@ def convincing(fitter: HypothesisFitter, base: Solution, best: Solution) -> bool
     for a, b in ((0, 1), (1, 0)):
         without = fitter.fit(base.terms, only=[a])
         whole = fitter.refine(fitter.fit(best.terms, only=[a]), only=[a])
-        gains.append(
-            (without.chi2_of(a) - whole.chi2_of(a), without.chi2_of(b) - whole.chi2_of(b))
-        )
+        gains.append((without.chi2_of(a) - whole.chi2_of(a), without.chi2_of(b) - whole.chi2_of(b)))
     least = _WORSE * max(own for own, _ in gains)
     there = [other for _, other in gains]
     return min(there) > -least and sum(there) > least

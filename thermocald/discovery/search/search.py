@@ -81,17 +81,22 @@ class Search:
     """One examination of a fitter's series."""
 
     def __init__(
-        self, fitter: HypothesisFitter, progress: Callable[[str], None] | None = None
+        self,
+        fitter: HypothesisFitter,
+        progress: Callable[[str], None] | None = None,
+        like: Search | None = None,
     ) -> None:
+        """like: a search in the same histories under other noise, whose trajectories serve."""
         self.fitter = fitter
-        self.candidates = candidates(fitter.series)
-        self.scanner = Scanner(fitter)
+        self.candidates: list[Candidate] = like.candidates if like else candidates(fitter.series)
+        self.scanner: Scanner = Scanner(fitter, like.scanner if like else None)
         self.epochs = sum(int((e.n > 0).sum()) for e in fitter.series)
         # the more noise is correlated, the less is known of it
         self.margin = MARGIN * max(e.correlation for e in fitter.series)
         self.progress = progress or (lambda _: None)
         self._trials: dict[tuple[str, tuple[str, ...]], float] = {}
         self._refined: dict[tuple[Term, ...], Fit] = {}
+        self._known: dict[frozenset[tuple[str, tuple[str, ...]]], Solution] = {}
 
     def base(self, given: Sequence[tuple[str, dict[str, Any]]] = ()) -> Solution:
         """The base model, with the effects that a model has already, fitted."""
@@ -150,37 +155,67 @@ class Search:
         key = tuple(terms)
         if key not in self._refined:
             self._refined[key] = self.fitter.refine(self.fitter.fit(terms), max_iterations=5)
-        return Solution(self._refined[key], tuple(penalties))
+        found = Solution(self._refined[key], tuple(penalties))
+        same = _kinds(terms)
+        if same not in self._known or found.score < self._known[same].score:
+            self._known[same] = found
+        return found
 
-    def expand(self, solution: Solution, width: int = 6) -> list[Solution]:
-        """The best solutions with one effect more, best first."""
+    def expand(self, solution: Solution, width: int = 6, least: float = 0.0) -> list[Solution]:
+        """The best solutions with one effect more, best first.
+
+        least: what a scan of an effect but an event has to promise beyond its penalty.
+        """
+        grown = [self._with(solution, p) for p in self._promises(solution, width, least)]
+        return sorted(grown, key=lambda s: s.score)
+
+    def expand_all(self, solutions: Sequence[Solution], width: int, most: int) -> list[Solution]:
+        """The best with one effect more of several solutions: `most` sets of effects at most."""
+        pairs = [(s, p) for s in solutions for p in self._promises(s, width)]
+        pairs.sort(key=lambda pair: pair[0].score - pair[1].net)
+        grown: dict[frozenset[str], Solution] = {}
+        for solution, promise in pairs:
+            names = frozenset((*solution.names, promise.candidate.effect))
+            if len(grown) < most and names not in grown:
+                grown[names] = self._with(solution, promise)
+        return sorted(grown.values(), key=lambda s: s.score)
+
+    def _with(self, solution: Solution, promise: Scanned) -> Solution:
+        penalties = (*solution.penalties, promise.penalty)
+        return self.refine((*solution.terms, promise.term), penalties)
+
+    def _promises(self, solution: Solution, width: int, least: float = 0.0) -> list[Scanned]:
         promises = []
         for candidate in self.candidates:
             if candidate.effect in solution.names:
                 continue
             found = self.scan(candidate, solution)
-            if np.isfinite(found.gain):
+            enough = found.net > (0.0 if candidate.kind.is_event else least)
+            if np.isfinite(found.gain) and enough:
                 promises.append(found)
-        grown = [
-            self.refine((*solution.terms, promise.term), (*solution.penalties, promise.penalty))
-            for promise in _worth_fitting(promises, width)
-        ]
-        grown.sort(key=lambda s: s.score)
-        return grown
+        return _worth_fitting(promises, width)
 
     def shrink(self, solution: Solution, kept: int = 0) -> Solution:
         """Without every effect that is no longer worth its penalty; the first `kept` stay."""
         while len(solution.terms) > kept + 1:
-            fewer = []
-            for i in range(kept, len(solution.terms)):
-                terms = tuple(t for j, t in enumerate(solution.terms) if j != i)
-                penalties = tuple(p for j, p in enumerate(solution.penalties) if j != i)
-                fewer.append(self.refine(terms, penalties))
+            fewer = [self._without(solution, i) for i in range(kept, len(solution.terms))]
             best = min(fewer, key=lambda s: s.score)
             if best.score > solution.score:
                 break
             solution = best
         return solution
+
+    def _without(self, solution: Solution, number: int) -> Solution:
+        """Without one effect; as it was found before, where the rest was fitted already."""
+        terms = tuple(t for j, t in enumerate(solution.terms) if j != number)
+        known = self._known.get(_kinds(terms))
+        penalties = [p for j, p in enumerate(solution.penalties) if j != number]
+        return known or self.refine(terms, penalties)
+
+
+def _kinds(terms: Sequence[Term]) -> frozenset[tuple[str, tuple[str, ...]]]:
+    """What a hypothesis consists of, whatever its numbers."""
+    return frozenset((t.effect, t.parameters) for t in terms)
 
 
 def _worth_fitting(promises: Sequence[Scanned], width: int) -> list[Scanned]:

@@ -1,0 +1,120 @@
+"""The sums of a series before anything is integrated out of its likelihood.
+
+Normal equations of the epochs' parameters, of the random effects (movement of the mount, offsets of
+hidden targets), and their couplings; with shifts of single epochs, which trembling or a temperature
+nobody saw makes, as part of the noise.
+
+Source: Rasmussen, Williams (2006), Gaussian Processes for Machine Learning, A.3 (Woodbury).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from thermocald.reduction.series import ReducedSeries
+
+    Array = NDArray[np.float64]
+
+__all__ = ["Sums", "sums_of"]
+
+
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """The sums of a series before anything is integrated out, those of random effects included."""
+
+    N: Array  # (E, P, P)
+    b: Array  # (E, P)
+    yy: float
+    logdet: float
+    cross: Array  # (F, E, P)
+    normal: Array  # (F, F)
+    right: Array  # (F,)
+
+    def blurred(self, D: Array, epochs: NDArray[np.int64]) -> Sums:
+        """With random shifts of unit variance of some epochs (n,) along D (n, P, t): Woodbury."""
+        N, b, cross = self.N[epochs], self.b[epochs], self.cross[:, epochs]
+        Dt = np.swapaxes(D, 1, 2)
+        DtN = Dt @ N
+        L = np.linalg.cholesky(np.eye(D.shape[2]) + DtN @ D)
+        own = np.linalg.solve(L, DtN)  # (n, t, P)
+        data = np.linalg.solve(L, Dt @ b[..., None])  # (n, t, 1)
+        coupled = np.linalg.solve(L, Dt @ np.moveaxis(cross, 0, 2))  # (n, t, F)
+        out = replace(self, N=self.N.copy(), b=self.b.copy(), cross=self.cross.copy())
+        out.N[epochs] -= np.swapaxes(own, 1, 2) @ own
+        out.b[epochs] -= np.sum(own * data, axis=1)
+        out.cross[:, epochs] -= np.swapaxes(np.swapaxes(coupled, 1, 2) @ own, 0, 1)
+        wide = coupled.reshape(data.size, len(self.cross))
+        return replace(
+            out,
+            yy=self.yy - float(np.sum(data**2)),
+            logdet=self.logdet + 2 * float(np.sum(np.log(np.einsum("eii->ei", L)))),
+            normal=self.normal - wide.T @ wide,
+            right=self.right - wide.T @ data.ravel(),
+        )
+
+    def shifted(self, shift: Array) -> Sums:
+        """With shifts (E, P) of the parameters taken off the data."""
+        moved = np.einsum("epq,eq->ep", self.N, shift)
+        yy = self.yy - 2 * float(np.sum(shift * self.b)) + float(np.sum(shift * moved))
+        right = self.right - np.einsum("sep,ep->s", self.cross, shift)
+        return Sums(self.N, self.b - moved, yy, self.logdet, self.cross, self.normal, right)
+
+
+@dataclass(frozen=True, eq=False)
+class _Still:
+    """A series whatever its movement: two are equal where all else is the same."""
+
+    evidence: ReducedSeries
+
+    @property
+    def _parts(self) -> tuple[object, ...]:
+        e = self.evidence
+        return e.N, e.b, e.yy, e.hidden, e.tremble
+
+    def __hash__(self) -> int:
+        return hash(tuple(map(id, self._parts)))
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, _Still):
+            return False
+        return all(a is b for a, b in zip(self._parts, other._parts, strict=True))
+
+
+@lru_cache(maxsize=4)
+def _trembled(still: _Still) -> Sums:
+    """The sums with what trembles from epoch to epoch."""
+    evidence, hidden = still.evidence, still.evidence.hidden
+    cross, right = np.zeros((0, *evidence.b.shape)), np.zeros(0)
+    normal = np.zeros((0, 0))
+    if hidden is not None:
+        cross, normal, right = hidden.cross, np.diag(hidden.normal), hidden.right.sum(axis=1)
+    sums = Sums(evidence.N, evidence.b, float(evidence.yy.sum()), 0.0, cross, normal, right)
+    if evidence.tremble is None:
+        return sums
+    every = np.arange(len(evidence.N))
+    D = np.broadcast_to(evidence.tremble, (len(every), *evidence.tremble.shape))
+    return sums.blurred(D, every)
+
+
+@lru_cache(maxsize=4)
+def sums_of(evidence: ReducedSeries) -> Sums:
+    """The sums with what moves: first the movement, then hidden targets."""
+    sums, movement = _trembled(_Still(evidence)), evidence.movement
+    if movement is None:
+        return sums
+    cross = movement.cross(sums.N)
+    own = movement.onto(cross) + np.eye(len(movement))
+    between = movement.onto(sums.cross)
+    return replace(
+        sums,
+        cross=np.concatenate([cross, sums.cross]),
+        normal=np.block([[own, between.T], [between, sums.normal]]),
+        right=np.concatenate([movement.onto(sums.b[None])[0], sums.right]),
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import threading
 
 import numpy as np
 import pytest
@@ -97,6 +98,22 @@ def test_the_last_write_is_damaged_where_the_index_counts_it(store_path, head, f
         assert read_wal_tail(wal) == WalTail(lost=1)
         wal.with_name(f"{store_path.name}-shm").unlink()
         assert read_wal_tail(wal) == WalTail(unfinished=True)
+
+
+def test_a_store_that_is_being_written_is_not_damaged(store_path, head, field, make_epoch):
+    wal = store_path.with_name(f"{store_path.name}-wal")
+    with Store.open(store_path, "append", durable=False) as store:
+        series = store.create_series(head, field)
+        writer = threading.Thread(
+            target=lambda: [store.append(series, make_epoch(i)) for i in range(1, 400)]
+        )
+        writer.start()
+        tails = []
+        while writer.is_alive():
+            tails.append(read_wal_tail(wal))
+        writer.join()
+        assert len(tails) > 2
+        assert not any(tail.lost for tail in tails)
 
 
 def test_the_daemon_says_so_and_keeps_a_copy(crashed):

@@ -11,6 +11,7 @@ https://www.sqlite.org/walformat.html#the_wal_index_file_format
 from __future__ import annotations
 
 import struct
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -24,6 +25,7 @@ _FRAME = struct.Struct(">6I")  # page, size of the database after a commit, two 
 _MAGIC = 0x377F0682
 _INDEX_BYTES = 48
 _DAMAGED_SALT_BITS = 3  # salts of another run differ in about half of their 64 bits
+_LOOKS, _PAUSE_S = 3, 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +39,17 @@ class WalTail:
 
 
 def read_wal_tail(path: Path) -> WalTail:
-    """Look at a -wal file, and at the -shm file beside it; nobody must write the file meanwhile."""
+    """Look at a -wal file, and at the -shm file beside it; it may be written meanwhile."""
+    for _ in range(_LOOKS):
+        tail = _look(path)
+        if not tail.lost:
+            break
+        time.sleep(_PAUSE_S)  # half of what is just being written looks like damage
+    return tail
+
+
+def _look(path: Path) -> WalTail:
+    committed = _committed_frames(path)  # first: what is committed later may be read half-written
     try:
         data = path.read_bytes()
     except OSError:
@@ -66,8 +78,8 @@ def read_wal_tail(path: Path) -> WalTail:
             commits.append(number)
     if not broken:
         return WalTail()
-    committed = _committed_frames(path, data[16:24])
-    lost = len([n for n in commits if n != commits[-1] or n <= committed])
+    frames = committed.get(data[16:24], 0)
+    lost = len([n for n in commits if n != commits[-1] or n <= frames])
     return WalTail(lost, unfinished=not lost)
 
 
@@ -77,19 +89,19 @@ def _nearly(some: list[int], salts: list[int]) -> bool:
     return bits <= _DAMAGED_SALT_BITS
 
 
-def _committed_frames(wal: Path, salts: bytes) -> int:
-    """How many frames the index beside a -wal file counts as committed; 0 where it is unknown."""
+def _committed_frames(wal: Path) -> dict[bytes, int]:
+    """{salts of a -wal file: how many frames of it the index counts as committed}."""
     try:
         with wal.with_name(f"{wal.name.removesuffix('-wal')}-shm").open("rb") as file:
             one, two = file.read(_INDEX_BYTES), file.read(_INDEX_BYTES)
     except OSError:
-        return 0
-    if len(one) < _INDEX_BYTES or one != two or one[32:40] != salts:
-        return 0
+        return {}
+    if len(one) < _INDEX_BYTES or one != two:
+        return {}
     order = "<" if struct.pack("=I", 1)[0] else ">"
     if _checksum(order, one[:40], (0, 0)) != struct.unpack("=2I", one[40:]):
-        return 0
-    return int(struct.unpack_from("=I", one, 16)[0])
+        return {}
+    return {one[32:40]: int(struct.unpack_from("=I", one, 16)[0])}
 
 
 def _checksum(order: str, data: bytes, start: tuple[int, int]) -> tuple[int, int]:

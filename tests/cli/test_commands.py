@@ -237,6 +237,17 @@ def resident_mb(imports):
     return int(done.stdout) / 1024
 
 
+def test_what_only_some_commands_need_is_imported_by_those():
+    """OpenCV, SciPy and Matplotlib are half of the page's memory and of a command's start."""
+    code = (
+        "import sys, thermocald.cli, thermocald.output.dashboard.application\n"
+        "thermocald.cli.application()\n"
+        "print(*sorted({'cv2', 'matplotlib', 'plotly', 'scipy'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
 def test_the_daemon_s_imports_stay_small():
     """What the daemon needs, imported and waiting: 80 MB where numpy and cv2 alone are 41.
 

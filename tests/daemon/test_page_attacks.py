@@ -156,3 +156,25 @@ def test_under_systemd_the_page_is_not_the_daemons_child(daemon, devices):
     children = Path(f"/proc/{daemon.process.pid}/task/{daemon.process.pid}/children")
     assert children.read_text().split() == []
     assert daemon.stop() == 0
+
+
+ROUTES = (
+    "/", "/static/page.js", "/static/page.css", "/static/plotly.js", "/api/status", "/api/series",
+    "/api/columns?camera=rpi&series=M1&points=1000", "/api/columns?camera=rpi&series=M1&last=3600",
+    "/api/events", CSV, "/metrics",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("rounds", [8, pytest.param(100, marks=pytest.mark.slow)])
+def test_the_page_keeps_to_80_mb_however_often_it_is_asked(tmp_path, page_of, rounds):
+    """Every route, by turns: 100 rounds are three months of somebody who looks once a day."""
+    make_store(tmp_path / "s.db", 2000)
+    page = page_of(tmp_path / "s.db")
+    resident = []
+    for _ in range(rounds):
+        for route in ROUTES:
+            page.get(route)
+        resident.append(resident_mb(page.process.pid))
+    print(f"{resident[0]:.1f} MB after one round, at most {max(resident):.1f} MB")
+    assert max(resident) < 80.0
+    assert np.mean(resident[-4:]) < np.mean(resident[rounds // 4 :][:4]) + 2.0

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.errors import DataError
-from thermocald.photogrammetry.orientation.approximate import plane_fit
+from thermocald.photogrammetry.field.planes import plane_fit
 
 if TYPE_CHECKING:
     from thermocald.reduction.series import SeriesInput

@@ -15,11 +15,8 @@ from thermocald.photogrammetry.epoch.adjustment import (
     failed,
 )
 from thermocald.photogrammetry.epoch.geometry import GeometryBounds
-from thermocald.photogrammetry.orientation.approximate import (
-    approximate_orientation,
-    plane_fit,
-    resection,
-)
+from thermocald.photogrammetry.field.planes import plane_fit
+from thermocald.photogrammetry.orientation.approximate import approximate_orientation, resection
 
 if TYPE_CHECKING:
     from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor

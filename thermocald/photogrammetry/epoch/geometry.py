@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, PARAMETER_NAMES, rotation
-from thermocald.photogrammetry.orientation.approximate import plane_fit
+from thermocald.photogrammetry.field.planes import plane_fit
 from thermocald.photogrammetry.parameters import EOP
 
 if TYPE_CHECKING:

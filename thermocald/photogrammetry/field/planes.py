@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
     from thermocald.photogrammetry.field.testfield import TestField
 
     Array = NDArray[np.float64]
 
-__all__ = ["field_normals", "target_normals"]
+__all__ = ["field_normals", "plane_fit", "target_normals"]
 
 _NEIGHBOURS = 8
 _FLATNESS = 0.03  # of the distance between neighbours
@@ -119,3 +119,18 @@ def _planes_of_neighbours(
     key = np.column_stack([seeds, np.rint(planes * sign * 200).astype(np.int64)])
     _, first = np.unique(key, axis=0, return_index=True)
     return seeds[first], planes[first]
+
+
+def plane_fit(points: ArrayLike, tolerance: float = 0.002) -> tuple[Array, Array, bool]:
+    """Centre (3,), axes (3, 3; rows, right-handed, the last the normal), and whether it is flat.
+
+    Flat: the RMS distance from the plane is below `tolerance` of the RMS extent in it.
+    """
+    X = np.asarray(points, dtype=float)
+    centre = X.mean(axis=0)
+    reduced = X - centre
+    s2, vectors = np.linalg.eigh(reduced.T @ reduced)
+    axes = vectors.T[::-1].copy()
+    (a, b, c), (d, e, f) = axes[0], axes[1]
+    axes[2] = (b * f - c * e, c * d - a * f, a * e - b * d)  # right-handed
+    return centre, axes, bool(s2[0] <= tolerance**2 * max(s2[2], 1e-300))

@@ -23,6 +23,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     project,
     rays,
 )
+from thermocald.photogrammetry.field.planes import plane_fit
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["approximate_orientation", "plane_fit", "resection"]
+__all__ = ["approximate_orientation", "resection"]
 
 _FLIP = np.diag([1.0, -1.0, -1.0])  # OpenCV's camera looks along +Z with y down
 _FIELDS_OF_VIEW_DEG = (18.0, 25.0, 33.0, 42.0, 52.0, 62.0, 73.0, 85.0, 98.0)
@@ -170,21 +171,6 @@ def resection(
         rms = float(np.sqrt(np.mean(np.nan_to_num(predicted - uv, nan=1e6) ** 2)))
         solutions.append((rms, pose))
     return sorted(solutions, key=lambda s: s[0])
-
-
-def plane_fit(points: ArrayLike, tolerance: float = 0.002) -> tuple[Array, Array, bool]:
-    """Centre (3,), axes (3, 3; rows, right-handed, the last the normal), and whether it is flat.
-
-    Flat: the RMS distance from the plane is below `tolerance` of the RMS extent in it.
-    """
-    X = np.asarray(points, dtype=float)
-    centre = X.mean(axis=0)
-    reduced = X - centre
-    s2, vectors = np.linalg.eigh(reduced.T @ reduced)
-    axes = vectors.T[::-1].copy()
-    (a, b, c), (d, e, f) = axes[0], axes[1]
-    axes[2] = (b * f - c * e, c * d - a * f, a * e - b * d)  # right-handed
-    return centre, axes, bool(s2[0] <= tolerance**2 * max(s2[2], 1e-300))
 
 
 def _direct_linear_transformation(sensor: Sensor, X: Array, uv: Array) -> float | None:

@@ -147,6 +147,7 @@ def _configuration_page() -> str:
         ("`store`", config.StoreConfig),
         ("`frames`", config.FramesConfig),
         ("`dashboard`", config.DashboardConfig),
+        ("`forward`", config.ForwardConfig),
         ("`logging`", config.LoggingConfig),
     ]
     parts = []

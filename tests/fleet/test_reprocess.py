@@ -201,3 +201,18 @@ def test_a_scheduler_that_is_not_there_is_said(archive, tmp_path):
     assert done.returncode == 1
     assert "the scheduler cannot be reached" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("reader", ["pandas", "duckdb"])
+def test_the_files_are_read_without_us(archive, tmp_path, reader):
+    run_blocks(blocks_of(archive, tmp_path, 75)[:2])
+    if reader == "pandas":
+        pandas = pytest.importorskip("pandas", reason="pip install pandas")
+        table = pandas.read_parquet(tmp_path / "rpi-v2.1-M1")
+        rows, good = len(table), int((table.status == "ok").sum())
+    else:
+        duckdb = pytest.importorskip("duckdb", reason="pip install duckdb")
+        rows, good = duckdb.execute(
+            f"SELECT count(*), count(*) FILTER (status = 'ok') FROM '{tmp_path}/*/*.parquet'"
+        ).fetchone()
+    assert (rows, good) == (150, 150)

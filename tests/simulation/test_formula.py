@@ -50,6 +50,7 @@ CASES = {
     "power(above(temperature, k), p)": ({"k": 22.0, "p": 0.5}, np.clip(T - 22.0, 0, None) ** 0.5),
     "peak(temperature, tau)": ({"tau": 150.0}, stepped(T, 150.0, fading=True)),
     "maximum(lag(board, tau))": ({"tau": 30.0}, np.maximum.accumulate(stepped(B, 30.0))),
+    "square(change(board))": ({}, (B - B[0]) ** 2),
     "minimum(temperature)": ({}, np.minimum.accumulate(T)),
     "cube(offset(temperature, a))": ({"a": 25.0}, (T - 25.0) ** 3),
     "square(wave(temperature, P, phi))": (

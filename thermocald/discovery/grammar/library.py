@@ -76,6 +76,9 @@ class Library:
             out += self.waves(leaf)
             for rated in self.rates(leaf):
                 out += [rated, *self.shapes(rated, about_zero=True)]
+            changed = _of("change", leaf)
+            out += [_of(n, changed) for n in ("square", "cube", "magnitude", "signed_square")]
+            out.append(_of("product", changed, Node(TIME)))
             for shape in (*self.offsets(leaf), *self.shapes(leaf)):
                 out += self.remembered(shape, few=True)
                 out.append(_of("integral", shape))
@@ -106,7 +109,8 @@ class Library:
         """A quantity counted from somewhere else."""
         low, high = self.span(node)
         width = high - low
-        places = np.linspace(low - 0.5 * width, high + 0.5 * width, 5 if few else 9)
+        far = low + width * np.array([-3.0, -1.0, -0.2, 0.5, 1.2, 2.0, 4.0])
+        places = far if few else np.linspace(low - 0.5 * width, high + 0.5 * width, 9)
         return [_of("offset", node, a) for a in places]
 
     def shapes(self, node: Node, about_zero: bool = False) -> list[Node]:

@@ -17,10 +17,12 @@ from thermocald.discovery.grammar.search import FormulaSearch
 from thermocald.discovery.search.search import MARGIN, Solution
 from thermocald.discovery.search.surrogates import SurrogateTest
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
+from thermocald.reduction.adequacy import examine
 from thermocald.reduction.curvature import relinearised
 from thermocald.reduction.fit import HypothesisFitter
-from thermocald.reduction.hypothesis import Term
+from thermocald.reduction.hypothesis import BASE, Term
 from thermocald.reduction.series import COLUMNS
+from thermocald.simulation.formula.expression import parse
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -36,15 +38,16 @@ if TYPE_CHECKING:
 
 __all__ = ["Proposal", "propose"]
 
-_FITTED = 5  # formulas of a pass that are fitted in full
+_FITTED = 8  # formulas of a pass that are fitted in full
+_REFINED = 2  # of them with exact constants
+_MATTERS = 0.01  # of the misfit that one more parameter has to explain
 _TURNS = 3
 _SECOND = 0.02  # share of the base's misfit that one formula leaves and a second is asked for
 _COUNT = 199
 _SEED = 16
 # of the base's misfit on the other series that constants of one alone have to explain: of M2 by M1,
 # and the other way round, where M2 may hold less than M1
-_CLOSED, _CLOSED_BACK = 0.8, 0.5
-_LEFT = 0.25  # of the base's misfit in px that a smooth trajectory may still have
+_CLOSED, _CLOSED_BACK, _CLOSED_ALONE = 0.8, 0.5, 0.95
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,13 +79,14 @@ def propose(
 
     parameters: columns in which the image moves. One series alone allows none.
     """
-    moving = [p for p in parameters if p in PARAMETER_NAMES]
-    if len(x.fitter.series) < 2 or not moving:
+    # what moves the image little may still be seen well
+    moving = [p for p in PARAMETER_NAMES if p in {*parameters, *BASE}]
+    if len(x.fitter.series) < 2:
         return None
     (progress or (lambda _: None))("beyond the catalogue")
     fitter, base = _straightened(x)
-    first = FormulaSearch(condensed(fitter, base.fit, moving), MARGIN)
-    test = _surrogate_test(first)
+    search = FormulaSearch(condensed(fitter, base.fit, moving), MARGIN)
+    test = _surrogate_test(search)
     if not test.passed:
         return None
     tried: dict[str, Solution] = {}
@@ -91,22 +95,16 @@ def propose(
         before = best
         if turn:
             here = condensed(fitter, base.fit, moving, best.fit.weightings)
-            first = FormulaSearch(here, MARGIN, first.tried)
-        for found in first.best(further=turn > 0)[:_FITTED]:
-            solution = _fitted(fitter, base, moving, found)
-            if solution is None:
-                continue
-            text = solution.terms[-1].effect
-            if text not in tried or solution.score < tried[text].score:
-                tried[text] = solution
+            search = FormulaSearch(here, MARGIN, search)
+        _try(fitter, base, moving, search.best(further=turn > 0), tried)
         best = min([base, *tried.values()], key=lambda s: s.score)
-        if best.score > before.score - MARGIN:
+        if best.score > before.score - MARGIN or _adequate(fitter, best.fit):
             break
     if best is base:
         return None
-    best = _parameters_chosen(fitter, base, best)
+    best = _parameters_chosen(fitter, base, _simplified(fitter, base, best))
     closed = _closed(fitter, base, best)
-    if closed[0] < _CLOSED or closed[1] < _CLOSED_BACK:
+    if closed is None or not _transferable(closed):
         return None
     rivals = sorted(
         ((s.terms[-1], float(s.score - best.score)) for s in tried.values()
@@ -132,22 +130,74 @@ def _surrogate_test(search: FormulaSearch) -> SurrogateTest:
     return SurrogateTest(own, shares)
 
 
-def _fitted(
-    fitter: HypothesisFitter, base: Solution, parameters: Sequence[str], found: Found
-) -> Solution | None:
-    """A formula in the full likelihood, its own reading errors carried through it; None where they
-    are beyond all bounds.
-    """
-    structure, values = found.node.named()
-    term = Term(structure.text(), tuple(parameters), tuple(values.items()))
+def _try(
+    fitter: HypothesisFitter,
+    base: Solution,
+    parameters: Sequence[str],
+    formulas: Sequence[Found],
+    tried: dict[str, Solution],
+) -> None:
+    """Fit formulas in the full likelihood, those that are best then exactly."""
+    here: dict[str, Solution] = {}
+    for found in formulas[:_FITTED]:
+        structure, values = found.node.named()
+        term = Term(structure.text(), tuple(parameters), tuple(values.items()))
+        penalty = found.penalty + MARGIN * sum(not n.is_leaf for n in structure.walk())
+        fit = _fit(fitter, (*base.terms, term))
+        if fit is not None:
+            here[term.effect] = Solution(fit, (*base.penalties, penalty))
+    for text, solution in sorted(here.items(), key=lambda h: h[1].score)[:_REFINED]:
+        better = _fit(fitter, solution.terms, refined=True)
+        here[text] = solution if better is None else replace(solution, fit=better)
+    for text, solution in here.items():
+        if text not in tried or solution.score < tried[text].score:
+            tried[text] = solution
+
+
+def _fit(
+    fitter: HypothesisFitter,
+    terms: Sequence[Term],
+    only: Sequence[int] | None = None,
+    refined: bool = False,
+) -> Fit | None:
+    """A fit in the full likelihood; None where a formula is too steep for the readings' noise."""
     try:
-        fit = fitter.refine(fitter.fit((*base.terms, term)), max_iterations=3)
+        fit = fitter.fit(terms, only=only)
+        fit = fitter.refine(fit, 4, only) if refined else fit
     except np.linalg.LinAlgError:
         return None
-    if not np.isfinite(fit.objective):
-        return None
-    operators = sum(not n.is_leaf for n in structure.walk())
-    return Solution(fit, (*base.penalties, found.penalty + MARGIN * operators))
+    return fit if np.isfinite(fit.objective) else None
+
+
+def _adequate(fitter: HypothesisFitter, fit: Fit) -> bool:
+    return all(examine(fitter, fit, s).adequate for s in range(len(fitter.series)))
+
+
+def _nothing_left(fitter: HypothesisFitter, fit: Fit) -> bool:
+    """Whether no smooth trajectory is significant any more, however small."""
+    return all(examine(fitter, fit, s).significance < 6.0 for s in range(len(fitter.series)))
+
+
+def _simplified(fitter: HypothesisFitter, base: Solution, best: Solution) -> Solution:
+    """The same without operators that it does as well without, one after the other."""
+    nothing_left = _nothing_left(fitter, best.fit)
+    while True:
+        term = best.terms[-1]
+        node = parse(term.effect).bound(dict(term.nonlinear))
+        found = []
+        for simpler in node.simpler():
+            structure, values = simpler.named()
+            if not structure.inputs:
+                continue
+            own = Term(structure.text(), term.parameters, tuple(values.items()))
+            fit = _fit(fitter, (*base.terms, own), refined=True)
+            if fit is not None:
+                solution = Solution(fit, (*base.penalties, best.penalties[-1] - MARGIN))
+                if solution.score < best.score or (nothing_left and _nothing_left(fitter, fit)):
+                    found.append(solution)
+        if not found:
+            return best
+        best = min(found, key=lambda s: s.score)
 
 
 def _parameters_chosen(fitter: HypothesisFitter, base: Solution, best: Solution) -> Solution:
@@ -169,17 +219,20 @@ def _parameters_chosen(fitter: HypothesisFitter, base: Solution, best: Solution)
         if gain(fewer) < gain(chosen):
             break
         chosen = fewer
+    least = max(MARGIN, _MATTERS * gain(chosen))
     while True:
         more = [[*chosen, j] for j in range(len(c)) if j not in chosen and A[j, j] > 1e-6]
         wider = max(more, key=gain, default=chosen)
-        if gain(wider) < gain(chosen) + MARGIN:
+        if gain(wider) < gain(chosen) + least:
             break
         chosen = wider
     names = tuple(PARAMETER_NAMES[i] for i in sorted(chosen))
     if names == term.parameters:
         return best
     terms = (*best.terms[:-1], replace(term, parameters=names))
-    fit = fitter.refine(fitter.fit(terms), max_iterations=3)
+    fit = _fit(fitter, terms, refined=True)
+    if fit is None:
+        return best
     change = n * (len(names) - len(term.parameters))
     return Solution(fit, (*best.penalties[:-1], best.penalties[-1] + change))
 
@@ -208,12 +261,26 @@ def _all_parameters(
     return A - B @ X[:, 1:], c - B @ X[:, 0]
 
 
-def _closed(fitter: HypothesisFitter, base: Solution, best: Solution) -> tuple[float, float]:
-    """Share of the misfit of M2 that constants of M1 alone explain, and the other way round."""
+def _transferable(closed: tuple[float, float]) -> bool:
+    by_m1, by_m2 = closed
+    if np.isnan(by_m2):  # M2 says too little to be held against M1
+        return by_m1 > _CLOSED_ALONE
+    return by_m1 > _CLOSED and by_m2 > _CLOSED_BACK
+
+
+def _closed(fitter: HypothesisFitter, base: Solution, best: Solution) -> tuple[float, float] | None:
+    """Share of the misfit of M2 that constants of M1 alone explain, and the other way round, NaN
+    where M2 alone does not determine them; None where M1 does not.
+    """
     shares = []
     for here, there in ((0, 1), (1, 0)):
         without = fitter.fit(base.terms, only=[here])
-        whole = fitter.refine(fitter.fit(best.terms, only=[here]), 4, only=[here])
+        whole = _fit(fitter, best.terms, [here], refined=True)
+        if whole is None:
+            if here == 0:
+                return None
+            shares.append(float("nan"))
+            continue
         left, before = (_misfit_px(fitter, f, there) for f in (whole, without))
         shares.append(1.0 - (left / max(before, 1e-9)) ** 2)
     return shares[0], shares[1]

@@ -29,10 +29,11 @@ if TYPE_CHECKING:
 
 __all__ = ["FormulaSearch", "Found"]
 
-_WIDTH = 10  # structures whose constants are made exact
+_WIDTH = 16  # structures whose constants are made exact
+_KEPT = 800  # formulas of a library that are tried again under other covariances
 _FURTHER = 3  # of them that are taken one operator further
 _STEPS = 2  # how many operators further
-_ITERATIONS = 8
+_ITERATIONS = 6
 _SIMPLER = 0.25  # log of what is left: one operator more has to leave a quarter less
 
 
@@ -52,21 +53,34 @@ class Found:
 class FormulaSearch:
     """One search over what some series recorded."""
 
-    def __init__(self, evidence: Condensed, margin: float, tried: int = 0) -> None:
+    def __init__(
+        self, evidence: Condensed, margin: float, before: FormulaSearch | None = None
+    ) -> None:
+        """before: a search over the same series with other covariances; its worst are left out."""
         self.margin = margin
         self.evidence = evidence
-        self.library = Library(evidence.histories)
-        self.nodes = self.library.first()
-        self.tried = max(tried, len(self.nodes))
-        stack = self.library.stack(self.nodes)
-        good = np.isfinite(stack).all(axis=0) & (np.ptp(stack, axis=0) > 0)
-        self.nodes = [n for n, ok in zip(self.nodes, good, strict=True) if ok]
-        self.regressors = evidence.regressors(stack[:, good])
+        if before is None:
+            self.library = Library(evidence.histories)
+            self.nodes = self.library.first()
+            self.tried = len(self.nodes)
+            self.nodes, self.stack = self._finite(self.nodes)
+        else:
+            self.library, self.tried = before.library, before.tried
+            kept = np.sort(np.argsort(-before.gains)[:_KEPT])
+            self.nodes, self.stack = [before.nodes[i] for i in kept], before.stack[:, kept]
+        self.regressors = evidence.regressors(self.stack)
+        self.gains: Array = np.sum((self.regressors @ evidence.data) ** 2, axis=1)
+
+    def _finite(self, nodes: Sequence[Node]) -> tuple[list[Node], Array]:
+        """The formulas that have values everywhere and change, and their trajectories (rows, G)."""
+        with np.errstate(all="ignore"):
+            stack = self.library.stack(nodes)
+            good = np.isfinite(stack).all(axis=0) & (np.ptp(stack, axis=0) > 0)
+        return [n for n, ok in zip(nodes, good, strict=True) if ok], stack[:, good]
 
     def best(self, further: bool = True) -> list[Found]:
         """Formulas, best first, each structure once; further: with operators added, too."""
-        gains = np.sum((self.regressors @ self.evidence.data) ** 2, axis=1)
-        found = self._exact(self.nodes, gains, _WIDTH)
+        found = self._exact(self.nodes, self.gains, _WIDTH)
         for _ in range(_STEPS if further else 0):
             if self._left(found[0].gain) < 0.5 * len(self.evidence.data):
                 break
@@ -82,11 +96,8 @@ class FormulaSearch:
     def _tried(self, nodes: Sequence[Node]) -> list[Found]:
         """Formulas one operator further, the most promising exact."""
         self.tried += len(nodes)
-        with np.errstate(all="ignore"):
-            stack = self.library.stack(nodes)
-        good = np.isfinite(stack).all(axis=0) & (np.ptp(stack, axis=0) > 0)
-        kept = [n for n, ok in zip(nodes, good, strict=True) if ok]
-        return self._exact(kept, self.evidence.gains(stack[:, good]), _WIDTH // 2)
+        kept, stack = self._finite(nodes)
+        return self._exact(kept, self.evidence.gains(stack), _WIDTH // 2)
 
     def _rank(self, found: Found) -> float:
         """What it explains, by what it leaves; a further operator has to leave a quarter less."""

@@ -94,7 +94,7 @@ def _document(found: Proposal, term: Term, x: Examination) -> dict[str, Any]:
         "formula": term.effect,
         "transferable": True,
         "closed_on_verify_by_fit": by_m1,
-        "closed_on_fit_by_verify": by_m2,
+        "closed_on_fit_by_verify": by_m2 if by_m2 == by_m2 else None,
         "score_gain": float(found.base.score - found.best.score),
         "penalty": float(found.best.penalties[-1]),
         "false_alarm_probability": found.surrogates.p,

@@ -88,6 +88,13 @@ class Node:
             constants=tuple(float(values[c]) if isinstance(c, str) else c for c in self.constants),
         )
 
+    def simpler(self) -> Iterator[Node]:
+        """Every formula with one operator less: a node replaced by one of its inputs."""
+        yield from self.inputs
+        for i, node in enumerate(self.inputs):
+            for other in node.simpler():
+                yield replace(self, inputs=(*self.inputs[:i], other, *self.inputs[i + 1 :]))
+
     def named(self) -> tuple[Node, dict[str, float]]:
         """The same with names for all numbers, and the numbers by those names."""
         values: dict[str, float] = {}

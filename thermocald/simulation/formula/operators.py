@@ -18,6 +18,7 @@ carried through a formula, and with the unit and the words of what it makes.
     integral(x)           ∫ x dt from the first frame, s
     lag(x, tau)           first-order lag
     play(x, r)            backlash of half-width r
+    change(x)             x less what it was at the first frame
     maximum(x), minimum(x)   the highest, the lowest value so far
     peak(x, tau)          the highest value so far, which fades towards x with a time constant
 """
@@ -157,6 +158,17 @@ def _from_start(whole: Array, knots: Array) -> Array:
     return out
 
 
+def _change(knots: Array, values: Array, at: Array) -> Array:
+    return np.asarray(np.interp(at, knots, values) - np.interp(0.0, knots, values))
+
+
+def _change_matrix(knots: Array, values: Array, at: Array) -> csr_array:  # noqa: ARG001
+    from scipy.sparse import csr_array
+
+    start = interpolation_matrix(knots, np.zeros(1))
+    return csr_array(interpolation_matrix(knots, at) - start[np.zeros(len(at), dtype=int)])
+
+
 def _maximum(knots: Array, values: Array, at: Array) -> Array:
     return running_maximum(knots, values, at)
 
@@ -265,6 +277,8 @@ OPERATORS: dict[str, Operator] = {
                      matrix=_rate_matrix),
     "integral": Operator(1, (), "∫ {0} dt", seconds=1, trajectory=_integral,
                          matrix=_integral_matrix),
+    "change": Operator(1, (), "({0} − {0} at the start)", trajectory=_change,
+                       matrix=_change_matrix),
     "lag": Operator(1, (_TAU,), "({0}, lagged by {1})", keeps=True, trajectory=lag,
                     matrix=_lag_matrix),
     "play": Operator(

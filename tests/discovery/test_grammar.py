@@ -1,0 +1,120 @@
+"""Beyond the catalogue: what follows something recorded is described, what does not is not.
+
+The influences are those of `tests.blind.outside`, which shares no code with the operators.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tests.blind.bridge import series_input
+from tests.blind.case import OUTSIDE, Case
+from tests.blind.generator import generate
+from tests.blind.outside import HUMID
+from thermocald.discovery.grammar.condensed import condensed
+from thermocald.discovery.grammar.library import Library
+from thermocald.discovery.grammar.proposal import propose
+from thermocald.discovery.search.search import Search
+from thermocald.discovery.verdict.result import discover_series
+from thermocald.reduction.adequacy import examine
+from thermocald.reduction.calibrated import calibrated_thermometers
+from thermocald.reduction.candidate import Candidate
+from thermocald.reduction.fit import HypothesisFitter
+from thermocald.reduction.hypothesis import BASE
+from thermocald.reduction.noise import with_correlated_noise
+from thermocald.reduction.reduce import reduce_together
+from thermocald.reduction.scan import Scanner
+from thermocald.simulation.formula.expression import Node
+
+TEN = (
+    "tanh", "sign_rate_square", "integral_above", "abs_rate", "two_lags", "product", "switch",
+    "play_of_lag", "fading_peak", "time_times_T",
+)  # fmt: skip
+
+
+def reduced(kind: str, seed: int):
+    case = Case((OUTSIDE,), 0.3, seed, influence=kind, record_humidity=kind in HUMID)
+    return reduce_together([series_input(s) for s in generate(case)[0]])
+
+
+def examined(kind: str, seed: int):
+    """What an examination leaves of the base model, without the catalogue's search."""
+    ready = [with_correlated_noise(e) for e in calibrated_thermometers(reduced(kind, seed))]
+    fitter = HypothesisFitter(ready)
+    base = Search(fitter).base()
+    adequacy = tuple(examine(fitter, base.fit, s) for s in range(2))
+    return SimpleNamespace(fitter=fitter, base=base, base_adequacy=adequacy)
+
+
+@pytest.fixture(scope="module")
+def above():
+    return examined("integral_above", 41)
+
+
+def test_an_integral_above_a_threshold_is_told_with_its_constant(above):
+    found = propose(above, BASE)
+    (term,) = found.terms
+    assert term.effect == "integral(above(temperature, k))"
+    assert dict(term.nonlinear)["k"] == pytest.approx(26.48, abs=0.2)
+    assert min(found.closed) > 0.95
+    assert found.surrogates.p < 0.01
+    assert all(examine(found.fitter, found.best.fit, s).adequate for s in range(2))
+
+
+@pytest.mark.slow
+def test_a_recorded_humidity_is_a_quantity_too():
+    found = propose(examined("lag_of_humidity", 31), BASE)
+    assert found.terms[0].effect == 'lag(column("humidity"), tau)'
+    assert dict(found.terms[0].nonlinear)["tau"] == pytest.approx(120.0, abs=2.0)
+
+
+@pytest.mark.parametrize("kind", ["smooth", pytest.param("random_walk", marks=pytest.mark.slow)])
+def test_what_was_not_recorded_gets_no_formula(kind):
+    assert propose(examined(kind, 33), BASE) is None
+
+
+def test_one_recording_gets_no_formula(above):
+    x = SimpleNamespace(**{**above.__dict__, "fitter": HypothesisFitter(above.fitter.series[:1])})
+    assert propose(x, BASE) is None
+
+
+def test_condensed_evidence_is_the_likelihood(above):
+    """What condensed rows promise of a trajectory is what the full normal equations give."""
+    few = condensed(above.fitter, above.base.fit, BASE)
+    library = Library(few.histories)
+    node = library.offsets(library.reference)[0]
+    whole = Node("integral", (Node("above", (library.reference,), (26.5,)),))
+    gain = float(few.gains(library.values(whole)[:, None])[0])
+    fit = above.fitter.fit(above.base.terms)
+    structure, values = whole.named()
+    candidate = Candidate(structure.text(), BASE, "k", np.array([values["k"]]))
+    full = float(Scanner(above.fitter).scan(candidate, fit).gains[0])
+    assert gain == pytest.approx(full, rel=0.002)
+    assert few.gains(library.values(node)[:, None])[0] < 1e-3 * gain  # T itself is the base's
+
+
+def test_surrogates_are_as_strong_as_the_misfit(above):
+    few = condensed(above.fitter, above.base.fit, BASE)
+    power = np.sum(few.surrogates(40, np.random.default_rng(0)) ** 2, axis=0)
+    assert 0.1 < np.median(power) / few.power < 10
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", TEN)
+def test_ten_kinds_of_outside_effects_are_described(kind):
+    found = propose(examined(kind, 52), BASE)
+    assert found is not None
+    assert found.closed[0] > 0.8
+
+
+@pytest.mark.slow
+def test_a_discovery_says_the_formula_and_the_gap_closes():
+    found = discover_series(reduced("tanh", 52))
+    (entry,) = found.effects
+    assert (found.verdict, entry.effect) == ("unexplained", "unnamed")
+    assert "tanh((T − " in entry.statement
+    assert entry.as_json()["evidence"]["proposal"]["transferable"] is True
+    assert found.excess_closed() > 0.8

@@ -251,7 +251,7 @@ def _say(document: dict[str, Any]) -> None:
         typer.echo(f"  {effect['effect']}: {', '.join(parts)}")
     for s in document["series"]:
         typer.echo(
-            f"  {s['name']}: {s['epochs']} epochs, {s['rms_px']:.4f} px, "
+            f"  {s['name']}: {s['epochs']} epochs{_on_means(s['means'])}, {s['rms_px']:.4f} px, "
             f"thermometer ± {s['thermometer_sd']:.3f} K"
         )
     for h in document["prediction_test"]:
@@ -259,3 +259,7 @@ def _say(document: dict[str, Any]) -> None:
             f"  {h['name']} left out: predicted to {h['rms_px']:.4f} px (noise alone "
             f"{h['floor_px']:.4f}), {h['object_mm']:.2f} mm at 10 m"
         )
+
+
+def _on_means(count: int | None) -> str:
+    return "" if count is None else f" on {count} means"

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.reduction.resolution import resolved
 from thermocald.reduction.series import Blocks, solve
 
 if TYPE_CHECKING:
@@ -19,7 +20,8 @@ def in_blocks(evidence: ReducedSeries, rows: int = 720) -> ReducedSeries:
     """A long series on at most `rows` blocks of neighbouring epochs; a short one as it is.
 
     Heat is slow: over twelve epochs of 10 s a trajectory of parameters loses what is faster than
-    some minutes, and nothing else. Trajectories are computed on all epochs and then averaged.
+    some minutes, and nothing else. Trajectories are computed on all epochs and then averaged. The
+    blocks of a series of weeks and more are short where the camera moves fast, and days elsewhere.
     """
     from scipy.sparse import csr_array
 
@@ -27,14 +29,17 @@ def in_blocks(evidence: ReducedSeries, rows: int = 720) -> ReducedSeries:
     if rows >= E:
         return evidence
     size = int(np.ceil(E / rows))
-    block = np.arange(E) // size
+    first = np.arange(0, E, size)
+    if evidence.source.counts is not None:
+        first = resolved(evidence, rows)
+    block = np.repeat(np.arange(len(first)), np.diff(first, append=E))
     B = int(block[-1]) + 1
-    weight = evidence.n.astype(float)
+    weight = evidence.n * evidence.source.per_row
     total = np.bincount(block, weight, minlength=B)
     share = weight / np.where(total > 0, total, 1.0)[block]
     average = csr_array((share, (block, np.arange(E))), shape=(B, E))
-    N = np.add.reduceat(evidence.N, np.arange(0, E, size), axis=0)
-    b = np.add.reduceat(evidence.b, np.arange(0, E, size), axis=0)
+    N = np.add.reduceat(evidence.N, first, axis=0)
+    b = np.add.reduceat(evidence.b, first, axis=0)
     values = solve(N, b)
     yy = np.einsum("ek,ek->e", values, b)
     rank = float(np.sum(np.linalg.eigvalsh(N.sum(axis=0)) > 1e-9 * np.trace(N.sum(axis=0))))
@@ -50,7 +55,6 @@ def in_blocks(evidence: ReducedSeries, rows: int = 720) -> ReducedSeries:
         (np.ones(len(knots)), (np.arange(len(knots)), state)),
         shape=(len(knots), int(state.max()) + 1),
     )
-    first = np.arange(0, E, size)
     there = np.maximum(np.add.reduceat((evidence.n > 0).astype(float), first), 1.0)
     return replace(
         evidence,

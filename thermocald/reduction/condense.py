@@ -37,8 +37,9 @@ __all__ = ["condensed", "rows_at_most"]
 _POINTS = 1_300_000  # image points of all rows: 300 MB while they are reduced
 _FEWEST, _MOST = 2_000, 10_000  # rows
 _COARSE = 0.8  # of the rows are long means
-_A_WINDOW = 24  # long means
+_SHORTEST, _LONGEST = 4, 24  # long means of a window
 _FINER = 12  # short means in a long one
+_NEIGHBOURS = 5  # epochs that tell a gross error
 _GROSS = 6.0  # standard deviations from the median of a short mean
 
 
@@ -94,8 +95,9 @@ def condensed(
     coarse, course = _coarse(source, E, T, size, fine)
     rows = coarse
     if size > 1:
-        length = _A_WINDOW * size
-        count = max(int((1.0 - _COARSE) * most * fine / length), 1)
+        spare = (1.0 - _COARSE) * most * fine  # epochs that may stand on short means
+        length = size * int(np.clip(0.5 * spare / size, _SHORTEST, _LONGEST))
+        count = max(int(spare / length), 1)
         chosen = _fast_windows(course, _means(_temperature(series), fine), length // fine, count)
         windows = [slice(k * length, min((k + 1) * length, E)) for k in chosen]
         rows = coarse.without(windows).beside(
@@ -223,20 +225,27 @@ def _seen_mean(grid: ObservationGrid) -> Array:
 
 def _gross(p: Array, seen: NDArray[np.bool_], short: int) -> NDArray[np.bool_]:
     """Points (E, T) far from the median of their short mean."""
-    n = len(p) // short * short
     out = np.zeros(seen.shape, dtype=bool)
-    if short < 5 or not n:
+    short = max(short, _NEIGHBOURS)
+    n = len(p) // short * short
+    if not n:
         return out
+    if n < len(p):  # the last ones, beside their neighbours
+        out[-short:] = _gross(p[-short:], seen[-short:], short)
     values = np.where(seen[..., None], p, np.nan)[:n]
     runs = values.reshape(-1, short, *p.shape[1:])
     ordered = np.sort(runs, axis=1)  # NaN go to the end
     count = np.isfinite(ordered).sum(axis=1)
     pick = np.maximum(count - 1, 0) // 2
     median = np.take_along_axis(ordered, pick[:, None], axis=1)
-    off = np.abs(runs - median).reshape(n, *p.shape[1:])
+    off = (runs - median).reshape(n, *p.shape[1:])
+    # the whole image may move within a short mean
+    ordered = np.sort(off, axis=1)
+    pick = np.maximum(np.isfinite(ordered).sum(axis=1) - 1, 0) // 2
+    off = np.abs(off - np.take_along_axis(ordered, pick[:, None], axis=1))
     known = np.isfinite(off)
     scale = MAD_TO_SD * float(np.median(off[known])) if known.any() else 0.0
-    out[:n] = (np.where(known, off, 0.0) > _GROSS * max(scale, 1e-6)).any(axis=-1)
+    out[:n] |= (np.where(known, off, 0.0) > _GROSS * max(scale, 1e-6)).any(axis=-1)
     return out
 
 

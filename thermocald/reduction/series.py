@@ -74,10 +74,15 @@ class SeriesInput:
                 out[name] = (t[there], values[there])
         return out
 
+    def epochs(self, rows: NDArray[np.bool_]) -> int:
+        """How many epochs some rows (E,) stand for."""
+        return int(rows.sum() if self.counts is None else self.counts[rows].sum())
+
     @property
-    def epochs(self) -> int:
-        """How many epochs were recorded."""
-        return len(self.frame_times) if self.counts is None else int(self.counts.sum())
+    def per_row(self) -> Array:
+        """Of how many epochs each row (E,) is the mean."""
+        ones: Array = np.ones(len(self.frame_times))
+        return ones if self.counts is None else self.counts.astype(np.float64)
 
 
 @dataclass(frozen=True, eq=False)

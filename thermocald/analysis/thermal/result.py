@@ -49,12 +49,16 @@ _EXTERIOR = [COLUMNS.index(n) for n in EOP_NAMES]
 
 @dataclass(frozen=True, slots=True)
 class SeriesFit:
-    """How well one series is explained: RMS px of the image points, thermometer's noise K."""
+    """How well one series is explained: RMS px of the image points, thermometer's noise K.
+
+    means: on how many means of epochs a long series was fitted, and the RMS is of; else None.
+    """
 
     name: str
     epochs: int
     rms_px: float
     thermometer_sd: float
+    means: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +188,7 @@ class _Parts:
         for k, s in enumerate(self.series):
             ok = s.n > 0
             weights = s.weights[ok, :, :2]
-            w = weights.mean(axis=(1, 2), where=weights > 0)
+            w = weights.mean(axis=(1, 2), where=weights > 0) / s.source.per_row[ok]
             rise = self.growth.noise[k][ok] if self.growth else np.ones(len(w))
             total += float(np.sum(s.n[ok] / w / rise**2))
             count += int(s.n[ok].sum())
@@ -213,9 +217,11 @@ def fitted_model(
     fits = tuple(
         SeriesFit(
             s.source.series or s.source.name,
-            int((s.n > 0).sum()),
+            s.source.epochs(s.n > 0),
             _rms(s, parts.model(k, level)),
-            fitter.series[k].thermometers[s.history.reference].noise,
+            fitter.series[k].thermometers[s.history.reference].noise
+            * float(np.sqrt(np.median(s.source.per_row))),
+            None if s.source.counts is None else int((s.n > 0).sum()),
         )
         for k, s in enumerate(series)
     )

@@ -1,0 +1,59 @@
+"""A year of a camera, drawn as the means that three million epochs are condensed to."""
+
+from __future__ import annotations
+
+import corner_camera as scene
+import numpy as np
+
+from thermocald.photogrammetry.camera.camera_model import project
+from thermocald.photogrammetry.series.normals import ObservationGrid
+from thermocald.reduction.reduce import reduce_together
+from thermocald.reduction.series import SeriesInput
+
+DAY = 86_400.0
+RATES = {0: 2e-4, 1: 4e-4, 2: -3e-4}  # mm/K
+HOUR = 360  # epochs
+
+
+def rows(afternoons=(200,)):
+    """Middles s and lengths (epochs) of hours, of five minutes on some days."""
+    first, count = [], []
+    for day in range(365):
+        n = 30 if day in afternoons else HOUR
+        begin = np.arange(0, 8640, n) + 8640 * day
+        first.append(begin)
+        count.append(np.full(len(begin), n))
+    start, length = np.concatenate(first), np.concatenate(count)
+    return 10.0 * (start + 0.5 * (length - 1)), length, start
+
+
+def year(temperature, moved, seed, afternoons=(200,), noise_K=0.02, targets=24):
+    """The reduced series; temperature(t s) °C; moved(t, T) K·px: what c, x0, y0 follow instead."""
+    rng = np.random.default_rng(seed)
+    t, count, start = rows(afternoons)
+    whole = scene.corner_field(0.02)
+    field = whole.subset(np.linspace(0, len(whole) - 1, targets).astype(int))
+    # means over a row, from eight instants of it
+    inside = (np.arange(8) - 3.5) / 8.0
+    at = t[:, None] + 10.0 * count[:, None] * inside
+    T = temperature(at)
+    values = np.tile(
+        np.concatenate([scene.INTERIOR.as_array(), scene.EXTERIOR.as_array()]), (len(t), 1)
+    )
+    drive = moved(at, T).mean(axis=1)
+    for column, rate in RATES.items():
+        values[:, column] += rate * (drive - 15.0)
+    sigma = scene.SIGMA_PX / np.sqrt(count)
+    points = project(scene.SENSOR, values[:, :10], values[:, 10:], field.points)
+    points += rng.normal(0, 1, points.shape) * sigma[:, None, None]
+    weights = np.zeros((*points.shape[:2], 3))
+    weights[..., :2] = 1.0 / sigma[:, None, None] ** 2
+    noise = noise_K / np.sqrt(count)
+    read = T.mean(axis=1) + rng.normal(0, 1, len(t)) * noise
+    return reduce_together([
+        SeriesInput(
+            "year", "camera", scene.SENSOR, field, scene.INTERIOR.c, t, t, {"temperature": read},
+            {"temperature": None}, ObservationGrid(points, weights), start, series="year",
+            interior=scene.INTERIOR, counts=count, noises={"temperature": noise},
+        )
+    ])  # fmt: skip

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter, deque
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from thermocald.acquisition import common_unknowns
 from thermocald.acquisition.calibrator import Calibrator
 from thermocald.acquisition.common_unknowns import CommonUnknowns
 from thermocald.photogrammetry.camera.camera_model import (
@@ -179,3 +183,58 @@ def test_the_first_epochs_are_not_surer_than_they_are(scene):
     results, alone, _, _ = run(scene, 6, exterior="series", offsets=True)
     for together, apart in zip(results, alone, strict=True):
         assert (together.sd[:3] > 0.6 * apart.sd[:3]).all()
+
+
+def held_bytes(value, seen=None) -> int:
+    """Bytes of all arrays that an object holds."""
+    seen = set() if seen is None else seen
+    if id(value) in seen:
+        return 0
+    seen.add(id(value))
+    if isinstance(value, np.ndarray):
+        return value.nbytes
+    if isinstance(value, (list, tuple, deque)):
+        return sum(held_bytes(v, seen) for v in value)
+    slots = getattr(type(value), "__slots__", ())
+    inner = [*vars(value).values()] if hasattr(value, "__dict__") else []
+    return sum(held_bytes(v, seen) for v in [*inner, *(getattr(value, s) for s in slots)])
+
+
+def test_an_epoch_of_month_twelve_costs_what_one_of_the_first_day_does(scene, monkeypatch):
+    """Calls and sizes are counted, of 120 epochs after some hundred and after 100,000."""
+    sensor, field, epoch = scene
+    calibrator = Calibrator(sensor, field, AdjustmentSettings(), nominal_c=3.04)
+    prepared = [(o, calibrator.adjust(o)) for o, _ in (epoch(40) for _ in range(40))]
+    common = CommonUnknowns(sensor, field, AdjustmentSettings(), exterior="auto", offsets=True)
+    counted: Counter[str] = Counter()
+
+    def count(name):
+        real = getattr(common_unknowns, name)
+
+        def wrapper(first, *others):
+            counted[name] += np.size(first) if isinstance(first, np.ndarray) else 1
+            return real(first, *others)
+
+        monkeypatch.setattr(common_unknowns, name, wrapper)
+
+    for name in ("project", "scaled_inverse", "estimate_movement", "normal_matrices"):
+        count(name)
+
+    def work(epochs):
+        counted.clear()
+        for k in range(epochs):
+            assert common.refine(*prepared[k % len(prepared)]).ok
+        return dict(counted), held_bytes(common)
+
+    work(260)  # the window of the mount is full
+    early, memory = work(120)
+    age = 100_000 // common.epochs
+    common._H, common._h = common._H * age, common._h * age  # as many epochs like these
+    common.epochs *= age
+    common._looked *= age
+    common._solved = replace(common._solved, epochs=common._solved.epochs * age)
+    late, memory_late = work(120)
+    assert common.epochs > 90_000
+    assert memory_late == memory
+    for name, size in late.items():
+        assert size <= early[name], name

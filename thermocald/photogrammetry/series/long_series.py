@@ -27,6 +27,7 @@ from thermocald.photogrammetry.series.adjustment import (
     result,
 )
 from thermocald.photogrammetry.series.blocks import gathered, spread_windows
+from thermocald.photogrammetry.series.cofactors import among_all
 from thermocald.photogrammetry.series.common_sums import (
     CommonSums,
     Shared,
@@ -213,32 +214,30 @@ class _Blocks:
         """Covariances (n, 16, 16) of a block's epochs relative to the series."""
         s, own = self.found.series.s, system.own
         n = len(system.Q)
-        block = (slice(None), own[:, None], own)
-        relative = np.zeros((n, 16, 16))
-        relative[block] = system.Q
+        mine = system.Q.copy()
         for kind in kinds:
             away = kind.G - self.shared.mean
-            apart = away @ self.shared.cofactors @ away.T
-            relative[np.ix_(kind.rows, own, own)] += apart
+            mine[kind.rows] += away @ self.shared.cofactors @ away.T
         if s.scale == "posterior":
             # What priors of the mount contribute is known as well as the mount, not as the epoch.
-            bound = system.from_priors()
-            relative[block] -= bound
-            relative *= epoch_variance(unit, redundancy, self.unit)[:, None, None]
-            relative[block] += self.unit * bound
+            bound = system.from_priors() if system.own_prior.any() else 0.0
+            mine -= bound
+            mine *= epoch_variance(unit, redundancy, self.unit)[:, None, None]
+            mine += self.unit * bound
+        whole = np.ix_(own, own)
         for kind in kinds:
             if s.exterior == "series" and self.movement.covariance.any():
                 G = kind.G[:, :6]
-                moved = G @ self.movement.covariance @ G.T
-                relative[np.ix_(kind.rows, own, own)] += moved
+                mine[kind.rows] += G @ self.movement.covariance @ G.T
             if self.pairs is not None:
-                relative[kind.rows] += kind.system.correlated(self.pairs)
-        relative[:, own, own] += self.excess[own]
+                mine[kind.rows] += kind.system.correlated(self.pairs)[0][whole]
+        mine += np.diag(self.excess[own])
         # Slow errors: a line through zero in the middle of the series, uncertain at its ends.
-        line = (first + np.arange(n)) / max(self.epochs - 1, 1) - 0.5
-        relative += line[:, None, None] ** 2 * self.slow
-        relative[~system.good] = 0.0
-        return relative
+        if self.slow.any():
+            line = (first + np.arange(n)) / max(self.epochs - 1, 1) - 0.5
+            mine += line[:, None, None] ** 2 * self.slow[whole]
+        mine[~system.good] = 0.0
+        return among_all(mine, own)
 
     def finished(
         self, solved: Solved, out: RowWriter, sample: SeriesAdjustment,

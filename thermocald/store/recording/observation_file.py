@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ObservationFile", "ObservationTable"]
 
-_GRID_POINTS = 300_000  # cells of a grid: 12 MB
+_GRID_POINTS, _GRID_EPOCHS = 300_000, 4_000  # of a grid: 12 MB
 _REQUIRED = ("epoch", "target", "x", "y", "sx", "sy")
 
 
@@ -159,7 +159,7 @@ class ObservationFile:
                 break
 
     def _grids(self, block: _Block, first: int, stop: int) -> Iterator[tuple[int, ObservationGrid]]:
-        size = max(_GRID_POINTS // len(self._field), 1)
+        size = max(min(_GRID_POINTS // len(self._field), _GRID_EPOCHS), 1)
         for begin in range(first, stop, size):
             end = min(begin + size, stop)
             low, high = np.searchsorted(block.epochs, [begin, end])

@@ -1,0 +1,143 @@
+"""What a command costs over a series of 10³ to 3 × 10⁶ epochs: processor time, memory, growth.
+
+Run: python -m benchmarks.scale [--full] [--commands replay,fit] [--epochs 1000,10000]
+Recordings are drawn as Parquet (`long_recording`), the dashboard's store is filled with columns.
+Each command is a process of its own. Printed are seconds of processor time and MB resident at most,
+and the exponent of growth of the last decade, start-up (that of the shortest series) taken off.
+Bounds: exponent ≤ 1.05, 1000 MB. Exit status 1 where one is missed. Default: up to 10⁵ epochs.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import argparse
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+MOST_MB = 1000.0
+MOST_EXPONENT = 1.05
+NOISE_S = 3.0  # below, what else the machine does decides the exponent
+SHORT = (1_000, 10_000, 100_000)
+FULL = (*SHORT, 1_000_000, 3_153_600)
+
+SERIES = """
+import sys; from pathlib import Path
+from thermocald.store.recording.reader import open_recording
+from thermocald.photogrammetry.series.long_series import adjust_long_series
+from thermocald.photogrammetry.series.result import SeriesSettings
+from benchmarks.adjustment import EXTERIOR, INTERIOR
+r = open_recording(Path(sys.argv[1]))
+found = adjust_long_series(r.camera.sensor, r.testfield, r, INTERIOR, EXTERIOR, SeriesSettings())
+assert found.rows.ok.mean() > 0.99
+"""
+QUERY = """
+import sys; from pathlib import Path
+from thermocald.output.dashboard.view import View
+view = View(Path(sys.argv[1]), Path(sys.argv[1]).parent)
+one = view.series()[0]
+found = view.columns(one["camera"], one["series"], None, None, 1000)
+assert len(found["c"]) <= 1000
+"""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Seconds of processor time and MB resident at most."""
+
+    seconds: float
+    megabytes: float
+
+
+def arguments(command: str, folder: Path, recording: Path, store: Path) -> list[str]:
+    """The process of a command."""
+    python, tool = sys.executable, str(Path(sys.executable).with_name("thermocald"))
+    return {
+        "replay": [tool, "replay", str(recording)],
+        "series": [python, "-c", SERIES, str(recording)],
+        "study": [tool, "study", str(recording), "--json", str(folder / "study.json")],
+        "fit": [tool, "fit", str(recording), "-o", str(folder / "model.yaml")],
+        "discover": [tool, "discover", str(recording)],
+        "export": [tool, "export", str(recording), "-o", str(folder / "export.csv")],
+        "dashboard": [python, "-c", QUERY, str(store)],
+    }[command]
+
+
+COMMANDS = ("replay", "series", "study", "fit", "discover", "export", "dashboard")
+
+
+def cost(process: list[str]) -> Cost:
+    """Run it to its end."""
+    with tempfile.TemporaryFile() as errors:
+        # a session of its own has no terminal: progress as lines
+        child = subprocess.Popen(process, stdout=subprocess.DEVNULL, stderr=errors)
+        _, status, used = os.wait4(child.pid, 0)
+        child.returncode = os.waitstatus_to_exitcode(status)
+        if child.returncode:
+            errors.seek(0)
+            sys.exit(f"{' '.join(process)[:200]}:\n{errors.read().decode()[-2000:]}")
+    return Cost(used.ru_utime + used.ru_stime, used.ru_maxrss / 1024)
+
+
+def exponent(epochs: list[int], costs: list[Cost]) -> float:
+    """Of the last two lengths, start-up taken off; NaN where too little was measured."""
+    if len(costs) < 3 or costs[-2].seconds - costs[0].seconds < NOISE_S:
+        return float("nan")
+    last, before = costs[-1].seconds - costs[0].seconds, costs[-2].seconds - costs[0].seconds
+    longer = (epochs[-1] - epochs[0]) / (epochs[-2] - epochs[0])
+    return float(np.log(last / before) / np.log(longer))
+
+
+def row(command: str, epochs: list[int], costs: list[Cost]) -> tuple[str, bool]:
+    """A line of the table, and whether its bounds are kept."""
+    growth = exponent(epochs, costs)
+    cells = [f"{c.seconds:.1f} s, {c.megabytes:.0f} MB" for c in costs]
+    shown = "" if np.isnan(growth) else f"{growth:.2f}"
+    kept = not growth > MOST_EXPONENT and max(c.megabytes for c in costs) <= MOST_MB
+    return f"| {command} | {' | '.join(cells)} | {shown} |", kept
+
+
+def main() -> int:
+    from benchmarks.long_recording import write_long_recording
+    from benchmarks.store import fill_columns
+
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--full", action="store_true", help="to a year at 10 s")
+    parser.add_argument("--epochs", help="lengths, with commas")
+    parser.add_argument("--commands", default=",".join(COMMANDS))
+    parser.add_argument("--targets", type=int, default=15)
+    parser.add_argument("--folder", type=Path, help="keep recordings and stores there")
+    options = parser.parse_args()
+    lengths = list(FULL if options.full else SHORT)
+    if options.epochs:
+        lengths = [int(n) for n in options.epochs.split(",")]
+    kept = True
+    with tempfile.TemporaryDirectory() as name:
+        folder = options.folder or Path(name)
+        print(f"| {options.targets} targets | {' | '.join(f'{n:,}' for n in lengths)} | exponent |")
+        print("|---|" + "---|" * (len(lengths) + 1), flush=True)
+        for command in options.commands.split(","):
+            costs = []
+            for n in lengths:
+                recording, store = folder / f"{n}", folder / f"{n}.db"
+                if command == "dashboard" and not store.exists():
+                    fill_columns(store, n)
+                elif command != "dashboard" and not recording.exists():
+                    write_long_recording(recording, n, options.targets)
+                costs.append(cost(arguments(command, folder, recording, store)))
+            line, good = row(command, lengths, costs)
+            kept &= good
+            print(line, flush=True)
+    return 0 if kept else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -113,7 +113,7 @@ def main() -> int:
     parser.add_argument("--full", action="store_true", help="to a year at 10 s")
     parser.add_argument("--epochs", help="lengths, with commas")
     parser.add_argument("--commands", default=",".join(COMMANDS))
-    parser.add_argument("--targets", type=int, default=15)
+    parser.add_argument("--targets", type=int, default=21)
     parser.add_argument("--folder", type=Path, help="keep recordings and stores there")
     options = parser.parse_args()
     lengths = list(FULL if options.full else SHORT)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from datetime import UTC, datetime
+
 import pytest
 
 from thermocald.discovery.search import examination
@@ -24,7 +27,14 @@ def test_an_effect_in_a_long_series(short_blocks, evidence_of):
     first, last = found.effects[0].where["epochs"]
     assert 0 <= first < last <= evidence[0].source.numbers[-1]
     assert last > 60  # epochs, not rows
-    assert "<svg" in report_html(found, "long")
+    page = report_html(found, "long", datetime(2026, 6, 14, 12, 30, tzinfo=UTC))
+    assert "<svg" in page
+    assert "Made on 2026-06-14 at 12:30 UTC with thermocald" in page
+    source = evidence[0].source
+    assert f"{source.camera}, {source.sensor.width} × {source.sensor.height} px of" in page
+    links, heads = re.findall(r"href='#(s\d+)'", page), re.findall(r"id='(s\d+)'", page)
+    assert links == heads
+    assert len(heads) >= 5
 
 
 def test_what_is_unexplained_in_a_long_series(short_blocks, evidence_of):

@@ -126,7 +126,7 @@ def signature(discovery: Discovery) -> str:
     twin.plot(minutes, T, color=_INK, lw=0.7, ls=":", label="T")
     twin.set_ylabel("T / °C", fontsize=8)
     twin.tick_params(labelsize=8)
-    axes[1].legend(fontsize=7, frameon=False)
+    _legend_above(axes[1])
     return _svg(figure)
 
 
@@ -139,7 +139,7 @@ def ranking(discovery: Discovery) -> str:
         if s.terms[-1].parameters == MOUNT != s.terms[-1].kind.usual:
             name += " (mount)"
         rows[name] = max(rows.get(name, 0.0), x.base.score - s.score)
-    figure, axes = _figure(6.5, 0.6 + 0.3 * max(len(rows), 1))
+    figure, axes = _figure(9.0, 0.6 + 0.3 * max(len(rows), 1))
     names = sorted(rows, key=lambda n: rows[n])
     axes[0].barh(names, [max(rows[n], 1.0) for n in names], color=_PALE)
     best = [n for n in names if n.split(" ")[0] in x.best.names]
@@ -173,8 +173,16 @@ def staircase(discovery: Discovery) -> str:
         axis.set_yscale("log")
         axis.set_xticks(range(len(labels)), labels, rotation=15, fontsize=8)
         axis.set_ylabel(title, fontsize=8)
-        axis.legend(fontsize=7, frameon=False)
+        _legend_above(axis)
     return _svg(figure)
+
+
+def _legend_above(axis: Any) -> None:
+    """The legend above the axes, clear of the data."""
+    axis.legend(
+        fontsize=7, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3,
+        borderaxespad=0.2,
+    )  # fmt: skip
 
 
 def misfit_matrix(discovery: Discovery) -> str:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from datetime import UTC, datetime
 from html import escape
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
+from thermocald import __version__
 from thermocald.discovery.verdict.misfit import resolve
 from thermocald.output.discovery import figures
+from thermocald.output.figures.numbers import with_sd
 
 if TYPE_CHECKING:
     from thermocald.discovery.verdict.found import EffectFound
@@ -22,9 +27,15 @@ h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2.2rem;border-bottom:1px sol
 .sentence{font-size:1.25rem;border-left:4px solid #c4542b;padding:.4rem 1rem;background:#faf5f2}
 table{border-collapse:collapse;font-size:.9rem;margin:.6rem 0}
 td,th{padding:.25rem .7rem;text-align:left;border-bottom:1px solid #e3e8ec}
-td.n{text-align:right;font-variant-numeric:tabular-nums}svg{max-width:100%;height:auto}
-.note{color:#5b6b76;font-size:.9rem}
+td.n{text-align:right;font-variant-numeric:tabular-nums}
+.figure{overflow-x:auto}.figure svg{display:block;width:100%;min-width:36rem;height:auto}
+.note,.made{color:#5b6b76;font-size:.9rem}.made{margin:.2rem 0}
+nav{border:1px solid #cfd8de;border-radius:4px;padding:.4rem 1rem;margin:1rem 0;font-size:.9rem}
+nav ol{margin:.3rem 0;padding-left:1.4rem}a{color:#0b63a5}
 """
+_SECTIONS = (
+    "The signature", "Where simulation and measurement disagree", "All candidates, alone",
+)
 _VERDICTS = {
     "adequate": "The model reproduces the recording within its noise: nothing is missing that "
     "this recording could show.",
@@ -35,8 +46,8 @@ _VERDICTS = {
 }
 
 
-def report_html(discovery: Discovery, title: str) -> str:
-    """The whole page."""
+def report_html(discovery: Discovery, title: str, made: datetime | None = None) -> str:
+    """The whole page; made: the time that it bears, by default now."""
     parts = [
         (
             "<!doctype html><html lang='en'><head><meta charset='utf-8'>"
@@ -45,27 +56,56 @@ def report_html(discovery: Discovery, title: str) -> str:
         ),
         f"<h1>Discovery: {escape(title)}</h1>",
     ]
+    parts += [f"<p class='made'>{escape(line)}</p>" for line in _origin(discovery, made)]
     parts += [f"<p class='sentence'>{escape(e.statement)}</p>" for e in discovery.effects]
     parts.append(f"<p>{escape(_VERDICTS[discovery.verdict])}</p>")
-    parts.append("<h2>The gap</h2>" + _gaps(discovery) + figures.staircase(discovery))
-    parts += [_effect(e) for e in discovery.effects]
-    parts.append("<h2>The signature</h2>" + figures.signature(discovery))
+    names = ["The gap", *(e.effect for e in discovery.effects), *_SECTIONS]
     parts.append(
-        "<h2>Where simulation and measurement disagree</h2>"
-        + figures.misfit_map(discovery)
+        "<nav aria-label='Contents'><b>Contents</b><ol>"
+        + "".join(f"<li><a href='#s{i}'>{escape(name)}</a></li>" for i, name in enumerate(names))
+        + "</ol></nav>"
+    )
+    heads = iter([f"<h2 id='s{i}'>{escape(name)}</h2>" for i, name in enumerate(names)])
+    parts.append(next(heads) + _gaps(discovery) + _drawn(figures.staircase(discovery)))
+    parts += [next(heads) + _effect(e) for e in discovery.effects]
+    parts.append(next(heads) + _drawn(figures.signature(discovery)))
+    parts.append(
+        next(heads)
+        + _drawn(figures.misfit_map(discovery))
         + "<p class='note'>Colour: what the model leaves of each target over the series. "
         "Arrows: its strongest pattern. M1.</p>"
         + _where(discovery)
-        + figures.misfit_matrix(discovery)
+        + _drawn(figures.misfit_matrix(discovery))
     )
     parts.append(
-        "<h2>All candidates, alone</h2>"
-        + figures.ranking(discovery)
+        next(heads)
+        + _drawn(figures.ranking(discovery))
         + "<p class='note'>Improvement of −2 log L less the penalty for what was searched. "
         "Candidates that promise nothing are not drawn.</p>"
     )
     parts.append("</body></html>")
     return "".join(parts)
+
+
+def _drawn(svg: str) -> str:
+    """A figure; a narrow page scrolls it, so that its text can be read."""
+    return f"<div class='figure'>{svg}</div>"
+
+
+def _origin(discovery: Discovery, made: datetime | None) -> list[str]:
+    """When and with what it was made, of which camera, when it was measured."""
+    at = made or datetime.now(tz=UTC)
+    versions = ", ".join(f"{name} {version(name)}" for name in ("numpy", "scipy"))
+    lines = [f"Made on {at:%Y-%m-%d at %H:%M} UTC with thermocald {__version__} ({versions})."]
+    for evidence in discovery.examination.fitter.series:
+        source = evidence.source
+        sensor, start = source.sensor, datetime.fromtimestamp(float(source.frame_times[0]), UTC)
+        lines.append(
+            f"{source.camera}, {sensor.width} × {sensor.height} px of "
+            f"{sensor.pixel_pitch * 1000:g} µm; {source.series or source.name} measured "
+            f"{start:%Y-%m-%d %H:%M} UTC, {source.epochs} epochs."
+        )
+    return lines
 
 
 def _row(name: str, gap: Gap | None) -> str:
@@ -103,16 +143,12 @@ def _effect(effect: EffectFound) -> str:
     rows = []
     for name, e in effect.estimates.items():
         value, sd = e["value"], e["sd"]
-        shown = f"{value:.6g}" if isinstance(value, float) else escape(str(value))
-        spread = f"{sd:.2g}" if isinstance(sd, float) else ""
-        rows.append(
-            f"<tr><td>{escape(name)}</td><td class='n'>{shown}</td><td class='n'>{spread}</td>"
-            f"<td>{escape(e['unit'])}</td></tr>"
-        )
-    text = (
-        f"<h2>{escape(effect.effect)}</h2><table><tr><th>parameter</th><th>value</th><th>sd</th>"
-        f"<th>unit</th></tr>{''.join(rows)}</table>"
-    )
+        unit = "" if e["unit"] == "1" else e["unit"]
+        shown = str(value)
+        if isinstance(value, float):
+            shown = with_sd(value, sd if isinstance(sd, float) else math.nan, unit)
+        rows.append(f"<tr><td>{escape(name)}</td><td class='n'>{escape(shown)}</td></tr>")
+    text = f"<table><tr><th>parameter</th><th>value ± sd</th></tr>{''.join(rows)}</table>"
     excluded = [a for a in effect.alternatives if not a.get("resembles")]
     alike = [a["effect"] for a in effect.alternatives if a.get("resembles")]
     if excluded:
@@ -136,7 +172,7 @@ def _where(discovery: Discovery) -> str:
     for name, value, sigmas in resolve(discovery.examination).rows:
         rows.append(
             f"<tr><td>{escape(name)}</td><td class='n'>{_text(value)}</td>"
-            f"<td class='n'>{sigmas:.1f}</td></tr>"
+            f"<td class='n'>{_text(sigmas, 1)}</td></tr>"
         )
     return (
         "<table><tr><th>misfit of the base model against</th><th>size / px RMS</th>"
@@ -144,5 +180,7 @@ def _where(discovery: Discovery) -> str:
     )
 
 
-def _text(value: Any) -> str:
-    return f"{value:.4f}" if isinstance(value, float) else str(value)
+def _text(value: Any, decimals: int = 4) -> str:
+    if not isinstance(value, float):
+        return str(value)
+    return f"{value:.{decimals}f}".replace("-", "−")

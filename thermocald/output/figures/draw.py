@@ -107,9 +107,10 @@ def draw_panel(panel: Panel, *, legend: bool = True) -> Any:
         drawing = _figure(*_PANEL_INCHES, None)
         axis = drawing.subplots()
         rows = _fill(axis, panel, legend=legend)
+        drawing.subplots_adjust(right=0.95, bottom=0.19, top=0.89 - 0.055 * rows)
+        # how many ticks there are, and with how many digits, depends on the height
         longest = max((len(text) for text in _tick_labels(axis)), default=0)
-        left = min(0.32, 0.135 + 0.0155 * longest)
-        drawing.subplots_adjust(left=left, right=0.95, bottom=0.19, top=0.89 - 0.055 * rows)
+        drawing.subplots_adjust(left=min(0.34, 0.145 + 0.0165 * longest))
         return drawing
 
 

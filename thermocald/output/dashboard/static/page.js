@@ -38,10 +38,11 @@ function options(select, names) {
 function show(document_) {
   status = document_;
   const cameras = status.cameras || {};
-  options($("camera"), Object.keys(cameras));
+  if (Object.keys(cameras).length) options($("camera"), Object.keys(cameras));
   const old = status.age_s > 10;
   $("connection").textContent = !status.pid ? "no daemon runs" :
     old ? `the daemon has not answered for ${fixed(status.age_s, 0)} s` : "live";
+  if (!status.pid) $("state").textContent = "no daemon runs; what was stored is below";
   showCamera(cameras[$("camera").value]);
   showDevices();
   showWarnings();
@@ -182,7 +183,7 @@ function draw(columns) {
   const panels = [[columns.channels, "°C"], [["c"], "c mm"], [["x0"], "x0 mm"], [["y0"], "y0 mm"], [["sigma0"], "σ0"]];
   panels.forEach(([names, title], i) => {
     const axis = i ? `y${i + 1}` : "y", top = 1 - i * 0.205;
-    layout[i ? `yaxis${i + 1}` : "yaxis"] = { title: { text: title }, domain: [top - 0.18, top],
+    layout[i ? `yaxis${i + 1}` : "yaxis"] = { title: { text: title, standoff: 10 }, automargin: true, domain: [top - 0.18, top],
       gridcolor: colour("--line"), zeroline: false, tickformat: title.endsWith("mm") ? ".4f" : "" };
     for (const name of names) {
       const y = columns[name], sd = columns["sd_" + name];

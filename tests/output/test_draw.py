@@ -1,0 +1,32 @@
+"""Panels as people see them: labels inside the drawing, legends clear of the data."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+from thermocald.output.figures.draw import draw_panel
+from thermocald.output.figures.panels import Curve, Panel
+
+
+@pytest.mark.parametrize("lowest", [-11.8, -1234.0, -0.0123, -3.0, 5e-5, -9.9e-5, 3.0405])
+def test_the_y_label_is_inside_the_drawing_and_clear_of_the_numbers(lowest):
+    """Of `Δx₀ in µm` a half was cut off where ticks had more digits than was reckoned with."""
+    x = np.linspace(0, 25, 150)
+    curves = tuple(Curve(f"M{i}", x, lowest * np.sin(x / (7 + i))) for i in (1, 2))
+    for panel in (Panel("x", "time in min", "Δx₀ in µm", curves[:1]),
+                  Panel("x", "time in min", "ΔA3 in 10⁻⁵ mm⁻⁶", curves)):  # fmt: skip
+        drawing = draw_panel(panel)
+        canvas = FigureCanvasAgg(drawing)
+        canvas.draw()
+        (axis,) = drawing.axes
+        label = axis.yaxis.label.get_window_extent(canvas.get_renderer())
+        low, high = axis.get_ylim()
+        ticks = zip(axis.get_yticks(), axis.get_yticklabels(), strict=True)
+        numbers = [t.get_window_extent() for y, t in ticks if low <= y <= high]
+        assert label.x0 >= 1.0
+        assert label.x1 <= min(n.x0 for n in numbers) + 1.0
+        legend = axis.get_legend()
+        if legend is not None:
+            assert legend.get_window_extent().y0 >= axis.get_window_extent().y1 - 1.0

@@ -11,7 +11,8 @@ _ROOT = Path("/sys/fs/cgroup")
 class Cgroup:
     """A group of processes with a limit of memory, and groups within it with weights of the CPU.
 
-    Raises OSError where none can be made: that needs root, and the controllers.
+    Together they come before whatever else the machine does. Raises OSError where none can be made:
+    that needs root, and the controllers.
     """
 
     def __init__(self, name: str, memory_mb: int) -> None:
@@ -21,14 +22,18 @@ class Cgroup:
             own.update(dict.fromkeys(controllers.split(","), path.lstrip("/")))
         self.version = 1 if "memory" in own else 2
         self._made: list[Path] = []
+        self._visitors = 0
         try:
             if self.version == 1:
                 self._memory = self._make(_ROOT / "memory" / own["memory"] / name)
-                self._cpu = self._make(_ROOT / "cpu" / own["cpu"] / name)
+                self._home = _ROOT / "cpu" / own["cpu"]
+                self._cpu = self._make(self._home / name)
+                (self._cpu / "cpu.shares").write_text("262144")
                 limit = self._memory / "memory.limit_in_bytes"
             else:
                 self._memory = self._cpu = self._make(_ROOT / own[""] / name)
                 (self._memory / "cgroup.subtree_control").write_text("+memory +cpu")
+                (self._cpu / "cpu.weight").write_text("10000")
                 limit = self._memory / "memory.max"
             limit.write_text(str(memory_mb * 1024 * 1024))
         except BaseException:
@@ -50,6 +55,13 @@ class Cgroup:
             (folder / "cpu.weight").write_text(str(cpu_weight))
         (folder / "cgroup.procs").write_text(str(pid))
 
+    def add_visitors(self, pid: int) -> None:
+        """Put a process beside the others that does not count for their memory (version 1)."""
+        if self.version == 1:
+            folder = self._make(self._cpu / "visitors")
+            (folder / "cgroup.procs").write_text(str(pid))
+            self._visitors = pid
+
     def peak_mb(self) -> float:
         """The most memory that it had at once, files read and written included."""
         name = "memory.max_usage_in_bytes" if self.version == 1 else "memory.peak"
@@ -62,7 +74,9 @@ class Cgroup:
         return sum(int(line.split()[1]) for line in lines if line.startswith("oom_kill "))
 
     def remove(self) -> None:
-        """Remove all groups; their processes have ended."""
+        """Remove all groups; their processes have ended, visitors go back."""
+        if self._visitors:
+            (self._home / "cgroup.procs").write_text(str(self._visitors))
         while self._made:
             with contextlib.suppress(OSError):
                 self._made.pop().rmdir()

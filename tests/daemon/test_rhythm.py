@@ -1,7 +1,6 @@
 """The daemon's rhythm while the page is attacked, both in 400 MB, as the units would have them.
 
-Blocks without and with the attack take turns, so that whatever else the machine does falls into
-both.
+Blocks without and with the attack take turns, and both come before whatever else the machine does.
 """
 
 from __future__ import annotations
@@ -134,6 +133,7 @@ def processes(daemon, recording, replayed, group):
         log.close()
         started.append(process)
         group.add(process.pid, name, weight)
+    group.add_visitors(os.getpid())
     yield *started, port
     for process in started:
         process.kill()

@@ -4,9 +4,9 @@
     python -m benchmarks.fleet workers                     # reprocess on Dask: 1 and 2 workers
     python -m benchmarks.fleet forward                     # rows a second, bytes an epoch
 
-`server` needs PostgreSQL (a cluster of its own is made, and removed) and about 0.7 kB of disk an
-epoch: the rows are generated without covariances and observations, which no figure here reads, but
-of one camera, whose year is copied from a store. Measure on a quiet machine.
+`server` needs PostgreSQL (a cluster of its own is made, and removed) and about 0.6 kB of disk an
+epoch: the rows are generated without covariances and observations, which the overview and columns
+do not read; the year that is studied, an epoch an hour, has them. Measure on a quiet machine.
 """
 
 from __future__ import annotations
@@ -29,20 +29,22 @@ import psycopg
 
 from benchmarks.generated_fleet import GeneratedCamera, add_camera
 from tests.fleet.conftest import new_cluster
-from thermocald.analysis.study.input import load_series
+from thermocald.acquisition.calibrator import Calibrator
 from thermocald.epoch import Epoch
 from thermocald.fleet.document import fleet_document
 from thermocald.fleet.forward import Forwarder
 from thermocald.fleet.reprocess import find_blocks, run_blocks
-from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE
+from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
 from thermocald.simulation.presets import preset_simulation
 from thermocald.store.database.row import EpochResult
 from thermocald.store.database.store import Store
+from thermocald.store.recording.reader import open_recording
 from thermocald.store.server.address import ServerAddress
 from thermocald.store.server.reader import ServerStore
 from thermocald.store.server.schema import create_tables
 
 CAMERAS = 50
+STUDIED = 8760  # epochs of the year that is studied: one an hour
 YEAR_S = 365 * 86400.0
 NAMES = ["epoch", "frame_time", "c", "x0", "y0", "sd_c", "sigma0", "temperature"]
 
@@ -81,19 +83,26 @@ def server(full: bool) -> dict[str, float]:
         whole = Path(cluster.address(name="thermocald"))
         found["overview_s"], document = timed(lambda: fleet_document([whole]))
         found["sound"] = document["summary"]["sound"]
-        one = Path(f"{whole}?station=gauge07")
-        path = Path(folder) / "year.db"
+        print(json.dumps(found), file=sys.stderr)
+        one, path = Path(f"{whole}?station=gauge07"), Path(folder) / "columns.db"
         _copy_to_store(one, path)
-        for name, source in (("server", one), ("store", path)):
-            with ServerStore.open(source) if name == "server" else Store.open(source) as opened:
+        for name, opened in (("server", ServerStore.open(one)), ("store", Store.open(path))):
+            with opened:
                 series = opened.find_series()
-                seconds = min(timed(lambda: opened.series_columns(series, NAMES))[0]  # noqa: B023
-                              for _ in range(3))  # fmt: skip
-                found[f"columns_from_{name}_s"] = seconds
-            if epochs <= 200_000:
-                found[f"study_input_from_{name}_s"] = timed(
-                    lambda: load_series(source, exterior="stored")  # noqa: B023
-                )[0]
+                found[f"columns_from_{name}_s"] = min(
+                    timed(lambda: opened.series_columns(series, NAMES))[0]  # noqa: B023
+                    for _ in range(3)
+                )
+        path = Path(folder) / "year.db"
+        _write_year(path)
+        Forwarder(path, address, "studied").send_waiting()
+        for name, source in (("server", f"{whole}?station=studied"), ("store", path)):
+            command = [sys.executable, "-m", "thermocald", "study", source, "--sets", "1000"]
+            done = [str(part) for part in (*command, "--json", Path(folder) / f"{name}.json")]
+            found[f"study_from_{name}_s"], _ = timed(
+                lambda: subprocess.run(done, check=True, stdout=subprocess.DEVNULL)  # noqa: B023
+            )
+    found["study_ratio"] = found["study_from_server_s"] / found["study_from_store_s"]
     return found
 
 
@@ -104,6 +113,25 @@ def _copy_to_store(address: Path, path: Path) -> None:
         series = store.create_series(found.head, found.testfield, identity={}, created_utc=1.0)
         for stored in there.epochs(found, details=False):
             store.append(series, stored.epoch, stored.result)
+
+
+def _write_year(path: Path) -> None:
+    """A year of one camera with all details: 150 simulated epochs, calibrated, again and again."""
+    simulation = preset_simulation("rpi-v2.1-heating", 1)
+    with tempfile.TemporaryDirectory() as name:
+        simulation.write(Path(name) / "M1")
+        recording = open_recording(Path(name) / "M1")
+        calibrator = Calibrator.of_recording(recording, AdjustmentSettings())
+        done = [calibrator.calibrate(epoch) for epoch in recording.iter_epochs()]
+    interval = YEAR_S / STUDIED
+    head = replace(simulation.head, interval=interval)
+    with Store.open(path, "append", durable=False) as store:
+        series = store.create_series(head, simulation.field, created_utc=1.0)
+        for number in range(1, STUDIED + 1):
+            one = done[number % len(done)]
+            at = time.time() - YEAR_S + number * interval
+            epoch = replace(one.epoch, number=number, frame_time=at, temperature_time=at + 0.5)
+            store.append(series, epoch, EpochResult.from_adjustment(one.adjustment))
 
 
 def workers() -> dict[str, float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import re
+import sqlite3
 import threading
 from pathlib import Path
 
@@ -181,6 +182,28 @@ def test_a_server_that_dies_and_comes_back_gets_everything_once(filled, server, 
     assert [bool(t) for t in troubles[:4]] == [False, True, True, False]
     assert "cannot be reached" in troubles[1]
     assert sum(sent) == count(server, "epoch") == 20 + 5 * 3
+
+
+def test_a_damaged_row_is_not_sent_and_stops_no_other(filled, server):
+    """Bits that flipped on an SD card must not become a value at the server."""
+    store, _ = filled
+    store.add_readings([LoggedReading("air", 1.6e9 + i, {"t": 20.0}) for i in range(3)])
+    other = sqlite3.connect(store.path)
+    for (name,) in other.execute(
+        "SELECT name FROM sqlite_master WHERE type = 'trigger'"
+    ).fetchall():
+        other.execute(f'DROP TRIGGER "{name}"')
+    other.execute("UPDATE epoch SET c = c + 1e-3 WHERE number = 5")
+    other.execute("UPDATE detail SET data = zeroblob(length(data)) WHERE id / 1024 = 9")
+    other.execute("UPDATE reading SET utc = utc + 1 WHERE id = 2")
+    other.commit()
+    other.close()
+    done = Forwarder(store.path, address(server), "bank").send_waiting()
+    assert (done.sent["epoch"], done.sent["reading"], done.refused) == (18, 2, 3)
+    with psycopg.connect(server.address(name="thermocald")) as connection:
+        numbers = connection.execute("SELECT number FROM epoch ORDER BY 1").fetchall()
+        assert [n for (n,) in numbers] == [n for n in range(1, 21) if n not in (5, 9)]
+        assert connection.execute("SELECT refused FROM station").fetchone() == (3,)
 
 
 def test_a_second_store_of_a_station_adds_what_it_says(server, tmp_path, head, field, make_epoch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import time
@@ -93,9 +94,11 @@ def cluster(tmp_path):
 
     def start(program, *options):
         command = [sys.executable, "-m", f"distributed.cli.{program}", "--scheduler-file", known]
+        # as Dask's own nanny starts workers: sums do not depend on the number of cores
         return subprocess.Popen(
-            [*map(str, command), *options], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
+            [*map(str, command), *options], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+        )  # fmt: skip
 
     with ExitStack() as stack:
         scheduler = start("dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard")
@@ -135,10 +138,11 @@ def test_workers_that_are_killed_again_and_again_finish_with_equal_results(
 ):
     """One after every few blocks, and another takes its place, as on machines that are lent."""
     address, workers, start_worker = cluster
+    archive = archive / "M1"
     single = [tmp_path / "one", tmp_path / "many"]
     run_blocks(blocks_of(archive, single[0], 10))
     command = [sys.executable, "-m", "thermocald", "reprocess", archive, "--out"]
-    whole = [*command, tmp_path / "cluster", "--engine", address, "--do", "study", "--sets", "2000"]
+    whole = [*command, tmp_path / "cluster", "--engine", address, "--do", "study", "--sets", "500"]
     client = subprocess.Popen(
         [sys.executable, "-c", RUN_BLOCKS, archive, single[1], address],
         stdout=subprocess.PIPE, text=True,
@@ -148,7 +152,7 @@ def test_workers_that_are_killed_again_and_again_finish_with_equal_results(
     while client.poll() is None:
         assert time.monotonic() < deadline
         time.sleep(0.1)
-        if (now := len(files(single[1]))) < done + 6:
+        if (now := len(files(single[1]))) < done + 4:
             continue
         done = now
         workers[killed % 2].kill()
@@ -161,12 +165,12 @@ def test_workers_that_are_killed_again_and_again_finish_with_equal_results(
     assert killed >= 2
     # Monte-Carlo over the fleet, on the same cluster and here
     subprocess.run(whole, check=True, capture_output=True, timeout=200)
-    local = [*command, tmp_path / "local", "--do", "study", "--sets", "2000"]
+    local = [*command, tmp_path / "local", "--do", "study", "--sets", "500"]
     subprocess.run(local, check=True, capture_output=True, timeout=200)
     assert {p.name: p.read_bytes() for p in (tmp_path / "cluster").iterdir()} == {
         p.name: p.read_bytes() for p in (tmp_path / "local").iterdir()
     }
-    assert len([*(tmp_path / "local").iterdir()]) == 2
+    assert len([*(tmp_path / "local").iterdir()]) == 1
 
 
 def test_series_are_analysed_one_by_one_and_done_ones_are_left(archive, tmp_path):

@@ -118,7 +118,7 @@ class Forwarder:
                     break
                 if any(r.get("series_id") not in {None, *series} for r in rows):
                     series = {one.id: one for one in store.all_series()}
-                bad = self._send(writer, table, rows, series)
+                bad = self._send_sound(writer, table, rows, series)
                 cursor.sent[table] = rows[-1]["id"]
                 if bad:
                     cursor.refused.setdefault(table, []).extend(bad)
@@ -129,6 +129,22 @@ class Forwarder:
             count["frame"] = self._frames.send(store, writer, series, cursor, keep, stop)
         if self._waiting:
             self._report(store, writer, cursor)
+
+    def _send_sound(
+        self,
+        writer: ServerWriter,
+        table: str,
+        rows: list[dict[str, Any]],
+        series: Mapping[int, StoredSeries],
+    ) -> list[int]:
+        """Send what is as it was written; the ids of rows that are damaged or refused."""
+        damaged = []
+        for row in rows:
+            if why := row.pop("damage"):
+                log.error("%s; it is not sent", why)
+                damaged.append(int(row["id"]))
+        sound = [row for row in rows if row["id"] not in damaged]
+        return [*damaged, *(self._send(writer, table, sound, series) if sound else [])]
 
     @property
     def _report_is_due(self) -> bool:

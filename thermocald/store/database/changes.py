@@ -10,7 +10,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from thermocald.errors import StoreError
-from thermocald.store.database.epoch_table import select_details
+from thermocald.store.database.checksum import require_checksum
+from thermocald.store.database.epoch_columns import require_sound
+from thermocald.store.database.epoch_table import check_details, select_details
 from thermocald.store.database.row import NOT_CALIBRATED
 from thermocald.store.recording.paths import relative_path
 
@@ -25,6 +27,11 @@ KEPT = ("epoch", "event", "reading")
 """The tables that grow while a daemon runs."""
 
 _CHECKSUMS = ("checksum", "detail_checksum")
+# what the checksum of a row is of, in its order: numbers and texts
+_CHECKED = {
+    "event": (("utc", "series_id", "epoch"), ("kind", "text", "data")),
+    "reading": (("utc", "clock_trusted"), ("thermometer", "temperatures")),
+}
 
 
 def rows_after(
@@ -32,7 +39,8 @@ def rows_after(
 ) -> Iterator[dict[str, Any]]:
     """Up to `limit` rows of one of KEPT with an id above `after`, as {column: value}.
 
-    An epoch also has `covariance` and `observations`, bytes as `blob` packs them, or None.
+    An epoch also has `covariance` and `observations`, bytes as `blob` packs them, or None. Every
+    row has `damage`: empty, or in a sentence how it is not as it was written.
     """
     if table not in KEPT:
         raise ValueError(f"{table!r} is not one of {', '.join(KEPT)}")
@@ -42,12 +50,31 @@ def rows_after(
     names = [column[0] for column in cursor.description]
     for values in cursor:
         row = dict(zip(names, values, strict=True))
+        row["damage"] = _damage(connection, table, row)
         for name in _CHECKSUMS:  # of this file's rows, as SQLite gives them back
             row.pop(name, None)
         if table == "epoch":
             covariance, observations = select_details(connection, row["id"])
             row |= {"covariance": covariance or None, "observations": observations or None}
         yield row
+
+
+def _damage(connection: sqlite3.Connection, table: str, row: dict[str, Any]) -> str:
+    try:
+        if table == "epoch":
+            require_sound(row)
+            check_details(connection, row)
+        else:
+            numbers, texts = _CHECKED[table]
+            require_checksum(
+                row["checksum"],
+                f"{table} {row['id']}",
+                [row[name] for name in numbers],
+                [row[name] for name in texts],
+            )
+    except StoreError as error:
+        return str(error)
+    return ""
 
 
 @dataclass(frozen=True, slots=True)

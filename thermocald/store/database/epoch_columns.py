@@ -29,6 +29,7 @@ __all__ = [
     "insert_row",
     "late_columns",
     "latest_columns",
+    "require_sound",
     "rows_of",
     "sql_name",
     "status_codes",
@@ -99,6 +100,13 @@ def all_rows(connection: sqlite3.Connection) -> Iterator[dict[str, Any] | Damage
         except DamageError:
             series, number = row[_NUMBERS.index("series_id")], row[_NUMBERS.index("number")]
             yield DamageError(f"{names.get(series, f'series {series}')}, epoch {number}")
+
+
+def require_sound(row: Mapping[str, Any]) -> None:
+    """StoreError where a row, by the names of the table's columns, is not as it was written."""
+    numbers = [row[sql_name(name)] for name in _NUMBERS]
+    texts = [row[sql_name(name)] for name in _TEXTS]
+    require_checksum(row["checksum"], f"epoch {row['number']}", numbers, texts)
 
 
 def latest_columns(

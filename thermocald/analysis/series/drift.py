@@ -16,6 +16,7 @@ import numpy as np
 from thermocald.analysis.statistics.autocorrelation import slope_noise
 from thermocald.analysis.statistics.dependence import holm, pearson_p_value
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
+from thermocald.photogrammetry.series.spool import released
 from thermocald.photogrammetry.series.target_noise import slow_errors
 
 if TYPE_CHECKING:
@@ -30,6 +31,7 @@ __all__ = ["Course", "courses", "settled"]
 _LEVEL = 0.01
 _FEWEST = 10
 _LEAST_WARMING_K = 0.5  # below, the thermometer's own noise is all there is
+_MOST_VALUES = 100_000  # of a line: neighbours beyond that are averaged
 _SUSPECTS = 5  # groups that are left out in turn
 _SHRUNK = 0.5  # of its change must go with a group that a parameter's drift rests on
 
@@ -78,6 +80,22 @@ class _Line:
     p: float
 
 
+def _column(values: Array, ok: NDArray[np.bool_], column: int) -> Array:
+    """One parameter of the epochs with a result; the others of a long series leave memory."""
+    out: Array = values[ok, column]
+    released(values)
+    return out
+
+
+def _thinned(*columns: Array) -> list[Array]:
+    """Means of neighbours where there are more values than a line needs; the rest left out."""
+    n = len(columns[0])
+    size = -(-n // _MOST_VALUES)
+    if size == 1:
+        return list(columns)
+    return [c[: n // size * size].reshape(-1, size).mean(axis=1) for c in columns]
+
+
 def _lines(table: SeriesTable, names: tuple[str, ...]) -> dict[str, _Line]:
     """Lines through the parameters that were estimated, p corrected for their number (Holm)."""
     found = []
@@ -85,7 +103,7 @@ def _lines(table: SeriesTable, names: tuple[str, ...]) -> dict[str, _Line]:
     t = table.frame_time[ok]
     for name in names:
         column = IOP_NAMES.index(name)
-        y, sd = table.values[ok, column], table.sd[ok, column]
+        y, sd = _column(table.values, ok, column), _column(table.sd, ok, column)
         if len(y) < _FEWEST or not np.isfinite(sd).all() or np.ptp(t) == 0:
             continue
         found.append(_Line(name, y, sd, *_line(t, y, float(table.trend_sd[column]))))
@@ -128,12 +146,13 @@ def _with_temperature(temperature: Array, columns: list[Array]) -> list[tuple[fl
     unknown = [(float("nan"), float("nan"))] * len(columns)
     if have.sum() < _FEWEST or np.ptp(temperature[have]) < _LEAST_WARMING_K:
         return unknown
-    t = temperature[have] - temperature[have].mean()
     slopes, ps = [], []
-    for y in columns:
-        slopes.append(float(y[have] @ t / (t @ t)))
-        n = slope_noise(y[have], t, slopes[-1]).n_effective
-        ps.append(pearson_p_value(float(np.corrcoef(y[have], t)[0, 1]), n))
+    for column in columns:
+        t, y = _thinned(temperature[have], column[have])
+        t = t - t.mean()
+        slopes.append(float(y @ t / (t @ t)))
+        n = slope_noise(y, t, slopes[-1]).n_effective
+        ps.append(pearson_p_value(float(np.corrcoef(y, t)[0, 1]), n))
     return list(zip(slopes, holm(ps), strict=True)) if columns else []
 
 
@@ -185,11 +204,12 @@ def _line(t: Array, y: Array, tilt_sd: float) -> tuple[float, float, float]:
     """
     from scipy.stats import t as student
 
+    span = float(np.ptp(t))
+    t, y = _thinned(t, y)
     x = t - t.mean()
     slope = float(x @ y / (x @ x))
     noise = slope_noise(y, x, slope)
     freedom = max(noise.n_effective - 2.0, 1.0)
-    span = float(np.ptp(t))
     residual = y - y.mean() - slope * x
     own = float(np.sqrt(np.mean(residual**2) / freedom)) / float(x.std()) * span
     p = 2 * student.sf(abs(slope) * span / float(np.hypot(own, tilt_sd)), freedom)

@@ -68,7 +68,8 @@ class ParquetTable:
         pyarrow = _pyarrow()
         first = 0
         try:
-            with pyarrow.parquet.ParquetFile(self.path, memory_map=True) as file:
+            # not mapped: what was read of a long file would stay resident
+            with pyarrow.parquet.ParquetFile(self.path) as file:
                 groups = range(file.num_row_groups)
                 if epochs is not None:
                     groups, first = _holding(file.metadata, self.columns.index("epoch"), epochs)

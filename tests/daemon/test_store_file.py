@@ -9,6 +9,7 @@ import sqlite3
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from tests.daemon.conftest import ENVIRONMENT
@@ -32,8 +33,6 @@ def path(tmp_path):
 
 @pytest.fixture
 def guard(path):
-    import numpy as np
-
     guard = StoreGuard(path, durable=False)
     head = Head("a", "M1", 10.0, CameraSpec("rpi", Sensor(640, 480, 0.001)), {"t": Channel()})
     field = TestField.build(["a"], np.zeros((1, 3)))
@@ -171,6 +170,21 @@ def test_the_file_is_followed_while_others_read(guard, path):
     done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr.count("Error")) == (0, "True\n", 0), done
     assert numbers(path) == list(range(1, 200))
+
+
+def test_a_deleted_store_behind_a_link_is_written_again_behind_it(tmp_path):
+    (tmp_path / "disk").mkdir()
+    link = tmp_path / "t.db"
+    link.symlink_to(tmp_path / "disk/real.db")
+    guard = StoreGuard(link, durable=False)
+    head = Head("a", "M1", 10.0, CameraSpec("rpi", Sensor(640, 480, 0.001)))
+    series = guard.store.create_series(head, TestField.build(["a"], np.zeros((1, 3))))
+    for name in (tmp_path / "disk").iterdir():
+        name.unlink()
+    guard.append(Row(series, Epoch(1, 1e9, 1e9), None, {}, True))
+    guard.close()
+    assert link.is_symlink()
+    assert numbers(tmp_path / "disk/real.db") == [1]
 
 
 def test_a_store_that_was_moved_away_stays_whole_and_a_new_one_is_begun(guard, path):

@@ -116,7 +116,7 @@ class FollowedStore:
         carried = there or (file.deleted and not other)
         self.close()
         if carried and copy is not None:
-            os.replace(copy, self.path)
+            os.replace(copy, self.path.resolve())  # a link stays one
         self._open()
         self._note("store_followed", text)
         return carried
@@ -132,8 +132,9 @@ class FollowedStore:
     def _rescued(self) -> Path:
         """A copy of all that the open store holds, beside where it was."""
         stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
-        copy = self.path.with_name(f"{self.path.stem}-rescued-{stamp}.db")
-        self.path.parent.mkdir(parents=True, exist_ok=True)
+        target = self.path.resolve()
+        copy = target.with_name(f"{target.stem}-rescued-{stamp}.db")
+        target.parent.mkdir(parents=True, exist_ok=True)
         self.store.copy_to(copy)
         return copy
 

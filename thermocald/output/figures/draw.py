@@ -110,7 +110,7 @@ def draw_panel(panel: Panel, *, legend: bool = True) -> Any:
         drawing.subplots_adjust(right=0.95, bottom=0.19, top=0.89 - 0.055 * rows)
         # how many ticks there are, and with how many digits, depends on the height
         longest = max((len(text) for text in _tick_labels(axis)), default=0)
-        drawing.subplots_adjust(left=min(0.34, 0.145 + 0.0165 * longest))
+        drawing.subplots_adjust(left=min(0.36, 0.155 + 0.0185 * longest))
         return drawing
 
 

@@ -147,6 +147,14 @@ def test_a_chessboard_that_looks_the_same_upside_down_is_refused():
 KALIBR = "target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 6\ntagSize: 0.04\ntagSpacing: 0.3\n"
 OPENCV = """{"type": "charuco", "squaresX": 11, "squaresY": 8, "squareLength": 0.03,
 "markerLength": 0.0225, "dictionary": "5X5_250"}"""
+UNDERSCORES = """{num_squares_x: 11, num_squares_y: 8, square_size_mm: 30, marker_size_mm: 22.5,
+aruco_dict: DICT_5X5_250}"""
+CAPITALS = """BOARD_ROWS: 8
+BOARD_COLS: 11
+SQUARE_SIZE: 0.03
+MARKER_SIZE: 0.0225
+DICT_NAME: DICT_5X5_250
+"""
 CHECKER = """target_type: checkerboard
 targetCols: 9
 targetRows: 6
@@ -171,6 +179,45 @@ def test_files_that_describe_boards(tmp_path, text, expected):
     assert field.codes == expected.codes
     assert field.points == pytest.approx(expected.points)
     assert " × " in said
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (UNDERSCORES, boards.charuco(11, 8, 30.0, 22.5, "DICT_5X5_250")),
+        (CAPITALS, boards.charuco(11, 8, 30.0, 22.5, "DICT_5X5_250")),
+        ('{"type": "checkerboard", "squaresX": 10, "squaresY": 7, "squareLength": 25}',
+         boards.chessboard(9, 6, 25.0)),
+        ("type: chessboard\ncols: 9\nrows: 6\nsquare_size: 0.025\n", boards.chessboard(9, 6, 25.0)),
+    ],
+)  # fmt: skip
+def test_keys_of_other_programs(tmp_path, text, expected):
+    """With or without underscores and units; squares of a chessboard are one more than corners."""
+    (tmp_path / "board.yaml").write_text(text)
+    field, _ = read_board(tmp_path / "board.yaml")
+    assert field.codes == expected.codes
+    assert field.points == pytest.approx(expected.points)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("calib.io_charuco_420x297_8x11_34_25_DICT_5X5.pdf",
+         boards.charuco(11, 8, 34.0, 25.0, "DICT_5X5_1000")),
+        ("calib.io_checker_200x150_8x11_15.pdf", boards.chessboard(10, 7, 15.0)),
+        ("calib.io_checker_A4_7x8_18.5.png", boards.chessboard(7, 6, 18.5)),
+    ],
+)  # fmt: skip
+def test_boards_of_calib_io_by_the_name_of_their_file(tmp_path, name, expected):
+    field, said = read_board(tmp_path / name)
+    assert "calib.io" in said
+    assert field.codes == expected.codes
+    assert field.points == pytest.approx(expected.points)
+
+
+def test_a_name_that_does_not_state_the_markers_says_what_to_give(tmp_path):
+    with pytest.raises(TestFieldError, match="--charuco 11x8 --square 24 with --marker"):
+        read_board(tmp_path / "calib.io_charuco_279x215_8x11_24_DICT_4X4.pdf")
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,8 @@ def import_(
     source: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[FILE]", help="Kalibr's target.yaml, OpenCV's board parameters, or a list."
+            metavar="[FILE]",
+            help="Kalibr's target.yaml, OpenCV's parameters, a file of calib.io's, or a list.",
         ),
     ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="The testfield.csv to write.")] = Path(

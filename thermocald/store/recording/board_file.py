@@ -23,12 +23,23 @@ __all__ = ["read_board", "read_rings"]
 _MOST_LINES = 20_000
 _LARGEST_BYTES = 5_000_000
 _SYNONYMS = {
-    "columns": ("squaresx", "squares_x", "cols", "columns", "width", "targetcols", "tagcols"),
-    "rows": ("squaresy", "squares_y", "rows", "height", "targetrows", "tagrows"),
-    "square": ("squarelength", "square_length", "square_size", "squaresize", "square"),
-    "marker": ("markerlength", "marker_length", "marker_size", "markersize", "marker"),
-    "dictionary": ("dictionary", "dict", "aruco_dict", "dictionary_name"),
-}
+    "columns": ("squaresx", "numsquaresx", "cols", "columns", "boardcols", "numcols", "ncols",
+                "width", "boardwidth", "targetcols", "tagcols"),
+    "rows": ("squaresy", "numsquaresy", "rows", "boardrows", "numrows", "nrows", "height",
+             "boardheight", "targetrows", "tagrows"),
+    "square": ("squarelength", "squaresize", "squareside", "square", "checkersize", "checkerwidth",
+               "cellsize"),
+    "marker": ("markerlength", "markersize", "markerside", "marker"),
+    "dictionary": ("dictionary", "dict", "arucodict", "arucodictionary", "dictname",
+                   "dictionaryname"),
+}  # fmt: skip
+"""Keys without case, underscores and the unit that they may end with."""
+_CALIB_IO = re.compile(
+    r"calib\.io_(checker|charuco)_[^_]+_(\d{1,3})x(\d{1,3})_([\d.]+?)"
+    r"(?:_([\d.]+))?(?:_(DICT_\w+?))?(?:\.\w+)?",
+    re.IGNORECASE,
+)
+"""A file of calib.io's generator: kind, page, rows x columns of squares, square, marker mm."""
 
 
 def read_board(path: Path, sigma: float | None = None) -> tuple[TestField, str]:
@@ -36,17 +47,23 @@ def read_board(path: Path, sigma: float | None = None) -> tuple[TestField, str]:
 
     Kalibr: target_type aprilgrid or checkerboard, lengths in metres. Others: type charuco or
     chessboard with OpenCV's names for the parameters; lengths below 1 are metres, else mm.
-    Raises TestFieldError naming the file and the key.
+    A file of calib.io's generator states its board by its name (`calib.io_charuco_420x297_8x11_34_
+    25_DICT_5X5.pdf`: 8 rows of 11 squares of 34 mm). Raises TestFieldError naming file and key.
     """
-    document = {str(k).lower(): v for k, v in read_yaml(path, TestFieldError).items()}
-    kind = str(document.get("target_type", document.get("type", ""))).lower()
+    named = _CALIB_IO.fullmatch(path.name)
+    if named is not None:
+        return _of_calib_io(path, named, sigma)
+    document = {_key(k): v for k, v in read_yaml(path, TestFieldError).items()}
+    kind = str(document.get("targettype", document.get("type", ""))).lower()
+    if not kind and any(k in document for k in _SYNONYMS["dictionary"]):
+        kind = "charuco"
     if kind in ("aprilgrid", "april_grid"):
         columns, rows = _count(path, document, "tagcols"), _count(path, document, "tagrows")
         size, spacing = (
             1e3 * _number(path, document, "tagsize"),
             _number(path, document, "tagspacing"),
         )
-        first = int(document.get("startid", document.get("low_id", 0)) or 0)
+        first = int(document.get("startid", document.get("lowid", 0)) or 0)
         field = boards.aprilgrid(columns, rows, size, spacing, first=first, sigma=sigma)
         said = (
             f"Kalibr's AprilGrid of {columns} × {rows} tags of {size:g} mm, {spacing * size:g} mm"
@@ -62,11 +79,13 @@ def read_board(path: Path, sigma: float | None = None) -> tuple[TestField, str]:
         columns, rows = (_count(path, document, *_SYNONYMS[k]) for k in ("columns", "rows"))
         square = _length(path, document, "square")
         if "charuco" not in kind:
+            if {"squaresx", "numsquaresx"} & set(document):  # of them there is one more than of corners
+                columns, rows = columns - 1, rows - 1
             field = boards.chessboard(columns, rows, square, sigma=sigma)
             return field, f"a chessboard of {columns} × {rows} inner corners, {square:g} mm"
         marker = _length(path, document, "marker")
         name = _dictionary(path, _value(path, document, *_SYNONYMS["dictionary"]))
-        legacy = bool(document.get("legacy", document.get("legacy_pattern", False)))
+        legacy = bool(document.get("legacy", document.get("legacypattern", False)))
         field = boards.charuco(columns, rows, square, marker, name, legacy=legacy, sigma=sigma)
         return field, (
             f"a ChArUco board of {columns} × {rows} squares of {square:g} mm, markers of "
@@ -75,6 +94,39 @@ def read_board(path: Path, sigma: float | None = None) -> tuple[TestField, str]:
     raise TestFieldError(
         f"{path}, key target_type: {kind or 'is missing'}; aprilgrid, checkerboard, charuco and "
         "chessboard are read"
+    )
+
+
+def _key(name: object) -> str:
+    """`Square_Length_mm` → `squarelength`: how a key is compared."""
+    return re.sub(r"[^a-z0-9]", "", str(name).lower().removesuffix("_mm"))
+
+
+def _of_calib_io(
+    path: Path, named: re.Match[str], sigma: float | None
+) -> tuple[TestField, str]:
+    """The board that a file's name states."""
+    kind, rows, columns = named[1].lower(), int(named[2]), int(named[3])
+    square = float(named[4])
+    if kind == "checker":
+        field = boards.chessboard(columns - 1, rows - 1, square, sigma=sigma)
+        return field, (
+            f"calib.io's checkerboard of {columns - 1} × {rows - 1} inner corners, {square:g} mm"
+        )
+    if named[5] is None or named[6] is None:
+        raise TestFieldError(
+            f"{path}: the name does not state the markers: give --charuco {columns}x{rows} "
+            f"--square {square:g} with --marker and --dictionary"
+        )
+    # the smaller dictionaries of a size are the beginning of the largest
+    name = named[6].upper()
+    name = name if name.count("_") > 1 else f"{name}_1000"
+    field = boards.charuco(
+        columns, rows, square, float(named[5]), _dictionary(path, name), sigma=sigma
+    )
+    return field, (
+        f"calib.io's ChArUco board of {columns} × {rows} squares of {square:g} mm, markers of "
+        f"{float(named[5]):g} mm of {name}"
     )
 
 

@@ -79,7 +79,7 @@ def read_board(path: Path, sigma: float | None = None) -> tuple[TestField, str]:
         columns, rows = (_count(path, document, *_SYNONYMS[k]) for k in ("columns", "rows"))
         square = _length(path, document, "square")
         if "charuco" not in kind:
-            if {"squaresx", "numsquaresx"} & set(document):  # of them there is one more than of corners
+            if {"squaresx", "numsquaresx"} & set(document):  # one more than corners
                 columns, rows = columns - 1, rows - 1
             field = boards.chessboard(columns, rows, square, sigma=sigma)
             return field, f"a chessboard of {columns} × {rows} inner corners, {square:g} mm"

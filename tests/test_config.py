@@ -123,6 +123,7 @@ BAD = [
     (document(logging={"level": "loud"}), "logging.level: is 'loud'"),
     (document(cameras="none"), "cameras: is 'none'"),
     (document(cameras=[{"name": "a", "driver": "m"}] * 2), "cameras: the name 'a' is duplicated"),
+    (document(cameras=[{"name": "status", "driver": "m"}]), "choose another name"),
 ]
 
 

@@ -322,6 +322,8 @@ class Config(_Section):
                     raise _wrong(f"{kind}: the name {name!r} is duplicated")
         there = [thermometer.name for thermometer in self.thermometers]
         for camera in self.cameras:
+            if camera.name == "status":
+                raise _wrong("camera 'status': choose another name; the live folder has a status")
             for name in camera.thermometers:
                 if name not in there:
                     raise _wrong(

@@ -7,6 +7,7 @@ memory (RUNTIME_DIRECTORY), otherwise next to the store.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import math
@@ -85,6 +86,8 @@ class LiveState:
             os.replace(partial, self.folder / name)
             self._failed = False
         except OSError as error:
+            with contextlib.suppress(OSError):
+                partial.unlink(missing_ok=True)
             if not self._failed:
                 log.warning("%s: the status cannot be written: %s", self.folder, error)
             self._failed = True

@@ -179,3 +179,14 @@ def test_times_with_a_zone_keep_it_unless_the_zone_is_forced():
     assert DeviceClock(time_zone("UTC")).utc([moment], str) == JUNE
     assert DeviceClock(time_zone("UTC"), forced=True).utc([moment], str) == JUNE + 7200
     assert DeviceClock().utc([moment + timedelta(seconds=1)], str) == JUNE + 1
+
+
+def test_a_zone_in_the_header_is_not_overruled_by_that_of_times_without_one(tmp_path):
+    """Loggers stay on standard time in summer, and say so; the photographs' zone is not theirs."""
+    standard = HOBO.replace("GMT+02:00", "GMT+01:00")
+    log = logged(tmp_path, standard)
+    assert log.times.tolist() == [JUNE + 3600, JUNE + 3660]
+    assert any("the header says the time zone: GMT+01:00" in note for note in log.notes)
+    forced = logged(tmp_path, standard, clock=DeviceClock(time_zone("+02:00"), forced=True))
+    assert forced.times.tolist() == [JUNE, JUNE + 60]
+    assert any("was given instead" in note for note in forced.notes)

@@ -81,9 +81,12 @@ def read_log(path: Path, options: LogOptions | None = None) -> LoggedTemperature
     moments = _moments(table, time_names, options)
     clock = options.clock
     header = " ".join(time_names)
-    if clock.zone is None and (said := _HEADER_ZONE.search(header)):
-        clock = replace(clock, zone=time_zone(said[0]))
-        notes.append(f"log: the header says the time zone: {said[0]}")
+    if said := _HEADER_ZONE.search(header):
+        if clock.forced:
+            notes.append(f"log: the header says {said[0]}; the logger's own zone was given instead")
+        else:  # it is no time without a zone: what is said of such times is not meant for it
+            clock = replace(clock, zone=time_zone(said[0]))
+            notes.append(f"log: the header says the time zone: {said[0]}")
 
     def where(i: int) -> str:
         return f"{path}, line {table.lines[i]}"

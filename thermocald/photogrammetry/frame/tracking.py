@@ -88,6 +88,7 @@ class _State:
     seen: int
     circles: _Circles | None
     markers: MarkerCorners | None
+    boxes: NDArray[np.int64]  # what is looked at in the next frame
 
 
 class Tracker:
@@ -131,16 +132,17 @@ class Tracker:
         state = self._state
         if state is None or state.dtype != np.uint8:
             return None
-        parts = image.around(_boxes(state), state.shape)
+        parts = image.around(state.boxes, state.shape)
         return None if parts is None else self._track(parts, state, _MARGIN_PX)
 
     def _search(self, image: NDArray[Any], why: str) -> TrackedMeasurement:
         found = measure(image, self._testfield, self._prior, self._eccentricity)
         # A frame that shows nothing says nothing about where the targets are: keep what is known.
         if found.status.ok:
+            circles, markers = self._begin(image, found), found.markers or None
             self._state = _State(
-                image.shape, image.dtype, len(found.observations),
-                self._begin(image, found), found.markers if found.markers else None,
+                image.shape, image.dtype, len(found.observations), circles, markers,
+                _boxes(circles, markers),
             )  # fmt: skip
         return TrackedMeasurement(
             found.observations, found.status, found.missed, found.orientation, found.markers, why
@@ -191,20 +193,21 @@ class Tracker:
         both = join(corners, found)
         if len(both) < max(_FEWEST, (1 - _LOST_SHARE) * state.seen):
             return None
-        self._state = replace(state, seen=len(both), circles=circles, markers=markers)
+        boxes = _boxes(circles, markers) if renewed or markers is not None else state.boxes
+        self._state = replace(state, seen=len(both), circles=circles, markers=markers, boxes=boxes)
         return TrackedMeasurement(both, OK, missed, None, markers, "", renewed)
 
 
-def _boxes(state: _State) -> NDArray[np.int64]:
+def _boxes(circles: _Circles | None, markers: MarkerCorners | None) -> NDArray[np.int64]:
     """What is looked at in the next frame (n, 4) px: left, top, right and bottom (exclusive)."""
     centres, halves = [np.zeros((0, 2))], [np.zeros((0, 2))]
-    if (circles := state.circles) is not None:
+    if circles is not None:
         p = circles.weights.parameters
         centres.append(p[:, :2])
         halves.append(circles.maps.half_extent + window_reach(float(np.median(p[:, 5]))))
-    if state.markers is not None:
-        centres.append(state.markers.corners)
-        halves.append(np.full((len(state.markers), 2), CORNER_REACH_PX))
+    if markers is not None:
+        centres.append(markers.corners)
+        halves.append(np.full((len(markers), 2), CORNER_REACH_PX))
     centre, half = np.concatenate(centres), np.concatenate(halves) + _MARGIN_PX + 1.0
     low, high = np.floor(centre - half), np.ceil(centre + half) + 1.0
     return np.column_stack([low, high]).astype(np.int64)

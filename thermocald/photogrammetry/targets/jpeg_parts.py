@@ -135,13 +135,11 @@ def _upper_rows(data: bytes, layout: _Layout, bottom: int) -> Grey | None:
     if height > _WORTH_IT * layout.height:
         return None
     grey: Grey = scratch("parts", (layout.height, layout.width), np.uint8)
+    file = scratch("file", (len(data),), np.uint8)
+    file[:] = np.frombuffer(data, np.uint8)
+    file[layout.size_at : layout.size_at + 2] = divmod(height, 256)
     # What follows the last row is reported as superfluous, which is why warnings are no errors.
-    simplejpeg.decode_jpeg(
-        _headed(data, layout, layout.width, height) + data[layout.scan :],
-        colorspace="GRAY",
-        buffer=grey[:height],
-        strict=False,
-    )
+    simplejpeg.decode_jpeg(file.data, colorspace="GRAY", buffer=grey[:height], strict=False)
     return grey
 
 

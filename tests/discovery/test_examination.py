@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from thermocald.discovery.verdict.result import discover_series
+from thermocald.output.discovery.report import report_html
 
 KEYS = {
     "effect",
@@ -100,7 +101,8 @@ def test_a_play_shorter_than_an_interval_is_named(evidence_of):
 def test_document(evidence_of):
     evidence, truth = evidence_of("thermal_lag", seed=25)
     said: list[str] = []
-    document = discover_series(evidence, said.append).as_json("model.yaml")
+    found = discover_series(evidence, said.append)
+    document = found.as_json("model.yaml")
     # how far it is: each stage once, in the order of the work
     stages = ("targets that moved", "measuring noise", "base model", "effect 1")
     first = [next(i for i, line in enumerate(said) if line.startswith(s)) for s in stages]
@@ -116,6 +118,9 @@ def test_document(evidence_of):
     assert tau["unit"] == "s"
     for gap in (document["gap"]["fit"]["before"], document["gap"]["verify"]["after"]):
         assert set(gap) == {"rms_px", "chi2_reduced", "object_mm_at_10m"}
+    page = report_html(found, "M1")  # the name beside what noise alone reaches
+    assert "Could noise do this?" in page
+    assert page.count("<svg") == 6
 
 
 def test_a_drift_of_a_few_targets_is_not_the_camera(evidence_of):

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from thermocald.cli import application
-from thermocald.discovery.evidence.pair import load_pair
+from thermocald.discovery.evidence.pair import load_together
 from thermocald.fleet.forward import Forwarder
 from thermocald.simulation.presets import preset_simulation
 from thermocald.store.database.store import Store
@@ -54,7 +54,7 @@ def test_a_server_gives_what_the_file_gives(places):
 def test_discover_and_correct_read_a_server_too(places, tmp_path):
     file, server = places
     # what is discovered follows from these
-    (here,), (there,) = (load_pair(Path(place), None, lambda _: None) for place in places)
+    (here,), (there,) = (load_together(Path(place), (), lambda _: None) for place in places)
     assert "secret" not in there.name
     assert np.array_equal(here.frame_times, there.frame_times)
     assert np.array_equal(here.grid.points, there.grid.points, equal_nan=True)

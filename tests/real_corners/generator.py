@@ -194,7 +194,7 @@ def write(series: RealSeries, source: str, folder: Path) -> None:
     head = yaml.safe_load((SHARED / source / "recording.yaml").read_text())
     head |= {"name": f"{source}-{series.name}", "series": series.name, "interval": INTERVAL}
     head["temperatures"] = {name: {"unit": "degC"} for name in series.temperatures}
-    (folder / "recording.yaml").write_text(yaml.safe_dump(head))
+    (folder / "recording.yaml").write_text(yaml.safe_dump(head, sort_keys=False))
     (folder / "testfield.csv").write_text((SHARED / source / "testfield.csv").read_text())
     names, _, _ = corners(source)
     with (folder / "epochs.csv").open("w") as f:

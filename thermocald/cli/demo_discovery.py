@@ -20,7 +20,7 @@ _TAU_S = 75.0
 
 def discover_hidden_effect(out: Path, seed: int, quiet: bool) -> dict[str, Any]:
     """Simulate M1 and M2 with a hidden lag, discover it on M1, prove it on M2; the document."""
-    from thermocald.discovery.evidence.pair import load_pair
+    from thermocald.discovery.evidence.pair import load_together
     from thermocald.discovery.verdict.model import model_of
     from thermocald.discovery.verdict.result import discover_series
     from thermocald.reduction.reduce import reduce_together
@@ -40,7 +40,7 @@ def discover_hidden_effect(out: Path, seed: int, quiet: bool) -> dict[str, Any]:
         model = replace(simulation.model, effects=hidden)
         replace(simulation, model=model).write(folder / name)
     say("discovering: where do model and measurement disagree, and why?")
-    inputs = load_pair(folder / "M1", folder / "M2", say)
+    inputs = load_together(folder / "M1", [folder / "M2"], say)
     found = discover_series(reduce_together(inputs, None), say, ())
     path = folder / "camera.thermal.yaml"
     write_model(path, model_of(found, None))

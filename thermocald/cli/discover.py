@@ -28,8 +28,10 @@ def discover(
         typer.Argument(metavar="M1", help="What to explain: a recording, a store, postgresql://…"),
     ] = None,
     verify: Annotated[
-        Path | None,
-        typer.Option("--verify", help="M2: another recording of this camera, to prove it on."),
+        list[Path] | None,
+        typer.Option(
+            "--verify", help="M2: another recording of this camera, to prove it on; repeatable."
+        ),
     ] = None,
     model: Annotated[
         Path | None, typer.Option("--model", help="The model so far (YAML) [base model].")
@@ -76,7 +78,7 @@ def discover(
         return
     if recording is None:
         raise UsageError("M1 is missing: the folder of the recording to explain")
-    found = _examined(recording, verify, model)
+    found = _examined(recording, verify or [], model)
     written: str | None = None
     if model_out is not None:
         from thermocald.discovery.verdict.model import model_of
@@ -98,15 +100,15 @@ def discover(
             typer.echo(line)
 
 
-def _examined(recording: Path, verify: Path | None, model: Path | None) -> Discovery:
-    from thermocald.discovery.evidence.pair import load_pair
+def _examined(recording: Path, verify: list[Path], model: Path | None) -> Discovery:
+    from thermocald.discovery.evidence.pair import load_together
     from thermocald.discovery.verdict.found import terms_of
     from thermocald.discovery.verdict.result import discover_series
     from thermocald.reduction.reduce import reduce_together
     from thermocald.simulation.model_file import read_model
 
     old = read_model(model) if model is not None else None
-    inputs = load_pair(recording, verify, say)
+    inputs = load_together(recording, verify, say)
     say("reducing the epochs to normal equations")
     evidence = reduce_together(inputs, old.T0 if old else None)
     return discover_series(evidence, say, terms_of(old) if old else ())
@@ -158,14 +160,13 @@ def _lines(found: Discovery) -> list[str]:
         ]
     lines += mount_lines(found.examination)
     names = [Path(e.source.name).name or e.source.name for e in found.examination.fitter.series]
-    gaps = [(first.fit, last.fit), (first.verify, last.verify)]
-    for name, (before, after) in zip(names, gaps, strict=False):
-        if before is not None and after is not None:
-            lines.append(
-                f"gap on {name}: {before.rms_px:.4f} → {after.rms_px:.4f} px RMS, reduced χ² "
-                f"{before.chi2_reduced:.3f} → {after.chi2_reduced:.3f}, "
-                f"{before.object_mm_at_10m:.2f} → {after.object_mm_at_10m:.2f} mm at 10 m"
-            )
+    gaps = zip((first.fit, *first.others), (last.fit, *last.others), strict=True)
+    for name, (before, after) in zip(names, gaps, strict=True):
+        lines.append(
+            f"gap on {name}: {before.rms_px:.4f} → {after.rms_px:.4f} px RMS, reduced χ² "
+            f"{before.chi2_reduced:.3f} → {after.chi2_reduced:.3f}, "
+            f"{before.object_mm_at_10m:.2f} → {after.object_mm_at_10m:.2f} mm at 10 m"
+        )
     return lines
 
 

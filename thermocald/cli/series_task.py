@@ -87,11 +87,11 @@ def lost(task: SeriesTask, why: str) -> SeriesOutcome:
 
 
 def _discovered(task: SeriesTask) -> dict[str, Any]:
-    from thermocald.discovery.evidence.pair import load_pair
+    from thermocald.discovery.evidence.pair import load_together
     from thermocald.discovery.verdict.result import discover_series
     from thermocald.reduction.reduce import reduce_together
 
-    inputs = load_pair(task.source, None, lambda _: None)
+    inputs = load_together(task.source, (), lambda _: None)
     return discover_series(reduce_together(inputs, None), lambda _: None).as_json(None)
 
 

@@ -1,4 +1,4 @@
-"""Two series of one camera: M1 to discover on, M2 to prove it on; recordings or in stores."""
+"""Series of one camera: M1 to discover on, others to prove it on; recordings or in stores."""
 
 from __future__ import annotations
 
@@ -11,29 +11,33 @@ from thermocald.store.server.address import is_server
 from thermocald.store.sources import require_source, source_name
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from thermocald.reduction.series import SeriesInput
 
-__all__ = ["load_pair"]
+__all__ = ["load_together"]
 
 
-def load_pair(first: Path, second: Path | None, say: Callable[[str], None]) -> list[SeriesInput]:
-    """Read M1, and M2 where it is given; refuses an M2 of another camera or thermometer."""
-    if second is not None and _place(first) == _place(second):
-        raise UsageError(
-            f"{second} is the recording to explain itself; --verify needs another recording of the "
-            "same camera, made at another time"
-        )
+def load_together(
+    first: Path, others: Sequence[Path], say: Callable[[str], None]
+) -> list[SeriesInput]:
+    """Read M1 and the recordings to prove it on; refuses those of another camera or thermometer."""
+    places = [_place(p) for p in (first, *others)]
+    for k, path in enumerate(others, start=1):
+        if places[k] == places[0]:
+            raise UsageError(
+                f"{path} is the recording to explain itself; --verify needs another recording of "
+                "the same camera, made at another time"
+            )
+        if places[k] in places[1:k]:
+            raise UsageError(f"{path} is given to --verify twice; one time is enough")
     out = []
-    for path in (first, second):
-        if path is None:
-            continue
+    for path in (first, *others):
         say(f"reading {source_name(path)}")
         out.append(_read(path, say))
-    if len(out) == 2:
-        _same_camera(*out)
+    for other in out[1:]:
+        _same_camera(out[0], other)
     return out
 
 

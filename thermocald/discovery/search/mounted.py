@@ -194,17 +194,20 @@ def _concluded(
 def convincing(fitter: HypothesisFitter, base: Solution, best: Solution) -> bool:
     """Whether the effects of `best` are worth their penalties, and hold in both series.
 
-    Constants from one series are held against the other, both ways; events are new each time.
+    Constants from all series but one are held against that one, and from two each against the
+    other; events are new each time.
     """
     if base.score <= best.score:
         return False
-    if len(fitter.series) < 2 or all(t.is_separate for t in best.terms[len(base.terms) :]):
+    every = range(len(fitter.series))
+    if len(every) < 2 or all(t.is_separate for t in best.terms[len(base.terms) :]):
         return True
-    gains = []
-    for a, b in ((0, 1), (1, 0)):
-        without = fitter.fit(base.terms, only=[a])
-        whole = fitter.refine(fitter.fit(best.terms, only=[a]), only=[a])
-        gains.append((without.chi2_of(a) - whole.chi2_of(a), without.chi2_of(b) - whole.chi2_of(b)))
-    least = _WORSE * max(own for own, _ in gains)
-    there = [other for _, other in gains]
+    own, there = [], []
+    for left in every:
+        rest = [s for s in every if s != left]
+        without = fitter.fit(base.terms, only=rest)
+        whole = fitter.refine(fitter.fit(best.terms, only=rest), only=rest)
+        own.append(sum(without.chi2_of(s) - whole.chi2_of(s) for s in rest) / len(rest))
+        there.append(without.chi2_of(left) - whole.chi2_of(left))
+    least = _WORSE * max(own)
     return min(there) > -least and sum(there) > least

@@ -15,11 +15,12 @@ from thermocald.discovery.verdict.estimates import (
     term_estimates,
 )
 from thermocald.discovery.verdict.found import EffectFound
-from thermocald.discovery.verdict.gap import Gap, fit_first, gap_of
-from thermocald.discovery.verdict.image_effects import image_effects, image_places
+from thermocald.discovery.verdict.gap import Gap, fit_first
+from thermocald.discovery.verdict.image_effects import image_effects
 from thermocald.discovery.verdict.misfit import resolve
 from thermocald.discovery.verdict.mount import mount_of
 from thermocald.discovery.verdict.proposed import NO_PROPOSAL, proposed
+from thermocald.discovery.verdict.stages import Stage, gap_at, stage_of
 from thermocald.discovery.verdict.unnamed import describe_unnamed
 from thermocald.simulation import effects as catalogue
 
@@ -34,16 +35,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["Discovery", "Stage", "discover_series"]
-
-
-@dataclass(frozen=True, eq=False)
-class Stage:
-    """One step of the staircase: what was added, and the gap then, on M1 and on M2."""
-
-    added: str
-    fit: Gap
-    verify: Gap | None
+__all__ = ["Discovery", "discover_series"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,9 +61,13 @@ class Discovery:
         """CONVENTIONS §4; alongside a mount that moves, what it did stands under `mount`."""
         mount = mount_of(self.examination)
         first, last = self.stages[0], self.stages[-1]
-        verify = None
-        if first.verify is not None and last.verify is not None:
-            verify = {"before": first.verify.as_json(), "after": last.verify.as_json()}
+        others = [
+            {"recording": e.source.name, "before": b.as_json(), "after": a.as_json()}
+            for e, b, a in zip(
+                self.examination.fitter.series[1:], first.others, last.others, strict=True
+            )
+        ]
+        verify = {k: others[0][k] for k in ("before", "after")} if others else None
         effects = [e.as_json() for e in self.effects]
         if effects:  # where the base model is wrong, told with the first of its causes
             misfit = resolve(self.examination).as_json()
@@ -83,6 +79,7 @@ class Discovery:
             "gap": {
                 "fit": {"before": first.fit.as_json(), "after": last.fit.as_json()},
                 "verify": verify,
+                **({"verify_each": others} if len(others) > 1 else {}),
             },
             "model": model,
             **({"mount": mount} if mount is not None else {}),
@@ -100,7 +97,7 @@ def discover_series(
     progress: Callable[[str], None] | None = None,
     given: Sequence[tuple[str, dict[str, Any]]] = (),
 ) -> Discovery:
-    """Examine M1, or M1 and M2, and put what was found into words and numbers."""
+    """Examine M1, or M1 and others, and put what was found into words and numbers."""
     x = examine_series(series, progress, given)
     return conclude(x, progress)
 
@@ -110,10 +107,10 @@ def conclude(x: Examination, progress: Callable[[str], None] | None = None) -> D
     terms = x.best.terms if x.adequate else x.base.terms
     known = len(x.base.terms)
     fits = [fit_first(x.fitter, terms[:k]) for k in range(known, len(terms) + 1)]
-    found = image_effects(x, _gap(x, fits[0], 0, 0))
-    stages = [Stage("", _gap(x, fits[0], 0, 0), _verify(x, fits[0], 0))]
+    stages = [stage_of(x, "", fits[0], 0)]
+    found = image_effects(x, stages[0].fit)
     for k, entry in enumerate(found):
-        stages.append(Stage(entry.effect, _gap(x, fits[0], 0, k + 1), _verify(x, fits[0], k + 1)))
+        stages.append(stage_of(x, entry.effect, fits[0], k + 1))
         entry = replace(entry, gap_before=stages[-2].fit, gap_after=stages[-1].fit)
         found[k] = entry
     n = len(found)
@@ -121,25 +118,11 @@ def conclude(x: Examination, progress: Callable[[str], None] | None = None) -> D
         return _unexplained(x, fits[0], stages, n, progress)
     for k in range(known, len(terms)):
         fit = fits[k + 1 - known]
-        stages.append(Stage(terms[k].effect, _gap(x, fit, 0, n), _verify(x, fit, n)))
+        stages.append(stage_of(x, terms[k].effect, fit, n))
         found.append(_entry(x, fits[-1], k, stages[-2].fit, stages[-1].fit, len(found) == n))
     blocks = cross_validation(x.fitter, fits[-1]) if found else (float("nan"), float("nan"))
     verdict = "effects_found" if found else "adequate"
     return Discovery(verdict, tuple(found), tuple(stages), x, fits[0], fits[-1], blocks)
-
-
-def _verify(x: Examination, fit: Fit, known: int) -> Gap | None:
-    return _gap(x, fit, 1, known) if len(x.fitter.series) > 1 else None
-
-
-def _gap(x: Examination, fit: Fit, series: int, known: int, explained: float = 0.0) -> Gap:
-    """The gap when the first `known` effects of image space are in the model."""
-    order = image_places(x)[:known]
-    noise = x.noise_growth.noise[series] if x.noise_growth else None
-    return gap_of(
-        x.fitter, fit, series,
-        x.displaced[series], "targets" in order, noise, "noise" in order, explained,
-    )  # fmt: skip
 
 
 def _entry(x: Examination, fit: Fit, k: int, before: Gap, after: Gap, first: bool) -> EffectFound:
@@ -283,17 +266,16 @@ def _unexplained(
     if found is not None:
         y = found.examination
         fits = (found.base_fit, found.final_fit)
-        both = [(_gap(y, f, 0, known), _verify(y, f, known)) for f in fits]
-        stages[-1:] = [Stage(stages[-1].added, *both[0]), Stage("unnamed", *both[1])]
+        added = (stages[-1].added, "unnamed")
+        stages[-1:] = [stage_of(y, a, f, known) for a, f in zip(added, fits, strict=True)]
         entry = EffectFound(
             "unnamed", found.statement, found.where, found.estimates, found.evidence,
             [*found.alternatives, *resembling], stages[-2].fit, stages[-1].fit, found.term,
         )  # fmt: skip
         return Discovery("unexplained", (entry,), tuple(stages), y, *fits, (nan, nan))
     bridge = sum(a.excess for a in x.base_adequacy[:1])
-    before = _gap(x, base, 0, known)
-    after = _gap(x, base, 0, known, bridge)
-    stages.append(Stage("unnamed", after, _verify(x, base, known)))
+    before = stage_of(x, "unnamed", base, known)
+    stages.append(replace(before, fit=gap_at(x, base, 0, known, bridge)))
     entry = EffectFound(
         "unnamed", f"{description.statement}; {NO_PROPOSAL[len(x.fitter.series) > 1]}",
         description.where, description.estimates,
@@ -305,8 +287,8 @@ def _unexplained(
                 "sigmas": [float(a.significance) for a in x.adequacy],
                 "misfit_px": [float(a.misfit_px) for a in x.adequacy],
             },
-            "image_space": [e.effect for e in image_effects(x, before)],
+            "image_space": [e.effect for e in image_effects(x, before.fit)],
         },
-        resembling, before, after,
+        resembling, before.fit, stages[-1].fit,
     )  # fmt: skip
     return Discovery("unexplained", (entry,), tuple(stages), x, base, base, (nan, nan))

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["misfit_map", "misfit_matrix", "ranking", "signature", "staircase"]
+__all__ = ["misfit_map", "misfit_matrix", "ranking", "signature", "staircase", "surrogates"]
 
 _INK, _ACCENT, _PALE = "#1f3a4d", "#c4542b", "#9fb4c1"
 
@@ -160,10 +160,9 @@ def staircase(discovery: Discovery) -> str:
         (axes[0], "chi2_reduced", "reduced χ²"),
         (axes[1], "rms_px", "px RMS"),
     ):
-        for attribute, colour, name in (("fit", _INK, "M1"), ("verify", _ACCENT, "M2")):
-            gaps = [getattr(s, attribute) for s in stages]
-            if any(g is None for g in gaps):
-                continue
+        series = zip(*((s.fit, *s.others) for s in stages), strict=True)
+        for number, gaps in enumerate(series):
+            colour, name = (_ACCENT if number else _INK), f"M{number + 1}"
             axis.plot(
                 range(len(gaps)), [getattr(g, key) for g in gaps], "o-", color=colour,
                 drawstyle="steps-post", label=name, ms=4,
@@ -183,6 +182,36 @@ def _legend_above(axis: Any) -> None:
         fontsize=7, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3,
         borderaxespad=0.2,
     )  # fmt: skip
+
+
+def surrogates(discovery: Discovery) -> str:
+    """Penalised gain of each effect against those of surrogates of the recording's own noise.
+
+    Empty where no effect was held against surrogates.
+    """
+    x = discovery.examination
+    tests = list(zip(x.best.names[len(x.base.terms) :], x.surrogates, strict=False))
+    if not tests:
+        return ""
+    figure, axes = _figure(9.0, 0.9 + 0.9 * len(tests))
+    axis = axes[0]
+    rows = range(len(tests), 0, -1)
+    for row, (_, test) in zip(rows, tests, strict=True):
+        spread = np.linspace(-0.22, 0.22, len(test.surrogates))
+        axis.plot(test.surrogates, row + spread, "o", color=_PALE, ms=3, mew=0)
+        axis.plot([test.gain], [row], "D", color=_ACCENT, ms=8)
+        axis.annotate(
+            f"p = {test.p:.3f}", (test.gain, row), (0, 9), textcoords="offset points",
+            ha="right", fontsize=8, color=_INK,
+        )  # fmt: skip
+    axis.set_xscale("symlog", linthresh=50)
+    axis.xaxis.set_major_formatter("{x:g}")
+    axis.set_yticks(list(rows), [name for name, _ in tests], fontsize=9)
+    axis.set_ylim(0.5, len(tests) + 0.6)
+    axis.axvline(0.0, color=_PALE, lw=0.8)
+    axis.set_xlabel("gain of −2 log L less the penalty; dots: surrogates, diamond: found",
+                    fontsize=8)  # fmt: skip
+    return _svg(figure)
 
 
 def misfit_matrix(discovery: Discovery) -> str:

@@ -34,7 +34,9 @@ nav{border:1px solid #cfd8de;border-radius:4px;padding:.4rem 1rem;margin:1rem 0;
 nav ol{margin:.3rem 0;padding-left:1.4rem}a{color:#0b63a5}
 """
 _SECTIONS = (
-    "The signature", "Where simulation and measurement disagree", "All candidates, alone",
+    "The signature",
+    "Where simulation and measurement disagree",
+    "All candidates, alone",
 )
 _VERDICTS = {
     "adequate": "The model reproduces the recording within its noise: nothing is missing that "
@@ -59,7 +61,9 @@ def report_html(discovery: Discovery, title: str, made: datetime | None = None) 
     parts += [f"<p class='made'>{escape(line)}</p>" for line in _origin(discovery, made)]
     parts += [f"<p class='sentence'>{escape(e.statement)}</p>" for e in discovery.effects]
     parts.append(f"<p>{escape(_VERDICTS[discovery.verdict])}</p>")
-    names = ["The gap", *(e.effect for e in discovery.effects), *_SECTIONS]
+    tested = discovery.verdict == "effects_found" and bool(discovery.examination.surrogates)
+    names = ["The gap", *(e.effect for e in discovery.effects),
+             *(["Could noise do this?"] if tested else []), *_SECTIONS]  # fmt: skip
     parts.append(
         "<nav aria-label='Contents'><b>Contents</b><ol>"
         + "".join(f"<li><a href='#s{i}'>{escape(name)}</a></li>" for i, name in enumerate(names))
@@ -68,6 +72,13 @@ def report_html(discovery: Discovery, title: str, made: datetime | None = None) 
     heads = iter([f"<h2 id='s{i}'>{escape(name)}</h2>" for i, name in enumerate(names)])
     parts.append(next(heads) + _gaps(discovery) + _drawn(figures.staircase(discovery)))
     parts += [next(heads) + _effect(e) for e in discovery.effects]
+    if tested:
+        parts.append(
+            next(heads)
+            + _drawn(figures.surrogates(discovery))
+            + "<p class='note'>The recording's own noise, moved in time against the temperatures "
+            "and searched in the same way. A name needs a gain that no surrogate reaches.</p>"
+        )
     parts.append(next(heads) + _drawn(figures.signature(discovery)))
     parts.append(
         next(heads)
@@ -122,7 +133,7 @@ def _gaps(discovery: Discovery) -> str:
     for stage in discovery.stages:
         label = f"with {stage.added}" if stage.added else "base model"
         rows.append(_row(f"M1, {label}", stage.fit))
-        rows.append(_row(f"M2, {label}", stage.verify))
+        rows += [_row(f"M{k}, {label}", gap) for k, gap in enumerate(stage.others, start=2)]
     text = (
         "<table><tr><th></th><th>px RMS</th><th>reduced χ²</th><th>mm at 10 m</th></tr>"
         + "".join(rows)

@@ -153,6 +153,12 @@ def _lines(found: Discovery) -> list[str]:
                 f"(gain {surrogates['gain']:.0f}; the largest of {surrogates['count']} surrogates "
                 f"{surrogates['gains_of_surrogates'][-1]:.0f})"
             )
+        if proposal := effect.evidence.get("proposal"):
+            lines.append(
+                f"    constants of the first recording explain "
+                f"{proposal['closed_on_verify_by_fit']:.0%} of the misfit of the second; "
+                f"probability of a false formula {proposal['false_alarm_probability']:.3f}"
+            )
         lines += [
             f"    not excluded: {a['effect']}; {a['experiment']}"
             for a in effect.alternatives

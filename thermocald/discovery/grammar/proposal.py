@@ -56,7 +56,7 @@ class Proposal:
 
     fitter: the series it was found on; base, best: solutions in it; closed: share of the misfit of
     M2 that constants of M1 explain, and of M1 by constants of M2; surrogates: shares of
-    surrogates; rivals: other formulas and by how much they score worse.
+    surrogates; rivals: other formulas, as simple, and by how much they score worse.
     """
 
     fitter: HypothesisFitter
@@ -106,9 +106,11 @@ def propose(
     closed = _closed(fitter, base, best)
     if closed is None or not _transferable(closed):
         return None
+    size = _operators(best.terms[-1])
     rivals = sorted(
         ((s.terms[-1], float(s.score - best.score)) for s in tried.values()
-         if s.terms[-1].effect != best.terms[-1].effect), key=lambda r: r[1],
+         if s.terms[-1].effect != best.terms[-1].effect and _operators(s.terms[-1]) <= size),
+        key=lambda r: r[1],
     )  # fmt: skip
     return Proposal(fitter, base, best, closed, test, tuple(rivals))
 
@@ -142,7 +144,7 @@ def _try(
     for found in formulas[:_FITTED]:
         structure, values = found.node.named()
         term = Term(structure.text(), tuple(parameters), tuple(values.items()))
-        penalty = found.penalty + MARGIN * sum(not n.is_leaf for n in structure.walk())
+        penalty = found.penalty + MARGIN * _operators(term)
         fit = _fit(fitter, (*base.terms, term))
         if fit is not None:
             here[term.effect] = Solution(fit, (*base.penalties, penalty))
@@ -152,6 +154,10 @@ def _try(
     for text, solution in here.items():
         if text not in tried or solution.score < tried[text].score:
             tried[text] = solution
+
+
+def _operators(term: Term) -> int:
+    return sum(not n.is_leaf for n in parse(term.effect).walk())
 
 
 def _fit(

@@ -32,8 +32,9 @@ class EffectFound:
 
     @property
     def alternative_names(self) -> list[str]:
-        """Effects that the data cannot exclude."""
-        return [a["effect"] for a in self.alternatives if not a.get("resembles")]
+        """Effects of the catalogue that the data cannot exclude."""
+        others = ("resembles", "formula")
+        return [a["effect"] for a in self.alternatives if not any(a.get(k) for k in others)]
 
     def as_json(self) -> dict[str, Any]:
         """As the document has it."""

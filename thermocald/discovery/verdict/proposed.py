@@ -27,6 +27,7 @@ NO_PROPOSAL = {
     False: "a formula is proposed only where a second recording can test it: give --verify",
 }
 """Why there is no proposal, by whether there is a second recording."""
+_EXPERIMENT = "record over a wider range of temperatures, and at other rates"
 _RIVALS = 4
 _BAND = 16.0  # score by which a formula may be worse and still not be excluded
 
@@ -68,7 +69,13 @@ def proposed(
     estimates = term_estimates(final_fit, len(found.best.terms) - 1, e)
     sentence = catalogue.get(term.effect).sentence(estimates)
     alternatives = [
-        {"effect": t.effect, "score_difference": d, "values": dict(t.nonlinear), "formula": True}
+        {
+            "effect": t.effect,
+            "score_difference": d,
+            "values": dict(t.nonlinear),
+            "experiment": _EXPERIMENT,
+            "formula": True,
+        }
         for t, d in found.rivals[:_RIVALS]
         if d < _BAND
     ]

@@ -115,7 +115,7 @@ def signature(discovery: Discovery) -> str:
     figure, axes = _figure(9.0, 3.4, 2)
     minutes = e.times / 60.0
     T = e.averaged(e.history.temperature())
-    named = discovery.verdict == "effects_found"
+    named = discovery.verdict == "effects_found" or any(f.term for f in discovery.effects)
     for axis, x, label in ((axes[0], minutes, "time / min"), (axes[1], T, "T / °C")):
         axis.plot(x, measured, ".", color=_PALE, ms=3, label="measured minus base model")
         if named:

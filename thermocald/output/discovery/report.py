@@ -160,6 +160,16 @@ def _effect(effect: EffectFound) -> str:
             shown = with_sd(value, sd if isinstance(sd, float) else math.nan, unit)
         rows.append(f"<tr><td>{escape(name)}</td><td class='n'>{escape(shown)}</td></tr>")
     text = f"<table><tr><th>parameter</th><th>value ± sd</th></tr>{''.join(rows)}</table>"
+    if proposal := effect.evidence.get("proposal"):
+        largest = proposal["surrogates"]["largest_of_surrogates"]
+        text += (
+            f"<p>Formula <code>{escape(proposal['formula'])}</code>: constants of M1 alone explain "
+            f"{proposal['closed_on_verify_by_fit']:.0%} of the misfit of M2. Formulas on a grid of "
+            f"constants explain {proposal['surrogates']['explained']:.0%} of the misfit, of "
+            f"{proposal['surrogates']['count']} surrogates whose cause was not recorded at most "
+            f"{largest:.0%}: probability of a false formula "
+            f"{proposal['false_alarm_probability']:.3f}.</p>"
+        )
     excluded = [a for a in effect.alternatives if not a.get("resembles")]
     alike = [a["effect"] for a in effect.alternatives if a.get("resembles")]
     if excluded:
@@ -173,8 +183,11 @@ def _effect(effect: EffectFound) -> str:
     if alike:
         text += (
             f"<p>Effects that merely resemble it: {escape(', '.join(alike))}. None passes "
-            "the absolute test. The smooth bridge in M1 does not transfer to another series.</p>"
-        )
+            "the absolute test."
+            + (" The smooth bridge in M1 does not transfer to another series."
+               if effect.term is None else "")
+            + "</p>"
+        )  # fmt: skip
     return text
 
 

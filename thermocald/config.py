@@ -158,7 +158,7 @@ class CalibrationConfig(_Section):
     correlation_bound: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.9999
     """Above it an epoch's geometry is called weak."""
     snooping_alpha: Annotated[float, Field(ge=0.0, le=0.1)] = 0.001
-    """Error probability of a single test for gross errors; 0: no test."""
+    """Probability that the test rejects a single good observation; 0: no test."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

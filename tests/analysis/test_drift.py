@@ -65,6 +65,14 @@ def test_no_target_is_accused_of_what_the_camera_did(seed):
     assert x0.last_minus_first == pytest.approx(-1.39e-3, abs=4 * x0.sd_last_minus_first)
 
 
+@pytest.mark.parametrize("epochs", [30, 80, 150])
+def test_a_warm_up_is_a_drift_however_long_the_series(epochs):
+    """To a straight line the bend of 150 epochs was noise with a memory, and no drift."""
+    table, found = settled(series(101, epochs=epochs))
+    assert table.left_out == ()
+    assert [c.drifts for c in found[1:]] == [True, True]
+
+
 def test_a_target_that_wanders_is_no_drift_of_the_camera():
     _, found = settled(series(11, warms=False, wanders=3.0))
     assert not any(c.drifts for c in found)

@@ -53,6 +53,60 @@ class Integral(Outside):
         return (np.cumsum((history.temperature() - history.T0) * steps) / 1e4)[:, None]
 
 
+def follows(history, tau):
+    """The temperature (E,) of something that follows with a time constant of its own, s."""
+    T = history.temperature()
+    out = T.copy()
+    for k, step in enumerate(np.diff(history.times), 1):
+        out[k] = T[k] + (out[k - 1] - T[k]) * np.exp(-step / tau)
+    return out
+
+
+class TwoLags(Outside):
+    name = "two_lags"
+
+    def signal(self, history, **_):
+        slow = 0.5 * (follows(history, 40.0) + follows(history, 400.0))
+        return ((slow - history.temperature()) / 4)[:, None]
+
+
+class OtherBody(Outside):
+    name = "other_body"
+
+    def signal(self, history, **_):
+        return ((follows(history, 600.0) - history.T0) / 4)[:, None]
+
+
+class Exposure(Outside):
+    """A step with the lamp, as an exposure that follows its light."""
+
+    name = "exposure"
+
+    def signal(self, history, **_):
+        rate = np.gradient(history.temperature(), history.times)
+        return (1.0 / (1.0 + np.exp(-(rate - 0.01) / 0.002)))[:, None]
+
+
+class Play(Outside):
+    name = "play"
+
+    def signal(self, history, **_):
+        T = history.temperature()
+        out = T.copy()
+        for k in range(1, len(T)):
+            out[k] = min(max(out[k - 1], T[k] - 2.0), T[k] + 2.0)
+        return ((out - T) / 2)[:, None]
+
+
+class Quadratic(Outside):
+    name = "quadratic"
+
+    def signal(self, history, **_):
+        return ((history.temperature() - history.T0) ** 2 / 60)[:, None]
+
+
+OTHERS = (TwoLags, OtherBody, Exposure, Play, Quadratic)
+
 CASES = {
     "lag": ModelEffect("thermal_lag", {"tau": 120.0}),
     "tanh": ("tanh", SIZE),
@@ -64,7 +118,7 @@ CASES = {
 @pytest.fixture
 def outside(monkeypatch):
     """The catalogue with effects that no fit is told of."""
-    own = {c.name: c() for c in (Tanh, SignedSquare, Integral)}
+    own = {c.name: c() for c in (Tanh, SignedSquare, Integral, *OTHERS)}
     inside = effects.get
     monkeypatch.setattr(effects, "get", lambda name: own.get(name) or inside(name))
 
@@ -95,6 +149,19 @@ def test_a_camera_outside_the_family(outside, name):
     if name != "tanh":  # whose linear part is a rate like any other
         for n in ("c", "x0", "y0"):
             assert abs(f.model.rates[n] - first.model.rates[n]) < 3 * f.sd(f"rates.{n}"), n
+
+
+@pytest.mark.parametrize("kind", OTHERS)
+def test_no_band_that_does_not_hold(outside, kind):
+    """Effects from hardly visible to large: a band holds at least 90 %, or none is stated."""
+    for k, size in enumerate((0.03, 0.3)):
+        effect = ModelEffect(kind.name, {n: v * size for n, v in SIZE.items()})
+        first = simulated(100 + k, "M1", listed=(effect,))
+        second = simulated(151 + k, "M2", listed=(effect,), power=6.5)
+        f = fit_thermal_model([reduced(first)], [])
+        error = predicted_error(f.model, reduced(second), f.series[0].thermometer_sd)
+        assert np.isnan(error.coverage) or error.coverage > 0.9
+        assert f.missing.found or error.rms_px < 1.1 * error.floor_px
 
 
 def test_inside_the_family_nothing_is_missing():

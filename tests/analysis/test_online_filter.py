@@ -253,3 +253,21 @@ def test_the_noise_is_measured_apart_from_the_field():
             errors.split(result, seen)
         # 30 differences of 96 coordinates: 3 %.
         assert errors.level == pytest.approx(1.0, abs=0.1)
+
+
+def test_noise_twice_as_large_as_stated_is_followed_from_the_first_epoch():
+    """The first epoch was weighted by the stated noise: error over sd 1.5 after six epochs."""
+    from benchmarks.audit_camera import Scene
+
+    off = []
+    for seed in range(30):
+        scene = Scene(np.random.default_rng(seed), 0.0, 0.08)
+        errors = FieldErrors(scene.sensor, scene.field)
+        found = OnlineFilter(scene.sensor, common_variances=errors.variances)
+        for _ in range(6):
+            seen = scene.observe(scene.iop, scene.eop)
+            result = scene.adjust(seen)
+            found.update(result, 25.0, errors.split(result, seen))
+        sd = np.sqrt(np.diag(found.covariance()))[:3]
+        off.append((found.values()[:3] - scene.iop[:3]) / sd)
+    assert 0.75 < np.sqrt(np.mean(np.square(off))) < 1.25

@@ -262,7 +262,7 @@ def _tell(document: dict[str, Any]) -> None:
     console = Console()
     typer.echo(
         f"{document['ok']} of {document['epochs']} epochs calibrated, exterior orientation "
-        f"{_EXTERIOR_WORDS[document['exterior']]}, {document['rejected']} gross errors"
+        f"{_EXTERIOR_WORDS[document['exterior']]}, {document['rejected']} rejected observations"
     )
     if document["sigma0"] is not None:
         typer.echo(

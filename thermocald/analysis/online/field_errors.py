@@ -56,7 +56,7 @@ class FieldErrors:
     """Splits the covariance of consecutive epochs before one test field.
 
     variances (3 T,): of the targets' coordinates, mm²; level: measured over stated variance of the
-    image points, 1 until two epochs are there.
+    image points, the first epoch's σ₀² until two are there.
     """
 
     def __init__(self, sensor: Sensor, testfield: TestField) -> None:
@@ -89,6 +89,11 @@ class FieldErrors:
         influence = np.zeros((16, len(self._field), 3))
         influence[np.ix_(free, rows)] = np.einsum("nui,nik->unk", G, B)
         self._measure_level(adjustment, used, influence.reshape(16, -1)[free], noise, information)
+        if not self._compared:
+            # One epoch alone: its own residuals, which hold the field's errors too.
+            redundancy = 2 * len(used) - len(free)
+            own = min(max(adjustment.sigma0**2, _LOWEST), _HIGHEST)
+            self.level = own if redundancy >= _LEAST_DEGREES else max(own, 1.0)
         covariance = np.zeros((16, 16))
         covariance[np.ix_(free, free)] = self.level * noise
         return EpochErrors(covariance, influence.reshape(16, -1))

@@ -15,6 +15,7 @@ import numpy as np
 
 from thermocald.analysis.statistics.autocorrelation import slope_noise
 from thermocald.analysis.statistics.dependence import holm, pearson_p_value
+from thermocald.analysis.statistics.drift_test import drift_test
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.photogrammetry.series.spool import released
 from thermocald.photogrammetry.series.target_noise import slow_errors
@@ -33,6 +34,7 @@ _FEWEST = 10
 _LEAST_WARMING_K = 0.5  # below, the thermometer's own noise is all there is
 _MOST_VALUES = 100_000  # of a line: neighbours beyond that are averaged
 _SUSPECTS = 5  # groups that are left out in turn
+_BEYOND_TILT = 6.0  # sds of the tilt: a range that hidden targets do not explain
 _SHRUNK = 0.5  # of its change must go with a group that a parameter's drift rests on
 
 
@@ -106,7 +108,8 @@ def _lines(table: SeriesTable, names: tuple[str, ...]) -> dict[str, _Line]:
         y, sd = _column(table.values, ok, column), _column(table.sd, ok, column)
         if len(y) < _FEWEST or not np.isfinite(sd).all() or np.ptp(t) == 0:
             continue
-        found.append(_Line(name, y, sd, *_line(t, y, float(table.trend_sd[column]))))
+        tilt = float(table.trend_sd[column])
+        found.append(_Line(name, y, sd, *_line(t, y, sd, tilt)))
     corrected = holm([line.p for line in found])
     return {line.name: replace(line, p=p) for line, p in zip(found, corrected, strict=True)}
 
@@ -196,11 +199,12 @@ def _suspects(table: SeriesTable) -> list[str]:
     return sorted(size, key=lambda first: -size[first])[:_SUSPECTS]
 
 
-def _line(t: Array, y: Array, tilt_sd: float) -> tuple[float, float, float]:
-    """Change of a straight line over the series, its sd and its p-value.
+def _line(t: Array, y: Array, sds: Array, tilt_sd: float) -> tuple[float, float, float]:
+    """Change of a straight line over the series, its sd, and the p-value of no drift.
 
-    tilt_sd: the part of the change's sd that all epochs share: targets hidden at the end and not
-    at the beginning tilt the line by their coordinate errors.
+    The p-value is twice the smaller one of the line's and of drift of any shape. tilt_sd: the part
+    of the change's sd that all epochs share: targets hidden at the end and not at the beginning
+    tilt the line by their coordinate errors.
     """
     from scipy.stats import t as student
 
@@ -213,4 +217,8 @@ def _line(t: Array, y: Array, tilt_sd: float) -> tuple[float, float, float]:
     residual = y - y.mean() - slope * x
     own = float(np.sqrt(np.mean(residual**2) / freedom)) / float(x.std()) * span
     p = 2 * student.sf(abs(slope) * span / float(np.hypot(own, tilt_sd)), freedom)
-    return slope * span, float(np.hypot(noise.sd * span, tilt_sd)), float(p)
+    shape = None
+    if np.ptp(y) > _BEYOND_TILT * tilt_sd:
+        shape = drift_test(y, sds, np.ones(len(y)))
+    both = 2.0 * min(float(p), shape.p_value if shape is not None else 1.0)
+    return slope * span, float(np.hypot(noise.sd * span, tilt_sd)), min(1.0, both)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.discovery.verdict.found import effects_of
+from thermocald.discovery.verdict.level import level_of
 from thermocald.photogrammetry.camera.camera_model import (
     EOP_NAMES,
     IOP_NAMES,
@@ -20,11 +21,7 @@ from thermocald.reduction.series import COLUMNS
 from thermocald.simulation.model import ThermalModel
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from thermocald.discovery.verdict.result import Discovery
-
-    Array = NDArray[np.float64]
 
 __all__ = ["model_of"]
 
@@ -36,7 +33,7 @@ def model_of(discovery: Discovery, old: ThermalModel | None = None) -> ThermalMo
     """
     x, fit = discovery.examination, discovery.final_fit
     e = x.fitter.series[0]
-    level, sd = _level(discovery)
+    level, sd = level_of(x.fitter, fit)
     scale = e.scale[: len(PARAMETER_NAMES)]
     start = np.concatenate([e.at.iop, e.at.eop])
     values, sds = start + level / scale, sd / scale
@@ -97,29 +94,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.generic):
         return value.item()
     return value
-
-
-def _level(discovery: Discovery) -> tuple[Array, Array]:
-    """Level of the 16 parameters at T0 with all effects at zero, px-scaled, and its sd."""
-    fit = discovery.final_fit
-    fitter = discovery.examination.fitter
-    e = fitter.series[0]
-    C, V, index = fit.designs[0]
-    x = fit.coefficients[index]
-    rest = (e.b - np.einsum("epq,eq->ep", e.N, (C * x) @ V.T)).sum(axis=0)[:16]
-    N = e.N.sum(axis=0)[:16, :16]
-    d = np.sqrt(np.diag(N))
-    inverse = np.linalg.inv(N / np.outer(d, d) + 1e-12 * np.eye(16)) / np.outer(d, d)
-    level = inverse @ rest
-    # the columns of the design are centred; the model's are not
-    means = []
-    for block in fit.blocks:
-        if block.series not in (None, 0):
-            continue
-        if block.term < 0:
-            trajectory = fitter.drive(fit.terms, 0)[0][:, None] - e.T0
-        else:
-            trajectory = fitter.trajectories(fit.terms[block.term], 0, fit.terms)[0]
-        means += [m for m in trajectory.mean(axis=0) for _ in block.parameters]
-    level = level - (V @ (np.array(means) * x))[:16]
-    return level, np.sqrt(np.diag(inverse))

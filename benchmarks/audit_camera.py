@@ -1,0 +1,202 @@
+"""Audit of what adjusts image points: an epoch, a series, a mount, photographs, the filter."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from benchmarks.audit_rows import Row, ratio
+from thermocald.analysis.camera.photographs import calibrate_observations
+from thermocald.analysis.online.equilibrium import slope
+from thermocald.analysis.online.field_errors import FieldErrors
+from thermocald.analysis.online.filter import OnlineFilter
+from thermocald.photogrammetry.camera.camera_model import (
+    ExteriorOrientation,
+    InteriorOrientation,
+    project,
+)
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, adjust
+from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.photogrammetry.series.adjustment import SeriesSettings, adjust_series
+from thermocald.simulation.demonstration import demonstration_model
+from thermocald.simulation.testfields import corner_field
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+NOISE_PX = 0.04
+
+
+class Scene:
+    """A camera before a corner of 48 targets whose coordinates err as stated."""
+
+    def __init__(self, rng: np.random.Generator, sigma_mm: float, noise_px: float = NOISE_PX):
+        self.rng, self.noise = rng, noise_px
+        plain = corner_field("plain", per_side=4, pitch_mm=150.0)
+        model = demonstration_model(plain)
+        self.sensor = model.sensor
+        self.iop, self.eop = model.interior.as_array(), model.exterior.as_array()
+        self.field = TestField.build(plain.names, plain.points, sigma_mm)
+        self.points = plain.points + sigma_mm * rng.standard_normal(plain.points.shape)
+
+    def observe(self, iop: Array, eop: Array, gross: float = 0.0) -> Observations:
+        seen = project(self.sensor, iop, eop, self.points)
+        seen = seen + self.rng.normal(0, self.noise, seen.shape)
+        wrong = self.rng.random(len(seen)) < gross
+        seen[wrong] += self.rng.normal(0, 5.0, (int(wrong.sum()), 2))
+        return Observations(np.arange(len(seen)), seen, np.full(seen.shape, NOISE_PX))
+
+    def adjust(self, observations: Observations):
+        return adjust(
+            self.sensor, self.field, observations, InteriorOrientation.from_array(self.iop),
+            ExteriorOrientation.from_array(self.eop),
+        )  # fmt: skip
+
+
+def epoch(draws: int, rng: np.random.Generator) -> list[Row]:
+    """One epoch's adjustment."""
+    rows = []
+    cases = (
+        ("field 0.01 mm", 0.01, 0.0, 1.0),
+        ("field 0.01 mm, 3 % gross errors", 0.01, 0.03, 1.0),
+        ("noise twice the stated", 0.0, 0.0, 2.0),
+    )
+    for what, sigma, gross, factor in cases:
+        off, sigma0 = [], []
+        for _ in range(draws):
+            scene = Scene(rng, sigma, factor * NOISE_PX)
+            result = scene.adjust(scene.observe(scene.iop, scene.eop, gross))
+            if result.ok:
+                truth = np.concatenate([scene.iop, scene.eop])
+                off.append(((result.values - truth) / result.sd)[[0, 1, 2, 13, 14, 15]])
+                sigma0.append(result.sigma0)
+        rows.append(ratio("`replay`, daemon: an epoch", f"sd of c, x0, y0, X0, Y0, Z0; {what}",
+                          "noise, the field's coordinates", np.array(off)))  # fmt: skip
+        if factor != 1.0:
+            print(f"(σ₀: {np.mean(sigma0):.2f}, against the stated sigmas)", file=sys.stderr)
+    return rows
+
+
+def _series(
+    scene: Scene, epochs: int, tremble_px: float, exterior: str, drift: float = 1.0, tau: float = 10
+):
+    truth = np.tile(np.concatenate([scene.iop, scene.eop]), (epochs, 1))
+    warm = drift * (1 - np.exp(-np.arange(epochs) / tau))
+    truth[:, :3] += warm[:, None] * np.array([2e-3, -4.5e-3, 3e-3])
+    per_px = scene.sensor.pixel_pitch / scene.iop[0]
+    truth[:, 10:13] += tremble_px * per_px * scene.rng.standard_normal((epochs, 3))
+    seen = [scene.observe(one[:10], one[10:]) for one in truth]
+    result = adjust_series(
+        scene.sensor, scene.field, seen, InteriorOrientation.from_array(scene.iop),
+        ExteriorOrientation.from_array(scene.eop), SeriesSettings(exterior=exterior),  # type: ignore[arg-type]
+    )  # fmt: skip
+    return result, truth
+
+
+def series(draws: int, rng: np.random.Generator) -> list[Row]:
+    """A series that stands still: differences between epochs, and what all have in common."""
+    change, level = [], []
+    for _ in range(draws):
+        scene = Scene(rng, 0.01)
+        found, truth = _series(scene, 24, 0.0, "series")
+        error = (found.values - truth)[:, :3]
+        sd = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)[:, :3])
+        change.append((error[-1] - error[0]) / np.hypot(sd[0], sd[-1]))
+        level.append(error.mean(axis=0) / np.sqrt(np.diag(found.level_covariance)[:3]))
+    strong = []
+    for _ in range(max(draws // 10, 4)):
+        scene = Scene(rng, 0.0, 0.5 * NOISE_PX)
+        found, truth = _series(scene, 150, 0.0, "series", drift=4.0, tau=15.0)
+        error = (found.values - truth)[:, :3]
+        sd = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)[:, :3])
+        strong.append((error[-1] - error[0]) / np.hypot(sd[0], sd[-1]))
+    return [
+        ratio("`replay`, `study`: a series", "the same, warm-up by 16 px in 150 epochs",
+              "noise of both epochs", np.array(strong)),
+        ratio("`replay`, `study`: a series", "sd of last − first; c, x0, y0",
+              "noise of both epochs", np.array(change)),
+        ratio("`replay`, `study`: a series", "sd of the level; c, x0, y0",
+              "EOP and field, common to all epochs", np.array(level)),
+    ]  # fmt: skip
+
+
+def mount(draws: int, rng: np.random.Generator) -> list[Row]:
+    """A mount that trembles."""
+    rows = []
+    for tremble in (0.02, 0.1):
+        off = []
+        for _ in range(draws):
+            scene = Scene(rng, 0.0)
+            found, truth = _series(scene, 40, tremble, "mount")
+            error = (found.values - truth)[:, :3]
+            sd = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)[:, :3])
+            off.append((error[30] - error[10]) / np.hypot(sd[10], sd[30]))
+        rows.append(ratio("`--exterior mount`", f"sd of a difference; c, x0, y0; {tremble} px",
+                          "noise and movements of the mount", np.array(off)))  # fmt: skip
+    return rows
+
+
+def calibrate(draws: int, rng: np.random.Generator) -> list[Row]:
+    """Four photographs before one field."""
+    rows = []
+    for sigma in (0.0, 0.05):
+        off, failed = [], 0
+        for _ in range(draws):
+            scene = Scene(rng, sigma)
+            seen = []
+            for turn in (0.0, 0.05, -0.05, 0.1):
+                eop = scene.eop + np.array([0, turn, 20 * turn, 400 * turn, 0, 0])
+                seen.append(scene.observe(scene.iop, eop))
+            found = calibrate_observations(
+                ["a", "b", "c", "d"], seen, {}, scene.field, scene.sensor, AdjustmentSettings(),
+                None, InteriorOrientation.from_array(scene.iop),
+            )  # fmt: skip
+            if found.interior is None or not found.estimated:
+                failed += 1
+                continue
+            sd = np.sqrt(np.diag(found.covariance)[:3])
+            off.append((found.interior.as_array()[:3] - scene.iop[:3]) / sd)
+        if failed:
+            print(f"({failed} of {draws} not calibrated)", file=sys.stderr)
+        rows.append(ratio("`calibrate`", f"sd of c, x0, y0; 4 photographs, field {sigma} mm",
+                          "noise, the field's coordinates", np.array(off)))  # fmt: skip
+    return rows
+
+
+def online(draws: int, rng: np.random.Generator) -> list[Row]:
+    """The filter in the daemon: its estimate, its innovations, its drift."""
+    rows = []
+    for what, sigma, factor in (
+        ("field 0.01 mm", 0.01, 1.0), ("field 0.05 mm", 0.05, 1.0),
+        ("noise twice the stated", 0.0, 2.0),
+    ):  # fmt: skip
+        off, chi2 = [], []
+        for _ in range(draws):
+            scene = Scene(rng, sigma, factor * NOISE_PX)
+            errors = FieldErrors(scene.sensor, scene.field)
+            found = OnlineFilter(scene.sensor, common_variances=errors.variances)
+            for k in range(4):
+                seen = scene.observe(scene.iop, scene.eop)
+                result = scene.adjust(seen)
+                one = found.update(result, 25.0, errors.split(result, seen))
+                if k and one is not None:
+                    chi2.append(one.chi2 / one.dof)
+            sd = np.sqrt(np.diag(found.covariance()))[:3]
+            off.append((found.values() - np.concatenate([scene.iop, scene.eop]))[:3] / sd)
+        rows.append(ratio("daemon, `status`: online", f"sd of c, x0, y0; {what}",
+                          "noise, the field's coordinates", np.array(off)))  # fmt: skip
+        rows.append(ratio("daemon: innovation", f"√(χ²/dof); {what}", "noise alone",
+                          np.sqrt(chi2)))  # fmt: skip
+    t = np.arange(20) * 10.0
+    drift = []
+    for _ in range(draws):
+        found_slope, sd_slope = slope(t, (0.01 * t + rng.normal(0, 0.05, 20))[:, None],
+                                      np.full((20, 1), 0.05))  # fmt: skip
+        drift.append((found_slope[0] - 0.01) / sd_slope[0])
+    rows.append(ratio("daemon, `status`: drift", "sd of px/min", "noise, more where no line fits",
+                      np.array(drift), low=0.85))  # fmt: skip
+    return rows

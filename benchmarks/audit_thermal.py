@@ -1,0 +1,168 @@
+"""Audit of the thermal model: `fit`, `predict`, `correct`, and what `discover` writes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from benchmarks.audit_rows import Row, ratio, share
+from thermocald.analysis.thermal.correction import TemperatureLog, correct_points
+from thermocald.analysis.thermal.prediction_test import predicted_error
+from thermocald.analysis.thermal.thermal_camera import ThermalCamera
+from thermocald.analysis.thermal.thermal_model import fit_thermal_model
+from thermocald.discovery.verdict.model import model_of
+from thermocald.discovery.verdict.result import discover_series
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, project
+from thermocald.reduction.reduce import reduce_series
+from thermocald.reduction.source import epochs_input
+from thermocald.simulation.course import Course
+from thermocald.simulation.model import ModelEffect
+from thermocald.simulation.presets import preset_simulation
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from thermocald.analysis.thermal.result import FittedModel
+    from thermocald.reduction.series import SeriesInput
+
+    Array = NDArray[np.float64]
+
+NAMES = ("c", "x0", "y0")
+TAU = 70.0
+LAG = ModelEffect("thermal_lag", {"tau": TAU})
+FIELD_MM = 0.02
+NEAR = 35.0  # °C at which `predict` is asked
+
+
+def simulated(
+    seed: int, effects: tuple[ModelEffect, ...] = (LAG,), epochs: int = 120, power: float = 9.0,
+    until: float = 500.0, series: str = "M1",
+) -> Any:  # fmt: skip
+    """The camera of the preset, heated until some second, with effects of our choice."""
+    s = preset_simulation("rpi-v2.1-heating", seed=seed, series=series)
+    lamp = Course.steps([0, 80.0, until, 1e5], [0.0, power, 0.0])
+    programme = replace(s.programme, epochs=epochs, sources={"housing": lamp})
+    return replace(s, model=replace(s.model, effects=effects), programme=programme)
+
+
+def seen(s: Any, rng: np.random.Generator | None = None) -> SeriesInput:
+    """What was recorded; with rng before a field whose stated coordinates err by 0.02 mm."""
+    field = s.field
+    if rng is not None:
+        points = field.points + rng.normal(0, FIELD_MM, field.points.shape)
+        field = replace(field, points=points, sigmas=np.full(points.shape, FIELD_MM))
+    return epochs_input(s.head, field, list(s.epochs()), s.programme.series)
+
+
+def fitted(source: SeriesInput, *effects: ModelEffect) -> FittedModel:
+    """The series reduced as `fit` does it, and fitted."""
+    return fit_thermal_model([reduce_series(source, affinity=False, strict=False)], effects)
+
+
+def _seeds(rng: np.random.Generator, draws: int) -> list[int]:
+    return [int(seed) for seed in rng.integers(0, 2**31, draws)]
+
+
+def thermal(draws: int, rng: np.random.Generator) -> list[Row]:
+    """`fit`: rates, the time of a lag, the level; `predict` and `correct` with the fitted model."""
+    rates, tau, level, predicted, corrected = [], [], [], [], []
+    for seed in _seeds(rng, draws):
+        s = simulated(seed)
+        truth = s.model
+        f = fitted(seen(s, rng), ModelEffect("thermal_lag", {"tau": 10.0}))
+        tau.append((f.model.effects[0].values["tau"] - TAU) / f.sd("thermal_lag.tau"))
+        rates.append([(f.model.rates[n] - truth.rates[n]) / f.sd(f"rates.{n}") for n in NAMES])
+        start = truth.interior.as_array() + (f.model.T0 - truth.T0) * truth.rate_vector
+        off = f.model.interior.as_array() - start
+        level.append([off[IOP_NAMES.index(n)] / f.sd(f"interior.{n}") for n in NAMES])
+        camera = ThermalCamera(f.model)
+        state = camera.at(NEAR)
+        steady = truth.interior.as_array() + (NEAR - truth.T0) * truth.rate_vector
+        predicted.append([(getattr(state.interior, n) - steady[IOP_NAMES.index(n)]) / state.sd[n]
+                          for n in NAMES])  # fmt: skip
+        corrected.append(_corrected(s, camera))
+    return [
+        ratio("`fit`", "sd of the rates of c, x0, y0", "noise of image and thermometer",
+              np.array(rates)),
+        ratio("`fit`", "sd of the lag τ", "noise of image and thermometer", np.array(tau)),
+        ratio("`fit`", "sd of the level: c, x0, y0 at T₀; field 0.02 mm",
+              "both noises, the field's coordinates", np.array(level)),
+        ratio("`predict`", "sd of c, x0, y0 at 35 °C; field 0.02 mm",
+              "the model's covariance", np.array(predicted)),
+        ratio("`correct`", "sd of a corrected point, 15 K from T₀ to the steady camera",
+              "the model's covariance, noise of the log", np.array(corrected)),
+    ]  # fmt: skip
+
+
+def _corrected(s: Any, camera: ThermalCamera) -> list[float]:
+    """Error over sd of points seen at 40 °C, corrected to 25 °C: a log that stands still."""
+    truth = s.model
+    warm, cool = (truth.interior.as_array() + (T - truth.T0) * truth.rate_vector for T in (40, 25))
+    eop = s.truth.eop[0]
+    rows = np.flatnonzero(s.model.sensor.contains(project(truth.sensor, cool, eop, s.field.points)))
+    points = s.field.points[rows[:: max(1, len(rows) // 3)][:3]]
+    log = TemperatureLog(np.arange(3.0), {"temperature": np.full(3, 40.0)})
+    found = correct_points(
+        camera, log, np.ones(len(points)), project(truth.sensor, warm, eop, points), to=25.0
+    )
+    off = (found.points - project(truth.sensor, cool, eop, points)) / found.sds
+    return [float(v) for v in off.ravel()]
+
+
+UNKNOWN = (
+    ("thermal_lag", {"tau": 150.0}, {}),
+    ("hysteresis", {"half_width": 2.0}, {}),
+    ("time_offset", {"d": 60.0}, {}),
+    ("nonlinear_expansion", {}, {"c": 2e-6, "x0": 6e-6, "y0": -4e-6}),
+    ("permanent_set", {}, {"c": 2e-5, "x0": 6e-5, "y0": -4e-5}),
+    ("creep", {}, {"c": 3e-7, "x0": 1e-6, "y0": -8e-7}),
+    ("self_heating", {"tau": 300.0}, {"c": 3e-4, "x0": 9e-4, "y0": -6e-4}),
+    ("softening", {"T_k": 34.0}, {"c": 2e-5, "x0": 6e-5, "y0": -4e-5}),
+    ("thermal_gradient", {}, {"c": 2e-3, "x0": 6e-3, "y0": -4e-3}),
+)
+"""Effects that a fit is not told of: times as they are, the others times a size drawn anew."""
+
+
+def outside(draws: int, rng: np.random.Generator) -> list[Row]:
+    """Cameras whose effect `fit` is not told of: a band that does not hold is a false alarm."""
+    found = []
+    for seed in _seeds(rng, draws):
+        name, times, sizes = UNKNOWN[int(rng.integers(len(UNKNOWN)))]
+        size = float(np.exp(rng.uniform(np.log(0.03), 0.0)))
+        shrunk = {k: max(v * size, 1.0) for k, v in times.items()} if not sizes else times
+        effect = ModelEffect(name, {**shrunk, **{k: v * size for k, v in sizes.items()}})
+        first = fitted(seen(simulated(seed, (effect,))))
+        second = simulated(seed + 1, (effect,), power=6.5, until=700.0, series="M2")
+        reduced = reduce_series(seen(second), affinity=False, strict=False)
+        error = predicted_error(first.model, reduced, first.series[0].thermometer_sd)
+        found.append(bool(error.coverage < 0.9))
+    return [share("`predict --test`", "a band that holds less than 90 %; an effect that `fit` "
+                  "is not told of", "no band where an effect is missing", found)]  # fmt: skip
+
+
+def discovery(draws: int, rng: np.random.Generator) -> list[Row]:
+    """`discover`: the estimate of what was found, and the model it writes."""
+    tau, level, rates = [], [], []
+    for seed in _seeds(rng, draws):
+        s = simulated(seed, epochs=60)
+        found = discover_series([reduce_series(seen(s, rng))])
+        entry = next((e for e in found.effects if e.effect == "thermal_lag"), None)
+        if entry is None:
+            continue
+        estimate = entry.estimates["tau"]
+        tau.append((estimate["value"] - TAU) / estimate["sd"])
+        model = model_of(found)
+        start = s.model.interior.as_array() + (model.T0 - s.model.T0) * s.model.rate_vector
+        off = model.interior.as_array() - start
+        level.append([off[k] / model.sds[f"interior.{n}"] for k, n in enumerate(NAMES)])
+        rates.append([(model.rates[n] - s.model.rates[n]) / model.sds[f"rates.{n}"]
+                      for n in NAMES])  # fmt: skip
+    return [
+        ratio("`discover`", "sd of the lag τ", "noise of image and thermometer", np.array(tau)),
+        ratio("`discover`", "sd of the written rates of c, x0, y0",
+              "noise of image and thermometer", np.array(rates)),
+        ratio("`discover`", "sd of the written level: c, x0, y0 at T₀; field 0.02 mm",
+              "both noises, the field's coordinates", np.array(level)),
+    ]  # fmt: skip

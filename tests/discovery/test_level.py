@@ -1,0 +1,48 @@
+"""The level of a discovered model: its sds hold both noises and the test field's errors."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.analysis.test_thermal_model import simulated
+from thermocald.discovery.verdict.level import level_of
+from thermocald.reduction.calibrated import calibrated_thermometers
+from thermocald.reduction.fit import HypothesisFitter
+from thermocald.reduction.hypothesis import known_term
+from thermocald.reduction.reduce import reduce_series
+from thermocald.reduction.source import epochs_input
+
+
+def pulls(draws: int, noise: float, field: float) -> np.ndarray:
+    """Errors of c, x0, y0 at T0 over their sds (draws, 3)."""
+    out = []
+    for seed in range(draws):
+        s = simulated(seed, epochs=40)
+        thermometers = {k: replace(t, noise=noise) for k, t in s.device.thermometers.items()}
+        s = replace(s, device=replace(s.device, thermometers=thermometers))
+        rng = np.random.default_rng(1000 + seed)
+        wrong = s.field.points + rng.normal(0, field, s.field.points.shape)
+        said = replace(s.field, points=wrong, sigmas=np.full(wrong.shape, field))
+        reduced = reduce_series(epochs_input(s.head, said, list(s.epochs()), "M1"), 30.0)
+        fitter = HypothesisFitter(calibrated_thermometers([reduced]))
+        fit = fitter.refine(fitter.fit((known_term("thermal_lag", {"tau": 70.0}, 1),)))
+        level, sd = level_of(fitter, fit)
+        truth = s.model.interior.as_array() + (30.0 - s.model.T0) * s.model.rate_vector
+        found = reduced.at.iop + (level / reduced.scale[:16])[:10]
+        out.append((found - truth)[:3] / (sd / reduced.scale[:16])[:3])
+    return np.array(out)
+
+
+@pytest.mark.parametrize(("noise", "field"), [(0.1, 0.02), (1.0, 1e-4)])
+def test_the_level_is_as_sure_as_stated(noise, field):
+    """Without the part of field and thermometer errors are 12 and 3 times the sds."""
+    spread = np.sqrt(np.mean(pulls(6, noise, field) ** 2))
+    assert 0.5 < spread < 1.6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("noise", "field"), [(0.1, 0.02), (1.0, 1e-4)])
+def test_the_level_over_200_draws(noise, field):
+    spread = np.sqrt(np.mean(pulls(200, noise, field) ** 2))
+    assert 0.9 < spread < 1.1

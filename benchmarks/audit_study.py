@@ -46,7 +46,7 @@ def significance(draws: int, rng: np.random.Generator) -> list[Row]:
             rows.append(share("`study`: p, within sds", what, "noise of the stated sds", excess))
         rows.append(share("`study`: p of r", what, "noise of any size and memory", r))
     family = []
-    for _ in range(draws // 4):
+    for _ in range(max(draws // 4, 1)):
         tests = [drift_test(_noise(rng, 0.5, 0.97), ones, redundancy) for _ in range(8)]
         family.append(min(holm([one.p_value for one in tests if one])) <= 0.05)
     rows.append(share("`study`: p, no drift", "any of 8 parameters, AR 0.97 on white", "", family))

@@ -77,13 +77,13 @@ def server(full: bool) -> dict[str, float]:
             found["generated_s"] = time.perf_counter() - begin
             connection.execute("VACUUM (ANALYZE) epoch")
             found["bytes_an_epoch"] = connection.execute(
-                "SELECT sum(pg_total_relation_size(inhrelid)) FROM pg_inherits "
+                "SELECT sum(pg_total_relation_size(inhrelid))::float8 FROM pg_inherits "
                 "WHERE inhparent = 'epoch'::regclass"
             ).fetchone()[0] / found["epochs"]  # fmt: skip
         whole = Path(cluster.address(name="thermocald"))
         found["overview_s"], document = timed(lambda: fleet_document([whole]))
         found["sound"] = document["summary"]["sound"]
-        print(json.dumps(found), file=sys.stderr)
+        print(json.dumps(found), file=sys.stderr, flush=True)
         one, path = Path(f"{whole}?station=gauge07"), Path(folder) / "columns.db"
         _copy_to_store(one, path)
         for name, opened in (("server", ServerStore.open(one)), ("store", Store.open(path))):
@@ -203,7 +203,7 @@ def forward() -> dict[str, float]:
         with psycopg.connect(cluster.address(name="thermocald"), autocommit=True) as connection:
             connection.execute("VACUUM (ANALYZE) epoch")
             found["bytes_at_server"] = connection.execute(
-                "SELECT sum(pg_total_relation_size(inhrelid)) FROM pg_inherits "
+                "SELECT sum(pg_total_relation_size(inhrelid))::float8 FROM pg_inherits "
                 "WHERE inhparent = 'epoch'::regclass"
             ).fetchone()[0] / count  # fmt: skip
     return found

@@ -84,16 +84,26 @@ def new_cluster(prepare=lambda server: None):
         shutil.rmtree(folder)
 
 
-@pytest.fixture
-def server(cluster):
-    """The cluster with an empty, initialised database `thermocald`."""
+@pytest.fixture(scope="session")
+def template(cluster):
+    """A database with the tables, to be copied: that is faster than to make them."""
     import psycopg
 
     from thermocald.store.server.address import ServerAddress
     from thermocald.store.server.schema import create_tables
 
     with psycopg.connect(cluster.address(), autocommit=True) as connection:
+        connection.execute("CREATE DATABASE initialised")
+    create_tables(ServerAddress.parse(cluster.address(name="initialised")))
+    return "initialised"
+
+
+@pytest.fixture
+def server(cluster, template):
+    """The cluster with an empty, initialised database `thermocald`."""
+    import psycopg
+
+    with psycopg.connect(cluster.address(), autocommit=True) as connection:
         connection.execute("DROP DATABASE IF EXISTS thermocald WITH (FORCE)")
-        connection.execute("CREATE DATABASE thermocald")
-    create_tables(ServerAddress.parse(cluster.address(name="thermocald")))
+        connection.execute(f"CREATE DATABASE thermocald TEMPLATE {template}")
     return cluster

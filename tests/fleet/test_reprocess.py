@@ -173,6 +173,7 @@ def test_workers_that_are_killed_again_and_again_finish_with_equal_results(
     assert len([*(tmp_path / "local").iterdir()]) == 1
 
 
+@pytest.mark.slow
 def test_series_are_analysed_one_by_one_and_done_ones_are_left(archive, tmp_path):
     run = [sys.executable, "-m", "thermocald", "reprocess", archive, "--out", tmp_path / "o",
            "--do", "study", "--sets", "500", "--json", "-"]  # fmt: skip

@@ -6,6 +6,7 @@ Rows are never changed or deleted, so the last id that was sent is all a sender 
 from __future__ import annotations
 
 import json
+import logging
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 __all__ = ["KEPT", "KeptFrame", "frames_after", "rows_after"]
+
+log = logging.getLogger(__name__)
 
 KEPT = ("epoch", "event", "reading")
 """The tables that grow while a daemon runs."""
@@ -99,6 +102,10 @@ def frames_after(connection: sqlite3.Connection, after: int, limit: int) -> Iter
         "WHERE id > ? ORDER BY id LIMIT ?",
         (after, limit),
     ):
-        path = relative_path(frame, f"epoch {number}: frame", StoreError) if frame else None
-        happened = status not in ("ok", NOT_CALIBRATED) or "event" in json.loads(extra)
+        path, happened = None, False
+        try:
+            path = relative_path(frame, f"epoch {number}: frame", StoreError) if frame else None
+            happened = status not in ("ok", NOT_CALIBRATED) or "event" in json.loads(extra)
+        except (StoreError, ValueError) as error:
+            log.warning("%s; its frame is left out", error)
         yield KeptFrame(id_, series, number, time, path, happened)

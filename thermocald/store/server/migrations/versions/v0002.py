@@ -41,6 +41,8 @@ RETURNS void LANGUAGE sql SECURITY DEFINER SET search_path = public, pg_temp AS 
   INSERT INTO public.station VALUES ($1, {_NOW}, $2, $3, $4, $5)
   ON CONFLICT (name) DO UPDATE SET contact = excluded.contact, clock = excluded.clock,
     waiting = excluded.waiting, refused = excluded.refused, version = excluded.version
+  -- what was under way when a connection broke may come after what was said later
+  WHERE excluded.clock >= station.clock OR excluded.contact > station.contact + 600
 $$
 """
 

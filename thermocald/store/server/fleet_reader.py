@@ -131,8 +131,8 @@ class FleetReader(Connected):
         rows = self._query(
             "SELECT s.key, e.frame_time, e.received, e.status, e.temperatures "
             "FROM unnest(%s::uuid[]) s(key) CROSS JOIN LATERAL (SELECT * FROM epoch "
-            "WHERE series = s.key AND frame_time <= %s "
-            "ORDER BY frame_time DESC, revision DESC LIMIT %s) e",
+            "WHERE series = s.key AND frame_time <= %s ORDER BY frame_time DESC LIMIT %s) e "
+            "ORDER BY s.key, e.frame_time DESC, e.revision DESC",
             ([*current], now + _DAY_S, RECENT),
         )
         for key, frame_time, received, status, temperatures in rows:
@@ -157,10 +157,12 @@ class FleetReader(Connected):
             "FROM unnest(%s::uuid[], %s::text[], %s::float8[], %s::float8[], %s::int[]) "
             "s(key, channel, first, last, count) "
             "CROSS JOIN LATERAL generate_series(0, s.count - 1) k "
-            "CROSS JOIN LATERAL (SELECT * FROM epoch "
+            # ordered by the index alone: with the revision too, whole intervals would be sorted
+            "CROSS JOIN LATERAL (SELECT frame_time AS t FROM epoch "
             "WHERE series = s.key AND frame_time >= s.first + (s.last - s.first) * k / s.count "
             "AND frame_time <= s.first + (s.last - s.first) * (k + 1) / s.count "
-            "ORDER BY frame_time, revision DESC LIMIT 1) e "
+            "ORDER BY frame_time LIMIT 1) first CROSS JOIN LATERAL (SELECT * FROM epoch "
+            "WHERE series = s.key AND frame_time = first.t ORDER BY revision DESC LIMIT 1) e "
             "WHERE e.status = 'ok' ORDER BY s.first, s.key, e.frame_time",
             ([*keys], [*channels], [*firsts], [*lasts], counts),
         )

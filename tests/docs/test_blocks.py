@@ -58,7 +58,7 @@ def thermocald_commands() -> list[tuple[str, str]]:
     found = []
     for block in all_blocks("bash"):
         for line in block.commands():
-            parts = re.split(r"\s*(?:&&|\||;)\s*", line)
+            parts = re.split(r"\s*(?:&&|\||;\s)\s*", line)
             found += [(identity(block), p) for p in parts if p.startswith("thermocald ")]
     for page in (*PAGES, *NOTEBOOKS):
         found += [(name(page), text) for text in inline_commands(page)]

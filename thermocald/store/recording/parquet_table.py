@@ -69,14 +69,15 @@ class ParquetTable:
         first = 0
         try:
             # not mapped: what was read of a long file would stay resident
-            with pyarrow.parquet.ParquetFile(self.path) as file:
+            with pyarrow.parquet.ParquetFile(self.path, pre_buffer=False) as file:
                 groups = range(file.num_row_groups)
                 if epochs is not None:
                     groups, first = _holding(file.metadata, self.columns.index("epoch"), epochs)
-                for batch in file.iter_batches(rows, list(groups), columns):
-                    if len(batch):
-                        yield ColumnChunk(self, first, batch)
-                        first += len(batch)
+                for group in groups:  # one call for all would keep what was read
+                    for batch in file.iter_batches(rows, [group], columns):
+                        if len(batch):
+                            yield ColumnChunk(self, first, batch)
+                            first += len(batch)
         except (OSError, ValueError) as cause:  # pyarrow's errors are both
             if isinstance(cause, RecordingError):
                 raise

@@ -482,7 +482,7 @@ def test_absent_binary_and_unknown(tmp_path, plain):
     with pytest.raises(UsageError, match="there are opencv"):
         camera_files.write(plain, tmp_path / "x", "vision9000")
     with pytest.raises(UsageError, match="cannot be written"):
-        camera_files.write(plain, tmp_path / "no" / "folder.yaml", "opencv")
+        camera_files.write(plain, tmp_path / "x.jpg" / "folder.yaml", "opencv")
     with pytest.raises(UsageError, match="shape"):
         camera_files.write(plain, tmp_path / "x", "json", np.eye(3))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["x.jpg"]

@@ -237,3 +237,32 @@ def test_the_makefile_builds_it():
     (script,) = settings["extra"]["polyfills"]
     assert "iframe-worker" in script  # else the plugin adds one from a public server
     assert (ROOT / "docs" / script).is_file()
+
+
+def test_the_makefile_installs_nothing_where_mkdocs_is(tmp_path):
+    there = tmp_path / "bin" / "mkdocs"
+    there.parent.mkdir()
+    there.touch()
+
+    def commands(folder: Path) -> str:
+        return subprocess.run(
+            ["make", "--dry-run", "docs", f"VENV={folder}"],
+            cwd=ROOT, check=True, capture_output=True, text=True,
+        ).stdout  # fmt: skip
+
+    assert "pip" not in commands(tmp_path)
+    assert "pip install" in commands(tmp_path / "elsewhere")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [1280, 390])
+def test_the_search_works_from_a_folder(built, page_of, width):
+    page = page_of((built(False) / "index.html").as_uri(), width=width, height=800)
+    if width < 600:
+        page.locator("label.md-icon[for=__search]").first.click()
+    box = page.locator("input.md-search__input")
+    box.click()
+    box.press_sequentially("hysteresis", delay=30)
+    page.locator("li.md-search-result__item").first.wait_for(timeout=20_000)
+    assert "hysteresis" in page.locator("ol.md-search-result__list").inner_text().lower()
+    assert page.problems == []

@@ -10,7 +10,7 @@ A short series does not decide between models, so their weights beforehand matte
 by simulation such that errors are about as large as the standard deviations. Over 150 epochs of a
 warm-up, or of heating and cooling, they are 0.9 of it for white noise, 0.9 to 1.0 for phi = 0.9,
 1.0 to 1.2 for phi = 0.97 on white noise of equal size; all that was tried with phi up to 0.97 lies
-between 0.75 and 1.35. Noise whose memory is more than a seventh of the series leaves an order of
+between 0.65 and 1.35. Noise whose memory is more than a seventh of the series leaves an order of
 magnitude (1.3 to 1.5 for phi = 0.99); where that is likely, `too_short` is set.
 
 Sources: Whittle (1953), Estimation and information in stationary time series; Harville (1974),

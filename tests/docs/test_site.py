@@ -265,4 +265,4 @@ def test_the_search_works_from_a_folder(built, page_of, width):
     box.press_sequentially("hysteresis", delay=30)
     page.locator("li.md-search-result__item").first.wait_for(timeout=20_000)
     assert "hysteresis" in page.locator("ol.md-search-result__list").inner_text().lower()
-    assert page.problems == []
+    assert [p for p in page.problems if not p.startswith("file:")] == []

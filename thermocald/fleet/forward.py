@@ -152,9 +152,11 @@ class Forwarder:
 
     def _report(self, store: Store, writer: ServerWriter, cursor: Cursor) -> None:
         """Tell the server how this station is."""
-        # before it is sent: where the answer is lost, the server may have it all the same
-        self._waiting = store.rows_waiting(cursor.sent)
-        writer.report(self._waiting, cursor.rows_refused, time.time())
+        waiting = store.rows_waiting(cursor.sent)
+        # where the answer is lost the server may have this report or the last one
+        self._waiting = max(self._waiting, waiting)
+        writer.report(waiting, cursor.rows_refused, time.time())
+        self._waiting = waiting
         self._reported = time.monotonic()
 
     def _send(

@@ -202,7 +202,7 @@ def test_mqtt_with_a_real_broker(machine, report):
     received = result["received"]
     results = [p for topic, p, _ in received if topic == "thermocald/thermocald/result"]
     assert len(results) == 5
-    assert sum(topic.startswith("homeassistant/sensor/") for topic, _, _ in received) == 8
+    assert sum(topic.startswith("homeassistant/sensor/") for topic, _, _ in received) == 11
     available = [p for topic, p, _ in received if topic == "thermocald/thermocald/available"]
     assert available == ["online", "offline"]  # killed: the broker speaks the last will
     report(f"mqtt (mosquitto): result to acknowledgement {milliseconds(result['took_s'][1:])}")

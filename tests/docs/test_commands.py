@@ -12,6 +12,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -146,7 +147,7 @@ class Page:
         if block.language == "python":
             self.finish("python", self.start(f"{sys.executable} -", block.text))
         elif block.language == "sql":
-            with sqlite3.connect(self.folder / "thermocald.db") as database:
+            with closing(sqlite3.connect(self.folder / "thermocald.db")) as database, database:
                 assert database.execute(block.text).fetchall()
             database.close()
         elif block.language == "text" and self.page in SHOWN:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 import threading
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -242,7 +243,7 @@ def test_threads_share_a_store(filled, head, field, make_epoch, make_result):
 
 def test_plain_sql_can_read_it(filled, store_path):
     """Users look with the sqlite3 shell: parameters are columns, temperatures are JSON."""
-    with sqlite3.connect(store_path) as database:
+    with closing(sqlite3.connect(store_path)) as database, database:
         row = database.execute(
             "SELECT number, c, sd_c, centre_X0, json_extract(temperatures, '$.temperature') "
             "FROM epoch WHERE number = 3"
@@ -276,7 +277,7 @@ def test_not_ours(tmp_path, mode):
         Store.open(text, mode)
     assert text.read_text() == "not a database, " * 100
     other = tmp_path / "other.db"
-    with sqlite3.connect(other) as database:
+    with closing(sqlite3.connect(other)) as database, database:
         database.execute("CREATE TABLE recipes (id)")
     database.close()
     before = other.read_bytes()
@@ -289,7 +290,7 @@ def test_not_ours(tmp_path, mode):
 def test_a_newer_version_is_left_alone(filled, store_path, mode):
     store, _ = filled
     store.close()
-    with sqlite3.connect(store_path) as database:
+    with closing(sqlite3.connect(store_path)) as database, database:
         database.execute("PRAGMA user_version = 99")
     database.close()
     with pytest.raises(StoreVersionError, match=r"version 99.*update thermocald"):

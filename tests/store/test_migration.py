@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 import zlib
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -98,9 +99,14 @@ def test_before_it_is_changed_an_older_store_is_copied(version_1, mode):
     copy = version_1.with_name("small.db.version-1")
     assert version(copy) == 1
     assert version(version_1) == migrations.VERSION
-    rows = [list(sqlite3.connect(p).iterdump()) for p in (copy,)]
+    rows = dump(copy)
     version_1.write_bytes(before)
-    assert rows == [list(sqlite3.connect(version_1).iterdump())]
+    assert rows == dump(version_1)
+
+
+def dump(path):
+    with closing(sqlite3.connect(path)) as database:
+        return list(database.iterdump())
 
 
 def test_without_room_for_the_copy_nothing_is_changed(version_1, monkeypatch):

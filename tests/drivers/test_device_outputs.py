@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from thermocald_drivers.picamera import sensor_temperature
 
-from tests.drivers.fakes.adb_server import AdbServer, FakePhone
+from tests.drivers.fakes.adb_server import FakePhone
 from tests.drivers.fakes.pty_instrument import Instrument
 from tests.drivers.fakes.sysfs import Sysfs
 from thermocald.errors import BadReading, DeviceDenied, DeviceError, DeviceGone
@@ -28,13 +28,6 @@ HEAD = re.compile(
 )
 
 pytestmark = pytest.mark.skipif(not FILES, reason=f"{FOLDER} is not there")
-
-
-@pytest.fixture(scope="module")
-def server():
-    server = AdbServer()
-    yield server
-    server.close()
 
 
 def android(server, serial, **options):

@@ -9,13 +9,7 @@ from __future__ import annotations
 import pytest
 
 from tests.drivers.fakes.sysfs import Sysfs, w1_crc
-from tests.drivers.test_device_outputs import (
-    battery,
-    onewire,
-    phone_reads,
-    serial,
-    server,  # noqa: F401
-)
+from tests.drivers.test_device_outputs import battery, onewire, phone_reads, serial
 from thermocald.errors import BadReading
 from thermocald.hal import VirtualClock, open_device
 
@@ -195,7 +189,7 @@ BATTERY = {
 
 
 @pytest.mark.parametrize("case", BATTERY)
-def test_battery(case, server, tmp_path):  # noqa: F811
+def test_battery(case, server, tmp_path):
     text, expected = BATTERY[case]
     assert result(lambda: battery(server, tmp_path, text, {})) == expected
 
@@ -227,7 +221,7 @@ THERMAL = {
 
 
 @pytest.mark.parametrize("case", THERMAL)
-def test_thermal_service(case, server):  # noqa: F811
+def test_thermal_service(case, server):
     line, expected = THERMAL[case]
     name = line.partition("mName=")[2].partition(",")[0]
     text = HAL.format(f"\t{line}")
@@ -249,7 +243,7 @@ ibat-high 2000
 """
 
 
-def test_zones_of_a_phone(server):  # noqa: F811
+def test_zones_of_a_phone(server):
     wanted = {line.split()[0]: f"zone:{line.split()[0]}" for line in PHONE_ZONES.splitlines()}
     assert phone_reads(server, wanted, zones=PHONE_ZONES) == {
         "cpu-0-0-usr": 38.2, "gpuss-0-usr": 36.1, "battery": 31.0, "quiet-therm-adc": 32.1,

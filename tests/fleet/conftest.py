@@ -1,4 +1,4 @@
-"""A real PostgreSQL of its own on loopback, for the tests that need one."""
+"""A real PostgreSQL of its own on loopback, and the small store of tests/store to forward to it."""
 
 from __future__ import annotations
 
@@ -11,6 +11,37 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+
+from tests.store.conftest import field, filled, head, make_epoch, make_result, store_path
+from thermocald.store.server.address import ServerAddress
+
+__all__ = [
+    "address",
+    "cluster",
+    "count",
+    "field",
+    "filled",
+    "head",
+    "make_epoch",
+    "make_result",
+    "new_cluster",
+    "server",
+    "store_path",
+    "template",
+]
+
+
+def address(server: Server, query: str = "", **given: str) -> ServerAddress:
+    """The address of the database `thermocald` of a cluster."""
+    return ServerAddress.parse(server.address(query, name="thermocald", **given))
+
+
+def count(server: Server, table: str) -> int:
+    """The rows of a table of the database `thermocald`."""
+    import psycopg
+
+    with psycopg.connect(server.address(name="thermocald")) as connection:
+        return connection.execute(f"SELECT count(*) FROM {table}").fetchone()[0]
 
 
 def _programs() -> Path | None:
@@ -89,7 +120,6 @@ def template(cluster):
     """A database with the tables, to be copied: that is faster than to make them."""
     import psycopg
 
-    from thermocald.store.server.address import ServerAddress
     from thermocald.store.server.schema import create_tables
 
     with psycopg.connect(cluster.address(), autocommit=True) as connection:

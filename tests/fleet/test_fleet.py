@@ -7,9 +7,11 @@ import re
 import time
 from dataclasses import replace
 
-import psycopg
 import pytest
 from typer.testing import CliRunner
+
+pytest.importorskip("psycopg", reason="pip install thermocald[server]")
+import psycopg
 
 from benchmarks.generated_fleet import GeneratedCamera, add_camera
 from thermocald.cli import application

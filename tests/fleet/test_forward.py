@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import sqlite3
 import threading
@@ -16,30 +15,14 @@ from thermocald.fleet.forward import Forwarder, forward_forever
 from thermocald.store.database.row import Event, LoggedReading
 from thermocald.store.database.store import Store
 
-_spec = importlib.util.spec_from_file_location(
-    "store_fixtures", Path(__file__).parents[1] / "store" / "conftest.py"
-)
-_fixtures = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(_fixtures)
-field, head, make_epoch, make_result, store_path, filled = (
-    getattr(_fixtures, name)
-    for name in ("field", "head", "make_epoch", "make_result", "store_path", "filled")
-)
+pytest.importorskip("psycopg", reason="pip install thermocald[server]")
+import psycopg
 
-psycopg = pytest.importorskip("psycopg", reason="pip install thermocald[server]")
-from thermocald.store.server.address import ServerAddress, is_server  # noqa: E402
-from thermocald.store.server.reader import ServerStore  # noqa: E402
-from thermocald.store.server.schema import grant  # noqa: E402
-from thermocald.store.server.writer import ServerWriter  # noqa: E402
-
-
-def address(server, query="", **given):
-    return ServerAddress.parse(server.address(query, name="thermocald", **given))
-
-
-def count(server, table):
-    with psycopg.connect(server.address(name="thermocald")) as connection:
-        return connection.execute(f"SELECT count(*) FROM {table}").fetchone()[0]
+from tests.fleet.conftest import address, count
+from thermocald.store.server.address import ServerAddress, is_server
+from thermocald.store.server.reader import ServerStore
+from thermocald.store.server.schema import grant
+from thermocald.store.server.writer import ServerWriter
 
 
 def test_a_last_report_that_is_lost_is_sent_again(filled, server, monkeypatch):

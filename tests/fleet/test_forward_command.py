@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from tests.fleet.test_forward import count, field, head, make_epoch, make_result  # noqa: F401
+from tests.fleet.conftest import count
 from thermocald.cli import application
 from thermocald.config import load_config
 from thermocald.errors import ConfigurationError
@@ -30,7 +30,7 @@ def run(*arguments):
 
 
 @pytest.fixture
-def configured(tmp_path, head, field, make_epoch, make_result):  # noqa: F811
+def configured(tmp_path, head, field, make_epoch, make_result):
     """A folder with a store of three epochs; the second has no result and a frame."""
     with Store.open(tmp_path / "k.db", "append") as store:
         series = store.create_series(head, field)

@@ -7,18 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
-import psycopg
 import pytest
 
-from tests.fleet.test_forward import (  # noqa: F401
-    address,
-    count,
-    field,
-    head,
-    make_epoch,
-    make_result,
-    store_path,
-)
+pytest.importorskip("psycopg", reason="pip install thermocald[server]")
+import psycopg
+
+from tests.fleet.conftest import address, count
 from thermocald.errors import ServerError
 from thermocald.fleet.forward import Forwarder
 from thermocald.fleet.frames import FrameRule
@@ -27,7 +21,7 @@ from thermocald.store.server.reader import ServerStore
 
 
 @pytest.fixture
-def station(tmp_path, store_path, head, field, make_epoch, make_result):  # noqa: F811
+def station(tmp_path, store_path, head, field, make_epoch, make_result):
     """A store of 20 epochs with frames of 1000 bytes; 7 and 13 have no result."""
     folder = tmp_path / "frames"
     with Store.open(store_path, "append", durable=False) as store:

@@ -2,19 +2,12 @@
 
 from __future__ import annotations
 
-import psycopg
 import pytest
 
-from tests.fleet.test_forward import (  # noqa: F401  # noqa: F401
-    address,
-    count,
-    field,
-    filled,
-    head,
-    make_epoch,
-    make_result,
-    store_path,
-)
+pytest.importorskip("psycopg", reason="pip install thermocald[server]")
+import psycopg
+
+from tests.fleet.conftest import address, count
 from thermocald.fleet.forward import Forwarder
 from thermocald.store.server import timescale
 from thermocald.store.server.connection import connect
@@ -29,7 +22,7 @@ def partitioned(server):
         ).fetchone()[0]
 
 
-def test_a_hypertable_where_the_extension_is(cluster, filled):  # noqa: F811
+def test_a_hypertable_where_the_extension_is(cluster, filled):
     with psycopg.connect(cluster.address(), autocommit=True) as connection:
         connection.execute("DROP DATABASE IF EXISTS thermocald WITH (FORCE)")
         connection.execute("CREATE DATABASE thermocald")
@@ -51,7 +44,7 @@ def test_a_hypertable_where_the_extension_is(cluster, filled):  # noqa: F811
     assert numbers.tolist() == store.series_columns(series, ["epoch"])["epoch"].tolist()
 
 
-def test_it_is_not_needed_and_what_fails_changes_nothing(server, filled, monkeypatch, caplog):  # noqa: F811
+def test_it_is_not_needed_and_what_fails_changes_nothing(server, filled, monkeypatch, caplog):
     """The statements fail here, on a server without the extension: the partitions stay."""
     assert partitioned(server) == 1
     monkeypatch.setattr(timescale, "_wanted", lambda connection: True)

@@ -9,20 +9,12 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
-import psycopg
 import pytest
 
-from tests.fleet.conftest import new_cluster
-from tests.fleet.test_forward import (  # noqa: F401  # noqa: F401
-    address,
-    count,
-    field,
-    filled,
-    head,
-    make_epoch,
-    make_result,
-    store_path,
-)
+pytest.importorskip("psycopg", reason="pip install thermocald[server]")
+import psycopg
+
+from tests.fleet.conftest import address, count, new_cluster
 from thermocald.cli.series_task import find_series_tasks
 from thermocald.errors import ServerError, ServerGone, StoreError, StoreVersionError
 from thermocald.fleet.forward import Forwarder
@@ -36,7 +28,7 @@ HOSTILE = ["x'); DROP TABLE epoch; --", 'a"b', "%s", "{0}", "$1", "; SELECT pg_s
 
 
 @pytest.mark.parametrize("evil", HOSTILE)
-def test_names_are_values_and_never_statements(server, tmp_path, head, field, make_epoch, evil):  # noqa: F811
+def test_names_are_values_and_never_statements(server, tmp_path, head, field, make_epoch, evil):
     """Of a station, camera, series, channel and extra column; read back by them, and narrowed."""
     channel = evil.replace("/", "")
     camera = replace(head.camera, name=evil)
@@ -66,7 +58,7 @@ def test_names_are_values_and_never_statements(server, tmp_path, head, field, ma
         assert task.target.parent == tmp_path / "out"
 
 
-def test_a_newer_server_is_told_from_an_older_one(filled, server):  # noqa: F811
+def test_a_newer_server_is_told_from_an_older_one(filled, server):
     store, _ = filled
     with psycopg.connect(server.address(name="thermocald")) as connection:
         connection.execute("UPDATE alembic_version SET version_num = '9999'")
@@ -80,7 +72,7 @@ def test_a_newer_server_is_told_from_an_older_one(filled, server):  # noqa: F811
     assert Forwarder(store.path, address(server), "b").send_waiting().rows == 20
 
 
-def test_a_clock_that_jumps_loses_nothing(server, tmp_path, head, field, make_epoch):  # noqa: F811
+def test_a_clock_that_jumps_loses_nothing(server, tmp_path, head, field, make_epoch):
     """Before 1970, in the far future, back again: every epoch arrives, in its own month or none."""
     times = [-5.0, 0.0, 3.0e3, 1.7e9, 1.7e9 + 10, 9.0e11, 1.7e9 + 20, 1.69e9]
     with Store.open(tmp_path / "k.db", "append") as store:
@@ -113,7 +105,7 @@ def small_disk():
 
 
 @pytest.mark.slow
-def test_a_full_disk_of_the_server_is_said_and_made_up_for(small_disk, filled):  # noqa: F811
+def test_a_full_disk_of_the_server_is_said_and_made_up_for(small_disk, filled):
     store, series = filled
     with new_cluster() as server:
         with psycopg.connect(server.address(), autocommit=True) as connection:
@@ -160,7 +152,7 @@ def certificates(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_certificates(certificates, filled):  # noqa: F811
+def test_certificates(certificates, filled):
     """A client certificate is enough; an expired one, on either side, or a foreign one, is said."""
     store, _ = filled
 

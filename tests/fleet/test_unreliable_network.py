@@ -14,6 +14,7 @@ import pytest
 pytest.importorskip("psycopg", reason="pip install thermocald[server]")
 import psycopg
 
+from tests.fleet.conftest import count
 from tests.fleet.simulated_stations import station_name
 from tests.fleet.unreliable_proxy import UnreliableProxy
 from thermocald.store.database.store import Store
@@ -53,11 +54,6 @@ def forwarded(server, folder, stations, per_process, epochs, kills, cut_every_s)
             assert "Traceback" not in errors, errors[-3000:]
         assert proxy.cuts > stations
         return time.monotonic() - recovered
-
-
-def count(server, table):
-    with psycopg.connect(server.address(name="thermocald")) as connection:
-        return connection.execute(f"SELECT count(*) FROM {table}").fetchone()[0]
 
 
 def require_equal(server, folder, stations):

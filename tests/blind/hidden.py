@@ -93,6 +93,11 @@ def hide(rng: np.random.Generator, name: str, camera: Camera, truth: dict) -> di
     elif name == "housing_tilt":
         e["along"] = np.zeros(16)
         e["along"][10:13] = rng.normal(size=3) * 1e-5
+    elif name == "mount_motion":  # a bracket of some decimetres: it bends late, or at once
+        e["tau"] = float(rng.choice([1e-3, np.exp(rng.uniform(np.log(60), np.log(500)))]))
+        e["along"] = np.zeros(16)
+        e["along"][10:13] = rng.normal(size=3) * 1e-5
+        e["along"][13:16] = rng.normal(size=3) * 1e-2
     elif name == "radial_distortion_drift":
         e["along"] = np.zeros(16)
         e["along"][3] = 1e-5
@@ -174,6 +179,8 @@ def true_parameters(
             "affinity_drift",
         ):
             course = T - camera.T0
+        elif name == "mount_motion":
+            course = lagged(T, e["tau"]) - camera.T0
         elif name == OUTSIDE:
             course = unknown
         elif name == "test_field_expansion":

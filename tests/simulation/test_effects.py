@@ -70,6 +70,7 @@ def test_catalogue_is_complete():
         "second_heat_source",
         "defocus",
         "housing_tilt",
+        "mount_motion",
         "radial_distortion_drift",
         "decentering_drift",
         "affinity_drift",
@@ -122,6 +123,18 @@ def test_thermal_lag_of_a_ramp_and_a_sine():
     assert np.all(added[:, [column(n) for n in PARAMETER_NAMES if n not in ("c", "x0", "y0")]] == 0)
 
 
+def test_mount_motion_follows_late_by_its_lag():
+    h = history()
+    late = effects.get("thermal_lag").drive(h, tau=400.0) - T0
+    added = shift(h, ModelEffect("mount_motion", {"tau": 400.0, "kappa": 1e-5, "X0": 3e-3}))
+    np.testing.assert_allclose(added[:, column("kappa")], 1e-5 * late, atol=1e-15)
+    np.testing.assert_allclose(added[:, column("X0")], 3e-3 * late, atol=1e-12)
+    assert np.all(added[:, :10] == 0)
+    assert "with a lag of" in effects.get("mount_motion").sentence(
+        {"tau": {"value": 400.0, "sd": 9.0, "unit": "s"}}
+    )
+
+
 def test_time_offset_is_a_pure_delay():
     h = history()
     expected = T0 + 12 * np.sin(np.maximum(h.times - 37.0, 0.0) / 300.0)
@@ -166,6 +179,10 @@ FORMULAS = {
         {"c": lambda t: 1e-4 * 5 * np.cos(t / 170)},
     ),
     "housing_tilt": ({"phi": 1e-5}, {"phi": lambda t: 1e-5 * T_SINE(t)}),
+    "mount_motion": (
+        {"phi": 1e-5, "Z0": 2e-3},
+        {"phi": lambda t: 1e-5 * T_SINE(t), "Z0": lambda t: 2e-3 * T_SINE(t)},
+    ),
     "radial_distortion_drift": (
         {"A1": 1e-5, "A2": 2e-6},
         {"A1": lambda t: 1e-5 * T_SINE(t), "A2": lambda t: 2e-6 * T_SINE(t)},

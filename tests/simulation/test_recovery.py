@@ -49,6 +49,10 @@ CASES = {
     ),
     "defocus": ({"factor": 0.08}, {}),
     "housing_tilt": ({"omega": 4e-6, "phi": -6e-6, "kappa": 3e-6}, {}),
+    "mount_motion": (
+        {"tau": 200.0, "omega": 4e-6, "phi": -6e-6, "kappa": 3e-6, "X0": 4e-3, "Z0": -3e-3},
+        {"tau": 40.0},
+    ),
     "radial_distortion_drift": ({"A1": 6e-6}, {}),
     "decentering_drift": ({"B1": 4e-6, "B2": -3e-6}, {}),
     "affinity_drift": ({"C1": 6e-6, "C2": -4e-6}, {}),

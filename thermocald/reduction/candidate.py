@@ -56,15 +56,19 @@ def candidate_of(
     parameters: tuple[str, ...],
     series: Sequence[ReducedSeries],
     fixed: tuple[tuple[str, Any], ...] = (),
+    *,
+    plain: bool = False,
 ) -> Candidate:
     """An effect on some of its coefficients; what belongs to a series but an event is not searched.
 
-    fixed: non-linear values that are given.
+    fixed: non-linear values that are given; plain: without the parameters that a model may leave
+    out.
     """
     given = dict(fixed)
     columns = tuple(effect.column(p) for p in parameters)
     for key, parameter in effect.nonlinear.items():
         own = key in effect.fresh and parameter.role != "event"
-        if not (parameter.text or own or key in given):
+        left_out = plain and key in effect.optional
+        if not (parameter.text or own or left_out or key in given):
             return Candidate(effect.name, columns, key, trial_values(parameter, series), fixed)
     return Candidate(effect.name, columns, "", np.zeros(0), fixed)

@@ -50,6 +50,8 @@ def candidates(series: Sequence[ReducedSeries]) -> list[Candidate]:
                 if c != first.history.reference and all(_varies(e, c) for e in series)
             ]
         out += [candidate_of(effect, p, series, fixed) for fixed in channels for p in sets]
+        if effect.optional:
+            out.append(candidate_of(effect, sets[0], series, (), plain=True))
     return out
 
 

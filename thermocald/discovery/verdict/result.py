@@ -10,16 +10,14 @@ import numpy as np
 from thermocald.discovery.search.candidates import richer_set
 from thermocald.discovery.search.cross_validation import cross_validation
 from thermocald.discovery.search.examination import Examination, examine_series
-from thermocald.discovery.verdict.estimates import (
-    acts_on,
-    term_estimates,
-)
+from thermocald.discovery.verdict.estimates import acts_on, term_estimates
 from thermocald.discovery.verdict.found import EffectFound
 from thermocald.discovery.verdict.gap import Gap, fit_first
 from thermocald.discovery.verdict.image_effects import image_effects
 from thermocald.discovery.verdict.misfit import resolve
 from thermocald.discovery.verdict.mount import mount_of
 from thermocald.discovery.verdict.proposed import NO_PROPOSAL, proposed
+from thermocald.discovery.verdict.separable import shift_or_tilt
 from thermocald.discovery.verdict.stages import Stage, gap_at, stage_of
 from thermocald.discovery.verdict.unnamed import describe_unnamed
 from thermocald.simulation import effects as catalogue
@@ -151,11 +149,10 @@ def _entry(x: Examination, fit: Fit, k: int, before: Gap, after: Gap, first: boo
             "gains_of_surrogates": [float(g) for g in np.sort(test.surrogates)],
         }
     statement = effect.sentence(estimates)
-    if x.mount is not None and {"x0", "y0"} & set(term.parameters):
-        statement += (
-            "; alongside a mount that moves, its cause in time is named, while a shift of the "
-            "principal point and a tilt of the camera are hardly separable"
-        )
+    part = shift_or_tilt(x.fitter, x.best.fit, k)
+    if part is not None:
+        statement += part.sentence
+        evidence["shift_and_tilt"] = part.as_json()
     others = [a["effect"] for a in _alternatives(x, term, first)]
     if others:
         statement += f". Not excluded instead: {', '.join(others)}"

@@ -62,8 +62,8 @@ class Effect(ABC):
 
     name: as in the catalogue; noun: for sentences; nonlinear: searched parameters; linear:
     {coefficient: unit}; usual: the coefficients that act unless told otherwise; fresh: non-linear
-    parameters that belong to one series and do not carry over to another; behaviour: answers to
-    EXPERIMENTS.
+    parameters that belong to one series and do not carry over to another; optional: non-linear
+    parameters that a model may leave out; behaviour: answers to EXPERIMENTS.
 
     For a search: seen_in: the trajectories of the camera's parameters, the measuring noise, or
     single targets; parameter_sets: the sets of coefficients that it may act on, by default the
@@ -79,6 +79,7 @@ class Effect(ABC):
     linear: ClassVar[Mapping[str, str]] = {}
     usual: ClassVar[tuple[str, ...]] = ()
     fresh: ClassVar[tuple[str, ...]] = ()
+    optional: ClassVar[tuple[str, ...]] = ()
     behaviour: ClassVar[Mapping[str, str]] = {}
     seen_in: ClassVar[SeenIn] = "trajectory"
     parameter_sets: ClassVar[tuple[tuple[str, ...], ...]] = ()
@@ -236,6 +237,8 @@ class Effect(ABC):
                 )
         for name, parameter in self.nonlinear.items():
             if name not in values:
+                if name in self.optional:
+                    continue
                 raise ConfigurationError(
                     f"{place}: parameter {name!r} ({parameter.unit}) is missing"
                 )

@@ -1,0 +1,43 @@
+"""A shift of the principal point and a tilt of the camera: separated where the recording does it."""
+
+from __future__ import annotations
+
+import pytest
+
+from thermocald.discovery.verdict.result import discover_series
+
+
+@pytest.mark.parametrize(
+    ("px", "separable"), [pytest.param(0.1, True, marks=pytest.mark.slow), (0.006, False)]
+)
+def test_the_recording_decides_whether_shift_and_tilt_are_separable(evidence_of, px, separable):
+    evidence, _ = evidence_of("creep", px=px, seed=1)
+
+    (found,) = discover_series(evidence).effects
+
+    assert found.effect == "creep"  # the cause in time, either way
+    part = found.evidence["shift_and_tilt"]
+    assert part["separable"] is separable
+    assert 0.99 < part["correlation"] < 1.0
+    assert ("not separable" in found.statement) is not separable
+
+
+def test_a_mount_that_bends_late_is_named(evidence_of):
+    evidence, truth = evidence_of("mount_motion", px=0.1, seed=3)
+
+    (found,) = discover_series(evidence).effects
+
+    assert found.effect == "mount_motion"
+    tau = found.estimates["tau"]
+    assert tau["value"] == pytest.approx(truth["effects"][0][0]["tau"], abs=3 * tau["sd"])
+    assert found.evidence["shift_and_tilt"]["chi2_difference"] < -100  # a tilt, not a shift
+
+
+@pytest.mark.slow
+def test_a_mount_that_bends_at_once_is_named(evidence_of):
+    evidence, _ = evidence_of("mount_motion", px=0.1, seed=1)
+
+    (found,) = discover_series(evidence).effects
+
+    assert (found.effect, "tau" in found.estimates) == ("mount_motion", False)
+    assert "at once" in found.statement

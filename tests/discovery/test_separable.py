@@ -1,4 +1,4 @@
-"""A shift of the principal point and a tilt of the camera: separated where the recording does it."""
+"""A shift of the principal point or a tilt of the camera: the recording says which it can tell."""
 
 from __future__ import annotations
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.photogrammetry.series.blocks import runs
 from thermocald.photogrammetry.series.normals import ObservationGrid
 
 if TYPE_CHECKING:
@@ -40,13 +41,12 @@ class StoredBlocks:
         """Grids of consecutive epochs, each with its first epoch (from 0); only of windows."""
         field = self.series.testfield
         size = max(_GRID_POINTS // len(field), 1)
-        for window in windows or (slice(0, len(self)),):
-            for first in range(window.start, window.stop, size):
-                numbers = self.numbers[first : min(first + size, window.stop)]
-                part: list[Observations | None] = [None] * len(numbers)
-                found = self.store.epochs(self.series, int(numbers[0]), int(numbers[-1]))
-                for stored in found:
-                    row = int(np.searchsorted(numbers, stored.epoch.number))
-                    if row < len(numbers) and numbers[row] == stored.epoch.number:
-                        part[row] = stored.epoch.observations
-                yield first, ObservationGrid.from_observations(field, part)
+        for rows in runs(len(self), size, windows):
+            numbers = self.numbers[rows]
+            part: list[Observations | None] = [None] * len(numbers)
+            found = self.store.epochs(self.series, int(numbers[0]), int(numbers[-1]))
+            for stored in found:
+                row = int(np.searchsorted(numbers, stored.epoch.number))
+                if row < len(numbers) and numbers[row] == stored.epoch.number:
+                    part[row] = stored.epoch.observations
+            yield rows.start, ObservationGrid.from_observations(field, part)

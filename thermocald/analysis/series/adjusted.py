@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
     from thermocald.photogrammetry.field.testfield import Observations, TestField
     from thermocald.photogrammetry.series.blocks import ObservationBlocks
+    from thermocald.photogrammetry.series.long_result import LongAdjustment, RowWriter
     from thermocald.photogrammetry.series.normals import ObservationGrid
     from thermocald.photogrammetry.series.result import Exterior
     from thermocald.store.recording.head import Head
@@ -106,26 +107,7 @@ def _together(
         mask[:, rows] = True
         return _together(head, testfield, apart, start, _grid(grid.reject(mask)), rough)
 
-    observed, rejected = result.observed.sum(axis=1), result.rejected.sum(axis=1)
-    status, reasons = _said(result.status, result.reasons, apart)
-    return replace(
-        apart,
-        values=result.values,
-        sd=result.sd,
-        sigma0=np.where(result.ok, result.sigma0, np.nan),
-        n_observations=observed + rejected,
-        n_rejected=rejected,
-        status=status,
-        reasons=reasons,
-        exterior=result.exterior,
-        level_sd=result.level_sd,
-        adjustment=result,
-        groups=_groups(testfield, result),
-        without=without,
-        trend_sd=result.trend_sd,
-        redundancy=result.redundancy,
-        stillness=result.stillness,
-    )
+    return replace(_table(apart, testfield, result, result, result), without=without)
 
 
 def _in_blocks(
@@ -155,26 +137,40 @@ def _in_blocks(
         )
         return _together(head, testfield, some, start, _grid(used), rough)
 
+    table = _table(apart, testfield, rows, found, sample)
+    return replace(table, without=without, sampled=found.sampled)
+
+
+def _table(
+    apart: SeriesTable, testfield: TestField, rows: SeriesAdjustment | RowWriter,
+    whole: SeriesAdjustment | LongAdjustment, sample: SeriesAdjustment,
+) -> SeriesTable:  # fmt: skip
+    """The table of adjusted epochs (`rows`), of the series as a whole, and of epochs in full."""
+    rejected = _count(rows.rejected)
     status, reasons = _said(rows.status, rows.reasons, apart)
     return replace(
         apart,
         values=rows.values,
         sd=rows.sd,
-        sigma0=rows.sigma0,
-        n_observations=rows.observed + rows.rejected,
-        n_rejected=rows.rejected,
+        sigma0=np.where(rows.ok, rows.sigma0, np.nan),
+        n_observations=_count(rows.observed) + rejected,
+        n_rejected=rejected,
         status=status,
         reasons=reasons,
         exterior=sample.exterior,
-        level_sd=found.level_sd,
+        level_sd=whole.level_sd,
         adjustment=sample,
         groups=_groups(testfield, sample),
-        without=without,
-        trend_sd=found.trend_sd,
+        trend_sd=whole.trend_sd,
         redundancy=rows.redundancy,
         stillness=rows.stillness,
-        sampled=found.sampled,
     )
+
+
+def _count(targets: NDArray[Any]) -> NDArray[np.int64]:
+    """How many targets (E,), from their numbers or a mask (E, T)."""
+    count: NDArray[np.int64] = targets if targets.ndim == 1 else targets.sum(axis=1)
+    return count
 
 
 def _grid(grid: ObservationGrid) -> GridBlocks:
@@ -215,4 +211,5 @@ def settings_for_series(settings: AdjustmentSettings, exterior: str) -> SeriesSe
         scale=settings.scale,
         bounds=settings.bounds,
         max_rejected=settings.max_rejected,
+        priors=settings.priors,
     )

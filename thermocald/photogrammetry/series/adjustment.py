@@ -19,12 +19,23 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.epoch.gauss_markov import TRUSTED_REDUNDANCY
-from thermocald.photogrammetry.parameters import EOP, EOP_COLUMNS
+from thermocald.photogrammetry.parameters import EOP
+from thermocald.photogrammetry.series.covariances import (
+    all_cofactors,
+    line_weights,
+    of_common,
+    of_correlated,
+    of_priors,
+    of_slow_targets,
+    offset_cofactors,
+    stillness,
+    typical_sensitivity,
+)
+from thermocald.photogrammetry.series.design import State
 from thermocald.photogrammetry.series.estimator import (
     ENOUGH_FOR_NOISE,
     Estimate,
     SeriesEstimator,
-    Start,
     pooled_variance,
 )
 from thermocald.photogrammetry.series.exterior import choose, loose_bound, observed_movement
@@ -32,7 +43,6 @@ from thermocald.photogrammetry.series.mount import FEWEST_EPOCHS
 from thermocald.photogrammetry.series.normals import ObservationGrid, sums_of_squares
 from thermocald.photogrammetry.series.result import SeriesAdjustment, SeriesSettings
 from thermocald.photogrammetry.series.status import enough_targets, judge
-from thermocald.photogrammetry.series.system import line_weights
 from thermocald.photogrammetry.series.target_noise import excess_scatter, slow_errors
 
 if TYPE_CHECKING:
@@ -101,7 +111,7 @@ def adjusted(
     windows: runs of consecutive epochs, where the series is a sample of a longer one.
     """
     use = grid.observed & enough_targets(grid, s)[:, None]
-    first = Start(np.tile(start, (len(use), 1)), np.zeros((len(testfield), 2)), start[EOP])
+    first = State(np.tile(start, (len(use), 1)), np.zeros((len(testfield), 2)), start[EOP])
     series = SeriesEstimator(sensor, testfield, grid, grid.weights, s, windows=windows)
     if s.exterior in ("mount", "auto"):
         # Loosely bound at first, so that no movement is taken for gross errors.
@@ -127,13 +137,13 @@ def result(found: Adjusted) -> SeriesAdjustment:
     stated = sums_of_squares(series.stated, estimate.residuals, system.use)
     sigma0 = np.sqrt(stated / np.where(positive, redundancy, 1.0))
     sigma0[~positive] = np.nan
-    cofactors = system.covariances()
+    cofactors = all_cofactors(system)
     relative, level, trend = cofactors.relative, cofactors.level, cofactors.trend
-    excess, own, sound = np.zeros(16), system.own, system.good
+    excess, own, sound = np.zeros(16), system.design.own, system.good
     block = (slice(None), own[:, None], own)
     if s.scale == "posterior":
-        # What priors of the mount contribute is known as well as the mount, not as the epoch.
-        bound = system.from_priors()
+        # What priors contribute is known as well as they are, not as the epoch.
+        bound = of_priors(system)
         relative[block] -= bound
         relative *= epoch_variance(unit, redundancy, pooled)[:, None, None]
         relative[block] += pooled * bound
@@ -145,15 +155,17 @@ def result(found: Adjusted) -> SeriesAdjustment:
     mount_trend = np.zeros((16, 16))
     if movement.covariance.any() and sound.any():
         if s.exterior == "series":
-            relative[block] += system.of_common(movement.covariance)
-        G = system.typical_sensitivity()
+            relative[block] += of_common(system, movement.covariance)
+        G = typical_sensitivity(system)
         mount_trend[own[:, None], own] = G @ movement.tilt(line_weights(sound)) @ G.T
     slow = np.zeros((16, 16))
     if s.target_noise and len(use) >= ENOUGH_FOR_NOISE:
         pairs = series.pairs(estimate, use)
         if len(pairs):
-            relative += system.correlated(pairs)
-        slow = system.slow(slow_errors(estimate.residuals, use), series.testfield.groups)
+            relative += of_correlated(system, pairs)
+        slow = of_slow_targets(
+            system, slow_errors(estimate.residuals, use), series.testfield.groups
+        )
         trend += slow
     if s.target_noise:
         variances = np.diagonal(relative, axis1=1, axis2=2)[:, own]
@@ -163,10 +175,9 @@ def result(found: Adjusted) -> SeriesAdjustment:
     if slow.any():
         relative += np.linspace(-0.5, 0.5, len(use))[:, None, None] ** 2 * slow
     relative[~sound] = 0.0
-    stillness = np.full(len(sigma0), np.nan)
+    still = np.full(len(sigma0), np.nan)
     if s.exterior == "series":
-        score = system.score(estimate.residuals, EOP_COLUMNS)
-        stillness = score / np.where(positive, unit, 1.0)
+        still = stillness(system, estimate.residuals) / np.where(positive, unit, 1.0)
     values = estimate.values.copy()
     observed = series.grid.observed
     status, reasons = judge(
@@ -177,7 +188,7 @@ def result(found: Adjusted) -> SeriesAdjustment:
     return SeriesAdjustment(
         s, values, relative, level, sigma0, redundancy, use, observed & ~use,
         estimate.residuals, estimate.offsets if series.has_offsets else estimate.offsets * np.nan,
-        np.sqrt(system.offset_cofactors() * pooled), tuple(status), tuple(reasons), stillness,
+        np.sqrt(offset_cofactors(system) * pooled), tuple(status), tuple(reasons), still,
         np.sqrt(excess), np.sqrt(np.diag(trend + mount_trend)),
         _noise_ratio(sigma0, sound), movement, found.choice,
     )  # fmt: skip

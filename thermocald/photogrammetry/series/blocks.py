@@ -22,6 +22,7 @@ __all__ = [
     "ObservedBlocks",
     "WithoutTargets",
     "gathered",
+    "runs",
     "spread_windows",
 ]
 
@@ -41,6 +42,16 @@ class ObservationBlocks(Protocol):
         ...
 
 
+def runs(count: int, size: int, windows: Sequence[slice] | None = None) -> Iterator[slice]:
+    """The rows of `count` epochs, at most `size` at a time.
+
+    windows: only the rows of these slices, ascending; each begins a run.
+    """
+    for window in windows or (slice(0, count),):
+        for first in range(window.start, window.stop, size):
+            yield slice(first, min(first + size, window.stop))
+
+
 @dataclass(frozen=True, eq=False)
 class GridBlocks:
     """A grid in memory as blocks of at most `size` epochs."""
@@ -54,11 +65,9 @@ class GridBlocks:
     def blocks(
         self, windows: Sequence[slice] | None = None
     ) -> Iterator[tuple[int, ObservationGrid]]:
-        """The blocks; of windows, each begins one."""
-        for window in windows or (slice(0, len(self)),):
-            for first in range(window.start, window.stop, self.size):
-                rows = slice(first, min(first + self.size, window.stop))
-                yield first, ObservationGrid(self.grid.points[rows], self.grid.weights[rows])
+        """The blocks, as of `runs`."""
+        for rows in runs(len(self), self.size, windows):
+            yield rows.start, ObservationGrid(self.grid.points[rows], self.grid.weights[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,11 +84,10 @@ class ObservedBlocks:
     def blocks(
         self, windows: Sequence[slice] | None = None
     ) -> Iterator[tuple[int, ObservationGrid]]:
-        """The blocks; of windows, each begins one."""
-        for window in windows or (slice(0, len(self)),):
-            for first in range(window.start, window.stop, self.size):
-                part = self.observations[first : min(first + self.size, window.stop)]
-                yield first, ObservationGrid.from_observations(self.field, part)
+        """The blocks, as of `runs`."""
+        for rows in runs(len(self), self.size, windows):
+            part = self.observations[rows]
+            yield rows.start, ObservationGrid.from_observations(self.field, part)
 
 
 @dataclass(frozen=True, eq=False)

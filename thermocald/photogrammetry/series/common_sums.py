@@ -16,13 +16,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.linalg import inverse_of_determined, root_of
-from thermocald.photogrammetry.series.normals import right_hand_sides
 from thermocald.photogrammetry.series.system import SeriesSystem
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from thermocald.photogrammetry.series.normals import Partials
+    from thermocald.photogrammetry.series.design import Design
 
     Array = NDArray[np.float64]
     Mask = NDArray[np.bool_]
@@ -74,16 +73,11 @@ class _Pattern:
 class CommonSums:
     """The sums over the blocks so far.
 
-    at: linearisation; own (p,), common (q,): columns; own_prior (p, p) as in `SeriesSystem`; prior
-    (T, 3) px⁻²: of the offsets, None without; gradient (q + 2T,); epochs, times, squares: how many,
-    sums of their numbers and of the squares; ends: the first and the last.
+    design: the unknowns; gradient (q + 2T,); epochs, times, squares: how many, sums of their
+    numbers and of the squares; ends: the first and the last.
     """
 
-    at: Partials
-    own: Columns
-    common: Columns
-    own_prior: Array
-    prior: Array | None
+    design: Design
     gradient: Array = field(init=False)
     epochs: int = 0
     times: float = 0.0
@@ -92,12 +86,7 @@ class CommonSums:
     patterns: dict[bytes, _Pattern] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.gradient = np.zeros(self.width)
-
-    @property
-    def width(self) -> int:
-        """How many common unknowns there are."""
-        return len(self.common) + (0 if self.prior is None else 2 * len(self.at.A))
+        self.gradient = np.zeros(self.design.width)
 
     def add(self, first: int, system: SeriesSystem, left: Array, right: Array) -> None:
         """Add a block that begins at epoch `first`.
@@ -113,15 +102,10 @@ class CommonSums:
         self.epochs += len(good)
         self.times += float(t.sum())
         self.squares += float(t @ t)
-        if not self.width:
+        if not self.design.width:
             return
-        w = np.where(system.use[..., None], system.weights, 0.0)[good]
-        v = np.nan_to_num(left[good])
-        total = [right_hand_sides(w, v, self.at.A[..., self.common]).sum(axis=0)]
-        if self.prior is not None:
-            total.append((w[..., 0] * v[..., 0] + w[..., 2] * v[..., 1]).sum(axis=0))
-            total.append((w[..., 2] * v[..., 0] + w[..., 1] * v[..., 1]).sum(axis=0))
-        self.gradient += np.concatenate(total)
+        w = system.used(good)
+        self.gradient += self.design.gradient(w, left[good])
         seen, of = np.unique(np.packbits(system.use[good], axis=1), axis=0, return_inverse=True)
         for k, bits in enumerate(seen):
             rows = np.flatnonzero(of.ravel() == k)
@@ -129,7 +113,7 @@ class CommonSums:
             if key not in self.patterns and len(self.patterns) >= _MOST_PATTERNS:
                 key = b""
             if key not in self.patterns:
-                empty = np.zeros((len(self.at.A), 3)), np.zeros(len(self.own))
+                empty = np.zeros((len(self.design.at.A), 3)), np.zeros(len(self.design.own))
                 self.patterns[key] = _Pattern(0, empty[0], 0.0, empty[1])
             found = self.patterns[key]
             found.epochs += len(rows)
@@ -139,12 +123,14 @@ class CommonSums:
 
     def solved(self, known: Shared) -> Solved:
         """What is known with these sums."""
-        p, q, n = len(self.own), len(self.common), max(self.epochs, 1)
-        normal, gradient = np.zeros((self.width, self.width)), self.gradient.copy()
-        mean, tilt = np.zeros((2, p, self.width))
+        design, n = self.design, max(self.epochs, 1)
+        p, q, width = len(design.own), len(design.common), design.width
+        normal = design.prior_matrix()
+        gradient = self.gradient + design.common_pull(known.pose, known.offsets)
+        mean, tilt = np.zeros((2, p, width))
         kinds = []
-        for pattern in self.patterns.values() if self.width else ():
-            one = _typical(self, pattern.weights / pattern.epochs)
+        for pattern in self.patterns.values() if width else ():
+            one = _typical(design, pattern.weights / pattern.epochs)
             if not one.good[0]:
                 continue
             G = _sensitivity(one)
@@ -154,24 +140,15 @@ class CommonSums:
             tilt += pattern.times * G
             kinds.append((G, np.sqrt(np.diag(one.Q[0]))))
         mean /= n
-        if self.prior is not None:
-            T, o, w = len(self.prior), known.offsets, self.prior
-            x, y = np.arange(q, q + T), np.arange(q + T, q + 2 * T)
-            normal[x, x] += w[:, 0]
-            normal[y, y] += w[:, 1]
-            normal[x, y] += w[:, 2]
-            normal[y, x] += w[:, 2]
-            gradient[x] -= w[:, 0] * o[:, 0] + w[:, 2] * o[:, 1]
-            gradient[y] -= w[:, 2] * o[:, 0] + w[:, 1] * o[:, 1]
         cofactors = inverse_of_determined(normal)
         change = cofactors @ gradient
         offsets = known.offsets
-        if self.prior is not None:
+        if design.offset_prior is not None:
             offsets = offsets + change[q:].reshape(2, -1).T
         rest = max((float(np.max(np.abs((G - mean) @ change) / sd)) for G, sd in kinds), default=0)
         middle = self.times / n
         spread = self.squares - n * middle**2
-        line = np.zeros((p, self.width))
+        line = np.zeros((p, width))
         if spread > 0 and self.ends is not None:
             line = (tilt - middle * n * mean) / spread * (self.ends[1] - self.ends[0])
         pose = known.pose + change[:q] if q else known.pose
@@ -191,27 +168,24 @@ class Solved:
     rest: float
 
 
-def _typical(sums: CommonSums, weights: Array) -> SeriesSystem:
-    """The system of one epoch with some weights (T, 3)."""
+def _typical(design: Design, weights: Array) -> SeriesSystem:
+    """The system of one epoch with some weights (T, 3), without the priors of what is common."""
     w = weights[None]
-    zero = None if sums.prior is None else np.zeros((len(weights), 3))
-    return SeriesSystem.formed(
-        sums.at, w, w[..., 0] > 0, sums.own, sums.common, zero, sums.own_prior
-    )
+    return SeriesSystem.formed(design.without_common_priors(), w, w[..., 0] > 0)
 
 
 def _sensitivity(one: SeriesSystem) -> Array:
     """G (p, q + 2T): by how much own parameters of an epoch follow the common unknowns."""
     coupling = next((C for _, C in one.couplings()), None)
-    width = len(one.common) + (0 if one.prior is None else 2 * len(one.at.A))
-    out: Array = np.zeros((len(one.own), width)) if coupling is None else one.Q[0] @ coupling[0]
+    none = np.zeros((len(one.design.own), one.design.width))
+    out: Array = none if coupling is None else one.Q[0] @ coupling[0]
     return out
 
 
-def kinds_of(sums: CommonSums, system: SeriesSystem) -> list[Alike]:
+def kinds_of(design: Design, system: SeriesSystem) -> list[Alike]:
     """The kinds of epochs of a block: the frequent ones by what they see, the others together.
 
-    system: of the block, its common unknowns held.
+    design: of the series; system: of the block, its common unknowns held.
     """
     good = np.flatnonzero(system.good)
     if not len(good):
@@ -227,22 +201,19 @@ def kinds_of(sums: CommonSums, system: SeriesSystem) -> list[Alike]:
         groups.append(rest)
     out = []
     for rows in groups:
-        w = np.where(system.use[rows][..., None], system.weights[rows], 0.0)
-        one = _typical(sums, w.mean(axis=0))
+        one = _typical(design, system.used(rows).mean(axis=0))
         if one.good[0]:
             out.append(Alike(rows, one, _sensitivity(one)))
     return out
 
 
-def level_of(known: Shared, own: Columns, common: Columns) -> Array:
+def level_of(known: Shared, design: Design) -> Array:
     """Cofactors (16, 16) of what all epochs have in common."""
-    width = len(known.cofactors)
-    out = np.zeros((16, 16))
-    if not width:
-        return out
+    if not design.width:
+        return np.zeros((16, 16))
     root = root_of(known.cofactors)
-    whole = np.zeros((16, width))
-    whole[common] = root[: len(common)]
-    whole[own] -= known.mean @ root
+    whole = np.zeros((16, design.width))
+    whole[design.common] = root[: len(design.common)]
+    whole[design.own] -= known.mean @ root
     level: Array = whole @ whole.T
     return level

@@ -13,7 +13,8 @@ import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.epoch.gauss_markov import Rejections
-from thermocald.photogrammetry.parameters import EOP, IOP
+from thermocald.photogrammetry.parameters import EOP, IOP, PARAMETER_NAMES
+from thermocald.photogrammetry.series.design import Design, State
 from thermocald.photogrammetry.series.mount import STILL, Movement
 from thermocald.photogrammetry.series.normals import (
     ObservationGrid,
@@ -45,7 +46,7 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
     Mask = NDArray[np.bool_]
 
-__all__ = ["ENOUGH_FOR_NOISE", "Estimate", "SeriesEstimator", "Start", "pooled_variance"]
+__all__ = ["ENOUGH_FOR_NOISE", "Estimate", "SeriesEstimator", "pooled_variance"]
 
 ENOUGH_FOR_NOISE = 20
 """Epochs that show the noise of single targets."""
@@ -59,18 +60,9 @@ _RELINEARISE_PX = 1.0  # movement of the mean that changes the partials by more 
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
-    """values (E, 16), offsets (T, 2) px and the common pose (6,)."""
-
-    values: Array
-    offsets: Array
-    pose: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Estimate(Start):
-    """The same estimated, the residuals (E, T, 2) px that they leave, the system, and which epochs
-    converged (E,).
+class Estimate(State):
+    """A state as estimated, the residuals (E, T, 2) px that it leaves, the system, and which
+    epochs converged (E,).
     """
 
     residuals: Array
@@ -102,7 +94,7 @@ class SeriesEstimator:
     windows: tuple[slice, ...] = ()
     typical: float | None = None
 
-    def adjusted(self, start: Start, use: Mask) -> tuple[SeriesEstimator, Estimate, Mask]:
+    def adjusted(self, start: State, use: Mask) -> tuple[SeriesEstimator, Estimate, Mask]:
         """Solve, find the gross errors and the targets' own noise; the series with that noise."""
         series, s = self, self.s
         estimate = series.solve(start, use, self.unit)
@@ -121,29 +113,24 @@ class SeriesEstimator:
 
     @property
     def has_offsets(self) -> bool:
-        """Whether the targets' offsets are unknowns: only where the field has sigmas."""
-        known = self.held is not None or not self.s.target_offsets
-        return not known and bool((self.testfield.sigmas > 0).any())
+        """Whether the targets have offsets: only where the field has sigmas."""
+        return self.s.target_offsets and bool((self.testfield.sigmas > 0).any())
 
-    @property
-    def common(self) -> NDArray[np.int64]:
-        """Positions of the parameters that are estimated once."""
-        return self.s.common if self.held is None else self.s.common[:0]
-
-    def solve(self, start: Start, use: Mask, variance: float) -> Estimate:
+    def solve(self, start: State, use: Mask, variance: float) -> Estimate:
         """Gauss-Newton with one linearisation at the series' mean, renewed while that moves.
 
         variance: of unit weight, by which the offsets' prior is weighted against image points.
         """
         values, offsets, pose = start.values, start.offsets, start.pose
         system = self._linearised(values, use, variance)
+        own, common = system.design.own, system.design.common
         residuals = self._residuals(values, offsets, planes(2, *use.shape))
         for _ in range(_ITERATIONS):
-            step = system.step(residuals, offsets, self.deviations(values, pose))
+            step = system.step(residuals, State(values, offsets, pose))
             values = values.copy()
-            values[:, system.own] += step.d_own
-            values[:, system.common] += step.d_common
-            if len(system.common):
+            values[:, own] += step.d_own
+            values[:, common] += step.d_common
+            if len(common):
                 pose = pose + step.d_common
             offsets = offsets + step.d_offsets
             if step.size < (_SMALL if self.held is None else _SMALLER):
@@ -151,25 +138,17 @@ class SeriesEstimator:
                 break
             residuals = self._residuals(values, offsets, residuals)
             moved = np.zeros(16)
-            moved[system.common] = step.d_common
+            moved[common] = step.d_common
             if system.good.any():
-                moved[system.own] += np.median(step.d_own[system.good], axis=0)
-            far = self.held is None and np.abs(system.at.A @ moved).max(initial=0.0)
+                moved[own] += np.median(step.d_own[system.good], axis=0)
+            far = self.held is None and np.abs(system.design.at.A @ moved).max(initial=0.0)
             if far > _RELINEARISE_PX:
                 system = self._linearised(values, use, variance)
         return Estimate(values, offsets, pose, residuals, system, step.sizes < _NEAR)
 
-    def deviations(self, values: Array, pose: Array) -> Array | None:
-        """How far the own parameters (E, p) are from what their prior draws them to."""
-        if self.bound is None:
-            return None
-        deviations = np.zeros((len(values), len(self.s.per_epoch)))
-        deviations[:, -len(pose) :] = values[:, EOP] - pose
-        return deviations
-
     def snoop(self, estimate: Estimate, use: Mask) -> tuple[Estimate, Mask]:
         """Find the gross errors; the estimate without them and what takes part."""
-        shared = len(self.common) > 0 or self.has_offsets
+        shared = estimate.system.design.width > 0
         return (self._snoop_together if shared else self._snoop_apart)(estimate, use)
 
     def with_target_noise(self, estimate: Estimate, use: Mask) -> SeriesEstimator:
@@ -232,29 +211,25 @@ class SeriesEstimator:
             part = rows = rows[changed]
             if len(rows) == 0:
                 break
-            system = SeriesSystem.build(
-                whole.at, self.grid.weights[rows], keep[changed], whole.own, whole.common, None,
-                whole.own_prior,
-            )  # fmt: skip
+            system = SeriesSystem.formed(whole.design, self.grid.weights[rows], keep[changed])
             some = replace(self, grid=ObservationGrid(self.grid.points[rows], system.weights))
             values[rows], residuals[rows] = some._without(
-                system, values[rows], residuals[rows], estimate.pose
+                system, values[rows], residuals[rows], estimate
             )
             whole.replace(rows, system)
         return replace(estimate, values=values, residuals=residuals, system=whole), use
 
     def _without(
-        self, system: SeriesSystem, values: Array, left: Array, pose: Array
+        self, system: SeriesSystem, values: Array, left: Array, known: State
     ) -> tuple[Array, Array]:
         """Values (E, 16) and residuals (E, T, 2) of epochs of which points were taken out."""
-        offsets = np.zeros((left.shape[1], 2))
         for _ in range(_ITERATIONS):
-            step = system.step(left, offsets, self.deviations(values, pose))
-            values[:, system.own] += step.d_own
+            step = system.step(left, replace(known, values=values))
+            values[:, system.design.own] += step.d_own
             if step.size < (_NEAR if self.held is None else _SMALLER):
                 system.move(left, step)
                 break
-            left = self._residuals(values, offsets, left)
+            left = self._residuals(values, known.offsets, left)
         return values, left
 
     def _linearised(self, values: Array, use: Mask, variance: float) -> SeriesSystem:
@@ -263,13 +238,28 @@ class SeriesEstimator:
             used = use.any(axis=1)
             mean = np.median(values[used] if used.any() else values, axis=0)
             at = linearise(self.sensor, self.testfield, mean[IOP], mean[EOP])
-        prior = self.offset_prior(at) * variance if self.has_offsets else None
-        own = self.s.per_epoch
-        bound = None
+        design = self.design(at, variance, with_common=self.held is None)
+        system = SeriesSystem.formed(design, self.grid.weights, use)
+        return system.solved() if design.width else system
+
+    def design(self, at: Partials, variance: float, *, with_common: bool = True) -> Design:
+        """The unknowns at a linearisation; variance: of unit weight, by which priors are weighted
+        against image points; with_common: the common ones too.
+        """
+        s, own = self.s, self.s.per_epoch
+        common = s.common if with_common else s.common[:0]
+        known, weight = np.zeros(16), np.zeros(16)
+        for name, (value, sd) in s.priors.items():
+            k = PARAMETER_NAMES.index(name)
+            known[k], weight[k] = value, variance / sd**2
+        own_prior = np.diag(weight[own])
         if self.bound is not None:
-            bound = np.zeros((len(own), len(own)))
-            bound[-6:, -6:] = self.bound * variance
-        return SeriesSystem.build(at, self.grid.weights, use, own, self.common, prior, bound)
+            own_prior[-6:, -6:] = self.bound * variance
+        offsets = self.has_offsets and with_common
+        return Design(
+            at, own, common, known, own_prior, weight[common], self.bound is not None,
+            self._offset_prior(at) * variance if offsets else None,
+        )  # fmt: skip
 
     def _residuals(self, values: Array, offsets: Array, out: Array) -> Array:
         if (values == values[:1]).all():
@@ -277,11 +267,11 @@ class SeriesEstimator:
             np.subtract(self.grid.points, first, out=out)
         else:
             series_residuals(self.sensor, self.grid, self.testfield.points, values, out)
-        if self.has_offsets:
+        if offsets.any():
             out -= offsets
         return out
 
-    def offset_prior(self, at: Partials) -> Array:
+    def _offset_prior(self, at: Partials) -> Array:
         """Inverse covariance (T, 3) px⁻² of the offsets, from that of the object coordinates."""
         variance = self.testfield.sigmas**2
         tiny = 1e-12  # px²: a target without sigma has no offset

@@ -45,15 +45,15 @@ def choose(
         own = replace(series, s=replace(series.s, exterior="per_epoch"), bound=None)
         return own, f"{good} epochs do not show how the mount moves ({FEWEST_EPOCHS} would)"
     movement = observed_movement(series, estimate)
-    px = movement.image_px(estimate.system.at.A)
-    noise = movement.noise_px(estimate.system.at.A)
+    px = movement.image_px(estimate.system.design.at.A)
+    noise = movement.noise_px(estimate.system.design.at.A)
     if movement.still and asked == "auto":
         still = replace(series, s=replace(series.s, exterior="series"), bound=None)
         return still, f"no movement of the mount beyond the noise of an epoch ({noise:.3f} px)"
     mount = replace(series, bound=movement.precision(), movement=movement)
     how = ""
     if movement.memory:
-        part = movement.slow_fraction(estimate.system.at.A)
+        part = movement.slow_fraction(estimate.system.design.at.A)
         slowly = f"over about {movement.memory:.0f} epochs"
         how = f", {part:.0%} of it {slowly if movement.memory < good / 3 else 'slowly'}"
     if movement.jumps:
@@ -65,7 +65,8 @@ def observed_movement(series: SeriesEstimator, estimate: Estimate) -> Movement:
     """The variance components of the mount's movements."""
     system = estimate.system
     variance = series.variance(estimate)
-    before = np.concatenate([system.at.iop, system.at.eop])
+    at = system.design.at
+    before = np.concatenate([at.iop, at.eop])
     b = system.gradient(estimate.residuals)
     N = system.N
     b = b + np.einsum("eij,ej->ei", N, estimate.values - before)
@@ -74,7 +75,7 @@ def observed_movement(series: SeriesEstimator, estimate: Estimate) -> Movement:
         pairs = series.pairs(estimate, system.use)
         if len(pairs):
             typical = (series.grid.weights * system.use[..., None])[system.good].mean(axis=0)
-            extra = pairs.normal_matrices(typical[None], system.at.A[..., EOP])[0]
+            extra = pairs.normal_matrices(typical[None], at.A[..., EOP])[0]
             correlated = extra / variance**2
     free = np.array(free_columns(series.s.free), dtype=np.int64)
     found, starts = [], []

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.linalg import root_of
-from thermocald.photogrammetry.parameters import EOP, EOP_COLUMNS
+from thermocald.photogrammetry.parameters import EOP
 from thermocald.photogrammetry.series.adjustment import (
     Adjusted,
     adjusted,
@@ -35,7 +35,15 @@ from thermocald.photogrammetry.series.common_sums import (
     kinds_of,
     level_of,
 )
-from thermocald.photogrammetry.series.estimator import ENOUGH_FOR_NOISE, SeriesEstimator, Start
+from thermocald.photogrammetry.series.covariances import (
+    line_weights,
+    of_correlated,
+    of_priors,
+    of_slow_targets,
+    stillness,
+)
+from thermocald.photogrammetry.series.design import State
+from thermocald.photogrammetry.series.estimator import ENOUGH_FOR_NOISE, SeriesEstimator
 from thermocald.photogrammetry.series.long_result import LongAdjustment, RowWriter
 from thermocald.photogrammetry.series.normals import (
     ObservationGrid,
@@ -43,7 +51,6 @@ from thermocald.photogrammetry.series.normals import (
     sums_of_squares,
 )
 from thermocald.photogrammetry.series.status import enough_targets, judge
-from thermocald.photogrammetry.series.system import line_weights
 from thermocald.photogrammetry.series.target_noise import slow_errors
 
 if TYPE_CHECKING:
@@ -129,17 +136,19 @@ class _Blocks:
         """What a sample of a series of so many epochs says."""
         series, estimate = found.series, found.estimate
         system = estimate.system
-        sums = _sums(series, estimate.system, series.variance(estimate))
-        sums.add(0, system, estimate.residuals, np.zeros((len(found.use), len(system.own))))
+        sums = CommonSums(series.design(system.design.at, series.variance(estimate)))
+        sums.add(0, system, estimate.residuals, np.zeros((len(found.use), len(system.design.own))))
         known = Shared(estimate.offsets, estimate.pose, system.Q_common, np.zeros((0, 0)))
         known = replace(known, mean=sums.solved(known).shared.mean)
         slow, pairs = np.zeros((16, 16)), None
         if series.s.target_noise and len(found.use) >= ENOUGH_FOR_NOISE:
             pairs = series.pairs(estimate, found.use)
-            slow = system.slow(slow_errors(estimate.residuals, found.use), series.testfield.groups)
+            slow = of_slow_targets(
+                system, slow_errors(estimate.residuals, found.use), series.testfield.groups
+            )
         good = sample.ok
         middle = np.median(sample.values[good] if good.any() else estimate.values, axis=0)
-        if len(series.common):
+        if len(series.s.common):
             middle[EOP] = estimate.pose
         return cls(
             found, epochs, known,
@@ -162,33 +171,30 @@ class _Blocks:
 
     def walk(self, source: ObservationBlocks, out: RowWriter) -> CommonSums:
         """One pass: every block's epochs into `out`, and the sums."""
-        sums = _sums(self.found.series, self.found.estimate.system, self.unit)
+        series, at = self.found.series, self.found.estimate.system.design.at
+        sums = CommonSums(series.design(at, self.unit))
         for first, grid in source.blocks():
             self._block(first, grid, sums, out)
             out.release()
         return sums
 
     def _block(self, first: int, grid: ObservationGrid, sums: CommonSums, out: RowWriter) -> None:
-        series, at = self.found.series, self.found.estimate.system.at
+        series, at = self.found.series, self.found.estimate.system.design.at
         s = series.s
-        shifted = ObservationGrid(grid.points - self.shared.offsets, grid.weights * self.ratios)
+        weighted = ObservationGrid(grid.points, grid.weights * self.ratios)
         held = replace(
-            series, grid=shifted, stated=grid.weights, held=at, unit=self.unit, windows=(),
+            series, grid=weighted, stated=grid.weights, held=at, unit=self.unit, windows=(),
             typical=self.unit,
         )  # fmt: skip
-        start = Start(
-            np.tile(self.middle, (len(grid), 1)), np.zeros((len(at.A), 2)), self.shared.pose
-        )
+        values = np.tile(self.middle, (len(grid), 1))
+        start = State(values, self.shared.offsets, self.shared.pose)
         use = grid.observed & enough_targets(grid, s)[:, None]
         held, estimate, use = held.adjusted(start, use)
         system, values, residuals = estimate.system, estimate.values, estimate.residuals
-        kinds = kinds_of(sums, system)
-        right = system.gradient(residuals)[:, system.own]
-        if (drawn := held.deviations(values, estimate.pose)) is not None:
-            right = right - drawn @ system.own_prior
-        sums.add(first, system, residuals, right)
+        kinds = kinds_of(sums.design, system)
+        sums.add(first, system, residuals, system.own_gradient(residuals, estimate))
         vPv, redundancy = held.sums(estimate)
-        redundancy = redundancy - sums.width / self.epochs
+        redundancy = redundancy - sums.design.width / self.epochs
         positive = redundancy > 0
         unit = vPv / np.where(positive, redundancy, 1.0)
         relative = self._covariance(first, system, kinds, unit, redundancy)
@@ -204,23 +210,22 @@ class _Blocks:
         out.redundancy[here] = redundancy
         out.observed[here], out.rejected[here] = use.sum(axis=1), (grid.observed & ~use).sum(axis=1)
         if s.exterior == "series":
-            w = np.where(system.use[..., None], system.weights, 0.0)
-            score = replace(system, N=normal_matrices(w, at.A)).score(residuals, EOP_COLUMNS)
+            score = stillness(replace(system, N=normal_matrices(system.used(), at.A)), residuals)
             out.stillness[here] = score / np.where(positive, unit, 1.0)
 
     def _covariance(
         self, first: int, system: SeriesSystem, kinds: list[Alike], unit: Array, redundancy: Array
     ) -> Array:
         """Covariances (n, 16, 16) of a block's epochs relative to the series."""
-        s, own = self.found.series.s, system.own
+        s, own = self.found.series.s, system.design.own
         n = len(system.Q)
         mine = system.Q.copy()
         for kind in kinds:
             away = kind.G - self.shared.mean
             mine[kind.rows] += away @ self.shared.cofactors @ away.T
         if s.scale == "posterior":
-            # What priors of the mount contribute is known as well as the mount, not as the epoch.
-            bound = system.from_priors() if system.own_prior.any() else 0.0
+            # What priors contribute is known as well as they are, not as the epoch.
+            bound = of_priors(system) if system.design.own_prior.any() else 0.0
             mine -= bound
             mine *= epoch_variance(unit, redundancy, self.unit)[:, None, None]
             mine += self.unit * bound
@@ -230,7 +235,7 @@ class _Blocks:
                 G = kind.G[:, :6]
                 mine[kind.rows] += G @ self.movement.covariance @ G.T
             if self.pairs is not None:
-                mine[kind.rows] += kind.system.correlated(self.pairs)[0][whole]
+                mine[kind.rows] += of_correlated(kind.system, self.pairs)[0][whole]
         mine += np.diag(self.excess[own])
         # Slow errors: a line through zero in the middle of the series, uncertain at its ends.
         if self.slow.any():
@@ -245,8 +250,9 @@ class _Blocks:
     ) -> LongAdjustment:  # fmt: skip
         """The last change of the common unknowns on all epochs, and what is of the whole series."""
         series, shared = self.found.series, solved.shared
-        own, common = series.s.per_epoch, series.common
-        level = level_of(shared, own, common) * self.unit
+        design = series.design(self.found.estimate.system.design.at, self.unit)
+        own, common = design.own, design.common
+        level = level_of(shared, design) * self.unit
         total = np.zeros(16)
         total[own] += solved.own
         total[common] += (shared.pose - self.shared.pose)[: len(common)]
@@ -266,16 +272,6 @@ class _Blocks:
             out, np.sqrt(np.clip(np.diag(level), 0.0, None)), np.sqrt(np.diag(trend)), sample,
             sampled, passes,
         )  # fmt: skip
-
-
-def _sums(series: SeriesEstimator, system: SeriesSystem, unit: float) -> CommonSums:
-    """Empty sums for the blocks of a series; unit: variance of unit weight."""
-    prior = series.offset_prior(system.at) * unit if series.has_offsets else None
-    own = series.s.per_epoch
-    drawn = np.zeros((len(own), len(own)))
-    if series.bound is not None:
-        drawn[-6:, -6:] = series.bound * unit
-    return CommonSums(system.at, own, series.common, drawn, prior)
 
 
 def _ratios(series: SeriesEstimator) -> Array:

@@ -23,6 +23,8 @@ from thermocald.photogrammetry.parameters import EOP, EOP_COLUMNS, IOP, free_col
 from thermocald.photogrammetry.series.mount import STILL, Movement
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     Array = NDArray[np.float64]
@@ -47,7 +49,7 @@ class SeriesSettings:
     target_noise: the measuring noise, also its correlations within a marker and what neighbouring
     epochs scatter beyond it, from the series' own scatter where it is long enough; drift_period:
     the shortest of the camera's drift in epochs (`mount.drift_period`), 0 for a series too short
-    for one; snooping_alpha, max_rejected, scale, bounds as in `AdjustmentSettings`.
+    for one; priors, snooping_alpha, max_rejected, scale, bounds as in `AdjustmentSettings`.
     """
 
     exterior: Exterior = "series"
@@ -55,6 +57,7 @@ class SeriesSettings:
     target_offsets: bool = True
     target_noise: bool = True
     drift_period: float = 24.0
+    priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     snooping_alpha: float = 0.002
     max_rejected: float = 0.35
     scale: Literal["posterior", "prior"] = "posterior"

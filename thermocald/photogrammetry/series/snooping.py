@@ -33,7 +33,7 @@ def point_tests(system: SeriesSystem, residuals: Array) -> Array:
     """
     first, of = system.alike or alike(system.weights, system.use)
     E, T = residuals.shape[:2]
-    pairs = products(system.at.A[..., system.own])
+    pairs = products(system.design.at.A[..., system.design.own])
     shared = _test_weights(system, first, pairs) if len(first) < E else None
     test = np.empty((E, T))
     for part in chunks(E, T):
@@ -55,7 +55,7 @@ def _test_weights(
 ) -> Array:
     """Inverse covariance (3, M, T) of the residuals, xx, yy, twice xy; 0 without a test."""
     weights = system.weights[epochs]
-    rows, columns = np.triu_indices(len(system.own))
+    rows, columns = np.triu_indices(len(system.design.own))
     Q = system.Q[epochs][:, rows, columns] * np.where(rows == columns, 1.0, 2.0)
     sign = np.where(system.use[epochs], -1.0, 1.0)
     lxx, lyy, lxy = (sign * (Q @ pairs.T) for pairs in products)

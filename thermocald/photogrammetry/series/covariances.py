@@ -1,0 +1,191 @@
+"""How sure an adjusted series is: covariances of its parameters from the linearised system.
+
+Two kinds are kept apart: what differs between epochs, and the level, which all have in common.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.photogrammetry.linalg import root_of
+from thermocald.photogrammetry.parameters import EOP, EOP_COLUMNS
+from thermocald.photogrammetry.series.cofactors import among_all, cofactors
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from thermocald.photogrammetry.series.system import SeriesSystem
+    from thermocald.photogrammetry.series.target_noise import CorrelatedPairs
+
+    Array = NDArray[np.float64]
+    Mask = NDArray[np.bool_]
+
+__all__ = [
+    "SeriesCofactors",
+    "all_cofactors",
+    "line_weights",
+    "of_common",
+    "of_correlated",
+    "of_priors",
+    "of_slow_targets",
+    "offset_cofactors",
+    "stillness",
+    "typical_sensitivity",
+]
+
+
+@dataclass(frozen=True, eq=False)
+class SeriesCofactors:
+    """relative (E, 16, 16): to the series; level (16, 16): of what all epochs have in common; trend
+    (16, 16): of what the common unknowns do to a straight line from the first to the last epoch.
+    """
+
+    relative: Array
+    level: Array
+    trend: Array
+
+
+def all_cofactors(system: SeriesSystem) -> SeriesCofactors:
+    """The cofactors of all parameters.
+
+    An epoch's parameters depend on the common unknowns by -G; what of G is the same in all
+    epochs cancels in differences within the series, the rest is the epoch's own.
+    """
+    design = system.design
+    own, common = design.own, design.common
+    Q = system.Q
+    level, trend = np.zeros((16, 16)), np.zeros((16, 16))
+    width = len(system.Q_common)
+    if width:
+        Q = Q.copy()
+        mean, tilt = np.zeros((len(own), width)), np.zeros((len(own), width))
+        line = line_weights(system.good)
+        for part, C in system.couplings():
+            G = system.Q[part] @ C
+            mean += G.sum(axis=0)
+            tilt += np.tensordot(line[part], G, axes=1)
+        mean /= max(int(system.good.sum()), 1)
+        root = root_of(system.Q_common)
+        own_tilt = tilt @ root
+        trend[own[:, None], own] = own_tilt @ own_tilt.T
+        for part, C in system.couplings():
+            deviation = (system.Q[part] @ C - mean) @ root
+            Q[part] += deviation @ np.swapaxes(deviation, 1, 2)
+        # A parameter that is both own and common takes both ways.
+        all_level = np.zeros((16, width))
+        all_level[common] = root[: len(common)]
+        all_level[own] -= mean @ root
+        level = all_level @ all_level.T
+    relative = among_all(Q, own)
+    relative[~system.good] = 0.0
+    return SeriesCofactors(relative, level, trend)
+
+
+def of_slow_targets(system: SeriesSystem, errors: Array, group: NDArray[np.int64]) -> Array:
+    """Covariance (16, 16) of a straight line over the series from targets' slow errors.
+
+    errors (T, 2) px: seen in the residuals, of which a group of targets that errs together has
+    already pulled a part into the parameters; as in the jackknife (HC3) that is put back:
+    Σ Q Aᵀ W (I - H)⁻¹ e eᵀ (I - H)⁻¹ W A Q over the groups.
+    """
+    design = system.design
+    out = np.zeros((16, 16))
+    if not system.good.any():
+        return out
+    w = np.sqrt(system.used(system.good).mean(axis=0)[:, :2])
+    J = design.at.A[..., design.own] * w[..., None]
+    inverse, good = cofactors((np.einsum("tkp,tkq->pq", J, J) + design.own_prior)[None])
+    if not good[0]:
+        return out
+    total = np.zeros((len(design.own), len(design.own)))
+    for label in np.unique(group):
+        rows = group == label
+        e = (errors[rows] * w[rows]).ravel()
+        if not e.any():
+            continue
+        Jg = J[rows].reshape(len(e), -1)
+        left = np.eye(len(e)) - Jg @ inverse[0] @ Jg.T
+        values, vectors = np.linalg.eigh(left)
+        # What a group determines alone cannot be seen in its residuals at all.
+        back = vectors @ ((vectors.T @ e) / np.maximum(values, 0.1))
+        pull = inverse[0] @ (Jg.T @ back)
+        total += np.outer(pull, pull)
+    out[design.own[:, None], design.own] = total
+    return out
+
+
+def of_correlated(system: SeriesSystem, pairs: CorrelatedPairs) -> Array:
+    """What correlated errors add to the covariance (E, 16, 16) of own parameters."""
+    design = system.design
+    extra = pairs.normal_matrices(system.used(), design.at.A[..., design.own])
+    own = system.Q @ extra @ system.Q
+    # Covariances from epochs that do not see the same targets may be indefinite together: drawn
+    # in so that they take at most three fifths off the variance of any combination.
+    root = np.linalg.inv(np.linalg.cholesky(system.Q))
+    least = np.linalg.eigvalsh(root @ own @ np.swapaxes(root, 1, 2))[:, 0]
+    drawn = np.where(system.good, np.minimum(1.0, 0.6 / np.maximum(-least, 1e-9)), 0.0)
+    drawn[least >= 0] = 1.0
+    return among_all(drawn[:, None, None] * own, design.own)
+
+
+def of_priors(system: SeriesSystem) -> Array:
+    """The part (E, p, p) of the cofactors that the priors contribute, Q P Q."""
+    design = system.design
+    part: Array = system.Q @ design.own_prior @ system.Q
+    part[~system.good] = 0.0
+    return part
+
+
+def typical_sensitivity(system: SeriesSystem) -> Array:
+    """By how much own parameters (p,) follow an error of the pose (6,), in a typical epoch."""
+    design = system.design
+    N = system.N[system.good].mean(axis=0)
+    Q, _ = cofactors((N[design.own[:, None], design.own] + design.own_prior)[None])
+    sensitivity: Array = Q[0] @ N[design.own[:, None], EOP_COLUMNS]
+    return sensitivity
+
+
+def of_common(system: SeriesSystem, covariance: Array) -> Array:
+    """Covariance (E, p, p) of own parameters where the common ones (q, q) err in an epoch."""
+    design = system.design
+    G = system.Q @ system.N[:, design.own[:, None], design.common]
+    part: Array = G @ covariance @ np.swapaxes(G, 1, 2)
+    part[~system.good] = 0.0
+    return part
+
+
+def offset_cofactors(system: SeriesSystem) -> Array:
+    """Cofactors (T, 2) px² of the offsets in x and y; NaN without offsets."""
+    design = system.design
+    if design.offset_prior is None:
+        return np.full((len(design.at.A), 2), np.nan)
+    return np.diag(system.Q_common)[len(design.common) :].reshape(2, -1).T
+
+
+def stillness(system: SeriesSystem, residuals: Array) -> Array:
+    """Chi-square (E,) of the held exterior orientation being the same in an epoch as in the series.
+
+    Rao's score test: the gradient by its six parameters, with the epoch's own ones reduced.
+    """
+    design = system.design
+    b = system.gradient(residuals)
+    C = system.N[:, design.own[:, None], EOP_COLUMNS]
+    QC = system.Q @ C
+    V = system.N[:, EOP, EOP] - np.swapaxes(C, 1, 2) @ QC
+    g = b[:, EOP] - np.einsum("epi,ep->ei", QC, b[:, design.own])
+    inverse, good = cofactors(V)
+    score = np.einsum("ei,eij,ej->e", g, inverse, g)
+    return np.where(good & system.good, score, np.nan)
+
+
+def line_weights(good: Mask) -> Array:
+    """Weights (E,) that give the change of a straight line from the first epoch to the last."""
+    t = np.flatnonzero(good).astype(np.float64)
+    weights = np.zeros(len(good))
+    if len(t) > 1:
+        centred = t - t.mean()
+        weights[good] = centred / (centred @ centred) * (t[-1] - t[0])
+    return weights

@@ -21,7 +21,7 @@ from thermocald.errors import (
     TestFieldError,
     ThermocaldError,
 )
-from thermocald.output.camera_files.camera_record import number
+from thermocald.output.camera_files.file_text import number
 from thermocald.photogrammetry.targets.image_file import decode_grey
 from thermocald.photogrammetry.targets.image_header import image_size
 from thermocald.store.logger.photographs import read_photograph

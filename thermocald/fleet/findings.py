@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from thermocald.durations import short_duration
 from thermocald.fleet.overview import ODD, RATED, Finding
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
     from thermocald.fleet.overview import CameraOverview, TypeOverview
 
-__all__ = ["add_findings", "duration"]
+__all__ = ["add_findings"]
 
 _LATE_INTERVALS, _LATE_S = 20.0, 900.0
 _SILENT_S = 600.0
@@ -50,27 +51,17 @@ def add_findings(
         ]
 
 
-def duration(seconds: float) -> str:
-    """A time in the unit that a person would choose."""
-    if not math.isfinite(seconds):
-        return "–"
-    for unit, size in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
-        if abs(seconds) >= 2 * size:
-            return f"{seconds / size:.0f} {unit}"
-    return f"{seconds:.0f} s"
-
-
 def _late(camera: CameraOverview, now: float) -> Iterator[Finding]:
     limit = max(_LATE_INTERVALS * camera.record.head.interval, _LATE_S)
     if camera.lag_s > limit:
-        since = f"no epoch for {duration(camera.lag_s)}"
+        since = f"no epoch for {short_duration(camera.lag_s)}"
         state = camera.state
         if state is None:
             yield Finding("late", f"{since}; its station has never reported")
         elif now - state.contact > _SILENT_S:
             yield Finding(
                 "late",
-                f"{since}; its station was last heard {duration(now - state.contact)} ago: "
+                f"{since}; its station was last heard {short_duration(now - state.contact)} ago: "
                 "power or network",
             )
         elif state.waiting:
@@ -107,7 +98,7 @@ def _trouble(camera: CameraOverview, read: Sequence[float], *, reference: bool) 
     if len(known) >= _FEWEST and {*known} == {_POWER_ON_C}:
         return "reads 85 °C, which a DS18B20 gives that has measured nothing"
     if reference and (since := _stuck_for(camera, known)) >= _STUCK_S:
-        return f"has read exactly {known[0]:g} °C for {duration(since)}"
+        return f"has read exactly {known[0]:g} °C for {short_duration(since)}"
     return ""
 
 
@@ -135,7 +126,7 @@ def _calibration(camera: CameraOverview, now: float) -> Iterator[Finding]:
         yield Finding("calibrate", "was never calibrated")
         return
     if now - camera.last_ok > _OLD_S and camera.lag_s < _OLD_S:
-        yield Finding("calibrate", f"the last result is {duration(now - camera.last_ok)} old")
+        yield Finding("calibrate", f"the last result is {short_duration(now - camera.last_ok)} old")
     low, high = camera.range
     outside = max(low - camera.temperature, camera.temperature - high)
     if outside > _OUTSIDE_K:
@@ -178,8 +169,8 @@ def _clock(camera: CameraOverview) -> Iterator[Finding]:
         way = "ahead of" if state.clock > 0 else "behind"
         yield Finding(
             "clock",
-            f"its station's clock is {duration(abs(state.clock))} {way} the server's; epochs keep "
-            "the station's time",
+            f"its station's clock is {short_duration(abs(state.clock))} {way} the server's; "
+            "epochs keep the station's time",
         )
     elif camera.lag_s < -_FUTURE_S:
-        yield Finding("clock", f"its last epoch is {duration(-camera.lag_s)} in the future")
+        yield Finding("clock", f"its last epoch is {short_duration(-camera.lag_s)} in the future")

@@ -23,6 +23,7 @@ from thermocald.output.figures.numbers import (
     with_sd,
 )
 from thermocald.output.figures.panels import PALETTE, Curve, Panel
+from thermocald.output.page import render_page
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 
 if TYPE_CHECKING:
@@ -37,8 +38,7 @@ if TYPE_CHECKING:
 
 __all__ = ["coverage", "render_calibration"]
 
-_TEMPLATES = Path(__file__).parent / "templates"
-_STYLE = Path(__file__).parents[1] / "study" / "templates" / "study.css"
+_TEMPLATE = Path(__file__).parent / "templates" / "calibration.html.j2"
 _CELLS = (12, 9)
 _LONGEST = 0.06  # of the image width, for a long arrow
 _MOST_ARROWS = 3000
@@ -49,17 +49,10 @@ def render_calibration(
     result: Photographs, sensor: Sensor, name: str, made: datetime | None = None
 ) -> str:
     """The report as HTML text; made: the time that it bears, by default now."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
-
-    environment = Environment(
-        loader=FileSystemLoader(_TEMPLATES),
-        autoescape=select_autoescape(["html", "j2"]),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-    )
     at = made or datetime.now(tz=UTC)
     posed = [p for p in result.photographs if len(p.points)]
-    return environment.get_template("calibration.html.j2").render(
+    return render_page(
+        _TEMPLATE,
         title=f"Calibration of {name}",
         made=f"Made on {at:%Y-%m-%d at %H:%M} UTC with thermocald {__version__}.",
         device=f"{name}, {sensor.width} × {sensor.height} px of {sensor.pixel_pitch * 1000:g} µm.",
@@ -71,8 +64,6 @@ def render_calibration(
         interior=_interior(result, sensor),
         correlations=_correlations(result),
         photographs=[_photograph(p) for p in result.photographs],
-        style=_STYLE.read_text(encoding="utf-8"),
-        footer=f"thermocald {__version__}",
     )
 
 

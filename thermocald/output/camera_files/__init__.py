@@ -97,7 +97,15 @@ def read(
     text = _text(path)
     chosen = _format(format) if format is not None else _recognised(text, path)
     try:
-        return chosen.decode(text, pixel_pitch)
+        found = chosen.decode(text)
+        if not isinstance(found, ImportedCamera):
+            return found.imported(chosen.name, text, pixel_pitch)
+        own = found.model.sensor.pixel_pitch
+        if pixel_pitch is not None and not np.isclose(pixel_pitch, own, rtol=1e-9):
+            raise ConfigurationError(
+                f"pixel pitch {pixel_pitch:g} mm was given, the file says {own:g} mm"
+            )
+        return found
     except (ConfigurationError, DataError) as cause:
         raise ConfigurationError(f"{path} ({chosen.about}): {cause}") from cause
 

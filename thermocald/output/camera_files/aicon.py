@@ -23,14 +23,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.errors import ConfigurationError
-from thermocald.output.camera_files.camera_record import (
-    Format,
-    ImportedCamera,
-    Record,
-    header,
-    import_family,
-    number,
-)
+from thermocald.output.camera_files.camera_record import ForeignCamera, Format, Record, header
+from thermocald.output.camera_files.file_text import number
 from thermocald.photogrammetry.camera.conversions import to_family
 from thermocald.photogrammetry.camera.model_families import MeasuredPoint
 
@@ -112,10 +106,10 @@ def _encode(record: Record) -> tuple[str, str]:
     return "\n".join(lines) + "\n" + header(record, result.statement), result.statement
 
 
-def _decode(text: str, pitch: float | None) -> ImportedCamera:
+def _decode(text: str) -> ForeignCamera:
     fields = _record(text)
     if fields is None:
-        return _typed(text, pitch)
+        return _typed(text)
     found = dict(zip(_FIELDS, fields, strict=True))
     spread, name = {}, "camera"
     for line in text.splitlines():
@@ -130,7 +124,7 @@ def _decode(text: str, pitch: float | None) -> ImportedCamera:
             "R0 is 0: programs differ in the unit of such terms; type the numbers over, one name "
             "and value per line"
         )
-    return _imported(text, found, spread, _Balanced(r0), pitch, name)
+    return _foreign(found, spread, _Balanced(r0), name)
 
 
 def _record(text: str) -> list[str] | None:
@@ -145,7 +139,7 @@ def _record(text: str) -> list[str] | None:
     return words if values[2] < 0 else None
 
 
-def _typed(text: str, pitch: float | None) -> ImportedCamera:
+def _typed(text: str) -> ForeignCamera:
     """One `name value [sd]` per line."""
     found: dict[str, str] = {}
     spread: dict[str, float] = {}
@@ -171,17 +165,12 @@ def _typed(text: str, pitch: float | None) -> ImportedCamera:
     if missing:
         raise ConfigurationError(f"{', '.join(missing)} missing")
     r0 = number(found.get("R0", 0.0), "R0")
-    return _imported(text, found, spread, MeasuredPoint(r0), pitch, name)
+    return _foreign(found, spread, MeasuredPoint(r0), name)
 
 
-def _imported(
-    text: str,
-    found: dict[str, str],
-    spread: dict[str, float],
-    family: Family,
-    pitch: float | None,
-    name: str,
-) -> ImportedCamera:
+def _foreign(
+    found: dict[str, str], spread: dict[str, float], family: Family, name: str
+) -> ForeignCamera:
     values = np.array([number(found.get(key, 0.0), key) for key in _NAMES])
     values[0] = abs(values[0])
     sizes = [number(found[key], key) for key in _SIZES]
@@ -193,10 +182,8 @@ def _imported(
     covariance = None
     if spread:
         covariance = np.diag([spread.get(key, 0.0) ** 2 for key in _NAMES])
-    return import_family(
-        "aicon", text, (int(sizes[2]), int(sizes[3])), family, values,
-        pitch if pitch is not None else sizes[0] / sizes[2], name, covariance,
-    )  # fmt: skip
+    size = int(sizes[2]), int(sizes[3])
+    return ForeignCamera(size, family, values, name, covariance, sizes[0] / sizes[2])
 
 
 def _recognises(text: str) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["Format", "ImportedCamera", "Record", "header", "import_family", "number", "numbers"]
+__all__ = ["ForeignCamera", "Format", "ImportedCamera", "Record", "header"]
 
 _LARGEST = 1e9
 _PITCH = re.compile(r"pixel_pitch_mm[\"']?\s*[:=]\s*([0-9.eE+-]+)")
@@ -51,20 +51,57 @@ class ImportedCamera:
     covariance: Array | None = None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ForeignCamera:
+    """A camera as another program's file holds it.
+
+    size: (width, height) px. values: in the order of the family's parameters. covariance: of the
+    values, or None. pixel_pitch: mm, where the record itself holds it.
+    """
+
+    size: tuple[int, int]
+    family: Family
+    values: Array
+    name: str = "camera"
+    covariance: Array | None = None
+    pixel_pitch: float | None = None
+
+    def imported(self, format_name: str, text: str, pitch: float | None) -> ImportedCamera:
+        """The camera in our model; pitch: mm, as the user gave it, else as the file states it."""
+        width, height = self.size
+        if not (0 < width <= 100_000 and 0 < height <= 100_000):
+            raise ConfigurationError(f"image size {width} × {height} px is impossible")
+        if not np.all(np.abs(self.values) < _LARGEST):
+            raise ConfigurationError("a camera parameter is not a number, or far out of range")
+        sensor = Sensor(width, height, _pitch(text, self.pixel_pitch if pitch is None else pitch))
+        # a focal length of zero or less would only fail later, and in other words
+        focal = self.values[0] / (sensor.pixel_pitch if self.family.parameters[0] == "c" else 1.0)
+        if not 0.05 * max(self.size) < focal < 1000 * max(self.size):
+            raise ConfigurationError(
+                f"a principal distance of {focal:g} px does not belong to an image of {width} × "
+                f"{height} px"
+            )
+        result = from_family(sensor, self.family, self.values, self.covariance)
+        return ImportedCamera(
+            CameraModel(sensor, InteriorOrientation.from_array(result.values)),
+            format_name, self.name, result.exact, result.largest_px, result.rms_px,
+            result.covariance,
+        )  # fmt: skip
+
+
 @dataclass(frozen=True, slots=True)
 class Format:
     """A file format: its name, usual suffix, what it is for, and its writer and reader of text.
 
-    `encode(record)` gives the file's text and the statement of its residual; `decode(text, pitch)`
-    reads it, pitch being mm per px where the caller knows it; `recognises(text)` tells from the
-    content alone.
+    `encode(record)` gives the file's text and the statement of its residual; `decode(text)` reads
+    it; `recognises(text)` decides from the content alone.
     """
 
     name: str
     suffix: str
     about: str
     encode: Callable[[Record], tuple[str, str]]
-    decode: Callable[[str, float | None], ImportedCamera]
+    decode: Callable[[str], ForeignCamera | ImportedCamera]
     recognises: Callable[[str], bool]
 
 
@@ -92,58 +129,3 @@ def _pitch(text: str, given: float | None) -> float:
     if not (math.isfinite(pitch) and 1e-5 < pitch < 1):
         raise ConfigurationError(f"pixel pitch {pitch:g} mm: between 0.00001 and 1 mm are possible")
     return pitch
-
-
-def import_family(
-    format_name: str,
-    text: str,
-    size: tuple[int, int],
-    family: Family,
-    values: Array,
-    pitch: float | None,
-    name: str = "camera",
-    covariance: Array | None = None,
-) -> ImportedCamera:
-    """A camera of another family, converted; size (width, height) px."""
-    width, height = size
-    if not (0 < width <= 100_000 and 0 < height <= 100_000):
-        raise ConfigurationError(f"image size {width} × {height} px is impossible")
-    if not np.all(np.abs(values) < _LARGEST):
-        raise ConfigurationError("a camera parameter is not a number, or far out of range")
-    sensor = Sensor(width, height, _pitch(text, pitch))
-    # a focal length of zero or less would only fail later, and in other words
-    focal = values[0] / (sensor.pixel_pitch if family.parameters[0] == "c" else 1.0)
-    if not 0.05 * max(size) < focal < 1000 * max(size):
-        raise ConfigurationError(
-            f"a principal distance of {focal:g} px does not belong to an image of {width} × "
-            f"{height} px"
-        )
-    result = from_family(sensor, family, values, covariance)
-    return ImportedCamera(
-        CameraModel(sensor, InteriorOrientation.from_array(result.values)),
-        format_name, name, result.exact, result.largest_px, result.rms_px, result.covariance,
-    )  # fmt: skip
-
-
-def number(value: Any, what: str) -> float:
-    """A finite number, or an error that names it."""
-    try:
-        result = float(value)
-    except (TypeError, ValueError):
-        raise ConfigurationError(f"{what} is {value!r}, not a number") from None
-    except OverflowError:
-        raise ConfigurationError(f"{what} is too large a number") from None
-    if not math.isfinite(result):
-        raise ConfigurationError(f"{what} is {value!r}, not a finite number")
-    return result
-
-
-def numbers(values: Any, what: str, counts: tuple[int, ...]) -> Array:
-    """A list of finite numbers of one of some lengths, or an error that names it."""
-    if not isinstance(values, list | tuple | np.ndarray):
-        raise ConfigurationError(f"{what} is missing or no list")
-    result = np.array([number(v, what) for v in np.ravel(np.asarray(values, dtype=object))])
-    if len(result) not in counts:
-        wanted = " or ".join(map(str, counts))
-        raise ConfigurationError(f"{what} has {len(result)} numbers, not {wanted}")
-    return result

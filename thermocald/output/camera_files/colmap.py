@@ -8,14 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from thermocald.errors import ConfigurationError
-from thermocald.output.camera_files.camera_record import (
-    Format,
-    ImportedCamera,
-    Record,
-    header,
-    import_family,
-    number,
-)
+from thermocald.output.camera_files.camera_record import ForeignCamera, Format, Record, header
+from thermocald.output.camera_files.file_text import number
 from thermocald.photogrammetry.camera.conversions import to_family
 from thermocald.photogrammetry.camera.model_families import BrownOpenCV
 
@@ -50,7 +44,7 @@ def _cameras(text: str) -> list[list[str]]:
     return [line.split() for line in text.splitlines() if line.strip() and line.lstrip()[0] != "#"]
 
 
-def _decode(text: str, pitch: float | None) -> ImportedCamera:
+def _decode(text: str) -> ForeignCamera:
     cameras = _cameras(text)
     if len(cameras) != 1:
         raise ConfigurationError(
@@ -69,7 +63,7 @@ def _decode(text: str, pitch: float | None) -> ImportedCamera:
         values[list(where)] = value
     values[2:4] -= _HALF
     size = int(number(fields[2], "WIDTH")), int(number(fields[3], "HEIGHT"))
-    return import_family("colmap", text, size, BrownOpenCV(8), values, pitch)
+    return ForeignCamera(size, BrownOpenCV(8), values)
 
 
 FORMAT = Format(

@@ -3,17 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import yaml
 
 from thermocald.errors import ConfigurationError
-from thermocald.output.camera_files.camera_record import (
-    Format,
-    ImportedCamera,
-    Record,
-    header,
-    import_family,
-    numbers,
-)
+from thermocald.output.camera_files.camera_record import ForeignCamera, Format, Record, header
+from thermocald.output.camera_files.file_text import numbers, yaml_document, yaml_text
 from thermocald.photogrammetry.camera.conversions import to_family
 from thermocald.photogrammetry.camera.model_families import BrownOpenCV
 
@@ -34,15 +27,11 @@ def _encode(record: Record) -> tuple[str, str]:
             "rostopic": f"/{record.name}/image_raw",
         }
     }
-    body = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=10_000)
-    return header(record, result.statement) + body, result.statement
+    return header(record, result.statement) + yaml_text(document), result.statement
 
 
-def _decode(text: str, pitch: float | None) -> ImportedCamera:
-    try:
-        document = yaml.safe_load(text)
-    except yaml.YAMLError as cause:
-        raise ConfigurationError(f"no valid YAML: {str(cause).splitlines()[0]}") from None
+def _decode(text: str) -> ForeignCamera:
+    document = yaml_document(text)
     camera = document.get("cam0") if isinstance(document, dict) else None
     if not isinstance(camera, dict):
         raise ConfigurationError("no camchain: there is no cam0")
@@ -56,11 +45,8 @@ def _decode(text: str, pitch: float | None) -> ImportedCamera:
         )
     f = numbers(camera.get("intrinsics"), "intrinsics", (4,))
     d = numbers(camera.get("distortion_coeffs") or [], "distortion_coeffs", (0, 4))
-    size = numbers(camera.get("resolution"), "resolution", (2,)).astype(int)
-    return import_family(
-        "kalibr", text, (int(size[0]), int(size[1])), BrownOpenCV(len(d)),
-        np.concatenate([f, d]), pitch,
-    )  # fmt: skip
+    size = numbers(camera.get("resolution"), "resolution", (2,))
+    return ForeignCamera((int(size[0]), int(size[1])), BrownOpenCV(len(d)), np.concatenate([f, d]))
 
 
 FORMAT = Format(

@@ -11,15 +11,8 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from thermocald.errors import ConfigurationError
-from thermocald.output.camera_files.camera_record import (
-    Format,
-    ImportedCamera,
-    Record,
-    header,
-    import_family,
-    number,
-    numbers,
-)
+from thermocald.output.camera_files.camera_record import ForeignCamera, Format, Record, header
+from thermocald.output.camera_files.file_text import number, numbers
 from thermocald.photogrammetry.camera.conversions import to_family
 from thermocald.photogrammetry.camera.model_families import Metashape
 
@@ -49,7 +42,7 @@ def _encode(record: Record) -> tuple[str, str]:
     return "\n".join(lines) + "\n", result.statement
 
 
-def _decode(text: str, pitch: float | None) -> ImportedCamera:
+def _decode(text: str) -> ForeignCamera:
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ConfigurationError("a calibration needs no DOCTYPE and no entities")
     try:
@@ -78,9 +71,9 @@ def _decode(text: str, pitch: float | None) -> ImportedCamera:
     for tag in ("p3", "p4"):
         if number(calibration.findtext(tag, "0"), f"<{tag}>") != 0:
             raise ConfigurationError(f"<{tag}> has no counterpart in this model")
-    return import_family(
-        "metashape", text, (int(number(size[0], "width")), int(number(size[1], "height"))),
-        _FAMILY, values, pitch, covariance=_covariance(root),
+    return ForeignCamera(
+        (int(number(size[0], "width")), int(number(size[1], "height"))),
+        _FAMILY, values, covariance=_covariance(root),
     )  # fmt: skip
 
 

@@ -4,17 +4,9 @@ from __future__ import annotations
 
 import ast
 
-import numpy as np
-
 from thermocald.errors import ConfigurationError
-from thermocald.output.camera_files.camera_record import (
-    Format,
-    ImportedCamera,
-    Record,
-    header,
-    import_family,
-    numbers,
-)
+from thermocald.output.camera_files.camera_record import ForeignCamera, Format, Record, header
+from thermocald.output.camera_files.file_text import numbers
 from thermocald.photogrammetry.camera.conversions import to_family
 from thermocald.photogrammetry.camera.model_families import BrownOpenCV
 
@@ -41,7 +33,7 @@ def _encode(record: Record) -> tuple[str, str]:
     return header(record, result.statement) + body, result.statement
 
 
-def _decode(text: str, pitch: float | None) -> ImportedCamera:
+def _decode(text: str) -> ForeignCamera:
     try:
         document = ast.literal_eval(text.strip())
     except (ValueError, SyntaxError, MemoryError, RecursionError):
@@ -53,10 +45,8 @@ def _decode(text: str, pitch: float | None) -> ImportedCamera:
         raise ConfigurationError(f"lensmodel {lens!r}: {', '.join(sorted(_COUNTS))} can be read")
     count = _COUNTS[lens]
     values = numbers(document.get("intrinsics"), "intrinsics", (4 + count,))
-    size = numbers(document.get("imagersize"), "imagersize", (2,)).astype(int)
-    return import_family(
-        "mrcal", text, (int(size[0]), int(size[1])), BrownOpenCV(count), np.asarray(values), pitch
-    )
+    size = numbers(document.get("imagersize"), "imagersize", (2,))
+    return ForeignCamera((int(size[0]), int(size[1])), BrownOpenCV(count), values)
 
 
 FORMAT = Format(

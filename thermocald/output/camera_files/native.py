@@ -7,13 +7,8 @@ import json
 import numpy as np
 
 from thermocald.errors import ConfigurationError
-from thermocald.output.camera_files.camera_record import (
-    Format,
-    ImportedCamera,
-    Record,
-    number,
-    numbers,
-)
+from thermocald.output.camera_files.camera_record import Format, ImportedCamera, Record
+from thermocald.output.camera_files.file_text import number, numbers
 from thermocald.photogrammetry.camera.camera_model import (
     IOP_NAMES,
     CameraModel,
@@ -48,7 +43,7 @@ def _encode(record: Record) -> tuple[str, str]:
     return json.dumps(document, indent=1, allow_nan=False) + "\n", "exact: it is our own model"
 
 
-def _decode(text: str, pitch: float | None) -> ImportedCamera:
+def _decode(text: str) -> ImportedCamera:
     try:
         document = json.loads(text)
     except json.JSONDecodeError as cause:
@@ -60,8 +55,6 @@ def _decode(text: str, pitch: float | None) -> ImportedCamera:
         raise ConfigurationError("sensor or interior is missing")
     width, height = (int(number(head.get(side), f"sensor.{side}")) for side in ("width", "height"))
     own = number(head.get("pixel_pitch"), "sensor.pixel_pitch")
-    if pitch is not None and not np.isclose(pitch, own, rtol=1e-9):
-        raise ConfigurationError(f"pixel pitch {pitch:g} mm was given, the file says {own:g} mm")
     if "c" not in values:
         raise ConfigurationError("interior.c is missing")
     interior = InteriorOrientation.from_mapping(

@@ -13,15 +13,8 @@ import numpy as np
 import yaml
 
 from thermocald.errors import ConfigurationError
-from thermocald.output.camera_files.camera_record import (
-    Format,
-    ImportedCamera,
-    Record,
-    header,
-    import_family,
-    number,
-    numbers,
-)
+from thermocald.output.camera_files.camera_record import ForeignCamera, Format, Record, header
+from thermocald.output.camera_files.file_text import number, numbers, yaml_document
 from thermocald.photogrammetry.camera.conversions import to_family
 from thermocald.photogrammetry.camera.model_families import BrownOpenCV
 
@@ -75,12 +68,9 @@ def _numbers(document: dict[Any, Any], key: str, counts: tuple[int, ...]) -> Arr
     return numbers(node.get("data") if isinstance(node, dict) else node, key, counts)
 
 
-def _decode(text: str, pitch: float | None) -> ImportedCamera:
+def _decode(text: str) -> ForeignCamera:
     # not with cv2.FileStorage: a damaged file makes it crash the process (OpenCV 5.0.0)
-    try:
-        document = yaml.load(text.partition("\n")[2], _Loader)
-    except (yaml.YAMLError, ValueError) as cause:
-        raise ConfigurationError(f"no valid YAML: {str(cause).splitlines()[0]}") from None
+    document = yaml_document(text.partition("\n")[2], _Loader)
     if not isinstance(document, dict):
         raise ConfigurationError("the file holds no keys")
     K = _numbers(document, "camera_matrix", (9,)).reshape(3, 3)
@@ -100,9 +90,7 @@ def _decode(text: str, pitch: float | None) -> ImportedCamera:
         n = len(values)
         covariance = _numbers(document, "intrinsics_covariance", (n * n,)).reshape(n, n)
     name = str(document.get("camera_name", "camera"))
-    return import_family(
-        "opencv", text, (size[0], size[1]), BrownOpenCV(len(d)), values, pitch, name, covariance
-    )
+    return ForeignCamera((size[0], size[1]), BrownOpenCV(len(d)), values, name, covariance)
 
 
 FORMAT = Format(

@@ -5,18 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import yaml
 
 from thermocald.errors import ConfigurationError
-from thermocald.output.camera_files.camera_record import (
-    Format,
-    ImportedCamera,
-    Record,
-    header,
-    import_family,
-    number,
-    numbers,
-)
+from thermocald.output.camera_files.camera_record import ForeignCamera, Format, Record, header
+from thermocald.output.camera_files.file_text import number, numbers, yaml_document, yaml_text
 from thermocald.photogrammetry.camera.conversions import to_family
 from thermocald.photogrammetry.camera.model_families import BrownOpenCV
 
@@ -44,15 +36,11 @@ def _encode(record: Record) -> tuple[str, str]:
         "rectification_matrix": _matrix(np.eye(3), 3),
         "projection_matrix": _matrix([fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0], 3),
     }
-    body = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=10_000)
-    return header(record, result.statement) + body, result.statement
+    return header(record, result.statement) + yaml_text(document), result.statement
 
 
-def _decode(text: str, pitch: float | None) -> ImportedCamera:
-    try:
-        document = yaml.safe_load(text)
-    except yaml.YAMLError as cause:
-        raise ConfigurationError(f"no valid YAML: {str(cause).splitlines()[0]}") from None
+def _decode(text: str) -> ForeignCamera:
+    document = yaml_document(text)
     if not isinstance(document, dict):
         raise ConfigurationError("no camera_info: the file holds no keys")
     model = document.get("distortion_model")
@@ -67,10 +55,9 @@ def _decode(text: str, pitch: float | None) -> ImportedCamera:
     K = numbers(data["camera_matrix"], "camera_matrix.data", (9,))
     d = numbers(data["distortion_coefficients"], "distortion_coefficients.data", (_COUNT[model],))
     size = [int(number(document.get(key), key)) for key in ("image_width", "image_height")]
-    return import_family(
-        "ros", text, (size[0], size[1]), BrownOpenCV(len(d)),
-        np.concatenate([K[[0, 4, 2, 5]], d]), pitch, str(document.get("camera_name", "camera")),
-    )  # fmt: skip
+    values = np.concatenate([K[[0, 4, 2, 5]], d])
+    name = str(document.get("camera_name", "camera"))
+    return ForeignCamera((size[0], size[1]), BrownOpenCV(len(d)), values, name)
 
 
 FORMAT = Format(

@@ -12,15 +12,15 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from thermocald import __version__
+from thermocald.durations import short_duration
+from thermocald.output.page import render_page
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 __all__ = ["render_fleet"]
 
-_TEMPLATES = Path(__file__).parent / "templates"
-_STYLE = Path(__file__).parents[1] / "study" / "templates" / "study.css"
+_TEMPLATE = Path(__file__).parent / "templates" / "fleet.html.j2"
 _WORDS = {
     "late": "late",
     "sensor": "dead sensor",
@@ -61,21 +61,13 @@ class _Drawing:
 
 def render_fleet(document: Mapping[str, Any], made: datetime | None = None) -> str:
     """The page as HTML text; document: of `fleet_document`; made: the time that it bears."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
-
-    environment = Environment(
-        loader=FileSystemLoader(_TEMPLATES),
-        autoescape=select_autoescape(["html", "j2"]),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-    )
     at = made or datetime.now(tz=UTC)
     summary, cameras = document["summary"], document["cameras"]
     tiles = [(str(summary["sound"]), "sound", "sound")]
     tiles += [(str(summary[kind]), word, kind) for kind, word in _WORDS.items() if summary[kind]]
-    return environment.get_template("fleet.html.j2").render(
+    return render_page(
+        _TEMPLATE,
         title=f"{summary['cameras']} cameras at {summary['stations']} stations",
-        style=_STYLE.read_text(encoding="utf-8"),
         made=f"{at:%Y-%m-%d %H:%M} UTC, from {', '.join(document['servers'])}",
         tiles=tiles,
         words=_WORDS,
@@ -84,7 +76,6 @@ def render_fleet(document: Mapping[str, Any], made: datetime | None = None) -> s
         types=[(kind, _drawings(kind, cameras)) for kind in document["types"]],
         width=_WIDTH,
         left=_LEFT,
-        footer=f"thermocald {__version__}",
     )
 
 
@@ -97,8 +88,8 @@ def _row(camera: Mapping[str, Any]) -> dict[str, str | bool]:
     return {
         "name": f"{camera['station']}/{camera['camera']}",
         "type": camera["type"],
-        "last": _ago(camera["lag_s"]),
-        "way": _ago(camera["on_the_way_s"]),
+        "last": short_duration(camera["lag_s"]),
+        "way": short_duration(camera["on_the_way_s"]),
         "waiting": "–" if camera["waiting"] is None else str(camera["waiting"]),
         "ok": f"{camera['ok']:.0%}" if math.isfinite(camera["ok"]) else "–",
         "now": f"{camera['temperature']:.1f}" if math.isfinite(camera["temperature"]) else "–",
@@ -106,15 +97,6 @@ def _row(camera: Mapping[str, Any]) -> dict[str, str | bool]:
         **{name: rates.get(name, "–") for name in ("c", "x0", "y0")},
         "sound": not camera["findings"],
     }
-
-
-def _ago(seconds: float) -> str:
-    if not math.isfinite(seconds):
-        return "–"
-    for unit, size in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
-        if abs(seconds) >= 2 * size:
-            return f"{seconds / size:.0f} {unit}"
-    return f"{seconds:.0f} s"
 
 
 def _drawings(kind: Mapping[str, Any], cameras: Sequence[Mapping[str, Any]]) -> list[_Drawing]:

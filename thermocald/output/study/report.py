@@ -21,6 +21,7 @@ from thermocald.output.figures.clips import clip_png, cut_clip, data_uri
 from thermocald.output.figures.draw import draw_figure, draw_matrix, draw_panel, inline_svg, save
 from thermocald.output.figures.numbers import parameter_label
 from thermocald.output.figures.panels import Figure, document
+from thermocald.output.page import render_page
 from thermocald.output.study import figures, tables
 from thermocald.output.study import object_space_figures as object_space
 from thermocald.output.study.summary import summary
@@ -81,15 +82,8 @@ def render_report(
 
     made: the time that it bears, by default now.
     """
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
     from plotly.offline import get_plotlyjs
 
-    environment = Environment(
-        loader=FileSystemLoader(_TEMPLATES),
-        autoescape=select_autoescape(["html", "j2"]),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-    )
     cameras = [
         {
             "id": f"camera-{i}",
@@ -101,15 +95,14 @@ def render_report(
         }
         for i, camera in enumerate(study.cameras)
     ]
-    return environment.get_template("study.html.j2").render(
+    return render_page(
+        _TEMPLATES / "study.html.j2",
         title=title,
         lead=_LEAD,
         cameras=cameras,
-        style=(_TEMPLATES / "study.css").read_text(encoding="utf-8"),
         script=(_TEMPLATES / "study.js").read_text(encoding="utf-8"),
         plotly=_packed(get_plotlyjs()),
         made=_made(made),
-        footer=f"thermocald {__version__}",
     )
 
 

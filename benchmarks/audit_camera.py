@@ -20,6 +20,7 @@ from thermocald.photogrammetry.camera.camera_model import (
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, adjust
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.series.adjustment import SeriesSettings, adjust_series
+from thermocald.photogrammetry.series.result import Exterior
 from thermocald.simulation.demonstration import demonstration_model
 from thermocald.simulation.testfields import corner_field
 
@@ -82,7 +83,7 @@ def epoch(draws: int, rng: np.random.Generator) -> list[Row]:
 
 
 def _series(
-    scene: Scene, epochs: int, tremble_px: float, exterior: str, drift: float = 1.0, tau: float = 10
+    scene: Scene, epochs: int, tremble_px: float, exterior: Exterior, drift=1.0, tau=10.0
 ):
     truth = np.tile(np.concatenate([scene.iop, scene.eop]), (epochs, 1))
     warm = drift * (1 - np.exp(-np.arange(epochs) / tau))
@@ -92,7 +93,7 @@ def _series(
     seen = [scene.observe(one[:10], one[10:]) for one in truth]
     result = adjust_series(
         scene.sensor, scene.field, seen, InteriorOrientation.from_array(scene.iop),
-        ExteriorOrientation.from_array(scene.eop), SeriesSettings(exterior=exterior),  # type: ignore[arg-type]
+        ExteriorOrientation.from_array(scene.eop), SeriesSettings(exterior=exterior),
     )  # fmt: skip
     return result, truth
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 from uuid import UUID
 
 import numpy as np
@@ -19,6 +20,9 @@ from thermocald.store.database.row import StoredSeries
 from thermocald.store.recording.head import CameraSpec, Channel, Head, head_document
 from thermocald.store.recording.testfield_file import testfield_csv
 from thermocald.store.server.writer import series_key
+
+if TYPE_CHECKING:
+    from psycopg import Connection
 
 PITCH = 0.00112
 TARGETS = 147
@@ -97,14 +101,14 @@ _DAY, _YEAR = 2 * np.pi / 86400, 2 * np.pi / 31_557_600
 _GAUSS = "(random() + random() + random() + random() - 2) * 1.732"
 
 
-def add_camera(connection: object, camera: GeneratedCamera, first: int = 1) -> None:
+def add_camera(connection: Connection, camera: GeneratedCamera, first: int = 1) -> None:
     """Insert the series and its epochs numbered `first` on; in the caller's transaction.
 
     connection: psycopg's, of a role that owns the tables; months are made as a station makes them.
     """
     series = camera.series
     csv = testfield_csv(series.testfield)
-    execute = connection.execute  # type: ignore[attr-defined]
+    execute = connection.execute
     execute("INSERT INTO testfield VALUES ('generated', %s) ON CONFLICT DO NOTHING", (csv,))
     execute(
         "INSERT INTO series VALUES (%s, %s, %s, %s, '', %s, 'generated', %s, %s, '{}') "

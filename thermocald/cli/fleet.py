@@ -97,7 +97,7 @@ def _lines(document: dict[str, Any], every: bool) -> list[str]:
 
 
 def _row(camera: dict[str, Any], width: int) -> str:
-    from thermocald.fleet.findings import duration
+    from thermocald.durations import short_duration
 
     rate = camera["rates"].get("c")
     text = "–" if rate is None else f"{rate['value'] * 1e3:+.3f} ± {rate['sd'] * 1e3:.3f}"
@@ -105,7 +105,7 @@ def _row(camera: dict[str, Any], width: int) -> str:
     ok = "–" if not math.isfinite(camera["ok"]) else f"{camera['ok']:.0%}"
     degrees = camera["temperature"]
     return (
-        f"{_shortened(_name(camera), width):<{width}} {duration(camera['lag_s']):>7} "
+        f"{_shortened(_name(camera), width):<{width}} {short_duration(camera['lag_s']):>7} "
         f"{waiting:>7} {ok:>5} {'–' if not math.isfinite(degrees) else f'{degrees:.1f}':>6} "
         f"{text:>16}"
     )

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.store.database.row import StoredSeries
+    from thermocald.store.database.series_reader import SeriesReader
     from thermocald.store.recording.head import Head
     from thermocald.store.recording.reader import Recording
-    from thermocald.store.sources import SeriesSource
 
     Array = NDArray[np.float64]
 
@@ -50,26 +50,19 @@ def measured_epochs(
 
 def epochs_input(head: Head, field: TestField, epochs: Sequence[Epoch], name: str) -> SeriesInput:
     """The arrays of some epochs; name: of their recording or store, for messages."""
-    camera = head.camera
     readings = {
         channel: np.array([e.temperatures.get(channel, np.nan) for e in epochs], dtype=float)
         for channel in head.channels
     }
-    return SeriesInput(
-        name=name,
-        camera=camera.name,
-        sensor=camera.sensor,
-        field=field,
-        principal_distance=camera.principal_distance,
-        frame_times=np.array([e.frame_time for e in epochs], dtype=float),
-        reading_times=np.array([e.temperature_time for e in epochs], dtype=float),
-        readings=readings,
-        resolutions={channel: c.resolution for channel, c in head.channels.items()},
-        grid=ObservationGrid.from_observations(field, [e.observations for e in epochs]),
-        numbers=np.array([e.number for e in epochs], dtype=np.int64),
-        series=head.series,
-        interior=camera.interior,
-    )
+    whole = _without_points(
+        head, field, name,
+        np.array([e.number for e in epochs], dtype=np.int64),
+        np.array([e.frame_time for e in epochs], dtype=float),
+        np.array([e.temperature_time for e in epochs], dtype=float),
+        readings,
+    )  # fmt: skip
+    grid = ObservationGrid.from_observations(field, [e.observations for e in epochs])
+    return replace(whole, grid=grid)
 
 
 def series_input(
@@ -112,7 +105,7 @@ def _all_epochs(recording: Recording) -> SeriesInput:
     )  # fmt: skip
 
 
-def _stored(store: SeriesSource, series: StoredSeries, name: str) -> SeriesInput:
+def _stored(store: SeriesReader, series: StoredSeries, name: str) -> SeriesInput:
     """The arrays of a series in a store; a long one is condensed while it is read."""
     numbers = store.series_columns(series, ["epoch"])["epoch"].astype(np.int64)
     if len(numbers) <= rows_at_most(len(series.testfield)):

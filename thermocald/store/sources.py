@@ -6,7 +6,7 @@ Analyses read times that are corrected where the clock was wrong; the store has 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.store.database.epoch_table import StoredEpoch
-    from thermocald.store.database.row import Event, StoredSeries
+    from thermocald.store.database.row import StoredSeries
+    from thermocald.store.database.series_reader import StampedReader
 
     Array = NDArray[Any]
 
 __all__ = [
     "CorrectedSource",
-    "SeriesSource",
     "is_store",
     "open_source",
     "require_source",
@@ -38,48 +38,17 @@ __all__ = [
 _SQLITE = b"SQLite format 3\0"
 
 
-class SeriesSource(Protocol):
-    """An open store that is read: `database.store.Store` or `server.reader.ServerStore`."""
-
-    path: Path
-
-    def __enter__(self) -> Self: ...
-    def __exit__(self, *error: Any) -> None: ...
-    def all_series(self) -> list[StoredSeries]: ...
-    def find_series(self, camera: str | None = None, name: str | None = None) -> StoredSeries: ...
-    def series_columns(self, series: StoredSeries, names: Sequence[str]) -> dict[str, Array]: ...
-    def temperatures_at_frame(self, series: StoredSeries) -> dict[str, Array]: ...
-    def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array: ...
-    def epochs(
-        self,
-        series: StoredSeries,
-        first: int = 0,
-        last: int | None = None,
-        *,
-        details: bool = True,
-    ) -> Iterator[StoredEpoch]: ...
-
-
-class StampedSource(SeriesSource, Protocol):
-    """One that also has the steps of the clock that the daemon noted, as events."""
-
-    def clock_steps(self, series: StoredSeries) -> list[Event]: ...
-
-
 class CorrectedSource(SeriesReader):
     """An open store whose times are corrected, `database.times`; else as it is."""
 
-    def __init__(self, stamped: StampedSource) -> None:
+    def __init__(self, stamped: StampedReader) -> None:
         self.path = stamped.path
         self._stamped = stamped
         self._times: dict[int, SeriesTimes | None] = {}
 
-    def __enter__(self) -> Self:
-        self._stamped.__enter__()
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        self._stamped.__exit__(*error)
+    def close(self) -> None:
+        """Close the store."""
+        self._stamped.close()
 
     def all_series(self) -> list[StoredSeries]:
         """As the store's."""
@@ -102,15 +71,9 @@ class CorrectedSource(SeriesReader):
             columns |= {name: corrected[name] for name in timed}
         return columns
 
-    def epochs(
-        self,
-        series: StoredSeries,
-        first: int = 0,
-        last: int | None = None,
-        *,
-        details: bool = True,
+    def _epochs(
+        self, series: StoredSeries, first: int, last: int | None, details: bool
     ) -> Iterator[StoredEpoch]:
-        """As the store's, with corrected times."""
         times = self._corrected(series)
         for stored in self._stamped.epochs(series, first, last, details=details):
             if times is None:
@@ -128,7 +91,7 @@ class CorrectedSource(SeriesReader):
         return self._times[series.id]
 
 
-def open_source(source: Path) -> SeriesSource:
+def open_source(source: Path) -> SeriesReader:
     """Open a store for reading: a file, or `postgresql://…?camera=…&series=…`.
 
     Raises StoreError, for a server also UsageError, ServerGone, ServerError.

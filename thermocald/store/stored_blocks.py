@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from thermocald.photogrammetry.field.testfield import Observations
     from thermocald.store.database.row import StoredSeries
-    from thermocald.store.sources import SeriesSource
+    from thermocald.store.database.series_reader import SeriesReader
 
 __all__ = ["StoredBlocks"]
 
@@ -28,7 +28,7 @@ _GRID_POINTS = 300_000  # cells of a block
 class StoredBlocks:
     """The observations of a series in a store; numbers (E,): of its epochs."""
 
-    store: SeriesSource
+    store: SeriesReader
     series: StoredSeries
     numbers: NDArray[np.int64]
 

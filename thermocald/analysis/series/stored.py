@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
     from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
     from thermocald.store.database.row import StoredSeries
+    from thermocald.store.database.series_reader import SeriesReader
     from thermocald.store.recording.reader import Recording
-    from thermocald.store.sources import SeriesSource
 
     Array = NDArray[np.float64]
 
@@ -98,7 +98,7 @@ def _series(store: Store, recording: Recording, settings: AdjustmentSettings) ->
 
 
 def table_of_stored(
-    store: SeriesSource, series: StoredSeries, settings: AdjustmentSettings, exterior: str
+    store: SeriesReader, series: StoredSeries, settings: AdjustmentSettings, exterior: str
 ) -> SeriesTable:
     """The table of a series in an open store. Raises DataError where it has no epochs."""
     names = ["epoch", "frame_time", "sigma0", "n_observations", "n_rejected", "status"]
@@ -138,7 +138,7 @@ def table_of_stored(
 
 
 def _parameters(
-    store: SeriesSource, series: StoredSeries, prefix: str, ok: NDArray[np.bool_]
+    store: SeriesReader, series: StoredSeries, prefix: str, ok: NDArray[np.bool_]
 ) -> Array:
     """Columns (E, 16) of all parameters, one after the other, for a year of epochs must fit."""
     spool = ColumnSpool(len(ok), 16)

@@ -34,9 +34,9 @@ if TYPE_CHECKING:
     from thermocald.analysis.series.table import SeriesTable
     from thermocald.photogrammetry.field.testfield import Observations
     from thermocald.store.database.row import StoredSeries
+    from thermocald.store.database.series_reader import SeriesReader
     from thermocald.store.recording.head import Head
     from thermocald.store.recording.reader import Recording
-    from thermocald.store.sources import SeriesSource
 
     Array = NDArray[np.float64]
 
@@ -112,7 +112,7 @@ def from_recording(
 
 
 def from_store(
-    store: SeriesSource,
+    store: SeriesReader,
     series: StoredSeries,
     label: str | None = None,
     thermometer_sd: float | None = None,
@@ -133,7 +133,7 @@ def from_store(
 
 
 def _from_columns(
-    store: SeriesSource, series: StoredSeries, label: str, thermometer_sd: float | None
+    store: SeriesReader, series: StoredSeries, label: str, thermometer_sd: float | None
 ) -> MeasuredSeries:
     """A series as it was stored; one column at a time, for a year of epochs must fit."""
 
@@ -254,7 +254,7 @@ def _thermometer(
 
 
 def _stored_thermometers(
-    store: SeriesSource, series: StoredSeries, frame_time: Array, sd: float | None
+    store: SeriesReader, series: StoredSeries, frame_time: Array, sd: float | None
 ) -> list[Thermometer]:
     reading_time = store.series_columns(series, ["temperature_time"])["temperature_time"]
     return [
@@ -306,7 +306,7 @@ def _spread(count: int, most: int) -> NDArray[np.int64]:
 
 
 def _stored_clip(
-    store: SeriesSource, series: StoredSeries, number: NDArray[np.int64]
+    store: SeriesReader, series: StoredSeries, number: NDArray[np.int64]
 ) -> Clip | None:
     first, last = (next(store.epochs(series, int(n), int(n))).epoch for n in number[[0, -1]])
     if first.frame is None or last.frame is None:

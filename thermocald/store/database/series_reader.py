@@ -3,29 +3,34 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 from thermocald.errors import StoreError
 from thermocald.store.recording.readings import interpolate_readings
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     import numpy as np
     from numpy.typing import NDArray
 
-    from thermocald.store.database.row import StoredSeries
+    from thermocald.store.database.epoch_table import StoredEpoch
+    from thermocald.store.database.row import Event, StoredSeries
 
     Array = NDArray[np.float64]
 
-__all__ = ["SeriesReader"]
+__all__ = ["SeriesReader", "StampedReader"]
 
 _LISTED = 20
 
 
 class SeriesReader(ABC):
-    """Finding a series, and temperatures at the times of its frames: of a file or of a server."""
+    """An open store that is read, of a file or of a server; use it in a `with` block.
+
+    Each has its own way to list series and to read their columns and epochs; finding a series and
+    temperatures at the times of its frames follow from these.
+    """
 
     path: Path
     _remedy = ""  # how a series is selected, where that is not by a name alone
@@ -37,6 +42,39 @@ class SeriesReader(ABC):
     @abstractmethod
     def series_columns(self, series: StoredSeries, names: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Columns (E,) over all epochs by name."""
+
+    @abstractmethod
+    def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
+        """(E, 16, 16) covariances of some epochs, NaN for those without a result."""
+
+    @abstractmethod
+    def _epochs(
+        self, series: StoredSeries, first: int, last: int | None, details: bool
+    ) -> Iterator[StoredEpoch]: ...
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close it; may be called twice."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def epochs(
+        self,
+        series: StoredSeries,
+        first: int = 0,
+        last: int | None = None,
+        *,
+        details: bool = True,
+    ) -> Iterator[StoredEpoch]:
+        """The epochs numbered `first` to `last`, one after the other, in constant memory.
+
+        details: False leaves out observations and covariances, and is faster.
+        """
+        return self._epochs(series, first, last, details)
 
     def find_series(self, camera: str | None = None, name: str | None = None) -> StoredSeries:
         """The one series of a camera and a name, either of which may be left open.
@@ -67,3 +105,11 @@ class SeriesReader(ABC):
 
     def _label(self, series: StoredSeries) -> str:
         return f"{series.camera}/{series.name}"
+
+
+class StampedReader(SeriesReader):
+    """One whose times are as they were stamped, with the steps of the clock noted as events."""
+
+    @abstractmethod
+    def clock_steps(self, series: StoredSeries) -> list[Event]:
+        """The steps of the clock while this series ran."""

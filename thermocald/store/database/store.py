@@ -37,7 +37,7 @@ from thermocald.store.database.row import (
     LoggedReading,
     StoredSeries,
 )
-from thermocald.store.database.series_reader import SeriesReader
+from thermocald.store.database.series_reader import StampedReader
 from thermocald.store.database.series_table import (
     insert_events,
     insert_readings,
@@ -53,7 +53,6 @@ if TYPE_CHECKING:
     import sqlite3
     from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
-    from types import TracebackType
 
     from numpy.typing import NDArray
 
@@ -71,7 +70,7 @@ _EPOCHS_AT_ONCE = 100
 _READINGS_AT_ONCE = 1000
 
 
-class Store(SeriesReader):
+class Store(StampedReader):
     """An open store; use `Store.open` and a `with` block. Threads may share it."""
 
     def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
@@ -96,17 +95,6 @@ class Store(SeriesReader):
         with self._lock, in_words(self.path, "the store cannot be closed"):
             self.closed = True
             self._db.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def create_series(
         self,
@@ -252,20 +240,12 @@ class Store(SeriesReader):
         last = self._end(series)[0]
         return None if last < 0 else last
 
-    def epochs(
-        self,
-        series: StoredSeries,
-        first: int = 0,
-        last: int | None = None,
-        *,
-        details: bool = True,
+    def _epochs(
+        self, series: StoredSeries, first: int, last: int | None, details: bool
     ) -> Iterator[StoredEpoch]:
-        """The epochs numbered `first` to `last`, one after the other, in constant memory.
-
-        details: False leaves out observations and covariances, and is faster.
-        """
+        """As they are read; what is missing of a whole series is logged at its end."""
         missing, before = 0, first or 1
-        for stored in self._epochs(series, first, last, details):
+        for stored in self._pages(series, first, last, details):
             missing += max(0, stored.epoch.number - before)
             before = stored.epoch.number + 1
             yield stored
@@ -277,7 +257,7 @@ class Store(SeriesReader):
                     self.path, missing, series.name,
                 )  # fmt: skip
 
-    def _epochs(
+    def _pages(
         self, series: StoredSeries, first: int, last: int | None, details: bool
     ) -> Iterator[StoredEpoch]:
         """The epochs page by page: no statement is open while another thread may close the file.

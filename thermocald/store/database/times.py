@@ -8,7 +8,7 @@ the epochs that follow and from the steps that the daemon noted.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,20 +17,14 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from thermocald.store.database.row import Event, StoredSeries
+    from thermocald.store.database.row import StoredSeries
+    from thermocald.store.database.series_reader import StampedReader
 
     Array = NDArray[np.float64]
 
 __all__ = ["SeriesTimes", "clock_corrections", "series_times"]
 
 _TOLERANCE_S = 10.0
-
-
-class _Source(Protocol):
-    """What is read here of a store in a file or on a server."""
-
-    def series_columns(self, series: StoredSeries, names: Sequence[str]) -> dict[str, Array]: ...
-    def clock_steps(self, series: StoredSeries) -> list[Event]: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +46,7 @@ class SeriesTimes:
         return float(self.frame[row]), float(self.reading[row])
 
 
-def series_times(source: _Source, series: StoredSeries) -> SeriesTimes:
+def series_times(source: StampedReader, series: StoredSeries) -> SeriesTimes:
     """The corrected times of all epochs of a series. Raises StoreError."""
     names = ["epoch", "frame_time", "temperature_time", "clock_trusted"]
     columns = source.series_columns(series, names)

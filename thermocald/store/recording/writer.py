@@ -16,7 +16,6 @@ from thermocald.store.recording.testfield_file import testfield_csv
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
     from pathlib import Path
-    from types import TracebackType
     from typing import Any, TextIO
 
     import numpy as np
@@ -95,12 +94,7 @@ class RecordingWriter:
         if math.isfinite(epoch.temperature_time):
             self._last_reading = epoch.temperature_time
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
         if kind is not None:
             self._abandon()
             return

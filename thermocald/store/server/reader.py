@@ -19,7 +19,7 @@ from thermocald.store.database.blob import unpack_covariance, unpack_observation
 from thermocald.store.database.epoch_columns import COLUMN_NAMES, sql_name
 from thermocald.store.database.epoch_table import StoredEpoch, stored_epoch
 from thermocald.store.database.row import Event, LoggedReading, StoredSeries
-from thermocald.store.database.series_reader import SeriesReader
+from thermocald.store.database.series_reader import StampedReader
 from thermocald.store.recording.head import parse_head
 from thermocald.store.recording.testfield_file import parse_testfield
 from thermocald.store.server.address import ServerAddress
@@ -44,7 +44,7 @@ _LATEST = (
 )
 
 
-class ServerStore(SeriesReader, Connected):
+class ServerStore(Connected, StampedReader):
     """An open store on a server, narrowed to what its address selects; use it in a `with` block."""
 
     _remedy = "; select with ?station=…&camera=…&series=… in the address"
@@ -110,15 +110,9 @@ class ServerStore(SeriesReader, Connected):
         missing = np.full((16, 16), np.nan)
         return np.array([found.get(int(n), missing) for n in numbers]).reshape(-1, 16, 16)
 
-    def epochs(
-        self,
-        series: StoredSeries,
-        first: int = 0,
-        last: int | None = None,
-        *,
-        details: bool = True,
+    def _epochs(
+        self, series: StoredSeries, first: int, last: int | None, details: bool
     ) -> Iterator[StoredEpoch]:
-        """The epochs numbered `first` to `last`, one after the other, in constant memory."""
         blobs = ["covariance", "observations"] if details else []
         fields = [*_EPOCH, *(f'"{sql_name(n)}"' for n in PARAMETER_NAMES), *blobs]
         statement = (

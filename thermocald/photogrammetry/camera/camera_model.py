@@ -301,18 +301,20 @@ def partials(
     # run; the callers see (..., n, 2, 16) through `_points_first`.
     q = _turned(R, e, np.asarray(points, dtype=float))
     depth = -q[..., 2, :]
-    if not (depth > 0).all():
+    if not np.minimum.reduce(depth, axis=None, initial=np.inf) > 0:  # NaN too
         depth = np.where(depth > 0, depth, np.nan)
     inverse_depth = 1.0 / depth
     uv = q[..., :2, :] * inverse_depth[..., None, :]
     ideal = i[..., 0, None, None] * uv
-    x, y = ideal[..., 0, :], ideal[..., 1, :]
-    batch, n = x.shape[:-1], x.shape[-1]
+    batch, n = ideal.shape[:-2], ideal.shape[-1]
+    by_axis = ideal.transpose(len(batch), *range(len(batch)), -1)  # (2, ..., n)
+    x, y = by_axis[0], by_axis[1]
     squares = np.empty((*batch, 3, n))  # x², xy, y²
     np.multiply(ideal, x[..., None, :], out=squares[..., :2, :])
     np.multiply(y, y, out=squares[..., 2, :])
-    powers = np.empty((*batch, 4, n))  # 1, r², r⁴, r⁶
+    powers = np.empty((*batch, 6, n))  # 1, r², r⁴, r⁶, x, y
     powers[..., 0, :] = 1.0
+    powers[..., 4:, :] = ideal
     r2, r4 = powers[..., 1, :], powers[..., 2, :]
     np.add(squares[..., 0, :], squares[..., 2, :], out=r2)
     np.multiply(r2, r2, out=r4)
@@ -322,30 +324,31 @@ def partials(
     out = np.zeros((2, *batch, 16, n))
     out[0, ..., 1, :] = out[1, ..., 2, :] = 1.0
     twice = 2 * squares
-    for axis in range(2):
-        np.multiply(ideal[..., axis, None, :], powers[..., 1:, :], out=out[axis, ..., 3:6, :])
-        np.add(r2, twice[..., 2 * axis, :], out=out[axis, ..., 6 + axis, :])
-        out[axis, ..., 7 - axis, :] = twice[..., 1, :]
+    np.multiply(by_axis[..., None, :], powers[..., 1:4, :], out=out[..., 3:6, :])
+    np.add(r2, twice[..., 0, :], out=out[0, ..., 6, :])
+    np.add(r2, twice[..., 2, :], out=out[1, ..., 7, :])
+    out[0, ..., 7, :] = out[1, ..., 6, :] = twice[..., 1, :]
     out[0, ..., 8:10, :] = ideal
-    moved = (i[..., None, 1:] @ out[..., 1:10, :])[..., 0, :]
-    xd, yd = x + moved[0], y + moved[1]
+    measured = (i[..., None, 1:] @ out[..., 1:10, :])[..., 0, :]
+    measured += by_axis
 
-    # ∂(x', y')/∂(x̄, ȳ), symmetric but for C1 and C2: radial and slope·x², the bend of B1 and B2
-    factors = np.zeros((*batch, 2, 4))
-    factors[..., 0, 0] = 1.0
-    factors[..., 0, 1:] = i[..., 3:6]
-    np.multiply(i[..., 3:6], _SLOPE, out=factors[..., 1, :3])
-    radial_and_slope = factors @ powers
-    jacobian = squares  # xx, xy, yy
-    jacobian *= radial_and_slope[..., 1, None, :]
-    jacobian += (_BEND @ i[..., 6:8, None]).reshape(*i.shape[:-1], 3, 2) @ ideal
-    jacobian[..., ::2, :] += radial_and_slope[..., 0, None, :]
+    # ∂(x', y')/∂(x̄, ȳ) as xx, xy, yy, symmetric but for C1 and C2: slope · (x², xy, y²), and what
+    # is linear in the powers, the radial part and the bend of B1 and B2
+    linear = np.zeros((*i.shape[:-1], 3, 6))
+    linear[..., ::2, 0] = 1.0
+    linear[..., ::2, 1:4] = i[..., None, 3:6]
+    linear[..., 4:] = (_BEND @ i[..., 6:8, None]).reshape(*i.shape[:-1], 3, 2)
+    jacobian = squares
+    jacobian *= (i[..., None, 3:6] * _SLOPE) @ powers[..., :3, :]
+    jacobian += linear @ powers
 
     # By the camera coordinates: the same with ∂/∂c as its third component
     by_ideal = np.empty((2, *batch, 3, n))
     np.add(jacobian[..., :2, :], i[..., 8:10, None], out=by_ideal[0, ..., :2, :])
     by_ideal[1, ..., :2, :] = jacobian[..., 1:, :]
     scale = (_UPWARDS / sensor.pixel_pitch).reshape(2, *(1,) * (out.ndim - 1))
+    measured *= scale[..., 0]
+    measured += sensor.centre.reshape(scale[..., 0].shape)
     by_ideal[..., :2, :] *= scale
     by_c = by_ideal[..., 2, :]
     pair = by_ideal[..., :2, :] * uv
@@ -366,7 +369,8 @@ def partials(
     np.matmul(
         _turning_axes(e, R) * (i[..., 0, None, None] * _TURNS), moment, out=out[..., 10:13, :]
     )
-    return _as_px(sensor, xd, yd), _points_first(out), _points_first(by_point)
+    image_points = measured.transpose(*range(1, measured.ndim), 0)
+    return image_points, _points_first(out), _points_first(by_point)
 
 
 def _points_first(array: Array) -> Array:
@@ -379,7 +383,11 @@ def _turning_axes(eop: Array, R: Array) -> Array:
     """The axes (..., 3, 3) about which omega, phi, kappa turn the camera, in its frame (rows)."""
     axes = np.zeros(R.shape)
     axes[..., 0, :] = R[..., 0, :]
-    axes[..., 1, 0], axes[..., 1, 1] = np.sin(eop[..., 2]), np.cos(eop[..., 2])
+    if eop.ndim == 1:  # one camera: as in `rotation`
+        kappa = float(eop[2])
+        axes[1, 0], axes[1, 1] = math.sin(kappa), math.cos(kappa)
+    else:
+        axes[..., 1, 0], axes[..., 1, 1] = np.sin(eop[..., 2]), np.cos(eop[..., 2])
     axes[..., 2, 2] = 1.0
     return axes
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from math import sqrt
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -29,19 +30,21 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
 )
 from thermocald.photogrammetry.epoch.gauss_markov import (
-    TRUSTED_REDUNDANCY,
     NoConvergenceError,
     Problem,
-    Rejections,
     Solution,
-    fails_global_test,
-    most_rejected,
-    point_tests,
     resolve,
-    snoop,
     solve,
 )
 from thermocald.photogrammetry.epoch.geometry import GeometryBounds, weaknesses
+from thermocald.photogrammetry.epoch.snooping import (
+    TRUSTED_REDUNDANCY,
+    Rejections,
+    fails_global_test,
+    most_rejected,
+    point_tests,
+    snoop,
+)
 from thermocald.photogrammetry.parameters import EOP, IOP
 
 if TYPE_CHECKING:
@@ -98,7 +101,7 @@ class AdjustmentSettings:
     @property
     def unknowns(self) -> NDArray[np.int64]:
         """Positions of the unknowns in `PARAMETER_NAMES`."""
-        return _positions(tuple(self.free), self.exterior_free)
+        return _positions(self.free, self.exterior_free)
 
 
 @lru_cache(maxsize=64)
@@ -250,19 +253,21 @@ def _result(
     test: Array,
     redundancy_numbers: Array,
 ) -> Adjustment:
-    u = problem.unknowns
-    redundancy = 2 * int(use.sum()) + len(s.priors) - len(u)
+    u, n = problem.unknowns, int(np.count_nonzero(use))
+    redundancy = 2 * n + len(s.priors) - len(u)
     v, points, observed = solution.whitened[-1], problem.points, problem.observations.points
     rejected: tuple[int, ...] = ()
-    if not use.all():
+    if n < len(use):
         v, points, observed = v[:, use], points[use], observed[use]
         rejected = tuple(problem.observations.targets[~use].tolist())
-    sigma0 = float(np.sqrt(problem.cost(v, solution.values) / redundancy))
+    sigma0 = sqrt(problem.cost(v, solution.values) / redundancy)
     factor = sigma0**2 if s.scale == "posterior" else 1.0
     if redundancy < TRUSTED_REDUNDANCY:
         factor = max(1.0, factor)  # a handful of residuals may be small by luck
-    covariance = np.zeros((16, 16))
-    covariance[u[:, None], u] = solution.root @ solution.root.T * factor
+    root = np.zeros((16, len(u)))
+    root[u] = solution.root
+    covariance = root @ root.T
+    covariance *= factor
     values = solution.values.tolist()
     result = Adjustment(
         "ok",
@@ -270,7 +275,7 @@ def _result(
         InteriorOrientation(*values[IOP]),
         ExteriorOrientation(*values[EOP]),
         covariance,
-        _estimated(tuple(s.free)),
+        _estimated(s.free),
         sigma0,
         redundancy,
         problem.observations.targets,

@@ -23,8 +23,9 @@ from thermocald.photogrammetry.camera.camera_model import (
     partials,
 )
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
-from thermocald.photogrammetry.epoch.gauss_markov import chi2_2d, point_covariances
+from thermocald.photogrammetry.epoch.gauss_markov import point_covariances
 from thermocald.photogrammetry.epoch.geometry import image_coverage, obliqueness_deg
+from thermocald.photogrammetry.epoch.snooping import chi2_2d
 from thermocald.photogrammetry.field.planes import plane_fit
 from thermocald.photogrammetry.linalg import diagonal_scale, scaled_inverse
 from thermocald.photogrammetry.parameters import EOP_COLUMNS, free_columns

@@ -108,7 +108,7 @@ def weaknesses(
                 f"the targets cover {coverage:.1%} of the image (at least {bounds.coverage:.0%} "
                 "are needed)"
             )
-    pair = _strongest_correlation(covariance, bounds.correlation)
+    pair = _strongest_correlation(covariance, sd, bounds.correlation)
     if pair:
         reasons.append(pair)
     return reasons
@@ -117,19 +117,19 @@ def weaknesses(
 def _has_depth(points: Array) -> bool:
     """Whether points are certainly no plane: a quick look that spares most epochs the fit."""
     reduced = points - np.full(len(points), 1.0 / len(points)) @ points
-    (a, b, c), (_, d, e), (_, _, f) = (reduced.T @ reduced).tolist()
+    (a, b, c), (_, d, e), (_, _, f) = (points.T @ reduced).tolist()
     determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
     return bool(determinant > 1e-4 * (a + d + f) ** 3)
 
 
-def _strongest_correlation(covariance: Array, bound: float) -> str:
-    variance = covariance.diagonal()
-    scale = 1.0 / np.sqrt(np.where(variance > 0, variance, np.inf))
-    r = np.abs(covariance * scale * scale[:, None])
-    r.flat[:: len(r) + 1] = 0.0
+def _strongest_correlation(covariance: Array, sd: Array, bound: float) -> str:
     # Only pairs that an IOP takes part in: EOP alone do not spoil the camera.
-    inner = r[: len(IOP_NAMES)]
-    i, j = divmod(int(inner.argmax()), len(r))
+    n = len(IOP_NAMES)
+    scale = 1.0 / np.where(sd > 0, sd, np.inf)
+    inner = np.abs(covariance[:n] * scale)
+    inner *= scale[:n, None]
+    inner.flat[:: len(sd) + 1] = 0.0
+    i, j = divmod(int(inner.argmax()), len(sd))
     if inner[i, j] <= bound:
         return ""
     return (

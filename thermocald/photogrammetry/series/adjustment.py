@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.epoch.gauss_markov import TRUSTED_REDUNDANCY
+from thermocald.photogrammetry.epoch.snooping import TRUSTED_REDUNDANCY
 from thermocald.photogrammetry.parameters import EOP
 from thermocald.photogrammetry.series.covariances import (
     all_cofactors,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import project
-from thermocald.photogrammetry.epoch.gauss_markov import Rejections
+from thermocald.photogrammetry.epoch.snooping import Rejections
 from thermocald.photogrammetry.parameters import EOP, IOP, PARAMETER_NAMES
 from thermocald.photogrammetry.series.design import Design, State
 from thermocald.photogrammetry.series.mount import STILL, Movement

@@ -1,6 +1,6 @@
 """Data snooping in a series: every point against its own epoch, and which of them stay.
 
-As `gauss_markov.point_tests` and `gauss_markov.snoop` do for one epoch, for all epochs at once.
+As `epoch.snooping.point_tests` and `snoop` do for one epoch, for all epochs at once.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.epoch.gauss_markov import TRUSTED_REDUNDANCY, chi2_2d
+from thermocald.photogrammetry.epoch.snooping import TRUSTED_REDUNDANCY, chi2_2d
 from thermocald.photogrammetry.series.normals import chunks, products
 from thermocald.photogrammetry.series.system import alike
 
@@ -80,7 +80,7 @@ def typical_variance(tests: Array, used: Mask) -> float:
 def snoop_series(
     tests: Array, offered: Mask, used: Mask, unknowns: int, alpha: float, typical: float
 ) -> Mask:
-    """Which image points (E, T) stay, epoch by epoch, as `gauss_markov.snoop` does.
+    """Which image points (E, T) stay, epoch by epoch, as `epoch.snooping.snoop` does.
 
     typical: variance of unit weight of the series, for epochs too poor to tell their own.
     """

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.epoch.gauss_markov import (
+from thermocald.photogrammetry.epoch.geometry import weaknesses
+from thermocald.photogrammetry.epoch.snooping import (
     TRUSTED_REDUNDANCY,
     fails_global_test,
     most_rejected,
 )
-from thermocald.photogrammetry.epoch.geometry import weaknesses
 from thermocald.photogrammetry.parameters import PRINCIPAL_POINT
 
 if TYPE_CHECKING:

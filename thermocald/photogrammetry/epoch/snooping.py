@@ -1,0 +1,145 @@
+"""Data snooping of one epoch: what each image point contradicts, and which of them stay.
+
+Baarda's tests on the two coordinates of a point together, with the noise that the residuals show.
+"""
+
+from __future__ import annotations
+
+from math import log
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    from thermocald.photogrammetry.epoch.gauss_markov import Solution
+
+    Array = NDArray[np.float64]
+    Mask = NDArray[np.bool_]
+
+__all__ = [
+    "TRUSTED_REDUNDANCY",
+    "Rejections",
+    "chi2_2d",
+    "fails_global_test",
+    "most_rejected",
+    "point_tests",
+    "snoop",
+]
+
+TRUSTED_REDUNDANCY = 20
+"""From here on the residuals themselves give the noise."""
+
+_MOST_OF_FEW = 0.15  # one of 7 to 13 targets, two of 14 and more
+_CHI2_MEDIAN = 2 * log(2)  # with two degrees of freedom
+_GLOBAL_TEST_NORMAL = 3.09  # quantile of the normal distribution: error probability 0.1 %
+
+
+def chi2_2d(alpha: float) -> float:
+    """Quantile 1 - alpha of chi-square with two degrees of freedom, which has a closed form."""
+    return -2.0 * log(alpha) if alpha > 0 else float("inf")
+
+
+def fails_global_test(unit: ArrayLike, redundancy: ArrayLike) -> NDArray[np.bool_]:
+    """Whether residuals are too large for their sigmas, where they are too few to tell the noise.
+
+    unit: variance of unit weight; redundancy: its degrees of freedom. Chi-square at 0.1 %, by
+    Wilson and Hilferty's approximation (1931).
+    """
+    r = np.maximum(np.asarray(redundancy, dtype=float), 1.0)
+    ninth = 2.0 / (9.0 * r)
+    bound = (1.0 - ninth + _GLOBAL_TEST_NORMAL * np.sqrt(ninth)) ** 3
+    return np.asarray((np.asarray(redundancy) < TRUSTED_REDUNDANCY) & (np.asarray(unit) > bound))
+
+
+def most_rejected(fraction: float, redundancy: int) -> float:
+    """Fraction of the targets that may be rejected.
+
+    Where residuals are few a second gross error is hardly told from the good ones that it bends.
+    """
+    return min(fraction, _MOST_OF_FEW) if redundancy < TRUSTED_REDUNDANCY else fraction
+
+
+def point_tests(solution: Solution, use: Mask) -> tuple[Array, Array]:
+    """Chi-square with 2 degrees of freedom per point (n,), and redundancy numbers (n, 2).
+
+    A point that takes part has the residual covariance I - h'h, one that does not I + h'h.
+    """
+    u, n = len(solution.root), len(use)
+    h = solution.root.T @ solution.whitened[:-1].reshape(u, -1)
+    claimed = np.add.reduce(h * h).reshape(2, n)
+    q, qxy = 1 - claimed, np.add.reduce(h[:, :n] * h[:, n:])
+    redundancy_numbers = np.maximum(q.T, 0.0)
+    if np.count_nonzero(use) == n:
+        np.negative(qxy, out=qxy)
+    else:
+        sign = np.where(use, -1.0, 1.0)
+        q = 1 + sign * claimed
+        qxy *= sign
+    v = solution.whitened[-1]
+    determinant = q[0] * q[1]
+    determinant -= qxy * qxy
+    # A point that alone carries a parameter has no residual: it cannot be tested.
+    determinant[determinant <= 1e-9] = np.inf
+    squares = v * v
+    squares *= q[::-1]
+    qxy *= v[0]
+    qxy *= v[1]
+    test = squares[0] + squares[1]
+    test -= qxy
+    test -= qxy
+    test /= determinant
+    return test, redundancy_numbers
+
+
+class Rejections:
+    """What data snooping has done so far: a point rejected for the second time stays out.
+
+    A borderline point would otherwise come and go for ever.
+    """
+
+    def __init__(self, used: Mask) -> None:
+        self._back = np.zeros(used.shape, dtype=bool)
+        self._barred = np.zeros(used.shape, dtype=bool)
+
+    def settle(self, use: Mask, keep: Mask, part: slice | NDArray[np.int64] = slice(None)) -> Mask:
+        """Which of those that a round would keep do stay, `use` itself where nothing changes.
+
+        part: the rows that the round looked at.
+        """
+        if keep is use or not np.count_nonzero(keep != use):
+            return use
+        keep = keep & ~self._barred[part]
+        self._barred[part] |= self._back[part] & use & ~keep
+        self._back[part] |= keep & ~use
+        return keep if np.count_nonzero(keep != use) else use
+
+
+def snoop(test: Array, use: Mask, unknowns: int, alpha: float) -> Mask:
+    """Which observations stay: the worst are rejected, those that fit again come back.
+
+    test (n,) of `point_tests`; alpha: error probability of one test.
+    """
+    if alpha <= 0:
+        return use
+    n = int(np.count_nonzero(use))
+    used = test if n == len(use) else test[use]
+    # The median is a scale that the gross errors do not reach.
+    ordered = used.copy()
+    ordered.partition(n // 2)
+    variance = float(ordered[n // 2]) / _CHI2_MEDIAN
+    few = 2 * n - unknowns < TRUSTED_REDUNDANCY
+    if few:
+        variance = 1.0  # one gross error reaches every residual: the stated sigmas are the scale
+    limit = chi2_2d(alpha) * max(variance, 1e-12)
+    fits = test <= limit
+    if not np.count_nonzero(fits != use):
+        return use
+    keep: Mask = use | fits
+    suspicious = use & ~fits
+    if suspicious.any():
+        # One gross error lifts its neighbours: only those near the worst go at once.
+        near = 1.0 if few else 0.5
+        keep[suspicious & (test >= near * used.max())] = False
+    return keep

@@ -174,7 +174,9 @@ class Picamera2Camera(Camera):
         try:
             camera = library.Picamera2(self.number)
         except RuntimeError as error:
-            raise DeviceDenied(f"{self.where}: another program has it ({error})") from error
+            raise DeviceDenied(
+                f"{self.where}: cannot be opened ({error}); does another program have it?"
+            ) from error
         try:
             self._configure(camera)
         except BaseException:

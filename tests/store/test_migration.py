@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermocald.errors import StoreError
+from thermocald.errors import StoreError, StoreVersionError
 from thermocald.store.database import columns, connection, migrations
 from thermocald.store.database.store import Store
 
@@ -102,6 +102,17 @@ def test_before_it_is_changed_an_older_store_is_copied(version_1, mode):
     rows = dump(copy)
     version_1.write_bytes(before)
     assert rows == dump(version_1)
+
+
+def test_after_a_downgrade_the_copy_that_serves_is_named(version_1, monkeypatch):
+    with Store.open(version_1, "append"):
+        pass
+    monkeypatch.setattr(connection, "VERSION", 1)
+    with pytest.raises(StoreVersionError, match=r"go on with .*small\.db\.version-1, the copy"):
+        Store.open(version_1)
+    version_1.with_name("small.db.version-1").unlink()
+    with pytest.raises(StoreVersionError, match=r"update thermocald$"):
+        Store.open(version_1)
 
 
 def dump(path):

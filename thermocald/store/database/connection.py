@@ -152,9 +152,11 @@ def _version(connection: sqlite3.Connection, path: Path) -> int:
     if application != APPLICATION_ID and (tables or application or version):
         raise StoreError(f"{path}: is an SQLite file, but no thermocald store")
     if version > VERSION:
+        copy = _copy_of_version(path, VERSION)
+        older = f", or go on with {copy}, the copy made before" if copy.exists() else ""
         raise StoreVersionError(
             f"{path}: is a store of version {version}, this program knows up to {VERSION}; "
-            "update thermocald"
+            f"update thermocald{older}"
         )
     return int(version)
 
@@ -190,9 +192,13 @@ def _migrate(connection: sqlite3.Connection) -> None:
         build_all_chunks(connection)
 
 
+def _copy_of_version(path: Path, version: int) -> Path:
+    return path.with_name(f"{path.name}.version-{version}")
+
+
 def _backup_version(connection: sqlite3.Connection, path: Path, version: int) -> None:
     """Copy an older file before it is changed: `<name>.version-<version>`, made once."""
-    copy = path.with_name(f"{path.name}.version-{version}")
+    copy = _copy_of_version(path, version)
     if copy.exists():
         return
     try:

@@ -38,3 +38,4 @@ class Case:
     with_m2: bool = True
     influence: str = ""  # of `outside`, where the effect is OUTSIDE
     record_humidity: bool = False
+    field_motion: str = ""  # what happens to the test field in M1: knock, creep, wander

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from tests.blind.case import CAMERAS, PROGRAMMES, Case
+from tests.blind.field_motion import moved_field
 from tests.blind.hidden import fresh, hide, left_over, make_camera, true_parameters
 from tests.blind.outside import trajectories
 from tests.blind.world import climate, corner_field, image, smooth_unknown
@@ -138,6 +139,8 @@ def generate(case: Case) -> tuple[list[Series], dict]:
         frames = frame_axis[s]
         p, X, noise = true_parameters(camera, per_series[s], climates[s], unknowns[s], frames,
                                       nominal + field_error, views[s], offsets[s])  # fmt: skip
+        if case.field_motion and s == 0:
+            X = moved_field(np.random.default_rng([case.seed, 79]), case.field_motion, X, frames)
         uv = image(X, p, camera.sensor)
         built.append(
             _measure(rng, case, camera_name, f"M{s + 1}", frames, uv, noise, climates[s], nominal)

@@ -133,6 +133,7 @@ def _write_effects(path: Path, found: Discovery) -> None:
 
 def _lines(found: Discovery) -> list[str]:
     """The result for people."""
+    from thermocald.discovery.verdict.field import field_lines
     from thermocald.discovery.verdict.mount import mount_lines
     from thermocald.output.figures.numbers import with_sd
 
@@ -164,7 +165,7 @@ def _lines(found: Discovery) -> list[str]:
             for a in effect.alternatives
             if not a.get("resembles")
         ]
-    lines += mount_lines(found.examination)
+    lines += [*mount_lines(found.examination), *field_lines(found.examination)]
     names = [Path(e.source.name).name or e.source.name for e in found.examination.fitter.series]
     gaps = zip((first.fit, *first.others), (last.fit, *last.others), strict=True)
     for name, (before, after) in zip(names, gaps, strict=True):

@@ -45,11 +45,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from thermocald.photogrammetry.series.normals import Partials
+    from thermocald.photogrammetry.series.normals import ObservationGrid, Partials
 
     Array = NDArray[np.float64]
 
-__all__ = ["reduce_series", "reduce_together", "reweighted", "without_targets"]
+__all__ = ["reduce_series", "reduce_together", "reweighted", "with_points", "without_targets"]
 
 _ANY_GEOMETRY = GeometryBounds(0, 2.0, 1e9, 1e9, 0.0, 0.0)
 
@@ -306,15 +306,19 @@ def reweighted(evidence: ReducedSeries, noise: Array) -> ReducedSeries:
 
 def without_targets(evidence: ReducedSeries, rows: NDArray[np.int64]) -> ReducedSeries:
     """The same series as if some targets of the field had never been observed."""
-    source = evidence.source
-    mask = np.zeros(source.grid.observed.shape, dtype=bool)
+    mask = np.zeros(evidence.source.grid.observed.shape, dtype=bool)
     mask[:, rows] = True
-    reduced = _reduce(
-        replace(source, grid=source.grid.reject(mask)),
+    reduced = with_points(evidence, evidence.source.grid.reject(mask))
+    return replace(reduced, source=evidence.source, excluded=np.union1d(evidence.excluded, rows))
+
+
+def with_points(evidence: ReducedSeries, grid: ObservationGrid) -> ReducedSeries:
+    """The same series with other image points, at the same linearisation."""
+    return _reduce(
+        replace(evidence.source, grid=grid),
         evidence.times,
         evidence.history,
         evidence.thermometers,
         evidence.at,
         evidence.scale,
     )
-    return replace(reduced, source=source, excluded=np.union1d(evidence.excluded, rows))

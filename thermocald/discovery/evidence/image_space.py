@@ -29,7 +29,7 @@ __all__ = ["Displaced", "displaced_targets"]
 
 _GAIN = 60.0  # χ² of a step, for 147 targets × 180 times a chance of 1e-8
 _STEP_PX = 0.02
-_SHARE = 0.6  # of a target's slow movement that the step has to explain
+_SHARE = 0.9  # of a target's slow movement that the step has to explain: else it wanders
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from thermocald.discovery.evidence.image_space import Displaced, displaced_targets
+from thermocald.discovery.evidence.moved_field import moved_boards, wandering_apart
 from thermocald.discovery.search.cross_validation import confirmed, gains
 from thermocald.discovery.search.mounted import convincing, search_beside_mount, without_slips
 from thermocald.discovery.search.search import Search, Solution
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from thermocald.photogrammetry.series.field_motion import FieldMovement
     from thermocald.reduction.adequacy import Adequacy
     from thermocald.reduction.hypothesis import Term
     from thermocald.reduction.movement import Mount
@@ -59,7 +61,7 @@ class Examination:
     ranking: singles by score; rivals: solutions that cannot be excluded; adequacy: of best, per
     series; cross_validation: gains (blocks,) of its effects on blocks of time left out; surrogates:
     each of its effects against surrogates; mount: its movement, where it moves; knocks: of the
-    mount, terms of the base.
+    mount, terms of the base; field_movements: boards and targets that moved, per series.
     """
 
     fitter: HypothesisFitter
@@ -77,6 +79,7 @@ class Examination:
     mount: Mount | None = None
     knocks: tuple[Term, ...] = ()
     original: tuple[ReducedSeries, ...] = ()
+    field_movements: tuple[tuple[FieldMovement, ...], ...] = ()
 
 
 def examine_series(
@@ -90,9 +93,12 @@ def examine_series(
     """
     say = progress or (lambda _: None)
     say("targets that moved")
-    displaced, cleaned = [], []
+    displaced, cleaned, field = [], [], []
     for e in series:
-        groups, without = displaced_targets(e)
+        boards, still = moved_boards(e)
+        groups, without = displaced_targets(still)
+        wandering, without = wandering_apart(without)
+        field.append((*boards, *wandering))
         displaced.append(tuple(groups))
         cleaned.append(without)
     say("measuring noise")
@@ -106,7 +112,10 @@ def examine_series(
         found = _beside_mount(calibrated, say, given)
     if found is None:
         found = _still(ready, say, given)
-    return replace(found, displaced=tuple(displaced), noise_growth=growth, original=tuple(series))
+    return replace(
+        found, displaced=tuple(displaced), noise_growth=growth, original=tuple(series),
+        field_movements=tuple(field),
+    )  # fmt: skip
 
 
 def _still(

@@ -11,6 +11,7 @@ from thermocald.discovery.search.candidates import richer_set
 from thermocald.discovery.search.cross_validation import cross_validation
 from thermocald.discovery.search.examination import Examination, examine_series
 from thermocald.discovery.verdict.estimates import acts_on, term_estimates
+from thermocald.discovery.verdict.field import field_of
 from thermocald.discovery.verdict.found import EffectFound
 from thermocald.discovery.verdict.gap import Gap, fit_first
 from thermocald.discovery.verdict.image_effects import image_effects
@@ -56,8 +57,8 @@ class Discovery:
         return 1.0 - (after.chi2_reduced - after.floor) / (before.chi2_reduced - before.floor)
 
     def as_json(self, model: str | None) -> dict[str, Any]:
-        """CONVENTIONS §4; alongside a mount that moves, what it did stands under `mount`."""
-        mount = mount_of(self.examination)
+        """CONVENTIONS §4; what the mount and the test field did stands under `mount`, `field`."""
+        mount, field = mount_of(self.examination), field_of(self.examination)
         first, last = self.stages[0], self.stages[-1]
         others = [
             {"recording": e.source.name, "before": b.as_json(), "after": a.as_json()}
@@ -81,6 +82,7 @@ class Discovery:
             },
             "model": model,
             **({"mount": mount} if mount is not None else {}),
+            **({"field": field} if field is not None else {}),
         }
 
     @property

@@ -275,6 +275,7 @@ def test_an_older_database_is_brought_up_to_date_with_its_rows_and_roles(cluster
         assert count(cluster, "event") == 1
         with psycopg.connect(cluster.address(user="reader:r", name="thermocald")) as connection:
             assert connection.execute("SELECT waiting FROM station").fetchone() == (0,)
+            assert connection.execute("SELECT sum(epochs) FROM summary").fetchone() == (20,)
     finally:
         with psycopg.connect(cluster.address(name="thermocald"), autocommit=True) as connection:
             connection.execute("DROP OWNED BY reader")

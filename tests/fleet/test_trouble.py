@@ -20,6 +20,7 @@ from thermocald.errors import ServerError, ServerGone, StoreError, StoreVersionE
 from thermocald.fleet.forward import Forwarder
 from thermocald.store.database.store import Store
 from thermocald.store.server.address import ServerAddress
+from thermocald.store.server.connection import REVISION
 from thermocald.store.server.fleet_reader import FleetReader
 from thermocald.store.server.reader import ServerStore
 from thermocald.store.server.schema import create_tables, grant
@@ -68,7 +69,7 @@ def test_a_newer_server_is_told_from_an_older_one(filled, server):
         with pytest.raises(StoreVersionError, match="update thermocald here"):
             use()
     with psycopg.connect(server.address(name="thermocald")) as connection:
-        connection.execute("UPDATE alembic_version SET version_num = '0002'")
+        connection.execute("UPDATE alembic_version SET version_num = %s", (REVISION,))
     assert Forwarder(store.path, address(server), "b").send_waiting().rows == 20
 
 

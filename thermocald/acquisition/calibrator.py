@@ -100,9 +100,7 @@ class Calibrator:
         self._usual = float("nan")
 
     @classmethod
-    def of_recording(
-        cls, recording: _Recorded, settings: AdjustmentSettings | None = None
-    ) -> Self:
+    def of_recording(cls, recording: _Recorded, settings: AdjustmentSettings | None = None) -> Self:
         """The calibrator of a recording's camera before its test field."""
         camera = recording.camera
         return cls(

@@ -287,9 +287,7 @@ def _print(document: dict[str, Any]) -> None:
                 "of px; give --pixel-pitch or --camera"
             )
     else:
-        typer.echo(
-            f"not calibrated: {document['status']}: {document['reason']}"
-        )
+        typer.echo(f"not calibrated: {document['status']}: {document['reason']}")
     for p in document["photographs"]:
         line = f"{p['image']}: {p['status']}, {p['n_targets']} targets"
         if p["exterior"] is not None:

@@ -269,13 +269,9 @@ def _tell(document: dict[str, Any]) -> None:
             f"sigma0 {document['sigma0']:.2f}: the noise found is that many times the stated one"
         )
     if document["exterior_choice"]:
-        typer.echo(
-            f"--exterior {document['exterior']}: {document['exterior_choice']}"
-        )
+        typer.echo(f"--exterior {document['exterior']}: {document['exterior_choice']}")
     for name in document["left_out"]:
-        typer.echo(
-            f"left out: target {name} and what belongs to it moves by itself"
-        )
+        typer.echo(f"left out: target {name} and what belongs to it moves by itself")
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
     titles = ("", "mean mm", "scatter", "sd", "ratio", "line µm", "last - first", "drift")
     for title in titles:

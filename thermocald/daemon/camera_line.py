@@ -145,7 +145,6 @@ class SeriesRun:
                 self._previewed = now
                 station.live.write_frame(name, acquired.frame)
 
-
     def _drift(self, row: dict[str, Any]) -> dict[str, float]:
         """Against the start of the series, where the size of the pixels is known."""
         if self.plan.sensor is None:

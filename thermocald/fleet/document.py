@@ -57,6 +57,7 @@ def fleet_document(sources: Sequence[Path]) -> dict[str, Any]:
         "summary": {
             "cameras": len(cameras),
             "stations": len({c.record.station for c in cameras}),
+            "epochs": sum(c.record.epochs for c in cameras),
             "sound": sum(not c.findings for c in cameras),
             **{kind: counts[kind] for kind in _KINDS},
         },
@@ -70,6 +71,8 @@ def _camera(camera: CameraOverview) -> dict[str, Any]:
         "camera": record.camera,
         "type": camera.type,
         "series": record.series,
+        "epochs": record.epochs,
+        "results": record.results,
         "last_epoch": record.last_time,
         "lag_s": camera.lag_s,
         "on_the_way_s": camera.on_the_way_s,

@@ -1,8 +1,8 @@
 """What a fleet looks like: of each camera how far behind it is, how it moves with temperature.
 
-The rates of c, x0 and y0 come from epochs that are spread over all that a camera has measured, so
-that the overview of a year costs what that of a day does. They hold no effect but a straight line:
-they compare specimens, a model to correct with is made by `thermocald fit`.
+The rates of c, x0 and y0 come from epochs that are spread over all that a camera has measured. They
+hold no effect but a straight line: they compare specimens, a model to correct with is made by
+`thermocald fit`.
 """
 
 from __future__ import annotations
@@ -159,10 +159,6 @@ def _camera(record: CameraRecord, state: StationState | None, now: float) -> Cam
     read = [e.temperatures.get(reference, math.nan) for e in recent]
     known = [t for t in read if math.isfinite(t)]
     on_the_way = [e.received - e.frame_time for e in recent if math.isfinite(e.received)]
-    good = [e.frame_time for e in recent if e.status == "ok"]
-    good += [s.frame_time for s in record.samples]
-    temperatures = np.array([s.temperature for s in record.samples])
-    finite = temperatures[np.isfinite(temperatures)]
     rates, shift_px, shift_sds = _rates(record)
     return CameraOverview(
         record,
@@ -171,9 +167,9 @@ def _camera(record: CameraRecord, state: StationState | None, now: float) -> Cam
         now - record.last_time,
         float(np.median(on_the_way)) if on_the_way else math.nan,
         sum(e.status == "ok" for e in recent) / len(recent) if recent else math.nan,
-        max(good, default=math.nan),
+        record.last_ok,
         known[0] if known else math.nan,
-        (float(finite.min()), float(finite.max())) if finite.size else (math.nan, math.nan),
+        record.range,
         rates,
         shift_px,
         shift_sds,

@@ -87,9 +87,7 @@ class Population:
         covariance: Array = self.between + self.mean_covariance
         return covariance
 
-    def posterior(
-        self, values: Array, information: Array, gradient: Array | None = None
-    ) -> Shrunk:
+    def posterior(self, values: Array, information: Array, gradient: Array | None = None) -> Shrunk:
         """A new specimen from its own estimate and what little it knows.
 
         values (k,): its estimate, any number where it knows nothing; information (k, k): the

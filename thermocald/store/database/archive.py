@@ -15,7 +15,6 @@ from thermocald.store.recording.paths import FileFolder
 from thermocald.store.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
-
     from numpy.typing import NDArray
 
     from thermocald.epoch import Epoch

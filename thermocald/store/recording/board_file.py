@@ -102,9 +102,7 @@ def _key(name: object) -> str:
     return re.sub(r"[^a-z0-9]", "", str(name).lower().removesuffix("_mm"))
 
 
-def _of_calib_io(
-    path: Path, named: re.Match[str], sigma: float | None
-) -> tuple[TestField, str]:
+def _of_calib_io(path: Path, named: re.Match[str], sigma: float | None) -> tuple[TestField, str]:
     """The board that a file's name states."""
     kind, rows, columns = named[1].lower(), int(named[2]), int(named[3])
     square = float(named[4])

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["REVISION", "Connected", "connect", "in_words", "require_revision"]
 
-REVISION = "0002"
+REVISION = "0003"
 """The schema that this program writes and reads; `thermocald server init` brings a server to it."""
 
 _CONNECT_S = 10

@@ -56,7 +56,7 @@ def grant(address: ServerAddress, role: str, *, writes: bool) -> None:
         statements.append(f"GRANT INSERT ON {', '.join(_TABLES)} TO {name}")
         statements += [f"GRANT EXECUTE ON FUNCTION {one} TO {name}" for one in _FUNCTIONS]
     else:
-        statements.append(f"GRANT SELECT ON {', '.join(_TABLES)}, station TO {name}")
+        statements.append(f"GRANT SELECT ON {', '.join(_TABLES)}, station, summary TO {name}")
     engine = connect(address)
     try:
         with in_words(address, f"role {role!r} was not granted"), engine.begin() as connection:

@@ -8,6 +8,7 @@ and writes is the same for both.
 from __future__ import annotations
 
 import logging
+import re
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -27,8 +28,12 @@ ALTER TABLE epoch_whole RENAME TO epoch;
 SELECT create_hypertable('epoch', 'frame_time', time_partitioning_func => 'thermocald_time',
   chunk_time_interval => INTERVAL '1 month');
 CREATE OR REPLACE FUNCTION thermocald_month(at double precision) RETURNS void LANGUAGE sql
-  AS $$ SELECT $$
+  AS $$ SELECT $$;
+CREATE TRIGGER epoch_arrived AFTER INSERT ON epoch REFERENCING NEW TABLE AS arrived
+  FOR EACH STATEMENT EXECUTE FUNCTION thermocald_arrived()
 """
+_OLDEST = (2, 18)
+"""Before, hypertables refused triggers that see all rows of a statement, at the first insert."""
 
 
 def use_timescale(engine: Engine) -> bool:
@@ -59,10 +64,14 @@ def use_timescale(engine: Engine) -> bool:
 
 def _wanted(connection: Connection) -> bool:
     """Whether the extension is in this database, and the epochs are none and partitioned by us."""
-    return bool(
-        connection.exec_driver_sql(
-            "SELECT EXISTS (SELECT FROM pg_extension WHERE extname = 'timescaledb') "
-            "AND EXISTS (SELECT FROM pg_partitioned_table WHERE partrelid = 'epoch'::regclass) "
-            "AND NOT EXISTS (SELECT FROM epoch)"
-        ).scalar()
-    )
+    version = connection.exec_driver_sql(
+        "SELECT extversion FROM pg_extension WHERE extname = 'timescaledb' "
+        "AND EXISTS (SELECT FROM pg_partitioned_table WHERE partrelid = 'epoch'::regclass) "
+        "AND NOT EXISTS (SELECT FROM epoch)"
+    ).scalar()
+    if version is None:
+        return False
+    found = tuple(int(part) for part in re.findall(r"\d+", version)[:2])
+    if found < _OLDEST:
+        log.warning("TimescaleDB %s is not used: 2.18 or later is needed", version)
+    return found >= _OLDEST

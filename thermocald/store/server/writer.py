@@ -20,8 +20,6 @@ from thermocald.store.server.connection import Connected, in_words
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from sqlalchemy import TableClause
-
     from thermocald.store.database.changes import KeptFrame
     from thermocald.store.database.row import StoredSeries
     from thermocald.store.server.address import ServerAddress
@@ -29,6 +27,7 @@ if TYPE_CHECKING:
 __all__ = ["ServerWriter", "series_key"]
 
 _DAY_S = 86400.0
+_SANE = (946_684_800.0, 4_102_444_800.0)  # s UTC: 2000 to 2100
 _NAMESPACE = UUID("c1b7b0de-6c1e-5f0e-9d0d-7468656d6f63")
 # Columns of a store's row that the server does not keep: they have a meaning in that file alone.
 _LOCAL = {"epoch": {"id", "series_id"}, "event": {"series_id"}, "reading": set[str]()}
@@ -57,22 +56,22 @@ class ServerWriter(Connected):
             self._engine.dispose()
             raise
 
-    def _described(self) -> dict[str, TableClause]:
-        """The tables with their columns there: one query, as every round of a station needs it."""
-        from sqlalchemy import column, table, text
+    def _described(self) -> dict[str, dict[str, str]]:
+        """{table: {column: type}} there: one query, as every round of a station needs it."""
+        from sqlalchemy import text
 
         columns_of = text(
-            "SELECT table_name, column_name FROM information_schema.columns "
+            "SELECT table_name, column_name, udt_name FROM information_schema.columns "
             "WHERE table_schema = 'public' ORDER BY ordinal_position"
         )
         with (
             in_words(self.address, "its tables cannot be read"),
             self._engine.connect() as connection,
         ):
-            found: dict[str, list[str]] = {}
-            for name, one in connection.execute(columns_of):
-                found.setdefault(name, []).append(one)
-        return {name: table(name, *map(column, columns)) for name, columns in found.items()}
+            found: dict[str, dict[str, str]] = {}
+            for table, column, kind in connection.execute(columns_of):
+                found.setdefault(table, {})[column] = kind
+        return found
 
     def write(
         self, table: str, rows: Sequence[Mapping[str, Any]], series: Mapping[int, StoredSeries]
@@ -88,14 +87,16 @@ class ServerWriter(Connected):
         needed = {row["series_id"] for row in rows if row.get("series_id") is not None}
         days: set[int] = set()
         if table == "epoch":
-            days = {int(row["frame_time"] // _DAY_S) for row in rows} - self._days
+            times = (row["frame_time"] for row in rows)
+            # there is no month for what a clock says that was not set
+            days = {int(t // _DAY_S) for t in times if _SANE[0] <= t <= _SANE[1]} - self._days
         with in_words(self.address, f"{len(rows)} {table}s were not sent"):
             with self._engine.begin() as connection:
                 for id_ in sorted(needed):
                     if keys[id_] not in self._sent:
                         self._insert_series(connection, keys[id_], series[id_])
                 self._make_months(connection, days)
-                connection.execute(_insert(self._tables[table]), ready)
+                self._insert(connection, table, ready)
             # only what was committed counts as done
             self._sent.update(keys[id_] for id_ in needed)
             self._days |= days
@@ -112,7 +113,7 @@ class ServerWriter(Connected):
         }
         doing = in_words(self.address, f"the frame of epoch {frame.number} was not sent")
         with doing, self._engine.begin() as connection:
-            connection.execute(_insert(self._tables["frame"]), [row])
+            self._insert(connection, "frame", [row])
 
     def report(self, waiting: int, refused: int, clock: float) -> None:
         """Say how this station is: rows that wait, rows refused, its own clock (s, UTC)."""
@@ -133,7 +134,7 @@ class ServerWriter(Connected):
             )
 
     def _row(self, table: str, row: Mapping[str, Any], keys: Mapping[int, UUID]) -> dict[str, Any]:
-        columns = self._tables[table].columns
+        columns = self._tables[table]
         ready: dict[str, Any] = {}
         if table == "epoch" or "series" in columns:
             ready["series"] = keys.get(row["series_id"]) if row["series_id"] is not None else None
@@ -156,7 +157,7 @@ class ServerWriter(Connected):
     def _insert_series(self, connection: Any, key: UUID, series: StoredSeries) -> None:
         csv = testfield_csv(series.testfield)
         digest = hashlib.sha256(csv.encode()).hexdigest()
-        connection.execute(_insert(self._tables["testfield"]), [{"digest": digest, "csv": csv}])
+        self._insert(connection, "testfield", [{"digest": digest, "csv": csv}])
         row = {
             "key": key,
             "station": self.station,
@@ -169,7 +170,7 @@ class ServerWriter(Connected):
             "identity": json.dumps(dict(series.identity), default=str),
             "settings": json.dumps(dict(series.settings), default=str),
         }
-        connection.execute(_insert(self._tables["series"]), [row])
+        self._insert(connection, "series", [row])
 
     def _make_months(self, connection: Any, days: set[int]) -> None:
         """Partitions for the months of these days since 1970; a month has at most 31 of them."""
@@ -178,9 +179,22 @@ class ServerWriter(Connected):
         for day in sorted(days):
             connection.execute(text("SELECT thermocald_month(:at)"), {"at": day * _DAY_S})
 
+    def _insert(self, connection: Any, table: str, rows: Sequence[Mapping[str, Any]]) -> None:
+        """One statement for all rows, of which those that are there already are passed over."""
+        kinds = self._tables[table]
+        names = list(rows[0])
+        columns = ", ".join(f'"{name}"' for name in names)
+        arrays = ", ".join(f"%b::{kinds[name]}[]" for name in names)
+        values = tuple([_as(kinds[name], row[name]) for row in rows] for name in names)
+        connection.exec_driver_sql(
+            f'INSERT INTO "{table}" ({columns}) SELECT * FROM unnest({arrays}) '
+            # no conflict target: naming one would ask for the right to read
+            "ON CONFLICT DO NOTHING",
+            values,
+        )
 
-def _insert(table: TableClause) -> Any:
-    # no conflict target: naming one would ask for the right to read
-    from sqlalchemy.dialects.postgresql import insert
 
-    return insert(table).on_conflict_do_nothing()
+def _as(kind: str, value: Any) -> Any:
+    """A value as the column's type: an array must hold one type alone."""
+    of = {"float8": float, "int4": int, "int8": int}.get(kind)
+    return value if value is None or of is None else of(value)

@@ -1,0 +1,144 @@
+"""The summary that the server keeps says exactly what a scan of all epochs says."""
+
+from __future__ import annotations
+
+import json
+import math
+import threading
+from pathlib import Path
+
+import numpy as np
+import psycopg
+import pytest
+
+from benchmarks.generated_fleet import GeneratedCamera, add_camera
+from tests.fleet.test_forward import (  # noqa: F401
+    address,
+    field,
+    filled,
+    head,
+    make_epoch,
+    make_result,
+    store_path,
+)
+from thermocald.store.server.fleet_reader import SPREAD, FleetReader
+from thermocald.store.server.migrations.versions import v0003
+from thermocald.store.server.writer import ServerWriter
+
+SLOT_S = 21600.0
+VALUES = ("c", "sd_c", "x0", "sd_x0", "y0", "sd_y0")
+
+
+def summary(server):
+    with psycopg.connect(server.address(name="thermocald")) as connection:
+        return {row[:2]: row[2:] for row in connection.execute("SELECT * FROM summary")}
+
+
+def scanned(server):
+    """The same from every row of the table of epochs."""
+    with psycopg.connect(server.address(name="thermocald")) as connection:
+        rows = connection.execute(
+            "SELECT series, number, revision, frame_time, status, temperatures, "
+            "c, sd_c, x0, sd_x0, y0, sd_y0 FROM epoch"
+        ).fetchall()
+    latest = {}
+    for series, number, revision, *_ in rows:
+        latest[series, number] = max(revision, latest.get((series, number), 0))
+    slots = {}
+    for series, number, revision, frame_time, *rest in rows:
+        # the first calibrations are all kept where a restored store used a number again
+        if revision == latest[series, number]:
+            slot = int(min(max(frame_time, 0), 4102444800) // SLOT_S)
+            slots.setdefault((series, slot), []).append((frame_time, number, *rest))
+    found = {}
+    for key, epochs in slots.items():
+        times = [t for t, *_ in epochs]
+        good = [(t, n, json.loads(read)["temperature"], *values)
+                for t, n, status, read, *values in epochs if status == "ok"]  # fmt: skip
+        read = [g for g in good if g[2] is not None]
+        found[key] = (
+            len(epochs), len(good), min(times), max(times), max((g[0] for g in good), default=None),
+            min((g[2] for g in read), default=None), max((g[2] for g in read), default=None),
+            [*min(read)] if read else None,
+        )  # fmt: skip
+    return found
+
+
+def generated_rows(store, series, rng, count):
+    """Rows as a store gives them: late ones, revised ones, clocks that are wrong, no readings."""
+    usual = store.rows_after("epoch", 0, 1)[0]
+    usual.pop("damage")
+    rows = []
+    for number in range(1, count + 1):
+        at = 1.7e9 + float(rng.uniform(0, 4 * SLOT_S))
+        at = float(rng.choice([at, at, at, at, at, at, at, at, -5.0, 1e13, 4102444800.0]))
+        for revision in range(int(rng.choice([1, 1, 1, 1, 2, 3]))):
+            read = rng.choice([None, float(np.round(rng.normal(20, 5), 2))])
+            values = {name: float(v) for name, v in zip(VALUES, rng.normal(size=6), strict=True)}
+            rows.append(usual | values | {
+                "number": number, "revision": revision, "frame_time": at,
+                "status": str(rng.choice(["ok", "ok", "no_targets"])),
+                "temperatures": json.dumps({"temperature": read, "board": 3.0}),
+            })  # fmt: skip
+    return rows
+
+
+def test_late_repeated_and_revised_rows_count_exactly_once(server, filled):  # noqa: F811
+    store, series = filled
+    rng = np.random.default_rng(21)
+    rows = generated_rows(store, series, rng, 150)
+    known = {series.id: series}
+    errors = []
+
+    def send(seed):
+        mine = np.random.default_rng(seed)
+        try:
+            with ServerWriter(address(server), "bank") as writer:
+                order = mine.permutation(len(rows))
+                for batch in np.array_split(order, 12):
+                    # in the order of the store, as a forwarder sends them
+                    writer.write("epoch", [rows[i] for i in np.sort(batch)], known)
+        except Exception as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=send, args=(seed,)) for seed in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert errors == []
+    expected = scanned(server)
+    assert sum(found[0] for found in expected.values()) == 150
+    assert len(expected) >= 6
+    assert summary(server) == expected
+    # what an older server is given when it is brought up to date, and what is made again
+    again = "SELECT thermocald_summarise(series, array_agg(DISTINCT thermocald_slot(frame_time))) "
+    for made in (v0003._FILL, f"{again} FROM epoch GROUP BY series"):
+        with psycopg.connect(server.address(name="thermocald")) as connection:
+            connection.execute("DELETE FROM summary")
+            connection.execute(made)
+        assert summary(server) == expected
+
+
+@pytest.mark.parametrize("days", [20, 100])
+def test_an_overview_reads_the_summary_of_a_long_series(server, days):
+    """Of 100 days it reads no epoch but the last ones, and samples at every time of day."""
+    camera = GeneratedCamera("a", epochs=days * 24, interval=3600.0)
+    with psycopg.connect(server.address(name="thermocald")) as connection:
+        add_camera(connection, camera)
+        # what it would find there: the summary stays
+        connection.execute("DELETE FROM epoch WHERE frame_time < %s", (camera.end - 86400 * 5,))
+    assert summary(server) != scanned(server)
+    with FleetReader(address(server)) as reader:
+        (record,) = reader.cameras(camera.end, Path())
+    assert (record.epochs, record.results) == (days * 24, days * 24)
+    assert record.last_time == record.last_ok == camera.end
+    assert len(record.recent) == 60
+    times = np.array([s.frame_time for s in record.samples])
+    if days == 100:
+        assert SPREAD / 1.5 <= len(times) <= 2 * SPREAD
+        assert times[0] < camera.end - 98 * 86400
+        assert (np.bincount((times // SLOT_S % 4).astype(int)) > len(times) / 5).all()
+    else:
+        assert times[0] >= camera.end - 86400 * 5
+    assert all(math.isfinite(s.temperature) for s in record.samples)

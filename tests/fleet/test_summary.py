@@ -8,19 +8,13 @@ import threading
 from pathlib import Path
 
 import numpy as np
-import psycopg
 import pytest
 
+pytest.importorskip("psycopg", reason="pip install thermocald[server]")
+import psycopg
+
 from benchmarks.generated_fleet import GeneratedCamera, add_camera
-from tests.fleet.test_forward import (  # noqa: F401
-    address,
-    field,
-    filled,
-    head,
-    make_epoch,
-    make_result,
-    store_path,
-)
+from tests.fleet.conftest import address
 from thermocald.store.server.fleet_reader import SPREAD, FleetReader
 from thermocald.store.server.migrations.versions import v0003
 from thermocald.store.server.writer import ServerWriter
@@ -83,7 +77,7 @@ def generated_rows(store, series, rng, count):
     return rows
 
 
-def test_late_repeated_and_revised_rows_count_exactly_once(server, filled):  # noqa: F811
+def test_late_repeated_and_revised_rows_count_exactly_once(server, filled):
     store, series = filled
     rng = np.random.default_rng(21)
     rows = generated_rows(store, series, rng, 150)

@@ -64,14 +64,23 @@ def use_timescale(engine: Engine) -> bool:
 
 def _wanted(connection: Connection) -> bool:
     """Whether the extension is in this database, and the epochs are none and partitioned by us."""
-    version = connection.exec_driver_sql(
-        "SELECT extversion FROM pg_extension WHERE extname = 'timescaledb' "
-        "AND EXISTS (SELECT FROM pg_partitioned_table WHERE partrelid = 'epoch'::regclass) "
-        "AND NOT EXISTS (SELECT FROM epoch)"
-    ).scalar()
-    if version is None:
+    version = _version(connection)
+    if (
+        version is None
+        or not connection.exec_driver_sql(
+            "SELECT EXISTS (SELECT FROM pg_partitioned_table WHERE partrelid = 'epoch'::regclass) "
+            "AND NOT EXISTS (SELECT FROM epoch)"
+        ).scalar()
+    ):
         return False
     found = tuple(int(part) for part in re.findall(r"\d+", version)[:2])
     if found < _OLDEST:
         log.warning("TimescaleDB %s is not used: 2.18 or later is needed", version)
     return found >= _OLDEST
+
+
+def _version(connection: Connection) -> str | None:
+    found = connection.exec_driver_sql(
+        "SELECT extversion FROM pg_extension WHERE extname = 'timescaledb'"
+    ).scalar()
+    return None if found is None else str(found)

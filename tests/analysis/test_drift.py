@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -81,6 +82,35 @@ def test_a_target_that_wanders_is_no_drift_of_the_camera():
 def test_without_a_drift_none_is_claimed():
     claims = [any(c.drifts for c in courses(series(s, warms=False))) for s in range(20, 26)]
     assert sum(claims) <= 1
+
+
+def test_more_epochs_than_a_line_needs_are_averaged():
+    """Ended with a traceback: the standard deviations were those of all epochs."""
+    n = 250_000
+    rng = np.random.default_rng(5)
+    sd = np.full((n, 16), 1e-4)
+    values = rng.normal(0, 1e-4, (n, 16))
+    values[:, 1] += 3e-4 * np.sin(np.linspace(0, 20, n))
+    none = np.zeros(n, dtype=np.int64)
+    table = SeriesTable(
+        np.arange(n), 10.0 * np.arange(n), np.full(n, np.nan), values, sd, np.ones(n), none, none,
+        ("ok",) * n, ("",) * n, "series",
+    )  # fmt: skip
+    assert [c.drifts for c in courses(table)] == [False, True, False]
+
+
+def test_a_group_is_left_out_once_for_all_parameters(monkeypatch):
+    """Each of them asked for the same adjustments again."""
+    table, asked = series(0), []
+    assert table.without is not None
+
+    def without(rows, quick):
+        asked.append(tuple(rows))
+        return table.without(rows, quick)
+
+    found = courses(replace(table, without=without))
+    assert sum(c.drifts for c in found) > 1
+    assert len(asked) == len(set(asked)) > 0
 
 
 def test_what_is_stored_is_what_is_exported(tmp_path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,12 +17,14 @@ from thermocald.cli.options import (
     adjustment_settings,
 )
 from thermocald.errors import DataError, UsageError
+from thermocald.photogrammetry.series.words import Words
 from thermocald.store.sources import require_source
 
 if TYPE_CHECKING:
     from thermocald.analysis.series.drift import Course
     from thermocald.analysis.series.table import SeriesTable
     from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
+    from thermocald.store.recording.reader import Recording
 
 __all__ = ["register"]
 
@@ -67,7 +68,7 @@ def replay(
         with progress(len(opened.columns), "calibrating") as advance:
             table = replay_into(store, opened, settings, exterior, advance)
     else:
-        table = _recording_table(recording, settings, exterior)
+        table = _recording_table(opened, settings, exterior)
     table, found = settled(table)
     document = _summary(recording, store, table, found)
     if json is not None:
@@ -125,6 +126,7 @@ def export(
     from thermocald.analysis.series.drift import settled
     from thermocald.analysis.series.table import csv_text
     from thermocald.output import series_export
+    from thermocald.store.recording.reader import open_recording
 
     folder = source.is_dir()
     exterior = exterior or ("auto" if folder else "stored")
@@ -139,7 +141,7 @@ def export(
         raise UsageError("--units, --time, --separator and --decimal are for csv and parquet")
     settings = adjustment_settings(free)
     if require_source(source).is_dir():
-        table = _recording_table(source, settings, exterior)
+        table = _recording_table(open_recording(source), settings, exterior)
     else:
         from thermocald.analysis.series.stored import stored_table
 
@@ -158,9 +160,9 @@ def export(
             write_parts(series_export.as_json(series_export.as_rows(parts)), output)
         else:
             write_parts(series_export.as_csv(parts, style), output)
-    counted = Counter(r for r in table.reasons if r)
-    for sentence, count in sorted(counted.items()):
-        say(f"{count} epochs without a result: {sentence}")
+    for sentence, count in sorted(Words.of(table.reasons).counts().items()):
+        if sentence:
+            say(f"{count} epochs without a result: {sentence}")
 
 
 def _check_exterior(exterior: str) -> None:
@@ -170,12 +172,12 @@ def _check_exterior(exterior: str) -> None:
         raise UsageError(f"--exterior {exterior}: must be one of {', '.join(EXTERIOR_CHOICES)}")
 
 
-def _recording_table(path: Path, settings: AdjustmentSettings, exterior: str) -> SeriesTable:
+def _recording_table(
+    recording: Recording, settings: AdjustmentSettings, exterior: str
+) -> SeriesTable:
     """Calibrate a recording without a store."""
     from thermocald.analysis.series.recorded import recorded_table
-    from thermocald.store.recording.reader import open_recording
 
-    recording = open_recording(path)
     with progress(len(recording), "calibrating") as advance:
         return recorded_table(recording, settings, exterior, advance)[0]
 
@@ -217,9 +219,8 @@ def _summary(
             for c in found
         ],
         "without_result": [
-            {"epoch": int(n), "status": word, "reason": why}
-            for n, word, why in zip(table.number, table.status, table.reasons, strict=True)
-            if word != "ok"
+            {"epoch": int(table.number[i]), "status": table.status[i], "reason": table.reasons[i]}
+            for i in np.flatnonzero(~ok).tolist()
         ],
     }
     if table.adjustment is not None and table.exterior == "series":
@@ -242,8 +243,9 @@ def _stood_still(stillness: np.ndarray[Any, Any]) -> dict[str, Any]:
 
 
 def _commonest(table: SeriesTable) -> str:
-    reasons = [r for r in table.reasons if r]
-    return max(set(reasons), key=reasons.count) if reasons else "there is no epoch"
+    counts = Words.of(table.reasons).counts()
+    counts.pop("", None)
+    return max(counts, key=lambda reason: counts[reason], default="there is no epoch")
 
 
 def _drift(parameter: dict[str, Any]) -> str:

@@ -25,7 +25,7 @@ from thermocald.store.recording.reader import open_recording
 from thermocald.store.sources import open_source
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from thermocald.store.database.epoch_table import StoredEpoch
 
     Array = NDArray[np.float64]
-    Columns = dict[str, NDArray[np.int64] | Array | tuple[str, ...]]
+    Columns = dict[str, NDArray[np.integer] | Array | Sequence[str]]
     Row = dict[str, float | int | str | None]
 
 __all__ = [
@@ -191,8 +191,8 @@ def columns_of(
             columns[f"{prefix}{name}{suffix}"] = values[:, k] * factor
         if not prefix:
             columns["sigma0"] = table.sigma0
-            columns["n_observations"] = table.n_observations
-            columns["n_rejected"] = table.n_rejected
+            columns["n_observations"] = table.n_observations.astype(np.int64)
+            columns["n_rejected"] = table.n_rejected.astype(np.int64)
             columns["status"] = table.status
     for name, readings in others.thermometers.items():
         columns[f"temperature {name}"] = readings
@@ -234,7 +234,9 @@ def as_rows(parts: Iterable[Columns]) -> Iterator[Row]:
     for columns in parts:
         lists = [
             [None if isinstance(v, float) and not np.isfinite(v) else v for v in column]
-            for column in (c if isinstance(c, tuple) else c.tolist() for c in columns.values())
+            for column in (
+                c.tolist() if isinstance(c, np.ndarray) else c for c in columns.values()
+            )
         ]
         for row in zip(*lists, strict=True):
             yield dict(zip(columns, row, strict=True))
@@ -257,9 +259,9 @@ def as_json(rows: Iterable[Row]) -> Iterator[str]:
 
 
 def _cells(
-    name: str, values: NDArray[np.int64] | Array | tuple[str, ...], style: ExportStyle
+    name: str, values: NDArray[np.integer] | Array | Sequence[str], style: ExportStyle
 ) -> list[str]:
-    if isinstance(values, tuple):
+    if not isinstance(values, np.ndarray):
         return list(values)
     if np.issubdtype(values.dtype, np.integer):
         return [str(v) for v in values.tolist()]
@@ -281,7 +283,7 @@ def write_parquet(parts: Iterable[Columns], path: Path) -> None:
     with new_file(path) as partial:
         writer = None
         for columns in parts:
-            table = pa.table({name: pa.array(list(v) if isinstance(v, tuple) else v)
+            table = pa.table({name: pa.array(v if isinstance(v, np.ndarray) else list(v))
                               for name, v in columns.items()})  # fmt: skip
             writer = writer or parquet.ParquetWriter(partial, table.schema)
             writer.write_table(table)

@@ -25,6 +25,7 @@ from thermocald.photogrammetry.series.blocks import (
 from thermocald.photogrammetry.series.long_series import adjust_long_series, together_at_most
 from thermocald.photogrammetry.series.mount import drift_period
 from thermocald.photogrammetry.series.spool import released
+from thermocald.photogrammetry.series.words import Words
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -64,10 +65,10 @@ def table_of_series(
     """
     ok = apart.ok
     if start is None and not ok.any():
-        reasons = sorted({r for r in apart.reasons if r}, key=apart.reasons.count)
-        raise DataError(
-            f"{head.name}: no epoch has a result; most often: {reasons[-1] if reasons else '-'}"
-        )
+        counts = Words.of(apart.reasons).counts()
+        counts.pop("", None)
+        why = max(counts, key=lambda reason: counts[reason], default="-")
+        raise DataError(f"{head.name}: no epoch has a result; most often: {why}")
     if start is None:
         start = _middle(apart.values, ok)
     settings = replace(settings, drift_period=drift_period(apart.frame_time, apart.temperature))
@@ -178,20 +179,19 @@ def _grid(grid: ObservationGrid) -> GridBlocks:
 
 
 def _said(
-    status: tuple[str, ...], reasons: tuple[str, ...], apart: SeriesTable
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    status: Sequence[str], reasons: Sequence[str], apart: SeriesTable
+) -> tuple[Words, Words]:
     """Words and sentences of the epochs; what the epoch itself said of a frame without a result
     says more than "no observations".
     """
-    if "no_observations" not in status:
-        return status, reasons
-    pairs = [
-        (mine, why) if word == "no_observations" and mine != "ok" else (word, reason)
-        for word, reason, mine, why in zip(
-            status, reasons, apart.status, apart.reasons, strict=True
-        )
-    ]
-    return tuple(word for word, _ in pairs), tuple(reason for _, reason in pairs)
+    words, sentences = Words.of(status), Words.of(reasons)
+    rows = np.flatnonzero(words.are("no_observations") & ~apart.ok)
+    if not len(rows):
+        return words, sentences
+    new_words, new_sentences = list(words), list(sentences)
+    for row in rows.tolist():
+        new_words[row], new_sentences[row] = apart.status[row], apart.reasons[row]
+    return Words.of(new_words), Words.of(new_sentences)
 
 
 def _groups(testfield: TestField, result: SeriesAdjustment) -> dict[str, NDArray[np.int64]]:

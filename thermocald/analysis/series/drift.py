@@ -9,6 +9,7 @@ where it does not rest on a single marker or target: a board that gives way is n
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,6 +22,8 @@ from thermocald.photogrammetry.series.spool import released
 from thermocald.photogrammetry.series.target_noise import slow_errors
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from thermocald.analysis.series.table import SeriesTable
@@ -120,8 +123,15 @@ def courses(table: SeriesTable, names: tuple[str, ...] = ("c", "x0", "y0")) -> l
     lines = _lines(table, names)
     warm = _with_temperature(table.temperature[ok], [line.values for line in lines.values()])
     result = []
+
+    @cache
+    def without(group: str) -> dict[str, _Line]:
+        assert table.without is not None  # _single_support asks only then
+        left = table.without(table.groups[group], True)
+        return _lines(left, tuple(lines)) if left.ok.sum() >= _FEWEST else {}
+
     for line, (slope, p_warm) in zip(lines.values(), warm, strict=True):
-        rests_on = _single_support(table, line, tuple(lines)) if line.p < _LEVEL else ""
+        rests_on = _single_support(table, line, without) if line.p < _LEVEL else ""
         y, sd = line.values, line.sds
         result.append(
             Course(
@@ -169,20 +179,20 @@ def settled(table: SeriesTable) -> tuple[SeriesTable, list[Course]]:
     return left, courses(left)
 
 
-def _single_support(table: SeriesTable, line: _Line, names: tuple[str, ...]) -> str:
+def _single_support(
+    table: SeriesTable, line: _Line, lines_without: Callable[[str], dict[str, _Line]]
+) -> str:
     """The group of targets that alone makes a parameter drift, or "".
 
-    Without it the change must shrink by more than half and no longer be significant, corrected as
-    with it: a group whose absence only makes the change less certain is not accused.
+    lines_without: all lines of the series without a group. Without the group that is named the
+    change must shrink by more than half and no longer be significant, corrected as with it: a group
+    whose absence only makes the change less certain is not accused.
     """
     if table.without is None or len(table.groups) < 3:
         return ""
     best, least = "", _SHRUNK * abs(line.change)
     for first in _suspects(table):
-        left = table.without(table.groups[first], True)
-        if left.ok.sum() < _FEWEST:
-            continue
-        without = _lines(left, names).get(line.name)
+        without = lines_without(first).get(line.name)
         if without is None or without.p < _LEVEL:
             continue
         if abs(without.change) < least:
@@ -209,7 +219,7 @@ def _line(t: Array, y: Array, sds: Array, tilt_sd: float) -> tuple[float, float,
     from scipy.stats import t as student
 
     span = float(np.ptp(t))
-    t, y = _thinned(t, y)
+    t, y, sds = _thinned(t, y, sds)  # means err less than that, by one factor: p stays
     x = t - t.mean()
     slope = float(x @ y / (x @ x))
     noise = slope_noise(y, x, slope)

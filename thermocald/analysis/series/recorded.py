@@ -12,6 +12,7 @@ from thermocald.analysis.series.adjusted import settings_for_series, table_of_se
 from thermocald.analysis.series.table import SeriesTable, calibrate_epochs, frame_temperatures
 from thermocald.errors import DataError
 from thermocald.photogrammetry.series.long_series import together_at_most
+from thermocald.photogrammetry.series.words import Words
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -94,7 +95,8 @@ def _not_calibrated(recording: Recording) -> SeriesTable:
     temperature = np.full(E, np.nan) if channel is None else columns.at_frame(channel)
     return SeriesTable(
         columns.numbers, columns.frame_time, temperature, nothing, nothing, nothing[:, 0],
-        none, none, ("ok",) * E, ("",) * E, "per_epoch",
+        none, none, Words.repeated("ok", E), Words.repeated("", E),
+        "per_epoch",
     )  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from thermocald.analysis.series.table import SeriesTable
 from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.series.spool import ColumnSpool
+from thermocald.photogrammetry.series.words import Words
 from thermocald.store.database.row import EpochResult
 from thermocald.store.database.store import Store
 from thermocald.store.sources import open_source
@@ -122,8 +123,8 @@ def table_of_stored(
         np.where(ok, columns["sigma0"], np.nan),
         columns["n_observations"].astype(np.int64),
         columns["n_rejected"].astype(np.int64),
-        tuple(columns["status"].tolist()),
-        tuple(reasons),
+        Words.of(columns["status"].tolist()),
+        Words.of(reasons),
         "per_epoch",
     )
     if not ok.any() or exterior == "stored":

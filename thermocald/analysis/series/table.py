@@ -13,10 +13,11 @@ import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.series.spool import released
+from thermocald.photogrammetry.series.words import Words
 from thermocald.store.recording.reader import interpolate_readings
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -68,10 +69,10 @@ class SeriesTable:
     values: Array
     sd: Array
     sigma0: Array
-    n_observations: NDArray[np.int64]
-    n_rejected: NDArray[np.int64]
-    status: tuple[str, ...]
-    reasons: tuple[str, ...]
+    n_observations: NDArray[np.integer]
+    n_rejected: NDArray[np.integer]
+    status: Sequence[str]
+    reasons: Sequence[str]
     exterior: str
     level_sd: Array = field(default_factory=lambda: np.full(16, np.nan))
     adjustment: SeriesAdjustment | None = None
@@ -101,7 +102,7 @@ class SeriesTable:
     @property
     def ok(self) -> NDArray[np.bool_]:
         """(E,): epochs with a result."""
-        return np.array([s == "ok" for s in self.status], dtype=bool)
+        return Words.of(self.status).are("ok")
 
 
 def calibrate_epochs(

@@ -20,6 +20,7 @@ from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
 from thermocald.photogrammetry.series.spool import released
+from thermocald.photogrammetry.series.words import Words
 from thermocald.reduction.thermometer import reading_noise
 from thermocald.store.recording.reader import open_recording
 from thermocald.store.recording.readings import interpolate_readings
@@ -141,7 +142,7 @@ def _from_columns(
         values: Array = store.series_columns(series, [name])[name]
         return values
 
-    ok, lost = _assessed(store.series_columns(series, ["status"])["status"])
+    ok, lost = _assessed(store.series_columns(series, ["status"])["status"].tolist())
     source = f"{store.path}: {series.camera}/{series.name}"
     if not ok.any():
         raise DataError(f"{source}: no epoch has a result ({_in_words(lost)})")
@@ -194,7 +195,7 @@ def _from_table(
     """A series that was adjusted together; thermometers at the times of all its epochs."""
     adjustment = table.adjustment
     assert adjustment is not None  # table_of_series always has one
-    ok, lost = _assessed(np.array(table.status))
+    ok, lost = _assessed(table.status)
     ok = _whole(ok, table.values[:, :10], table.sd[:, :10], lost)
     released(table.values)
     released(table.sd)
@@ -270,11 +271,11 @@ def _stored_thermometers(
     ]
 
 
-def _assessed(status: NDArray[np.str_]) -> tuple[NDArray[np.bool_], dict[str, int]]:
+def _assessed(status: Sequence[str]) -> tuple[NDArray[np.bool_], dict[str, int]]:
     """Which epochs have a result, and how many have none for which reason."""
-    ok = status == "ok"
-    words, counts = np.unique(status[~ok], return_counts=True)
-    return ok, {str(word).replace("_", " "): int(n) for word, n in zip(words, counts, strict=True)}
+    words = Words.of(status)
+    lost = sorted((word, n) for word, n in words.counts().items() if word != "ok")
+    return words.are("ok"), {word.replace("_", " "): n for word, n in lost}
 
 
 def _whole(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.series.spool import ColumnSpool
+from thermocald.photogrammetry.series.words import Words
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -52,7 +53,7 @@ class RowWriter:
         self._spools = ColumnSpool(epochs, 16), ColumnSpool(epochs, 16)
         self.values, self.sd = (spool.array for spool in self._spools)
         self.sigma0, self.redundancy, self.stillness = np.full((3, epochs), np.nan)
-        self.observed, self.rejected = np.zeros((2, epochs), dtype=np.int64)
+        self.observed, self.rejected = np.zeros((2, epochs), dtype=np.int32)
         self._ok = np.zeros(epochs, dtype=bool)
         self._word, self._reason = np.zeros((2, epochs), dtype=np.uint16)
         self._words: dict[str, int] = {"": 0}
@@ -80,18 +81,14 @@ class RowWriter:
         return [self._words.get(sentence, 0) for sentence in sentences]
 
     @property
-    def status(self) -> tuple[str, ...]:
+    def status(self) -> Words:
         """One word per epoch."""
-        return self._said(self._word)
+        return Words(self._word, tuple(self._words))
 
     @property
-    def reasons(self) -> tuple[str, ...]:
+    def reasons(self) -> Words:
         """One sentence per epoch, "" where it has a result."""
-        return self._said(self._reason)
-
-    def _said(self, numbers: NDArray[np.uint16]) -> tuple[str, ...]:
-        words = list(self._words)
-        return tuple(words[n] for n in numbers)
+        return Words(self._reason, tuple(self._words))
 
     @property
     def ok(self) -> Mask:

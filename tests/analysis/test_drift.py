@@ -134,7 +134,7 @@ def test_what_is_stored_is_what_is_exported(tmp_path):
             epoch = Epoch(k, 10.0 * k, 10.0 * k, {"temperature": 20.0}, observations=measured)
             store.append(series, epoch, EpochResult.from_adjustment(calibrator.adjust(measured)))
         columns = store.series_columns(series, ["c", "sd_c"])
-    table = stored_table(path, None, AdjustmentSettings(), "stored")
+    table, _ = stored_table(path, None, AdjustmentSettings(), "stored")
     np.testing.assert_array_equal(table.values[:, 0], columns["c"])
     np.testing.assert_array_equal(table.sd[:, 0], columns["sd_c"])
     assert (table.sd[:, 0] > 1e-4).all()

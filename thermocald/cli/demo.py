@@ -89,12 +89,13 @@ def _acquire(out: Path, epochs: int, seed: int) -> _Run:
     """The pipeline on a virtual clock, kept in a store and a recording."""
     from thermocald.acquisition.calibrator import Calibrator
     from thermocald.acquisition.pipeline import Pipeline
-    from thermocald.analysis.series.stored import stored_table
+    from thermocald.analysis.series.stored import table_of_stored
     from thermocald.hal import VirtualClock, open_device
     from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
     from thermocald.store.database.row import EpochResult
     from thermocald.store.database.store import Store
     from thermocald.store.recording.reader import CameraSpec, Channel, Head, RecordingWriter
+    from thermocald.store.sources import open_source
 
     clock = VirtualClock()
     camera = open_device("camera", "mock", {"seed": seed}, clock)
@@ -133,7 +134,8 @@ def _acquire(out: Path, epochs: int, seed: int) -> _Run:
                 at = camera.truth(frame.monotonic)
                 truth.append(np.concatenate([at.iop[0], at.eop[0]]))
                 advance(1)
-    table = stored_table(out / "demo.db", None, settings, "series")
+    with open_source(out / "demo.db") as source:
+        table = table_of_stored(source, source.find_series(), settings, "series")
     return _Run(table, np.array(truth), sensor.pixel_pitch, len(field))
 
 

@@ -66,10 +66,9 @@ def replay(
         from thermocald.analysis.series.stored import replay_into
 
         with progress(len(opened.columns), "calibrating") as advance:
-            table = replay_into(store, opened, settings, exterior, advance)
+            table, found = replay_into(store, opened, settings, exterior, advance)
     else:
-        table = _recording_table(opened, settings, exterior)
-    table, found = settled(table)
+        table, found = settled(_recording_table(opened, settings, exterior))
     document = _summary(recording, store, table, found)
     if json is not None:
         write_json(document, json)
@@ -141,12 +140,11 @@ def export(
         raise UsageError("--units, --time, --separator and --decimal are for csv and parquet")
     settings = adjustment_settings(free)
     if require_source(source).is_dir():
-        table = _recording_table(open_recording(source), settings, exterior)
+        table, _ = settled(_recording_table(open_recording(source), settings, exterior))
     else:
         from thermocald.analysis.series.stored import stored_table
 
-        table = stored_table(source, series, settings, exterior)
-    table, _ = settled(table)
+        table, _ = stored_table(source, series, settings, exterior)
     if format_ == "csv" and style.is_plain and not extra:
         write_parts(csv_text(table), output)
     elif format_ == "json" and not extra:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.store.database.blob import ObservationRows
     from thermocald.store.database.epoch_table import StoredEpoch
     from thermocald.store.database.row import StoredSeries
     from thermocald.store.database.series_reader import StampedReader
@@ -61,6 +62,10 @@ class CorrectedSource(SeriesReader):
     def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
         """As the store's."""
         return self._stamped.covariances(series, numbers)
+
+    def observation_rows(self, series: StoredSeries, first: int, last: int) -> ObservationRows:
+        """As the store's."""
+        return self._stamped.observation_rows(series, first, last)
 
     def series_columns(self, series: StoredSeries, names: Sequence[str]) -> dict[str, Array]:
         """As the store's, with corrected times."""

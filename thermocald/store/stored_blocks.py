@@ -15,13 +15,12 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from thermocald.photogrammetry.field.testfield import Observations
     from thermocald.store.database.row import StoredSeries
     from thermocald.store.database.series_reader import SeriesReader
 
 __all__ = ["StoredBlocks"]
 
-_GRID_POINTS = 300_000  # cells of a block
+_GRID_POINTS, _GRID_EPOCHS = 300_000, 4_000  # of a block: 12 MB
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,14 +38,18 @@ class StoredBlocks:
         self, windows: Sequence[slice] | None = None
     ) -> Iterator[tuple[int, ObservationGrid]]:
         """Grids of consecutive epochs, each with its first epoch (from 0); only of windows."""
-        field = self.series.testfield
-        size = max(_GRID_POINTS // len(field), 1)
+        size = min(max(_GRID_POINTS // len(self.series.testfield), 1), _GRID_EPOCHS)
         for rows in runs(len(self), size, windows):
-            numbers = self.numbers[rows]
-            part: list[Observations | None] = [None] * len(numbers)
-            found = self.store.epochs(self.series, int(numbers[0]), int(numbers[-1]))
-            for stored in found:
-                row = int(np.searchsorted(numbers, stored.epoch.number))
-                if row < len(numbers) and numbers[row] == stored.epoch.number:
-                    part[row] = stored.epoch.observations
-            yield rows.start, ObservationGrid.from_observations(field, part)
+            yield rows.start, self._grid(self.numbers[rows])
+
+    def _grid(self, numbers: NDArray[np.int64]) -> ObservationGrid:
+        """The grid of some consecutive epochs."""
+        found = self.store.observation_rows(self.series, int(numbers[0]), int(numbers[-1]))
+        rows = np.searchsorted(numbers, found.numbers)
+        # an epoch that came while the series was read is not among them
+        known = numbers[np.minimum(rows, len(numbers) - 1)] == found.numbers
+        covariances = None if found.covariances is None else found.covariances[known]
+        return ObservationGrid.from_rows(
+            (len(numbers), len(self.series.testfield)), rows[known], found.targets[known],
+            found.points[known], found.sigmas[known], covariances,
+        )  # fmt: skip

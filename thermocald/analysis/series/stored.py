@@ -9,6 +9,7 @@ import numpy as np
 
 from thermocald.acquisition.calibrator import Calibrator
 from thermocald.analysis.series.adjusted import settings_for_series, table_of_series
+from thermocald.analysis.series.drift import settled
 from thermocald.analysis.series.table import SeriesTable
 from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.analysis.series.drift import Course
     from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
     from thermocald.store.database.row import StoredSeries
     from thermocald.store.database.series_reader import SeriesReader
@@ -41,8 +43,10 @@ def replay_into(
     settings: AdjustmentSettings,
     exterior: str,
     advance: Callable[[int], None],
-) -> SeriesTable:
+) -> tuple[SeriesTable, list[Course]]:
     """Calibrate a recording's epochs into a store, from where an earlier replay stopped.
+
+    Returns what `settled` makes of the series.
 
     Raises StoreError; DataError where the store's series of this name is of something else.
     """
@@ -61,20 +65,22 @@ def replay_into(
                     extra=done.extra,
                 )
             advance(1)
-        return table_of_stored(store, series, settings, exterior)
+        # while the store is open: targets are left out of a long series by reading it again
+        return settled(table_of_stored(store, series, settings, exterior))
 
 
 def stored_table(
     path: Path, name: str | None, settings: AdjustmentSettings, exterior: str
-) -> SeriesTable:
-    """The table of one series of a store; name: `CAMERA/SERIES`, `SERIES`, None: the only one.
+) -> tuple[SeriesTable, list[Course]]:
+    """What `settled` makes of one series of a store.
 
-    exterior: `stored` for the epochs as they were stored, else how the series is adjusted again.
+    name: `CAMERA/SERIES`, `SERIES`, None: the only one; exterior: `stored` for the epochs as they
+    were stored, else how the series is adjusted again.
     """
     with open_source(path) as store:
         camera, _, series_name = (name or "").rpartition("/")
         series = store.find_series(camera or None, series_name or None)
-        return table_of_stored(store, series, settings, exterior)
+        return settled(table_of_stored(store, series, settings, exterior))
 
 
 def _series(store: Store, recording: Recording, settings: AdjustmentSettings) -> StoredSeries:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import dataclass
+from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from thermocald.store.database.blob import (
     pack_observations,
     unpack_covariance,
     unpack_observations,
+    unpack_rows,
 )
 from thermocald.store.database.checksum import require_checksum, row_checksum
 from thermocald.store.database.epoch_columns import insert_row, rows_of
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.photogrammetry.field.testfield import Observations
+    from thermocald.store.database.blob import ObservationRows
 
     Array = NDArray[np.float64]
 
@@ -40,6 +43,7 @@ __all__ = [
     "select_covariance",
     "select_details",
     "select_epochs",
+    "select_observations",
     "stored_epoch",
 ]
 
@@ -136,6 +140,32 @@ def select_epochs(
             if row["measured"] is not None:
                 measured = row
         yield _epoch(connection, latest, measured, details)
+
+
+def select_observations(
+    connection: sqlite3.Connection, series: int, first: int, last: int
+) -> ObservationRows:
+    """The observations of the epochs numbered `first` to `last`, without their quality.
+
+    Raises StoreError where they are not as they were written; their epochs' other columns are left
+    unread.
+    """
+    parts = connection.execute(
+        "SELECT epoch.id, epoch.number, measured, detail_checksum, detail.id - epoch.id * ?1, data "
+        "FROM epoch LEFT JOIN detail ON detail.id >= epoch.id * ?1 "
+        "AND detail.id < (epoch.id + 1) * ?1 WHERE series_id = ?2 AND epoch.number >= ?3 "
+        "AND epoch.number <= ?4 ORDER BY epoch.number, revision, detail.id",
+        (_PARTS, series, first, last),
+    )
+    packed: dict[int, bytes] = {}
+    for (_, number, measured, checksum), rows in groupby(parts, key=lambda row: row[:4]):
+        if measured is None and number in packed:
+            continue  # a later calibration of the same observations does not keep them again
+        found = [(part, bytes(data)) for *_, part, data in rows if data is not None]
+        what = f"epoch {number}: its covariance or its observations"
+        require_checksum(checksum, what, (), data=b"".join(data for _, data in found))
+        packed[number] = b"".join(data for part, data in found if part)
+    return unpack_rows({number: data for number, data in packed.items() if data})
 
 
 def select_covariance(connection: sqlite3.Connection, series: int, number: int) -> Array | None:

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from thermocald.store.database.blob import ObservationRows
     from thermocald.store.database.epoch_table import StoredEpoch
     from thermocald.store.database.row import Event, StoredSeries
 
@@ -46,6 +47,10 @@ class SeriesReader(ABC):
     @abstractmethod
     def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
         """(E, 16, 16) covariances of some epochs, NaN for those without a result."""
+
+    @abstractmethod
+    def observation_rows(self, series: StoredSeries, first: int, last: int) -> ObservationRows:
+        """The observations of the epochs numbered `first` to `last`, without their quality."""
 
     @abstractmethod
     def _epochs(

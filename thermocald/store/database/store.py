@@ -28,6 +28,7 @@ from thermocald.store.database.epoch_table import (
     insert_epoch,
     select_covariance,
     select_epochs,
+    select_observations,
 )
 from thermocald.store.database.examination import Examination, examine
 from thermocald.store.database.row import (
@@ -58,6 +59,7 @@ if TYPE_CHECKING:
 
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.field.testfield import Observations, TestField
+    from thermocald.store.database.blob import ObservationRows
     from thermocald.store.recording.head import Head
 
     Array = NDArray[np.float64]
@@ -280,6 +282,11 @@ class Store(StampedReader):
             if len(page) < _EPOCHS_AT_ONCE:
                 return
             first = page[-1].epoch.number + 1
+
+    def observation_rows(self, series: StoredSeries, first: int, last: int) -> ObservationRows:
+        """The observations of the epochs numbered `first` to `last`, without their quality."""
+        with self._lock, in_words(self.path, "observations cannot be read", reading=True):
+            return select_observations(self._db, series.id, first, last)
 
     def observations(
         self, series: StoredSeries, numbers: Iterable[int]

@@ -14,7 +14,11 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
-from thermocald.store.database.blob import unpack_covariance, unpack_observations
+from thermocald.store.database.blob import (
+    unpack_covariance,
+    unpack_observations,
+    unpack_rows,
+)
 from thermocald.store.database.epoch_columns import COLUMN_NAMES, sql_name
 from thermocald.store.database.epoch_table import StoredEpoch, stored_epoch
 from thermocald.store.database.row import Event, LoggedReading, StoredSeries
@@ -29,6 +33,8 @@ if TYPE_CHECKING:
     from uuid import UUID
 
     from numpy.typing import NDArray
+
+    from thermocald.store.database.blob import ObservationRows
 
     Array = NDArray[np.float64]
 
@@ -144,6 +150,15 @@ class ServerStore(Connected, StampedReader):
             latest = stored
         if latest is not None:
             yield latest
+
+    def observation_rows(self, series: StoredSeries, first: int, last: int) -> ObservationRows:
+        """The observations of the epochs numbered `first` to `last`, without their quality."""
+        statement = (
+            "SELECT number, observations FROM epoch WHERE series = %s AND number >= %s "
+            "AND number <= %s AND observations IS NOT NULL ORDER BY number, revision"
+        )
+        rows = self._stream(statement, (self._keys[series.id], first, last))
+        return unpack_rows({number: bytes(data) for number, data in rows if data})
 
     def events(self, series: StoredSeries | None = None, since_utc: float = 0.0) -> list[Event]:
         """What happened, oldest first; of one series, or of all that the address selects."""

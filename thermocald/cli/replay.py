@@ -196,6 +196,7 @@ def _summary(
         "noise_ratio": None if table.adjustment is None else table.adjustment.noise_ratio,
         "rejected": int(table.n_rejected.sum()),
         "left_out": list(table.left_out),
+        "field_movements": [{**m.as_json(), "sentence": m.sentence} for m in table.field_movements],
         "parameters": [
             {
                 "name": c.name,
@@ -270,6 +271,8 @@ def _tell(document: dict[str, Any]) -> None:
         )
     if document["exterior_choice"]:
         typer.echo(f"--exterior {document['exterior']}: {document['exterior_choice']}")
+    for moved in document["field_movements"]:
+        typer.echo(f"{moved['sentence']}; this is taken off")
     for name in document["left_out"]:
         typer.echo(f"left out: target {name} and what belongs to it moves by itself")
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from thermocald.analysis.series.still_field import still_field
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation, InteriorOrientation
 from thermocald.photogrammetry.parameters import EOP, IOP
@@ -16,7 +17,6 @@ from thermocald.photogrammetry.series.adjustment import (
     adjust_series,
 )
 from thermocald.photogrammetry.series.blocks import (
-    GridBlocks,
     ObservedBlocks,
     WithoutTargets,
     gathered,
@@ -92,8 +92,26 @@ def _together(
     head: Head, testfield: TestField, apart: SeriesTable, start: Array,
     source: ObservationBlocks, settings: SeriesSettings,
 ) -> SeriesTable:  # fmt: skip
-    """The table of a series that is adjusted as one."""
+    """The table of a series that is adjusted as one, its field put back where it moved."""
     grid = gathered(source, [slice(0, len(source))])
+    found = _as_one(head, testfield, apart, start, grid, settings)
+    assert found.adjustment is not None
+    moved, still = still_field(
+        head.camera.sensor, testfield, grid, found.adjustment, start, apart.number,
+        apart.frame_time,
+    )
+    if not moved:
+        return found
+    return replace(
+        _as_one(head, testfield, apart, start, still, settings), field_movements=moved
+    )
+
+
+def _as_one(
+    head: Head, testfield: TestField, apart: SeriesTable, start: Array,
+    grid: ObservationGrid, settings: SeriesSettings,
+) -> SeriesTable:  # fmt: skip
+    """The table of one adjustment of all epochs."""
     result = adjust_series(
         head.camera.sensor, testfield, grid, InteriorOrientation.from_array(start[IOP]),
         ExteriorOrientation.from_array(start[EOP]), settings,
@@ -106,7 +124,7 @@ def _together(
             mask = ~result.observed
             rough = replace(rough, snooping_alpha=0.0, target_noise=False)
         mask[:, rows] = True
-        return _together(head, testfield, apart, start, _grid(grid.reject(mask)), rough)
+        return _as_one(head, testfield, apart, start, grid.reject(mask), rough)
 
     return replace(_table(apart, testfield, result, result, result), without=without)
 
@@ -136,7 +154,7 @@ def _in_blocks(
             status=tuple(apart.status[i] for i in found.sampled),
             reasons=tuple(apart.reasons[i] for i in found.sampled),
         )
-        return _together(head, testfield, some, start, _grid(used), rough)
+        return _as_one(head, testfield, some, start, used, rough)
 
     table = _table(apart, testfield, rows, found, sample)
     return replace(table, without=without, sampled=found.sampled)
@@ -172,10 +190,6 @@ def _count(targets: NDArray[Any]) -> NDArray[np.int64]:
     """How many targets (E,), from their numbers or a mask (E, T)."""
     count: NDArray[np.int64] = targets if targets.ndim == 1 else targets.sum(axis=1)
     return count
-
-
-def _grid(grid: ObservationGrid) -> GridBlocks:
-    return GridBlocks(grid, max(len(grid), 1))
 
 
 def _said(

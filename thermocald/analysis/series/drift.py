@@ -175,7 +175,10 @@ def settled(table: SeriesTable) -> tuple[SeriesTable, list[Course]]:
     moving = next((c.rests_on for c in found if c.rests_on), "")
     if not moving or table.without is None:
         return table, found
-    left = replace(table.without(table.groups[moving], False), left_out=(moving,))
+    left = replace(
+        table.without(table.groups[moving], False), left_out=(moving,),
+        field_movements=table.field_movements,
+    )  # fmt: skip
     return left, courses(left)
 
 

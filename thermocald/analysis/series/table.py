@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.field.testfield import Observations
     from thermocald.photogrammetry.series.adjustment import SeriesAdjustment
+    from thermocald.photogrammetry.series.field_motion import FieldMovement
 
     Array = NDArray[np.float64]
 
@@ -60,7 +61,8 @@ class SeriesTable:
     E words and sentences; exterior: `series` or `per_epoch`; level_sd (16,): what all epochs have
     in common, NaN where it cannot be separated; adjustment: the series', None epoch by epoch;
     groups: {name: rows of the test field} of what belongs together; without: the table without some
-    targets (rows), quickly or with all care; left_out: targets found to move by themselves.
+    targets (rows), quickly or with all care; left_out: targets found to move by themselves;
+    field_movements: boards and targets that moved, taken off the observations.
     """
 
     number: NDArray[np.int64]
@@ -83,6 +85,7 @@ class SeriesTable:
     redundancy: Array = field(default_factory=lambda: np.zeros(0))
     stillness: Array = field(default_factory=lambda: np.zeros(0))
     sampled: NDArray[np.int64] | None = None
+    field_movements: tuple[FieldMovement, ...] = ()
 
     def part(self, rows: slice) -> SeriesTable:
         """Some rows, without what belongs to the series as a whole."""

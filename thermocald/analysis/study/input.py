@@ -229,6 +229,7 @@ def _from_table(
         float(time_s[0]),
         adjustment.choice,
         adjustment.noise_ratio,
+        table.field_movements,
     )
 
 

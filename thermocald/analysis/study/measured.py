@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.photogrammetry.camera.camera_model import Sensor
+    from thermocald.photogrammetry.series.field_motion import FieldMovement
 
     Array = NDArray[np.float64]
 
@@ -61,7 +62,8 @@ class MeasuredSeries:
     in the adjustments of the epochs `correlation_rows` (m,), a sample where a series is long;
     exterior: how the exterior orientation was estimated, choice: why; without_result: {reason:
     epochs}; start_utc: s UTC of the first epoch, 0 where it has no date; image_noise_ratio: noise
-    of the image points found over the one stated, NaN where epochs were adjusted one by one.
+    of the image points found over the one stated, NaN where epochs were adjusted one by one;
+    field_movements: boards and targets that moved, taken off the observations.
     """
 
     label: str
@@ -84,6 +86,7 @@ class MeasuredSeries:
     start_utc: float = 0.0
     choice: str = ""
     image_noise_ratio: float = float("nan")
+    field_movements: tuple[FieldMovement, ...] = ()
 
     def __len__(self) -> int:
         return len(self.time_s)

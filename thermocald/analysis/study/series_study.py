@@ -216,6 +216,7 @@ def _circumstances(series: MeasuredSeries) -> list[str]:
         )
     if series.choice:
         notes.append(f"Exterior orientation: {series.exterior} ({series.choice}).")
+    notes += [f"The test field moved: {m.sentence}; taken off." for m in series.field_movements]
     if series.exterior == "per_epoch":
         notes.append(
             "Every epoch has an exterior orientation of its own: its movements and the principal "

@@ -60,4 +60,7 @@ def wandering_apart(evidence: ReducedSeries) -> tuple[list[FieldMovement], Reduc
 def _field_series(e: ReducedSeries) -> FieldSeries:
     field = e.source.field
     boards = field_sheets(field)
-    return FieldSeries(e.times, e.residuals, e.weights, e.columns, e.at.B, field.points, boards)
+    return FieldSeries(
+        e.times, e.residuals, e.weights, e.columns, e.at.B, field.points, boards, field.names,
+        e.numbers,
+    )  # fmt: skip

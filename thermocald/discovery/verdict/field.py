@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from thermocald.photogrammetry.series.field_motion import movement_entry
-
 if TYPE_CHECKING:
     from thermocald.discovery.search.examination import Examination
 
@@ -15,7 +13,7 @@ __all__ = ["field_lines", "field_of"]
 def field_of(x: Examination) -> dict[str, Any] | None:
     """The movements for the document; None where the field stood still."""
     movements = [
-        {"recording": e.source.name, **movement_entry(m, e.source.field.names, e.source.numbers)}
+        {"recording": e.source.name, **m.as_json()}
         for e, found in zip(x.original, x.field_movements, strict=True)
         for m in found
     ]
@@ -31,7 +29,7 @@ def field_of(x: Examination) -> dict[str, Any] | None:
 def field_lines(x: Examination) -> list[str]:
     """The same for people."""
     return [
-        f"{m.sentence(e.source.field.names)} in {e.source.name}; this is not counted as an effect"
+        f"{m.sentence} in {e.source.name}; this is not counted as an effect"
         for e, found in zip(x.original, x.field_movements, strict=True)
         for m in found
     ]

@@ -33,7 +33,7 @@ _SEED = 12  # nearest targets that give a first plane
 _FLATNESS = 0.05  # of the distance between neighbours
 _SIGMAS = 4.0  # of the coordinates
 _APART = 2.5  # times the distance between neighbours: another board
-_MOST_SEEDS = 400
+_SEEDS = 60
 
 
 @lru_cache(maxsize=16)
@@ -45,11 +45,12 @@ def field_sheets(testfield: TestField) -> NDArray[np.int64]:
         return labels
     near, spacing = _neighbours(points)
     tolerance = max(_FLATNESS * spacing, _SIGMAS * float(np.median(testfield.sigmas)))
-    seeds = np.arange(0, len(points), max(len(points) // _MOST_SEEDS, 1))
     left = np.ones(len(points), dtype=bool)
     count = 0
     while left.sum() >= FEWEST_ON_A_SHEET:
-        planes = [_plane(points, near[s], left, tolerance) for s in seeds[left[seeds]]]
+        rest = np.flatnonzero(left)
+        seeds = rest[:: max(len(rest) // _SEEDS, 1)]
+        planes = [_plane(points, near[s], left, tolerance) for s in seeds]
         best = max(planes, key=len, default=np.zeros(0, dtype=np.int64))
         if len(best) < FEWEST_ON_A_SHEET:
             break

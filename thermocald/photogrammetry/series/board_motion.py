@@ -25,7 +25,11 @@ from thermocald.photogrammetry.series.field_motion import (
     FieldMovement,
     FieldSeries,
     cosines,
+    put_back,
+    wandering_targets,
+    weighted_products,
     with_free_cameras,
+    without,
 )
 
 if TYPE_CHECKING:
@@ -42,6 +46,7 @@ _FEWEST_OTHERS = 8
 _SHARE = 0.6  # of a board's slow movement that its course has to explain
 _RIGID = 0.5  # of what its targets would do one by one that the board has to explain
 _MOST_BOARDS = 4
+_TRIES = 400  # times of a knock
 _SETTLING = (0.08, 0.3)  # of the duration: time constants
 
 
@@ -49,6 +54,8 @@ def board_movements(s: FieldSeries) -> list[FieldMovement]:
     """Boards that were knocked or creep, the largest first; each with the others in place."""
     if len(s.times) < FEWEST_EPOCHS:
         return []
+    for single in wandering_targets(s):  # it would pull at the cameras, and they at the boards
+        s = without(s, single.rows)
     seen = s.used.any(axis=0)
     boards = {}
     for label in np.unique(s.boards[s.boards >= 0]):
@@ -65,7 +72,7 @@ def board_movements(s: FieldSeries) -> list[FieldMovement]:
             break
         label = max(moved, key=lambda k: moved[k].gain)
         best = moved[label]
-        s = removed(s, best)
+        s = put_back(s, best)
         if best.gain < OTHERS * _usual(
             with_free_cameras(s), [r for k, r in boards.items() if k != label]
         ):
@@ -76,7 +83,7 @@ def board_movements(s: FieldSeries) -> list[FieldMovement]:
 
 def _usual(s: FieldSeries, boards: list[Rows]) -> float:
     """χ² that boards which stand usually explain by moving."""
-    courses = _courses(s.times)
+    courses, _ = _courses(s.times)
     gains = [_gains(*_board_equations(s, r, _rigid(s, r)), courses)[0].max() for r in boards]
     return float(np.median(gains)) if gains else 0.0
 
@@ -97,22 +104,23 @@ def refined(s: FieldSeries, movement: FieldMovement) -> FieldMovement:
     return replace(movement, image=image, size_mm=size, sd_mm=sd, size_px=size_px)
 
 
-def removed(s: FieldSeries, movement: FieldMovement) -> FieldSeries:
-    """The series as if something had not moved."""
-    residuals = s.residuals.copy()
-    residuals[:, movement.rows] -= movement.course[:, None, None] * movement.image
-    return replace(s, residuals=residuals)
-
-
 def _board(s: FieldSeries, rows: Rows) -> FieldMovement | None:
     """The best course of one board; None where it stands."""
     rigid = _rigid(s, rows)
     M, r = _board_equations(s, rows, rigid)
-    courses = _courses(s.times)
+    courses, firsts = _courses(s.times)
     gain, steps = _gains(M, r, courses)
     best = int(np.argmax(gain))
     if gain[best] < GAIN:
         return None
+    epoch = firsts[best]
+    if epoch and len(firsts) < len(s.times) - _SIDE:  # a long series: the epochs between two tries
+        stride = firsts[1] - firsts[0]
+        near = range(max(epoch - stride, _SIDE), min(epoch + stride, len(s.times) - _SIDE) + 1)
+        courses, firsts = _steps(len(s.times), near), list(near)
+        finer, steps = _gains(M, r, courses)
+        best = int(np.argmax(finer))
+        epoch, gain = firsts[best], finer
     slow = cosines(s.times)
     share = gain[best] / max(float(_gains(M, r, slow)[0].sum()) - 6 * len(slow), gain[best])
     course, step = courses[best], steps[best]
@@ -127,10 +135,10 @@ def _board(s: FieldSeries, rows: Rows) -> FieldMovement | None:
         return None
     covariance = inverse_of_determined(_information(M, course))
     size, sd = _across(s.B[rows], image, rigid, covariance)
-    epoch = int(np.argmax(course > 0)) if best < len(s.times) - 2 * _SIDE + 1 else 0
     before, after = s.times[max(epoch - 1, 0)], s.times[epoch]
     return FieldMovement(
-        "knock" if epoch else "creep", rows, epoch, float(0.5 * (before + after)),
+        "knock" if epoch else "creep", rows, tuple(s.names[r] for r in rows),
+        int(s.numbers[epoch]) if epoch else 0, float(0.5 * (before + after)),
         float((after - before) / np.sqrt(12.0)), course, image, size, sd, size_px,
         float(gain[best]),
     )  # fmt: skip
@@ -152,27 +160,27 @@ def _rigid(s: FieldSeries, rows: Rows) -> Array:
 
 def _board_equations(s: FieldSeries, rows: Rows, rigid: Array) -> tuple[Array, Array]:
     """Normal equations (E, 6, 6), (E, 6) of a board's movement, the cameras eliminated."""
-    P = s.A.shape[-1]
-    w = s.w
-    flat = s.A.reshape(-1, P)
-    N = np.einsum("ej,jp,jq->epq", w.reshape(len(w), -1), flat, flat, optimize=True)
-    held = 1e-9 * np.einsum("epp->e", N)[:, None, None] + 1e-12
-    own = w[:, rows].reshape(len(w), -1)
-    A = s.A[rows].reshape(-1, P)
-    C = np.einsum("ej,ji,jp->eip", own, rigid, A, optimize=True)
-    M = np.einsum("ej,ji,jk->eik", own, rigid, rigid, optimize=True)
-    M = M - C @ np.linalg.solve(N + held * np.eye(P), np.swapaxes(C, 1, 2))
+    assert s.cameras is not None
+    w = s.w[:, rows].reshape(len(s.times), -1)
+    C = weighted_products(w, rigid, s.A[rows].reshape(-1, s.A.shape[-1]))
+    M = weighted_products(w, rigid, rigid) - C @ s.cameras @ np.swapaxes(C, 1, 2)
     v = np.nan_to_num(s.residuals[:, rows]).reshape(len(w), -1)
-    return M, (own * v) @ rigid
+    return M, (w * v) @ rigid
 
 
-def _courses(times: Array) -> Array:
-    """Steps at every epoch but the outermost, then settling, (n, E), 0 to 1."""
+def _courses(times: Array) -> tuple[Array, list[int]]:
+    """Steps at some hundred epochs, then settling, (n, E), 0 to 1; a step's first epoch, else 0."""
     E = len(times)
-    steps = (np.arange(E) >= np.arange(_SIDE, E - _SIDE + 1)[:, None]).astype(float)
+    stride = int(np.ceil(E / _TRIES))
+    firsts = range(_SIDE, E - _SIDE + 1, stride)
     u = (times - times[0]) / max(float(times[-1] - times[0]), 1e-9)
     slow = [u, *((1 - np.exp(-u / f)) / (1 - np.exp(-1 / f)) for f in _SETTLING)]
-    return np.concatenate([steps, np.stack(slow)])
+    return np.concatenate([_steps(E, firsts), np.stack(slow)]), [*firsts, *(0 for _ in slow)]
+
+
+def _steps(epochs: int, firsts: range) -> Array:
+    """Steps (n, E) at some epochs."""
+    return (np.arange(epochs) >= np.array(firsts)[:, None]).astype(float)
 
 
 def _gains(M: Array, r: Array, courses: Array) -> tuple[Array, Array]:

@@ -2,7 +2,8 @@
 
 They are looked for in what a free camera per epoch leaves, so that nothing the camera does can be
 mistaken for them. A single target wanders where its slow residuals are far beyond those of the
-others, which have a life of their own in every real field; `board_motion` has the boards.
+others on its board, which have a life of their own in every real field; `board_motion` has the
+boards.
 """
 
 from __future__ import annotations
@@ -13,8 +14,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
 
     Array = NDArray[np.float64]
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "FEWEST_EPOCHS", "GAIN", "LEAST_PX", "OTHERS", "FieldMovement", "FieldSeries", "cosines",
-    "movement_entry", "wandering_targets", "with_free_cameras",
+    "put_back", "wandering_targets", "weighted_products", "with_free_cameras", "without",
 ]  # fmt: skip
 
 FEWEST_EPOCHS = 20
@@ -35,6 +34,8 @@ OTHERS = 8.0
 """Times what most of the others do."""
 
 _ORDERS = 14
+_PASSES = 3
+_MOST = 80.0  # per cent of the targets, which stay below what a single one does
 _MOST_TARGETS = 0.2  # of the targets: so many do not wander by themselves
 
 
@@ -44,7 +45,8 @@ class FieldSeries:
 
     times (E,) s; residuals (E, T, 2) px, NaN where unseen; weights (E, T, 3) px⁻²; A (T, 2, P), B
     (T, 2, 3): partials by the camera's parameters and by the object points (T, 3) mm; boards (T,):
-    labels, -1 on none.
+    labels, -1 on none; names: of the targets; numbers (E,): the epochs' own; cameras (E, P, P):
+    inverse normal matrices, where free cameras have been taken out.
     """
 
     times: Array
@@ -54,6 +56,9 @@ class FieldSeries:
     B: Array
     points: Array
     boards: Rows
+    names: tuple[str, ...]
+    numbers: Rows
+    cameras: Array | None = None
 
     @property
     def used(self) -> NDArray[np.bool_]:
@@ -71,13 +76,15 @@ class FieldSeries:
 class FieldMovement:
     """One board or target that moved.
 
-    kind: `knock`, `creep` or `wander`; rows: of the field; epoch: the first row after a knock, else
-    0; time, sd_time s from the start of the series, of a knock; course (E,) 0 to 1; image (k, 2)
-    px: where it went in the image; size_mm, sd_mm: RMS over its targets across the rays; size_px.
+    kind: `knock`, `creep` or `wander`; rows: of the field, targets: their names; epoch: number of
+    the first after a knock, else 0; time, sd_time s from the start of the series, of a knock;
+    course (E,) 0 to 1; image (k, 2) px: where it went in the image; size_mm, sd_mm: RMS over its
+    targets across the rays; size_px; gain: χ² that it explains.
     """
 
     kind: str
     rows: Rows
+    targets: tuple[str, ...]
     epoch: int
     time: float
     sd_time: float
@@ -88,36 +95,48 @@ class FieldMovement:
     size_px: float
     gain: float
 
-    def sentence(self, names: Sequence[str]) -> str:
-        """For people; names of the field's targets."""
-        who = f"{names[self.rows[0]]} to {names[self.rows[-1]]} ({len(self.rows)} targets)"
+    @property
+    def sentence(self) -> str:
+        """For people."""
+        who = f"{self.targets[0]} to {self.targets[-1]} ({len(self.targets)} targets)"
         size = f"{self.size_mm:.3f} ± {self.sd_mm:.3f} mm ({self.size_px:.3f} px)"
         if self.kind == "knock":
             return f"the board of {who} was moved by {size} at {self.time:.0f} s"
         if self.kind == "creep":
             return f"the board of {who} creeps, by {size} over the series"
-        return f"target {names[self.rows[0]]} wanders by {size} RMS"
+        return f"target {self.targets[0]} wanders by {size} RMS"
+
+    def as_json(self) -> dict[str, Any]:
+        """For a document."""
+        knocked = self.kind == "knock"
+        return {
+            "kind": self.kind,
+            "targets": list(self.targets),
+            "time_s": self.time if knocked else None,
+            "sd_time_s": self.sd_time if knocked else None,
+            "epoch": self.epoch if knocked else None,
+            "size_mm": self.size_mm,
+            "sd_size_mm": self.sd_mm,
+            "size_px": self.size_px,
+        }
 
 
-def movement_entry(
-    m: FieldMovement, names: Sequence[str], numbers: NDArray[np.int64]
-) -> dict[str, Any]:
-    """A movement for a JSON document; numbers (E,): the epochs' own."""
-    knocked = m.kind == "knock"
-    return {
-        "kind": m.kind,
-        "targets": [names[r] for r in m.rows],
-        "time_s": m.time if knocked else None,
-        "sd_time_s": m.sd_time if knocked else None,
-        "epoch": int(numbers[m.epoch]) if knocked else None,
-        "size_mm": m.size_mm,
-        "sd_size_mm": m.sd_mm,
-        "size_px": m.size_px,
-    }
+def without(s: FieldSeries, rows: Rows) -> FieldSeries:
+    """The series as if some targets had not been observed."""
+    weights = s.weights.copy()
+    weights[:, rows] = 0.0
+    return replace(s, weights=weights)
+
+
+def put_back(s: FieldSeries, movement: FieldMovement) -> FieldSeries:
+    """The series as if something had not moved."""
+    residuals = s.residuals.copy()
+    residuals[:, movement.rows] -= movement.course[:, None, None] * movement.image
+    return replace(s, residuals=residuals)
 
 
 def wandering_targets(s: FieldSeries) -> list[FieldMovement]:
-    """Single targets whose slow residuals are far beyond the others'."""
+    """Single targets whose slow residuals are far beyond those of the others on their board."""
     if len(s.times) < FEWEST_EPOCHS:
         return []
     found: list[FieldMovement] = []
@@ -132,17 +151,18 @@ def wandering_targets(s: FieldSeries) -> list[FieldMovement]:
         there = count > 0.5 * len(free.times)
         if not there.any():
             break
-        usual = OTHERS * float(np.percentile(power[there], 85))
         power = np.where(there, power, 0.0)
+        usual = np.full(len(power), float(np.percentile(power[there], _MOST)))
+        for board in np.unique(s.boards[there & (s.boards >= 0)]):
+            usual[s.boards == board] = np.percentile(power[there & (s.boards == board)], _MOST)
+        power = np.where(power > np.maximum(OTHERS * usual, GAIN), power, 0.0)
         row = int(np.argmax(power))
         smooth = slow.T @ np.einsum("je,ek->jk", slow, np.nan_to_num(free.residuals[:, row]))
         size = float(np.sqrt(np.mean(np.sum(smooth**2, axis=1)) / 2))
-        if power[row] < max(GAIN, usual) or size < LEAST_PX:
+        if not power[row] or size < LEAST_PX:
             break
         found.append(_wanderer(free, row, smooth, float(power[row])))
-        weights = s.weights.copy()
-        weights[:, row] = 0.0
-        s = replace(s, weights=weights)
+        s = without(s, found[-1].rows)
         if len(found) > _MOST_TARGETS * every:
             return []
     return found
@@ -154,14 +174,23 @@ def with_free_cameras(s: FieldSeries) -> FieldSeries:
     flat = s.A.reshape(-1, P)
     scale = np.sqrt(np.maximum((flat**2).mean(axis=0), 1e-300))
     flat = flat / scale
-    v = np.nan_to_num(s.residuals)
-    N = np.einsum("ej,jp,jq->epq", w.reshape(len(w), -1), flat, flat, optimize=True)
-    b = (w * v).reshape(len(w), -1) @ flat
+    N = weighted_products(w.reshape(len(w), -1), flat, flat)
     held = 1e-9 * np.einsum("epp->e", N)[:, None, None] + 1e-12
-    values = np.linalg.solve(N + held * np.eye(P), b[..., None])[..., 0]
-    left = s.residuals - (values @ flat.T).reshape(s.residuals.shape)
-    mean = np.sum(w * np.nan_to_num(left), axis=0) / np.maximum(w.sum(axis=0), 1e-12)
-    return replace(s, residuals=left - mean, A=flat.reshape(s.A.shape))
+    inverse = np.linalg.inv(N + held * np.eye(P))
+    left, total = s.residuals, np.maximum(w.sum(axis=0), 1e-12)
+    for _ in range(_PASSES):  # targets that come and go pull at the cameras by their own error
+        b = (w * np.nan_to_num(left)).reshape(len(w), -1) @ flat
+        values = np.einsum("epq,eq->ep", inverse, b)
+        left = left - (values @ flat.T).reshape(left.shape)
+        left = left - np.sum(w * np.nan_to_num(left), axis=0) / total
+    return replace(s, residuals=left, A=flat.reshape(s.A.shape), cameras=inverse)
+
+
+def weighted_products(w: Array, a: Array, b: Array) -> Array:
+    """Σ w a bᵀ (E, p, q) of weights (E, n) and partials (n, p), (n, q)."""
+    pairs = (a[:, :, None] * b[:, None, :]).reshape(len(a), -1)
+    out: Array = (w @ pairs).reshape(len(w), a.shape[1], b.shape[1])
+    return out
 
 
 def cosines(times: Array) -> Array:
@@ -182,6 +211,6 @@ def _wanderer(s: FieldSeries, row: int, smooth: Array, gain: float) -> FieldMove
     sd = sigma * float(np.sqrt(np.mean(np.sum(inverse**2, axis=0)))) / np.sqrt(len(s.times))
     rms = float(np.sqrt(np.mean(np.sum(smooth**2, axis=1)) / 2))
     return FieldMovement(
-        "wander", np.array([row]), 0, 0.0, 0.0, np.zeros(len(s.times)), np.zeros((1, 2)), size,
-        float(sd), rms, gain,
+        "wander", np.array([row]), (s.names[row],), 0, 0.0, 0.0, np.zeros(len(s.times)),
+        np.zeros((1, 2)), size, float(sd), rms, gain,
     )  # fmt: skip

@@ -1,0 +1,65 @@
+"""A board that is knocked, a target that wanders: replay and study say it and take it off."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from tests.blind.case import Case
+from tests.blind.field_motion import BOARD, TARGET
+from tests.blind.generator import generate, write
+from thermocald.cli import application
+
+EPOCHS = 50
+
+
+def recorded(tmp_path, field_motion):
+    """A camera with a base drift alone, and of the same with a field that moves."""
+    for name, kind in (("still", ""), ("moved", field_motion)):
+        case = Case((), 0.1, 3, epochs=EPOCHS, with_m2=False, field_motion=kind, noise_px=0.04)
+        write(generate(case)[0][0], tmp_path / name)
+    return tmp_path / "moved", tmp_path / "still"
+
+
+def replayed(folder):
+    result = CliRunner().invoke(application(), ["replay", str(folder), "--json", "-"])
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout)
+
+
+@pytest.mark.parametrize(
+    ("kind", "targets"),
+    [
+        ("knock", [str(i + 1) for i in BOARD]),
+        pytest.param("creep", [str(i + 1) for i in BOARD], marks=pytest.mark.slow),
+        pytest.param("wander", [str(TARGET + 1)], marks=pytest.mark.slow),
+    ],
+)
+def test_what_the_field_did_is_said_and_is_no_drift(tmp_path, kind, targets):
+    moved, still = recorded(tmp_path, kind)
+
+    found, plain = replayed(moved), replayed(still)
+
+    assert plain["field_movements"] == []
+    assert [(m["kind"], m["targets"]) for m in found["field_movements"]] == [(kind, targets)]
+    assert found["ok"] == plain["ok"] == EPOCHS
+    for a, b in zip(found["parameters"], plain["parameters"], strict=True):
+        sd = np.hypot(a["sd_change"], b["sd_change"])
+        assert abs(a["change"] - b["change"]) < 3 * sd, a["name"]
+        assert a["scatter_over_sd"] < 1.5 * b["scatter_over_sd"]
+
+
+@pytest.mark.slow
+def test_the_study_notes_it(tmp_path):
+    moved, _ = recorded(tmp_path, "knock")
+    out = tmp_path / "study.json"
+
+    result = CliRunner().invoke(application(), ["study", str(moved), "--json", str(out)])
+
+    assert result.exit_code == 0, result.output
+    text = out.read_text()
+    assert '"kind": "knock"' in text
+    assert "The test field moved" in text

@@ -67,7 +67,7 @@ def test_what_is_attached_can_be_written_as_it_is_shown(sysfs):
 
 def test_the_command(sysfs, tmp_path):
     app = typer.Typer()
-    devices.register(app)
+    app.command("devices")(devices.devices)
     app.callback()(lambda: None)
     out = tmp_path / "devices.json"
     result = CliRunner().invoke(app, ["devices", "--json", str(out)])
@@ -102,10 +102,10 @@ def test_a_probe_takes_one_of_each_and_names_what_fails(sysfs, tmp_path):
 @pytest.fixture
 def check(tmp_path):
     """Runs `thermocald check config.yaml --probe`: (its error, its lines, its JSON)."""
-    from thermocald.cli.check import register
+    from thermocald.cli.check import check
 
     app = typer.Typer()
-    register(app)
+    app.command("check")(check)
     app.callback()(lambda: None)
 
     def run(document, *more):

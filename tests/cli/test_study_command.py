@@ -31,7 +31,7 @@ def recording(tmp_path_factory):
 def run():
     """Runs the command with arguments; errors of ours come out as they are raised."""
     app = typer.Typer()
-    command.register(app)
+    app.command("study")(command.study)
 
     def run_(*arguments):
         result = CliRunner().invoke(app, [str(a) for a in arguments])

@@ -23,8 +23,8 @@ from thermocald.store.recording.testfield_file import read_testfield
 def run():
     """Run a command; returns its result, raises what the program would report."""
     app = typer.Typer()
-    testfield.register(app)
-    camera.register(app)
+    app.add_typer(testfield.group, name="testfield")
+    app.add_typer(camera.group, name="camera")
 
     def call(*arguments):
         result = CliRunner().invoke(app, [str(a) for a in arguments])

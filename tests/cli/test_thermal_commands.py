@@ -12,7 +12,7 @@ import yaml
 from typer.testing import CliRunner
 
 from thermocald.cli import application
-from thermocald.cli.options import read_camera
+from thermocald.cli.camera_file import read_camera
 from thermocald.errors import ThermocaldError
 from thermocald.output import camera_files
 from thermocald.photogrammetry.camera.camera_model import CameraModel, ExteriorOrientation, Sensor

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from tests.cli.test_import import photograph
+from thermocald.cli.camera_file import read_camera
 from thermocald.cli.common import printable
-from thermocald.cli.options import read_camera
 from thermocald.errors import (
     ConfigurationError,
     ImageError,

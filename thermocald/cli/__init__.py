@@ -1,4 +1,4 @@
-"""The commands. Each module of this package adds its own to one application.
+"""The command line: one application with every command of `commands`.
 
 Exit status: 0 done, 1 the data do not allow it, 2 wrong usage or configuration, 3 a device failed.
 """
@@ -6,9 +6,7 @@ Exit status: 0 done, 1 the data do not allow it, 2 wrong usage or configuration,
 from __future__ import annotations
 
 import contextlib
-import importlib
 import os
-import pkgutil
 import signal
 import sys
 from typing import Annotated
@@ -21,6 +19,7 @@ import typer
 
 from thermocald import __version__
 from thermocald.atomic_file import cannot_write
+from thermocald.cli.commands import COMMANDS, GROUPS
 from thermocald.cli.common import log_to_stderr, say
 from thermocald.errors import ThermocaldError
 
@@ -30,7 +29,7 @@ _INTERRUPTED = 130
 
 
 def application() -> typer.Typer:
-    """The application with every command of the modules next to this file."""
+    """The application with every command."""
     app = typer.Typer(
         help="Thermal calibration of low-cost cameras: live, with true standard deviations.",
         no_args_is_help=True,
@@ -39,10 +38,10 @@ def application() -> typer.Typer:
         rich_markup_mode=None,
     )
     app.callback()(_options)
-    for module in sorted(pkgutil.iter_modules(__path__), key=lambda m: m.name):
-        register = getattr(importlib.import_module(f"{__name__}.{module.name}"), "register", None)
-        if register is not None:
-            register(app)
+    for name, command in COMMANDS.items():
+        app.command(name)(command)
+    for name, group in GROUPS.items():
+        app.add_typer(group, name=name)
     return app
 
 

@@ -10,35 +10,26 @@ import typer
 
 from thermocald.atomic_file import make_folder
 from thermocald.cli.common import say, write_json
-from thermocald.cli.options import JsonOption
+from thermocald.cli.options import JsonOption, StoreArgument
 from thermocald.errors import UsageError
 
 if TYPE_CHECKING:
     from thermocald.config import Config
 
-__all__ = ["register"]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("archive")(archive)
+__all__ = ["archive"]
 
 
 def archive(
-    store: Annotated[
-        Path | None, typer.Argument(help="The store; may be in use by a daemon.")
-    ] = None,
+    store: StoreArgument = None,
     folder: Annotated[
         Path, typer.Option("--to", help="The folder in which recordings are written.")
     ] = Path(),
     config: Annotated[
         Path | None, typer.Option("--config", "-c", help="Store and frames of this configuration.")
     ] = None,
-    frames: Annotated[
-        Path | None, typer.Option("--frames", help="The daemon's folder of frames.")
-    ] = None,
+    frames: Annotated[Path | None, typer.Option(help="The daemon's folder of frames.")] = None,
     series: Annotated[
-        str | None, typer.Option("--series", help="CAMERA/SERIES or SERIES; default: all.")
+        str | None, typer.Option(help="CAMERA/SERIES or SERIES; default: all.")
     ] = None,
     skip_existing: Annotated[
         bool, typer.Option("--skip-existing", help="Pass over recordings that are there already.")

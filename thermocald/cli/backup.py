@@ -9,21 +9,14 @@ from typing import Annotated
 import typer
 
 from thermocald.cli.common import say, write_json
-from thermocald.cli.options import JsonOption
+from thermocald.cli.options import JsonOption, StoreArgument
 from thermocald.errors import DataError, StoreError, UsageError
 
-__all__ = ["register"]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("backup")(backup)
+__all__ = ["backup"]
 
 
 def backup(
-    store: Annotated[
-        Path | None, typer.Argument(help="The store; may be in use by a daemon.")
-    ] = None,
+    store: StoreArgument = None,
     to: Annotated[
         Path | None, typer.Argument(help="A file that does not exist yet, or a folder.")
     ] = None,
@@ -34,8 +27,7 @@ def backup(
         Path | None, typer.Option("--config", "-c", help="The store of this configuration.")
     ] = None,
     keep: Annotated[
-        int,
-        typer.Option("--keep", min=0, help="In a folder: delete all but the newest N; 0: none."),
+        int, typer.Option(min=0, help="In a folder: delete all but the newest N; 0: none.")
     ] = 0,
     json: JsonOption = None,
 ) -> None:

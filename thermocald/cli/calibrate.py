@@ -9,14 +9,13 @@ import numpy as np
 import typer
 
 from thermocald.atomic_file import make_folder, write_text
-from thermocald.cli.common import progress, write_json
+from thermocald.cli.camera_file import CameraFile, read_camera
+from thermocald.cli.common import progress, write_result
 from thermocald.cli.options import (
     DEFAULT_FREE_TEXT,
-    CameraFile,
     FreeOption,
     JsonOption,
     adjustment_settings,
-    read_camera,
 )
 from thermocald.errors import DataError, ImageError, UsageError
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES, IOP_NAMES, Sensor
@@ -24,15 +23,10 @@ from thermocald.photogrammetry.camera.camera_model import EOP_NAMES, IOP_NAMES, 
 if TYPE_CHECKING:
     from thermocald.analysis.camera.photographs import PhotographResult, Photographs
 
-__all__ = ["register"]
+__all__ = ["calibrate"]
 
 _IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".tif", ".tiff", ".webp"})
 _ASSUMED_PITCH = 0.001
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("calibrate")(calibrate)
 
 
 def calibrate(
@@ -40,11 +34,10 @@ def calibrate(
         list[Path],
         typer.Argument(metavar="IMAGE_OR_FOLDER…", help="Photographs, or folders of them."),
     ],
-    testfield: Annotated[Path, typer.Option("--testfield", help="testfield.csv, in mm.")],
+    testfield: Annotated[Path, typer.Option(help="testfield.csv, in mm.")],
     camera: Annotated[
         Path | None,
         typer.Option(
-            "--camera",
             help="Camera file: width, height, pixel_pitch, principal_distance, interior; or one "
             "of OpenCV, ROS, COLMAP, mrcal, Kalibr, Metashape, AICON, as initial values.",
         ),
@@ -52,21 +45,17 @@ def calibrate(
     pixel_pitch: Annotated[
         float | None,
         typer.Option(
-            "--pixel-pitch",
-            min=1e-6,
-            help="Size of a pixel in mm, without --camera or where that lacks it.",
+            min=1e-6, help="Size of a pixel in mm, without --camera or where that lacks it."
         ),
     ] = None,
     camera_out: Annotated[
         Path | None,
         typer.Option(
-            "--camera-out",
-            help="Write the camera: .json with covariance (what every --camera takes), or .yaml.",
+            help="Write the camera: .json with covariance (what every --camera takes), or .yaml."
         ),
     ] = None,
     report: Annotated[
-        Path | None,
-        typer.Option("--report", help="Write residuals and coverage as one HTML file."),
+        Path | None, typer.Option(help="Write residuals and coverage as one HTML file.")
     ] = None,
     free: FreeOption = DEFAULT_FREE_TEXT,
     json: JsonOption = None,
@@ -109,9 +98,7 @@ def calibrate(
     assumed = camera is None and pixel_pitch is None
     document = _document(result, file, assumed)
     written = _write(result, file, camera_out, report)
-    if json is not None:
-        write_json(document, json)
-    if json != "-":
+    if write_result(document, json):
         _print(document)
         for line in written:
             typer.echo(f"written: {line}")

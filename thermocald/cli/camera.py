@@ -7,17 +7,11 @@ from typing import Annotated
 
 import typer
 
-__all__ = ["register"]
+from thermocald.cli.options import JsonOption
+
+__all__ = ["group"]
 
 _FORMATS = "opencv, ros, colmap, mrcal, kalibr, metashape, aicon, json"
-
-
-def register(app: typer.Typer) -> None:
-    """Add the group of commands."""
-    group = typer.Typer(help="Camera files of other programs.", no_args_is_help=True)
-    group.callback()(_group)
-    group.command("convert")(convert)
-    app.add_typer(group, name="camera")
 
 
 def _group() -> None:
@@ -26,18 +20,15 @@ def _group() -> None:
 
 def convert(
     source: Annotated[Path, typer.Argument(metavar="FILE", help="A camera file.")],
-    to: Annotated[str, typer.Option("--to", help=f"Format to write: {_FORMATS}.")],
+    to: Annotated[str, typer.Option(help=f"Format to write: {_FORMATS}.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="The file to write.")],
     from_: Annotated[
         str | None, typer.Option("--from", help="Format of FILE; default: told by its content.")
     ] = None,
     pixel_pitch: Annotated[
-        float | None,
-        typer.Option("--pixel-pitch", help="Size of a pixel in mm, where FILE does not say it."),
+        float | None, typer.Option(help="Size of a pixel in mm, where FILE does not say it.")
     ] = None,
-    json: Annotated[
-        str | None, typer.Option("--json", help="Write the result as JSON; - for standard output.")
-    ] = None,
+    json: JsonOption = None,
 ) -> None:
     """Convert a camera file, exactly where the conventions allow, else by a fit whose residual is
     stated.
@@ -75,3 +66,8 @@ def convert(
     if json != "-":
         typer.echo(f"{source} ({camera.format}): {read}")
         typer.echo(f"{out} ({to}): {statement}")
+
+
+group = typer.Typer(help="Camera files of other programs.", no_args_is_help=True)
+group.callback()(_group)
+group.command("convert")(convert)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from thermocald.cli.common import say, write_json
+from thermocald.cli.common import say, write_result
 from thermocald.cli.options import JsonOption
 from thermocald.errors import ConfigurationError, DataError, DeviceError
 
@@ -17,14 +17,9 @@ if TYPE_CHECKING:
     from thermocald.config import DeviceConfig
     from thermocald.hal import Kind
 
-__all__ = ["register"]
+__all__ = ["check"]
 
 _SHOWN = 20  # lines of a kind
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("check")(check)
 
 
 def check(
@@ -51,9 +46,7 @@ def check(
         document = _config(source, probe)
     else:
         document = _store(source)
-    if json is not None:
-        write_json(document, json)
-    if json != "-":
+    if write_result(document, json):
         for line in document.pop("lines"):
             typer.echo(line)
     if damaged := document.get("damaged"):

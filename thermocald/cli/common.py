@@ -27,6 +27,7 @@ __all__ = [
     "say",
     "write_json",
     "write_parts",
+    "write_result",
     "write_text",
 ]
 
@@ -119,6 +120,13 @@ def default_config() -> Path | None:
 def write_json(document: Any, destination: str) -> None:
     """Write one JSON document to a file, or to standard output for `-`."""
     write_text(json.dumps(jsonable(document), indent=1, allow_nan=False) + "\n", destination)
+
+
+def write_result(document: Any, json: str | None) -> bool:
+    """Write a command's result where `--json` says; whether standard output is free for lines."""
+    if json is not None:
+        write_json(document, json)
+    return json != "-"
 
 
 def write_text(text: str, destination: str | Path) -> None:

@@ -10,19 +10,14 @@ import typer
 from thermocald.cli.common import progress, say
 from thermocald.errors import RecordingError, UsageError
 
-__all__ = ["register"]
+__all__ = ["convert"]
 
 _NAMES = {"csv": "observations.csv", "parquet": "observations.parquet"}
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("convert")(convert)
-
-
 def convert(
     recording: Annotated[Path, typer.Argument(help="The recording's folder; changed in place.")],
-    to: Annotated[str, typer.Option("--to", help="csv, or parquet (needs pyarrow).")] = "parquet",
+    to: Annotated[str, typer.Option(help="csv, or parquet (needs pyarrow).")] = "parquet",
     keep: Annotated[
         bool, typer.Option("--keep", help="Keep the other file, under its name with `.old`.")
     ] = False,

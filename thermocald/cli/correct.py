@@ -8,19 +8,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from thermocald.atomic_file import make_folder, new_file
-from thermocald.cli.options import TimezoneOption, device_clock
+from thermocald.cli.options import (
+    ExtrapolateOption,
+    JsonOption,
+    ModelOption,
+    TimezoneOption,
+    device_clock,
+)
 from thermocald.errors import DataError, ImageError, UsageError
 
 if TYPE_CHECKING:
     from thermocald.analysis.thermal.correction import TemperatureLog
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 
-__all__ = ["register"]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("correct")(correct)
+__all__ = ["correct"]
 
 
 def correct(
@@ -30,32 +31,24 @@ def correct(
             metavar="POINTS.csv", help="Columns time, x, y (px) and others; or time, image."
         ),
     ],
-    model: Annotated[Path, typer.Option("--model", help="The thermal model.")],
-    log: Annotated[
-        Path, typer.Option("--log", help="CSV of temperatures, epochs.csv, or a store.")
-    ],
+    model: ModelOption,
+    log: Annotated[Path, typer.Option(help="CSV of temperatures, epochs.csv, or a store.")],
     out: Annotated[
-        Path | None, typer.Option("--out", help="CSV to write (points), or folder (images).")
+        Path | None, typer.Option(help="CSV to write (points), or folder (images).")
     ] = None,
     to: Annotated[
-        float | None, typer.Option("--to", help="°C to correct to; default: the model's T0.")
+        float | None, typer.Option(help="°C to correct to; default: the model's T0.")
     ] = None,
-    column: Annotated[
-        str | None, typer.Option("--column", help="Temperature column of the log.")
-    ] = None,
+    column: Annotated[str | None, typer.Option(help="Temperature column of the log.")] = None,
     timezone: TimezoneOption = None,
     temperature_sd: Annotated[
-        float, typer.Option("--temperature-sd", min=0.0, help="Of a reading of the log, K.")
+        float, typer.Option(min=0.0, help="Of a reading of the log, K.")
     ] = 0.05,
     image_size: Annotated[
         str | None, typer.Option("--size", help="WIDTHxHEIGHT where images are binned.")
     ] = None,
-    extrapolate: Annotated[
-        bool, typer.Option("--extrapolate", help="Allow temperatures far outside the fit.")
-    ] = False,
-    json: Annotated[
-        str | None, typer.Option("--json", help="Write the results as JSON; - for stdout.")
-    ] = None,
+    extrapolate: ExtrapolateOption = False,
+    json: JsonOption = None,
 ) -> None:
     """Correct image points, or images, that were taken at known temperatures.
 

@@ -15,7 +15,7 @@ import typer
 
 from thermocald.atomic_file import make_folder
 from thermocald.cli.common import progress, say, write_json
-from thermocald.cli.options import JsonOption
+from thermocald.cli.options import JsonOption, SeedOption
 from thermocald.errors import DataError
 
 if TYPE_CHECKING:
@@ -25,22 +25,17 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["register"]
+__all__ = ["demo"]
 
 _NAMES = ("c", "x0", "y0")
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("demo")(demo)
-
-
 def demo(
-    out: Annotated[
-        Path, typer.Option("--out", help="Folder for the store and the recording.")
-    ] = Path("thermocald-demo"),
-    epochs: Annotated[int, typer.Option("--epochs", min=10, help="Of 10 s each.")] = 150,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of all random numbers.")] = 0,
+    out: Annotated[Path, typer.Option(help="Folder for the store and the recording.")] = Path(
+        "thermocald-demo"
+    ),
+    epochs: Annotated[int, typer.Option(min=10, help="Of 10 s each.")] = 150,
+    seed: SeedOption = 0,
     discovery: Annotated[
         bool, typer.Option("--discovery/--no-discovery", help="End with a hidden effect found.")
     ] = True,

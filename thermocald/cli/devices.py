@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
+from thermocald.cli.options import JsonOption
 from thermocald.errors import DeviceError, ThermocaldError
 from thermocald.hal import SystemClock, driver_names, load_driver, open_device
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from thermocald.config import Config, DeviceConfig
     from thermocald.hal import Frame, Kind, Reading
 
-__all__ = ["Attached", "Probe", "attached", "probe", "probe_document", "probe_lines", "register"]
+__all__ = ["Attached", "Probe", "attached", "devices", "probe", "probe_document", "probe_lines"]
 
 KINDS: tuple[Kind, ...] = ("camera", "thermometer", "output")
 
@@ -138,15 +139,8 @@ def _reading_values(reading: Reading) -> dict[str, Any]:
     return values
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("devices")(devices)
-
-
 def devices(
-    json: Annotated[
-        str | None, typer.Option("--json", help="Write it as JSON; - for standard output.")
-    ] = None,
+    json: JsonOption = None,
 ) -> None:
     """List attached cameras, thermometers and outputs, as they are written in config.yaml.
 

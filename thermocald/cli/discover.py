@@ -8,18 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from thermocald.cli.common import say, write_json, write_text
+from thermocald.cli.common import say, write_result, write_text
+from thermocald.cli.options import JsonOption
 from thermocald.errors import UsageError
 
 if TYPE_CHECKING:
     from thermocald.discovery.verdict.result import Discovery
 
-__all__ = ["register"]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("discover")(discover)
+__all__ = ["discover"]
 
 
 def discover(
@@ -29,45 +25,34 @@ def discover(
     ] = None,
     verify: Annotated[
         list[Path] | None,
-        typer.Option(
-            "--verify", help="M2: another recording of this camera, to prove it on; repeatable."
-        ),
+        typer.Option(help="M2: another recording of this camera, to prove it on; repeatable."),
     ] = None,
     model: Annotated[
-        Path | None, typer.Option("--model", help="The model so far (YAML) [base model].")
+        Path | None, typer.Option(help="The model so far (YAML) [base model].")
     ] = None,
-    json: Annotated[
-        str | None, typer.Option("--json", help="Write the result as JSON; - for standard output.")
-    ] = None,
+    json: JsonOption = None,
     model_out: Annotated[
-        Path | None, typer.Option("--model-out", help="Write the model with what was found.")
+        Path | None, typer.Option(help="Write the model with what was found.")
     ] = None,
     effect_out: Annotated[
-        Path | None,
-        typer.Option("--effect-out", help="Write what was found as an effect file (YAML)."),
+        Path | None, typer.Option(help="Write what was found as an effect file (YAML).")
     ] = None,
-    report: Annotated[
-        Path | None, typer.Option("--report", help="Write a report, one HTML file.")
-    ] = None,
+    report: Annotated[Path | None, typer.Option(help="Write a report, one HTML file.")] = None,
     plan: Annotated[
         bool,
         typer.Option("--plan", help="Which effects a set-up would show, before heating anything."),
     ] = False,
     preset: Annotated[
-        str | None, typer.Option("--preset", help="With --plan: a camera of the reference study.")
+        str | None, typer.Option(help="With --plan: a camera of the reference study.")
     ] = None,
-    testfield: Annotated[
-        str | None, typer.Option("--testfield", help="With --plan: a testfield.csv.")
-    ] = None,
+    testfield: Annotated[str | None, typer.Option(help="With --plan: a testfield.csv.")] = None,
     programme: Annotated[
-        Path | None, typer.Option("--programme", help="With --plan: what is done to the camera.")
+        Path | None, typer.Option(help="With --plan: what is done to the camera.")
     ] = None,
     strength: Annotated[
-        float, typer.Option("--strength", min=0.001, help="With --plan: size of an effect, px.")
+        float, typer.Option(min=0.001, help="With --plan: size of an effect, px.")
     ] = 0.1,
-    seeds: Annotated[
-        int, typer.Option("--seeds", min=1, max=50, help="With --plan: repetitions.")
-    ] = 2,
+    seeds: Annotated[int, typer.Option(min=1, max=50, help="With --plan: repetitions.")] = 2,
 ) -> None:
     """Find where simulation and measurement disagree, name the missing effect, prove it.
 
@@ -93,9 +78,7 @@ def discover(
         from thermocald.store.sources import source_name
 
         write_text(report_html(found, source_name(recording).rsplit("/", 1)[-1]), report)
-    if json is not None:
-        write_json(found.as_json(written), json)
-    if json != "-":
+    if write_result(found.as_json(written), json):
         for line in _lines(found):
             typer.echo(line)
 
@@ -193,8 +176,6 @@ def _plan(
     with progress(None, "planning") as advance:
         inputs = set_ups(recording, model, preset, testfield, programme, seeds)
         result = plan_power(inputs, strength, lambda: advance(1))
-    if json is not None:
-        write_json(result.as_json(), json)
-    if json != "-":
+    if write_result(result.as_json(), json):
         for line in result.lines():
             typer.echo(line)

@@ -12,29 +12,23 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from thermocald.cli.common import write_json
+from thermocald.cli.options import JsonOption
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from thermocald.machine import Finding
 
-__all__ = ["register", "report"]
+__all__ = ["doctor", "report"]
 
 _MARKS = {"ok": "ok", "missing": "MISSING", "warning": "warning", "not needed": "-"}
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("doctor")(doctor)
-
-
 def doctor(
     root: Annotated[
-        Path, typer.Option("--root", help="The machine's root folder, such as a mounted card.")
+        Path, typer.Option(help="The machine's root folder, such as a mounted card.")
     ] = Path("/"),
-    json: Annotated[
-        str | None, typer.Option("--json", help="Write it as JSON; - for standard output.")
-    ] = None,
+    json: JsonOption = None,
 ) -> None:
     """Say what this machine lacks: camera stack, groups, I2C, clock, power, disk.
 

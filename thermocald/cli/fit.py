@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from thermocald.cli.options import JsonOption
 from thermocald.errors import UsageError
 from thermocald.store.sources import require_source
 
@@ -19,12 +20,7 @@ if TYPE_CHECKING:
     from thermocald.reduction.series import ReducedSeries
     from thermocald.simulation.model import ModelEffect, ThermalModel
 
-__all__ = ["register"]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("fit")(fit)
+__all__ = ["fit"]
 
 
 def fit(
@@ -34,14 +30,10 @@ def fit(
     output: Annotated[Path, typer.Option("-o", "--output", help="The model file to write.")],
     effect: Annotated[
         list[str] | None,
-        typer.Option(
-            "--effect",
-            help="NAME[:PARAMETER=VALUE,…] to fit alongside the base model; repeatable.",
-        ),
+        typer.Option(help="NAME[:PARAMETER=VALUE,…] to fit alongside the base model; repeatable."),
     ] = None,
     model: Annotated[
-        Path | None,
-        typer.Option("--model", help="Fit the effects of this model, such as discovery wrote it."),
+        Path | None, typer.Option(help="Fit the effects of this model, such as discovery wrote it.")
     ] = None,
     reference_temperature: Annotated[
         float | None, typer.Option("--t0", help="Reference temperature °C; default: the mean.")
@@ -56,19 +48,16 @@ def fit(
         ),
     ] = None,
     code: Annotated[
-        Path | None,
-        typer.Option("--code", help="Write the model as FILE.h (C, C++) and FILE.py too."),
+        Path | None, typer.Option(help="Write the model as FILE.h (C, C++) and FILE.py too.")
     ] = None,
-    json: Annotated[
-        str | None, typer.Option("--json", help="Write the results as JSON; - for stdout.")
-    ] = None,
+    json: JsonOption = None,
 ) -> None:
     """Fit a thermal model to all series of a camera, in one adjustment over all image points.
 
     Example: thermocald fit M1 M2 -o camera.thermal.yaml --effect thermal_lag
     """
     from thermocald.analysis.thermal.type_model import fit_with_type
-    from thermocald.cli.common import progress, write_json
+    from thermocald.cli.common import progress, write_result
     from thermocald.cli.effect_options import check_names
     from thermocald.simulation.model_file import write_model
 
@@ -95,9 +84,7 @@ def fit(
         from thermocald.output.model_code import write_code
 
         document["code"] = [str(file) for file in write_code(ThermalCamera(fitted_model), code)]
-    if json is not None:
-        write_json(document, json)
-    if json != "-":
+    if write_result(document, json):
         _say(document)
 
 

@@ -9,19 +9,14 @@ from typing import Annotated, Any
 
 import typer
 
-from thermocald.cli.common import write_json, write_text
+from thermocald.cli.common import write_result, write_text
 from thermocald.cli.options import JsonOption
 
-__all__ = ["register"]
+__all__ = ["fleet"]
 
 _WIDTH = 80
 _MOST_SOUND = 40
 _LONGEST_NAME = 34
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("fleet")(fleet)
 
 
 def fleet(
@@ -29,9 +24,7 @@ def fleet(
         list[str],
         typer.Argument(metavar="ADDRESS…", help="postgresql://USER@HOST/DATABASE?station=…"),
     ],
-    report: Annotated[
-        Path | None, typer.Option("--report", help="Write a page, one HTML file.")
-    ] = None,
+    report: Annotated[Path | None, typer.Option(help="Write a page, one HTML file.")] = None,
     every: Annotated[
         bool, typer.Option("--all", help="List every camera, also of a large fleet.")
     ] = False,
@@ -48,9 +41,7 @@ def fleet(
         from thermocald.output.fleet.page import render_fleet
 
         write_text(render_fleet(document), report)
-    if json is not None:
-        write_json(document, json)
-    if json != "-":
+    if write_result(document, json):
         for line in _lines(document, every):
             typer.echo(line)
 

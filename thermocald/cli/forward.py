@@ -7,54 +7,38 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from thermocald.cli.common import log_to_stderr, say, write_json
-from thermocald.cli.options import JsonOption
+from thermocald.cli.common import log_to_stderr, say, write_result
+from thermocald.cli.options import JsonOption, StoreArgument
 from thermocald.config import Config, load_config
 from thermocald.errors import UsageError
 
 if TYPE_CHECKING:
     from thermocald.fleet.frames import FrameRule
 
-__all__ = ["register"]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("forward")(forward)
+__all__ = ["forward"]
 
 
 def forward(
-    store: Annotated[
-        Path | None, typer.Argument(help="The store; may be in use by a daemon.")
-    ] = None,
+    store: StoreArgument = None,
     to: Annotated[
-        str | None,
-        typer.Option("--to", metavar="ADDRESS", help="postgresql://USER@HOST/DATABASE?…"),
+        str | None, typer.Option(metavar="ADDRESS", help="postgresql://USER@HOST/DATABASE?…")
     ] = None,
     config: Annotated[
         Path | None, typer.Option("--config", "-c", help="Store and `forward:` of this file.")
     ] = None,
     station: Annotated[
-        str | None, typer.Option("--station", help="This station's name; default: the host's.")
+        str | None, typer.Option(help="This station's name; default: the host's.")
     ] = None,
-    frames: Annotated[
-        Path | None, typer.Option("--frames", help="Send frames from this folder too.")
-    ] = None,
-    choose: Annotated[
-        str, typer.Option("--choose", help="Which of them: events, every_n, all.")
-    ] = "events",
-    every_n: Annotated[
-        int, typer.Option("--every-n", min=1, help="With every_n: one of so many.")
-    ] = 360,
+    frames: Annotated[Path | None, typer.Option(help="Send frames from this folder too.")] = None,
+    choose: Annotated[str, typer.Option(help="Which of them: events, every_n, all.")] = "events",
+    every_n: Annotated[int, typer.Option(min=1, help="With every_n: one of so many.")] = 360,
     frames_mb: Annotated[
-        float, typer.Option("--frames-mb", min=0.001, help="Frames beyond it wait for tomorrow.")
+        float, typer.Option(min=0.001, help="Frames beyond it wait for tomorrow.")
     ] = 200.0,
     once: Annotated[
         bool, typer.Option("--once", help="Send what waits, then end; else go on for ever.")
     ] = False,
-    cursor: Annotated[
-        Path | None, typer.Option("--cursor", help="Where it keeps how far it has sent.")
-    ] = None,
+    cursor: Annotated[Path | None, typer.Option(help="Where it keeps how far it has sent.")] = None,
     json: JsonOption = None,
 ) -> None:
     """Send epochs, events, readings and chosen frames to a PostgreSQL server, each of them once.
@@ -87,9 +71,7 @@ def forward(
     forwarder = Forwarder(store, address, station or socket.gethostname(), cursor, frames=rule)
     if once:
         done = forwarder.send_waiting()
-        if json is not None:
-            write_json({"sent": dict(done.sent), "refused": done.refused}, json)
-        if json != "-":
+        if write_result({"sent": dict(done.sent), "refused": done.refused}, json):
             counts = ", ".join(f"{n} {table}s" for table, n in done.sent.items())
             say(f"sent {counts}" + (f"; {done.refused} refused" if done.refused else ""))
         return

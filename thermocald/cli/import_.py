@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from thermocald.cli.common import say, write_json
-from thermocald.cli.options import JsonOption
+from thermocald.cli.common import say, write_result
+from thermocald.cli.options import JsonOption, PhotosArgument, PixelPitchOption, TimezoneOption
 from thermocald.errors import UsageError
 
 if TYPE_CHECKING:
@@ -16,84 +16,56 @@ if TYPE_CHECKING:
     from thermocald.store.logger.photographs import Photograph
     from thermocald.store.recording.head import CameraSpec
 
-__all__ = ["register"]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("import")(import_)
+__all__ = ["import_"]
 
 
 def import_(
-    photos: Annotated[
-        list[Path], typer.Argument(metavar="PHOTO…", help="Photographs, or folders of them.")
-    ],
-    log: Annotated[Path, typer.Option("--log", help="The logger's file, in any dialect of CSV.")],
+    photos: PhotosArgument,
+    log: Annotated[Path, typer.Option(help="The logger's file, in any dialect of CSV.")],
     testfield: Annotated[
-        Path | None, typer.Option("--testfield", help="The surveyed test field, testfield.csv.")
+        Path | None, typer.Option(help="The surveyed test field, testfield.csv.")
     ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="The recording to write (a new folder).")
     ] = None,
-    timezone: Annotated[
-        str | None,
-        typer.Option("--timezone", help="Of times without a zone: Europe/Berlin, UTC, +02:00."),
-    ] = None,
+    timezone: TimezoneOption = None,
     camera_timezone: Annotated[
-        str | None,
-        typer.Option("--camera-timezone", help="The camera's own, whatever EXIF says of it."),
+        str | None, typer.Option(help="The camera's own, whatever EXIF says of it.")
     ] = None,
-    log_timezone: Annotated[
-        str | None, typer.Option("--log-timezone", help="The logger's own.")
-    ] = None,
+    log_timezone: Annotated[str | None, typer.Option(help="The logger's own.")] = None,
     camera_clock: Annotated[
-        str,
-        typer.Option("--camera-clock", help="How far the camera's clock was ahead: +00:03:12."),
+        str, typer.Option(help="How far the camera's clock was ahead: +00:03:12.")
     ] = "0",
-    log_clock: Annotated[
-        str, typer.Option("--log-clock", help="How far the logger's clock was ahead.")
-    ] = "0",
+    log_clock: Annotated[str, typer.Option(help="How far the logger's clock was ahead.")] = "0",
     ambiguous: Annotated[
         str,
         typer.Option(
-            "--ambiguous",
-            help="The hour that comes twice in autumn: refuse, order (of rows), earlier, later.",
+            help="The hour that comes twice in autumn: refuse, order (of rows), earlier, later."
         ),
     ] = "refuse",
     times: Annotated[
-        str, typer.Option("--times", help="Of photographs: exif, name (of the file), file (date).")
+        str, typer.Option(help="Of photographs: exif, name (of the file), file (date).")
     ] = "exif",
     time_column: Annotated[
-        list[str] | None,
-        typer.Option("--time-column", help="Of the log; twice for a date and a time."),
+        list[str] | None, typer.Option(help="Of the log; twice for a date and a time.")
     ] = None,
     temperature_column: Annotated[
-        list[str] | None,
-        typer.Option("--temperature-column", help="Of the log; the first is the reference."),
+        list[str] | None, typer.Option(help="Of the log; the first is the reference.")
     ] = None,
     separator: Annotated[
-        str | None, typer.Option("--separator", help="Of the log's columns: ';' ',' tab.")
+        str | None, typer.Option(help="Of the log's columns: ';' ',' tab.")
     ] = None,
-    decimal: Annotated[
-        str | None, typer.Option("--decimal", help="The log's decimal mark: , or .")
-    ] = None,
-    date_order: Annotated[
-        str | None, typer.Option("--date-order", help="Of 06/07/2026: dmy or mdy.")
-    ] = None,
+    decimal: Annotated[str | None, typer.Option(help="The log's decimal mark: , or .")] = None,
+    date_order: Annotated[str | None, typer.Option(help="Of 06/07/2026: dmy or mdy.")] = None,
     unit: Annotated[
-        str | None, typer.Option("--unit", help="Of the log: degC, K or degF; converted to °C.")
+        str | None, typer.Option(help="Of the log: degC, K or degF; converted to °C.")
     ] = None,
-    pixel_pitch: Annotated[
-        float | None, typer.Option("--pixel-pitch", help="Size of a pixel in mm.", min=1e-5, max=1)
-    ] = None,
+    pixel_pitch: PixelPitchOption = None,
     principal_distance: Annotated[
-        float | None,
-        typer.Option("--principal-distance", help="Of the lens, mm; EXIF's by default.", min=0.1),
+        float | None, typer.Option(help="Of the lens, mm; EXIF's by default.", min=0.1)
     ] = None,
-    camera: Annotated[
-        Path | None, typer.Option("--camera", help="A camera file of any format.")
-    ] = None,
-    series: Annotated[str, typer.Option("--series", help="Name of this series.")] = "M1",
+    camera: Annotated[Path | None, typer.Option(help="A camera file of any format.")] = None,
+    series: Annotated[str, typer.Option(help="Name of this series.")] = "M1",
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Show what would be written, and write nothing.")
     ] = False,
@@ -161,9 +133,7 @@ def import_(
         with RecordingWriter(out, head, field) as writer:
             for epoch in placed.epochs():
                 writer.append(epoch)
-    if json is not None:
-        write_json(document, json)
-    if json != "-":
+    if write_result(document, json):
         typer.echo(
             "nothing was written (--dry-run)" if dry_run
             else f"{out}: {len(placed.times)} epochs; next: thermocald replay {out}"
@@ -199,7 +169,7 @@ def _camera(
     dry_run: bool,
 ) -> tuple[CameraSpec, list[str]]:
     """The camera, and what of it was taken from EXIF."""
-    from thermocald.cli.options import read_camera
+    from thermocald.cli.camera_file import read_camera
     from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.store.recording.head import CameraSpec
 

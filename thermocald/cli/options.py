@@ -1,34 +1,61 @@
-"""Options that several commands share: which camera, what is free."""
+"""Options that several commands share, and what their text stands for."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from thermocald.errors import ConfigurationError, UsageError
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, InteriorOrientation, Sensor
+from thermocald.errors import UsageError
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
-from thermocald.yaml_file import read_yaml
 
 if TYPE_CHECKING:
     from thermocald.store.logger.clock import DeviceClock
 
 __all__ = [
-    "CameraFile",
+    "DEFAULT_FREE_TEXT",
+    "ConfigOption",
     "ExteriorOption",
+    "ExtrapolateOption",
     "FreeOption",
     "JsonOption",
+    "ModelOption",
+    "PhotosArgument",
+    "PixelPitchOption",
+    "SeedOption",
+    "StoreArgument",
     "TimezoneOption",
+    "adjustment_settings",
     "device_clock",
     "free_names",
-    "read_camera",
 ]
 
 JsonOption = Annotated[
     str | None, typer.Option("--json", help="Write the result as JSON; - for standard output.")
+]
+ConfigOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--config", "-c", help="The configuration [./config.yaml, /etc/thermocald/config.yaml]."
+    ),
+]
+StoreArgument = Annotated[Path | None, typer.Argument(help="The store; may be in use by a daemon.")]
+PhotosArgument = Annotated[
+    list[Path], typer.Argument(metavar="PHOTO…", help="Photographs, or folders of them.")
+]
+PixelPitchOption = Annotated[
+    float | None, typer.Option("--pixel-pitch", help="Size of a pixel in mm.", min=1e-5, max=1.0)
+]
+ModelOption = Annotated[Path, typer.Option("--model", help="The thermal model.")]
+ExtrapolateOption = Annotated[
+    bool, typer.Option("--extrapolate", help="Allow temperatures far outside the fit.")
+]
+SeedOption = Annotated[int, typer.Option("--seed", min=0, help="Of all random numbers.")]
+TimezoneOption = Annotated[
+    str | None,
+    typer.Option("--timezone", help="Of times without a zone: Europe/Berlin, UTC, +02:00."),
 ]
 FreeOption = Annotated[
     str,
@@ -46,27 +73,11 @@ ExteriorOption = Annotated[
 ]
 
 
-TimezoneOption = Annotated[
-    str | None,
-    typer.Option("--timezone", help="Of times without a zone: Europe/Berlin, UTC, +02:00."),
-]
-
-
 def device_clock(timezone: str | None) -> DeviceClock:
     """The clock that `--timezone` describes; without it times without a zone are refused."""
     from thermocald.store.logger.clock import DeviceClock, time_zone
 
     return DeviceClock(None if timezone is None else time_zone(timezone), ambiguous="order")
-
-
-@dataclass(frozen=True, slots=True)
-class CameraFile:
-    """A camera as a YAML file describes it: sensor, nominal c mm, interior orientation if known."""
-
-    name: str
-    sensor: Sensor
-    principal_distance: float | None
-    interior: InteriorOrientation | None
 
 
 def free_names(text: str) -> tuple[str, ...]:
@@ -86,57 +97,3 @@ def adjustment_settings(free: str) -> AdjustmentSettings:
 
 
 DEFAULT_FREE_TEXT = ",".join(DEFAULT_FREE)
-
-
-def read_camera(path: Path, pixel_pitch: float | None = None) -> CameraFile:
-    """Read a camera file: name, width, height, pixel_pitch, principal_distance, interior.
-
-    With `interior:` (c, x0, y0 mm, A1 … C2; CONVENTIONS §2) the camera counts as calibrated. A file
-    of another program (OpenCV, ROS, Metashape, …) is read as what it is; pixel_pitch: mm, where it
-    does not say it.
-    """
-    from thermocald.output import camera_files
-
-    if camera_files.recognised(path) is not None:
-        found = camera_files.read(path, pixel_pitch=pixel_pitch)
-        model = found.model
-        return CameraFile(found.name, model.sensor, model.interior.c, model.interior)
-    document = read_yaml(path, ConfigurationError)
-    if not isinstance(document, dict):
-        raise ConfigurationError(f"{path}: is not a camera file; it must hold `width: …` and so on")
-    camera = document.get("camera", document)
-
-    def number(key: str, required: bool = True) -> float | None:
-        value = camera.get(key)
-        if value is None and not required:
-            return None
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < 1e5:
-            raise ConfigurationError(
-                f"{path}: {key} must be a number above 0 and below 100000, it is {str(value)[:40]}"
-            )
-        return float(value)
-
-    width, height, pitch = number("width"), number("height"), number("pixel_pitch")
-    assert width is not None
-    assert height is not None
-    assert pitch is not None
-    nominal = number("principal_distance", required=False)
-    interior = None
-    given = camera.get("interior")
-    if given is not None:
-        unknown = set(given) - set(IOP_NAMES) if isinstance(given, dict) else {str(given)}
-        if unknown or "c" not in given:
-            raise ConfigurationError(
-                f"{path}: interior must hold c and any of {', '.join(IOP_NAMES[1:])}"
-                + (f"; {min(unknown)!r} is none of them" if unknown else "")
-            )
-        try:
-            interior = InteriorOrientation(**{k: float(v) for k, v in given.items()})
-        except (TypeError, ValueError) as error:
-            raise ConfigurationError(f"{path}: interior: {error}") from error
-    return CameraFile(
-        str(camera.get("name", path.stem)),
-        Sensor(int(width), int(height), pitch),
-        nominal,
-        interior,
-    )

@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from thermocald.cli.options import TimezoneOption, device_clock
+from thermocald.cli.options import (
+    ExtrapolateOption,
+    JsonOption,
+    ModelOption,
+    TimezoneOption,
+    device_clock,
+)
 from thermocald.errors import UsageError
 from thermocald.store.sources import require_source
 
@@ -20,7 +26,7 @@ if TYPE_CHECKING:
     from thermocald.analysis.thermal.correction import TemperatureLog
     from thermocald.analysis.thermal.thermal_camera import Along, ThermalCamera
 
-__all__ = ["read_log", "register", "say_what_is_missing", "warnings_said"]
+__all__ = ["predict", "read_log", "say_what_is_missing", "warnings_said"]
 
 
 @contextmanager
@@ -48,54 +54,38 @@ def say_what_is_missing(thermal: ThermalCamera) -> None:
         )
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("predict")(predict)
-
-
 def predict(
-    model: Annotated[Path, typer.Option("--model", help="The thermal model.")],
+    model: ModelOption,
     temperature: Annotated[
-        float | None, typer.Option("--temperature", help="°C: a camera that has long been there.")
+        float | None, typer.Option(help="°C: a camera that has long been there.")
     ] = None,
     log: Annotated[
-        Path | None, typer.Option("--log", help="CSV of temperatures, epochs.csv, or a store.")
+        Path | None, typer.Option(help="CSV of temperatures, epochs.csv, or a store.")
     ] = None,
     timezone: TimezoneOption = None,
     test: Annotated[
-        Path | None,
-        typer.Option("--test", help="Recording or store: how well the model predicts it."),
+        Path | None, typer.Option(help="Recording or store: how well the model predicts it.")
     ] = None,
     programme: Annotated[
-        Path | None,
-        typer.Option("--programme", help="Warm-up advice for what is done to the camera."),
+        Path | None, typer.Option(help="Warm-up advice for what is done to the camera.")
     ] = None,
-    camera: Annotated[
-        Path | None, typer.Option("--camera", help="Camera file, for --programme.")
-    ] = None,
+    camera: Annotated[Path | None, typer.Option(help="Camera file, for --programme.")] = None,
     channel: Annotated[
-        list[str] | None,
-        typer.Option("--channel", help="NAME=°C of another thermometer; repeatable."),
+        list[str] | None, typer.Option(help="NAME=°C of another thermometer; repeatable.")
     ] = None,
-    distance: Annotated[
-        float, typer.Option("--distance", min=0.01, help="Of the object, m.")
-    ] = 10.0,
+    distance: Annotated[float, typer.Option(min=0.01, help="Of the object, m.")] = 10.0,
     wanted: Annotated[
         float, typer.Option("--wanted-mm", min=1e-3, help="Wanted error there, mm.")
     ] = 5.0,
-    extrapolate: Annotated[
-        bool, typer.Option("--extrapolate", help="Allow temperatures far outside the fit.")
-    ] = False,
-    json: Annotated[
-        str | None, typer.Option("--json", help="Write the results as JSON; - for stdout.")
-    ] = None,
+    extrapolate: ExtrapolateOption = False,
+    json: JsonOption = None,
 ) -> None:
     """Predict the interior orientation with standard deviations.
 
     Example: thermocald predict --model camera.thermal.yaml --temperature 35
     """
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
-    from thermocald.cli.common import write_json
+    from thermocald.cli.common import write_result
 
     if sum(option is not None for option in (temperature, log, test, programme)) != 1:
         raise UsageError("give one of --temperature, --log, --test, --programme")
@@ -115,9 +105,7 @@ def predict(
         else:
             assert programme is not None
             document, lines = _advice(thermal, programme, camera, distance, wanted)
-    if json is not None:
-        write_json(document, json)
-    if json != "-":
+    if write_result(document, json):
         typer.echo("\n".join(lines))
 
 

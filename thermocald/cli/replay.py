@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from thermocald.cli.common import progress, say, write_json, write_parts
+from thermocald.cli.common import progress, say, write_parts, write_result
 from thermocald.cli.options import (
     DEFAULT_FREE_TEXT,
     ExteriorOption,
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
     from thermocald.store.recording.reader import Recording
 
-__all__ = ["register"]
+__all__ = ["export", "replay"]
 
 
 _EXTERIOR_WORDS = {
@@ -36,17 +36,10 @@ _EXTERIOR_WORDS = {
 }
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.command("replay")(replay)
-    app.command("export")(export)
-
-
 def replay(
     recording: Annotated[Path, typer.Argument(help="The recording's folder.")],
     store: Annotated[
-        Path | None,
-        typer.Option("--store", help="Keep all in this store; an interrupted replay goes on."),
+        Path | None, typer.Option(help="Keep all in this store; an interrupted replay goes on.")
     ] = None,
     exterior: ExteriorOption = "auto",
     free: FreeOption = DEFAULT_FREE_TEXT,
@@ -70,9 +63,7 @@ def replay(
     else:
         table, found = settled(_recording_table(opened, settings, exterior))
     document = _summary(recording, store, table, found)
-    if json is not None:
-        write_json(document, json)
-    if json != "-":
+    if write_result(document, json):
         _tell(document)
     if not table.ok.any():
         raise DataError(f"{recording}: no epoch has a result: {_commonest(table)}")
@@ -87,24 +78,22 @@ def export(
     exterior: Annotated[
         str,
         typer.Option(
-            "--exterior",
             help="stored: a store's epochs as they were stored; the others adjust the series "
             "again: auto (of a recording), per_epoch, series, mount.",
         ),
     ] = "",
     free: FreeOption = DEFAULT_FREE_TEXT,
     series: Annotated[
-        str | None, typer.Option("--series", help="Which of a store: CAMERA/SERIES or SERIES.")
+        str | None, typer.Option(help="Which of a store: CAMERA/SERIES or SERIES.")
     ] = None,
     units: Annotated[
-        str,
-        typer.Option("--units", help="px, um, deg instead of mm and rad; named in the columns."),
+        str, typer.Option(help="px, um, deg instead of mm and rad; named in the columns.")
     ] = "",
     time_: Annotated[
         str, typer.Option("--time", help="seconds since 1970 UTC, or iso.")
     ] = "seconds",
-    separator: Annotated[str, typer.Option("--separator", help="Of the columns: , ; | tab")] = ",",
-    decimal: Annotated[str, typer.Option("--decimal", help="The decimal mark: . or ,")] = ".",
+    separator: Annotated[str, typer.Option(help="Of the columns: , ; | tab")] = ",",
+    decimal: Annotated[str, typer.Option(help="The decimal mark: . or ,")] = ".",
     extra: Annotated[
         bool,
         typer.Option(

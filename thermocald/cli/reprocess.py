@@ -7,18 +7,13 @@ from typing import Annotated
 
 import typer
 
-from thermocald.cli.common import progress, say, write_json
+from thermocald.cli.common import progress, say, write_json, write_result
 from thermocald.cli.options import DEFAULT_FREE_TEXT, FreeOption, JsonOption
 from thermocald.errors import DataError, OutputError, UsageError
 from thermocald.store.server.address import is_server
 from thermocald.store.sources import source_name
 
-__all__ = ["register"]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("reprocess")(reprocess)
+__all__ = ["reprocess"]
 
 
 def reprocess(
@@ -26,19 +21,17 @@ def reprocess(
         list[str],
         typer.Argument(metavar="ARCHIVE…", help="Folders that hold recordings, or postgresql://…"),
     ],
-    out: Annotated[Path, typer.Option("--out", help="Where the files are written.")],
+    out: Annotated[Path, typer.Option(help="Where the files are written.")],
     do: Annotated[
-        str, typer.Option("--do", help="calibrate every epoch, or discover, study every series.")
+        str, typer.Option(help="calibrate every epoch, or discover, study every series.")
     ] = "calibrate",
     engine: Annotated[
-        str, typer.Option("--engine", help="local, or a Dask scheduler: tcp://HOST:8786.")
+        str, typer.Option(help="local, or a Dask scheduler: tcp://HOST:8786.")
     ] = "local",
-    jobs: Annotated[
-        int, typer.Option("--jobs", min=1, max=256, help="Processes of the local engine.")
-    ] = 1,
+    jobs: Annotated[int, typer.Option(min=1, max=256, help="Processes of the local engine.")] = 1,
     free: FreeOption = DEFAULT_FREE_TEXT,
     sets: Annotated[
-        int, typer.Option("--sets", min=100, max=10_000_000, help="Of a study's Monte-Carlo.")
+        int, typer.Option(min=100, max=10_000_000, help="Of a study's Monte-Carlo.")
     ] = 100_000,
     json: JsonOption = None,
 ) -> None:
@@ -82,9 +75,7 @@ def _calibrate(
             for o in failed
         ],
     }
-    if json is not None:
-        write_json(document, json)
-    if json != "-":
+    if write_result(document, json):
         say(
             f"{out}: {document['calibrated']} of {document['epochs']} epochs calibrated in "
             f"{len(outcomes) - len(failed)} blocks"

@@ -8,47 +8,32 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from thermocald.cli.common import default_config
+from thermocald.cli.options import ConfigOption
 from thermocald.errors import StoreError, UsageError
 
 if TYPE_CHECKING:
     from thermocald.config import Config
 
-__all__ = ["mock_config", "recording_config", "register"]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.command("run")(run)
-    app.command("dashboard")(dashboard)
+__all__ = ["dashboard", "mock_config", "recording_config", "run"]
 
 
 def run(
-    config: Annotated[
-        Path | None,
-        typer.Option(
-            "--config", "-c", help="The configuration [./config.yaml, /etc/thermocald/config.yaml]."
-        ),
-    ] = None,
+    config: ConfigOption = None,
     mock: Annotated[
         bool, typer.Option("--mock", help="A rendered camera that warms up, and a thermometer.")
     ] = False,
     recording: Annotated[
-        Path | None, typer.Option("--recording", help="Play a recording instead of devices.")
+        Path | None, typer.Option(help="Play a recording instead of devices.")
     ] = None,
     store: Annotated[
-        Path | None, typer.Option("--store", help="The store; overrides the configuration.")
+        Path | None, typer.Option(help="The store; overrides the configuration.")
     ] = None,
-    epochs: Annotated[
-        int, typer.Option("--epochs", min=0, help="End after so many epochs per camera.")
-    ] = 0,
+    epochs: Annotated[int, typer.Option(min=0, help="End after so many epochs per camera.")] = 0,
     fast: Annotated[
         bool, typer.Option("--fast", help="Play the recording as fast as it can be calibrated.")
     ] = False,
     hang_after: Annotated[
-        float,
-        typer.Option(
-            "--hang-after", min=0.5, help="A device that does not return for so many s hangs."
-        ),
+        float, typer.Option(min=0.5, help="A device that does not return for so many s hangs.")
     ] = 60.0,
     dashboard: Annotated[bool, typer.Option("--dashboard", help="Show the web page too.")] = False,
 ) -> None:
@@ -168,19 +153,17 @@ def _name(text: str) -> str:
 
 
 def dashboard(
-    store: Annotated[Path | None, typer.Option("--store", help="The daemon's store.")] = None,
+    store: Annotated[Path | None, typer.Option(help="The daemon's store.")] = None,
     live: Annotated[
-        Path | None, typer.Option("--live", help="The folder of the daemon's live state.")
+        Path | None, typer.Option(help="The folder of the daemon's live state.")
     ] = None,
     host: Annotated[
-        str, typer.Option("--host", help="Elsewhere than here needs --token-file.")
+        str, typer.Option(help="Elsewhere than here needs --token-file.")
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option("--port", min=1, max=65535)] = 8437,
-    token_file: Annotated[
-        Path | None, typer.Option("--token-file", help="A file that holds the token.")
-    ] = None,
+    port: Annotated[int, typer.Option(min=1, max=65535)] = 8437,
+    token_file: Annotated[Path | None, typer.Option(help="A file that holds the token.")] = None,
     name: Annotated[
-        list[str] | None, typer.Option("--name", help="A further name of the page; repeatable.")
+        list[str] | None, typer.Option(help="A further name of the page; repeatable.")
     ] = None,
     config: Annotated[
         Path | None, typer.Option("--config", "-c", help="All of these from a configuration.")

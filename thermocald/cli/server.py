@@ -10,7 +10,7 @@ import typer
 
 from thermocald.cli.common import say, write_text
 
-__all__ = ["register"]
+__all__ = ["group"]
 
 _Address = Annotated[
     str, typer.Argument(metavar="ADDRESS", help="postgresql://OWNER@HOST/DATABASE, an owner's.")
@@ -21,15 +21,6 @@ _HELP = """The database of a fleet.
 
 Example: thermocald server init postgresql://owner@db.example/thermocald
 """
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    group = typer.Typer(no_args_is_help=True, help=_HELP)
-    group.command("init")(init)
-    group.command("grant")(grant)
-    group.command("dashboard")(dashboard)
-    app.add_typer(group, name="server")
 
 
 def init(address: _Address) -> None:
@@ -76,3 +67,9 @@ def dashboard(
     path = Path(output) if output != "-" else output
     text = (files("thermocald.output.fleet") / "grafana.json").read_text(encoding="utf-8")
     write_text(text, path)
+
+
+group = typer.Typer(no_args_is_help=True, help=_HELP)
+group.command("init")(init)
+group.command("grant")(grant)
+group.command("dashboard")(dashboard)

@@ -11,7 +11,7 @@ import typer
 
 from thermocald.atomic_file import make_folder
 from thermocald.cli.common import default_config, say, write_json
-from thermocald.cli.options import JsonOption
+from thermocald.cli.options import ConfigOption, JsonOption
 from thermocald.errors import ConfigurationError, DataError, UsageError
 
 if TYPE_CHECKING:
@@ -19,42 +19,27 @@ if TYPE_CHECKING:
     from thermocald.config import Config
     from thermocald.daemon.session import Session
 
-__all__ = ["register"]
+__all__ = ["group"]
 
 _LOOK_EVERY_S = 0.5
 _WAIT_FOR_DAEMON_S = 300.0
 
-ConfigOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--config", "-c", help="The configuration [./config.yaml, /etc/thermocald/config.yaml]."
-    ),
-]
 CameraOption = Annotated[
     str | None, typer.Option("--camera", help="Which of the configuration's cameras.")
 ]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    sessions = typer.Typer(help="One measurement series, from the check to the report.")
-    sessions.command("start")(start)
-    sessions.command("status")(status)
-    sessions.command("stop")(stop)
-    app.add_typer(sessions, name="session")
-
-
 def start(
     camera: CameraOption = None,
-    series: Annotated[str, typer.Option("--series", help="Name of the series; resumes it.")] = "M1",
+    series: Annotated[str, typer.Option(help="Name of the series; resumes it.")] = "M1",
     condition: Annotated[
         str, typer.Option("--start", help="Start condition, such as cold or warm.")
     ] = "",
-    epochs: Annotated[int, typer.Option("--epochs", min=1, help="How many epochs.")] = 150,
+    epochs: Annotated[int, typer.Option(min=1, help="How many epochs.")] = 150,
     config: ConfigOption = None,
     mock: Annotated[bool, typer.Option("--mock", help="Without hardware.")] = False,
     programme: Annotated[
-        Path | None, typer.Option("--programme", help="Steps of a heating output: YAML list.")
+        Path | None, typer.Option(help="Steps of a heating output: YAML list.")
     ] = None,
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder for recording and report.")
@@ -71,24 +56,20 @@ def start(
     until_separated: Annotated[
         str | None,
         typer.Option(
-            "--until-separated",
-            metavar="A,B",
-            help="Heat so that two effects separate, and stop when they are.",
+            metavar="A,B", help="Heat so that two effects separate, and stop when they are."
         ),
     ] = None,
     evidence: Annotated[
-        Path | None, typer.Option("--evidence", help="A recording that could not separate them.")
+        Path | None, typer.Option(help="A recording that could not separate them.")
     ] = None,
     max_temperature: Annotated[
-        float | None,
-        typer.Option("--max-temperature", help="Highest °C of a planned programme [the output's]."),
+        float | None, typer.Option(help="Highest °C of a planned programme [the output's].")
     ] = None,
     max_rate: Annotated[
-        float, typer.Option("--max-rate", min=0.1, max=60.0, help="Fastest planned rise, K/min.")
+        float, typer.Option(min=0.1, max=60.0, help="Fastest planned rise, K/min.")
     ] = 3.0,
     max_duty: Annotated[
-        float,
-        typer.Option("--max-duty", min=0.05, max=1.0, help="Share of time with heat."),
+        float, typer.Option(min=0.05, max=1.0, help="Share of time with heat.")
     ] = 0.8,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print the planned programme and end.")
@@ -309,3 +290,9 @@ def _finish(config: Config, session: Session, path: Path, report: bool) -> None:
     title = f"{session.camera}, series {session.series}"
     write_report(target, render_report(study(load_series(path)), title))
     say(f"report: {target}")
+
+
+group = typer.Typer(help="One measurement series, from the check to the report.")
+group.command("start")(start)
+group.command("status")(status)
+group.command("stop")(stop)

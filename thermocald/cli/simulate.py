@@ -8,61 +8,52 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from thermocald.cli.options import JsonOption, SeedOption
 from thermocald.errors import UsageError
 
 if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.simulation.observations import Simulation
 
-__all__ = ["register"]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("simulate")(simulate)
+__all__ = ["simulate"]
 
 
 def simulate(
     preset: Annotated[
-        str | None, typer.Option("--preset", help="A camera of the reference study; see --list.")
+        str | None, typer.Option(help="A camera of the reference study; see --list.")
     ] = None,
     model: Annotated[
-        Path | None, typer.Option("--model", help="A thermal model (YAML); replaces the preset's.")
+        Path | None, typer.Option(help="A thermal model (YAML); replaces the preset's.")
     ] = None,
     camera: Annotated[
-        Path | None,
-        typer.Option("--camera", help="A camera file (YAML): heat, thermometers, noise."),
+        Path | None, typer.Option(help="A camera file (YAML): heat, thermometers, noise.")
     ] = None,
     testfield: Annotated[
-        str | None,
-        typer.Option("--testfield", help="A testfield.csv, or markers, circles, plain."),
+        str | None, typer.Option(help="A testfield.csv, or markers, circles, plain.")
     ] = None,
     programme: Annotated[
-        Path | None, typer.Option("--programme", help="What is done to the camera (YAML).")
+        Path | None, typer.Option(help="What is done to the camera (YAML).")
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="The recording to write.")] = None,
+    out: Annotated[Path | None, typer.Option(help="The recording to write.")] = None,
     frames: Annotated[
         bool, typer.Option("--frames", help="Render frames instead of measured image points.")
     ] = False,
     effect: Annotated[
-        list[Path] | None,
-        typer.Option("--effect", help="An effect file (YAML) to add, such as a proposal."),
+        list[Path] | None, typer.Option(help="An effect file (YAML) to add, such as a proposal.")
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of all random numbers.")] = 0,
-    series: Annotated[str, typer.Option("--series", help="Name of the series (preset).")] = "M1",
+    seed: SeedOption = 0,
+    series: Annotated[str, typer.Option(help="Name of the series (preset).")] = "M1",
     model_out: Annotated[
-        Path | None, typer.Option("--model-out", help="Also write the model that was simulated.")
+        Path | None, typer.Option(help="Also write the model that was simulated.")
     ] = None,
     list_: Annotated[bool, typer.Option("--list", help="List presets and effects.")] = False,
-    json: Annotated[
-        str | None, typer.Option("--json", help="Write a summary as JSON; - for standard output.")
-    ] = None,
+    json: JsonOption = None,
 ) -> None:
     """Simulate a camera that warms up, and write a recording of it.
 
     Example: thermocald simulate --preset rpi-v2.1-heating --out rpi-M1 --seed 1
     """
-    from thermocald.cli.common import progress, write_json
+    from thermocald.cli.common import progress, write_result
 
     if list_:
         _print_list(json)
@@ -79,9 +70,7 @@ def simulate(
 
         write_model(model_out, replace(simulation.model, exterior=simulation.exterior))
     summary = _summary(simulation, out)
-    if json is not None:
-        write_json(summary, json)
-    if json != "-":
+    if write_result(summary, json):
         drift = summary["drift"]
         typer.echo(
             f"{out}: {summary['epochs']} epochs, {summary['targets']} targets, "

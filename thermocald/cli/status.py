@@ -15,23 +15,17 @@ from typing import Annotated, Any
 
 import typer
 
-from thermocald.cli.common import default_config, write_json
+from thermocald.cli.common import default_config, write_result
 from thermocald.cli.options import JsonOption
 from thermocald.errors import DataError
 from thermocald.output.status_text import status_lines
 
-__all__ = ["keys", "read_status", "register"]
+__all__ = ["keys", "read_status", "status", "top"]
 
 ConfigOption = Annotated[
     Path | None, typer.Option("--config", "-c", help="The daemon's configuration.")
 ]
 StoreOption = Annotated[Path | None, typer.Option("--store", help="The daemon's store.")]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.command("status")(status)
-    app.command("top")(top)
 
 
 def status(config: ConfigOption = None, store: StoreOption = None, json: JsonOption = None) -> None:
@@ -40,9 +34,7 @@ def status(config: ConfigOption = None, store: StoreOption = None, json: JsonOpt
     Example: thermocald status --config /etc/thermocald/config.yaml
     """
     document = read_status(config, store)
-    if json is not None:
-        write_json(document, json)
-    if json != "-":
+    if write_result(document, json):
         for line in status_lines(document):
             typer.echo(line)
 
@@ -50,7 +42,7 @@ def status(config: ConfigOption = None, store: StoreOption = None, json: JsonOpt
 def top(
     config: ConfigOption = None,
     store: StoreOption = None,
-    interval: Annotated[float, typer.Option("--interval", min=0.2, help="s.")] = 1.0,
+    interval: Annotated[float, typer.Option(min=0.2, help="s.")] = 1.0,
 ) -> None:
     """The same, always up to date; q or Ctrl-C ends it.
 

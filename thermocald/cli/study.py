@@ -10,7 +10,14 @@ import typer
 
 from thermocald.atomic_file import make_folder
 from thermocald.cli.common import progress, write_json
-from thermocald.cli.options import DEFAULT_FREE_TEXT, ExteriorOption, FreeOption, free_names
+from thermocald.cli.options import (
+    DEFAULT_FREE_TEXT,
+    ExteriorOption,
+    FreeOption,
+    JsonOption,
+    SeedOption,
+    free_names,
+)
 from thermocald.errors import DataError, UsageError
 from thermocald.store.server.address import is_server
 from thermocald.store.sources import require_source
@@ -20,12 +27,7 @@ if TYPE_CHECKING:
     from thermocald.analysis.study.reference import Comparison
     from thermocald.analysis.study.study import Study, StudySettings
 
-__all__ = ["register"]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("study")(study)
+__all__ = ["study"]
 
 
 def study(
@@ -37,46 +39,32 @@ def study(
             "the label is the camera's name unless given.",
         ),
     ] = None,
-    json: Annotated[
-        str | None, typer.Option("--json", help="Write all numbers as JSON; - for standard output.")
-    ] = None,
-    report: Annotated[
-        Path | None, typer.Option("--report", help="Write the report, one HTML file.")
-    ] = None,
+    json: JsonOption = None,
+    report: Annotated[Path | None, typer.Option(help="Write the report, one HTML file.")] = None,
     figures: Annotated[
-        Path | None, typer.Option("--figures", help="Write all figures as SVG and PNG here.")
+        Path | None, typer.Option(help="Write all figures as SVG and PNG here.")
     ] = None,
-    title: Annotated[
-        str, typer.Option("--title", help="Of the report.")
-    ] = "Thermal study of a camera",
-    window: Annotated[
-        int, typer.Option("--window", min=3, help="Epochs in the F-test's window, odd.")
-    ] = 31,
-    alpha: Annotated[
-        float, typer.Option("--alpha", min=1e-6, max=0.5, help="Level of the F-test.")
-    ] = 0.05,
+    title: Annotated[str, typer.Option(help="Of the report.")] = "Thermal study of a camera",
+    window: Annotated[int, typer.Option(min=3, help="Epochs in the F-test's window, odd.")] = 31,
+    alpha: Annotated[float, typer.Option(min=1e-6, max=0.5, help="Level of the F-test.")] = 0.05,
     sets: Annotated[
-        int, typer.Option("--sets", min=2, help="Interior orientations drawn (Monte-Carlo).")
+        int, typer.Option(min=2, help="Interior orientations drawn (Monte-Carlo).")
     ] = 50_000,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of all random numbers.")] = 0,
-    distance: Annotated[
-        float, typer.Option("--distance", min=0.01, help="Of the object plane, m.")
-    ] = 10.0,
+    seed: SeedOption = 0,
+    distance: Annotated[float, typer.Option(min=0.01, help="Of the object plane, m.")] = 10.0,
     grid: Annotated[
         int,
         typer.Option("--grid", "--raster", min=2, max=9, help="Image points per row and column."),
     ] = 3,
     focus: Annotated[
-        float, typer.Option("--focus", min=0.01, help="Focus distance for the depth of field, m.")
+        float, typer.Option(min=0.01, help="Focus distance for the depth of field, m.")
     ] = 1.0,
-    f_number: Annotated[float, typer.Option("--f-number", min=0.1, help="Of the lens.")] = 2.0,
+    f_number: Annotated[float, typer.Option(min=0.1, help="Of the lens.")] = 2.0,
     confusion: Annotated[
-        float | None,
-        typer.Option("--confusion", min=1e-6, help="Circle of confusion, mm [diagonal/2000]."),
+        float | None, typer.Option(min=1e-6, help="Circle of confusion, mm [diagonal/2000].")
     ] = None,
     thermometer_sd: Annotated[
-        float | None,
-        typer.Option("--thermometer-sd", min=0.0, help="Noise of the thermometers, K [estimated]."),
+        float | None, typer.Option(min=0.0, help="Noise of the thermometers, K [estimated].")
     ] = None,
     exterior: ExteriorOption = "auto",
     free: FreeOption = DEFAULT_FREE_TEXT,

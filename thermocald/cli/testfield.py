@@ -9,14 +9,11 @@ from thermocald.cli.testfield_import import import_
 from thermocald.cli.testfield_print import print_
 from thermocald.cli.testfield_survey import survey
 
-__all__ = ["register"]
+__all__ = ["group"]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the group of commands."""
-    group = typer.Typer(help="Test fields: print, import, survey, check.", no_args_is_help=True)
-    group.command("print")(print_)
-    group.command("import")(import_)
-    group.command("survey")(survey)
-    group.command("check")(check)
-    app.add_typer(group, name="testfield")
+group = typer.Typer(help="Test fields: print, import, survey, check.", no_args_is_help=True)
+group.command("print")(print_)
+group.command("import")(import_)
+group.command("survey")(survey)
+group.command("check")(check)

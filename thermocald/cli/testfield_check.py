@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from thermocald.cli.common import say
+from thermocald.cli.options import JsonOption, PixelPitchOption
 from thermocald.cli.testfield_options import (
     CameraFile,
     Diameter,
     Flat,
-    Json,
     Landscape,
     Paper,
-    PixelPitch,
     design_of,
 )
 
@@ -43,20 +42,18 @@ def check(
     landscape: Landscape = None,
     diameter: Diameter = None,
     camera: CameraFile = None,
-    pixel_pitch: PixelPitch = None,
+    pixel_pitch: PixelPitchOption = None,
     place: Annotated[
         tuple[float, float, float] | None,
         typer.Option("--from", metavar="X Y Z", help="Where the camera stands, mm."),
     ] = None,
     at: Annotated[
         tuple[float, float, float] | None,
-        typer.Option("--at", metavar="X Y Z", help="What it looks at; default the field's middle."),
+        typer.Option(metavar="X Y Z", help="What it looks at; default the field's middle."),
     ] = None,
-    roll: Annotated[float, typer.Option("--roll", help="Turned about its axis, degrees.")] = 0.0,
-    sigma: Annotated[
-        float, typer.Option("--sigma", min=1e-4, help="Of an image coordinate, px.")
-    ] = 0.03,
-    json: Json = None,
+    roll: Annotated[float, typer.Option(help="Turned about its axis, degrees.")] = 0.0,
+    sigma: Annotated[float, typer.Option(min=1e-4, help="Of an image coordinate, px.")] = 0.03,
+    json: JsonOption = None,
 ) -> None:
     """Assess a test field: what a camera sees of it, how well it would be calibrated, what to add.
 
@@ -70,7 +67,7 @@ def check(
     import numpy as np
 
     from thermocald.analysis.field.check import check_field, station_at, usual_station
-    from thermocald.cli.common import write_json
+    from thermocald.cli.common import write_result
     from thermocald.output.testfield.layout import field_of, lay_out
     from thermocald.store.recording.testfield_file import read_testfield
 
@@ -89,9 +86,7 @@ def check(
         stand = station_at(np.array(place), look_at, np.radians(roll))
     result = check_field(model, targets, stand, sigma)
     document = _check_document(result, targets, model, sigma)
-    if json is not None:
-        write_json(document, json)
-    if json != "-":
+    if write_result(document, json):
         _show_check(result, targets, model, document["advice"])
 
 

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from thermocald.cli.options import JsonOption
 from thermocald.cli.testfield_options import (
     AprilGrid,
     Charuco,
     Chessboard,
     Dictionary,
-    Json,
     Legacy,
     MarkerSide,
     Spacing,
@@ -42,8 +42,7 @@ def import_(
     chessboard: Chessboard = None,
     aprilgrid: AprilGrid = None,
     rings: Annotated[
-        int | None,
-        typer.Option("--rings", help="FILE lists targets with ring codes of 12 or 14 bits."),
+        int | None, typer.Option(help="FILE lists targets with ring codes of 12 or 14 bits.")
     ] = None,
     square: Square = None,
     marker: MarkerSide = None,
@@ -51,13 +50,13 @@ def import_(
     dictionary: Dictionary = "DICT_5X5_1000",
     legacy: Legacy = False,
     diameter: Annotated[
-        float | None, typer.Option("--diameter", min=0.1, help="Of ring-coded discs, mm.")
+        float | None, typer.Option(min=0.1, help="Of ring-coded discs, mm.")
     ] = None,
     sigma: Annotated[
-        float | None, typer.Option("--sigma", min=1e-4, help="Of a coordinate, mm, if measured.")
+        float | None, typer.Option(min=1e-4, help="Of a coordinate, mm, if measured.")
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
-    json: Json = None,
+    json: JsonOption = None,
 ) -> None:
     """Make a testfield.csv of a board that you own: ChArUco, chessboard, AprilGrid, coded rings.
 

@@ -21,27 +21,19 @@ __all__ = [
     "Diameter",
     "Dictionary",
     "Flat",
-    "Json",
     "Landscape",
     "Legacy",
     "MarkerSide",
     "Paper",
-    "PixelPitch",
     "Spacing",
     "Square",
     "board_of",
     "design_of",
 ]
 
-Json = Annotated[
-    str | None, typer.Option("--json", help="Write the result as JSON; - for standard output.")
-]
 CameraFile = Annotated[
     Path | None,
     typer.Option("--camera", help="A camera file of any format that `camera convert` reads."),
-]
-PixelPitch = Annotated[
-    float | None, typer.Option("--pixel-pitch", help="Size of a pixel in mm.", min=1e-5, max=1.0)
 ]
 Paper = Annotated[str, typer.Option("--paper", help="A4, A3, A2, A1, A0, or WIDTHxHEIGHT in mm.")]
 Flat = Annotated[

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from thermocald.cli.common import say
+from thermocald.cli.options import JsonOption
 from thermocald.cli.testfield_options import (
     AprilGrid,
     Charuco,
@@ -16,7 +17,6 @@ from thermocald.cli.testfield_options import (
     Diameter,
     Dictionary,
     Flat,
-    Json,
     Landscape,
     Legacy,
     MarkerSide,
@@ -47,25 +47,20 @@ def print_(
     landscape: Landscape = None,
     diameter: Diameter = None,
     bits: Annotated[
-        int | None, typer.Option("--bits", help="Of the ring codes: 12, 14, or 0 for none.")
+        int | None, typer.Option(help="Of the ring codes: 12, 14, or 0 for none.")
     ] = None,
     plain: Annotated[
         bool, typer.Option("--plain/--no-plain", help="Plain circles between the coded ones.")
     ] = True,
     markers: Annotated[
-        str | None,
-        typer.Option("--markers", help="Markers too, of a dictionary: DICT_APRILTAG_36h11."),
+        str | None, typer.Option(help="Markers too, of a dictionary: DICT_APRILTAG_36h11.")
     ] = None,
-    marker_every: Annotated[
-        int, typer.Option("--marker-every", help="Every N-th place is a marker.")
-    ] = 5,
+    marker_every: Annotated[int, typer.Option(help="Every N-th place is a marker.")] = 5,
     light: Annotated[bool, typer.Option("--light", help="White targets on black.")] = False,
     first_code: Annotated[
-        int, typer.Option("--first-code", min=0, help="Skip so many codes: for a second field.")
+        int, typer.Option(min=0, help="Skip so many codes: for a second field.")
     ] = 0,
-    pitch: Annotated[
-        float | None, typer.Option("--pitch", help="Distance of the coded targets, mm.")
-    ] = None,
+    pitch: Annotated[float | None, typer.Option(help="Distance of the coded targets, mm.")] = None,
     charuco: Charuco = None,
     chessboard: Chessboard = None,
     aprilgrid: AprilGrid = None,
@@ -77,7 +72,7 @@ def print_(
     force: Annotated[
         bool, typer.Option("--force", help="Replace a test field that was printed before.")
     ] = False,
-    json: Json = None,
+    json: JsonOption = None,
 ) -> None:
     """Draw a test field: a PDF, an SVG per sheet, and the testfield.csv that belongs to it.
 

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from thermocald.cli.common import say
+from thermocald.cli.options import JsonOption, PhotosArgument, PixelPitchOption
 from thermocald.cli.testfield_options import (
     CameraFile,
-    Json,
-    PixelPitch,
 )
 from thermocald.errors import UsageError
 
@@ -26,34 +25,28 @@ _EOP = ("omega", "phi", "kappa", "X0", "Y0", "Z0")
 
 
 def survey(
-    photos: Annotated[
-        list[Path], typer.Argument(metavar="PHOTO…", help="Photographs, or folders of them.")
-    ],
+    photos: PhotosArgument,
     out: Annotated[Path, typer.Option("--out", "-o", help="The testfield.csv to write.")],
     scale: Annotated[
         tuple[str, str, float] | None,
-        typer.Option("--scale", metavar="A B MM", help="Two targets and their measured distance."),
+        typer.Option(metavar="A B MM", help="Two targets and their measured distance."),
     ] = None,
-    scale_sd: Annotated[
-        float, typer.Option("--scale-sd", min=1e-6, help="Its standard deviation, mm.")
-    ] = 0.1,
+    scale_sd: Annotated[float, typer.Option(min=1e-6, help="Its standard deviation, mm.")] = 0.1,
     distances: Annotated[
-        Path | None,
-        typer.Option("--distances", help="More of them, a CSV: a, b, length, sigma in mm."),
+        Path | None, typer.Option(help="More of them, a CSV: a, b, length, sigma in mm.")
     ] = None,
     field: Annotated[
-        Path | None,
-        typer.Option("--field", help="The nominal testfield.csv, as printed; for plain circles."),
+        Path | None, typer.Option(help="The nominal testfield.csv, as printed; for plain circles.")
     ] = None,
     camera: CameraFile = None,
     hold_camera: Annotated[
         bool, typer.Option("--hold-camera", help="Trust --camera and do not calibrate it again.")
     ] = False,
-    pixel_pitch: PixelPitch = None,
+    pixel_pitch: PixelPitchOption = None,
     camera_out: Annotated[
-        Path | None, typer.Option("--camera-out", help="Write the camera that was found (JSON).")
+        Path | None, typer.Option(help="Write the camera that was found (JSON).")
     ] = None,
-    json: Json = None,
+    json: JsonOption = None,
 ) -> None:
     """Measure a test field from photographs of it: coordinates and their standard deviations.
 
@@ -63,7 +56,7 @@ def survey(
     Example: thermocald testfield survey photos/ --field field/testfield.csv --scale R65 R89 340.12
     --out surveyed.csv
     """
-    from thermocald.cli.common import write_json
+    from thermocald.cli.common import write_result
     from thermocald.output import camera_files
     from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
     from thermocald.photogrammetry.survey.survey import survey as run
@@ -93,9 +86,7 @@ def survey(
         comment = f"self-calibration in the survey of {out.name}, sigma0 {network.sigma0:.2f}"
         camera_files.write(network.camera, camera_out, "json", network.interior_covariance, comment)
     document = _survey_document(result, out)
-    if json is not None:
-        write_json(document, json)
-    if json != "-":
+    if write_result(document, json):
         _show_survey(result, out, document["advice"])
 
 

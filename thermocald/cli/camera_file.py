@@ -1,0 +1,76 @@
+"""A camera as `--camera` names it: our own YAML, or a file of another program."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from thermocald.errors import ConfigurationError
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, InteriorOrientation, Sensor
+from thermocald.yaml_file import read_yaml
+
+__all__ = ["CameraFile", "read_camera"]
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFile:
+    """A camera as a YAML file describes it: sensor, nominal c mm, interior orientation if known."""
+
+    name: str
+    sensor: Sensor
+    principal_distance: float | None
+    interior: InteriorOrientation | None
+
+
+def read_camera(path: Path, pixel_pitch: float | None = None) -> CameraFile:
+    """Read a camera file: name, width, height, pixel_pitch, principal_distance, interior.
+
+    With `interior:` (c, x0, y0 mm, A1 … C2; CONVENTIONS §2) the camera counts as calibrated. A file
+    of another program (OpenCV, ROS, Metashape, …) is read as what it is; pixel_pitch: mm, where it
+    does not say it.
+    """
+    from thermocald.output import camera_files
+
+    if camera_files.recognised(path) is not None:
+        found = camera_files.read(path, pixel_pitch=pixel_pitch)
+        model = found.model
+        return CameraFile(found.name, model.sensor, model.interior.c, model.interior)
+    document = read_yaml(path, ConfigurationError)
+    if not isinstance(document, dict):
+        raise ConfigurationError(f"{path}: is not a camera file; it must hold `width: …` and so on")
+    camera = document.get("camera", document)
+
+    def number(key: str, required: bool = True) -> float | None:
+        value = camera.get(key)
+        if value is None and not required:
+            return None
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < 1e5:
+            raise ConfigurationError(
+                f"{path}: {key} must be a number above 0 and below 100000, it is {str(value)[:40]}"
+            )
+        return float(value)
+
+    width, height, pitch = number("width"), number("height"), number("pixel_pitch")
+    assert width is not None
+    assert height is not None
+    assert pitch is not None
+    nominal = number("principal_distance", required=False)
+    interior = None
+    given = camera.get("interior")
+    if given is not None:
+        unknown = set(given) - set(IOP_NAMES) if isinstance(given, dict) else {str(given)}
+        if unknown or "c" not in given:
+            raise ConfigurationError(
+                f"{path}: interior must hold c and any of {', '.join(IOP_NAMES[1:])}"
+                + (f"; {min(unknown)!r} is none of them" if unknown else "")
+            )
+        try:
+            interior = InteriorOrientation(**{k: float(v) for k, v in given.items()})
+        except (TypeError, ValueError) as error:
+            raise ConfigurationError(f"{path}: interior: {error}") from error
+    return CameraFile(
+        str(camera.get("name", path.stem)),
+        Sensor(int(width), int(height), pitch),
+        nominal,
+        interior,
+    )

@@ -22,6 +22,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from thermocald.analysis.camera.state import CameraState
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.analysis.thermal.thermal_model import FittedModel, fit_thermal_model
 from thermocald.reduction.reduce import reduce_series
@@ -69,6 +70,15 @@ def use(model: FittedModel) -> bool:
         for _ in range(100):
             camera.at(35.0)
         took.append((time.thread_time() - begin) / 100)
+    ratio = undistorting(state)
+    print(
+        f"at: {min(took) * 1e6:.0f} µs; undistorting 1 M points: {ratio:.2f} × cv2.undistortPoints"
+    )
+    return min(took) <= 50e-6 and ratio <= 2.0
+
+
+def undistorting(state: CameraState) -> float:
+    """Time to undistort a million points over cv2.undistortPoints's, which stops earlier."""
     points = np.random.default_rng(0).uniform([0, 0], [3279, 2463], (1_000_000, 2))
     i, p = state.interior, state.sensor.pixel_pitch
     K = np.array([[i.c / p, 0, 3279 / 2 + i.x0 / p], [0, i.c / p, 2463 / 2 - i.y0 / p], [0, 0, 1]])
@@ -81,11 +91,7 @@ def use(model: FittedModel) -> bool:
         cv2.undistortPoints(points[:, None], K, D)
         ours.append(middle - begin)
         theirs.append(time.thread_time() - middle)
-    ratio = min(ours) / min(theirs)
-    print(
-        f"at: {min(took) * 1e6:.0f} µs; undistorting 1 M points: {ratio:.2f} × cv2.undistortPoints"
-    )
-    return min(took) <= 50e-6 and ratio <= 2.0
+    return min(ours) / min(theirs)
 
 
 def main() -> int:

@@ -6,20 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.montecarlo import CORRELATION, IOP, SDS, SENSOR
 from thermocald.analysis.camera.image_grid import image_grid
 from thermocald.analysis.study import montecarlo
 from thermocald.analysis.study.montecarlo import draw_root, plane_errors, simulate_errors
 from thermocald.analysis.study.object_plane import on_plane, plane_jacobian, propagate
 from thermocald.errors import GeometryError
-from thermocald.photogrammetry.camera.camera_model import Sensor
-
-SENSOR = Sensor(3264, 2448, 0.0014)
-IOP = np.array([3.97, 0.021, -0.034, 0.0051, -4e-4, 1e-5, 1.2e-4, -0.9e-4, 0.0, 0.0])
-SDS = np.array([0.0018, 0.005, 0.0028, 2e-5, 2e-6, 1e-7, 5e-6, 5e-6, 0.0, 0.0])
-CORRELATION = np.eye(10)
-CORRELATION[3, 4] = CORRELATION[4, 3] = CORRELATION[4, 5] = CORRELATION[5, 4] = -0.9
-CORRELATION[3, 5] = CORRELATION[5, 3] = 0.8
-CORRELATION[1, 6] = CORRELATION[6, 1] = 0.6
 
 
 def opencv_distances(sets, points, distance_mm):

@@ -24,6 +24,7 @@ from thermocald.simulation.demonstration import demonstration_field, demonstrati
 from thermocald.simulation.model_file import write_model
 from thermocald.simulation.testfields import corner_field
 from thermocald.store.database.store import Store
+from thermocald.store.recording.head import Head
 from thermocald.store.recording.reader import CameraSpec, Channel, write_recording
 
 ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
@@ -201,12 +202,9 @@ def make_recording(
             reading = {"temperature": round(temperature * 16) / 16}
             yield Epoch(k + 1, time_s, time_s + 0.001, reading, observations=seen)
 
-    write_recording(
-        path, name="small", series="M1", interval=interval,
-        camera=CameraSpec("rpi", model.sensor, 3.04),
-        channels={"temperature": Channel("degC", 0.0625)},
-        testfield=field, epochs=generate(),
-    )  # fmt: skip
+    channels = {"temperature": Channel("degC", 0.0625)}
+    head = Head("small", "M1", interval, CameraSpec("rpi", model.sensor, 3.04), channels)
+    write_recording(path, head, field, generate())
     return path
 
 

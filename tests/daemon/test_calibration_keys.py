@@ -14,6 +14,7 @@ from tests.daemon.conftest import ENVIRONMENT, fast_run, make_recording
 from thermocald.config import CalibrationConfig
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.store.database.store import Store
+from thermocald.store.recording.head import Head
 from thermocald.store.recording.reader import read_recording, write_recording
 
 EPOCHS = 24
@@ -45,10 +46,8 @@ def stored(tmp_path_factory):
             yield replace(epoch, observations=replace(epoch.observations, points=points))
 
     path = folder / "spoilt"
-    write_recording(
-        path, name="spoilt", series="M1", interval=10.0, camera=taken.camera,
-        channels=taken.channels, testfield=field, epochs=spoilt(),
-    )  # fmt: skip
+    head = Head("spoilt", "M1", 10.0, taken.camera, taken.channels)
+    write_recording(path, head, field, spoilt())
     sensor = taken.camera.sensor
     camera = {
         "driver": "replay", "recording": str(path), "testfield": str(path / "testfield.csv"),

@@ -14,6 +14,7 @@ from tests.daemon.conftest import ENVIRONMENT, fast_run, make_recording
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.simulation.demonstration import demonstration_field, demonstration_model
 from thermocald.store.database.store import Store
+from thermocald.store.recording.head import Head
 from thermocald.store.recording.reader import read_recording, write_recording
 
 EPOCHS, WHEN = 70, 41
@@ -47,10 +48,8 @@ def store(tmp_path_factory):
     cameras = []
     for name in HAPPENS:
         path = folder / f"{name}-recording"
-        write_recording(
-            path, name=name, series="M1", interval=10.0, camera=taken.camera,
-            channels=taken.channels, testfield=field, epochs=changed(name),
-        )  # fmt: skip
+        head = Head(name, "M1", 10.0, taken.camera, taken.channels)
+        write_recording(path, head, field, changed(name))
         cameras.append({
             "name": name, "driver": "replay", "recording": str(path),
             "testfield": str(path / "testfield.csv"), "principal_distance_mm": 3.04,

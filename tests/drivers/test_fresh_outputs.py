@@ -115,21 +115,14 @@ ZONES = {
 }
 
 
-@pytest.mark.parametrize("case", HWMON)
-def test_hwmon(case, tmp_path):
-    files, expected = HWMON[case]
-    Sysfs(tmp_path).hwmon(0, "chip", **files)
+@pytest.mark.parametrize(
+    ("driver", "case"), [*(("hwmon", case) for case in HWMON), *(("iio", case) for case in IIO)]
+)
+def test_hwmon_and_iio(driver, case, tmp_path):
+    files, expected = {"hwmon": HWMON, "iio": IIO}[driver][case]
+    getattr(Sysfs(tmp_path), driver)(0, "chip", **files)
     stanza = {"chip": "chip", "sysfs": str(tmp_path)}
-    with open_device("thermometer", "hwmon", stanza, VirtualClock()) as device:
-        assert result(lambda: device.read().values["temperature"]) == expected
-
-
-@pytest.mark.parametrize("case", IIO)
-def test_iio(case, tmp_path):
-    files, expected = IIO[case]
-    Sysfs(tmp_path).iio(0, "chip", **files)
-    stanza = {"chip": "chip", "sysfs": str(tmp_path)}
-    with open_device("thermometer", "iio", stanza, VirtualClock()) as device:
+    with open_device("thermometer", driver, stanza, VirtualClock()) as device:
         assert result(lambda: device.read().values["temperature"]) == expected
 
 

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.photogrammetry.printed_sheets import rasterised
 from thermocald.analysis.field.check import usual_station
 from thermocald.errors import UsageError
 from thermocald.output.testfield.layout import TRIM, Design, field_of, lay_out, paper_size
@@ -24,13 +25,7 @@ MM = DPI / 25.4  # px
 
 def rasterise(pdf, page=0, dpi=DPI):
     """One page as a grey image (H, W)."""
-    pdfium = pytest.importorskip("pypdfium2")
-    document = pdfium.PdfDocument(pdf)
-    try:
-        bitmap = document[page].render(scale=dpi / 72, grayscale=True)
-        return bitmap.to_numpy().copy().reshape(bitmap.height, bitmap.width)
-    finally:
-        document.close()
+    return rasterised(pdf, page, dpi)
 
 
 def page_px(field, rows, page, image):

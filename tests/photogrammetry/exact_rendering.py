@@ -159,12 +159,16 @@ def noisy(image: np.ndarray, rng: np.random.Generator, sd: float = 2.0) -> np.nd
     return np.clip(np.rint(image + rng.normal(0, sd, image.shape)), 0, 255).astype(np.uint8)
 
 
-def look_at(centre, target, roll: float = 0.0) -> ExteriorOrientation:
-    """A camera at `centre` that looks at `target`; roll in rad about the viewing axis."""
+def look_at(
+    centre, target, roll: float = 0.0, up=(0.0, 0.0, 1.0), else_up=(0.0, 1.0, 0.0), nearly=0.99
+) -> ExteriorOrientation:
+    """A camera at `centre` that looks at `target`; roll in rad about the viewing axis.
+
+    up: what is up in the image, `else_up` where the view is along it: cosine above `nearly`.
+    """
     z = np.asarray(centre, dtype=float) - target
     z /= np.linalg.norm(z)
-    up = np.array([0.0, 0.0, 1.0]) if abs(z[2]) < 0.99 else np.array([0.0, 1.0, 0.0])
-    x = np.cross(up, z)
+    x = np.cross(up if abs(np.dot(up, z)) < nearly else else_up, z)
     x /= np.linalg.norm(x)
     y = np.cross(z, x)
     c, s = np.cos(roll), np.sin(roll)

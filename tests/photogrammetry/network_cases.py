@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from tests.photogrammetry.exact_rendering import look_at
 from thermocald.photogrammetry.camera.camera_model import (
     CameraModel,
-    ExteriorOrientation,
     InteriorOrientation,
     Sensor,
 )
@@ -31,16 +31,7 @@ def bent_sheet(nx=12, ny=9, size=(800.0, 560.0), sag=6.0):
 
 def looking_at(centre, target, roll):
     """The orientation of a camera at `centre` that looks at `target`, turned by `roll` rad."""
-    z = np.asarray(centre, float) - target
-    z /= np.linalg.norm(z)
-    up = np.array([0.0, 1.0, 0.0]) if abs(z[1]) < 0.95 else np.array([1.0, 0.0, 0.0])
-    x = np.cross(up, z)
-    x /= np.linalg.norm(x)
-    y = np.cross(z, x)
-    c, s = np.cos(roll), np.sin(roll)
-    return ExteriorOrientation.from_rotation(
-        np.column_stack([c * x + s * y, -s * x + c * y, z]), centre
-    )
+    return look_at(centre, target, roll, up=(0.0, 1.0, 0.0), else_up=(1.0, 0.0, 0.0), nearly=0.95)
 
 
 def convergent_stations(field, n=12, distance=950.0, tilt=0.66, rolled=True):

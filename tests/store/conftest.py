@@ -56,16 +56,7 @@ def make_epoch():
 @pytest.fixture
 def recording_path(tmp_path: Path, field: TestField, head: Head, make_epoch) -> Path:
     path = tmp_path / "small"
-    write_recording(
-        path,
-        name=head.name,
-        series=head.series,
-        interval=head.interval,
-        camera=head.camera,
-        channels=head.channels,
-        testfield=field,
-        epochs=[make_epoch(i) for i in range(1, 6)],
-    )
+    write_recording(path, head, field, [make_epoch(i) for i in range(1, 6)])
     return path
 
 

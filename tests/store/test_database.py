@@ -200,16 +200,8 @@ def test_a_failed_epoch_leaves_nothing(filled, make_epoch, make_result):
 
 def test_store_to_recording_and_back(filled, tmp_path, field):
     store, series = filled
-    write_recording(
-        tmp_path / "r",
-        name=series.head.name,
-        series=series.name,
-        interval=series.head.interval,
-        camera=series.head.camera,
-        channels=series.head.channels,
-        testfield=series.testfield,
-        epochs=(stored.epoch for stored in store.epochs(series)),
-    )
+    epochs = (stored.epoch for stored in store.epochs(series))
+    write_recording(tmp_path / "r", series.head, series.testfield, epochs)
     stored = [s.epoch.observations for s in store.epochs(series)]
     for epoch, seen in zip(read_recording(tmp_path / "r").epochs, stored, strict=True):
         assert np.array_equal(epoch.observations.points, seen.points)

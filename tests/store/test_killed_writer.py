@@ -132,16 +132,7 @@ def test_a_recording_on_a_full_disk_leaves_nothing(tmp_path, head, field, make_e
     from thermocald.store.recording.reader import write_recording
 
     with pytest.raises(RecordingError, match="cannot be written"):
-        write_recording(
-            tmp_path / "r",
-            name="r",
-            series="M1",
-            interval=1.0,
-            camera=head.camera,
-            channels=head.channels,
-            testfield=field,
-            epochs=map(make_epoch, range(10_000)),
-        )
+        write_recording(tmp_path / "r", head, field, map(make_epoch, range(10_000)))
     assert list(tmp_path.iterdir()) == []
 
 

@@ -153,16 +153,7 @@ def test_a_failing_source_leaves_nothing(tmp_path, field, head, make_epoch):
         raise RuntimeError("the simulation failed")
 
     with pytest.raises(RuntimeError):
-        write_recording(
-            tmp_path / "r",
-            name="r",
-            series="M1",
-            interval=1.0,
-            camera=head.camera,
-            channels=head.channels,
-            testfield=field,
-            epochs=epochs(),
-        )
+        write_recording(tmp_path / "r", head, field, epochs())
     assert list(tmp_path.iterdir()) == []
 
 
@@ -175,11 +166,8 @@ def test_an_existing_recording_is_not_overwritten(recording_path, field, head):
 
 def test_writer_refuses_numbers_that_do_not_increase(tmp_path, field, head, make_epoch):
     epochs = [make_epoch(2), make_epoch(1)]
-    spec = {"name": "r", "series": "M1", "interval": 1.0, "camera": head.camera}
     with pytest.raises(RecordingError, match="epoch 1 comes after 2"):
-        write_recording(
-            tmp_path / "r", **spec, channels=head.channels, testfield=field, epochs=epochs
-        )
+        write_recording(tmp_path / "r", head, field, epochs)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -204,16 +192,7 @@ def test_real_recordings_are_read_and_survive_a_round_trip(shared, tmp_path, cam
     assert sum(len(epoch.observations) for epoch in recording.epochs) == rows
     assert np.isnan(temperature_at_frame(recording.epochs)).all()  # none was measured
     copy = tmp_path / "copy"
-    write_recording(
-        copy,
-        name=recording.name,
-        series=recording.series,
-        interval=recording.interval,
-        camera=recording.camera,
-        channels=recording.channels,
-        testfield=recording.testfield,
-        epochs=recording.epochs,
-    )
+    write_recording(copy, recording.head, recording.testfield, recording.epochs)
     for a, b in zip(read_recording(copy).epochs, recording.epochs, strict=True):
         assert same(a.observations, b.observations)
         assert a.frame_time == b.frame_time

@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image
 
+from tests.drivers.fakes.line_server import LineServer
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -123,40 +125,19 @@ class FakePhone:
         return answers.get(command, "")
 
 
-class AdbServer:
+class AdbServer(LineServer):
     """`phones` by serial number; `listing` in place of theirs, as `adb devices` prints it."""
 
     def __init__(self) -> None:
         self.phones: dict[str, FakePhone] = {}
         self.listing: str | None = None
-        self._server = socket.create_server(("127.0.0.1", 0))
-        self.port = self._server.getsockname()[1]
-        self._lines: list[socket.socket] = []
-        self._threads = [threading.Thread(target=self._accept, name="adb")]
-        self._threads[0].start()
+        super().__init__("adb")
 
     def close(self) -> None:
         for phone in self.phones.values():
             if phone.hang is not None:
                 phone.hang.set()
-        self._server.shutdown(socket.SHUT_RDWR)
-        self._server.close()
-        for line in self._lines:
-            with contextlib.suppress(OSError):
-                line.shutdown(socket.SHUT_RDWR)
-        for thread in self._threads:
-            thread.join(2.0)
-
-    def _accept(self) -> None:
-        while True:
-            try:
-                line, _ = self._server.accept()
-            except OSError:
-                return
-            self._lines.append(line)
-            thread = threading.Thread(target=self._serve, args=(line,), name="adb-line")
-            self._threads.append(thread)
-            thread.start()
+        super().close()
 
     def _serve(self, line: socket.socket) -> None:
         with line, contextlib.suppress(OSError, ValueError, struct.error):

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import socket
 import ssl
-import threading
+
+from tests.drivers.fakes.line_server import LineServer
 
 
-class Broker:
+class Broker(LineServer):
     """`messages` holds (topic, payload, retain); the will of a line that broke is in it too."""
 
     def __init__(self, port: int = 0, context: ssl.SSLContext | None = None) -> None:
@@ -20,22 +21,7 @@ class Broker:
         self.acknowledge = True
         self.answer_connect = True
         self.credentials: tuple[str, str] | None = None
-        self._server = socket.create_server(("127.0.0.1", port))
-        self.port = self._server.getsockname()[1]
-        self._lines: list[socket.socket] = []
-        self._threads = [threading.Thread(target=self._accept, name="broker")]
-        self._threads[0].start()
-
-    def _accept(self) -> None:
-        while True:
-            try:
-                line, _ = self._server.accept()
-            except OSError:
-                return
-            self._lines.append(line)
-            thread = threading.Thread(target=self._serve, args=(line,), name="broker-line")
-            self._threads.append(thread)
-            thread.start()
+        super().__init__("broker", port)
 
     def _serve(self, line: socket.socket) -> None:
         will: tuple[str, bytes, bool] | None = None
@@ -100,20 +86,3 @@ class Broker:
                 return None
             body += piece
         return head[0] >> 4, head[0] & 15, body
-
-    def drop(self) -> None:
-        """Every line breaks, as when the network goes away."""
-        for line in self._lines:
-            try:
-                line.shutdown(socket.SHUT_RDWR)
-            except OSError:
-                continue
-
-    def close(self) -> None:
-        if self._server.fileno() < 0:
-            return
-        self._server.shutdown(socket.SHUT_RDWR)
-        self._server.close()
-        self.drop()
-        for thread in self._threads:
-            thread.join(2.0)

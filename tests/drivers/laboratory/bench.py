@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -27,3 +28,51 @@ class Bench:
     unplug: Callable[[], None]
     plug: Callable[[], None]
     clock: Clock = field(default_factory=VirtualClock)
+
+
+def on_i2c(chip_name: str):
+    """The laboratory of a chip on a fake SMBus adapter: one of `fakes.chips`."""
+
+    @contextmanager
+    def thermometer(tmp_path, monkeypatch):
+        import smbus2
+
+        from tests.drivers.fakes.chips import CHIPS
+        from tests.drivers.fakes.smbus import Bus
+
+        bus = Bus()
+        monkeypatch.setattr(smbus2, "SMBus", bus)
+        address, chip, _ = CHIPS[chip_name]
+        bus.chips[address] = chip()
+        yield Bench(
+            {"bus": 1, "address": address},
+            unplug=bus.chips.clear,
+            plug=lambda: bus.chips.update({address: chip()}),
+        )
+
+    return thermometer
+
+
+def on_pins(options: dict[str, Any]):
+    """The laboratory of an output on gpiozero's mock pins."""
+
+    @contextmanager
+    def output(tmp_path, monkeypatch):
+        import gpiozero
+        from gpiozero.pins.mock import MockFactory
+
+        pins = MockFactory()
+        monkeypatch.setattr(gpiozero.Device, "pin_factory", pins)
+
+        def none(*_args):
+            raise gpiozero.BadPinFactory("no pins here")
+
+        monkeypatch.setattr(gpiozero.Device, "_default_pin_factory", staticmethod(none))
+        yield Bench(
+            options,
+            unplug=lambda: setattr(gpiozero.Device, "pin_factory", None),
+            plug=lambda: setattr(gpiozero.Device, "pin_factory", pins),
+        )
+        pins.close()
+
+    return output

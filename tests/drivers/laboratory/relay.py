@@ -1,29 +1,5 @@
 """gpiozero's mock pins; unplugging takes the pins away from the machine."""
 
-from __future__ import annotations
+from tests.drivers.laboratory.bench import on_pins
 
-from contextlib import contextmanager
-
-import gpiozero
-from gpiozero.pins.mock import MockFactory
-
-from tests.drivers.laboratory.bench import Bench
-
-PROGRAMME = [{"seconds": 1000, "hold_c": 45.0}]
-
-
-@contextmanager
-def output(tmp_path, monkeypatch):
-    pins = MockFactory()
-    monkeypatch.setattr(gpiozero.Device, "pin_factory", pins)
-
-    def none(*_args):
-        raise gpiozero.BadPinFactory("no pins here")
-
-    monkeypatch.setattr(gpiozero.Device, "_default_pin_factory", staticmethod(none))
-    yield Bench(
-        {"pin": 27, "limit_c": 60, "programme": PROGRAMME},
-        unplug=lambda: setattr(gpiozero.Device, "pin_factory", None),
-        plug=lambda: setattr(gpiozero.Device, "pin_factory", pins),
-    )
-    pins.close()
+output = on_pins({"pin": 27, "limit_c": 60, "programme": [{"seconds": 1000, "hold_c": 45.0}]})

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Self
 
 from thermocald.atomic_file import cannot_write
 from thermocald.errors import RecordingError
-from thermocald.store.recording.head import CameraSpec, Channel, Head, head_yaml
+from thermocald.store.recording.head import Head, head_yaml
 from thermocald.store.recording.testfield_file import testfield_csv
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable
     from pathlib import Path
     from typing import Any, TextIO
 
@@ -191,22 +191,12 @@ class RecordingWriter:
 
 
 def write_recording(
-    path: Path,
-    *,
-    name: str,
-    series: str,
-    interval: float,
-    camera: CameraSpec,
-    channels: Mapping[str, Channel],
-    testfield: TestField,
-    epochs: Iterable[Epoch],
-    extra: Mapping[str, Any] | None = None,
+    path: Path, head: Head, testfield: TestField, epochs: Iterable[Epoch]
 ) -> None:
     """Write a recording from an iterable of epochs, as a stream; frames are copied.
 
     Raises RecordingError if `path` exists, or the disk is full; then nothing is left behind.
     """
-    head = Head(name, series, interval, camera, channels, extra or {})
     with RecordingWriter(path, head, testfield) as writer:
         for epoch in epochs:
             writer.append(epoch)

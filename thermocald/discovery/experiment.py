@@ -19,12 +19,9 @@ from thermocald.simulation.history import History
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.simulation.effects import Effect
     from thermocald.simulation.effects.parameter import Parameter
-
-    Array = NDArray[np.float64]
 
 __all__ = ["Body", "Experiment", "Limits", "body_of", "experiments"]
 

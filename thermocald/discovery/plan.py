@@ -29,13 +29,10 @@ from thermocald.simulation.model import ModelEffect
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.reduction.candidate import Candidate
     from thermocald.simulation.history import History
     from thermocald.simulation.observations import Simulation
-
-    Array = NDArray[np.float64]
 
 __all__ = ["Plan", "SetUp", "plan_power", "set_ups"]
 

@@ -16,12 +16,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.reduction.fit import HypothesisFitter
     from thermocald.reduction.hypothesis import Fit
-
-    Array = NDArray[np.float64]
 
 __all__ = ["Adequacy", "examine"]
 

@@ -17,11 +17,8 @@ from thermocald.reduction.fit import HypothesisFitter
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.reduction.series import ReducedSeries
-
-    Array = NDArray[np.float64]
 
 __all__ = ["calibrated_thermometers"]
 

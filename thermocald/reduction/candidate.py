@@ -14,12 +14,9 @@ from thermocald.simulation import effects as catalogue
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.reduction.series import ReducedSeries
     from thermocald.simulation.effects import Effect
-
-    Array = NDArray[np.float64]
 
 __all__ = ["Candidate", "candidate_of"]
 

@@ -26,11 +26,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array, Index
     from thermocald.photogrammetry.series.blocks import ObservationBlocks
     from thermocald.reduction.series import SeriesInput
-
-    Array = NDArray[np.float64]
-    Index = NDArray[np.int64]
 
 __all__ = ["condensed", "rows_at_most"]
 

@@ -15,13 +15,10 @@ import numpy as np
 from thermocald.photogrammetry.camera.camera_model import project
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.reduction.fit import HypothesisFitter
     from thermocald.reduction.hypothesis import Fit
     from thermocald.reduction.series import ReducedSeries
-
-    Array = NDArray[np.float64]
 
 __all__ = ["curved", "relinearised"]
 

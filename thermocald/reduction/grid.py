@@ -13,12 +13,9 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.reduction.series import ReducedSeries
     from thermocald.simulation.effects.parameter import Parameter
-
-    Array = NDArray[np.float64]
 
 __all__ = ["trial_values"]
 

@@ -14,10 +14,7 @@ from thermocald.photogrammetry.linalg import MAD_TO_SD
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
-    Mask = NDArray[np.bool_]
+    from thermocald.arrays import Array, Mask
 
 __all__ = ["outlying", "spikes"]
 

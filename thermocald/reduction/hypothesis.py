@@ -19,10 +19,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.reduction.likelihood import NormalEquations, Weighting
     from thermocald.simulation.effects import Effect
-
-    Array = NDArray[np.float64]
 
 __all__ = ["BASE", "Block", "Fit", "Term", "known_term"]
 

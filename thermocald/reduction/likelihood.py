@@ -26,11 +26,8 @@ import numpy as np
 from thermocald.reduction.sums import Sums, sums_of
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.reduction.series import ReducedSeries
-
-    Array = NDArray[np.float64]
 
 __all__ = ["NormalEquations", "ReadingErrorTerm", "Weighting", "prepare", "with_error_term"]
 

@@ -23,12 +23,9 @@ from thermocald.reduction.random_effects import Movement, waves
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.reduction.hypothesis import Fit, Term
     from thermocald.reduction.series import ReducedSeries
-
-    Array = NDArray[np.float64]
 
 __all__ = ["Mount", "combinations", "estimated", "first_guess", "steadied"]
 

@@ -23,11 +23,10 @@ from thermocald.reduction.random_effects import waves
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.reduction.fit import HypothesisFitter
     from thermocald.reduction.hypothesis import Block, Fit
     from thermocald.reduction.series import ReducedSeries
-
-    Array = NDArray[np.float64]
 
 __all__ = ["jumps", "noisier", "slow_together", "trembling", "with_correlated_noise", "with_jumps"]
 

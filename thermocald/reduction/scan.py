@@ -14,13 +14,10 @@ from thermocald.reduction.hypothesis import BASE
 from thermocald.reduction.series import COLUMNS
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.reduction.candidate import Candidate
     from thermocald.reduction.fit import HypothesisFitter
     from thermocald.reduction.hypothesis import Fit
-
-    Array = NDArray[np.float64]
 
 __all__ = ["Scan", "Scanner"]
 

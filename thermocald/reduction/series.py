@@ -21,13 +21,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.series.normals import ObservationGrid, Partials
     from thermocald.reduction.random_effects import HiddenTargets, Movement
     from thermocald.reduction.thermometer import Thermometer
-
-    Array = NDArray[np.float64]
 
 __all__ = ["COLUMNS", "FIELD_SCALES", "Blocks", "ReducedSeries", "SeriesInput", "solve"]
 

@@ -21,14 +21,13 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.store.database.row import StoredSeries
     from thermocald.store.database.series_reader import SeriesReader
     from thermocald.store.recording.head import Head
     from thermocald.store.recording.reader import Recording
-
-    Array = NDArray[np.float64]
 
 __all__ = ["epochs_input", "load_series", "measured_epochs", "series_input"]
 

@@ -22,11 +22,10 @@ from thermocald.errors import ConfigurationError
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
+    from thermocald.arrays import Array
     from thermocald.simulation.quantities import QuantityReader
-
-    Array = NDArray[np.float64]
 
 __all__ = ["Course", "read_course"]
 

@@ -14,13 +14,11 @@ from thermocald.simulation import effects
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    import numpy as np
-    from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
+    from thermocald.arrays import Array
     from thermocald.simulation.history import History
 
-    Array = NDArray[np.float64]
     Drives = Sequence[tuple[str, Mapping[str, Any]]]
 
 __all__ = ["drive", "drive_matrix", "driven_history"]

@@ -23,12 +23,11 @@ from thermocald.errors import ConfigurationError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
+    from thermocald.arrays import Array
     from thermocald.simulation.course import Course
     from thermocald.simulation.quantities import QuantityReader
-
-    Array = NDArray[np.float64]
 
 __all__ = ["HeatNetwork", "Link", "read_network"]
 

@@ -22,12 +22,11 @@ from thermocald.simulation.operators import interpolation_matrix
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
     from scipy.sparse import csr_array
 
+    from thermocald.arrays import Array
     from thermocald.epoch import Epoch
-
-    Array = NDArray[np.float64]
 
 __all__ = ["History", "Polygon"]
 

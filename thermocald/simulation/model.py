@@ -28,12 +28,9 @@ from thermocald.simulation.effects.influence import Displacement, Influence
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.simulation.history import History
-
-    Array = NDArray[np.float64]
 
 __all__ = ["RATED", "ModelEffect", "Prediction", "ThermalModel"]
 

@@ -32,11 +32,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.simulation.device import CameraDevice
     from thermocald.simulation.model import Prediction, ThermalModel
     from thermocald.simulation.programme import Programme
-
-    Array = NDArray[np.float64]
 
 __all__ = ["Simulation"]
 

@@ -32,9 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = ["PROGRAMME_FORMAT", "Programme", "read_programme"]
 

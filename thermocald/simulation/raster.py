@@ -17,7 +17,8 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
+
     Integers = NDArray[np.int64]
 
 __all__ = ["Windows", "blur", "coverage", "windows_around"]

@@ -20,9 +20,9 @@ from thermocald.simulation.portable import sin_cos
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
 
-    Array = NDArray[np.float64]
     Integers = NDArray[np.int64]
 
 __all__ = ["Outlines", "outlines", "surface_normals"]

@@ -7,7 +7,7 @@ principal point from the orientation (Luhmann et al. 2014, section 7.3).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -15,11 +15,6 @@ from thermocald.errors import ConfigurationError
 from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.targets import ring_code
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
 
 __all__ = ["corner_field", "corner_view"]
 

@@ -10,11 +10,8 @@ import numpy as np
 from thermocald.simulation.operators import lag
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.simulation.quantities import QuantityReader
-
-    Array = NDArray[np.float64]
 
 __all__ = ["SimulatedThermometer", "read_thermometer"]
 

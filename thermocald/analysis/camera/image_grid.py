@@ -7,11 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
-
-    Array = NDArray[np.float64]
 
 __all__ = ["image_grid"]
 

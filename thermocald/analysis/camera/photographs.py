@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import (
         ExteriorOrientation,
         InteriorOrientation,
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
     )
     from thermocald.photogrammetry.epoch.adjustment import Adjustment, AdjustmentSettings
     from thermocald.photogrammetry.field.testfield import Observations, TestField
-
-    Array = NDArray[np.float64]
 
 __all__ = ["PhotographResult", "Photographs", "calibrate_observations", "calibrate_photographs"]
 

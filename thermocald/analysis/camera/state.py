@@ -18,11 +18,10 @@ from thermocald.photogrammetry.camera.camera_model import (
 )
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation, Sensor
-
-    Array = NDArray[np.float64]
 
 __all__ = ["CameraState"]
 

@@ -17,11 +17,10 @@ from thermocald.photogrammetry.camera.camera_model import rays
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
-
-    Array = NDArray[np.float64]
 
 __all__ = ["ideal_points", "undistorted_points"]
 

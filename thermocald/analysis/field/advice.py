@@ -9,12 +9,9 @@ import numpy as np
 from thermocald.analysis.field.check import CELLS, MIN_SIZE_PX, FieldCheck, precision
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import CameraModel, ExteriorOrientation
     from thermocald.photogrammetry.field.testfield import TestField
-
-    Array = NDArray[np.float64]
 
 __all__ = ["advise"]
 

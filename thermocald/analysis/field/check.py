@@ -32,9 +32,8 @@ from thermocald.photogrammetry.targets.outline import local_maps
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
-
-    Array = NDArray[np.float64]
 
 __all__ = ["CELLS", "FREE", "FieldCheck", "Precision", "check_field", "precision", "usual_station"]
 

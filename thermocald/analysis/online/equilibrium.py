@@ -14,9 +14,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = ["Approach", "Equilibrium", "EquilibriumWatch", "GivenInterior", "fit_approach", "slope"]
 

@@ -23,13 +23,10 @@ from thermocald.photogrammetry.camera.camera_model import partials, project
 from thermocald.photogrammetry.epoch.gauss_markov import point_covariances
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.epoch.adjustment import Adjustment
     from thermocald.photogrammetry.field.testfield import Observations, TestField
-
-    Array = NDArray[np.float64]
 
 __all__ = ["EpochErrors", "FieldErrors"]
 

@@ -28,10 +28,9 @@ from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.epoch.adjustment import Adjustment
-
-    Array = NDArray[np.float64]
 
 __all__ = ["FilterSettings", "Innovation", "OnlineFilter", "chi2_quantile"]
 

@@ -16,13 +16,10 @@ from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from numpy.typing import NDArray
-
     from thermocald.acquisition.calibrator import CalibratedEpoch
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.field.testfield import TestField
-
-    Array = NDArray[np.float64]
 
 __all__ = ["OnlineObserver", "given_exterior"]
 

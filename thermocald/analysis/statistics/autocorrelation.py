@@ -29,9 +29,7 @@ import numpy as np
 from thermocald.analysis.statistics.noise_models import grid, pooled, spectra
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = ["SlopeNoise", "slope_noise"]
 

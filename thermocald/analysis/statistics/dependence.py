@@ -20,9 +20,7 @@ from thermocald.analysis.statistics.straight_line import fit_straight_line
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = [
     "Dependence",

@@ -28,9 +28,7 @@ import numpy as np
 from thermocald.analysis.statistics.noise_models import MODELS, largest_p_value, pooled, spectra
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = ["DriftTest", "drift_test"]
 

@@ -15,11 +15,8 @@ import numpy as np
 from thermocald.photogrammetry.camera.camera_model import project, rays
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
-
-    Array = NDArray[np.float64]
 
 __all__ = ["Deviation", "deviation", "image_displacement", "sd_of_sigma0"]
 

@@ -20,10 +20,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.series.field_motion import FieldMovement
-
-    Array = NDArray[np.float64]
 
 __all__ = ["Clip", "MeasuredSeries", "Thermometer"]
 

@@ -27,9 +27,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
-
-    Array = NDArray[np.float64]
 
 __all__ = ["CLUSTERS_MM", "MonteCarlo", "draw_root", "plane_errors", "simulate_errors"]
 

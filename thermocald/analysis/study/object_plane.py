@@ -17,11 +17,10 @@ import numpy as np
 from thermocald.photogrammetry.camera.camera_model import partials, rays
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
-
-    Array = NDArray[np.float64]
 
 __all__ = [
     "DistanceLaw",

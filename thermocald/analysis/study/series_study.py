@@ -36,11 +36,8 @@ from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import NDArray
-
     from thermocald.analysis.study.measured import MeasuredSeries, Thermometer
-
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = [
     "ChannelStudy",

@@ -21,11 +21,8 @@ from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
     from thermocald.analysis.study.measured import MeasuredSeries
-
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = ["REFERENCES", "Trajectory", "correlations_over_time", "trajectories"]
 

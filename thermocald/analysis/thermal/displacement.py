@@ -12,9 +12,8 @@ from thermocald.photogrammetry.linalg import inverse_of_determined
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.reduction.series import ReducedSeries
-
-    Array = NDArray[np.float64]
 
 __all__ = ["Moved", "moved_targets"]
 

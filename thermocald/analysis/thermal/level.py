@@ -26,10 +26,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.reduction.series import ReducedSeries
     from thermocald.simulation.model import Prediction, ThermalModel
-
-    Array = NDArray[np.float64]
 
 __all__ = ["FREE_INTERIOR", "Level", "estimate_level", "series_means"]
 

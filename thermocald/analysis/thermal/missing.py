@@ -18,13 +18,10 @@ from thermocald.photogrammetry.linalg import inverse_of_determined
 from thermocald.reduction.adequacy import examine
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.reduction.adequacy import Adequacy
     from thermocald.reduction.fit import HypothesisFitter
     from thermocald.reduction.hypothesis import Fit
-
-    Array = NDArray[np.float64]
 
 __all__ = ["Missing", "missing"]
 

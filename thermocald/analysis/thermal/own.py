@@ -20,13 +20,10 @@ from thermocald.reduction.series import COLUMNS
 from thermocald.simulation import effects
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.reduction.hypothesis import Fit
     from thermocald.reduction.series import ReducedSeries
     from thermocald.simulation.model import ModelEffect, ThermalModel
-
-    Array = NDArray[np.float64]
 
 __all__ = ["with_own"]
 

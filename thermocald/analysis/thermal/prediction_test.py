@@ -28,10 +28,9 @@ from thermocald.simulation import effects
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.reduction.series import ReducedSeries
     from thermocald.simulation.model import ThermalModel
-
-    Array = NDArray[np.float64]
 
 __all__ = ["PredictedError", "predicted_error"]
 

@@ -30,16 +30,13 @@ from thermocald.simulation.model import RATED, ModelEffect, ThermalModel
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
     from thermocald.analysis.thermal.displacement import Moved
     from thermocald.analysis.thermal.terms import Unknown
+    from thermocald.arrays import Array
     from thermocald.reduction.fit import HypothesisFitter
     from thermocald.reduction.hypothesis import Fit
     from thermocald.reduction.noise_growth import NoiseGrowth
     from thermocald.reduction.series import ReducedSeries
-
-    Array = NDArray[np.float64]
 
 __all__ = ["FittedModel", "SeriesFit", "fitted_model"]
 

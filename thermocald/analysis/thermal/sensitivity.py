@@ -17,14 +17,12 @@ from thermocald.simulation.drive import drive_matrix
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.simulation.history import History
     from thermocald.simulation.model import Prediction, ThermalModel
-
-    Array = NDArray[np.float64]
 
 __all__ = ["derivatives", "reading_operators", "unresolved"]
 

@@ -14,14 +14,11 @@ from thermocald.reduction.series import COLUMNS
 from thermocald.simulation import effects
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.reduction.fit import HypothesisFitter
     from thermocald.reduction.hypothesis import Block, Fit
     from thermocald.reduction.series import ReducedSeries
     from thermocald.simulation.model import ModelEffect
-
-    Array = NDArray[np.float64]
 
 __all__ = [
     "Unknown",

@@ -34,12 +34,11 @@ from thermocald.simulation.model_file import read_model
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
+    from thermocald.arrays import Array
     from thermocald.simulation.effects.base import Steady
     from thermocald.simulation.model import ModelEffect, ThermalModel
-
-    Array = NDArray[np.float64]
 
 __all__ = ["Along", "ExtrapolationWarning", "ThermalCamera"]
 

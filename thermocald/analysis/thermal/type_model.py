@@ -27,12 +27,9 @@ from thermocald.simulation.model import RATED, ModelEffect, ThermalModel
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from thermocald.analysis.thermal.result import FittedModel
+    from thermocald.arrays import Array
     from thermocald.reduction.series import ReducedSeries
-
-    Array = NDArray[np.float64]
 
 __all__ = ["fit_with_type", "odd_cameras", "shrunk_to_type", "type_model"]
 

@@ -16,11 +16,8 @@ from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import rays
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from thermocald.analysis.thermal.thermal_camera import Along
-
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = ["WarmUp", "warm_up"]
 

@@ -19,14 +19,11 @@ from thermocald.simulation.history import History
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.reduction.fit import HypothesisFitter
     from thermocald.reduction.hypothesis import Fit
     from thermocald.reduction.likelihood import Weighting
     from thermocald.reduction.series import ReducedSeries
-
-    Array = NDArray[np.float64]
 
 __all__ = ["Condensed", "condensed"]
 

@@ -19,11 +19,8 @@ from thermocald.simulation.formula.operators import OPERATORS
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.simulation.history import History
-
-    Array = NDArray[np.float64]
 
 __all__ = ["Library"]
 

@@ -27,14 +27,11 @@ from thermocald.simulation.formula.expression import parse
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.discovery.grammar.search import Found
     from thermocald.discovery.search.examination import Examination
     from thermocald.reduction.hypothesis import Fit
     from thermocald.reduction.series import ReducedSeries
-
-    Array = NDArray[np.float64]
 
 __all__ = ["Proposal", "propose"]
 

@@ -19,13 +19,10 @@ from thermocald.discovery.grammar.library import Library
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.discovery.grammar.condensed import Condensed
     from thermocald.simulation.formula.expression import Node
     from thermocald.simulation.formula.operators import Constant
-
-    Array = NDArray[np.float64]
 
 __all__ = ["FormulaSearch", "Found"]
 

@@ -18,11 +18,7 @@ from thermocald.simulation import effects as catalogue
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
     from thermocald.reduction.series import ReducedSeries
-
-    Array = NDArray[np.float64]
 
 __all__ = ["MOUNT", "candidates", "richer_set"]
 

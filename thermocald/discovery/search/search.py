@@ -25,14 +25,10 @@ from thermocald.reduction.scan import Scanner
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from numpy.typing import NDArray
-
     from thermocald.reduction.candidate import Candidate
     from thermocald.reduction.fit import HypothesisFitter
     from thermocald.reduction.hypothesis import Fit
     from thermocald.reduction.scan import Scan
-
-    Array = NDArray[np.float64]
 
 __all__ = ["MARGIN", "Scanned", "Search", "Solution"]
 

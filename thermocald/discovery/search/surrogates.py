@@ -25,14 +25,11 @@ from thermocald.reduction.hypothesis import BASE
 from thermocald.reduction.series import COLUMNS
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.discovery.search.search import Search, Solution
     from thermocald.reduction.candidate import Candidate
     from thermocald.reduction.hypothesis import Fit
     from thermocald.reduction.likelihood import Weighting
-
-    Array = NDArray[np.float64]
 
 __all__ = ["FALSE_ALARM", "SurrogateTest", "surrogate_test"]
 

@@ -10,14 +10,10 @@ from thermocald.reduction.series import COLUMNS, FIELD_SCALES
 from thermocald.simulation import effects as catalogue
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from thermocald.discovery.evidence.image_space import Displaced
     from thermocald.reduction.hypothesis import Block, Fit
     from thermocald.reduction.noise_growth import NoiseGrowth
     from thermocald.reduction.series import ReducedSeries
-
-    Array = NDArray[np.float64]
 
 __all__ = ["displacement_estimates", "growth_estimates", "model_values", "term_estimates"]
 

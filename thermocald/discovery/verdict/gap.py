@@ -17,12 +17,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.discovery.evidence.image_space import Displaced
     from thermocald.reduction.fit import HypothesisFitter
     from thermocald.reduction.hypothesis import Fit, Term
     from thermocald.reduction.series import ReducedSeries
-
-    Array = NDArray[np.float64]
 
 __all__ = ["Gap", "carried_over", "fit_first", "gap_of"]
 

@@ -14,12 +14,9 @@ import numpy as np
 from thermocald.reduction.series import COLUMNS
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.discovery.search.examination import Examination
     from thermocald.reduction.series import ReducedSeries
-
-    Array = NDArray[np.float64]
 
 __all__ = ["Misfit", "resolve"]
 

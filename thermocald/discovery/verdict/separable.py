@@ -22,10 +22,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.reduction.fit import HypothesisFitter
     from thermocald.reduction.hypothesis import Fit
-
-    Array = NDArray[np.float64]
 
 __all__ = ["ShiftOrTilt", "shift_or_tilt"]
 

@@ -11,13 +11,10 @@ from thermocald.photogrammetry.linalg import inverse_of_determined
 from thermocald.reduction.series import COLUMNS
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.discovery.search.examination import Examination
     from thermocald.reduction.adequacy import Adequacy
     from thermocald.reduction.series import ReducedSeries
-
-    Array = NDArray[np.float64]
 
 __all__ = ["Description", "describe_unnamed"]
 

@@ -29,12 +29,9 @@ from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
     from thermocald.analysis.camera.photographs import PhotographResult, Photographs
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
-
-    Array = NDArray[np.float64]
 
 __all__ = ["coverage", "render_calibration"]
 

@@ -29,11 +29,8 @@ from thermocald.output.camera_files.camera_record import Format, ImportedCamera,
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import CameraModel
-
-    Array = NDArray[np.float64]
 
 __all__ = ["FORMATS", "Format", "ImportedCamera", "file_name", "read", "recognised", "write"]
 

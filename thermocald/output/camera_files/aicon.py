@@ -29,16 +29,13 @@ from thermocald.photogrammetry.camera.conversions import to_family
 from thermocald.photogrammetry.camera.model_families import MeasuredPoint
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import (
         CameraModel,
         InteriorOrientation,
         Sensor,
     )
     from thermocald.photogrammetry.camera.conversions import Family
-
-    Array = NDArray[np.float64]
 
 __all__ = ["FORMAT"]
 

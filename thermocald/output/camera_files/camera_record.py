@@ -16,9 +16,7 @@ from thermocald.photogrammetry.camera.conversions import Family, from_family
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = ["ForeignCamera", "Format", "ImportedCamera", "Record", "header"]
 

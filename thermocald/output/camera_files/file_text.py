@@ -11,9 +11,7 @@ import yaml
 from thermocald.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = ["number", "numbers", "yaml_document", "yaml_text"]
 

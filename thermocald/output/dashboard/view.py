@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
     from thermocald.store.database.row import StoredSeries
 
-    Array = NDArray[np.float64]
-
 __all__ = ["View"]
 
 _SHOWN = ("c", "x0", "y0")

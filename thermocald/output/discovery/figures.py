@@ -11,12 +11,10 @@ from thermocald.discovery.search.candidates import MOUNT
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.discovery.verdict.result import Discovery
     from thermocald.reduction.hypothesis import Fit
-
-    Array = NDArray[np.float64]
 
 __all__ = ["misfit_map", "misfit_matrix", "ranking", "signature", "staircase", "surrogates"]
 

@@ -17,11 +17,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.output.figures.panels import Curve, Figure, Panel
-
-    Array = NDArray[np.float64]
 
 __all__ = ["draw_figure", "draw_matrix", "draw_panel", "inline_svg", "save"]
 

@@ -15,12 +15,8 @@ from thermocald.output.figures.panels import PALETTE, Curve, Figure, Panel, thin
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from thermocald.analysis.study.series_study import SeriesStudy
     from thermocald.analysis.study.study import CameraStudy
-
-    Array = NDArray[np.float64]
 
 __all__ = [
     "dependence_figure",

@@ -10,11 +10,8 @@ from thermocald.output.figures.numbers import percent
 from thermocald.output.figures.panels import Curve, Figure, Panel
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from thermocald.analysis.study.study import CameraStudy
-
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = ["error_figure", "point_figure"]
 

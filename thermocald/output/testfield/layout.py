@@ -26,9 +26,7 @@ from thermocald.photogrammetry.targets.markers import parse_marker
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = [
     "PAPERS",

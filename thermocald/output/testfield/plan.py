@@ -13,11 +13,8 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.output.testfield.layout import Sheet
-
-    Array = NDArray[np.float64]
 
 __all__ = ["ALLOWED_ANGLE_DEG", "STEPS", "draw_plan"]
 

@@ -29,9 +29,7 @@ from thermocald.photogrammetry.camera.camera_model import rays as camera_rays
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = ["Conversion", "Family", "directions_of", "from_family", "image_grid", "to_family"]
 

@@ -22,9 +22,7 @@ from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = ["BrownOpenCV", "MeasuredPoint", "Metashape"]
 

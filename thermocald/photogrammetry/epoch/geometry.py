@@ -19,11 +19,8 @@ from thermocald.photogrammetry.parameters import EOP
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
-
-    Array = NDArray[np.float64]
 
 __all__ = ["GeometryBounds", "image_coverage", "obliqueness_deg", "weaknesses"]
 

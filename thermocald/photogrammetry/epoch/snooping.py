@@ -13,10 +13,8 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
+    from thermocald.arrays import Array, Mask
     from thermocald.photogrammetry.epoch.gauss_markov import Solution
-
-    Array = NDArray[np.float64]
-    Mask = NDArray[np.bool_]
 
 __all__ = [
     "TRUSTED_REDUNDANCY",

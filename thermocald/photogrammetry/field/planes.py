@@ -19,9 +19,8 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
-
-    Array = NDArray[np.float64]
 
 __all__ = ["field_normals", "plane_fit", "target_normals"]
 

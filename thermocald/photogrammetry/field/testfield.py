@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = ["KINDS", "Observations", "TestField"]
 

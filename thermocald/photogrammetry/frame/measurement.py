@@ -39,15 +39,13 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array, Image
     from thermocald.photogrammetry.camera.camera_model import (
         ExteriorOrientation,
         InteriorOrientation,
     )
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.targets.circle import CircleFit
-
-    Array = NDArray[np.float64]
-    Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 __all__ = ["Measurement", "Prior", "circle_observations", "join", "measure", "predicted_maps"]
 

@@ -36,13 +36,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array, Image
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.targets.markers import MarkerCorners
     from thermocald.photogrammetry.targets.noise import NoiseModel
     from thermocald.photogrammetry.targets.outline import LocalMap
-
-    Array = NDArray[np.float64]
-    Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 __all__ = ["RENEWED_AT_PX", "TrackedMeasurement", "Tracker"]
 

@@ -35,13 +35,9 @@ from thermocald.photogrammetry.network.start import approximate
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import Observations
     from thermocald.photogrammetry.network.bundle import Bundle, ImageRays
-
-    Array = NDArray[np.float64]
-    Index = NDArray[np.int64]
 
 __all__ = ["Distance", "Network", "Photo", "Rejection", "Station", "adjust_network"]
 

@@ -29,10 +29,8 @@ from thermocald.photogrammetry.camera.camera_model import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array, Index
     from thermocald.photogrammetry.camera.camera_model import Sensor
-
-    Array = NDArray[np.float64]
-    Index = NDArray[np.int64]
 
 __all__ = [
     "Bundle",

@@ -12,13 +12,10 @@ from thermocald.photogrammetry.network.snooping import MIN_RAYS
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.network.bundle import ImageRays
     from thermocald.photogrammetry.network.datum import Distance
     from thermocald.photogrammetry.network.result import Network
-
-    Array = NDArray[np.float64]
 
 __all__ = ["advice", "refuse_before", "refuse_narrow", "refuse_weak"]
 

@@ -26,13 +26,9 @@ from thermocald.photogrammetry.network.bundle import (
 )
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array, Index
     from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.network.bundle import Bundle, ImageRays
-
-    Array = NDArray[np.float64]
-    Index = NDArray[np.int64]
 
 __all__ = ["Covariance", "covariance"]
 

@@ -19,9 +19,7 @@ from thermocald.photogrammetry.network.bundle import Bundle
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = ["Datum", "Distance", "bring_to_datum"]
 

@@ -8,12 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array, Index
     from thermocald.photogrammetry.camera.camera_model import CameraModel, ExteriorOrientation
-
-    Array = NDArray[np.float64]
-    Index = NDArray[np.int64]
 
 __all__ = ["Network", "Rejection", "Station"]
 

@@ -23,12 +23,10 @@ from thermocald.photogrammetry.camera.camera_model import rays as camera_rays
 from thermocald.photogrammetry.network.bundle import Bundle, ImageRays, residuals, solve
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
+    from thermocald.arrays import Array, Index
     from thermocald.photogrammetry.camera.camera_model import Sensor
-
-    Array = NDArray[np.float64]
-    Index = NDArray[np.int64]
 
 __all__ = ["approximate"]
 

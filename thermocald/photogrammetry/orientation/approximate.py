@@ -28,9 +28,8 @@ from thermocald.photogrammetry.field.planes import plane_fit
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
-
-    Array = NDArray[np.float64]
 
 __all__ = ["approximate_orientation", "resection"]
 

@@ -24,9 +24,7 @@ from thermocald.photogrammetry.camera.camera_model import (
 from thermocald.photogrammetry.orientation.approximate import approximate_orientation, resection
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = ["Orientation", "orient", "refine"]
 

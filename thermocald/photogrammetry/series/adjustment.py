@@ -48,17 +48,13 @@ from thermocald.photogrammetry.series.target_noise import excess_scatter, slow_e
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array, Mask
     from thermocald.photogrammetry.camera.camera_model import (
         ExteriorOrientation,
         InteriorOrientation,
         Sensor,
     )
     from thermocald.photogrammetry.field.testfield import Observations, TestField
-
-    Array = NDArray[np.float64]
-    Mask = NDArray[np.bool_]
 
 __all__ = ["Adjusted", "SeriesAdjustment", "SeriesSettings", "adjust_series", "adjusted"]
 

@@ -12,7 +12,7 @@ from thermocald.photogrammetry.series.normals import chunks
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = ["among_all", "cofactors"]
 

@@ -17,11 +17,9 @@ from thermocald.photogrammetry.series.cofactors import among_all, cofactors
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array, Mask
     from thermocald.photogrammetry.series.system import SeriesSystem
     from thermocald.photogrammetry.series.target_noise import CorrelatedPairs
-
-    Array = NDArray[np.float64]
-    Mask = NDArray[np.bool_]
 
 __all__ = [
     "SeriesCofactors",

@@ -18,9 +18,9 @@ from thermocald.photogrammetry.series.normals import right_hand_sides
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.series.normals import Partials
 
-    Array = NDArray[np.float64]
     Columns = NDArray[np.int64]
 
 __all__ = ["Design", "State"]

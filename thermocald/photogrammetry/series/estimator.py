@@ -38,13 +38,11 @@ from thermocald.photogrammetry.series.target_noise import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array, Mask
     from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.series.normals import Partials
     from thermocald.photogrammetry.series.result import SeriesSettings
-
-    Array = NDArray[np.float64]
-    Mask = NDArray[np.bool_]
 
 __all__ = ["ENOUGH_FOR_NOISE", "Estimate", "SeriesEstimator", "pooled_variance"]
 

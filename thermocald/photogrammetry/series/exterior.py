@@ -18,12 +18,9 @@ from thermocald.photogrammetry.series.mount import (
 from thermocald.photogrammetry.series.normals import linearise
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.series.estimator import Estimate, SeriesEstimator
     from thermocald.photogrammetry.series.result import Exterior
-
-    Array = NDArray[np.float64]
 
 __all__ = ["choose", "loose_bound", "observed_movement"]
 

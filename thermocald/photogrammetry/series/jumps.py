@@ -14,9 +14,7 @@ import numpy as np
 from thermocald.photogrammetry.linalg import mad_sd
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = ["Jumps", "Perspective", "jumps"]
 

@@ -16,10 +16,9 @@ from thermocald.photogrammetry.series.system import alike
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array, Mask
     from thermocald.photogrammetry.series.system import SeriesSystem
 
-    Array = NDArray[np.float64]
-    Mask = NDArray[np.bool_]
     Columns = NDArray[np.int64]
 
 __all__ = ["point_tests", "snoop_series", "typical_variance"]

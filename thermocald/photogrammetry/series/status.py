@@ -17,13 +17,11 @@ from thermocald.photogrammetry.parameters import PRINCIPAL_POINT
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array, Mask
     from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.series.normals import ObservationGrid
     from thermocald.photogrammetry.series.result import SeriesSettings
-
-    Array = NDArray[np.float64]
-    Mask = NDArray[np.bool_]
 
 __all__ = ["enough_targets", "judge"]
 

@@ -28,10 +28,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array, Mask
     from thermocald.photogrammetry.series.design import Design, State
 
-    Array = NDArray[np.float64]
-    Mask = NDArray[np.bool_]
     Columns = NDArray[np.int64]
 
 __all__ = ["SeriesSystem", "Step", "alike"]

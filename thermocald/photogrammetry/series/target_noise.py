@@ -19,8 +19,7 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
-    Mask = NDArray[np.bool_]
+    from thermocald.arrays import Array, Mask
 
 __all__ = [
     "CorrelatedPairs",

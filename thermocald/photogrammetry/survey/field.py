@@ -15,9 +15,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.network.result import Network
-
-    Array = NDArray[np.float64]
 
 __all__ = [
     "expected_field",

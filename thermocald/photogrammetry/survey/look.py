@@ -16,13 +16,9 @@ from thermocald.photogrammetry.targets.outline import LocalMap, local_maps
 from thermocald.photogrammetry.targets.ring_reading import read_codes
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array, Image
     from thermocald.photogrammetry.camera.camera_model import CameraModel, ExteriorOrientation
     from thermocald.photogrammetry.field.testfield import Observations, TestField
-
-    Array = NDArray[np.float64]
-    Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 __all__ = ["Codes", "codes_in", "known_codes", "targets_in"]
 

@@ -34,11 +34,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array, Image
     from thermocald.photogrammetry.camera.camera_model import InteriorOrientation
     from thermocald.photogrammetry.field.testfield import TestField
-
-    Array = NDArray[np.float64]
-    Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 __all__ = ["Picture", "Survey", "survey"]
 

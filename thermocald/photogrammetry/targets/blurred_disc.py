@@ -24,12 +24,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array, Single
     from thermocald.photogrammetry.targets.outline import LocalMap
-
-    Array = NDArray[np.float64]
-    Single = NDArray[np.float32]
 
 __all__ = ["PARAMETERS", "blurred_disc", "edge_distance", "normal_cdf"]
 

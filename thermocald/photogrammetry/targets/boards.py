@@ -21,9 +21,7 @@ from thermocald.photogrammetry.targets.dictionary import dictionary as markers_o
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = ["aprilgrid", "board_of", "charuco", "chessboard", "numbered_rings"]
 

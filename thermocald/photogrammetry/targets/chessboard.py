@@ -23,10 +23,9 @@ from thermocald.photogrammetry.targets.markers import MarkerCorners, measure_cor
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.orientation.identification import Orientation
-
-    Array = NDArray[np.float64]
 
 __all__ = ["chess_code", "find_chessboards", "is_chess", "locate_chess_corners", "parse_chess"]
 

@@ -26,11 +26,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array, Image, Single
     from thermocald.photogrammetry.targets.outline import LocalMap
-
-    Array = NDArray[np.float64]
-    Single = NDArray[np.float32]
-    Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 __all__ = ["CircleFit", "Windows", "fit_circles", "window_reach", "windows"]
 

@@ -27,9 +27,7 @@ from thermocald.photogrammetry.targets.blurred_disc import normal_cdf
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
-    Single = NDArray[np.float32]
-    Image = NDArray[np.uint8] | NDArray[np.uint16]
+    from thermocald.arrays import Array, Image, Single
 
 __all__ = ["REACH_PX", "CornerFit", "fit_corners"]
 

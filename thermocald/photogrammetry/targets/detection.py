@@ -18,7 +18,7 @@ from thermocald.photogrammetry.targets.scratch import scratch
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = ["Candidates", "find_circles"]
 

@@ -15,12 +15,9 @@ import numpy as np
 from thermocald.photogrammetry.targets.markers import parse_marker
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.targets.markers import MarkerCorners
-
-    Array = NDArray[np.float64]
 
 __all__ = ["corners_turned_deg"]
 

@@ -30,10 +30,8 @@ from thermocald.photogrammetry.targets.dictionary import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array, Image
     from thermocald.photogrammetry.field.testfield import TestField
-
-    Array = NDArray[np.float64]
-    Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 __all__ = [
     "DetectedMarkers",

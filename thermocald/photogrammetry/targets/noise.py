@@ -16,8 +16,6 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
-
 __all__ = ["NoiseModel", "estimate_noise"]
 
 _QUANTISATION = 1 / 12

@@ -23,9 +23,8 @@ from thermocald.photogrammetry.camera.camera_model import project
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
-
-    Array = NDArray[np.float64]
 
 __all__ = ["LocalMap", "from_ellipses", "local_maps", "target_axes"]
 

@@ -24,10 +24,8 @@ from thermocald.photogrammetry.targets.outline import LocalMap
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array, Single
     from thermocald.photogrammetry.targets.detection import Candidates
-
-    Array = NDArray[np.float64]
-    Single = NDArray[np.float32]
 
 __all__ = ["CodedTargets", "read_codes"]
 

@@ -33,10 +33,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.simulation.history import History
-
-    Array = NDArray[np.float64]
 
 __all__ = ["Effect", "OfTime", "Proportional", "Steady"]
 

@@ -22,13 +22,11 @@ from thermocald.simulation.formula.expression import Node, parse, unit_text
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
+    from thermocald.arrays import Array
     from thermocald.simulation.formula.operators import Constant
     from thermocald.simulation.history import History
-
-    Array = NDArray[np.float64]
 
 __all__ = ["formula_effect", "is_formula"]
 

@@ -12,13 +12,10 @@ from thermocald.simulation.operators import lag, lag_matrix
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    import numpy as np
-    from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
+    from thermocald.arrays import Array
     from thermocald.simulation.history import History
-
-    Array = NDArray[np.float64]
 
 __all__ = ["MountMotion"]
 

@@ -15,13 +15,11 @@ from thermocald.simulation.formula.expression import TIME
 from thermocald.simulation.operators import interpolation_matrix
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
+    from thermocald.arrays import Array
     from thermocald.simulation.formula.expression import Node
     from thermocald.simulation.history import History
-
-    Array = NDArray[np.float64]
 
 __all__ = ["Evaluator"]
 

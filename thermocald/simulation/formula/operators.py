@@ -44,10 +44,9 @@ from thermocald.simulation.operators import (
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = ["OPERATORS", "Constant", "Operator"]
 

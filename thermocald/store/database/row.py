@@ -10,16 +10,13 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import (
         ExteriorOrientation,
         InteriorOrientation,
     )
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.store.recording.head import Head
-
-    Array = NDArray[np.float64]
 
 __all__ = ["NOT_CALIBRATED", "EpochResult", "Event", "LoggedReading", "StoredSeries"]
 

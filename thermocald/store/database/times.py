@@ -17,10 +17,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.store.database.row import StoredSeries
     from thermocald.store.database.series_reader import StampedReader
-
-    Array = NDArray[np.float64]
 
 __all__ = ["SeriesTimes", "clock_corrections", "series_times"]
 

@@ -19,9 +19,7 @@ from thermocald.errors import DataError, UsageError
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = ["AMBIGUOUS", "DeviceClock", "clock_error", "time_zone"]
 

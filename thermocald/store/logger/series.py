@@ -21,11 +21,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.store.logger.clock import DeviceClock
     from thermocald.store.logger.photographs import Photograph
     from thermocald.store.logger.temperatures import LoggedTemperatures
-
-    Array = NDArray[np.float64]
 
 __all__ = ["PhotographSeries", "put_together"]
 

@@ -21,9 +21,7 @@ from thermocald.store.logger.moments import MomentFormat, order_of_dates, parse_
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = ["UNITS", "LogOptions", "LoggedTemperatures", "read_log"]
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = ["ColumnChunk", "ParquetTable", "csv_to_parquet", "parquet_to_csv", "write_parquet"]
 

@@ -33,10 +33,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import Observations, TestField
     from thermocald.photogrammetry.series.normals import ObservationGrid
-
-    Array = NDArray[np.float64]
 
 __all__ = [
     "CameraSpec",

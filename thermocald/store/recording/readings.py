@@ -9,11 +9,10 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
+    from thermocald.arrays import Array
     from thermocald.epoch import Epoch
-
-    Array = NDArray[np.float64]
 
 __all__ = ["interpolate_readings", "temperature_at_frame", "temperatures_at_frame"]
 

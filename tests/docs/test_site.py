@@ -21,7 +21,7 @@ from tests.docs.blocks import ROOT
 
 sys.path.insert(0, str(ROOT / "docs"))
 
-from _site import reference
+from _site import five_pages, reference
 
 LOADED = {
     "script": "src", "img": "src", "iframe": "src", "source": "src", "audio": "src", "video": "src",
@@ -195,6 +195,17 @@ def test_the_reference_has_every_command_key_effect_and_driver(site):
         for point in entry_points(group=f"thermocald.{kind}"):
             if point.value.startswith("thermocald_drivers"):
                 assert point.name in text("drivers.html")
+
+
+def test_five_pages_of_code(site):
+    """Each is there with its code, and none is longer than a page."""
+    folder, documents = site
+    text = "".join(documents[folder / "explanation" / "five-pages.html"].text)
+    for title, (_, *names) in five_pages.PAGES.items():
+        sources = [inspect.getsource(pkgutil.resolve_name(name)) for name in names]
+        assert title in text
+        assert all(source.splitlines()[0].strip() in text for source in sources)
+        assert sum(len(source.splitlines()) for source in sources) <= 66, title
 
 
 def keys(model) -> set[str]:

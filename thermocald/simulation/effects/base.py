@@ -214,12 +214,22 @@ class Effect(ABC):
     ) -> Influence:
         """What it changes at the history's times; a drive changes nothing by itself."""
         epochs = len(history.times)
+        if self.kind == "image":
+            return replace(Influence.none(epochs), **self.image_changes(history, values))
         searched, coefficients = self.split(values)
         if self.kind != "signal" or not any(coefficients.values()):
             return Influence.none(epochs)
         course = self.signal(history, **searched)
         changes = {name: course @ self.weights(values, name) for name in coefficients}
         return Influence.of_parameters(changes, epochs)
+
+    def image_changes(
+        self,
+        history: History,  # noqa: ARG002
+        values: Mapping[str, Any],  # noqa: ARG002
+    ) -> dict[str, Any]:
+        """Of an `image` effect that needs no test field: what it changes of an `Influence`."""
+        return {}
 
     def units(self) -> dict[str, str]:
         """The unit of every parameter by name."""

@@ -10,9 +10,7 @@ from thermocald.simulation.effects.parameter import coefficient_units
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    import numpy as np
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.simulation.history import History
 
 __all__ = ["Creep"]
@@ -38,5 +36,5 @@ class Creep(OfTime):
         "cycle": "does not repeat with the cycles",
     }
 
-    def signal(self, history: History, **_: Any) -> NDArray[np.float64]:
+    def signal(self, history: History, **_: Any) -> Array:
         return history.times[:, None].copy()

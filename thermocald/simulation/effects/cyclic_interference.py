@@ -12,8 +12,7 @@ from thermocald.simulation.effects.parameter import Parameter, coefficient_units
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.simulation.history import History
 
 __all__ = ["CyclicInterference"]
@@ -43,11 +42,11 @@ class CyclicInterference(OfTime):
         "hold": "goes on at the same period",
     }
 
-    def signal(self, history: History, P: float = 120.0, **_: Any) -> NDArray[np.float64]:
+    def signal(self, history: History, P: float = 120.0, **_: Any) -> Array:
         angle = (2.0 * np.pi / P) * history.times
         return np.stack([np.sin(angle), np.cos(angle)], axis=1)
 
-    def weights(self, values: Mapping[str, Any], name: str) -> NDArray[np.float64]:
+    def weights(self, values: Mapping[str, Any], name: str) -> Array:
         a, phase = float(values[name]), float(values["phase"])
         return a * np.array([np.cos(phase), np.sin(phase)])
 

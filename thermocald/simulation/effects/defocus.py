@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from thermocald.simulation.effects.base import Proportional
-from thermocald.simulation.effects.influence import Influence
 from thermocald.simulation.effects.parameter import spoken
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.simulation.history import History
 
 __all__ = ["Defocus"]
@@ -39,15 +36,9 @@ class Defocus(Proportional):
         "cycle": "makes noise come and go with the temperature",
     }
 
-    def influence(
-        self,
-        history: History,
-        values: Mapping[str, Any],
-        field: TestField | None = None,  # noqa: ARG002
-    ) -> Influence:
-        nothing = Influence.none(len(history.times))
+    def image_changes(self, history: History, values: Mapping[str, Any]) -> dict[str, Any]:
         factor = np.maximum(1.0 + values["factor"] * self.signal(history)[:, 0], 0.1)
-        return replace(nothing, noise_factor=factor, blur_factor=factor)
+        return {"noise_factor": factor, "blur_factor": factor}
 
     def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
         return f"heat defocuses: the measuring noise grows by {spoken(estimates['factor'])}"

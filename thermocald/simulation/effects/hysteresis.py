@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
+    from thermocald.arrays import Array
     from thermocald.simulation.history import History
 
 __all__ = ["Hysteresis"]
@@ -40,7 +41,7 @@ class Hysteresis(Effect):
         "idle": "does nothing",
     }
 
-    def drive(self, history: History, half_width: float = 1.0, **_: Any) -> NDArray[np.float64]:
+    def drive(self, history: History, half_width: float = 1.0, **_: Any) -> Array:
         p = history.polygon()
         return play(p.times, p.values, half_width, history.times)
 

@@ -10,10 +10,9 @@ from thermocald.simulation.effects.parameter import coefficient_units
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    import numpy as np
-    from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
+    from thermocald.arrays import Array
     from thermocald.simulation.history import History
 
 __all__ = ["NonlinearExpansion"]
@@ -40,7 +39,7 @@ class NonlinearExpansion(Effect):
         "idle": "does nothing",
     }
 
-    def signal(self, history: History, **_: Any) -> NDArray[np.float64]:
+    def signal(self, history: History, **_: Any) -> Array:
         return ((history.temperature() - history.T0) ** 2)[:, None]
 
     def sensitivity(self, history: History, **_: Any) -> csr_array:

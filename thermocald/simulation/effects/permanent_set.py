@@ -11,10 +11,9 @@ from thermocald.simulation.operators import running_maximum, running_maximum_mat
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    import numpy as np
-    from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
+    from thermocald.arrays import Array
     from thermocald.simulation.history import History
 
 __all__ = ["PermanentSet"]
@@ -42,7 +41,7 @@ class PermanentSet(Effect):
         "idle": "does nothing",
     }
 
-    def signal(self, history: History, **_: Any) -> NDArray[np.float64]:
+    def signal(self, history: History, **_: Any) -> Array:
         p = history.polygon()
         return (running_maximum(p.times, p.values, history.times) - history.T0)[:, None]
 

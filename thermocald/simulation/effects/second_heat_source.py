@@ -11,10 +11,9 @@ from thermocald.simulation.effects.parameter import Parameter, coefficient_units
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    import numpy as np
-    from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
+    from thermocald.arrays import Array
     from thermocald.simulation.history import History
 
 __all__ = ["SecondHeatSource"]
@@ -40,7 +39,7 @@ class SecondHeatSource(Effect):
     def channel(self, history: History, channel: str = "", **_: Any) -> str:
         return channel or next(c for c in history.readings if c != history.reference)
 
-    def signal(self, history: History, channel: str = "", **_: Any) -> NDArray[np.float64]:
+    def signal(self, history: History, channel: str = "", **_: Any) -> Array:
         return (history.temperature(self.channel(history, channel)) - history.T0)[:, None]
 
     def sensitivity(self, history: History, channel: str = "", **_: Any) -> csr_array:

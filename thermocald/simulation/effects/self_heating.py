@@ -12,8 +12,7 @@ from thermocald.simulation.effects.parameter import Parameter, coefficient_units
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.simulation.history import History
 
 __all__ = ["SelfHeating"]
@@ -42,7 +41,7 @@ class SelfHeating(OfTime):
         "cycle": "does not repeat with the cycles",
     }
 
-    def signal(self, history: History, tau: float = 300.0, **_: Any) -> NDArray[np.float64]:
+    def signal(self, history: History, tau: float = 300.0, **_: Any) -> Array:
         return -np.expm1(-history.times / tau)[:, None]
 
     def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:

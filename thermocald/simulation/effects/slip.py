@@ -10,9 +10,7 @@ from thermocald.simulation.effects.parameter import Parameter, coefficient_units
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    import numpy as np
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.simulation.history import History
 
 __all__ = ["Slip"]
@@ -40,7 +38,7 @@ class Slip(OfTime):
         "idle": "does nothing",
     }
 
-    def signal(self, history: History, time: float = 600.0, **_: Any) -> NDArray[np.float64]:
+    def signal(self, history: History, time: float = 600.0, **_: Any) -> Array:
         return (history.times >= time).astype(float)[:, None]
 
     def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:

@@ -12,9 +12,9 @@ from thermocald.simulation.effects.parameter import Parameter, coefficient_units
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
+    from thermocald.arrays import Array
     from thermocald.simulation.history import History
 
 __all__ = ["Softening"]
@@ -43,7 +43,7 @@ class Softening(Effect):
         "idle": "does nothing",
     }
 
-    def signal(self, history: History, T_k: float = 40.0, **_: Any) -> NDArray[np.float64]:
+    def signal(self, history: History, T_k: float = 40.0, **_: Any) -> Array:
         return np.maximum(history.temperature() - T_k, 0.0)[:, None]
 
     def sensitivity(self, history: History, T_k: float = 40.0, **_: Any) -> csr_array:

@@ -15,8 +15,7 @@ from thermocald.simulation.effects.parameter import Parameter, spoken
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.simulation.history import History
 
@@ -43,7 +42,7 @@ class TargetDisplacement(OfTime):
         "idle": "does nothing",
     }
 
-    def signal(self, history: History, time: float = 600.0, **_: Any) -> NDArray[np.float64]:
+    def signal(self, history: History, time: float = 600.0, **_: Any) -> Array:
         return (history.times >= time).astype(float)[:, None]
 
     def influence(

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from thermocald.simulation.effects.base import Proportional
-from thermocald.simulation.effects.influence import Influence
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.simulation.history import History
 
 __all__ = ["TestFieldExpansion"]
@@ -37,12 +34,6 @@ class TestFieldExpansion(Proportional):
         "cycle": "runs along the same line up and down",
     }
 
-    def influence(
-        self,
-        history: History,
-        values: Mapping[str, Any],
-        field: TestField | None = None,  # noqa: ARG002
-    ) -> Influence:
+    def image_changes(self, history: History, values: Mapping[str, Any]) -> dict[str, Any]:
         rates = np.array([float(values.get(axis, 0.0)) for axis in self.linear])
-        scale = 1.0 + self.signal(history) * rates
-        return replace(Influence.none(len(history.times)), scale=scale)
+        return {"scale": 1.0 + self.signal(history) * rates}

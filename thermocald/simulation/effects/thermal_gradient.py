@@ -13,9 +13,9 @@ from thermocald.simulation.operators import slope_matrix
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
+    from thermocald.arrays import Array
     from thermocald.simulation.history import History
 
 __all__ = ["ThermalGradient"]
@@ -44,17 +44,17 @@ class ThermalGradient(Effect):
         "idle": "does nothing",
     }
 
-    def signal(self, history: History, **_: Any) -> NDArray[np.float64]:
+    def signal(self, history: History, **_: Any) -> Array:
         p = history.polygon()
-        rate: NDArray[np.float64] = slope_matrix(p.times, history.times) @ p.values
+        rate: Array = slope_matrix(p.times, history.times) @ p.values
         return rate[:, None]
 
     def unresolved(
         self,
         history: History,
-        rate_jump: NDArray[np.float64] | None = None,
+        rate_jump: Array | None = None,
         **_: Any,
-    ) -> NDArray[np.float64]:
+    ) -> Array:
         """A lamp that is switched between two readings: the rate jumps, nobody knows when."""
         if rate_jump is not None:
             return rate_jump

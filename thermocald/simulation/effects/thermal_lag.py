@@ -11,10 +11,9 @@ from thermocald.simulation.operators import lag, lag_matrix
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    import numpy as np
-    from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
+    from thermocald.arrays import Array
     from thermocald.simulation.history import History
 
 __all__ = ["ThermalLag"]
@@ -40,7 +39,7 @@ class ThermalLag(Effect):
         "idle": "does nothing",
     }
 
-    def drive(self, history: History, tau: float = 60.0, **_: Any) -> NDArray[np.float64]:
+    def drive(self, history: History, tau: float = 60.0, **_: Any) -> Array:
         p = history.polygon()
         return lag(p.times, p.values, tau, history.times)
 
@@ -48,9 +47,7 @@ class ThermalLag(Effect):
         p = history.polygon()
         return lag_matrix(p.times, tau, history.times) @ p.matrix
 
-    def propagate(
-        self, history: History, errors: NDArray[np.float64], tau: float = 60.0, **_: Any
-    ) -> NDArray[np.float64]:
+    def propagate(self, history: History, errors: Array, tau: float = 60.0, **_: Any) -> Array:
         p = history.polygon()
         # the operator is linear: no matrix needed, whatever the length
         return lag(p.times, p.matrix @ errors, tau, history.times)

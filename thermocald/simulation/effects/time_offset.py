@@ -13,9 +13,9 @@ from thermocald.simulation.operators import interpolation_matrix
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
+    from thermocald.arrays import Array
     from thermocald.simulation.history import History
 
 __all__ = ["TimeOffset"]
@@ -40,16 +40,16 @@ class TimeOffset(Effect):
         "idle": "does nothing",
     }
 
-    def drive(self, history: History, d: float = 0.0, **_: Any) -> NDArray[np.float64]:
+    def drive(self, history: History, d: float = 0.0, **_: Any) -> Array:
         return history.polygon().at(history.times - d)
 
     def unresolved(
         self,
         history: History,
-        rate_jump: NDArray[np.float64] | None = None,  # noqa: ARG002
+        rate_jump: Array | None = None,  # noqa: ARG002
         d: float = 0.0,
         **_: Any,
-    ) -> NDArray[np.float64]:
+    ) -> Array:
         """A thermometer that is ahead is needed after the last reading: nobody knows it there.
 
         As much as the temperature usually changes over the time that is missing.

@@ -10,8 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from thermocald import config as module
-from thermocald.config import Config, load_config, parse_config
+from thermocald.config import Config, devices, load_config, parse_config
 from thermocald.errors import ConfigurationError
 from thermocald.hal import driver_names, option_names
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, PARAMETER_NAMES
@@ -51,8 +50,8 @@ def test_defaults():
 
 def test_names_are_those_of_the_camera_model():
     """config is a layer below photogrammetry and must repeat them."""
-    assert get_args(module.InteriorName) == IOP_NAMES
-    assert get_args(module.ParameterName) == PARAMETER_NAMES
+    assert get_args(devices.InteriorName) == IOP_NAMES
+    assert get_args(devices.ParameterName) == PARAMETER_NAMES
     assert parse(document()).calibration.free == DEFAULT_FREE
     assert parse(document()).calibration.snooping_alpha == AdjustmentSettings().snooping_alpha
 

@@ -16,7 +16,6 @@ is refused, unless extrapolation is asked for by name.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -25,6 +24,8 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 
 from thermocald.analysis.camera.state import CameraState
+from thermocald.analysis.thermal.steady import SteadyCamera, steady_camera
+from thermocald.analysis.thermal.validity import ExtrapolationWarning, Validity
 from thermocald.errors import ConfigurationError, UsageError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.simulation import effects
@@ -37,18 +38,11 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from thermocald.arrays import Array
-    from thermocald.simulation.effects.base import Steady
-    from thermocald.simulation.model import ModelEffect, ThermalModel
+    from thermocald.simulation.model import ThermalModel
 
 __all__ = ["Along", "ExtrapolationWarning", "ThermalCamera"]
 
-_REFUSED_SHARE = 0.5  # of the fitted range of temperature
-_MARGIN_K = 0.25  # what thermometers differ by is not an extrapolation
 _CHUNK = 20_000  # times in one go
-
-
-class ExtrapolationWarning(UserWarning):
-    """A model was asked for a temperature that it was not fitted on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,16 +75,6 @@ class Along:
     def sd(self) -> Array:
         """Standard deviations (E, 10), 0 where a parameter was held."""
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
-
-
-@dataclass(frozen=True, eq=False)
-class _Steady:
-    """p(T) and ∂p/∂(parameters) as polynomials in T - T₀, and from each knee on in T - T_k."""
-
-    p: tuple[Array, Array, Array]
-    J: tuple[Array, Array, Array]
-    knees: tuple[tuple[float, Array, Array, Array], ...]  # T_k, slope, ∂slope, ∂/∂T_k
-    covariance: Array
 
 
 @dataclass(frozen=True)
@@ -159,20 +143,10 @@ class ThermalCamera:
         (unless `extrapolate`), and for what looks like fahrenheit.
         """
         T = float(temperature)
-        beyond = self._beyond(T, extrapolate) if self._limits else 0.0
-        s = self._steady if channels is None and not self._uses_channels else self._with(channels)
-        dT = T - self.model.T0
-        p0, p1, p2 = s.p
-        J0, J1, J2 = s.J
-        values = p0 + dT * (p1 + dT * p2)
-        slope = p1 + 2.0 * dT * p2
-        J = J0 + dT * (J1 + dT * J2)
-        for knee, rate, by_rate, by_knee in s.knees:
-            if knee < T:
-                values = values + (T - knee) * rate
-                slope = slope + rate
-                J = J + (T - knee) * by_rate + by_knee
-        covariance = J @ s.covariance @ J.T
+        beyond = self._validity.beyond(T, extrapolate) if self._validity else 0.0
+        plain = channels is None and not self._uses_channels
+        values, slope, J = (self._steady if plain else self._with(channels)).at(T)
+        covariance = J @ self.covariance @ J.T
         if temperature_sd:
             covariance += temperature_sd**2 * np.outer(slope, slope)
         if beyond:
@@ -202,9 +176,11 @@ class ThermalCamera:
         begin = float(min(t[0], instants[0]))
         reference = next(iter(readings))
         history = History(instants - begin, t - begin, readings, reference, self.model.T0)
-        outside = self._outside(history.temperature(), extrapolate)
+        outside = np.zeros(len(instants))
+        if self._validity is not None:
+            outside = self._validity.outside(history.temperature(), extrapolate)
         values, covariance = [], []
-        steady = None if relative_to is None else self._steady_derivative(relative_to)
+        steady = None if relative_to is None else self._steady.at(relative_to)[2]
         for first in range(0, len(instants), _CHUNK):
             part = history.at(history.times[first : first + _CHUNK])
             found, matrix = self._propagated(part, outside[first : first + _CHUNK], steady)
@@ -221,16 +197,6 @@ class ThermalCamera:
             np.concatenate(covariance),
             outside,
         )
-
-    def _steady_derivative(self, temperature: float) -> Array:
-        """∂ IOP / ∂ parameters (10, p) of the steady camera."""
-        s = self._steady
-        dT = temperature - self.model.T0
-        J = s.J[0] + dT * (s.J[1] + dT * s.J[2])
-        for knee, _, by_rate, by_knee in s.knees:
-            if temperature > knee:
-                J = J + (temperature - knee) * by_rate + by_knee
-        return J
 
     def _propagated(
         self, history: History, outside: Array, steady: Array | None
@@ -270,61 +236,20 @@ class ThermalCamera:
         return np.asarray((sides[0] - sides[1]) / (2.0 * step))
 
     @cached_property
-    def _limits(self) -> tuple[float, float] | None:
-        return next(iter(self.model.validity.values()), None)
+    def _validity(self) -> Validity | None:
+        limits = next(iter(self.model.validity.values()), None)
+        return None if limits is None else Validity(*limits)
 
     @cached_property
     def _uses_channels(self) -> bool:
         return any("channel" in effects.get(e.name).nonlinear for e in self.model.effects)
 
-    def _beyond(self, T: float, extrapolate: bool) -> float:
-        """How many kelvin a temperature lies outside; warns or refuses."""
-        assert self._limits is not None
-        low, high = self._limits
-        if low - _MARGIN_K <= T <= high + _MARGIN_K:
-            return 0.0
-        beyond = low - T if low > T else T - high
-        far = beyond > _REFUSED_SHARE * max(high - low, 1.0)
-        if far and not extrapolate and low <= (T - 32.0) / 1.8 <= high:
-            raise UsageError(
-                f"{T:g} looks like fahrenheit: the model was fitted between {low:g} and {high:g} "
-                "°C; convert it"
-            )
-        if far and not extrapolate:
-            raise UsageError(
-                f"{T:g} °C is {beyond:.1f} K outside the {low:g} to {high:g} °C that the model was "
-                "fitted on; ask for extrapolation by name if you mean it"
-            )
-        warnings.warn(
-            f"{T:g} °C is {beyond:.1f} K outside the {low:g} to {high:g} °C that the model was "
-            "fitted on; standard deviations are widened",
-            ExtrapolationWarning,
-            stacklevel=3,
-        )
-        return beyond
-
-    def _outside(self, temperatures: Array, extrapolate: bool) -> Array:
-        outside = np.zeros(len(temperatures))
-        if self._limits is None or not len(temperatures):
-            return outside
-        low, high = self._limits
-        outside = np.maximum(np.maximum(low - temperatures, temperatures - high), 0.0)
-        outside[outside <= _MARGIN_K] = 0.0
-        worst = float(temperatures[int(np.argmax(outside))])
-        # half of a log in fahrenheit may lie inside the range by chance: its middle tells
-        middle = float(np.median(temperatures))
-        if outside.max() > 0:
-            self._beyond(middle if self._is_far(middle) else worst, extrapolate)
-        return outside
-
-    def _is_far(self, T: float) -> bool:
-        assert self._limits is not None
-        low, high = self._limits
-        return max(low - T, T - high) > _REFUSED_SHARE * max(high - low, 1.0)
-
     @cached_property
-    def _steady(self) -> _Steady:
+    def _steady(self) -> SteadyCamera:
         return self._with(None)
+
+    def _with(self, channels: Mapping[str, float] | None) -> SteadyCamera:
+        return steady_camera(self.model, self.parameters, channels)
 
     def steady_polynomials(self) -> tuple[Array, Array, Array]:
         """The parameters of the steady camera as polynomials in T - T0: three times (10,).
@@ -340,50 +265,3 @@ class ThermalCamera:
         ten parameters.
         """
         return tuple((knee, *rate.tolist()) for knee, rate, _, _ in self._steady.knees)
-
-    def _with(self, channels: Mapping[str, float] | None) -> _Steady:
-        """The steady camera as polynomials; see the module's docstring for what steady means."""
-        names = self.parameters
-        p = [np.zeros(10) for _ in range(3)]
-        J = [np.zeros((10, len(names))) for _ in range(3)]
-        knees = []
-
-        def add(parameter: str, value: float, row: int, power: int, factor: float = 1.0) -> None:
-            p[power][row] += value * factor
-            if parameter in names:
-                J[power][row, names.index(parameter)] += factor
-
-        for row, n in enumerate(IOP_NAMES):
-            add(f"interior.{n}", float(getattr(self.model.interior, n)), row, 0)
-            if n in self.model.rates:
-                add(f"rates.{n}", self.model.rates[n], row, 1)
-        for effect in self.model.effects:
-            kind = effects.get(effect.name)
-            steady = kind.steady(effect.values, self.model.T0, channels)
-            own = [
-                (k, IOP_NAMES.index(k))
-                for k in kind.linear
-                if k in effect.values and k in IOP_NAMES
-            ]
-            if steady.knee is not None:
-                knees.append(_knee(effect, steady, own, names))
-            for power, factor in enumerate(steady.powers):
-                if not factor:
-                    continue
-                for key, row in own:
-                    add(f"{effect.name}.{key}", float(effect.values[key]), row, power, factor)
-        return _Steady(tuple(p), tuple(J), tuple(knees), self.covariance)  # type: ignore[arg-type]
-
-
-def _knee(
-    effect: ModelEffect, steady: Steady, own: list[tuple[str, int]], names: tuple[str, ...]
-) -> tuple[float, Array, Array, Array]:
-    rate, by_rate, by_knee = np.zeros(10), np.zeros((10, len(names))), np.zeros((10, len(names)))
-    for key, row in own:
-        rate[row] = float(effect.values[key])
-        if f"{effect.name}.{key}" in names:
-            by_rate[row, names.index(f"{effect.name}.{key}")] = 1.0
-        if f"{effect.name}.{steady.knee_name}" in names:
-            by_knee[row, names.index(f"{effect.name}.{steady.knee_name}")] = -rate[row]
-    assert steady.knee is not None
-    return steady.knee, rate, by_rate, by_knee

@@ -24,6 +24,7 @@ from thermocald.output.figures.panels import Figure, document
 from thermocald.output.page import render_page
 from thermocald.output.study import figures, tables
 from thermocald.output.study import object_space_figures as object_space
+from thermocald.output.study.object_space_tables import cluster_table, point_table
 from thermocald.output.study.summary import summary
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 
@@ -236,7 +237,9 @@ def _parts(camera: CameraStudy, study: Study, prefix: str) -> list[_Part]:
         _Part(
             "What it means in object space",
             pick("object-space-errors", "errors-by-point"),
-            some(tables.cluster_table(camera), tables.point_table(camera)),
+            some(
+                cluster_table(camera), point_table(camera)
+            ),
         ),
     ]
     return [part for part in parts if part.figures or part.tables]

@@ -1,0 +1,103 @@
+"""A camera that has long been at one temperature, as a function of that temperature.
+
+Lags and self-heating have settled, a play lies in its middle, nothing creeps, slips or cycles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
+from thermocald.simulation import effects
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from thermocald.arrays import Array
+    from thermocald.simulation.effects.base import Steady
+    from thermocald.simulation.model import ModelEffect, ThermalModel
+
+__all__ = ["SteadyCamera", "steady_camera"]
+
+
+@dataclass(frozen=True, eq=False)
+class SteadyCamera:
+    """p(T) and ∂p/∂(parameters) as polynomials in T - T₀, and from each knee on in T - T_k.
+
+    knees: T_k, slope, ∂slope, ∂/∂T_k of each.
+    """
+
+    T0: float
+    p: tuple[Array, Array, Array]
+    J: tuple[Array, Array, Array]
+    knees: tuple[tuple[float, Array, Array, Array], ...]
+
+    def at(self, T: float) -> tuple[Array, Array, Array]:
+        """Values (10,), their slope (10,) per K, and the derivatives (10, p) at T °C."""
+        dT = T - self.T0
+        p0, p1, p2 = self.p
+        J0, J1, J2 = self.J
+        values = p0 + dT * (p1 + dT * p2)
+        slope = p1 + 2.0 * dT * p2
+        J = J0 + dT * (J1 + dT * J2)
+        for knee, rate, by_rate, by_knee in self.knees:
+            if knee < T:
+                values = values + (T - knee) * rate
+                slope = slope + rate
+                J = J + (T - knee) * by_rate + by_knee
+        return values, slope, J
+
+
+def steady_camera(
+    model: ThermalModel,
+    names: tuple[str, ...],
+    channels: Mapping[str, float] | None,
+) -> SteadyCamera:
+    """The steady camera of a model.
+
+    names: of the parameters whose derivatives are wanted; channels: °C of other thermometers.
+    """
+    p = [np.zeros(10) for _ in range(3)]
+    J = [np.zeros((10, len(names))) for _ in range(3)]
+    knees = []
+
+    def add(parameter: str, value: float, row: int, power: int, factor: float = 1.0) -> None:
+        p[power][row] += value * factor
+        if parameter in names:
+            J[power][row, names.index(parameter)] += factor
+
+    for row, n in enumerate(IOP_NAMES):
+        add(f"interior.{n}", float(getattr(model.interior, n)), row, 0)
+        if n in model.rates:
+            add(f"rates.{n}", model.rates[n], row, 1)
+    for effect in model.effects:
+        kind = effects.get(effect.name)
+        steady = kind.steady(effect.values, model.T0, channels)
+        own = [
+            (k, IOP_NAMES.index(k)) for k in kind.linear if k in effect.values and k in IOP_NAMES
+        ]
+        if steady.knee is not None:
+            knees.append(_knee(effect, steady, own, names))
+        for power, factor in enumerate(steady.powers):
+            if not factor:
+                continue
+            for key, row in own:
+                add(f"{effect.name}.{key}", float(effect.values[key]), row, power, factor)
+    return SteadyCamera(model.T0, (p[0], p[1], p[2]), (J[0], J[1], J[2]), tuple(knees))
+
+
+def _knee(
+    effect: ModelEffect, steady: Steady, own: list[tuple[str, int]], names: tuple[str, ...]
+) -> tuple[float, Array, Array, Array]:
+    rate, by_rate, by_knee = np.zeros(10), np.zeros((10, len(names))), np.zeros((10, len(names)))
+    for key, row in own:
+        rate[row] = float(effect.values[key])
+        if f"{effect.name}.{key}" in names:
+            by_rate[row, names.index(f"{effect.name}.{key}")] = 1.0
+        if f"{effect.name}.{steady.knee_name}" in names:
+            by_knee[row, names.index(f"{effect.name}.{steady.knee_name}")] = -rate[row]
+    assert steady.knee is not None
+    return steady.knee, rate, by_rate, by_knee

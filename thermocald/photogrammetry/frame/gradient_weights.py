@@ -82,8 +82,8 @@ class GradientWeights:
             p[:, :2] -= w.origin
             value, j = blurred_disc(placed.select(w.rows), p, w.x, w.y)
             weight = (w.weight / noise.variance(value)).astype(np.float32)
-            jw = j * weight[:, None, :]
-            N = (jw @ np.swapaxes(j, 1, 2)).astype(float)
+            jw = np.ascontiguousarray((j * weight).transpose(1, 0, 2))
+            N = (jw @ j.transpose(1, 2, 0)).astype(float)
             scale = np.sqrt(np.maximum(np.einsum("nii->ni", N), 1e-12))
             scaled = N / (scale[:, :, None] * scale[:, None, :]) + 1e-10 * np.eye(10)
             inverse[w.rows] = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])

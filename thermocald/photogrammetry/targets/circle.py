@@ -144,17 +144,19 @@ def windows(
         start = stop
         part = maps.select(rows)
         ox, oy = np.arange(-hx, hx + 1), np.arange(-hy, hy + 1)
-        lx, ly = np.tile(ox, len(oy))[None], np.repeat(oy, len(ox))[None]
+        lx, ly = np.tile(ox, len(oy)), np.repeat(oy, len(ox))
         origin = np.rint(part.centre).astype(np.int64)
+        x, y = lx.astype(np.float32), ly.astype(np.float32)
         centre = (part.centre - origin).astype(np.float32)
-        x, y = lx.astype(np.float32) - centre[:, :1], ly.astype(np.float32) - centre[:, 1:]
-        d, rho = edge_distance(part.linear, x, y)
+        d, rho = edge_distance(part.linear, x - centre[:, :1], y - centre[:, 1:])
         use = np.abs(d) <= reach_px  # the ellipse alone is good enough to choose pixels by
-        if np.any(coded[rows]):
+        ringed = np.flatnonzero(coded[rows])
+        if len(ringed):
             # d = (1 − ρ)/|∇ρ|, so the ring's inner edge is (2 − ρ)/|∇ρ| = d (2 − ρ)/(1 − ρ) away
+            rho = rho[ringed]
             with np.errstate(divide="ignore", invalid="ignore"):
-                ring = np.where(rho > 1, d * (RING_INNER - rho) / (1 - rho), np.inf)
-            use &= ~coded[rows, None] | (ring >= _RING_CLEARANCE * blur)
+                ring = d[ringed] * (RING_INNER - rho) / (1 - rho)
+            use[ringed] &= (rho <= 1) | (ring >= _RING_CLEARANCE * blur)
         cut = np.zeros(len(rows), dtype=bool)
         reach_xy = np.array([hx, hy])
         if np.any(origin < reach_xy) or np.any(origin + reach_xy >= (width, height)):
@@ -162,27 +164,23 @@ def windows(
             inside = (ix >= 0) & (ix < width) & (iy >= 0) & (iy < height)
             cut = np.any(~inside & (d > -2.0), axis=1)
             use &= inside
-        count = use.sum(axis=1)
-        k = max(int(count.max()), 1)
+        count = np.count_nonzero(use, axis=1)
         # The pixels used, moved to the front of each row.
-        where = np.flatnonzero(use)
-        row = np.repeat(np.arange(len(rows)), count)
-        place = np.arange(len(where)) + (k * np.arange(len(rows)) - (np.cumsum(count) - count))[row]
-        shape = (len(rows), k)
-        at = np.zeros(shape, dtype=np.int64)
-        at.ravel()[place] = where - row * use.shape[1]
-        weight = np.zeros(shape, dtype=np.float32)
-        weight.ravel()[place] = 1.0
-        base = origin[:, 1:] * width + origin[:, :1]
-        pixel = np.where(weight > 0, (ly * width + lx)[0].take(at) + base, 0)
+        filled = np.arange(max(int(count.max()), 1)) < count[:, None]
+        at = np.zeros(filled.shape, dtype=np.int64)
+        at[filled] = np.flatnonzero(use) - np.repeat(np.arange(len(rows)) * use.shape[1], count)
+        pixel = (ly * width + lx).take(at)
+        pixel += origin[:, 1:] * width + origin[:, :1]
+        pixel *= filled
+        weight = filled.astype(np.float32)
         grey = flat.take(pixel).astype(np.float32)
         begin = np.zeros((len(rows), 10))
         begin[:, :2] = part.centre
         begin[:, 5] = blur
         begin[:, 6:8] = levels[rows]
         yield Windows(
-            rows, pixel, origin.astype(float), lx[0].astype(np.float32).take(at),
-            ly[0].astype(np.float32).take(at), grey, weight, begin, cut,
+            rows, pixel, origin.astype(float), x.take(at),
+            y.take(at), grey, weight, begin, cut,
         )  # fmt: skip
 
 
@@ -289,27 +287,28 @@ def _gauss_newton(
     """
     p = begin.copy()
     p[:, :2] -= w.origin
-    shape = (len(p), 10, w.x.shape[1])
+    shape = (10, *w.x.shape)
     j, jw = (row[: np.prod(shape)].reshape(shape) for row in work)
     for _ in range(max(rounds, 1)):
         value, _ = blurred_disc(maps, p, w.x, w.y, out=j)
         weight = w.weight if noise is None else w.weight / noise.variance(value)
-        np.multiply(j, weight[:, None, :], out=jw)
+        np.multiply(j, weight, out=jw)
         residual = w.grey - value
-        N = (jw @ np.swapaxes(j, 1, 2)).astype(float)
-        delta = _limited(N, (jw @ residual[..., None])[..., 0])
+        by_target = jw.transpose(1, 0, 2)
+        N = (by_target @ j.transpose(1, 2, 0)).astype(float)
+        delta = _limited(N, (by_target @ residual[..., None])[..., 0])
         p = p + delta
         p[:, 5] = np.clip(p[:, 5], 0.2, 6.0)
         p[:, 2:5] = np.clip(p[:, 2:5], -0.6, 0.6)
         step = np.abs(delta[:, :2]).max(axis=1)
         if bool(np.all(step < tolerance_px) and np.all(np.abs(delta[:, 5]) < _BLUR_SETTLED_PX)):
             break
-    change = (np.swapaxes(j, 1, 2) @ delta[..., None].astype(np.float32))[..., 0]
+    change = (j.transpose(1, 2, 0) @ delta[..., None].astype(np.float32))[..., 0]
     p[:, :2] += w.origin
     flat = np.zeros(0, dtype=bool)
     if tells_noise:
         # Where a px of movement would change the grey value by next to nothing.
-        slope = np.maximum(np.abs(j[:, 0]), np.abs(j[:, 1]))
+        slope = np.maximum(np.abs(j[0]), np.abs(j[1]))
         flat = (w.weight > 0) & (slope < _FLAT * np.abs(p[:, 7, None]))
     return _Fit(p, value + change, residual - change, N, step, flat)
 
@@ -320,9 +319,11 @@ def _limited(N: Array, rhs: NDArray[np.floating[Any]]) -> Array:
 
 
 def _solve(N: Array, rhs: NDArray[np.floating[Any]]) -> Array:
-    scale = np.sqrt(np.maximum(np.einsum("nii->ni", N), 1e-12))
-    scaled = N / (scale[:, :, None] * scale[:, None, :]) + 1e-9 * np.eye(N.shape[-1])
-    solution: Array = np.linalg.solve(scaled, (rhs / scale)[..., None])[..., 0] / scale
+    scale = 1.0 / np.sqrt(np.maximum(np.einsum("nii->ni", N), 1e-12))
+    scaled = N * scale[:, :, None]
+    scaled *= scale[:, None, :]
+    np.einsum("nii->ni", scaled)[:] += 1e-9
+    solution: Array = np.linalg.solve(scaled, (rhs * scale)[..., None])[..., 0] * scale
     return solution
 
 

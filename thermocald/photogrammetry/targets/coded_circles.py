@@ -59,10 +59,11 @@ def find_coded(
     grey = to_8_bit(image)
     best: tuple[NDArray[np.int64], Array, LocalMap] | None = None
     foreign = False
+    enough = max(fewest + 2, _ENOUGH_CODES * (len(row_of) + sum(map(len, named.values()))))
     searches = _SEARCHES if image.shape[1] > _LARGE_WIDTH else _SEARCHES[2:]
     for scale, polarity in searches:
         candidates = find_circles(grey, scale, polarity)
-        codes = read_codes(grey, candidates)
+        codes = read_codes(grey, candidates, wanted=(row_of, enough))
         keys = list(zip(codes.bits.tolist(), codes.numbers.tolist(), strict=True))
         ours = [i for i, key in enumerate(keys) if key in row_of]
         foreign = foreign or len(ours) < len(keys)
@@ -75,7 +76,6 @@ def find_coded(
         if best is None or len(rows) > len(best[0]):
             maps = candidates.maps.select(np.array(which, dtype=np.int64))
             best = np.array(rows, dtype=np.int64), maps.centre, maps
-        enough = max(fewest + 2, _ENOUGH_CODES * (len(row_of) + sum(map(len, named.values()))))
         if len(best[0]) >= enough or (not needed and len(best[0]) >= fewest):
             break
     if best is None:

@@ -99,11 +99,13 @@ def _are_ellipses(contours: list[Any], e: Array) -> NDArray[np.bool_]:
         return np.zeros(0, dtype=bool)
     count = np.array([len(c) for c in contours])
     which = np.repeat(np.arange(len(contours)), count)
-    points = np.concatenate(contours)[:, 0].astype(float)
-    x, y, a, b, angle = e.T
-    c, s = np.cos(angle)[which], np.sin(angle)[which]
-    dx, dy = points[:, 0] - x[which], points[:, 1] - y[which]
-    rho = np.hypot((c * dx + s * dy) / a[which], (c * dy - s * dx) / b[which])
-    off = np.bincount(which, np.abs(rho - 1)) / count
+    a, b, angle = e[:, 2:].T
+    c, s = np.cos(angle), np.sin(angle)
+    # to the plane of the unit circle, by what is the same for all points of a contour
+    axes = np.stack([c / a, s / a, -s / b, c / b], axis=1).astype(np.float32)[which].T
+    points = np.concatenate(contours)[:, 0] - e[:, :2].astype(np.float32)[which]
+    dx, dy = points.astype(np.float32).T
+    u, v = axes[0] * dx + axes[1] * dy, axes[2] * dx + axes[3] * dy
+    off = np.bincount(which, np.abs(np.sqrt(u * u + v * v) - 1)) / count
     keeps: NDArray[np.bool_] = off < _RADIUS_TOLERANCE + 0.35 / np.minimum(a, b)
     return keeps

@@ -62,8 +62,8 @@ def estimate_noise(
     g, r2 = grey[good], residuals[good] ** 2
     if len(g) < _FEWEST:
         return NoiseModel(max(float(r2.mean()) if len(g) else sd * sd, _QUANTISATION))
-    order = np.argsort(g)
-    bins = np.array_split(order, _BINS)
+    edges = [len(g) * k // _BINS for k in range(1, _BINS)]
+    bins = np.split(np.argpartition(g, edges), edges)
     x = np.array([g[b].mean() for b in bins])
     v = np.empty(_BINS)
     for i, b in enumerate(bins):

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 from functools import cache
+from math import inf
 from typing import TYPE_CHECKING
 
 import cv2
@@ -22,6 +23,8 @@ from thermocald.photogrammetry.targets.blurred_disc import normal_cdf
 from thermocald.photogrammetry.targets.outline import LocalMap
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Single
@@ -69,31 +72,38 @@ def read_codes(
     image: NDArray[np.uint8],
     candidates: Candidates,
     known: frozenset[tuple[int, int]] | None = None,
+    wanted: tuple[Collection[tuple[int, int]], float] = ((), inf),
 ) -> CodedTargets:
     """The ring codes about candidates; `known` (bits, number), all others are ignored.
 
-    Both families are always read, since a ring of one may pass for one of the other. A code that
-    is read at two places is dropped: one of the two is not what it says.
+    Both families are always read, since a ring of one may be mistaken for one of the other. A code
+    that is read at two places is dropped: one of the two is wrong. wanted: codes, and how many of
+    them are enough: discs about which no code was found are then not looked at in perspective.
     """
     rows, gap, contrast = _disc_and_gap(image, candidates)
     maps = _sized(image, candidates.maps.select(rows), gap, contrast)
     bits, number = _read(image, maps, gap, contrast)
     # Seen from near and aslant, a ring is not concentric with its disc: by pixels if it is large.
     left = np.nonzero(bits == 0)[0]
-    if len(left):
+    codes, enough = wanted
+    if len(left) and sum(c in codes for c in _pairs(bits, number)) < enough:
         grey = gap[left], contrast[left]
         bits[left], number[left] = _read(
             image, in_perspective(image, maps.select(left), *grey), *grey
         )
     good = bits > 0
     bits, number, rows = bits[good], number[good], rows[good]
-    found = list(zip(bits.tolist(), number.tolist(), strict=True))
+    found = _pairs(bits, number)
     count = Counter(found)
     keep = np.array(
         [i for i, c in enumerate(found) if count[c] == 1 and (known is None or c in known)],
         dtype=np.int64,
     )
     return CodedTargets(bits[keep], number[keep], rows[keep])
+
+
+def _pairs(bits: NDArray[np.int64], number: NDArray[np.int64]) -> list[tuple[int, int]]:
+    return list(zip(bits.tolist(), number.tolist(), strict=True))
 
 
 def _read(

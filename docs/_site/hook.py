@@ -25,11 +25,13 @@ if TYPE_CHECKING:
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
 
-mathematics, notebooks, reference = (
-    importlib.import_module(f"_site.{name}") for name in ("mathematics", "notebooks", "reference")
+five_pages, mathematics, notebooks, reference = (
+    importlib.import_module(f"_site.{name}")
+    for name in ("five_pages", "mathematics", "notebooks", "reference")
 )
 
 GENERATED = "<!-- generated -->"
+GENERATORS = {**reference.GENERATORS, "explanation/five-pages.md": five_pages.page}
 
 
 def api_wanted() -> bool:
@@ -78,7 +80,7 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
     """Fill in the generated part of a page."""
     if GENERATED not in markdown:
         return markdown
-    return markdown.replace(GENERATED, reference.GENERATORS[page.file.src_uri]())
+    return markdown.replace(GENERATED, GENERATORS[page.file.src_uri]())
 
 
 def on_page_content(html: str, **_: Any) -> str:

@@ -12,8 +12,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from _site import five_pages
-
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
@@ -321,6 +319,5 @@ GENERATORS: dict[str, Callable[[], str]] = {
     "reference/config.md": _configuration_page,
     "reference/effects.md": _effect_page,
     "reference/drivers.md": _driver_page,
-    "explanation/five-pages.md": five_pages.page,
 }
 """By page: what stands in place of its mark."""

@@ -115,15 +115,23 @@ ZONES = {
 }
 
 
-@pytest.mark.parametrize(
-    ("driver", "case"), [*(("hwmon", case) for case in HWMON), *(("iio", case) for case in IIO)]
-)
-def test_hwmon_and_iio(driver, case, tmp_path):
-    files, expected = {"hwmon": HWMON, "iio": IIO}[driver][case]
-    getattr(Sysfs(tmp_path), driver)(0, "chip", **files)
-    stanza = {"chip": "chip", "sysfs": str(tmp_path)}
+def chip_reads(driver, files, folder):
+    getattr(Sysfs(folder), driver)(0, "chip", **files)
+    stanza = {"chip": "chip", "sysfs": str(folder)}
     with open_device("thermometer", driver, stanza, VirtualClock()) as device:
-        assert result(lambda: device.read().values["temperature"]) == expected
+        return result(lambda: device.read().values["temperature"])
+
+
+@pytest.mark.parametrize("case", HWMON)
+def test_hwmon(case, tmp_path):
+    files, expected = HWMON[case]
+    assert chip_reads("hwmon", files, tmp_path) == expected
+
+
+@pytest.mark.parametrize("case", IIO)
+def test_iio(case, tmp_path):
+    files, expected = IIO[case]
+    assert chip_reads("iio", files, tmp_path) == expected
 
 
 @pytest.mark.parametrize("case", ZONES)

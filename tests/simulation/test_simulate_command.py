@@ -35,7 +35,7 @@ def test_list():
     for name in (*preset_names(), "thermal_lag", "target_displacement"):
         assert name in result.output
     listed = json.loads(run("--list", "--json", "-").stdout)
-    assert len(listed["effects"]) == 19
+    assert len(listed["effects"]) == 20
 
 
 def test_preset_to_recording_and_json(tmp_path):

@@ -37,13 +37,15 @@ _MOST_PATTERNS = 300  # of targets seen, over the series; the epochs of others c
 @dataclass(frozen=True, eq=False)
 class Shared:
     """What is known of the common unknowns: offsets (T, 2) px, pose (6,), their cofactors (q + 2T,
-    q + 2T), the mean G (p, q + 2T) by which own parameters follow an error of theirs.
+    q + 2T), the mean G (p, q + 2T) by which own parameters follow an error of theirs; used: how
+    many observations they use up.
     """
 
     offsets: Array
     pose: Array
     cofactors: Array
     mean: Array
+    used: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +127,8 @@ class CommonSums:
         """What is known with these sums."""
         design, n = self.design, max(self.epochs, 1)
         p, q, width = len(design.own), len(design.common), design.width
-        normal = design.prior_matrix()
+        prior = design.prior_matrix()
+        normal = prior.copy()
         gradient = self.gradient + design.common_pull(known.pose, known.offsets)
         mean, tilt = np.zeros((2, p, width))
         kinds = []
@@ -152,7 +155,17 @@ class CommonSums:
         if spread > 0 and self.ends is not None:
             line = (tilt - middle * n * mean) / spread * (self.ends[1] - self.ends[0])
         pose = known.pose + change[:q] if q else known.pose
-        return Solved(Shared(offsets, pose, cofactors, mean), -mean @ change, line, rest)
+        used = float(width - np.einsum("ij,ji->", cofactors, prior))
+        return Solved(Shared(offsets, pose, cofactors, mean, used), -mean @ change, line, rest)
+
+    def settle(self, shared: Shared) -> None:
+        """Carry the sums to the common unknowns that they were solved for, in place.
+
+        There only the priors' pull is left of the gradients.
+        """
+        self.gradient = -self.design.common_pull(shared.pose, shared.offsets)
+        for pattern in self.patterns.values():
+            pattern.right[:] = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,13 +220,13 @@ def kinds_of(design: Design, system: SeriesSystem) -> list[Alike]:
     return out
 
 
-def level_of(known: Shared, design: Design) -> Array:
-    """Cofactors (16, 16) of what all epochs have in common."""
+def level_of(known: Shared, design: Design, G: Array) -> Array:
+    """Cofactors (16, 16) of what the common unknowns do to parameters that follow them by G."""
     if not design.width:
         return np.zeros((16, 16))
     root = root_of(known.cofactors)
     whole = np.zeros((16, design.width))
     whole[design.common] = root[: len(design.common)]
-    whole[design.own] -= known.mean @ root
+    whole[design.own] -= G @ root
     level: Array = whole @ whole.T
     return level

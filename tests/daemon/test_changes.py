@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from tests.daemon.conftest import ENVIRONMENT, fast_run, make_recording
+from thermocald.analysis.series.stored import table_of_stored
 from thermocald.photogrammetry.camera.camera_model import project
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.simulation.demonstration import demonstration_field, demonstration_model
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import Head
@@ -74,6 +76,21 @@ def told(store, name: str) -> list[tuple[str, int]]:
         (e.kind, e.epoch) for e in store.events(series)
         if e.kind in ("knock", "slip", "wrong_lens", "change", "target_moved")
     ]  # fmt: skip
+
+
+def test_what_was_stored_is_what_replay_makes_of_it(store):
+    """The late epochs; at an early one the daemon cannot know what the later ones say."""
+    series = store.find_series("nothing")
+    settings = AdjustmentSettings()
+    stored, replayed = (
+        table_of_stored(store, series, settings, exterior) for exterior in ("stored", "series")
+    )
+    assert (np.array(stored.status) == np.array(replayed.status)).all()
+    late = slice(-10, None)
+    apart = np.abs(stored.values - replayed.values)[late, :3] / stored.sd[late, :3]
+    assert apart.max() < 0.2
+    total = np.hypot(replayed.sd, replayed.level_sd)[late, :3]
+    np.testing.assert_allclose(stored.sd[late, :3], total, rtol=0.02)
 
 
 def test_nothing_happened_and_nothing_is_told(store):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -33,17 +33,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.analysis.series.table import SeriesTable
-    from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
     from thermocald.photogrammetry.field.testfield import Observations, TestField
     from thermocald.photogrammetry.series.blocks import ObservationBlocks
     from thermocald.photogrammetry.series.long_result import LongAdjustment, RowWriter
     from thermocald.photogrammetry.series.normals import ObservationGrid
-    from thermocald.photogrammetry.series.result import Exterior
     from thermocald.store.recording.head import Head
 
     Array = NDArray[np.float64]
 
-__all__ = ["settings_for_series", "table_of_series"]
+__all__ = ["table_of_series"]
 
 _SOME = 20_000  # epochs that tell the start values
 _AS_READ = ("number", "frame_time", "temperature")
@@ -215,15 +213,3 @@ def _groups(testfield: TestField, result: SeriesAdjustment) -> dict[str, NDArray
     for row in np.flatnonzero(seen):
         rows.setdefault(int(testfield.groups[row]), []).append(int(row))
     return {testfield.names[members[0]]: np.array(members) for members in rows.values()}
-
-
-def settings_for_series(settings: AdjustmentSettings, exterior: str) -> SeriesSettings:
-    """The series' settings that go with those of single epochs."""
-    return SeriesSettings(
-        exterior=cast("Exterior", exterior),
-        free=settings.free,
-        scale=settings.scale,
-        bounds=settings.bounds,
-        max_rejected=settings.max_rejected,
-        priors=settings.priors,
-    )

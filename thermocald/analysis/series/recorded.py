@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.acquisition.calibrator import Calibrator
-from thermocald.analysis.series.adjusted import settings_for_series, table_of_series
+from thermocald.analysis.series.adjusted import table_of_series
 from thermocald.analysis.series.table import SeriesTable, calibrate_epochs, frame_temperatures
 from thermocald.errors import DataError
 from thermocald.photogrammetry.series.long_series import together_at_most
+from thermocald.photogrammetry.series.result import SeriesSettings
 from thermocald.photogrammetry.series.words import Words
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ def recorded_table(
     adjusted at once, only some epochs are calibrated by themselves. advance: told of epochs done.
     Raises DataError where no epoch has a result.
     """
-    adjusted = settings_for_series(settings, exterior)
+    adjusted = SeriesSettings.of(settings, exterior)
     calibrator = Calibrator.of_recording(recording, settings)
     head, targets = recording.head, recording.testfield
     if recording.has_observations and len(recording) > together_at_most(len(targets)):

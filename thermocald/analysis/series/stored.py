@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.acquisition.calibrator import Calibrator
-from thermocald.analysis.series.adjusted import settings_for_series, table_of_series
+from thermocald.analysis.series.adjusted import table_of_series
 from thermocald.analysis.series.drift import settled
 from thermocald.analysis.series.table import SeriesTable
 from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
+from thermocald.photogrammetry.series.result import SeriesSettings
 from thermocald.photogrammetry.series.spool import ColumnSpool
 from thermocald.photogrammetry.series.words import Words
 from thermocald.store.database.row import EpochResult
@@ -140,7 +141,7 @@ def table_of_stored(
         series.testfield,
         apart,
         StoredBlocks(store, series, apart.number),
-        settings_for_series(settings, exterior),
+        SeriesSettings.of(settings, exterior),
     )
 
 

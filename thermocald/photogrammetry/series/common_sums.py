@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.linalg import inverse_of_determined, root_of
+from thermocald.photogrammetry.linalg import inverse_of_determined
 from thermocald.photogrammetry.series.system import SeriesSystem
 
 if TYPE_CHECKING:
@@ -127,28 +127,31 @@ class CommonSums:
         """What is known with these sums."""
         design, n = self.design, max(self.epochs, 1)
         p, q, width = len(design.own), len(design.common), design.width
+        patterns = list(self.patterns.values())
+        count = np.array([float(found.epochs) for found in patterns])
+        times = np.array([found.times for found in patterns])
+        right = np.array([found.right for found in patterns]).reshape(-1, p)
+        weights = np.array([found.weights / found.epochs for found in patterns])
+        kinds = _typical(design, weights.reshape(-1, len(design.at.A), 3))
         prior = design.prior_matrix()
-        normal = prior.copy()
         gradient = self.gradient + design.common_pull(known.pose, known.offsets)
         mean, tilt = np.zeros((2, p, width))
-        kinds = []
-        for pattern in self.patterns.values() if width else ():
-            one = _typical(design, pattern.weights / pattern.epochs)
-            if not one.good[0]:
-                continue
-            G = _sensitivity(one)
-            normal += pattern.epochs * one.common_normals()
-            gradient -= G.T @ pattern.right
-            mean += pattern.epochs * G
-            tilt += pattern.times * G
-            kinds.append((G, np.sqrt(np.diag(one.Q[0]))))
+        for part, C in kinds.couplings():
+            G = kinds.Q[part] @ C
+            gradient -= np.einsum("kpi,kp->i", G, right[part])
+            mean += np.tensordot(count[part], G, axes=1)
+            tilt += np.tensordot(times[part], G, axes=1)
         mean /= n
-        cofactors = inverse_of_determined(normal)
+        cofactors = inverse_of_determined(prior + kinds.common_normals(count))
         change = cofactors @ gradient
         offsets = known.offsets
         if design.offset_prior is not None:
             offsets = offsets + change[q:].reshape(2, -1).T
-        rest = max((float(np.max(np.abs((G - mean) @ change) / sd)) for G, sd in kinds), default=0)
+        rest = 0.0
+        for part, C in kinds.couplings():
+            sd = np.sqrt(np.diagonal(kinds.Q[part], axis1=1, axis2=2))
+            other = (kinds.Q[part] @ C - mean) @ change
+            rest = max(rest, float(np.max(np.abs(other) / sd)))
         middle = self.times / n
         spread = self.squares - n * middle**2
         line = np.zeros((p, width))
@@ -182,17 +185,8 @@ class Solved:
 
 
 def _typical(design: Design, weights: Array) -> SeriesSystem:
-    """The system of one epoch with some weights (T, 3), without the priors of what is common."""
-    w = weights[None]
-    return SeriesSystem.formed(design.without_common_priors(), w, w[..., 0] > 0)
-
-
-def _sensitivity(one: SeriesSystem) -> Array:
-    """G (p, q + 2T): by how much own parameters of an epoch follow the common unknowns."""
-    coupling = next((C for _, C in one.couplings()), None)
-    none = np.zeros((len(one.design.own), one.design.width))
-    out: Array = none if coupling is None else one.Q[0] @ coupling[0]
-    return out
+    """The system of epochs with some weights (K, T, 3), without the priors of what is common."""
+    return SeriesSystem.formed(design.without_common_priors(), weights, weights[..., 0] > 0)
 
 
 def kinds_of(design: Design, system: SeriesSystem) -> list[Alike]:
@@ -214,19 +208,19 @@ def kinds_of(design: Design, system: SeriesSystem) -> list[Alike]:
         groups.append(rest)
     out = []
     for rows in groups:
-        one = _typical(design, system.used(rows).mean(axis=0))
+        one = _typical(design, system.used(rows).mean(axis=0, keepdims=True))
         if one.good[0]:
-            out.append(Alike(rows, one, _sensitivity(one)))
+            G = np.zeros((len(design.own), design.width))
+            for _, C in one.couplings():
+                G = one.Q[0] @ C[0]
+            out.append(Alike(rows, one, G))
     return out
 
 
 def level_of(known: Shared, design: Design, G: Array) -> Array:
     """Cofactors (16, 16) of what the common unknowns do to parameters that follow them by G."""
-    if not design.width:
-        return np.zeros((16, 16))
-    root = root_of(known.cofactors)
     whole = np.zeros((16, design.width))
-    whole[design.common] = root[: len(design.common)]
-    whole[design.own] -= G @ root
-    level: Array = whole @ whole.T
+    whole[design.common, np.arange(len(design.common))] = 1.0
+    whole[design.own] -= G
+    level: Array = whole @ known.cofactors @ whole.T
     return level

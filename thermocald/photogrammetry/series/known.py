@@ -21,7 +21,7 @@ from thermocald.photogrammetry.series.common_sums import CommonSums, Shared, kin
 from thermocald.photogrammetry.series.covariances import of_correlated, of_priors
 from thermocald.photogrammetry.series.design import State
 from thermocald.photogrammetry.series.estimator import ENOUGH_FOR_NOISE
-from thermocald.photogrammetry.series.normals import ObservationGrid, sums_of_squares
+from thermocald.photogrammetry.series.normals import ObservationGrid, planes, sums_of_squares
 from thermocald.photogrammetry.series.status import enough_targets, judge
 
 if TYPE_CHECKING:
@@ -102,7 +102,8 @@ class KnownSeries:
             pairs = series.pairs(estimate, found.use)
         good = sample.ok
         middle = np.median(sample.values[good] if good.any() else estimate.values, axis=0)
-        none = ObservationGrid(series.grid.points[:0], series.grid.weights[:0])
+        T = series.grid.points.shape[1]
+        none = ObservationGrid(planes(2, 0, T), planes(3, 0, T))
         held = replace(
             series, grid=none, stated=none.weights, held=at, unit=unit, windows=(), typical=unit
         )

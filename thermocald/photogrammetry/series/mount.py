@@ -42,6 +42,7 @@ __all__ = [
     "Movement",
     "drift_period",
     "estimate_movement",
+    "fastest_period",
     "together",
 ]
 
@@ -146,7 +147,12 @@ def drift_period(time_s: Array, temperature: Array) -> float:
     warms = len(known) > 1 and float(np.ptp(known)) >= _LEAST_WARMING_K
     if interval <= 0 or (float(np.ptp(time_s)) < FASTEST_DRIFT_S and not warms):
         return 0.0
-    return max(FASTEST_DRIFT_S / interval, _FEWEST_A_PERIOD)
+    return fastest_period(interval)
+
+
+def fastest_period(interval_s: float) -> float:
+    """The shortest period of a camera's drift in epochs, which are so far apart."""
+    return max(FASTEST_DRIFT_S / interval_s, _FEWEST_A_PERIOD)
 
 
 def estimate_movement(

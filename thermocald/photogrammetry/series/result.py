@@ -8,7 +8,7 @@ and the targets' uncertainty), is stated separately and cancels in every drift.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 
 import numpy as np
 
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from numpy.typing import NDArray
+
+    from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 
     Array = NDArray[np.float64]
 
@@ -62,6 +64,18 @@ class SeriesSettings:
     max_rejected: float = 0.35
     scale: Literal["posterior", "prior"] = "posterior"
     bounds: GeometryBounds = field(default_factory=GeometryBounds)
+
+    @classmethod
+    def of(cls, settings: AdjustmentSettings, exterior: str) -> SeriesSettings:
+        """The series' settings that go with those of single epochs."""
+        return cls(
+            exterior=cast("Exterior", exterior),
+            free=settings.free,
+            scale=settings.scale,
+            bounds=settings.bounds,
+            max_rejected=settings.max_rejected,
+            priors=settings.priors,
+        )
 
     @property
     def per_epoch(self) -> NDArray[np.int64]:

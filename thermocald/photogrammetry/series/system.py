@@ -95,12 +95,19 @@ class SeriesSystem:
         """Weights (e, T, 3) of some epochs, 0 where a point takes no part."""
         return _used(self.weights[rows], self.use[rows])
 
-    def common_normals(self) -> Array:
-        """Normal matrix of the common unknowns, the own parameters of all epochs reduced."""
-        weights = self.used(self.good).sum(axis=0)
-        full = self.design.common_matrix(self.N[self.good].sum(axis=0), weights)
+    def common_normals(self, count: Array | None = None) -> Array:
+        """Normal matrix of the common unknowns, the own parameters of all epochs reduced.
+
+        count (E,): how many epochs each of these stands for, one by default.
+        """
+        n = np.ones(len(self.good)) if count is None else count
+        full = self.design.common_matrix(
+            np.tensordot(n[self.good], self.N[self.good], axes=1),
+            np.tensordot(n[self.good], self.used(self.good), axes=1),
+        )
         for part, C in self.couplings():
             half = np.swapaxes(np.linalg.cholesky(self.Q[part]), 1, 2) @ C
+            half *= np.sqrt(n[part, None, None])
             half = half.reshape(-1, half.shape[-1])
             full -= half.T @ half
         return full

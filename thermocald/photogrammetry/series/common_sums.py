@@ -19,13 +19,9 @@ from thermocald.photogrammetry.linalg import inverse_of_determined
 from thermocald.photogrammetry.series.system import SeriesSystem
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array, Index
     from thermocald.photogrammetry.series.design import Design
 
-    Array = NDArray[np.float64]
-    Mask = NDArray[np.bool_]
-    Columns = NDArray[np.int64]
 
 __all__ = ["Alike", "CommonSums", "Shared", "Solved", "kinds_of", "level_of"]
 
@@ -54,7 +50,7 @@ class Alike:
     mean weights, G (p, q + 2T): by how much own parameters follow the common unknowns.
     """
 
-    rows: Columns
+    rows: Index
     system: SeriesSystem
     G: Array
 

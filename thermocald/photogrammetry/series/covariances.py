@@ -15,9 +15,7 @@ from thermocald.photogrammetry.parameters import EOP, EOP_COLUMNS
 from thermocald.photogrammetry.series.cofactors import among_all, cofactors
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from thermocald.arrays import Array, Mask
+    from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.series.system import SeriesSystem
     from thermocald.photogrammetry.series.target_noise import CorrelatedPairs
 
@@ -82,7 +80,7 @@ def all_cofactors(system: SeriesSystem) -> SeriesCofactors:
     return SeriesCofactors(relative, level, trend)
 
 
-def of_slow_targets(system: SeriesSystem, errors: Array, group: NDArray[np.int64]) -> Array:
+def of_slow_targets(system: SeriesSystem, errors: Array, group: Index) -> Array:
     """Covariance (16, 16) of a straight line over the series from targets' slow errors.
 
     errors (T, 2) px: seen in the residuals, of which a group of targets that errs together has

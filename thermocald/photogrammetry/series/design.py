@@ -16,12 +16,9 @@ from thermocald.photogrammetry.parameters import EOP
 from thermocald.photogrammetry.series.normals import right_hand_sides
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from thermocald.arrays import Array
+    from thermocald.arrays import Array, Index
     from thermocald.photogrammetry.series.normals import Partials
 
-    Columns = NDArray[np.int64]
 
 __all__ = ["Design", "State"]
 
@@ -46,8 +43,8 @@ class Design:
     """
 
     at: Partials
-    own: Columns
-    common: Columns
+    own: Index
+    common: Index
     known: Array
     own_prior: Array
     common_prior: Array
@@ -120,7 +117,7 @@ class Design:
             return parameters
         return np.concatenate([parameters, self._with_offsets(weights, self.own)], axis=2)
 
-    def _with_offsets(self, weights: Array, columns: Columns) -> Array:
+    def _with_offsets(self, weights: Array, columns: Index) -> Array:
         """Blocks (E, k, 2T) of some parameters with the offsets."""
         wx, wy, wxy = np.moveaxis(weights, -1, 0)[:, :, None]
         ax, ay = self.at.A[:, 0, columns].T, self.at.A[:, 1, columns].T

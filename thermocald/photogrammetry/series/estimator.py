@@ -36,9 +36,7 @@ from thermocald.photogrammetry.series.target_noise import (
 )
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from thermocald.arrays import Array, Mask
+    from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.series.normals import Partials
@@ -196,7 +194,7 @@ class SeriesEstimator:
         system = whole = replace(estimate.system, use=use.copy())
         offered, use, rows = use, whole.use, np.arange(len(use))
         rejections = Rejections(use)
-        part: slice | NDArray[np.int64] = slice(None)  # without a copy
+        part: slice | Index = slice(None)  # without a copy
         typical = self.typical
         for _ in range(_ROUNDS):
             tests = point_tests(system, residuals[part])

@@ -25,8 +25,7 @@ from thermocald.photogrammetry.series.normals import ObservationGrid, planes, su
 from thermocald.photogrammetry.series.status import enough_targets, judge
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array, Mask
     from thermocald.photogrammetry.series.adjustment import Adjusted
     from thermocald.photogrammetry.series.common_sums import Alike
     from thermocald.photogrammetry.series.design import Design
@@ -35,8 +34,6 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.series.result import SeriesAdjustment, SeriesSettings
     from thermocald.photogrammetry.series.target_noise import CorrelatedPairs
 
-    Array = NDArray[np.float64]
-    Mask = NDArray[np.bool_]
 
 __all__ = ["AdjustedBlock", "KnownSeries"]
 

@@ -11,13 +11,9 @@ from thermocald.photogrammetry.series.spool import ColumnSpool
 from thermocald.photogrammetry.series.words import Words
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.series.result import SeriesAdjustment
 
-    Array = NDArray[np.float64]
-    Mask = NDArray[np.bool_]
-    Columns = NDArray[np.int64]
 
 __all__ = ["LongAdjustment", "RowWriter"]
 
@@ -37,7 +33,7 @@ class LongAdjustment:
     level_sd: Array
     trend_sd: Array
     sample: SeriesAdjustment
-    sampled: Columns
+    sampled: Index
     passes: int
 
 
@@ -95,13 +91,13 @@ class RowWriter:
         """(E,): epochs with a result."""
         return self._ok
 
-    def shift(self, columns: Columns, change: Array) -> None:
+    def shift(self, columns: Index, change: Array) -> None:
         """Add a change (k,) to some parameters of all epochs."""
         for column, size in zip(columns, change, strict=True):
             self.values[:, column] += size
             self.release()
 
-    def widen(self, columns: Columns, variance: Array) -> None:
+    def widen(self, columns: Index, variance: Array) -> None:
         """Add variances (k,) to some parameters of all epochs with a result."""
         for column, size in zip(columns, variance, strict=True):
             old = np.nan_to_num(self.sd[:, column])

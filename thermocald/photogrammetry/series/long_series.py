@@ -28,8 +28,7 @@ from thermocald.photogrammetry.series.normals import normal_matrices
 from thermocald.photogrammetry.series.target_noise import slow_errors
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array, Index
     from thermocald.photogrammetry.camera.camera_model import (
         ExteriorOrientation,
         InteriorOrientation,
@@ -42,7 +41,6 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.series.normals import ObservationGrid
     from thermocald.photogrammetry.series.result import SeriesAdjustment, SeriesSettings
 
-    Array = NDArray[np.float64]
 
 __all__ = ["adjust_long_series", "together_at_most"]
 
@@ -104,7 +102,7 @@ class _Blocks:
         return cls(KnownSeries.of(found, sample)[0], epochs, slow)
 
     def adjust(
-        self, source: ObservationBlocks, sample: SeriesAdjustment, sampled: NDArray[np.int64]
+        self, source: ObservationBlocks, sample: SeriesAdjustment, sampled: Index
     ) -> LongAdjustment:
         """All blocks, in as many passes as it takes."""
         out, blocks = RowWriter(self.epochs), self
@@ -142,7 +140,7 @@ class _Blocks:
 
     def finished(
         self, solved: Solved, out: RowWriter, sample: SeriesAdjustment,
-        sampled: NDArray[np.int64], passes: int,
+        sampled: Index, passes: int,
     ) -> LongAdjustment:  # fmt: skip
         """The last change of the common unknowns on all epochs, and what is of the whole series."""
         known, shared, design = self.known, solved.shared, self.known.design

@@ -29,11 +29,8 @@ from thermocald.photogrammetry.series.variance_components import components, mea
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
+    from thermocald.arrays import Array, Index, Mask
 
-    Array = NDArray[np.float64]
-    Mask = NDArray[np.bool_]
-    Columns = NDArray[np.int64]
 
 __all__ = [
     "FASTEST_DRIFT_S",
@@ -158,7 +155,7 @@ def fastest_period(interval_s: float) -> float:
 def estimate_movement(
     N: Array,
     b: Array,
-    own: Columns,
+    own: Index,
     good: Mask,
     period: float = 24.0,
     correlated: Array | None = None,
@@ -220,7 +217,7 @@ def together(movements: Sequence[Movement], starts: Sequence[int]) -> Movement:
     )
 
 
-def _perspective(N: Array, b: Array, own: Columns, root: Array, whiten: Array) -> Perspective:
+def _perspective(N: Array, b: Array, own: Index, root: Array, whiten: Array) -> Perspective:
     """What the perspective alone says of the pose, the interior orientation eliminated."""
     M, g = N[:, EOP, EOP], b[:, EOP]
     if len(own):
@@ -232,7 +229,7 @@ def _perspective(N: Array, b: Array, own: Columns, root: Array, whiten: Array) -
     return Perspective(np.swapaxes(back, 0, 1) @ M @ back, g @ back)
 
 
-def _courses(N: Array, b: Array, own: Columns) -> tuple[Array | None, Array, Mask]:
+def _courses(N: Array, b: Array, own: Index) -> tuple[Array | None, Array, Mask]:
     """Poses (E, 6) with the interior orientation held, in units of their noise; the root of their
     usual normal matrix; and which epochs (E,) say little.
 
@@ -261,7 +258,7 @@ def _courses(N: Array, b: Array, own: Columns) -> tuple[Array | None, Array, Mas
     return pose @ root.T, root, weak
 
 
-def _visible(N: Array, own: Columns, root: Array) -> Array:
+def _visible(N: Array, own: Index, root: Array) -> Array:
     """How much of a movement (6, 6) an epoch sees by its perspective, 0 to 1, in units of `root`.
 
     The rest looks like a change of the interior orientation.

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 
-    Array = NDArray[np.float64]
 
 __all__ = ["EXTERIOR_CHOICES", "Exterior", "SeriesAdjustment", "SeriesSettings"]
 
@@ -78,7 +78,7 @@ class SeriesSettings:
         )
 
     @property
-    def per_epoch(self) -> NDArray[np.int64]:
+    def per_epoch(self) -> Index:
         """Positions of the parameters that every epoch has of its own."""
         own = free_columns(self.free)
         if self.exterior != "series":
@@ -92,7 +92,7 @@ class SeriesSettings:
         return len(interior) + (6 if self.exterior == "per_epoch" else 0)
 
     @property
-    def common(self) -> NDArray[np.int64]:
+    def common(self) -> Index:
         """Positions of the parameters that are estimated once."""
         return np.empty(0, dtype=np.int64) if self.exterior == "per_epoch" else EOP_COLUMNS
 
@@ -120,8 +120,8 @@ class SeriesAdjustment:
     level_covariance: Array
     sigma0: Array
     redundancy: Array
-    observed: NDArray[np.bool_]
-    rejected: NDArray[np.bool_]
+    observed: Mask
+    rejected: Mask
     residuals: Array
     offsets: Array
     offset_sds: Array
@@ -155,11 +155,11 @@ class SeriesAdjustment:
         return np.sqrt(np.clip(np.diag(self.level_covariance), 0.0, None))
 
     @property
-    def ok(self) -> NDArray[np.bool_]:
+    def ok(self) -> Mask:
         """(E,): epochs with a result."""
         return np.array([s == "ok" for s in self.status], dtype=bool)
 
-    def spread(self, targets: NDArray[np.int64], n: int) -> SeriesAdjustment:
+    def spread(self, targets: Index, n: int) -> SeriesAdjustment:
         """The same with its columns of targets put where they stand in a larger test field."""
         if len(targets) == n:
             return self

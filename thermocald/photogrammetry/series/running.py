@@ -21,15 +21,12 @@ from thermocald.photogrammetry.series.mount import FEWEST_EPOCHS
 from thermocald.photogrammetry.series.normals import ObservationGrid
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array, Mask
     from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.field.testfield import Observations, TestField
     from thermocald.photogrammetry.series.common_sums import CommonSums
     from thermocald.photogrammetry.series.result import SeriesSettings
 
-    Array = NDArray[np.float64]
-    Mask = NDArray[np.bool_]
 
 __all__ = ["RunningEpoch", "RunningSeries"]
 

@@ -26,12 +26,9 @@ from thermocald.photogrammetry.series.normals import (
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from numpy.typing import NDArray
-
-    from thermocald.arrays import Array, Mask
+    from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.series.design import Design, State
 
-    Columns = NDArray[np.int64]
 
 __all__ = ["SeriesSystem", "Step", "alike"]
 
@@ -70,7 +67,7 @@ class SeriesSystem:
     Q: Array
     good: Mask
     Q_common: Array
-    alike: tuple[Columns, Columns] | None
+    alike: tuple[Index, Index] | None
 
     @classmethod
     def formed(cls, design: Design, weights: Array, use: Mask) -> SeriesSystem:
@@ -91,7 +88,7 @@ class SeriesSystem:
         """The same with the cofactors of the common unknowns."""
         return replace(self, Q_common=inverse_of_determined(self.common_normals()))
 
-    def used(self, rows: Columns | Mask | slice = slice(None)) -> Array:
+    def used(self, rows: Index | Mask | slice = slice(None)) -> Array:
         """Weights (e, T, 3) of some epochs, 0 where a point takes no part."""
         return _used(self.weights[rows], self.use[rows])
 
@@ -112,7 +109,7 @@ class SeriesSystem:
             full -= half.T @ half
         return full
 
-    def couplings(self) -> Iterator[tuple[Columns, Array]]:
+    def couplings(self) -> Iterator[tuple[Index, Array]]:
         """Chunks of good epochs and their blocks (e, p, q + 2T) of own with common unknowns."""
         rows = np.flatnonzero(self.good)
         if self.design.width == 0 or len(self.design.own) == 0:
@@ -167,7 +164,7 @@ class SeriesSystem:
             residuals[part, :, 0] -= step.d_own[part] @ Ax
             residuals[part, :, 1] -= step.d_own[part] @ Ay
 
-    def replace(self, rows: Columns, part: SeriesSystem) -> None:
+    def replace(self, rows: Index, part: SeriesSystem) -> None:
         """Put some epochs in from another system of the same linearisation, in place.
 
         Only where nothing is common: the common unknowns would not follow.
@@ -204,6 +201,6 @@ def _used(weights: Array, use: Mask) -> Array:
     return used
 
 
-def alike(weights: Array, use: Mask) -> tuple[Columns, Columns]:
+def alike(weights: Array, use: Mask) -> tuple[Index, Index]:
     """Epochs of which the same points take part with the same weights, as of `same_rows`."""
     return same_rows(np.packbits(use, axis=1), *np.moveaxis(weights, -1, 0))

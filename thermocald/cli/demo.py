@@ -19,11 +19,9 @@ from thermocald.cli.options import JsonOption, SeedOption
 from thermocald.errors import DataError
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
     from thermocald.analysis.series.table import SeriesTable
-
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = ["demo"]
 

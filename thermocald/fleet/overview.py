@@ -24,10 +24,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.store.server.address import ServerAddress
     from thermocald.store.server.fleet_reader import CameraRecord, StationState
-
-    Array = NDArray[np.float64]
 
 __all__ = [
     "ODD",

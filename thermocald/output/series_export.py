@@ -31,9 +31,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.analysis.series.table import SeriesTable
+    from thermocald.arrays import Array
     from thermocald.store.database.epoch_table import StoredEpoch
 
-    Array = NDArray[np.float64]
     Columns = dict[str, NDArray[np.integer] | Array | Sequence[str]]
     Row = dict[str, float | int | str | None]
 

@@ -45,9 +45,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.series.normals import ObservationGrid, Partials
-
-    Array = NDArray[np.float64]
 
 __all__ = ["reduce_series", "reduce_together", "reweighted", "with_points", "without_targets"]
 

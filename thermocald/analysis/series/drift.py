@@ -27,8 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.analysis.series.table import SeriesTable
-
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = ["Course", "courses", "settled"]
 

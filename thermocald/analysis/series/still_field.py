@@ -25,11 +25,10 @@ from thermocald.reduction.gross_errors import spikes
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.series.adjustment import SeriesAdjustment
-
-    Array = NDArray[np.float64]
 
 __all__ = ["still_field"]
 

@@ -21,9 +21,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.reduction.series import ReducedSeries
-
-    Array = NDArray[np.float64]
 
 __all__ = ["Displaced", "displaced_targets"]
 

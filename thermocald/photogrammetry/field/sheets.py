@@ -20,9 +20,8 @@ from thermocald.photogrammetry.field.planes import plane_fit
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
-
-    Array = NDArray[np.float64]
 
 __all__ = ["FEWEST_ON_A_SHEET", "field_sheets"]
 

@@ -35,7 +35,8 @@ from thermocald.photogrammetry.series.field_motion import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
+
     Rows = NDArray[np.int64]
 
 __all__ = ["board_movements", "refined"]

@@ -16,7 +16,8 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
+
     Rows = NDArray[np.int64]
 
 __all__ = [

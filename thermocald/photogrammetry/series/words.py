@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    Mask = NDArray[np.bool_]
+    from thermocald.arrays import Mask
 
 __all__ = ["Words"]
 

@@ -15,13 +15,10 @@ from thermocald.store.recording.paths import FileFolder
 from thermocald.store.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
     from thermocald.epoch import Epoch
     from thermocald.store.database.row import StoredSeries
     from thermocald.store.database.store import Store
-
-    Array = NDArray[np.float64]
 
 __all__ = ["archive_readings", "archive_series"]
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = [
     "POINT_QUANTUM_PX",

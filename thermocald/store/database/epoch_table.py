@@ -29,12 +29,9 @@ if TYPE_CHECKING:
     import sqlite3
     from collections.abc import Iterator, Mapping
 
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import Observations
     from thermocald.store.database.blob import ObservationRows
-
-    Array = NDArray[np.float64]
 
 __all__ = [
     "StoredEpoch",

@@ -12,14 +12,12 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    import numpy as np
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.store.database.blob import ObservationRows
     from thermocald.store.database.epoch_table import StoredEpoch
     from thermocald.store.database.row import Event, StoredSeries
-
-    Array = NDArray[np.float64]
 
 __all__ = ["SeriesReader", "StampedReader"]
 

@@ -57,12 +57,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.field.testfield import Observations, TestField
     from thermocald.store.database.blob import ObservationRows
     from thermocald.store.recording.head import Head
-
-    Array = NDArray[np.float64]
 
 __all__ = ["Store"]
 

@@ -34,9 +34,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.store.database.blob import ObservationRows
-
-    Array = NDArray[np.float64]
 
 __all__ = ["ServerStore"]
 

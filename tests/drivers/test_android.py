@@ -12,18 +12,7 @@ import pytest
 from thermocald_drivers.android_phone import AdbPhone
 
 from tests.drivers.fakes.adb_server import AdbServer, FakePhone, photograph
-from thermocald.errors import (
-    BadReading,
-    ConfigurationError,
-    DeviceDenied,
-    DeviceGone,
-    DeviceNotFound,
-    DeviceTimeout,
-    DriverMissing,
-    PermanentDeviceError,
-    TransientDeviceError,
-    WrongDevice,
-)
+from thermocald import errors
 from thermocald.hal import SystemClock, VirtualClock, open_device
 
 SERIAL = "0A1B2C3D4E"
@@ -170,7 +159,7 @@ def test_a_file_that_never_ends(server, phone):
     phone.shoot = lambda phone: phone.add("IMG_1.jpg", photograph(time.time())[:-300])
     with (
         camera(server, timeout_s=1.5) as device,
-        pytest.raises(BadReading, match="partial photograph, IMG_1"),
+        pytest.raises(errors.BadReading, match="partial photograph, IMG_1"),
     ):
         device.capture()
 
@@ -197,7 +186,7 @@ def test_pending_files_and_raw_copies_are_not_photographs(server, phone):
 
 def test_two_new_photographs(server, phone):
     phone.shoot = shoot(count=2)
-    with camera(server) as device, pytest.raises(BadReading, match="2 new photographs"):
+    with camera(server) as device, pytest.raises(errors.BadReading, match="2 new photographs"):
         device.capture()
 
 
@@ -205,7 +194,7 @@ def test_no_photograph(server, phone):
     phone.shoot = None
     with (
         camera(server, timeout_s=1.5) as device,
-        pytest.raises(DeviceTimeout, match="is the trigger right"),
+        pytest.raises(errors.DeviceTimeout, match="is the trigger right"),
     ):
         device.capture()
 
@@ -217,7 +206,7 @@ def test_exposure_that_moved_is_flagged_or_refused(server, phone):
             device.capture()
             phone.shoot = shoot(iso=200)
             if refuse:
-                with pytest.raises(BadReading, match="iso was 100 and is 200"):
+                with pytest.raises(errors.BadReading, match="iso was 100 and is 200"):
                     device.capture()
             else:
                 assert device.capture().metadata["locked"] is False
@@ -240,7 +229,7 @@ def test_a_phone_that_focuses_gives_no_frame(server, phone, change, tags, why):
         for name, value in change.items():
             setattr(phone, name, value)
         phone.shoot = shoot(**{"distance": 1.5, **tags})
-        with pytest.raises(BadReading, match=why):
+        with pytest.raises(errors.BadReading, match=why):
             device.capture()
 
 
@@ -282,13 +271,16 @@ def test_a_focus_that_nobody_tells_is_not_called_locked(server, phone):
 
 def test_a_smaller_photograph(server, phone):
     phone.shoot = shoot(size=(48, 32))
-    with camera(server) as device, pytest.raises(WrongDevice, match="has 48×32 px, not 96×64"):
+    with (
+        camera(server) as device,
+        pytest.raises(errors.WrongDevice, match="has 48×32 px, not 96×64"),
+    ):
         device.capture()
 
 
 def test_a_locked_screen(server, phone):
     phone.stays_locked = True
-    with pytest.raises(DeviceDenied, match="screen is locked"):
+    with pytest.raises(errors.DeviceDenied, match="screen is locked"):
         camera(server).open()
 
 
@@ -301,24 +293,24 @@ def test_a_phone_that_fell_asleep_is_woken(server, phone):
 
 def test_a_full_phone(server, phone):
     phone.free_kb = 10_000
-    with pytest.raises(PermanentDeviceError, match="storage is full"):
+    with pytest.raises(errors.PermanentDeviceError, match="storage is full"):
         camera(server).open()
 
 
 def test_a_phone_that_fills_up(server, phone):
     with camera(server, timeout_s=1.5) as device:
         phone.shoot, phone.free_kb = None, 10_000
-        with pytest.raises(PermanentDeviceError, match="storage is full"):
+        with pytest.raises(errors.PermanentDeviceError, match="storage is full"):
             device.capture()
 
 
 @pytest.mark.parametrize(
     ("state", "error", "message"),
     [
-        ("unauthorized", DeviceDenied, "Allow USB debugging"),
-        ("offline", DeviceGone, "re-plug"),
-        ("no", DeviceDenied, "udev"),
-        ("bootloader", DeviceGone, "boot"),
+        ("unauthorized", errors.DeviceDenied, "Allow USB debugging"),
+        ("offline", errors.DeviceGone, "re-plug"),
+        ("no", errors.DeviceDenied, "udev"),
+        ("bootloader", errors.DeviceGone, "boot"),
     ],
 )
 def test_states_of_the_server(server, phone, state, error, message):
@@ -329,7 +321,8 @@ def test_states_of_the_server(server, phone, state, error, message):
 
 
 @pytest.mark.parametrize(
-    ("state", "error"), [("offline", DeviceGone), ("unauthorized", TransientDeviceError)]
+    ("state", "error"),
+    [("offline", errors.DeviceGone), ("unauthorized", errors.TransientDeviceError)],
 )
 def test_states_that_come_later(server, phone, state, error):
     with camera(server) as device:
@@ -341,14 +334,14 @@ def test_states_that_come_later(server, phone, state, error):
 def test_not_attached_and_dropped_out(server, phone):
     del server.phones[SERIAL]
     device = camera(server)
-    with pytest.raises(DeviceNotFound, match="adb lists none"):
+    with pytest.raises(errors.DeviceNotFound, match="adb lists none"):
         device.open()
     server.phones[SERIAL] = phone
     device.open()
     del server.phones[SERIAL]
-    with pytest.raises(DeviceGone):
+    with pytest.raises(errors.DeviceGone):
         device.capture()
-    with pytest.raises(DeviceGone):
+    with pytest.raises(errors.DeviceGone):
         device.open()
     server.phones[SERIAL] = phone
     device.open()
@@ -359,7 +352,7 @@ def test_a_transfer_that_breaks_off(server, phone):
     phone.shoot = shoot(size=(96, 64))
     with camera(server) as device:
         phone.cut_transfer = True
-        with pytest.raises(DeviceGone, match="broke off"):
+        with pytest.raises(errors.DeviceGone, match="broke off"):
             device.capture()
 
 
@@ -367,7 +360,7 @@ def test_a_phone_that_hangs(server, phone):
     with camera(server, timeout_s=0.3) as device:
         phone.hang = threading.Event()
         begin = time.monotonic()
-        with pytest.raises(DeviceTimeout):
+        with pytest.raises(errors.DeviceTimeout):
             device.capture()
         assert time.monotonic() - begin < 1.5
 
@@ -376,13 +369,13 @@ def test_no_server():
     with socket.create_server(("127.0.0.1", 0)) as unused:
         port = unused.getsockname()[1]
     settings = {"serial": SERIAL, "port": port, "start_server": False}
-    with pytest.raises(DeviceNotFound, match="adb start-server"):
+    with pytest.raises(errors.DeviceNotFound, match="adb start-server"):
         open_device("thermometer", "android", settings, SystemClock()).open()
 
 
 def test_without_adbutils(server, monkeypatch):
     monkeypatch.setitem(sys.modules, "adbutils", None)
-    with pytest.raises(DriverMissing, match="android"):
+    with pytest.raises(errors.DriverMissing, match="android"):
         camera(server).open()
 
 
@@ -414,7 +407,9 @@ def test_a_zone_of_unknown_unit_asks_for_the_option(server, phone):
     sensors = {"soc": "zone:tsens_tz_sensor5"}
     with (
         thermometer(server, sensors=sensors) as device,
-        pytest.raises(BadReading, match=r"unit of 45 is not known; write units: \{soc: degC\}"),
+        pytest.raises(
+            errors.BadReading, match=r"unit of 45 is not known; write units: \{soc: degC\}"
+        ),
     ):
         device.read()
     with thermometer(server, sensors=sensors, units={"soc": "tenths"}) as device:
@@ -433,19 +428,22 @@ def test_a_unit_that_was_certain_once_is_kept(server, phone):
 
 @pytest.mark.parametrize("units", [{"soc": "kelvin"}, {"air": "degC"}, {"skin": "degC"}])
 def test_a_wrong_unit(server, units):
-    with pytest.raises(ConfigurationError, match="units"):
+    with pytest.raises(errors.ConfigurationError, match="units"):
         thermometer(server, sensors={"soc": "zone:x", "skin": "thermal:y"}, units=units)
 
 
 def test_two_phones_with_one_serial_number(server):
     server.listing = f"{SERIAL}\toffline\n{SERIAL}\tdevice\n"
-    with pytest.raises(WrongDevice, match="2 devices have this serial number"):
+    with pytest.raises(errors.WrongDevice, match="2 devices have this serial number"):
         thermometer(server).open()
 
 
 def test_a_phone_without_a_battery_sensor(server, phone):
     phone.battery = "  voltage: 0\n  temperature: 0\n"
-    with thermometer(server) as device, pytest.raises(BadReading, match="no battery temperature"):
+    with (
+        thermometer(server) as device,
+        pytest.raises(errors.BadReading, match="no battery temperature"),
+    ):
         device.read()
 
 
@@ -460,12 +458,12 @@ def test_two_phones_by_their_serials(server, phone):
 
 @pytest.mark.parametrize("source", ["batery", "thermal", "zone:", "battery:x"])
 def test_a_source_that_does_not_exist(server, source):
-    with pytest.raises(ConfigurationError, match="neither battery"):
+    with pytest.raises(errors.ConfigurationError, match="neither battery"):
         thermometer(server, sensors={"temperature": source})
 
 
 def test_tap_needs_its_place(server):
-    with pytest.raises(ConfigurationError, match="tap"):
+    with pytest.raises(errors.ConfigurationError, match="tap"):
         camera(server, trigger="tap")
 
 
@@ -511,7 +509,7 @@ def test_the_limit_stops_the_load_for_good(server, phone):
     with load(server, VirtualClock()) as output:
         output.emit({})
         heat(phone, 42.0)
-        with pytest.raises(BadReading, match=r"battery 42\.00 °C reached the limit"):
+        with pytest.raises(errors.BadReading, match=r"battery 42\.00 °C reached the limit"):
             output.emit({})
         assert not phone.load
         heat(phone, 20.0)
@@ -520,7 +518,7 @@ def test_the_limit_stops_the_load_for_good(server, phone):
 
 
 def test_a_limit_that_a_battery_does_not_survive(server):
-    with pytest.raises(ConfigurationError, match="limit_c: 60 °C"):
+    with pytest.raises(errors.ConfigurationError, match="limit_c: 60 °C"):
         open_device(
             "output",
             "android_load",

@@ -22,16 +22,7 @@ from tests.drivers.fakes.chips import (
     tmp117,
 )
 from tests.drivers.fakes.smbus import Bus, Chip
-from thermocald.errors import (
-    BadReading,
-    ConfigurationError,
-    DeviceDenied,
-    DeviceGone,
-    DeviceNotFound,
-    DeviceTimeout,
-    TransientDeviceError,
-    WrongDevice,
-)
+from thermocald import errors
 from thermocald.hal import VirtualClock, open_device
 
 
@@ -59,12 +50,12 @@ def test_a_good_reading(bus, name):
 @pytest.mark.parametrize(
     ("number", "error"),
     [
-        (errno.EREMOTEIO, DeviceGone),
-        (errno.ENXIO, DeviceGone),
-        (errno.ETIMEDOUT, DeviceTimeout),
-        (errno.EIO, BadReading),
-        (errno.EBUSY, TransientDeviceError),
-        (errno.EACCES, TransientDeviceError),
+        (errno.EREMOTEIO, errors.DeviceGone),
+        (errno.ENXIO, errors.DeviceGone),
+        (errno.ETIMEDOUT, errors.DeviceTimeout),
+        (errno.EIO, errors.BadReading),
+        (errno.EBUSY, errors.TransientDeviceError),
+        (errno.EACCES, errors.TransientDeviceError),
     ],
 )
 def test_a_bus_error_while_reading(bus, name, number, error):
@@ -79,14 +70,14 @@ def test_a_bus_error_while_reading(bus, name, number, error):
 @pytest.mark.parametrize("name", CHIPS)
 def test_nobody_at_the_address(bus, name):
     device = thermometer(name)
-    with pytest.raises(DeviceNotFound, match="dtparam=i2c_arm=on"):
+    with pytest.raises(errors.DeviceNotFound, match="dtparam=i2c_arm=on"):
         device.open()
     address, chip, _ = CHIPS[name]
     bus.chips[address] = chip()
     device.open()
     device.close()
     del bus.chips[address]
-    with pytest.raises(DeviceGone):  # it was there once: worth another try
+    with pytest.raises(errors.DeviceGone):  # it was there once: worth another try
         device.open()
 
 
@@ -95,7 +86,7 @@ def test_an_address_that_the_kernel_holds(bus, name):
     address, chip, _ = CHIPS[name]
     bus.chips[address] = chip()
     bus.chips[address].error = errno.EBUSY
-    with pytest.raises(DeviceDenied, match="a kernel driver"):
+    with pytest.raises(errors.DeviceDenied, match="a kernel driver"):
         thermometer(name).open()
 
 
@@ -103,7 +94,7 @@ def test_an_address_that_the_kernel_holds(bus, name):
 @pytest.mark.parametrize("number", [errno.ENOENT, errno.EACCES])
 def test_no_bus(bus, name, number):
     bus.open_error = number
-    with pytest.raises(DeviceNotFound if number == errno.ENOENT else DeviceDenied):
+    with pytest.raises(errors.DeviceNotFound if number == errno.ENOENT else errors.DeviceDenied):
         thermometer(name).open()
 
 
@@ -111,7 +102,7 @@ def test_no_bus(bus, name, number):
 def test_another_chip_at_the_address(bus, name):
     address = CHIPS[name][0]
     bus.chips[address] = Chip()  # every register reads 0xFF
-    with pytest.raises((WrongDevice, BadReading)):
+    with pytest.raises((errors.WrongDevice, errors.BadReading)):
         thermometer(name).open()
 
 
@@ -125,13 +116,13 @@ def test_0xffff_is_a_line_that_nobody_drives(bus, name):
         if name in ("tmp117", "bme280"):
             state = {0x01: b"\x20\x00"} if name == "tmp117" else {}
             bus.chips[address].on_write = lambda chip, r, d: chip.registers.update(state)
-        with pytest.raises(BadReading, match="0xFFFF"):
+        with pytest.raises(errors.BadReading, match="0xFFFF"):
             device.read()
 
 
 @pytest.mark.parametrize("name", CHIPS)
 def test_an_address_that_the_chip_cannot_have(name):
-    with pytest.raises(ConfigurationError, match="0x"):
+    with pytest.raises(errors.ConfigurationError, match="0x"):
         thermometer(name, address=0x50)
 
 
@@ -148,7 +139,10 @@ def test_mcp9808_sign_and_flags(bus, raw, value):
 
 def test_mcp9808_out_of_range(bus):
     bus.chips[0x18] = mcp9808(0x0FF0)  # 255 °C
-    with thermometer("mcp9808") as device, pytest.raises(BadReading, match="255 °C is outside"):
+    with (
+        thermometer("mcp9808") as device,
+        pytest.raises(errors.BadReading, match="255 °C is outside"),
+    ):
         device.read()
 
 
@@ -162,7 +156,7 @@ def test_mcp9808_in_shut_down_is_woken_and_a_conversion_awaited(bus):
 def test_mcp9808_that_stays_in_shut_down(bus):
     bus.chips[0x18] = mcp9808(configuration=0x0140)
     bus.chips[0x18].on_write = lambda *_: None
-    with pytest.raises(BadReading, match="shut-down"):
+    with pytest.raises(errors.BadReading, match="shut-down"):
         thermometer("mcp9808").open()
 
 
@@ -179,13 +173,13 @@ def test_tmp117_table_of_the_data_sheet(bus, raw, value):
 
 def test_tmp117_that_never_converted(bus):
     bus.chips[0x48] = tmp117(0x8000)
-    with thermometer("tmp117") as device, pytest.raises(BadReading, match="0x8000"):
+    with thermometer("tmp117") as device, pytest.raises(errors.BadReading, match="0x8000"):
         device.read()
 
 
 def test_tmp117_that_hangs(bus):
     bus.chips[0x48] = tmp117(ready=False)
-    with thermometer("tmp117") as device, pytest.raises(DeviceTimeout):
+    with thermometer("tmp117") as device, pytest.raises(errors.DeviceTimeout):
         device.read()
 
 
@@ -212,7 +206,7 @@ def test_lm75_family_words(bus, chip, raw, value):
 
 def test_lm75_with_bits_that_it_cannot_set(bus):
     bus.chips[0x48] = lm75(0x1910)
-    with thermometer("lm75") as device, pytest.raises(BadReading, match="0x1910 has bits"):
+    with thermometer("lm75") as device, pytest.raises(errors.BadReading, match="0x1910 has bits"):
         device.read()
 
 
@@ -229,7 +223,7 @@ def test_lm75_in_shut_down_is_woken(bus):
 def test_lm75_with_limits_of_another_chip(bus):
     bus.chips[0x48] = lm75()
     bus.chips[0x48].word(2, 0x4B37)
-    with pytest.raises(WrongDevice, match="hysteresis reads 0x4b37"):
+    with pytest.raises(errors.WrongDevice, match="hysteresis reads 0x4b37"):
         thermometer("lm75").open()
 
 
@@ -257,14 +251,14 @@ def test_the_power_up_register_is_not_zero_degrees(bus, case):
     name, options, address, chip, register, zero, one = case
     bus.chips[address] = chip(zero)
     with thermometer(name, **options) as device:
-        with pytest.raises(BadReading, match="0 °C is its power-up value"):
+        with pytest.raises(errors.BadReading, match="0 °C is its power-up value"):
             device.read()
         bus.chips[address].word(register, one)  # 1 °C, then 0 °C: a cold night
         assert device.read().values == {"temperature": 1.0}
         bus.chips[address].word(register, zero)
         assert device.read().values == {"temperature": 0.0}
         device.clock.advance(61.0)
-        with pytest.raises(BadReading, match="power-up"):
+        with pytest.raises(errors.BadReading, match="power-up"):
             device.read()
 
 
@@ -290,7 +284,7 @@ def test_sht3x_crc_of_the_data_sheet():
 @pytest.mark.parametrize("raw", [0x0000, 0xFFFE])
 def test_sht3x_ends_of_the_scale(bus, raw):
     bus.chips[0x44] = sht3x(raw)
-    with thermometer("sht3x") as device, pytest.raises(BadReading, match="outside"):
+    with thermometer("sht3x") as device, pytest.raises(errors.BadReading, match="outside"):
         device.read()
 
 
@@ -298,7 +292,7 @@ def test_sht3x_crc_error(bus):
     bus.chips[0x44] = sht3x()
     with thermometer("sht3x") as device:
         bus.chips[0x44] = sht3x(damage=0x10)
-        with pytest.raises(BadReading, match="CRC"):
+        with pytest.raises(errors.BadReading, match="CRC"):
             device.read()
 
 
@@ -338,17 +332,17 @@ def test_bme280_humidity_agrees_with_the_integer_formula():
 
 def test_bme280_that_is_a_bmp280(bus):
     bus.chips[0x76] = bme280(identity=0x58)
-    with pytest.raises(WrongDevice, match="0x0058"):
+    with pytest.raises(errors.WrongDevice, match="0x0058"):
         thermometer("bme280").open()
 
 
 def test_bme280_not_measured(bus):
     bus.chips[0x76] = bme280(adc_t=0x80000)
-    with thermometer("bme280") as device, pytest.raises(BadReading, match="0x80000"):
+    with thermometer("bme280") as device, pytest.raises(errors.BadReading, match="0x80000"):
         device.read()
 
 
 def test_bme280_that_hangs(bus):
     bus.chips[0x76] = bme280(status=0x08)
-    with thermometer("bme280") as device, pytest.raises(DeviceTimeout):
+    with thermometer("bme280") as device, pytest.raises(errors.DeviceTimeout):
         device.read()

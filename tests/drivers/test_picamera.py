@@ -12,16 +12,7 @@ import pytest
 from thermocald_drivers.picamera import Picamera2Camera, sensor_temperature
 
 from tests.drivers.fakes import picamera2_stand_in
-from thermocald.errors import (
-    BadReading,
-    ConfigurationError,
-    DeviceDenied,
-    DeviceGone,
-    DeviceNotFound,
-    DeviceTimeout,
-    DriverMissing,
-    WrongDevice,
-)
+from thermocald import errors
 from thermocald.hal import SystemClock, open_device
 
 
@@ -98,7 +89,7 @@ def test_a_lock_that_does_not_hold_gives_no_frame(focusing, moved):
     with camera() as device:
         device.capture()
         focusing.extra = moved
-        with pytest.raises(BadReading, match=f"{next(iter(moved))} was set to"):
+        with pytest.raises(errors.BadReading, match=f"{next(iter(moved))} was set to"):
             device.capture()
 
 
@@ -118,7 +109,7 @@ def test_auto_only_by_name_and_with_a_warning(focusing):
     "options", [{"colour_gains": [1.0]}, {"colour_gains": "warm"}, {"gain": "high"}]
 )
 def test_a_wrong_configuration(pi, options):
-    with pytest.raises(ConfigurationError):
+    with pytest.raises(errors.ConfigurationError):
         camera(**options)
 
 
@@ -179,7 +170,7 @@ def test_a_camera_that_does_not_obey(pi, extra, message):
     pi.extra = extra
     if extra.get("ExposureTime"):
         pi.extra = {**extra, "SensorTimestamp": time.clock_gettime_ns(time.CLOCK_BOOTTIME) + 10**10}
-    with camera() as device, pytest.raises(BadReading, match=message):
+    with camera() as device, pytest.raises(errors.BadReading, match=message):
         device.capture()
 
 
@@ -188,11 +179,11 @@ def test_a_capture_that_hangs_and_the_camera_opened_again(pi):
     device = camera(timeout_s=0.2)
     device.open()
     begin = time.monotonic()
-    with pytest.raises(DeviceTimeout, match=r"a capture hangs, given up after 0\.2 s"):
+    with pytest.raises(errors.DeviceTimeout, match=r"a capture hangs, given up after 0\.2 s"):
         device.capture()
     assert time.monotonic() - begin < 1.0
     assert pi.instances[0].closed
-    with pytest.raises(DeviceGone):
+    with pytest.raises(errors.DeviceGone):
         device.capture()
     pi.hang.set()
     pi.hang = None
@@ -204,46 +195,46 @@ def test_a_capture_that_hangs_and_the_camera_opened_again(pi):
 
 def test_a_partial_frame(pi):
     pi.cut = True
-    with camera() as device, pytest.raises(BadReading, match="partial frame"):
+    with camera() as device, pytest.raises(errors.BadReading, match="partial frame"):
         device.capture()
     assert pi.instances[0].requests_out == 0
 
 
 def test_no_camera_on_the_ribbon(pi):
     pi.cameras = ()
-    with pytest.raises(DeviceNotFound, match="ribbon cable"):
+    with pytest.raises(errors.DeviceNotFound, match="ribbon cable"):
         camera().open()
 
 
 def test_another_sensor(pi):
-    with pytest.raises(WrongDevice, match="this is a imx219, not a imx477"):
+    with pytest.raises(errors.WrongDevice, match="this is a imx219, not a imx477"):
         camera(model="imx477").open()
 
 
 def test_a_scaled_image_is_refused(pi):
-    with pytest.raises(WrongDevice, match="another interior orientation"):
+    with pytest.raises(errors.WrongDevice, match="another interior orientation"):
         camera(width=64, height=64).open()
 
 
 @pytest.mark.parametrize("size", [(64, 64)])
 def test_failing_to_open_gives_the_camera_back(pi, size):
-    with pytest.raises(WrongDevice):
+    with pytest.raises(errors.WrongDevice):
         camera(width=size[0], height=size[1]).open()
     assert [one.closed for one in pi.instances] == [True] * len(pi.instances)
 
 
 def test_a_lens_that_cannot_be_focused(pi):
-    with pytest.raises(WrongDevice, match="cannot be focused"):
+    with pytest.raises(errors.WrongDevice, match="cannot be focused"):
         camera(focus_dioptres=1.0).open()
 
 
 def test_a_camera_that_another_program_has(pi):
     pi.busy = True
-    with pytest.raises(DeviceDenied, match="another program"):
+    with pytest.raises(errors.DeviceDenied, match="another program"):
         camera().open()
 
 
 def test_without_picamera2(monkeypatch):
     monkeypatch.setitem(sys.modules, "picamera2", None)
-    with pytest.raises(DriverMissing):
+    with pytest.raises(errors.DriverMissing):
         camera().open()

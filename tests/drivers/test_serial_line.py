@@ -9,14 +9,7 @@ import time
 import pytest
 
 from tests.drivers.fakes.pty_instrument import Instrument
-from thermocald.errors import (
-    BadReading,
-    ConfigurationError,
-    DeviceDenied,
-    DeviceGone,
-    DeviceNotFound,
-    DeviceTimeout,
-)
+from thermocald import errors
 from thermocald.hal import SystemClock, open_device
 
 PATTERN = r"T=(?P<temperature>[-+]?\d+\.\d+)"
@@ -106,7 +99,7 @@ def test_a_line_is_never_used_twice(instrument):
         thread = later(lambda: far.send(b"\r+021.5C\r"))
         device.read()
         thread.join()
-        with pytest.raises(DeviceTimeout, match=r"silent for 0\.3 s"):
+        with pytest.raises(errors.DeviceTimeout, match=r"silent for 0\.3 s"):
             device.read()
 
 
@@ -141,26 +134,29 @@ def test_garbage_before_the_answer_is_skipped(instrument):
 @pytest.mark.parametrize("rubbish", [b"\xf8\x80\x00\xfe" * 20, b"\xf8\x80\r\n" * 20, b"T=\r\n"])
 def test_a_wrong_baud_rate_says_so(instrument, rubbish):
     far = instrument({b"T?\r\n": rubbish})
-    with asked(far) as device, pytest.raises(BadReading, match="is 9600 Bd 8N1 right"):
+    with asked(far) as device, pytest.raises(errors.BadReading, match="is 9600 Bd 8N1 right"):
         device.read()
 
 
 def test_an_endless_line_does_not_grow(instrument):
     far = instrument({b"T?\r\n": b"U" * 3000})
     with asked(far) as device:
-        with pytest.raises(BadReading):
+        with pytest.raises(errors.BadReading):
             device.read()
         assert len(device._line) == 0
 
 
 def test_half_a_line_then_silence(instrument):
     far = instrument({b"T?\r\n": b"T=20."})
-    with asked(far) as device, pytest.raises(BadReading, match=r"'T=20\.'"):
+    with asked(far) as device, pytest.raises(errors.BadReading, match=r"'T=20\.'"):
         device.read()
 
 
 def test_silence(instrument):
-    with asked(instrument()) as device, pytest.raises(DeviceTimeout, match=r"silent for 0\.4 s"):
+    with (
+        asked(instrument()) as device,
+        pytest.raises(errors.DeviceTimeout, match=r"silent for 0\.4 s"),
+    ):
         device.read()
 
 
@@ -190,7 +186,7 @@ def test_checksums(instrument, kind):
     far = instrument({b"T?\r\n": answers})
     with asked(far, pattern=CHECKED, checksum=kind) as device:
         assert device.read().values == {"temperature": 20.5}
-        with pytest.raises(BadReading, match="checksum"):
+        with pytest.raises(errors.BadReading, match="checksum"):
             device.read()
 
 
@@ -200,7 +196,7 @@ def answer(instrument, line, **options):
     with asked(far, timeout_s=0.15, **options) as device:
         try:
             return device.read().values["temperature"]
-        except BadReading:
+        except errors.BadReading:
             return None
 
 
@@ -242,7 +238,7 @@ def test_the_user_decides_what_means_no_sensor(instrument):
 def test_a_checksum_that_is_not_hexadecimal(instrument, given):
     pattern = PATTERN + r"\*(?P<checksum>..)"
     far = instrument({b"T?\r\n": f"T=20.50*{given}\r\n".encode()})
-    with asked(far, pattern=pattern, checksum="xor") as device, pytest.raises(BadReading):
+    with asked(far, pattern=pattern, checksum="xor") as device, pytest.raises(errors.BadReading):
         device.read()
 
 
@@ -270,11 +266,11 @@ def test_unplugged_and_plugged_again(instrument, tmp_path):
     device.open()
     device.read()
     far.unplug()
-    with pytest.raises(DeviceGone, match="unplugged"):
+    with pytest.raises(errors.DeviceGone, match="unplugged"):
         device.read()
     device.close()
     link.unlink()
-    with pytest.raises(DeviceGone):
+    with pytest.raises(errors.DeviceGone):
         device.open()
     link.symlink_to(instrument({b"T?\r\n": b"T=21.50\r\n"}).port)
     device.open()
@@ -286,13 +282,13 @@ def test_no_such_port():
     device = open_device(
         "thermometer", "serial", {"port": "/dev/ttyNONE", "instrument": "papouch-tm"}, SystemClock()
     )
-    with pytest.raises(DeviceNotFound, match="dialout"):
+    with pytest.raises(errors.DeviceNotFound, match="dialout"):
         device.open()
 
 
 def test_a_port_that_another_program_holds(instrument):
     far = instrument()
-    with asked(far), pytest.raises(DeviceDenied, match="another program holds the port"):
+    with asked(far), pytest.raises(errors.DeviceDenied, match="another program holds the port"):
         asked(far).open()
 
 
@@ -306,7 +302,7 @@ def test_permission_denied(instrument, monkeypatch):
         return original(path, *args, **kwargs)
 
     monkeypatch.setattr(os, "open", denied)
-    with pytest.raises(DeviceDenied, match="dialout"):
+    with pytest.raises(errors.DeviceDenied, match="dialout"):
         asked(far).open()
 
 
@@ -324,5 +320,5 @@ def test_permission_denied(instrument, monkeypatch):
     ],
 )
 def test_a_wrong_configuration(options, message):
-    with pytest.raises(ConfigurationError, match=message):
+    with pytest.raises(errors.ConfigurationError, match=message):
         open_device("thermometer", "serial", {"port": "/dev/null", **options}, SystemClock())

@@ -15,17 +15,7 @@ import pytest
 from thermocald_drivers.v4l2 import V4l2Camera
 
 from tests.drivers.fakes.v4l2_kernel import FakeCamera
-from thermocald.errors import (
-    BadReading,
-    ConfigurationError,
-    DeviceDenied,
-    DeviceGone,
-    DeviceNotFound,
-    DeviceTimeout,
-    DriverMissing,
-    TransientDeviceError,
-    WrongDevice,
-)
+from thermocald import errors
 from thermocald.hal import SystemClock, VirtualClock, open_device
 
 
@@ -121,7 +111,7 @@ def test_a_driver_that_does_not_say_which_clock(kernel):
 
 def test_a_stamp_of_another_clock_is_refused(kernel):
     kernel.stamp = lambda _now: 1_700_000_000.0
-    with camera(kernel) as device, pytest.raises(WrongDevice, match="monotonic clock"):
+    with camera(kernel) as device, pytest.raises(errors.WrongDevice, match="monotonic clock"):
         device.capture()
 
 
@@ -139,7 +129,7 @@ def test_manual_controls_are_set(kernel):
 
 def test_a_camera_that_does_not_obey(kernel):
     kernel.obeys = lambda control, value: 128 if control == 0x980913 else value
-    with pytest.raises(WrongDevice, match="gain was set to 10 and is 128"):
+    with pytest.raises(errors.WrongDevice, match="gain was set to 10 and is 128"):
         camera(kernel, gain=10).open()
     with camera(kernel, gain=10, strict=False) as device:
         assert "gain was set to 10" in device.capture().metadata["disobeyed"][0]
@@ -149,19 +139,19 @@ def test_a_camera_that_falls_back_to_automatic(kernel):
     with camera(kernel, exposure_s=0.01) as device:
         device.capture()
         kernel.controls[0x9A0901][4] = 3
-        with pytest.raises(BadReading, match="auto_exposure was set to 1 and is 3"):
+        with pytest.raises(errors.BadReading, match="auto_exposure was set to 1 and is 3"):
             device.capture()
 
 
 def test_a_value_out_of_the_cameras_range(kernel):
-    with pytest.raises(WrongDevice, match=r"takes 3 … 2047 in steps of 1"):
+    with pytest.raises(errors.WrongDevice, match=r"takes 3 … 2047 in steps of 1"):
         camera(kernel, exposure_s=2.0).open()
 
 
 def test_a_control_that_it_does_not_have(kernel):
-    with pytest.raises(WrongDevice, match="no control 'zoom'; it has auto_exposure"):
+    with pytest.raises(errors.WrongDevice, match="no control 'zoom'; it has auto_exposure"):
         camera(kernel, controls={"zoom": 1}).open()
-    with pytest.raises(WrongDevice, match="no control 0x009a090a"):
+    with pytest.raises(errors.WrongDevice, match="no control 0x009a090a"):
         camera(kernel, focus=0).open()
 
 
@@ -204,7 +194,7 @@ def test_a_lock_that_does_not_hold_gives_no_frame(focusing, control, value, name
     with camera(focusing) as device:
         device.capture()
         focusing.controls[control][4] = value
-        with pytest.raises(BadReading, match=f"{name}.* was set to .* and is {value}"):
+        with pytest.raises(errors.BadReading, match=f"{name}.* was set to .* and is {value}"):
             device.capture()
 
 
@@ -221,7 +211,7 @@ def test_after_a_plug_the_same_values_are_set_again(focusing):
 
 def test_an_automatic_mode_that_cannot_be_switched_off(focusing):
     focusing.obeys = lambda control, value: 1 if control == AUTO_FOCUS else value
-    with pytest.raises(WrongDevice, match="to let it change, write focus: auto"):
+    with pytest.raises(errors.WrongDevice, match="to let it change, write focus: auto"):
         camera(focusing).open()
     with camera(focusing, focus="auto") as device:
         focusing.controls[FOCUS][4] = 60
@@ -240,9 +230,9 @@ def test_auto_by_name_switches_it_on(focusing):
         assert focusing.controls[AUTO_FOCUS][4] == 1
         assert focusing.controls[AUTO_EXPOSURE][4] == 3
         assert device.capture().exposure is None
-    with pytest.raises(WrongDevice, match="no automatic mode"):
+    with pytest.raises(errors.WrongDevice, match="no automatic mode"):
         camera(focusing, gain="auto").open()
-    with pytest.raises(ConfigurationError, match="neither a number nor auto"):
+    with pytest.raises(errors.ConfigurationError, match="neither a number nor auto"):
         camera(focusing, focus="manual")
 
 
@@ -275,18 +265,20 @@ def test_the_stanza_has_the_current_values(focusing, tmp_path):
 
 
 def test_a_size_that_it_does_not_have(kernel):
-    with pytest.raises(WrongDevice, match="asked for 1920×1080 GREY, the camera gives 64×48 GREY"):
+    with pytest.raises(
+        errors.WrongDevice, match="asked for 1920×1080 GREY, the camera gives 64×48 GREY"
+    ):
         camera(kernel, width=1920, height=1080).open()
 
 
 def test_another_camera_at_the_node(kernel):
-    with pytest.raises(WrongDevice, match=r"this is 'Fake Webcam'"):
+    with pytest.raises(errors.WrongDevice, match=r"this is 'Fake Webcam'"):
         camera(kernel, card="C920").open()
 
 
 def test_a_node_that_does_not_capture(kernel):
     kernel.capture_device = False
-    with pytest.raises(WrongDevice, match="not a capture device"):
+    with pytest.raises(errors.WrongDevice, match="not a capture device"):
         camera(kernel).open()
 
 
@@ -295,7 +287,7 @@ def test_a_stalled_camera(kernel):
         device.capture()
         kernel.stalled = True
         begin = time.monotonic()
-        with pytest.raises(DeviceTimeout, match=r"no new frame in 0\.3 s"):
+        with pytest.raises(errors.DeviceTimeout, match=r"no new frame in 0\.3 s"):
             device.capture()
         assert time.monotonic() - begin < 0.6
         kernel.stalled = False
@@ -307,11 +299,11 @@ def test_unplugged_and_plugged_again(kernel):
     device.open()
     device.capture()
     kernel.errors = {"DQBUF": errno.ENODEV, "STREAMOFF": errno.ENODEV, "G_CTRL": errno.ENODEV}
-    with pytest.raises(DeviceGone):
+    with pytest.raises(errors.DeviceGone):
         device.capture()
     device.close()
     kernel.path.rename(kernel.path.with_name("away"))
-    with pytest.raises(DeviceGone):
+    with pytest.raises(errors.DeviceGone):
         device.open()
     kernel.path.with_name("away").rename(kernel.path)
     kernel.errors = {}
@@ -322,14 +314,14 @@ def test_unplugged_and_plugged_again(kernel):
 
 def test_it_was_never_there(kernel):
     kernel.path.unlink()
-    with pytest.raises(DeviceNotFound, match="group video"):
+    with pytest.raises(errors.DeviceNotFound, match="group video"):
         camera(kernel).open()
 
 
 @pytest.mark.parametrize(
     ("call", "number", "error"),
-    [("S_FMT", errno.EBUSY, DeviceDenied), ("STREAMON", errno.EBUSY, DeviceDenied),
-     ("QUERYCAP", errno.EACCES, DeviceDenied), ("STREAMON", errno.EIO, BadReading)],
+    [("S_FMT", errno.EBUSY, errors.DeviceDenied), ("STREAMON", errno.EBUSY, errors.DeviceDenied),
+     ("QUERYCAP", errno.EACCES, errors.DeviceDenied), ("STREAMON", errno.EIO, errors.BadReading)],
 )  # fmt: skip
 def test_busy_and_denied(kernel, call, number, error):
     kernel.errors = {call: number}
@@ -342,7 +334,7 @@ def test_denied_after_a_plug_is_tried_again(kernel):
     device.open()
     device.close()
     kernel.errors = {"QUERYCAP": errno.EACCES}  # the node is root's until udev has seen it
-    with pytest.raises(TransientDeviceError, match="Permission denied"):
+    with pytest.raises(errors.TransientDeviceError, match="Permission denied"):
         device.open()
     kernel.errors = {}
     device.open()
@@ -355,7 +347,7 @@ def test_another_device_at_its_number_is_not_the_end(kernel):
     device.open()
     device.close()
     kernel.capture_device = False
-    with pytest.raises(TransientDeviceError, match="not a capture device"):
+    with pytest.raises(errors.TransientDeviceError, match="not a capture device"):
         device.open()
     kernel.capture_device = True
     device.open()
@@ -372,7 +364,7 @@ def test_a_single_broken_frame_is_skipped(kernel):
 
 def test_only_broken_frames(kernel):
     kernel.broken = set(range(1000))
-    with camera(kernel) as device, pytest.raises(BadReading, match=r"only broken|as broken"):
+    with camera(kernel) as device, pytest.raises(errors.BadReading, match=r"only broken|as broken"):
         device.capture()
 
 
@@ -382,7 +374,7 @@ def test_a_partial_frame(kernel, pixel_format, keep):
     kernel.encode = lambda image, fourcc: full(image, fourcc)[:keep]
     with (
         camera(kernel, pixel_format=pixel_format) as device,
-        pytest.raises(BadReading, match="partial frame"),
+        pytest.raises(errors.BadReading, match="partial frame"),
     ):
         device.capture()
 
@@ -391,7 +383,7 @@ def test_a_jpeg_damaged_in_the_middle(kernel):
     kernel.encode = lambda _image, _fourcc: b"\xff\xd8" + b"\x55" * 300 + b"\xff\xd9"
     with (
         camera(kernel, pixel_format="MJPG") as device,
-        pytest.raises(BadReading, match="broken JPEG"),
+        pytest.raises(errors.BadReading, match="broken JPEG"),
     ):
         device.capture()
 
@@ -400,20 +392,20 @@ def test_by_serial_number(kernel, tmp_path):
     by_id = tmp_path / "v4l/by-id"
     by_id.mkdir(parents=True)
     device = camera(kernel, device=None, serial="8A3F", dev=str(tmp_path))
-    with pytest.raises(DeviceNotFound, match=r"8A3F"):
+    with pytest.raises(errors.DeviceNotFound, match=r"8A3F"):
         device.open()
     (by_id / "usb-046d_HD_Pro_Webcam_C920_8A3F-video-index0").symlink_to(kernel.path)
     (by_id / "usb-046d_HD_Pro_Webcam_C920_8A3F-video-index1").symlink_to(tmp_path / "video1")
     with device:
         device.capture()
     (by_id / "usb-046d_HD_Pro_Webcam_C920_18A3F-video-index0").symlink_to(kernel.path)
-    with pytest.raises(WrongDevice, match="several fit"):
+    with pytest.raises(errors.WrongDevice, match="several fit"):
         device.open()
 
 
 def test_without_linuxpy(kernel, monkeypatch):
     monkeypatch.setitem(sys.modules, "linuxpy.video.device", None)
-    with pytest.raises(DriverMissing, match=r"thermocald\[v4l2\]"):
+    with pytest.raises(errors.DriverMissing, match=r"thermocald\[v4l2\]"):
         camera(kernel, backend="linuxpy").open()
 
 
@@ -421,7 +413,7 @@ def test_without_linuxpy(kernel, monkeypatch):
     "options", [{"device": None}, {"serial": "x"}, {"pixel_format": "PNG"}, {"exposure_s": "long"}]
 )
 def test_a_wrong_configuration(kernel, options):
-    with pytest.raises(ConfigurationError):
+    with pytest.raises(errors.ConfigurationError):
         camera(kernel, **options)
 
 
@@ -482,7 +474,7 @@ def test_opencv_that_stalls_is_left_behind(opencv, kernel):
     device = camera(kernel, backend="opencv")
     device.open()
     begin = time.monotonic()
-    with pytest.raises(DeviceTimeout, match=r"no new frame in 0\.3 s"):
+    with pytest.raises(errors.DeviceTimeout, match=r"no new frame in 0\.3 s"):
         device.capture()
     device.close()
     assert time.monotonic() - begin < 1.0
@@ -497,11 +489,11 @@ def test_opencv_that_stalls_is_left_behind(opencv, kernel):
 def test_opencv_that_gets_nothing_more(opencv, kernel):
     with camera(kernel, backend="opencv") as device:
         opencv.good = False
-        with pytest.raises(DeviceGone, match="no frame"):
+        with pytest.raises(errors.DeviceGone, match="no frame"):
             device.capture()
 
 
 def test_opencv_of_another_size(opencv, kernel):
     opencv.size = (32, 24)
-    with pytest.raises(WrongDevice, match="gives 32×24"):
+    with pytest.raises(errors.WrongDevice, match="gives 32×24"):
         camera(kernel, backend="opencv").open()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,6 +21,7 @@ from thermocald.errors import DataError, ImageError, UsageError
 if TYPE_CHECKING:
     from thermocald.analysis.thermal.correction import TemperatureLog
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
+    from thermocald.store.logger.clock import DeviceClock
 
 __all__ = ["correct"]
 
@@ -69,11 +71,30 @@ def correct(
         raise DataError(f"{points}: cannot be read: {cause}") from cause
     if "image" in header and out is None:
         raise UsageError("--out is missing: the folder for the corrected images")
+    task = _Task(thermal, table, points, to, temperature_sd, extrapolate, device_clock(timezone))
     with warnings_said():
         if "image" in header and out is not None:
-            _images(thermal, table, points, out, to, temperature_sd, extrapolate, json, timezone)
+            _images(task, out, json)
         else:
-            _points(thermal, table, points, out, to, temperature_sd, extrapolate, json, timezone)
+            _points(task, out, json)
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """What is corrected, with which model and log; temperature_sd K, of a reading of the log."""
+
+    thermal: ThermalCamera
+    log: TemperatureLog
+    path: Path
+    asked_c: float | None
+    temperature_sd: float
+    extrapolate: bool
+    clock: DeviceClock
+
+    @property
+    def corrected_to(self) -> float:
+        """°C."""
+        return self.thermal.model.T0 if self.asked_c is None else self.asked_c
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -83,36 +104,28 @@ def _size(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def _points(
-    thermal: ThermalCamera,
-    table: TemperatureLog,
-    path: Path,
-    out: Path | None,
-    to: float | None,
-    temperature_sd: float,
-    extrapolate: bool,
-    json: str | None,
-    timezone: str | None,
-) -> None:
+def _points(task: _Task, out: Path | None, json: str | None) -> None:
     import csv
     import io
 
     import numpy as np
 
     from thermocald.analysis.thermal.correction import correct_points, read_rows
-    from thermocald.cli.common import write_json, write_text
+    from thermocald.cli.common import write_result, write_text
 
-    header, rows, numbers = read_rows(path, ("time", "x", "y"), device_clock(timezone))
-    inside = thermal.model.sensor.contains(numbers[:, 1:])
+    header, rows, numbers = read_rows(task.path, ("time", "x", "y"), task.clock)
+    inside = task.thermal.model.sensor.contains(numbers[:, 1:])
     if not inside.all():
         x, y = numbers[np.argmin(inside), 1:]
+        sensor = task.thermal.model.sensor
         raise DataError(
-            f"{path}: ({x:g}, {y:g}) px lies outside the model's {thermal.model.sensor.width}×"
-            f"{thermal.model.sensor.height} px; of another camera, or binned (--size)?"
+            f"{task.path}: ({x:g}, {y:g}) px lies outside the model's {sensor.width}×"
+            f"{sensor.height} px; of another camera, or binned (--size)?"
         )
     found = correct_points(
-        thermal, table, numbers[:, 0], numbers[:, 1:], to, temperature_sd, extrapolate
-    )
+        task.thermal, task.log, numbers[:, 0], numbers[:, 1:], task.asked_c,
+        task.temperature_sd, task.extrapolate,
+    )  # fmt: skip
     extra = ["dx", "dy", "sd_x", "sd_y", "temperature", "extrapolated_K"]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -127,48 +140,39 @@ def _points(
     summary: dict[str, Any] = {
         "format": "thermocald-correction/1",
         "points": len(rows),
-        "corrected_to": thermal.model.T0 if to is None else to,
+        "corrected_to": task.corrected_to,
         "rms_correction_px": float(np.sqrt(np.mean(moved**2))),
         "rms_left_over_px": float(np.sqrt(np.mean(found.sds**2))),
         "extrapolated_rows": int((found.extrapolated > 0).sum()),
     }
-    if json is not None:
-        write_json(summary, json)
-    if out is None and json != "-":
+    if not write_result(summary, json):
+        return
+    if out is None:
         typer.echo(text.getvalue(), nl=False)
-    elif json != "-":
+    else:
         typer.echo(
             f"{out}: {len(rows)} points corrected by {summary['rms_correction_px']:.3f} px (RMS); "
             f"left over ± {summary['rms_left_over_px']:.3f} px"
         )
 
 
-def _images(
-    thermal: ThermalCamera,
-    table: TemperatureLog,
-    path: Path,
-    out: Path,
-    to: float | None,
-    temperature_sd: float,
-    extrapolate: bool,
-    json: str | None,
-    timezone: str | None,
-) -> None:
+def _images(task: _Task, out: Path, json: str | None) -> None:
     import cv2
 
     from thermocald.analysis.thermal.correction import image_corrections, read_rows
-    from thermocald.cli.common import progress, write_json
+    from thermocald.cli.common import progress, write_result
 
-    _, rows, numbers = read_rows(path, ("time",), device_clock(timezone))
+    _, rows, numbers = read_rows(task.path, ("time",), task.clock)
     make_folder(out)
-    sensor = thermal.model.sensor
+    sensor = task.thermal.model.sensor
     done: list[dict[str, Any]] = []
     with progress(len(rows), "correcting images") as advance:
         corrections = image_corrections(
-            thermal, table, numbers[:, 0], to, temperature_sd, extrapolate
-        )
+            task.thermal, task.log, numbers[:, 0], task.asked_c, task.temperature_sd,
+            task.extrapolate,
+        )  # fmt: skip
         for row in rows:
-            source, written = path.parent / row["image"], out / Path(row["image"]).name
+            source, written = task.path.parent / row["image"], out / Path(row["image"]).name
             image = cv2.imread(str(source), cv2.IMREAD_UNCHANGED)
             if image is None:
                 raise ImageError(f"{source}: is not a readable image")
@@ -198,14 +202,12 @@ def _images(
                 }
             )
             advance(1)
-    if json is not None:
-        summary = {
-            "format": "thermocald-correction/1",
-            "corrected_to": thermal.model.T0 if to is None else to,
-            "images": done,
-        }
-        write_json(summary, json)
-    if json != "-":
+    summary = {
+        "format": "thermocald-correction/1",
+        "corrected_to": task.corrected_to,
+        "images": done,
+    }
+    if write_result(summary, json):
         worst = max(d["rms_left_over_px"] for d in done)
         most = max(d["largest_correction_px"] for d in done)
         typer.echo(

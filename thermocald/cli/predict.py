@@ -277,11 +277,11 @@ def _advice(
     else:
         network, thermometers = default_heat()
         device = CameraDevice(thermal.model.camera, thermal.model.sensor, network, thermometers)
-    course = Simulation(
+    history = Simulation(
         thermal.model, device, demonstration_field("plain"), read_programme(programme)
     ).true_history
     along = thermal.along(
-        course.reading_times, dict(course.readings), course.times, extrapolate=True
+        history.reading_times, dict(history.readings), history.times, extrapolate=True
     )
     advice = warm_up(along, distance * 1000.0, wanted)
     document = {

@@ -102,15 +102,15 @@ class SeriesRun:
         """Test the epoch against the series, then adjust it with what all its epochs share."""
         seen = calibrated.epoch.observations
         extra = self.observer.observe(calibrated) if self.observer and in_order else {}
-        apart = calibrated.adjustment
+        adjusted = calibrated.adjustment
         if self.common is not None and seen is not None:
             if in_order and self.first > 1 and not self.common.epochs:
                 self._remember()
             if "event" in extra:
                 self.common.reset()
             moved = extra.get("innovation_chi2", 0.0) > extra.get("innovation_bound", np.inf)
-            apart = self.common.refine(self._weighed(seen), apart, moved=moved)
-        return replace(calibrated, adjustment=apart, extra={**calibrated.extra, **extra})
+            adjusted = self.common.refine(self._weighed(seen), adjusted, moved=moved)
+        return replace(calibrated, adjustment=adjusted, extra={**calibrated.extra, **extra})
 
     def _weighed(self, seen: Observations) -> Observations:
         assert self.plan.calibrator is not None

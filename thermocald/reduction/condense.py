@@ -90,13 +90,15 @@ def condensed(
     size = int(np.ceil(E / (_COARSE * most)))
     fine = max(size // _FINER, 1)
     size = fine * int(np.ceil(size / fine))
-    coarse, course = _coarse(source, E, T, size, fine)
+    coarse, trajectory = _coarse(source, E, T, size, fine)
     rows = coarse
     if size > 1:
         spare = (1.0 - _COARSE) * most * fine  # epochs that may stand on short means
         length = size * int(np.clip(0.5 * spare / size, _SHORTEST, _LONGEST))
         count = max(int(spare / length), 1)
-        chosen = _fast_windows(course, _means(_temperature(series), fine), length // fine, count)
+        chosen = _fast_windows(
+            trajectory, _means(_temperature(series), fine), length // fine, count
+        )
         windows = [slice(k * length, min((k + 1) * length, E)) for k in chosen]
         rows = coarse.without(windows).beside(
             [_averaged(source.blocks([w]), w.start, w.stop - w.start, T, fine)[0] for w in windows]
@@ -257,15 +259,15 @@ def _shift_and_scale(p: Array, w: Array, middle: Array) -> Array:
     return np.stack([x.sum(1), y.sum(1), x @ arm[:, 0] + y @ arm[:, 1], u.sum(1)], axis=1)
 
 
-def _fast_windows(course: Array, temperature: Array, length: int, count: int) -> list[int]:
+def _fast_windows(trajectory: Array, temperature: Array, length: int, count: int) -> list[int]:
     """Which windows of `length` short means hold most of what is fast; in the order of time.
 
-    course (F, 3) px, temperature (F,) °C, of short means. Half of them for what does not follow the
-    temperature, half for what the temperature does.
+    trajectory (F, 3) px, temperature (F,) °C, of short means. Half of them for what does not follow
+    the temperature, half for what the temperature does.
     """
-    n = min(len(course), len(temperature))
+    n = min(len(trajectory), len(temperature))
     T = temperature[:n] - temperature[:n].mean()
-    z = course[:n] - course[:n].mean(axis=0)
+    z = trajectory[:n] - trajectory[:n].mean(axis=0)
     if (T @ T) > 0:
         z = z - np.outer(T, T @ z / (T @ T))
     windows = -(-n // length)

@@ -60,7 +60,7 @@ def still_field(
         return (), grid
     points = np.array(grid.points)
     for m in boards:
-        points[:, m.rows] -= m.course[:, None, None] * m.image
+        points[:, m.rows] -= m.trajectory[:, None, None] * m.image
     wandering = np.zeros(grid.observed.shape, dtype=bool)
     for m in single:
         wandering[:, m.rows] = True

@@ -44,7 +44,7 @@ def _without(evidence: ReducedSeries, found: list[FieldMovement]) -> ReducedSeri
     grid = evidence.source.grid
     points = np.array(grid.points)
     for m in found:
-        points[:, m.rows] -= m.course[:, None, None] * m.image
+        points[:, m.rows] -= m.trajectory[:, None, None] * m.image
     return with_points(evidence, ObservationGrid(points, grid.weights))
 
 

@@ -44,7 +44,7 @@ __all__ = ["board_movements", "refined"]
 _SIDE = 4  # epochs before and after a knock
 _LARGEST = 0.6  # share of the targets on one board: beyond, the others moved
 _FEWEST_OTHERS = 8
-_SHARE = 0.6  # of a board's slow movement that its course has to explain
+_SHARE = 0.6  # of a board's slow movement that its trajectory has to explain
 _RIGID = 0.5  # of what its targets would do one by one that the board has to explain
 _MOST_BOARDS = 4
 _TRIES = 400  # times of a knock
@@ -84,8 +84,8 @@ def board_movements(s: FieldSeries) -> list[FieldMovement]:
 
 def _usual(s: FieldSeries, boards: list[Rows]) -> float:
     """χ² that boards which stand usually explain by moving."""
-    courses, _ = _courses(s.times)
-    gains = [_gains(*_board_equations(s, r, _rigid(s, r)), courses)[0].max() for r in boards]
+    trajectories, _ = _trajectories(s.times)
+    gains = [_gains(*_board_equations(s, r, _rigid(s, r)), trajectories)[0].max() for r in boards]
     return float(np.median(gains)) if gains else 0.0
 
 
@@ -97,20 +97,20 @@ def refined(s: FieldSeries, movement: FieldMovement) -> FieldMovement:
     free = with_free_cameras(s)
     rigid = _rigid(free, movement.rows)
     M, r = _board_equations(free, movement.rows, rigid)
-    step = _gains(M, r, movement.course[None])[1][0]
+    step = _gains(M, r, movement.trajectory[None])[1][0]
     image = movement.image + (rigid @ step).reshape(-1, 2)
-    covariance = inverse_of_determined(_information(M, movement.course))
+    covariance = inverse_of_determined(_information(M, movement.trajectory))
     size, sd = _across(s.B[movement.rows], image, rigid, covariance)
     size_px = float(np.sqrt(np.mean(image**2)))
     return replace(movement, image=image, size_mm=size, sd_mm=sd, size_px=size_px)
 
 
 def _board(s: FieldSeries, rows: Rows) -> FieldMovement | None:
-    """The best course of one board; None where it stands."""
+    """The best trajectory of one board; None where it stands."""
     rigid = _rigid(s, rows)
     M, r = _board_equations(s, rows, rigid)
-    courses, firsts = _courses(s.times)
-    gain, steps = _gains(M, r, courses)
+    trajectories, firsts = _trajectories(s.times)
+    gain, steps = _gains(M, r, trajectories)
     best = int(np.argmax(gain))
     if gain[best] < GAIN:
         return None
@@ -118,29 +118,29 @@ def _board(s: FieldSeries, rows: Rows) -> FieldMovement | None:
     if epoch and len(firsts) < len(s.times) - _SIDE:  # a long series: the epochs between two tries
         stride = firsts[1] - firsts[0]
         near = range(max(epoch - stride, _SIDE), min(epoch + stride, len(s.times) - _SIDE) + 1)
-        courses, firsts = _steps(len(s.times), near), list(near)
-        finer, steps = _gains(M, r, courses)
+        trajectories, firsts = _steps(len(s.times), near), list(near)
+        finer, steps = _gains(M, r, trajectories)
         best = int(np.argmax(finer))
         epoch, gain = firsts[best], finer
     slow = cosines(s.times)
     share = gain[best] / max(float(_gains(M, r, slow)[0].sum()) - 6 * len(slow), gain[best])
-    course, step = courses[best], steps[best]
+    trajectory, step = trajectories[best], steps[best]
     w, v = s.w[:, rows], np.nan_to_num(s.residuals[:, rows])
     weight = np.maximum(w.sum(axis=0), 1e-12)
-    c = course[:, None, None] - (w * course[:, None, None]).sum(axis=0) / weight
+    c = trajectory[:, None, None] - (w * trajectory[:, None, None]).sum(axis=0) / weight
     each = np.sum(w * c * v, axis=0) ** 2 / np.maximum(np.sum(w * c**2, axis=0), 1e-12)
     one_by_one = float(each.sum()) - 2 * len(rows)
     image = (rigid @ step).reshape(-1, 2)
     size_px = float(np.sqrt(np.mean(image**2)))
     if share < _SHARE or gain[best] < _RIGID * one_by_one or size_px < LEAST_PX:
         return None
-    covariance = inverse_of_determined(_information(M, course))
+    covariance = inverse_of_determined(_information(M, trajectory))
     size, sd = _across(s.B[rows], image, rigid, covariance)
     before, after = s.times[max(epoch - 1, 0)], s.times[epoch]
     return FieldMovement(
         "knock" if epoch else "creep", rows, tuple(s.names[r] for r in rows),
         int(s.numbers[epoch]) if epoch else 0, float(0.5 * (before + after)),
-        float((after - before) / np.sqrt(12.0)), course, image, size, sd, size_px,
+        float((after - before) / np.sqrt(12.0)), trajectory, image, size, sd, size_px,
         float(gain[best]),
     )  # fmt: skip
 
@@ -169,7 +169,7 @@ def _board_equations(s: FieldSeries, rows: Rows, rigid: Array) -> tuple[Array, A
     return M, (w * v) @ rigid
 
 
-def _courses(times: Array) -> tuple[Array, list[int]]:
+def _trajectories(times: Array) -> tuple[Array, list[int]]:
     """Steps at some hundred epochs, then settling, (n, E), 0 to 1; a step's first epoch, else 0."""
     E = len(times)
     stride = int(np.ceil(E / _TRIES))
@@ -184,27 +184,27 @@ def _steps(epochs: int, firsts: range) -> Array:
     return (np.arange(epochs) >= np.array(firsts)[:, None]).astype(float)
 
 
-def _gains(M: Array, r: Array, courses: Array) -> tuple[Array, Array]:
-    """χ² (n,) that a board explains by moving along each course, and the movements (n, 6)."""
+def _gains(M: Array, r: Array, trajectories: Array) -> tuple[Array, Array]:
+    """χ² (n,) that a board explains by moving along each trajectory, and the movements (n, 6)."""
     E = len(M)
     flat = M.reshape(E, -1)
     N11 = M.sum(axis=0)
-    N12 = (courses @ flat).reshape(-1, 6, 6)
-    N22 = (courses**2 @ flat).reshape(-1, 6, 6)
+    N12 = (trajectories @ flat).reshape(-1, 6, 6)
+    N22 = (trajectories**2 @ flat).reshape(-1, 6, 6)
     held = 1e-9 * float(np.trace(N11)) * np.eye(6) + 1e-12 * np.eye(6)
     X = np.linalg.solve(N11 + held, N12)
     own = N22 - N12 @ X
-    right = courses @ r - X.swapaxes(1, 2) @ r.sum(axis=0)
+    right = trajectories @ r - X.swapaxes(1, 2) @ r.sum(axis=0)
     steps = np.linalg.solve(own + held, right[..., None])[..., 0]
     gains: Array = np.einsum("ni,ni->n", steps, right)
     return gains, steps
 
 
-def _information(M: Array, course: Array) -> Array:
-    """Normal matrix (6, 6) of a movement along one course, the board's level eliminated."""
+def _information(M: Array, trajectory: Array) -> Array:
+    """Normal matrix (6, 6) of a movement along one trajectory, the board's level eliminated."""
     flat = M.reshape(len(M), -1)
-    N12 = (course @ flat).reshape(6, 6)
-    out: Array = (course**2 @ flat).reshape(6, 6) - N12 @ np.linalg.pinv(M.sum(axis=0)) @ N12
+    N12 = (trajectory @ flat).reshape(6, 6)
+    out: Array = (trajectory**2 @ flat).reshape(6, 6) - N12 @ np.linalg.pinv(M.sum(axis=0)) @ N12
     return out
 
 

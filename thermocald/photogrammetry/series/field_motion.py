@@ -79,8 +79,8 @@ class FieldMovement:
 
     kind: `knock`, `creep` or `wander`; rows: of the field, targets: their names; epoch: number of
     the first after a knock, else 0; time, sd_time s from the start of the series, of a knock;
-    course (E,) 0 to 1; image (k, 2) px: where it went in the image; size_mm, sd_mm: RMS over its
-    targets across the rays; size_px; gain: χ² that it explains.
+    trajectory (E,) 0 to 1; image (k, 2) px: where it went in the image; size_mm, sd_mm: RMS over
+    its targets across the rays; size_px; gain: χ² that it explains.
     """
 
     kind: str
@@ -89,7 +89,7 @@ class FieldMovement:
     epoch: int
     time: float
     sd_time: float
-    course: Array
+    trajectory: Array
     image: Array
     size_mm: float
     sd_mm: float
@@ -132,7 +132,7 @@ def without(s: FieldSeries, rows: Rows) -> FieldSeries:
 def put_back(s: FieldSeries, movement: FieldMovement) -> FieldSeries:
     """The series as if something had not moved."""
     residuals = s.residuals.copy()
-    residuals[:, movement.rows] -= movement.course[:, None, None] * movement.image
+    residuals[:, movement.rows] -= movement.trajectory[:, None, None] * movement.image
     return replace(s, residuals=residuals)
 
 

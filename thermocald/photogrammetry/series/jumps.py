@@ -1,4 +1,4 @@
-"""Jumps in the course of a pose: the mount was knocked, or a lens slipped.
+"""Jumps in the trajectory of a pose: the mount was knocked, or a lens slipped.
 
 A jump that the perspective attributes to the interior orientation is left to the camera; every
 other one counts as a movement of the mount.
@@ -42,12 +42,12 @@ class Jumps:
     steps: Array
     variances: Array
 
-    def removed(self, course: Array) -> Array:
-        """The course (E, k) without the jumps."""
-        course = course.copy()
+    def removed(self, trajectory: Array) -> Array:
+        """The trajectory (E, k) without the jumps."""
+        trajectory = trajectory.copy()
         for row, step in zip(self.rows, self.steps, strict=True):
-            course[row:] -= step
-        return course
+            trajectory[row:] -= step
+        return trajectory
 
     def covariance(self, epochs: int) -> Array:
         """Covariance (k, k) of the pose about its mean over so many epochs."""
@@ -62,12 +62,12 @@ class Jumps:
         return out
 
 
-def jumps(course: Array, perspective: Perspective) -> Jumps:
-    """The jumps of a course (E, k), in units of its noise, that are the mount's."""
+def jumps(trajectory: Array, perspective: Perspective) -> Jumps:
+    """The jumps of a trajectory (E, k), in units of its noise, that are the mount's."""
     rows: list[int] = []
     steps: list[Array] = []
     variances: list[Array] = []
-    left = course.copy()
+    left = trajectory.copy()
     examined: set[int] = set()
     while len(examined) < _MOST and len(left) >= 4 * _SIDE:
         change = np.diff(left, axis=0)
@@ -87,14 +87,14 @@ def jumps(course: Array, perspective: Perspective) -> Jumps:
             rows.append(row)
             steps.append(step)
             variances.append(factor * mad_sd(change, axis=0) ** 2 / 2)
-    shape = (len(rows), course.shape[1])
+    shape = (len(rows), trajectory.shape[1])
     return Jumps(tuple(rows), np.array(steps).reshape(shape), np.array(variances).reshape(shape))
 
 
-def _step(course: Array, row: int) -> tuple[Array, float]:
+def _step(trajectory: Array, row: int) -> tuple[Array, float]:
     """The step (k,) at an epoch on a straight line, and its variance over the noise's."""
     first = max(row - _SIDE, 0)
-    part = course[first : row + _SIDE]
+    part = trajectory[first : row + _SIDE]
     t = np.arange(first, first + len(part)) - row
     estimator = np.linalg.pinv(np.column_stack([np.ones(len(t)), t, t >= 0]))[2]
     return estimator @ part, float(estimator @ estimator)

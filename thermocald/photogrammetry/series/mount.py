@@ -3,7 +3,7 @@
 The exterior orientation of an epoch is that of the series plus a movement m ~ N(0, S). Image shift
 and scale show a movement to hundredths of a pixel, but so does a change of the principal point or
 distance; only the perspective separates the two, a hundred times worse. S is therefore estimated
-from the *course* of the pose that each epoch would have with the interior orientation held: a
+from the *trajectory* of the pose that each epoch would have with the interior orientation held: a
 camera that warms up follows an integrated random walk there, a mount trembles (white) or sways and
 settles (with memory, first-order autoregressive). The variance components maximise the likelihood
 in the cosine domain, direction by direction of the movement that the field shows best.
@@ -171,32 +171,32 @@ def estimate_movement(
     if len(rows) < FEWEST_EPOCHS:
         return STILL
     N, b = N[rows], b[rows]
-    course, root, weak = _courses(N, b, own)
-    if course is None:
+    trajectory, root, weak = _trajectories(N, b, own)
+    if trajectory is None:
         return STILL
     noise = np.eye(6)
     if correlated is not None:
         inverse = np.linalg.inv(root)
         noise += inverse.T @ correlated @ inverse
     whiten = symmetric_power(noise, -0.5, 1e-3)
-    course = _filled(course @ whiten, weak)
-    found = jumps(course, _perspective(N, b, own, root, whiten))
-    course = found.removed(course)
-    period = min(period, len(course) / _PERIODS)
+    trajectory = _filled(trajectory @ whiten, weak)
+    found = jumps(trajectory, _perspective(N, b, own, root, whiten))
+    trajectory = found.removed(trajectory)
+    period = min(period, len(trajectory) / _PERIODS)
     if period:
-        smooth = _smoothed(course, int(_CUBIC * period))
+        smooth = _smoothed(trajectory, int(_CUBIC * period))
     else:
-        course = course - course.mean(axis=0)
-        smooth = np.zeros_like(course)
-    rough = course - smooth
+        trajectory = trajectory - trajectory.mean(axis=0)
+        smooth = np.zeros_like(trajectory)
+    rough = trajectory - smooth
     limit = _SPIKE * mad_sd(rough - np.median(rough, axis=0), axis=0)
     rough = np.clip(rough, -limit, limit)
     directions = _directions(rough, whiten @ _visible(N, own, root) @ whiten)
     parts = components((smooth + rough) @ directions, period)
     back = np.linalg.inv(root) @ np.linalg.inv(whiten)
     axes = back @ directions
-    slow = (axes * parts.slow) @ axes.T + back @ found.covariance(len(course)) @ back.T
-    memory = max(parts.memory, len(course) / 2.0) if found.rows else parts.memory
+    slow = (axes * parts.slow) @ axes.T + back @ found.covariance(len(trajectory)) @ back.T
+    memory = max(parts.memory, len(trajectory) / 2.0) if found.rows else parts.memory
     return Movement(
         (axes * parts.white) @ axes.T, slow, memory, back @ back.T,
         tuple(int(rows[k]) for k in found.rows),
@@ -229,12 +229,12 @@ def _perspective(N: Array, b: Array, own: Index, root: Array, whiten: Array) -> 
     return Perspective(np.swapaxes(back, 0, 1) @ M @ back, g @ back)
 
 
-def _courses(N: Array, b: Array, own: Index) -> tuple[Array | None, Array, Mask]:
+def _trajectories(N: Array, b: Array, own: Index) -> tuple[Array | None, Array, Mask]:
     """Poses (E, 6) with the interior orientation held, in units of their noise; the root of their
     usual normal matrix; and which epochs (E,) say little.
 
-    Held is the smooth course of the interior orientation, put back by the usual matrices: targets
-    that come and go then do not turn a drift into a movement.
+    Held is the smooth trajectory of the interior orientation, put back by the usual matrices:
+    targets that come and go then do not turn a drift into a movement.
     """
     usual = N[:, EOP, EOP].mean(axis=0)
     interior = np.zeros((len(N), len(own)))
@@ -289,28 +289,28 @@ def _directions(rough: Array, visible: Array) -> Array:
     return np.concatenate(found, axis=1)
 
 
-def _filled(course: Array, missing: Mask) -> Array:
-    """The course with missing epochs interpolated between their neighbours."""
+def _filled(trajectory: Array, missing: Mask) -> Array:
+    """The trajectory with missing epochs interpolated between their neighbours."""
     if not missing.any() or missing.all():
-        return course
-    t = np.arange(len(course))
+        return trajectory
+    t = np.arange(len(trajectory))
     kept = ~missing
-    return np.column_stack([np.interp(t, t[kept], column[kept]) for column in course.T])
+    return np.column_stack([np.interp(t, t[kept], column[kept]) for column in trajectory.T])
 
 
-def _smoothed(course: Array, window: int = _WINDOW) -> Array:
-    """Local cubics over a window of epochs through a course (E, k), also at its ends."""
-    window = min(max(window, 7), len(course) // 2 - 1) | 1
+def _smoothed(trajectory: Array, window: int = _WINDOW) -> Array:
+    """Local cubics over a window of epochs through a trajectory (E, k), also at its ends."""
+    window = min(max(window, 7), len(trajectory) // 2 - 1) | 1
     half = window // 2
     x = np.arange(-half, half + 1) / half
     V = np.vander(x, 4)
     hat = V @ np.linalg.pinv(V)
-    windows = np.lib.stride_tricks.sliding_window_view(course, window, axis=0)
+    windows = np.lib.stride_tricks.sliding_window_view(trajectory, window, axis=0)
     return np.concatenate(
         [
-            hat[:half] @ course[:window],
+            hat[:half] @ trajectory[:window],
             windows @ hat[half],
-            hat[half + 1 :] @ course[-window:],
+            hat[half + 1 :] @ trajectory[-window:],
         ]
     )
 

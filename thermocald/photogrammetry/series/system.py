@@ -75,13 +75,13 @@ class SeriesSystem:
         own, A = design.own, design.at.A
         first, of = alike(weights, use)
         w = _used(weights[first], use[first])
-        apart = design.width == 0
-        N = normal_matrices(w, A[..., own] if apart else A)
-        Q, good = cofactors((N if apart else N[:, own[:, None], own]) + design.own_prior)
+        separate = design.width == 0
+        N = normal_matrices(w, A[..., own] if separate else A)
+        Q, good = cofactors((N if separate else N[:, own[:, None], own]) + design.own_prior)
         good &= use[first].any(axis=1)
         if len(first) < len(of):
             Q, good = Q[of], good[of]
-        N = N[:0] if apart else N[of]
+        N = N[:0] if separate else N[of]
         return cls(design, weights, use, N, Q, good, np.empty((0, 0)), (first, of))
 
     def solved(self) -> SeriesSystem:

@@ -150,13 +150,13 @@ def slow_errors(residuals: Array, used: Mask) -> Array:
 
 
 def excess_scatter(values: Array, variances: Array, kinks: bool, drift: bool = True) -> Array:
-    """Variance (k,) by which epochs scatter about a smooth course beyond their variances.
+    """Variance (k,) by which epochs scatter about a smooth trajectory beyond their variances.
 
-    values, variances (E, k) of consecutive epochs. The smooth course is a local cubic over 15
+    values, variances (E, k) of consecutive epochs. The smooth trajectory is a local cubic over 15
     epochs, which leaves a drift with a time constant of 30 epochs its thousandth; kinks: whether
-    single kinks of the course (a lamp switched) exceed the noise, so that a median must judge;
-    drift: whether the camera may drift at all, else the course is constant; 0 where the excess is
-    not significant (5 %).
+    single kinks of the trajectory (a lamp switched) exceed the noise, so that a median must judge;
+    drift: whether the camera may drift at all, else the trajectory is constant; 0 where the excess
+    is not significant (5 %).
     """
     half = _SMOOTH // 2
     if len(values) < 2 * _SMOOTH:

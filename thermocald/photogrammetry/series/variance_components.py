@@ -1,8 +1,8 @@
-"""Variance components of a course in time: white, with memory, and the drift of the camera.
+"""Variance components of a trajectory in time: white, with memory, and the drift of the camera.
 
-The components maximise the likelihood in the cosine domain, where a course of evenly spaced epochs
-is nearly uncorrelated; how long the memory is, and whether a component is there at all, is averaged
-over as plausible.
+The components maximise the likelihood in the cosine domain, where a trajectory of evenly spaced
+epochs is nearly uncorrelated; how long the memory is, and whether a component is there at all, is
+averaged over as plausible.
 
 Source: Whittle (1953), Estimation and information in stationary time series; the maximisation by
 multiplicative updates as Févotte and Idier (2011), Neural Computation 23, 2421-2456.
@@ -43,14 +43,16 @@ class Components:
     memory: float
 
 
-def components(course: Array, period: float) -> Components:
-    """The components of every column of a course.
+def components(trajectory: Array, period: float) -> Components:
+    """The components of every column of a trajectory.
 
-    course (E, k) in units of its noise; period: the shortest of the drift in epochs, 0 for none. A
-    component that the likelihood does not ask for is 0.
+    trajectory (E, k) in units of its noise; period: the shortest of the drift in epochs, 0 for
+    none. A component that the likelihood does not ask for is 0.
     """
-    power = _cosine_power(_without_leak(_level_at_its_ends(course), period) if period else course)
-    n = len(course)
+    power = _cosine_power(
+        _without_leak(_level_at_its_ends(trajectory), period) if period else trajectory
+    )
+    n = len(trajectory)
     omega = np.pi * np.arange(1, n) / n
     if len(power) > _MOST_FREQUENCIES:  # the high ones are pooled, they look alike
         power, omega, count = _pooled(power, omega)
@@ -106,50 +108,50 @@ def _drift(omega: Array, period: float) -> Array:
     return shape
 
 
-def _level_at_its_ends(course: Array) -> Array:
-    """The course (E, k) less the parabola with its slopes at both ends.
+def _level_at_its_ends(trajectory: Array) -> Array:
+    """The trajectory (E, k) less the parabola with its slopes at both ends.
 
     Its mirror image then continues it smoothly, and a drift stays at the low frequencies.
     """
-    n = len(course)
+    n = len(trajectory)
     m = max(min(_END, n // 2), 4)
     t = np.arange(m) - 0.5 * (m - 1)
     V = np.vander(t, 3)
     slopes = np.linalg.pinv(V)
-    first = 2 * (slopes[0] @ course[:m]) * t[0] + slopes[1] @ course[:m]
-    last = 2 * (slopes[0] @ course[-m:]) * t[-1] + slopes[1] @ course[-m:]
+    first = 2 * (slopes[0] @ trajectory[:m]) * t[0] + slopes[1] @ trajectory[:m]
+    last = 2 * (slopes[0] @ trajectory[-m:]) * t[-1] + slopes[1] @ trajectory[-m:]
     u = np.arange(n)[:, None]
-    level: Array = course - first * u - (last - first) * u**2 / (2 * (n - 1))
+    level: Array = trajectory - first * u - (last - first) * u**2 / (2 * (n - 1))
     return level
 
 
-def _without_leak(course: Array, period: float) -> Array:
-    """The course (E, k) less the polynomial that explains most of its fast part.
+def _without_leak(trajectory: Array, period: float) -> Array:
+    """The trajectory (E, k) less the polynomial that explains most of its fast part.
 
     A strong drift that does not end flat has high frequencies of its own, those of a polynomial;
     besides a millipixel of noise they would be taken for movements of the mount.
     """
-    n = len(course)
+    n = len(trajectory)
     low = int(2 * n / period)
     if n - 1 - low < _LEAST_PER_DEGREE * _LEAK_DEGREE:
-        return course
+        return trajectory
     u = np.linspace(-1.0, 1.0, n)
     basis = np.stack([u**k for k in range(1, _LEAK_DEGREE + 1)], axis=1)
-    fast, _, _, _ = np.linalg.lstsq(_cosines(basis)[low:], _cosines(course)[low:], rcond=None)
-    clean: Array = course - basis @ fast
+    fast, _, _, _ = np.linalg.lstsq(_cosines(basis)[low:], _cosines(trajectory)[low:], rcond=None)
+    clean: Array = trajectory - basis @ fast
     return clean
 
 
-def _cosine_power(course: Array) -> Array:
+def _cosine_power(trajectory: Array) -> Array:
     """Squared coefficients (E - 1, k) of the orthonormal cosine transform, without the mean."""
-    power: Array = _cosines(course) ** 2
+    power: Array = _cosines(trajectory) ** 2
     return power
 
 
-def _cosines(course: Array) -> Array:
+def _cosines(trajectory: Array) -> Array:
     """Coefficients (E - 1, k) of the orthonormal cosine transform, without the mean."""
-    n = len(course)
-    even = np.concatenate([course, course[::-1]])
+    n = len(trajectory)
+    even = np.concatenate([trajectory, trajectory[::-1]])
     spectrum = np.fft.rfft(even, axis=0)[1:n]
     turn = np.exp(-0.5j * np.pi * np.arange(1, n) / n)[:, None]
     coefficients: Array = (spectrum * turn).real / np.sqrt(2 * n)

@@ -133,10 +133,10 @@ def _size(photograph: Photograph) -> tuple[int, int]:
 def _overlap(frames: Array, log: Array) -> None:
     if frames[0] <= log[-1] and frames[-1] >= log[0]:
         return
-    apart = log[0] - frames[-1] if frames[-1] < log[0] else frames[0] - log[-1]
+    gap = log[0] - frames[-1] if frames[-1] < log[0] else frames[0] - log[-1]
     raise DataError(
         f"photographs ({iso(frames[0])} to {iso(frames[-1])}) and log ({iso(log[0])} to "
-        f"{iso(log[-1])}) lie {apart / 3600:.1f} h apart: is a time zone wrong (--camera-timezone, "
+        f"{iso(log[-1])}) lie {gap / 3600:.1f} h apart: is a time zone wrong (--camera-timezone, "
         "--log-timezone), or a clock (--camera-clock, --log-clock)?"
     )
 

@@ -15,14 +15,15 @@ from thermocald.output.figures.panels import PALETTE, Curve, Figure, Panel, thin
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 
 if TYPE_CHECKING:
-    from thermocald.analysis.study.series_study import SeriesStudy
     from thermocald.analysis.study.study import CameraStudy
 
 __all__ = [
-    "dependence_figure",
     "deviation_figure",
+    "extent",
+    "free_parameters",
     "movement_figure",
     "principal_point_figure",
+    "scaled",
     "significance_figure",
 ]
 
@@ -35,7 +36,7 @@ def deviation_figure(camera: CameraStudy) -> Figure:
     """Every parameter minus its first value over time (the reference's Figures 3 and 5)."""
     panels = [
         _time_panel(camera, parameter_label(name), UNITS[name], IOP_NAMES.index(name))
-        for name in _free(camera)
+        for name in free_parameters(camera)
     ]
     panels.append(_sigma0_panel(camera))
     panels += _temperature_panels(camera)
@@ -58,7 +59,7 @@ def deviation_figure(camera: CameraStudy) -> Figure:
 
 
 def _time_panel(camera: CameraStudy, title: str, unit: str, k: int) -> Panel:
-    scale, label = _scaled(unit, _extent(camera, k))
+    scale, label = scaled(unit, extent(camera, k))
     curves = []
     for i, study in enumerate(camera.series):
         s = study.series
@@ -68,12 +69,12 @@ def _time_panel(camera: CameraStudy, title: str, unit: str, k: int) -> Panel:
     return Panel(f"Δ{title}", "time in min", f"Δ{title}{label}", tuple(curves))
 
 
-def _extent(camera: CameraStudy, k: int) -> float:
+def extent(camera: CameraStudy, k: int) -> float:
     """How far IOP number k goes over time."""
     return max(float(np.ptp(study.series.values[:, k])) for study in camera.series)
 
 
-def _scaled(unit: str, extent: float) -> tuple[float, str]:
+def scaled(unit: str, extent: float) -> tuple[float, str]:
     """A factor that makes numbers of this extent easy to read, and how to label the axis."""
     if unit == "mm":
         return 1000.0, " in µm"
@@ -110,7 +111,7 @@ def _temperature_panels(camera: CameraStudy) -> list[Panel]:
 
 def principal_point_figure(camera: CameraStudy) -> Figure | None:
     """The path of the principal point on the sensor (the reference's Figures 4 and 6)."""
-    if not {"x0", "y0"} <= set(_free(camera)):
+    if not {"x0", "y0"} <= set(free_parameters(camera)):
         return None
     curves, words = [], []
     for i, study in enumerate(camera.series):
@@ -185,7 +186,7 @@ def movement_figure(camera: CameraStudy) -> Figure | None:
 def significance_figure(camera: CameraStudy) -> Figure | None:
     """Moving variance over moving mean squared sd, with the limit of the F-test."""
     panels = []
-    for name in _free(camera):
+    for name in free_parameters(camera):
         curves = []
         critical = None
         for i, study in enumerate(camera.series):
@@ -228,7 +229,7 @@ def significance_figure(camera: CameraStudy) -> Figure | None:
                 )
             ),
         )
-        for name in _free(camera)
+        for name in free_parameters(camera)
     ]
     always = [parameter_label(n) for n, r in ratios if r >= 0.9]
     rarely = [parameter_label(n) for n, r in ratios if r <= 0.1]
@@ -253,71 +254,6 @@ def _spans_decades(curves: list[Curve]) -> bool:
     return low > 0 and max(float(np.max(c.y)) for c in curves) / low > _DECADES
 
 
-def dependence_figure(camera: CameraStudy) -> Figure | None:
-    """Parameters over the reference temperature with the fitted lines (Figure 7)."""
-    panels, words = [], []
-    for name in [*_free(camera), "sigma0"]:
-        curves = []
-        scale, label = 1.0, ""
-        if name != "sigma0":
-            scale, label = _scaled(UNITS[name], _extent(camera, IOP_NAMES.index(name)))
-        for i, study in enumerate(camera.series):
-            if not study.channels or name not in study.channels[0].dependences:
-                continue
-            curves += _dependence_curves(study, name, scale, PALETTE[i % 7])
-        if curves:
-            reference = camera.series[0].channels[0].thermometer.name
-            delta = "" if name == "sigma0" else "Δ"
-            panels.append(
-                Panel(
-                    parameter_label(name),
-                    f"{parameter_label(reference)} in °C",
-                    f"{delta}{parameter_label(name)}{label}",
-                    tuple(curves),
-                )
-            )
-            r = [
-                s.channels[0].dependences[name].r
-                for s in camera.series
-                if s.channels and name in s.channels[0].dependences
-            ]
-            if min(abs(v) for v in r) >= 0.9:
-                words.append(parameter_label(name))
-    if not panels:
-        return None
-    follow = (
-        f" {', '.join(words)} follow{'s' if len(words) == 1 else ''} it closely (|r| ≥ 0.9)."
-        if words
-        else " No parameter follows it closely (|r| ≥ 0.9)."
-    )
-    return Figure(
-        "temperature-dependence",
-        "Dependence on the temperature",
-        "Each parameter against the reference temperature, with the straight line that counts the "
-        "noise of both." + follow,
-        tuple(panels),
-    )
-
-
-def _dependence_curves(study: SeriesStudy, name: str, scale: float, colour: str) -> list[Curve]:
-    s = study.series
-    temperature = s.thermometers[0].values
-    if name == "sigma0":
-        value = s.sigma0
-    else:
-        column = s.values[:, IOP_NAMES.index(name)]
-        value = scale * (column - column[0])
-    rows = np.flatnonzero(np.isfinite(temperature))
-    t, v = temperature[rows], value[rows]
-    ends = np.array([t.min(), t.max()])
-    slope = scale * study.channels[0].dependences[name].slope
-    shown = np.unique(np.linspace(0, len(t) - 1, min(len(t), 400)).astype(int))
-    return [
-        Curve(s.name, t[shown], v[shown], "points", colour),
-        Curve("", ends, v.mean() + slope * (ends - t.mean()), "line", colour),
-    ]
-
-
 def _direction(x: float, y: float) -> str:
     """`16.2 px to the lower right` of a movement in px, y up."""
     length = float(np.hypot(x, y))
@@ -334,6 +270,6 @@ def _round_factor(factor: float) -> float:
     return float(max(m for m in (1.0, 2.0, 5.0) if m * power <= factor) * power)
 
 
-def _free(camera: CameraStudy) -> list[str]:
+def free_parameters(camera: CameraStudy) -> list[str]:
     """IOP that are free in any series."""
     return [n for n in IOP_NAMES if any(n in study.series.free for study in camera.series)]

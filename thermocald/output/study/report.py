@@ -24,6 +24,7 @@ from thermocald.output.figures.panels import Figure, document
 from thermocald.output.page import render_page
 from thermocald.output.study import figures, tables
 from thermocald.output.study import object_space_figures as object_space
+from thermocald.output.study.dependence import dependence_figure, dependence_tables
 from thermocald.output.study.object_space_tables import cluster_table, point_table
 from thermocald.output.study.summary import summary
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
@@ -164,7 +165,7 @@ def _panel_figures(camera: CameraStudy) -> list[Figure]:
         figures.principal_point_figure(camera),
         figures.movement_figure(camera),
         figures.significance_figure(camera),
-        figures.dependence_figure(camera),
+        dependence_figure(camera),
         object_space.error_figure(camera),
         object_space.point_figure(camera),
     )
@@ -229,7 +230,7 @@ def _parts(camera: CameraStudy, study: Study, prefix: str) -> list[_Part]:
         _Part(
             "How it depends on the temperature",
             (*pick("temperature-dependence"), *over_time),
-            some(*tables.dependence_tables(camera)),
+            some(*dependence_tables(camera)),
         ),
         _Part(
             "Correlations of the parameters", within, some(tables.correlation_noise_table(camera))
@@ -237,9 +238,7 @@ def _parts(camera: CameraStudy, study: Study, prefix: str) -> list[_Part]:
         _Part(
             "What it means in object space",
             pick("object-space-errors", "errors-by-point"),
-            some(
-                cluster_table(camera), point_table(camera)
-            ),
+            some(cluster_table(camera), point_table(camera)),
         ),
     ]
     return [part for part in parts if part.figures or part.tables]

@@ -23,7 +23,6 @@ from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 if TYPE_CHECKING:
     from thermocald.analysis.study.deviations import Deviation
     from thermocald.analysis.study.series_study import (
-        ChannelStudy,
         SeriesStudy,
         Significance,
         StudySettings,
@@ -33,7 +32,6 @@ if TYPE_CHECKING:
 __all__ = [
     "Table",
     "correlation_noise_table",
-    "dependence_tables",
     "deviation_table",
     "focus_table",
     "overview_table",
@@ -232,58 +230,6 @@ def _drift_cells(test: Significance) -> tuple[str, str, str]:
         return ("–", "–", "–")
     noise = with_sd(test.drift.noise_ratio, test.drift.sd_noise_ratio)
     return (p_text(test.p_holm), p_text(test.p_excess_holm), noise)
-
-
-def dependence_tables(camera: CameraStudy) -> list[Table]:
-    """Correlation and slope on each thermometer (the reference's section 4.3)."""
-    return [
-        _dependence_table(study, channel)
-        for study in camera.series
-        for channel in study.channels
-        if channel.dependences
-    ]
-
-
-def _dependence_table(study: SeriesStudy, channel: ChannelStudy) -> Table:
-    rows = []
-    for name, d in channel.dependences.items():
-        k, unit = (1000.0, "µm") if UNITS[name] == "mm" else (1.0, UNITS[name])
-        pitch = study.series.sensor.pixel_pitch
-        in_px = with_sd(d.slope / pitch, d.sd_slope / pitch) if name in ("c", "x0", "y0") else ""
-        rows.append(
-            (
-                parameter_label(name),
-                coefficient(d.r),
-                f"{d.n}",
-                f"{d.n_effective:.0f}",
-                p_text(channel.p_naive_holm[name]),
-                p_text(channel.p_holm[name]),
-                with_sd(k * d.slope, k * d.sd_slope, f"{unit}/K" if unit else "1/K"),
-                in_px,
-                f"{d.misfit:.1f}",
-            )
-        )
-    t = channel.thermometer
-    return Table(
-        f"Dependence on {parameter_label(t.name)}, {study.series.name}",
-        (
-            "parameter",
-            "r",
-            "n",
-            "n effective",
-            "p naive",
-            "p",
-            "slope ± sd",
-            "px/K",
-            "scatter / noise",
-        ),
-        tuple(rows),
-        f"r: Pearson's correlation. p naive counts every epoch as independent; p holds whatever "
-        "the memory of the noise; both are corrected for the number of parameters (Holm). n "
-        "effective: independent epochs that the series is worth. The slope counts the "
-        f"thermometer's noise of {plain(t.sd, 'K', 2)}, its sd the memory of the noise. "
-        "Scatter / noise above 1: the straight line does not explain all.",
-    )
 
 
 def correlation_noise_table(camera: CameraStudy) -> Table | None:

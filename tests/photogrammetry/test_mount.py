@@ -10,7 +10,8 @@ from mount_cases import Tremble, simulate, small_field, standardised
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.parameters import PRINCIPAL, PRINCIPAL_POINT
 from thermocald.photogrammetry.series.adjustment import SeriesSettings, adjust_series
-from thermocald.photogrammetry.series.mount import Movement, drift_period
+from thermocald.photogrammetry.series.mount import drift_period
+from thermocald.photogrammetry.series.movement import Movement
 from thermocald.photogrammetry.series.variance_components import components
 
 STILL, TREMBLES, SWAYS = Tremble(0.0), Tremble(0.1), Tremble(0.1, 0.8)

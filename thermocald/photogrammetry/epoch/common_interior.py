@@ -23,10 +23,12 @@ from thermocald.photogrammetry.camera.camera_model import (
     partials,
 )
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
+from thermocald.photogrammetry.epoch.common_checks import (
+    ray_tests,
+    snoop_rays,
+    weaknesses_together,
+)
 from thermocald.photogrammetry.epoch.gauss_markov import point_covariances
-from thermocald.photogrammetry.epoch.geometry import image_coverage, obliqueness_deg
-from thermocald.photogrammetry.epoch.snooping import chi2_2d
-from thermocald.photogrammetry.field.planes import plane_fit
 from thermocald.photogrammetry.linalg import diagonal_scale, scaled_inverse
 from thermocald.photogrammetry.parameters import EOP_COLUMNS, free_columns
 
@@ -44,9 +46,7 @@ __all__ = ["CommonInterior", "adjust_common_interior"]
 _ITERATIONS = 60
 _CONVERGED = 1e-3
 _ROUNDS = 10
-_UNTESTABLE = 1e-6  # of its variance: a ray whose residual its target takes up
 _LEAST_SIGMA_MM = 1e-6  # of a coordinate without sigma alongside others with one
-_LARGEST_OBLIQUENESS_NEEDED_DEG = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +121,7 @@ def adjust_common_interior(
     used = [np.ones(len(o), dtype=bool) for o in photographs]
     for _ in range(_ROUNDS):
         state, system = problem.solve(state, used)
-        kept = _snoop(system.tests, photographs, used, s.snooping_alpha)
+        kept = snoop_rays(system.tests, photographs, used, s.snooping_alpha)
         if all(np.array_equal(a, b) for a, b in zip(kept, used, strict=True)):
             break
         used = kept
@@ -142,7 +142,7 @@ def adjust_common_interior(
         -1, 6, 6
     )
     result_eops = tuple(ExteriorOrientation.from_array(e) for e in eops)
-    reasons = _weaknesses(sensor, testfield, photographs, used, values, eops, covariance, s)
+    reasons = weaknesses_together(sensor, testfield, photographs, used, values, eops, covariance, s)
     return CommonInterior(
         InteriorOrientation.from_array(values),
         covariance,
@@ -196,7 +196,7 @@ class _Problem:
         Q: Array = np.linalg.inv(M).astype(np.float64, copy=False)
         Q[~uncertain] = 0.0
         tests = tuple(
-            _tests(r, B, P, Q[obs.targets], mask)
+            ray_tests(r, B, P, Q[obs.targets], mask)
             for r, (B, P), obs, mask in zip(residuals, rays, self.photographs, used, strict=True)
         )
         CQ = np.einsum("utk,tkl->utl", C, Q).reshape(u, -1)
@@ -265,17 +265,6 @@ def _inverse_covariances(obs: Observations) -> Array:
     return P
 
 
-def _tests(r: Array, B: Array, P: Array, Q: Array, mask: Mask) -> Array:
-    """Chi-square (2) of residuals (n, 2), what they share with their target's coordinates known."""
-    share = np.einsum("nik,nkl,njl->nij", B, Q, B)
-    V = np.linalg.inv(P) + np.where(mask, -1.0, 1.0)[:, None, None] * share
-    determinant = np.linalg.det(V) * np.linalg.det(P)
-    testable = determinant > _UNTESTABLE
-    V[~testable] = np.eye(2)
-    test = np.einsum("ni,nij,nj->n", r, np.linalg.inv(V), r)
-    return np.where(testable, test, 0.0)
-
-
 def _inverse(N: Array) -> Array:
     """Inverse of the normal matrix; raises GeometryError where the photographs do not carry it."""
     scale = diagonal_scale(N)
@@ -287,71 +276,3 @@ def _inverse(N: Array) -> Array:
             "the normal matrix is singular: these photographs do not separate the parameters; "
             "take some from other directions or hold parameters fixed"
         ) from None
-
-
-def _snoop(
-    tests: Sequence[Array], photographs: Sequence[Observations], used: Sequence[Mask], alpha: float
-) -> list[Mask]:
-    """Which image points stay; of the rays of one target only the worst goes at a time.
-
-    The leverage on the camera's parameters is neglected, as hundreds of points share few unknowns.
-    """
-    if alpha <= 0:
-        return list(used)
-    offered = np.concatenate([test[m] for test, m in zip(tests, used, strict=True)])
-    limit = chi2_2d(alpha) * max(float(np.median(offered)) / (2 * np.log(2)), 1e-12)
-    size = 1 + max(int(o.targets.max(initial=0)) for o in photographs)
-    worst = np.zeros(size)
-    for test, o, m in zip(tests, photographs, used, strict=True):
-        np.maximum.at(worst, o.targets[m], test[m])
-    return [
-        (test <= limit) | (m & (test < worst[o.targets]))
-        for test, o, m in zip(tests, photographs, used, strict=True)
-    ]
-
-
-def _weaknesses(
-    sensor: Sensor,
-    testfield: TestField,
-    photographs: Sequence[Observations],
-    used: Sequence[Mask],
-    values: Array,
-    eops: Array,
-    covariance: Array,
-    s: AdjustmentSettings,
-) -> list[str]:
-    """Why the photographs do not carry the free parameters."""
-    reasons: list[str] = []
-    if not s.free:
-        return reasons
-    seen = np.unique(np.concatenate([o.targets[m] for o, m in zip(photographs, used, strict=True)]))
-    _, axes, flat = plane_fit(testfield.points[seen])
-    if flat and "c" in s.free:
-        angles = [obliqueness_deg(eop, axes[2]) for eop in eops]
-        if max(angles) < _LARGEST_OBLIQUENESS_NEEDED_DEG:
-            reasons.append(
-                f"one plane, in all {len(eops)} photographs within {max(angles):.0f}° of frontal "
-                f"(some at {_LARGEST_OBLIQUENESS_NEEDED_DEG:.0f}° and more are needed): principal "
-                "distance and distance to the field cannot be separated, however small the "
-                "residuals are"
-            )
-    points = np.concatenate([o.points[m] for o, m in zip(photographs, used, strict=True)])
-    coverage = image_coverage(sensor, points)
-    if coverage < s.bounds.coverage:
-        reasons.append(
-            f"the targets cover {coverage:.1%} of the image in all photographs together (at least "
-            f"{s.bounds.coverage:.0%} are needed)"
-        )
-    sd = np.sqrt(np.diag(covariance))
-    if "c" in s.free and sd[0] > s.bounds.relative_sd_c * values[0]:
-        reasons.append(
-            f"the principal distance is known to {sd[0] / values[0]:.1%} only "
-            f"(bound {s.bounds.relative_sd_c:.1%})"
-        )
-    for name, column in (("x0", 1), ("y0", 2)):
-        if name in s.free and sd[column] / sensor.pixel_pitch > s.bounds.sd_point_px:
-            reasons.append(
-                f"{name} is known to {sd[column] / sensor.pixel_pitch:.0f} px only "
-                f"(bound {s.bounds.sd_point_px:.0f} px)"
-            )
-    return reasons

@@ -17,12 +17,12 @@ from thermocald.photogrammetry.field.planes import plane_fit
 from thermocald.photogrammetry.parameters import EOP
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Container, Iterable
 
     from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
 
-__all__ = ["GeometryBounds", "image_coverage", "obliqueness_deg", "weaknesses"]
+__all__ = ["GeometryBounds", "image_coverage", "obliqueness_deg", "uncertain", "weaknesses"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,14 +72,10 @@ def weaknesses(
     covariance (16, 16) of the adjustment. Held parameters are not blamed: a pose alone needs far
     less.
     """
-    reasons: list[str] = []
     sd = np.sqrt(covariance.diagonal())
     free = set(free)
+    reasons = uncertain(sensor, values, sd, free, bounds)
     if "c" in free:
-        if sd[0] > bounds.relative_sd_c * values[0]:
-            share = sd[0] / values[0]
-            known = f"is known to {share:.1%} only" if share < 1 else "is not determined"
-            reasons.append(f"the principal distance {known} (bound {bounds.relative_sd_c:.1%})")
         if _has_depth(points):
             flat = False
         else:
@@ -92,12 +88,6 @@ def weaknesses(
                     f"{bounds.plane_obliqueness_deg:.0f}° are needed): principal distance and "
                     "distance to the field cannot be separated"
                 )
-    for name, column in (("x0", 1), ("y0", 2)):
-        size = sd[column] / sensor.pixel_pitch
-        if name in free and size > bounds.sd_point_px:
-            inside = size < max(sensor.width, sensor.height)
-            known = f"is known to {size:.0f} px only" if inside else "is not determined"
-            reasons.append(f"{name} {known} (bound {bounds.sd_point_px:.0f} px)")
     if free & {"x0", "y0", "A1", "A2", "A3", "B1", "B2"}:
         coverage = image_coverage(sensor, image_points)
         if coverage < bounds.coverage:
@@ -108,6 +98,27 @@ def weaknesses(
     pair = _strongest_correlation(covariance, sd, bounds.correlation)
     if pair:
         reasons.append(pair)
+    return reasons
+
+
+def uncertain(
+    sensor: Sensor, values: Array, sd: Array, free: Container[str], bounds: GeometryBounds
+) -> list[str]:
+    """Which of c, x0 and y0, where they are free, are worse known than the bounds allow.
+
+    values, sd (16,): of the adjustment.
+    """
+    reasons = []
+    share = sd[0] / values[0]
+    if "c" in free and share > bounds.relative_sd_c:
+        known = f"is known to {share:.1%} only" if share < 1 else "is not determined"
+        reasons.append(f"the principal distance {known} (bound {bounds.relative_sd_c:.1%})")
+    for name, column in (("x0", 1), ("y0", 2)):
+        size = sd[column] / sensor.pixel_pitch
+        if name in free and size > bounds.sd_point_px:
+            inside = size < max(sensor.width, sensor.height)
+            known = f"is known to {size:.0f} px only" if inside else "is not determined"
+            reasons.append(f"{name} {known} (bound {bounds.sd_point_px:.0f} px)")
     return reasons
 
 

@@ -15,7 +15,7 @@ from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.epoch.snooping import Rejections
 from thermocald.photogrammetry.parameters import EOP, IOP, PARAMETER_NAMES
 from thermocald.photogrammetry.series.design import Design, State
-from thermocald.photogrammetry.series.mount import STILL, Movement
+from thermocald.photogrammetry.series.movement import STILL, Movement
 from thermocald.photogrammetry.series.normals import (
     ObservationGrid,
     linearise,

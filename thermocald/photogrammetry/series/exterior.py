@@ -8,13 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.parameters import EOP, IOP, free_columns
-from thermocald.photogrammetry.series.mount import (
-    FEWEST_EPOCHS,
-    STILL,
-    Movement,
-    estimate_movement,
-    together,
-)
+from thermocald.photogrammetry.series.mount import FEWEST_EPOCHS, estimate_movement
+from thermocald.photogrammetry.series.movement import STILL, Movement, together
 from thermocald.photogrammetry.series.normals import linearise
 
 if TYPE_CHECKING:

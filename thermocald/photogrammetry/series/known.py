@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.series.common_sums import Alike
     from thermocald.photogrammetry.series.design import Design
     from thermocald.photogrammetry.series.estimator import Estimate, SeriesEstimator
-    from thermocald.photogrammetry.series.mount import Movement
+    from thermocald.photogrammetry.series.movement import Movement
     from thermocald.photogrammetry.series.result import SeriesAdjustment, SeriesSettings
     from thermocald.photogrammetry.series.target_noise import CorrelatedPairs
 

@@ -20,7 +20,7 @@ from thermocald.photogrammetry.camera.camera_model import (
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, Adjustment
 from thermocald.photogrammetry.epoch.geometry import GeometryBounds
 from thermocald.photogrammetry.parameters import EOP, EOP_COLUMNS, IOP, free_columns
-from thermocald.photogrammetry.series.mount import STILL, Movement
+from thermocald.photogrammetry.series.movement import STILL, Movement
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

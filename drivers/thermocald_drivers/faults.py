@@ -14,7 +14,7 @@ no driver can detect). A test may also call `inject` while the device is open.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 
 from thermocald.errors import BadReading, ConfigurationError, DeviceGone, DeviceTimeout
 from thermocald_drivers import support
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from thermocald.hal import Clock
 
-__all__ = ["Fault", "Faults", "Kind"]
+__all__ = ["Fault", "Faults", "Kind", "MockDevice"]
 
 Kind = Literal["timeout", "unplugged", "truncated", "wrong_size", "stuck"]
 
@@ -101,6 +101,36 @@ class Faults:
         now = self._clock.monotonic()
         elapsed = 0.0 if self._started is None else now - self._started
         return next((f.kind for f in self._faults if f.active(call, elapsed)), None)
+
+
+class MockDevice:
+    """What the mocks share: opening and closing with faults, and the time since the first opening.
+
+    name: for messages. A subclass sets `clock` and `faults`.
+    """
+
+    name: ClassVar[str]
+    clock: Clock
+    faults: Faults
+    _open = False
+    _started: float | None = None
+
+    def open(self) -> None:
+        self.faults.on_open()
+        if self._started is None:
+            self._started = self.clock.monotonic()
+        self._open = True
+
+    def close(self) -> None:
+        self._open = False
+
+    def _require_open(self) -> None:
+        if not self._open:
+            raise DeviceGone(f"{self.name}: it is not open")
+
+    def _elapsed(self, monotonic: float) -> float:
+        """Seconds from the first opening to a time of the monotonic clock; 0 before it."""
+        return monotonic - (monotonic if self._started is None else self._started)
 
 
 def _parse(where: str, entry: object) -> Fault:

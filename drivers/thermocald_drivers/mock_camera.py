@@ -24,10 +24,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.errors import ConfigurationError, DeviceGone
+from thermocald.errors import ConfigurationError
 from thermocald.hal import Camera, Frame, KnownScene
 from thermocald_drivers import support
-from thermocald_drivers.faults import Faults
+from thermocald_drivers.faults import Faults, MockDevice
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -42,8 +42,10 @@ if TYPE_CHECKING:
 __all__ = ["MockCamera"]
 
 
-class MockCamera(Camera):
+class MockCamera(MockDevice, Camera):
     """Renders what a warming camera would see; equal times give equal frames."""
+
+    name = "mock camera"
 
     def __init__(
         self,
@@ -66,25 +68,17 @@ class MockCamera(Camera):
         self._exposure_s = support.number("exposure_s", exposure_s, 1e-6, 10.0, "s")
         latency = support.number("latency_s", latency_s, 0.0, 60.0, "s")
         self._latency_s = max(latency, self._exposure_s)
-        self.faults = Faults("mock camera", clock, faults, timeout_s)
-        self._started: float | None = None
+        self.faults = Faults(self.name, clock, faults, timeout_s)
         self._sequence = 0
-        self._open = False
         self._scene: Scene | None = None
         self._last: NDArray[np.uint8] | None = None
 
     def open(self) -> None:
-        self.faults.on_open()
+        super().open()
         _ = self.scene
-        if self._started is None:
-            self._started = self.clock.monotonic()
-        self._open = True
-
-    def close(self) -> None:
-        self._open = False
 
     def identity(self) -> Mapping[str, str]:
-        return {"name": "mock camera", "serial": f"mock-{self._seed}", "testfield": self._testfield}
+        return {"name": self.name, "serial": f"mock-{self._seed}", "testfield": self._testfield}
 
     @property
     def scene(self) -> Scene:
@@ -122,8 +116,7 @@ class MockCamera(Camera):
         return self._model
 
     def capture(self) -> Frame:
-        if not self._open:
-            raise DeviceGone("mock camera: it is not open")
+        self._require_open()
         kind = self.faults.on_call()
         self.clock.sleep_until(self.clock.monotonic() + self._latency_s)
         self.faults.refuse(kind, "frame")
@@ -138,9 +131,10 @@ class MockCamera(Camera):
         """The true orientation and effects at a time of the monotonic clock."""
         from thermocald.simulation.history import History
 
-        elapsed = monotonic - (monotonic if self._started is None else self._started)
         readings = {"temperature": self._values}
-        history = History(np.array([elapsed]), self._times, readings, "temperature", 0.0)
+        history = History(
+            np.array([self._elapsed(monotonic)]), self._times, readings, "temperature", 0.0
+        )
         return self.model.predict(history, self.field)
 
     def _picture(self, monotonic: float) -> Any:

@@ -9,10 +9,9 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING, Any
 
-from thermocald.errors import DeviceGone
 from thermocald.hal import Output
 from thermocald_drivers import support
-from thermocald_drivers.faults import Faults
+from thermocald_drivers.faults import Faults, MockDevice
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -22,8 +21,10 @@ if TYPE_CHECKING:
 __all__ = ["MockOutput"]
 
 
-class MockOutput(Output):
+class MockOutput(MockDevice, Output):
     """Keeps the last results in `results`, oldest first."""
+
+    name = "mock output"
 
     def __init__(
         self,
@@ -35,23 +36,14 @@ class MockOutput(Output):
     ) -> None:
         self.clock = clock
         self.timeout_s = timeout_s
-        self.faults = Faults("mock output", clock, faults, timeout_s)
+        self.faults = Faults(self.name, clock, faults, timeout_s)
         size = int(support.number("keep", keep, 1, 1_000_000, whole=True))
         self.results: deque[dict[str, Any]] = deque(maxlen=size)
-        self._open = False
-
-    def open(self) -> None:
-        self.faults.on_open()
-        self._open = True
-
-    def close(self) -> None:
-        self._open = False
 
     def identity(self) -> Mapping[str, str]:
-        return {"name": "mock output"}
+        return {"name": self.name}
 
     def emit(self, result: Mapping[str, Any]) -> None:
-        if not self._open:
-            raise DeviceGone("mock output: it is not open")
+        self._require_open()
         self.faults.refuse(self.faults.on_call(), "acknowledgement")
         self.results.append(dict(result))

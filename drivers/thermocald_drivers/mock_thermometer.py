@@ -22,10 +22,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.errors import ConfigurationError, DeviceGone
+from thermocald.errors import ConfigurationError
 from thermocald.hal import Reading, Thermometer
 from thermocald_drivers import support
-from thermocald_drivers.faults import Faults
+from thermocald_drivers.faults import Faults, MockDevice
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -71,8 +71,10 @@ def lagged(
     return state
 
 
-class MockThermometer(Thermometer):
+class MockThermometer(MockDevice, Thermometer):
     """Reads a programme; equal times give equal readings."""
+
+    name = "mock thermometer"
 
     def __init__(
         self,
@@ -93,26 +95,14 @@ class MockThermometer(Thermometer):
         }
         self._seed = int(support.number("seed", seed, 0, 2**31, whole=True))
         self._conversion_s = support.number("conversion_s", conversion_s, 0.0, 60.0, "s")
-        self.faults = Faults("mock thermometer", clock, faults, timeout_s)
-        self._started: float | None = None
-        self._open = False
+        self.faults = Faults(self.name, clock, faults, timeout_s)
         self._last: dict[str, float] = {}
 
-    def open(self) -> None:
-        self.faults.on_open()
-        if self._started is None:
-            self._started = self.clock.monotonic()
-        self._open = True
-
-    def close(self) -> None:
-        self._open = False
-
     def identity(self) -> Mapping[str, str]:
-        return {"name": "mock thermometer", "serial": f"mock-{self._seed}"}
+        return {"name": self.name, "serial": f"mock-{self._seed}"}
 
     def read(self) -> Reading:
-        if not self._open:
-            raise DeviceGone("mock thermometer: it is not open")
+        self._require_open()
         kind = self.faults.on_call()
         start = self.clock.monotonic()
         self.clock.sleep_until(start + self._conversion_s)
@@ -134,9 +124,6 @@ class MockThermometer(Thermometer):
         value += options["noise_k"] * float(np.random.default_rng(seed).standard_normal())
         step = options["resolution_k"]
         return float(round(value / step) * step if step > 0 else value)
-
-    def _elapsed(self, monotonic: float) -> float:
-        return monotonic - (monotonic if self._started is None else self._started)
 
 
 def _channel(name: str, options: Mapping[str, float]) -> dict[str, float]:

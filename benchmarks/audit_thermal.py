@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from benchmarks.audit_rows import Row, ratio, share
-from thermocald.analysis.thermal.correction import TemperatureLog, correct_points
+from thermocald.analysis.thermal.correction import correct_points
 from thermocald.analysis.thermal.prediction_test import predicted_error
+from thermocald.analysis.thermal.temperature_log import TemperatureLog
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.discovery.verdict.model import model_of

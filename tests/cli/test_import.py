@@ -141,7 +141,7 @@ def test_times_from_names(place):
 @pytest.mark.parametrize("zone", [None, "UTC", "Europe/Berlin"])
 def test_correct_and_predict_take_no_time_for_utc_that_does_not_say_so(tmp_path, zone):
     """The readers that both commands use for their --log and for the points."""
-    from thermocald.analysis.thermal.correction import read_rows, read_temperature_log
+    from thermocald.analysis.thermal.temperature_log import read_rows, read_temperature_log
     from thermocald.cli.options import device_clock
 
     ours, foreign = tmp_path / "ours.csv", tmp_path / "foreign.csv"
@@ -165,7 +165,7 @@ def test_correct_and_predict_take_no_time_for_utc_that_does_not_say_so(tmp_path,
 
 
 def test_kelvin_in_a_log_is_refused_with_the_remedy(tmp_path):
-    from thermocald.analysis.thermal.correction import read_temperature_log
+    from thermocald.analysis.thermal.temperature_log import read_temperature_log
 
     (tmp_path / "log.csv").write_text("time,housing\n1,294.5\n2,294.6\n")
     with pytest.raises(ThermocaldError, match=r"kelvin.*subtract 273\.15"):

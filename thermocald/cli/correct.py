@@ -19,7 +19,7 @@ from thermocald.cli.options import (
 from thermocald.errors import DataError, ImageError, UsageError
 
 if TYPE_CHECKING:
-    from thermocald.analysis.thermal.correction import TemperatureLog
+    from thermocald.analysis.thermal.temperature_log import TemperatureLog
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
     from thermocald.store.logger.clock import DeviceClock
 
@@ -110,7 +110,8 @@ def _points(task: _Task, out: Path | None, json: str | None) -> None:
 
     import numpy as np
 
-    from thermocald.analysis.thermal.correction import correct_points, read_rows
+    from thermocald.analysis.thermal.correction import correct_points
+    from thermocald.analysis.thermal.temperature_log import read_rows
     from thermocald.cli.common import write_result, write_text
 
     header, rows, numbers = read_rows(task.path, ("time", "x", "y"), task.clock)
@@ -159,7 +160,8 @@ def _points(task: _Task, out: Path | None, json: str | None) -> None:
 def _images(task: _Task, out: Path, json: str | None) -> None:
     import cv2
 
-    from thermocald.analysis.thermal.correction import image_corrections, read_rows
+    from thermocald.analysis.thermal.correction import image_corrections
+    from thermocald.analysis.thermal.temperature_log import read_rows
     from thermocald.cli.common import progress, write_result
 
     _, rows, numbers = read_rows(task.path, ("time",), task.clock)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from thermocald.analysis.camera.state import CameraState
-    from thermocald.analysis.thermal.correction import TemperatureLog
+    from thermocald.analysis.thermal.temperature_log import TemperatureLog
     from thermocald.analysis.thermal.thermal_camera import Along, ThermalCamera
 
 __all__ = ["predict", "read_log", "say_what_is_missing", "warnings_said"]
@@ -158,7 +158,7 @@ def read_log(
     timezone: of times without one. ConfigurationError where the log is of a recording of another
     camera.
     """
-    from thermocald.analysis.thermal.correction import read_temperature_log
+    from thermocald.analysis.thermal.temperature_log import read_temperature_log
     from thermocald.store.recording.head import read_head
     from thermocald.store.sources import is_store
 

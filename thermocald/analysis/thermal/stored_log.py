@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.thermal.correction import TemperatureLog
+from thermocald.analysis.thermal.temperature_log import TemperatureLog
 from thermocald.errors import DataError
 from thermocald.store.sources import open_source
 

@@ -45,6 +45,7 @@ inside thermocald check /etc/thermocald/config.yaml >/dev/null
 # the private environment sees what the distribution installs (picamera2, libcamera)
 inside /usr/lib/thermocald/bin/python -c 'import sys, yaml; assert "/usr/lib/python3/dist-packages" in sys.path' ||
   fail "the system's modules are not seen"
+inside thermocald doctor | grep -q 'does not start with the machine' || fail "the doctor does not see the service"
 run() { inside su -s /bin/sh thermocald -c "cd /var/lib/thermocald && $1"; }
 run "thermocald simulate --preset nexus5-cold --out M1 >/dev/null 2>&1"
 lap "simulated"
@@ -58,6 +59,11 @@ lap "first replayed epochs"
 echo "$name: from a bare machine to replayed epochs in $ready s, without the download"
 [ -n "$ROOT" ] || [ $ready -le 300 ] || fail "that is more than 5 minutes"
 [ -n "${DEB_SHORT:-}" ] || { run "thermocald demo --epochs 20 --no-discovery --out demo >/dev/null"; lap "demo of 20 epochs"; }
+if [ -z "$ROOT" ] && apt-cache show python3-libcamera >/dev/null 2>&1; then
+  apt_get install python3-libcamera
+  /usr/lib/thermocald/bin/python -c 'from libcamera import controls; controls.AnalogueGain' || fail "libcamera is not seen"
+  lap "libcamera seen"
+fi
 echo "# mine" >> "$ROOT/etc/thermocald/config.yaml"
 run "thermocald export series.db --output first.csv"
 schema() {

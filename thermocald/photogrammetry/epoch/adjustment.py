@@ -291,13 +291,7 @@ def _result(
         )
         return replace(result, status="global_test", reason=why)
     reasons = weaknesses(
-        problem.sensor,
-        points,
-        observed,
-        solution.values,
-        covariance,
-        s.free,
-        s.bounds,
+        problem.sensor, points, observed, solution.values, covariance, s.free, s.bounds
     )
     if reasons:
         return replace(result, status="weak_geometry", reason="; ".join(reasons))

@@ -28,7 +28,7 @@ from thermocald.photogrammetry.epoch.common_checks import (
     snoop_rays,
     weaknesses_together,
 )
-from thermocald.photogrammetry.epoch.gauss_markov import point_covariances
+from thermocald.photogrammetry.epoch.whitening import point_covariances
 from thermocald.photogrammetry.linalg import diagonal_scale, scaled_inverse
 from thermocald.photogrammetry.parameters import EOP_COLUMNS, free_columns
 

@@ -143,3 +143,35 @@ class Observations:
             None if self.covariances is None else self.covariances[keep],
             {name: values[keep] for name, values in self.quality.items()},
         )
+
+    @classmethod
+    def none(cls) -> Observations:
+        """No observations, with covariances of none."""
+        return cls(np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
+
+    def joined(self, other: Observations) -> Observations:
+        """With those of another measurement of the frame, in the order of the test field.
+
+        No target may be in both, and both have covariances. A quality that one does not have is
+        NaN there.
+        """
+        if len(other) == 0:
+            return self
+        if len(self) == 0 and bool((other.targets[1:] > other.targets[:-1]).all()):
+            return other
+        targets = np.concatenate([self.targets, other.targets])
+        order = np.argsort(targets, kind="stable")
+        names = [*other.quality, *(k for k in self.quality if k not in other.quality)]
+
+        def column(part: Observations, name: str) -> Array:
+            return part.quality.get(name, np.full(len(part), np.nan))
+
+        assert self.covariances is not None
+        assert other.covariances is not None
+        return Observations(
+            targets[order],
+            np.concatenate([self.points, other.points])[order],
+            np.concatenate([self.sigmas, other.sigmas])[order],
+            np.concatenate([self.covariances, other.covariances])[order],
+            {k: np.concatenate([column(self, k), column(other, k)])[order] for k in names},
+        )

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 
 from thermocald.photogrammetry.targets.blurred_disc import blurred_disc
-from thermocald.photogrammetry.targets.circle import windows
+from thermocald.photogrammetry.targets.windows import windows
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -17,9 +17,9 @@ import numpy as np
 
 from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera.camera_model import CameraModel, Sensor
-from thermocald.photogrammetry.field.planes import field_normals
 from thermocald.photogrammetry.field.testfield import Observations
-from thermocald.photogrammetry.orientation.identification import Orientation, orient, refine
+from thermocald.photogrammetry.frame.circles import circle_observations, measure_circles
+from thermocald.photogrammetry.orientation.identification import Orientation, orient
 from thermocald.photogrammetry.targets import ring_code
 from thermocald.photogrammetry.targets.chessboard import find_chessboards, locate_chess_corners
 from thermocald.photogrammetry.targets.circle import fit_circles
@@ -32,30 +32,23 @@ from thermocald.photogrammetry.targets.markers import (
     measure_corners,
     predicted_markers,
 )
-from thermocald.photogrammetry.targets.outline import LocalMap, local_maps
 
 if TYPE_CHECKING:
     from typing import Any
 
     from numpy.typing import NDArray
 
-    from thermocald.arrays import Array, Image
+    from thermocald.arrays import Image
     from thermocald.photogrammetry.camera.camera_model import (
         ExteriorOrientation,
         InteriorOrientation,
     )
     from thermocald.photogrammetry.field.testfield import TestField
-    from thermocald.photogrammetry.targets.circle import CircleFit
+    from thermocald.photogrammetry.targets.outline import LocalMap
 
-__all__ = ["Measurement", "Prior", "circle_observations", "join", "measure", "predicted_maps"]
+__all__ = ["Measurement", "Prior", "measure"]
 
 _FEWEST = 4
-_LARGEST_TILT_COSINE = 0.2  # 78°: beyond, a sheet is seen edge-on
-_GROSS_SD = 8.0
-_GROSS_PX = 3.0
-_USUAL_BLUR_PX = 0.9
-_WIDE_BLUR_PX = 1.1
-_SETTLED_PX = 0.002
 _TURNED = (
     "the corners of the markers are numbered in another order in the test field: turned by {}°. "
     "Corner 0 is OpenCV's first, in an upright AprilTag the bottom right one, then clockwise; "
@@ -119,16 +112,18 @@ def measure(
     size = (prior.sensor.width, prior.sensor.height) if prior.sensor is not None else None
     status = inspect_frame(image, size)
     if not status.ok:
-        return Measurement(_nothing(), status)
+        return Measurement(Observations.none(), status)
     sensor = prior.sensor or Sensor(image.shape[1], image.shape[0], 1.0)
     missed: dict[int, str] = {}
     markers = locate_markers(image, testfield, missed)
     if turned := corners_turned_deg(markers, testfield):
-        return Measurement(_nothing(), FrameStatus("other_field", _TURNED.format(turned)), missed)
+        return Measurement(
+            Observations.none(), FrameStatus("other_field", _TURNED.format(turned)), missed
+        )
     corners = measure_corners(image, markers, missed)
     if "chess_corner" in testfield.kinds:
         plain = find_chessboards(image, testfield, missed)
-        corners = join(corners, plain) if len(plain) else corners
+        corners = corners.joined(plain) if len(plain) else corners
     corners = _by_orientation(image, testfield, prior, sensor, corners, markers, missed)
     found = _measure(image, testfield, prior, sensor, corners, missed, eccentricity)
     return replace(found, markers=markers)
@@ -172,7 +167,7 @@ def _by_orientation(
             found = measure_corners(image, place, missed)
             for row in found.targets.tolist():
                 missed.pop(row, None)
-            corners = join(corners, found) if len(found) else corners
+            corners = corners.joined(found) if len(found) else corners
     return corners
 
 
@@ -192,10 +187,10 @@ def _measure(
 
     if prior.interior is not None and prior.exterior is not None:
         known = Orientation(CameraModel(sensor, prior.interior), prior.exterior, np.zeros((0, 2)))
-        found = _measure_circles(image, testfield, known, corners, None, eccentricity)
+        found = measure_circles(image, testfield, known, corners, None, eccentricity)
         if len(found[0]) >= max(_FEWEST, 0.5 * (len(found[0]) + len(found[1]))):
             missed.update(found[1])
-            return _finish(testfield, join(corners, found[0]), missed, found[2], False)
+            return _finish(testfield, corners.joined(found[0]), missed, found[2], False)
 
     rows, points, maps, foreign = find_coded(
         image, testfield, _FEWEST, needed=len(corners) < _FEWEST
@@ -211,7 +206,7 @@ def _measure(
         )  # fmt: skip
     except GeometryError as error:
         return Measurement(
-            _nothing(),
+            Observations.none(),
             FrameStatus(
                 "other_field",
                 f"{len(pair_rows)} codes of the test field are seen, but not where it has them "
@@ -219,121 +214,11 @@ def _measure(
             ),
             missed,
         )
-    measured, lost, orientation = _measure_circles(
+    measured, lost, orientation = measure_circles(
         image, testfield, orientation, corners, prior.interior, eccentricity
     )
     missed.update(lost)
-    return _finish(testfield, join(corners, measured), missed, orientation, foreign)
-
-
-def predicted_maps(
-    testfield: TestField, orientation: Orientation, eccentricity: bool = True
-) -> tuple[NDArray[np.int64], LocalMap]:
-    """Rows and outlines of the field's circles that face the camera and lie in the image.
-
-    A circle whose plane is not known is taken as facing the camera, and has no eccentricity.
-    """
-    circles = np.array([kind == "circle" for kind in testfield.kinds], dtype=bool)
-    rows = np.nonzero(circles & np.isfinite(testfield.diameters))[0]
-    X = testfield.points[rows]
-    normals = field_normals(testfield)[rows]
-    view = orientation.exterior.centre - X
-    view = view / np.linalg.norm(view, axis=1, keepdims=True)
-    unknown = ~np.isfinite(normals[:, 0])
-    normals = np.where(unknown[:, None], view, normals)
-    cosine = np.abs(np.sum(view * normals, axis=1))
-    maps = local_maps(
-        orientation.camera.sensor, orientation.camera.interior.as_array(),
-        orientation.exterior.as_array(), X, normals, testfield.diameters[rows] / 2,
-    )  # fmt: skip
-    visible = (
-        np.isfinite(maps.second).all(axis=(1, 2))
-        & np.isfinite(maps.linear).all(axis=(1, 2))
-        & orientation.camera.sensor.contains(np.nan_to_num(maps.centre, nan=-1e9))
-        & (cosine > _LARGEST_TILT_COSINE)
-    )
-    maps = maps if eccentricity else maps.without_eccentricity()
-    return rows[visible], maps.select(visible)
-
-
-def _measure_circles(
-    image: Image,
-    testfield: TestField,
-    orientation: Orientation,
-    corners: Observations,
-    interior: InteriorOrientation | None,
-    eccentricity: bool,
-) -> tuple[Observations, dict[int, str], Orientation]:
-    """Fit every circle in view, improve the orientation with them, and fit once more if needed."""
-    rows, maps = predicted_maps(testfield, orientation, eccentricity)
-    coded = np.array([ring_code.is_ring(testfield.codes[r]) for r in rows], dtype=bool)
-    fit = fit_circles(image, maps, coded, _USUAL_BLUR_PX)
-    blur = float(np.median(fit.parameters[:, 5])) if len(rows) else _USUAL_BLUR_PX
-    if blur > _WIDE_BLUR_PX:
-        # The windows were too narrow for this frame.
-        fit = fit_circles(image, maps, coded, blur)
-    good = fit.good
-    if good.sum() + len(corners) < _FEWEST:
-        return _nothing(), dict(zip(rows.tolist(), fit.reasons, strict=True)), orientation
-    pairs = np.concatenate([corners.targets, rows[good]])
-    better = refine(
-        orientation.camera.sensor, orientation.camera.interior, orientation.exterior,
-        testfield.points[pairs], np.concatenate([corners.points, fit.points[good]]),
-        known=interior is not None,
-    )  # fmt: skip
-    new_rows, new_maps = predicted_maps(testfield, better, eccentricity)
-    same = len(new_rows) == len(rows) and bool(np.all(new_rows == rows))
-    # The outlines' asymmetry decides about the centres, the rest is estimated anyway.
-    settled = (
-        same
-        and bool(good.all())
-        and float(np.abs(new_maps.second - maps.second).max(initial=0.0)) < _SETTLED_PX
-    )
-    if not settled:
-        start = None
-        if same:
-            new_maps = new_maps.at(np.where(good[:, None], fit.points, new_maps.centre))
-            start = fit.parameters if good.all() else None
-        rows, maps = new_rows, new_maps
-        coded = np.array([ring_code.is_ring(testfield.codes[r]) for r in rows], dtype=bool)
-        fit = fit_circles(image, maps, coded, blur, None, start)
-    return (*_observations(rows, fit, testfield, better), better)
-
-
-def _observations(
-    rows: NDArray[np.int64], fit: CircleFit, testfield: TestField, orientation: Orientation
-) -> tuple[Observations, dict[int, str]]:
-    """The good fits; a circle far from where its target must be is another circle."""
-    reasons = list(fit.reasons)
-    predicted = orientation.camera.project(orientation.exterior, testfield.points[rows])
-    off = np.abs(fit.points - predicted).max(axis=1, initial=0.0)
-    limit = max(_GROSS_PX, _GROSS_SD * min(orientation.scatter, 1.0))
-    for i in np.nonzero(off > limit)[0]:
-        reasons[i] = reasons[i] or "not where the target must be"
-    good = np.array([not reason for reason in reasons], dtype=bool)
-    observations = circle_observations(rows, fit, good)
-    return observations, {int(r): why for r, why in zip(rows, reasons, strict=True) if why}
-
-
-def circle_observations(
-    rows: NDArray[np.int64], fit: CircleFit, good: NDArray[np.bool_]
-) -> Observations:
-    """Some of the fits (mask) as observations of the test field's rows (n,)."""
-    c, p = fit.covariances[good], fit.parameters[good]
-    return Observations(
-        rows[good].astype(np.int64),
-        p[:, :2],
-        np.sqrt(np.stack([c[:, 0, 0], c[:, 1, 1]], axis=-1)),
-        c[:, 0, 1],
-        {
-            "blur": p[:, 5],
-            "contrast": p[:, 7],
-            "grey": p[:, 6],
-            "noise": np.sqrt(fit.noise.variance(p[:, 6])).astype(float),
-            "saturation": fit.saturation[good],
-            "misfit": fit.misfit[good],
-        },
-    )
+    return _finish(testfield, corners.joined(measured), missed, orientation, foreign)
 
 
 def _few(
@@ -351,7 +236,7 @@ def _few(
     good = fit.good
     missed.update({int(r): why for r, why in zip(rows, fit.reasons, strict=True) if why})
     circles = circle_observations(rows, fit, good)
-    return _finish(testfield, join(corners, circles), missed, None, foreign)
+    return _finish(testfield, corners.joined(circles), missed, None, foreign)
 
 
 def _finish(
@@ -390,34 +275,4 @@ def _why_nothing(missed: dict[int, str]) -> str:
     remedy = _REMEDIES.get(word)
     return f"{len(reasons)} targets are seen and none can be measured; {count} are {word}" + (
         f": {remedy}" if remedy else ""
-    )
-
-
-def join(first: Observations, second: Observations) -> Observations:
-    """The observations of both, in the order of the test field; no target may be in both."""
-    if len(second) == 0:
-        return first
-    if len(first) == 0 and bool((second.targets[1:] > second.targets[:-1]).all()):
-        return second
-    targets = np.concatenate([first.targets, second.targets])
-    order = np.argsort(targets, kind="stable")
-    names = [*second.quality, *(k for k in first.quality if k not in second.quality)]
-
-    def column(part: Observations, name: str) -> Array:
-        return part.quality.get(name, np.full(len(part), np.nan))
-
-    assert first.covariances is not None
-    assert second.covariances is not None
-    return Observations(
-        targets[order],
-        np.concatenate([first.points, second.points])[order],
-        np.concatenate([first.sigmas, second.sigmas])[order],
-        np.concatenate([first.covariances, second.covariances])[order],
-        {k: np.concatenate([column(first, k), column(second, k)])[order] for k in names},
-    )
-
-
-def _nothing() -> Observations:
-    return Observations(
-        np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
     )

@@ -16,20 +16,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.field.testfield import Observations
+from thermocald.photogrammetry.frame.circles import predicted_maps
 from thermocald.photogrammetry.frame.gradient_weights import GradientWeights
-from thermocald.photogrammetry.frame.measurement import (
-    Measurement,
-    Prior,
-    join,
-    measure,
-    predicted_maps,
-)
+from thermocald.photogrammetry.frame.measurement import Measurement, Prior, measure
 from thermocald.photogrammetry.targets import ring_code
-from thermocald.photogrammetry.targets.circle import fit_circles, window_reach
+from thermocald.photogrammetry.targets.circle import fit_circles
 from thermocald.photogrammetry.targets.corner import REACH_PX as CORNER_REACH_PX
 from thermocald.photogrammetry.targets.frame_status import OK, inspect_frame
 from thermocald.photogrammetry.targets.image_file import EncodedImage
 from thermocald.photogrammetry.targets.markers import measure_corners
+from thermocald.photogrammetry.targets.windows import window_reach
 
 if TYPE_CHECKING:
     from typing import Any
@@ -118,7 +114,7 @@ class Tracker:
         if image.shape != state.shape:
             size = (state.shape[1], state.shape[0])
             status = inspect_frame(image, size)
-            return TrackedMeasurement(_none(), status)
+            return TrackedMeasurement(Observations.none(), status)
         if image.dtype != state.dtype:
             return self._search(image, f"the frame is {image.dtype}, it was {state.dtype}")
         return self._track(image, state) or self._search(
@@ -177,8 +173,8 @@ class Tracker:
         `farthest` px.
         """
         missed: dict[int, str] = {}
-        corners, circles, renewed = _none(), state.circles, 0
-        found = _none()
+        corners, circles, renewed = Observations.none(), state.circles, 0
+        found = Observations.none()
         markers = state.markers
         if markers is not None:
             corners = measure_corners(image, markers, missed)
@@ -188,7 +184,7 @@ class Tracker:
             if tracked is None:
                 return None
             found, circles, renewed = tracked
-        both = join(corners, found)
+        both = corners.joined(found)
         if len(both) < max(_FEWEST, (1 - _LOST_SHARE) * state.seen):
             return None
         boxes = _boxes(circles, markers) if renewed or markers is not None else state.boxes
@@ -285,9 +281,3 @@ def _median(values: Array) -> Array:
     n = len(ordered)
     middle: Array = (ordered[(n - 1) // 2] + ordered[n // 2]) / 2
     return middle
-
-
-def _none() -> Observations:
-    return Observations(
-        np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
-    )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.frame.measurement import circle_observations, join
+from thermocald.photogrammetry.frame.circles import circle_observations
 from thermocald.photogrammetry.targets import ring_code
 from thermocald.photogrammetry.targets.circle import fit_circles
 from thermocald.photogrammetry.targets.detection import find_circles
@@ -134,4 +134,4 @@ def targets_in(
     coded = np.array([ring_code.is_ring(field.codes[row]) for row in rows], dtype=bool)
     fit = fit_circles(image, maps, coded)
     off = np.linalg.norm(fit.points - maps.centre, axis=1)
-    return join(corners, circle_observations(rows, fit, fit.good & (off < _GROSS_PX)))
+    return corners.joined(circle_observations(rows, fit, fit.good & (off < _GROSS_PX)))

@@ -16,7 +16,6 @@ import numpy as np
 
 from thermocald.errors import GeometryError, ImageError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
-from thermocald.photogrammetry.frame.measurement import join
 from thermocald.photogrammetry.network.adjustment import Distance, Network, Photo, adjust_network
 from thermocald.photogrammetry.survey.field import (
     expected_field,
@@ -171,7 +170,7 @@ def _first_look(
         sensor = sensor or Sensor(image.shape[1], image.shape[0], pixel_pitch)
         seen, radii = codes_in(image, codes)
         if nominal is not None:
-            seen = join(measure_corners(image, locate_markers(image, nominal)), seen)
+            seen = measure_corners(image, locate_markers(image, nominal)).joined(seen)
         sizes.update({(picture.name, codes.names[row]): radii[row] for row in radii})
         said[picture.name] = f"{len(seen)} coded targets"
         if len(seen):

@@ -15,12 +15,17 @@ from functools import cache
 from math import inf
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 
 from thermocald.photogrammetry.targets import ring_code
-from thermocald.photogrammetry.targets.blurred_disc import normal_cdf
-from thermocald.photogrammetry.targets.outline import LocalMap
+from thermocald.photogrammetry.targets.ring_drawing import RADII, allowed_misfit, ring_misfit
+from thermocald.photogrammetry.targets.ring_samples import (
+    ANGLES,
+    COARSE_ANGLES,
+    in_perspective,
+    sample,
+    sized,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -29,15 +34,11 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array, Single
     from thermocald.photogrammetry.targets.detection import Candidates
+    from thermocald.photogrammetry.targets.outline import LocalMap
 
 __all__ = ["CodedTargets", "read_codes"]
 
-_ANGLES = 84  # a multiple of 12 and of 14
-_COARSE_ANGLES = 28
 _COARSE_RADII = (0.5, 1.5, 2.5, 3.4)
-_PROFILE, _PROFILE_STEP, _PROFILE_REACH = (0.5, 3.55), 0.05, 0.45
-_EDGE_RADII = (0.55, 0.65, 0.75, 0.85, 0.95, 1.05, 1.15, 1.25, 1.35, 1.45)
-_RADII = (1.75, 2.05, 2.25, 2.5, 2.75, 2.95, 3.25)
 _MIDDLE = slice(2, 5)
 _INSIDE, _OUTSIDE = 0.6, 0.4  # level of a sample, 0 background, 1 ink
 _LEAST_RELIEF = 0.35  # of the ring, against none about a plain circle
@@ -46,12 +47,6 @@ _LEAST_CONTRAST_DN = 10.0
 _SMALLEST_SEMI_AXIS_PX = 2.6  # a gap of less cannot be seen
 _RASTER_PX = 0.5  # by how much a transition may miss the raster, and by how many turns
 _RASTER_TURNS = 0.006
-_BLURS_PX = (0.8, 1.4)
-_LARGEST_SHIFT = 0.2  # radii, by which perspective and distortion move a ring against its disc
-# RMS of samples against what was read, in levels: at most, and for large targets, whose edges fill
-# less of the ring, less.
-_MISFIT = 0.13
-_MISFIT_LARGE, _MISFIT_EDGE_PX = 0.03, 0.45
 # A closed ring with something across is read as one arc, a line through a dot as two single bits.
 _MISFIT_OF_FEW = 0.06
 
@@ -81,7 +76,7 @@ def read_codes(
     them are enough: discs about which no code was found are then not looked at in perspective.
     """
     rows, gap, contrast = _disc_and_gap(image, candidates)
-    maps = _sized(image, candidates.maps.select(rows), gap, contrast)
+    maps = sized(image, candidates.maps.select(rows), gap, contrast)
     bits, number = _read(image, maps, gap, contrast)
     # Seen from near and aslant, a ring is not concentric with its disc: by pixels if it is large.
     left = np.nonzero(bits == 0)[0]
@@ -110,7 +105,7 @@ def _read(
     image: NDArray[np.uint8], maps: LocalMap, gap: Single, contrast: Single
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Bits (n,), 0 where no code can be trusted, and numbers (n,) of the codes about discs."""
-    level = _sample(image, maps, _RADII, _ANGLES)
+    level = sample(image, maps, RADII, ANGLES)
     level = (level - gap[:, None, None]) / contrast[:, None, None]
     families = np.array(ring_code.BITS, dtype=np.int64)
     readings = [_read_family(level, maps, n) for n in families.tolist()]
@@ -139,7 +134,7 @@ def _disc_and_gap(
     inside = np.all((low > 0) & (high < (width - 1, height - 1)), axis=1)
     large = candidates.maps.semi_axes[:, 1] >= _SMALLEST_SEMI_AXIS_PX
     rows = np.nonzero(inside & large)[0]
-    grey = _sample(image, candidates.maps.select(rows), _COARSE_RADII, _COARSE_ANGLES)
+    grey = sample(image, candidates.maps.select(rows), _COARSE_RADII, COARSE_ANGLES)
     ink, gap = grey[:, 0].mean(axis=1), grey[:, 1].mean(axis=1)
     contrast = ink - gap
     enough = contrast * candidates.polarity[rows] >= _LEAST_CONTRAST_DN
@@ -152,102 +147,6 @@ def _disc_and_gap(
         & (np.mean(level[:, 3] < _OUTSIDE, axis=1) >= _SHARE)
     )
     return rows[passed], gap[passed], contrast[passed]
-
-
-def _sized(image: NDArray[np.uint8], maps: LocalMap, gap: Single, contrast: Single) -> LocalMap:
-    """The maps with the size that the discs have at half of their contrast.
-
-    A contour lies where its threshold does, which may be a pixel off.
-    """
-    level = _sample(image, maps, _EDGE_RADII, _COARSE_ANGLES)
-    level = (level - gap[:, None, None]) / contrast[:, None, None]
-    # The disc reaches as far as ink goes: its level, summed outwards.
-    step = _EDGE_RADII[1] - _EDGE_RADII[0]
-    radius = _EDGE_RADII[0] - step / 2 + np.clip(level, 0, 1).sum(axis=1) * step
-    turn = 2 * np.pi * np.arange(_COARSE_ANGLES) / _COARSE_ANGLES
-    across = 1 / np.linalg.norm(
-        np.swapaxes(np.linalg.inv(maps.linear), 1, 2) @ np.stack([np.cos(turn), np.sin(turn)]),
-        axis=1,
-    )
-    excess = np.median((radius - 1) * across, axis=1)
-    axes = np.linalg.norm(maps.linear, axis=1)
-    factor = np.maximum(1 + excess[:, None] / axes, 0.5)
-    return LocalMap(maps.centre, maps.linear * factor[:, None, :], maps.second)
-
-
-def in_perspective(
-    image: NDArray[np.uint8], maps: LocalMap, gap: Single, contrast: Single
-) -> LocalMap:
-    """The maps (n,) of discs with the perspective in which their rings are seen.
-
-    gap, contrast (n,) DN. The edges of disc and ring are looked for along each radius; those of a
-    target seen in perspective w about a centre that is e off lie at R − e·u − uᵀA u R − (w·u) R²
-    instead of at R = 1, 2, 3, with u the direction and A the ellipse's error. What the ring says
-    is of no matter here.
-    """
-    rho = np.arange(_PROFILE[0], _PROFILE[1], _PROFILE_STEP)
-    level = _sample(image, maps, tuple(rho.tolist()), _ANGLES)
-    level = (level - gap[:, None, None]) / contrast[:, None, None]
-    turn = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
-    u = np.stack([np.cos(turn), np.sin(turn)])
-    # away from the ends of an arc, whose corners are rounded by blur
-    ring = level[:, np.argmin(np.abs(rho - 2.5))] > _INSIDE
-    ring &= np.roll(ring, 2, axis=1) & np.roll(ring, -2, axis=1)
-    normal, rhs = np.zeros((len(maps), 7, 7)), np.zeros((len(maps), 7))
-    for radius, rising in (
-        (1.0, False),
-        (ring_code.RING_INNER, True),
-        (ring_code.RING_OUTER, False),
-    ):
-        window = np.abs(rho - radius) < _PROFILE_REACH
-        part = level[:, window] if rising else 1 - level[:, window]
-        crossing = (part[:, :-1] < 0.5) & (part[:, 1:] >= 0.5)
-        known = crossing.sum(axis=1) == 1
-        if radius > 1:
-            known &= ring
-        first = np.argmax(crossing, axis=1)[:, None]
-        below = np.take_along_axis(part, first, 1)[:, 0]
-        above = np.take_along_axis(part, first + 1, 1)[:, 0]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            place = rho[window][first[:, 0]] + _PROFILE_STEP * (0.5 - below) / (above - below)
-        short = np.where(known, radius - place, 0.0)
-        design = np.stack(
-            [
-                u[0], u[1], radius * u[0] ** 2, 2 * radius * u[0] * u[1], radius * u[1] ** 2,
-                radius**2 * u[0], radius**2 * u[1],
-            ]
-        )  # fmt: skip
-        normal += (design * known[:, None]) @ design.T
-        rhs += short @ design.T
-    ex, ey, a, b, d, *w = np.linalg.solve(normal + 1e-3 * np.eye(7), rhs[..., None])[..., 0].T
-    e, shape = np.stack([ex, ey], axis=-1), np.stack([a, b, b, d], axis=-1).reshape(-1, 2, 2)
-    linear = maps.linear @ (np.eye(2) - shape)
-    first, second = linear[:, :, 0], linear[:, :, 1]
-    ws, wt = w[0][:, None], w[1][:, None]
-    bend = np.stack([-2 * ws * first, -ws * second - wt * first, -2 * wt * second], axis=-1)
-    return LocalMap(maps.centre - (maps.linear @ e[..., None])[..., 0], linear, bend)
-
-
-def _sample(
-    image: NDArray[np.uint8], maps: LocalMap, radii: tuple[float, ...], angles: int
-) -> Single:
-    """Grey values (n, radii, angles) on circles about discs, clockwise from the first axis."""
-    turn = 2 * np.pi * np.arange(angles) / angles
-    circle = np.stack([np.cos(turn), np.sin(turn)])
-    grey = np.empty((len(maps), len(radii), angles), dtype=np.float32)
-    chunk = 32_000 // len(radii)  # cv2.remap takes no more rows
-    rho = np.array(radii, dtype=np.float32)[:, None, None]
-    bend = np.stack([circle[0] ** 2, 2 * circle[0] * circle[1], circle[1] ** 2]) / 2
-    bent = bool(np.any(maps.second))
-    for i in range(0, len(maps), chunk):
-        part = slice(i, i + chunk)
-        around = (maps.linear[part] @ circle).astype(np.float32)[:, None] * rho
-        if bent:
-            around += (maps.second[part] @ bend).astype(np.float32)[:, None] * rho**2
-        around += maps.centre[part].astype(np.float32)[:, None, :, None]
-        x, y = (np.ascontiguousarray(around[:, :, k]).reshape(-1, angles) for k in (0, 1))
-        grey[part] = cv2.remap(image, x, y, cv2.INTER_LINEAR).reshape(-1, len(radii), angles)
-    return grey
 
 
 @cache
@@ -271,7 +170,7 @@ def _read_family(level: Single, maps: LocalMap, bits: int) -> tuple[NDArray[np.i
     target, at = np.nonzero(crosses)
     level_at = ring[target, at]
     place = at + (0.5 - level_at) / (after[target, at] - level_at)
-    phase = 2 * np.pi * place * bits / _ANGLES
+    phase = 2 * np.pi * place * bits / ANGLES
     cosine, sine = np.bincount(target, np.cos(phase), n), np.bincount(target, np.sin(phase), n)
     offset = np.arctan2(sine, cosine) / (2 * np.pi * bits)  # in turns: where the raster begins
     off = np.zeros(n)
@@ -282,7 +181,7 @@ def _read_family(level: Single, maps: LocalMap, bits: int) -> tuple[NDArray[np.i
     allowed = _RASTER_TURNS + _RASTER_PX / (2 * np.pi * 2.5 * maps.semi_axes[:, 1])
     on_raster = off < np.minimum(allowed, 0.3 / bits)
 
-    turns = np.arange(_ANGLES) / _ANGLES
+    turns = np.arange(ANGLES) / ANGLES
     position = ((turns - offset[:, None]) % 1.0) * bits
     which = np.minimum(position.astype(np.int64), bits - 1)
     within = position - which
@@ -296,78 +195,10 @@ def _read_family(level: Single, maps: LocalMap, bits: int) -> tuple[NDArray[np.i
     misfit = np.full(n, np.inf)
     rows = np.nonzero(readable)[0]
     if len(rows):
-        misfit[rows] = _misfit(
+        misfit[rows] = ring_misfit(
             level[rows], maps.select(rows), ones[rows], which[rows], within[rows]
         )
-        misfit[misfit > _allowed(maps)] = np.inf
+        misfit[misfit > allowed_misfit(maps)] = np.inf
         one_arc = np.sum(ones != np.roll(ones, 1, axis=1), axis=1) == 2
         misfit[(one_arc | (ones.sum(axis=1) <= 2)) & (misfit > _MISFIT_OF_FEW)] = np.inf
     return codes, misfit
-
-
-def _allowed(maps: LocalMap) -> Array:
-    allowed: Array = _MISFIT_LARGE + _MISFIT_EDGE_PX / maps.semi_axes[:, 1]
-    return np.minimum(allowed, _MISFIT)
-
-
-def _misfit(
-    level: Single,
-    maps: LocalMap,
-    ones: NDArray[np.bool_],
-    which: NDArray[np.int64],
-    within: Array,
-) -> Array:
-    """RMS (n,) of the samples against the ring that was read, drawn with one of two blurs."""
-    bits = ones.shape[1]
-    mine = np.take_along_axis(ones, which, 1)
-    left = np.take_along_axis(ones, (which - 1) % bits, 1) != mine
-    right = np.take_along_axis(ones, (which + 1) % bits, 1) != mine
-    # Angle to the nearest transition in rad, positive on ink; a bit farther off will do for far.
-    angle = np.minimum(np.where(left, within, within + 1), np.where(right, 1 - within, 2 - within))
-    angle = np.where(mine, angle, -angle) * (2 * np.pi / bits)
-    turn = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
-    u = np.stack([np.cos(turn), np.sin(turn)])
-    # How many px a radius is: across the circles, and across a radial edge at that radius.
-    across = 1 / np.linalg.norm(np.swapaxes(np.linalg.inv(maps.linear), 1, 2) @ u, axis=1)
-    along = np.abs(np.linalg.det(maps.linear))[:, None] / np.linalg.norm(maps.linear @ u, axis=1)
-    across, side = across.astype(np.float32), (angle * along).astype(np.float32)
-    rho = np.array(_RADII, dtype=np.float32)[:, None]
-    misfit = np.full(len(level), np.inf)
-    for blur in _BLURS_PX:
-        left = np.nonzero(misfit > _allowed(maps))[0]
-        if len(left) == 0:
-            break
-        scale = (across[left] / np.float32(blur))[:, None]
-        drawn = normal_cdf((rho - np.float32(ring_code.RING_INNER)) * scale)
-        drawn += normal_cdf((np.float32(ring_code.RING_OUTER) - rho) * scale)
-        drawn -= np.float32(1)
-        drawn *= normal_cdf(rho * (side[left] / np.float32(blur))[:, None])
-        misfit[left] = np.minimum(misfit[left], _rms_after_shift(level[left], drawn))
-    return misfit
-
-
-def _rms_after_shift(level: Single, drawn: Single) -> Array:
-    """RMS (n,) of level minus drawn (n, radii, angles) after the ring may shift, turn, and grow."""
-    n = len(level)
-    turn = (2 * np.pi * np.arange(_ANGLES) / _ANGLES).astype(np.float32)
-    radii = np.array(_RADII, dtype=np.float32)
-    rho, cosine, sine = radii[:, None], np.cos(turn), np.sin(turn)
-    outwards = np.gradient(drawn, radii, axis=1)
-    around = np.roll(drawn, -1, axis=2) - np.roll(drawn, 1, axis=2)
-    around *= np.float32(_ANGLES / (4 * np.pi))
-    design = np.stack(
-        [
-            outwards * cosine - around * sine / rho,
-            outwards * sine + around * cosine / rho,
-            around,
-            outwards * rho,
-        ],
-        axis=1,
-    ).reshape(n, 4, -1)
-    residual = (level - drawn).reshape(n, -1)
-    normal = design @ np.swapaxes(design, 1, 2) + 1e-3 * np.eye(4, dtype=np.float32)
-    shift = np.linalg.solve(normal, (design @ residual[..., None]))[..., 0]
-    shift = np.clip(shift, -_LARGEST_SHIFT, _LARGEST_SHIFT)
-    left = residual - (shift[:, None] @ design)[:, 0]
-    rms: Array = np.sqrt(np.mean(left * left, axis=1))
-    return rms

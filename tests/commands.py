@@ -10,7 +10,10 @@ import sys
 from pathlib import Path
 from unittest import mock
 
-from thermocald.cli import main
+from typer.testing import CliRunner, Result
+
+from thermocald.cli import application, main
+from thermocald.errors import ThermocaldError
 
 
 def call(*arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -32,3 +35,11 @@ def call(*arguments: object, folder: Path | None = None) -> subprocess.Completed
     finally:
         os.chdir(before)
     return subprocess.CompletedProcess(command, status, out.getvalue(), err.getvalue())
+
+
+def invoke(*arguments: object) -> Result:
+    """The result of a command; an error of ours is raised as it is."""
+    result = CliRunner().invoke(application(), [str(a) for a in arguments])
+    if isinstance(result.exception, ThermocaldError):
+        raise result.exception
+    return result

@@ -3,12 +3,11 @@
 import json
 import shutil
 from dataclasses import replace
+from functools import partial
 
 import pytest
-import typer
-from typer.testing import CliRunner
 
-from thermocald.cli import study as command
+from tests.commands import invoke
 from thermocald.errors import DataError, OutputError, ThermocaldError, UsageError
 from thermocald.simulation.presets import preset_simulation
 
@@ -30,16 +29,7 @@ def recording(tmp_path_factory):
 @pytest.fixture
 def run():
     """Runs the command with arguments; errors of ours come out as they are raised."""
-    app = typer.Typer()
-    app.command("study")(command.study)
-
-    def run_(*arguments):
-        result = CliRunner().invoke(app, [str(a) for a in arguments])
-        if isinstance(result.exception, ThermocaldError):
-            raise result.exception
-        return result
-
-    return run_
+    return partial(invoke, "study")
 
 
 def test_json_on_standard_output_is_one_document_and_nothing_else(run, recording):

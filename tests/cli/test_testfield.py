@@ -7,11 +7,9 @@ import json
 import cv2
 import numpy as np
 import pytest
-import typer
-from typer.testing import CliRunner
 
+from tests.commands import invoke
 from tests.photogrammetry import network_cases as cases
-from thermocald.cli import camera, testfield
 from thermocald.errors import ConfigurationError, GeometryError, ThermocaldError, UsageError
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 from thermocald.photogrammetry.field.testfield import TestField
@@ -22,17 +20,7 @@ from thermocald.store.recording.testfield_file import read_testfield
 @pytest.fixture(scope="module")
 def run():
     """Run a command; returns its result, raises what the program would report."""
-    app = typer.Typer()
-    app.add_typer(testfield.group, name="testfield")
-    app.add_typer(camera.group, name="camera")
-
-    def call(*arguments):
-        result = CliRunner().invoke(app, [str(a) for a in arguments])
-        if isinstance(result.exception, ThermocaldError):
-            raise result.exception
-        return result
-
-    return call
+    return invoke
 
 
 def test_print_writes_files_and_says_what_to_measure(run, tmp_path):

@@ -208,6 +208,11 @@ def _from_pair(start: _Start, pair: tuple[int, int]) -> bool:
     start.intersect()
     if np.isfinite(start.points[:, 0]).sum() < _MIN_PAIR:
         return False
+    return _refined(start)
+
+
+def _refined(start: _Start) -> bool:
+    """Refine what there is and add the other photographs; False where that fails."""
     try:
         start.refine()
         start.extend()
@@ -226,12 +231,7 @@ def _from_nominal(start: _Start, nominal: Array) -> bool:
     # from here on the photographs speak, and targets without nominal coordinates join
     start.points[:] = np.nan
     start.intersect()
-    try:
-        start.refine()
-        start.extend()
-    except GeometryError:
-        return False
-    return True
+    return _refined(start)
 
 
 def approximate(

@@ -128,9 +128,31 @@ def test_an_epoch_that_was_moved_has_no_result_and_the_next_begins_anew(scene):
     assert common.epochs == 3
 
 
+def test_gross_errors_in_most_epochs_are_found(scene):
+    sensor, field, epoch = scene
+    calibrator = Calibrator(sensor, field, AdjustmentSettings(), nominal_c=3.04)
+    common = CommonUnknowns(sensor, field, AdjustmentSettings(), exterior="auto", offsets=True)
+    for k in range(30):
+        observations, now = epoch(k)
+        points = observations.points.copy()
+        points[: 3 if k % 3 else 0] += 20.0
+        observations = replace(observations, points=points)
+        result = common.refine(observations, calibrator.adjust(observations))
+        assert result.ok
+        if k % 3:
+            assert set(observations.targets[:3]) <= set(result.rejected)
+        assert (np.abs(result.values[:3] - now[:3]) < 4 * result.sd[:3]).all()
+
+
 def test_nothing_shared_leaves_the_epoch_as_it_is(scene):
     results, alone, _, _ = run(scene, 3, exterior="per_epoch", offsets=False)
     assert all(a is b for a, b in zip(results, alone, strict=True))
+
+
+def test_nothing_of_its_own_leaves_the_epoch_as_it_is(scene):
+    sensor, field, _ = scene
+    held = AdjustmentSettings(free=())
+    assert not CommonUnknowns(sensor, field, held, exterior="series", offsets=True).any
 
 
 def test_priors_and_what_is_held_are_kept(scene):

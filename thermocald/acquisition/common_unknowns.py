@@ -70,8 +70,9 @@ class CommonUnknowns:
 
     @property
     def any(self) -> bool:
-        """Whether there is something that epochs share."""
-        return self._settings.exterior != "per_epoch" or self._settings.target_offsets
+        """Whether there is something that epochs share, and something of their own beside it."""
+        s = self._settings
+        return len(s.per_epoch) > 0 and (s.exterior != "per_epoch" or s.target_offsets)
 
     @property
     def epochs(self) -> int:
@@ -87,9 +88,10 @@ class CommonUnknowns:
     ) -> Adjustment:
         """An epoch's result given all epochs so far, this one included.
 
-        apart: the epoch's adjustment by itself; returned as it is where it is not a result. moved:
-        the epoch contradicts the others in what the caller knows. With a common orientation such an
-        epoch has no result; the second one in a row starts again.
+        apart: the epoch's adjustment by itself, whose rejected targets stay rejected; returned as
+        it is where it is not a result. moved: the epoch contradicts the others in what the caller
+        knows. With a common orientation such an epoch has no result; the second one in a row starts
+        again.
         """
         if not self.any or not apart.ok:
             return apart
@@ -102,7 +104,7 @@ class CommonUnknowns:
                 return failed("moved", why, observations, apart.free)
             self.reset()
         self._surprised = False
-        epoch = self._series.add(observations, apart.values)
+        epoch = self._series.add(observations, apart.values, apart.rejected)
         if epoch.status != "ok":
             return failed(epoch.status, epoch.reason, observations, apart.free)
         return replace(

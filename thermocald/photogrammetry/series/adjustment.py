@@ -36,12 +36,12 @@ from thermocald.photogrammetry.series.estimator import (
     ENOUGH_FOR_NOISE,
     Estimate,
     SeriesEstimator,
-    pooled_variance,
 )
 from thermocald.photogrammetry.series.exterior import choose, loose_bound, observed_movement
 from thermocald.photogrammetry.series.mount import FEWEST_EPOCHS
 from thermocald.photogrammetry.series.normals import ObservationGrid, sums_of_squares
 from thermocald.photogrammetry.series.result import SeriesAdjustment, SeriesSettings
+from thermocald.photogrammetry.series.snooping import pooled_variance
 from thermocald.photogrammetry.series.status import enough_targets, judge
 from thermocald.photogrammetry.series.target_noise import excess_scatter, slow_errors
 

@@ -17,10 +17,11 @@ from thermocald.photogrammetry.series.normals import right_hand_sides
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array, Index
+    from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.series.normals import Partials
 
 
-__all__ = ["Design", "State"]
+__all__ = ["Design", "State", "offset_weights"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,3 +133,14 @@ def _add_blocks(matrix: Array, blocks: Array) -> None:
     matrix[y, y] += blocks[:, 1]
     matrix[x, y] += blocks[:, 2]
     matrix[y, x] += blocks[:, 2]
+
+
+def offset_weights(field: TestField, at: Partials) -> Array:
+    """Inverse covariance (T, 3) px⁻² of the offsets, from that of the object coordinates."""
+    variance = field.sigmas**2
+    tiny = 1e-12  # px²: a target without sigma has no offset
+    xx = (at.B[:, 0] ** 2 * variance).sum(axis=1) + tiny
+    yy = (at.B[:, 1] ** 2 * variance).sum(axis=1) + tiny
+    xy = (at.B[:, 0] * at.B[:, 1] * variance).sum(axis=1)
+    weights: Array = np.stack([yy, xx, -xy], axis=1) / (xx * yy - xy**2)[:, None]
+    return weights

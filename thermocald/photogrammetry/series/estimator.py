@@ -14,7 +14,7 @@ import numpy as np
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.epoch.snooping import Rejections
 from thermocald.photogrammetry.parameters import EOP, IOP, PARAMETER_NAMES
-from thermocald.photogrammetry.series.design import Design, State
+from thermocald.photogrammetry.series.design import Design, State, offset_weights
 from thermocald.photogrammetry.series.movement import STILL, Movement
 from thermocald.photogrammetry.series.normals import (
     ObservationGrid,
@@ -25,6 +25,7 @@ from thermocald.photogrammetry.series.normals import (
 )
 from thermocald.photogrammetry.series.snooping import (
     point_tests,
+    pooled_variance,
     snoop_series,
     typical_variance,
 )
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.series.normals import Partials
     from thermocald.photogrammetry.series.result import SeriesSettings
 
-__all__ = ["ENOUGH_FOR_NOISE", "Estimate", "SeriesEstimator", "pooled_variance"]
+__all__ = ["ENOUGH_FOR_NOISE", "Estimate", "SeriesEstimator"]
 
 ENOUGH_FOR_NOISE = 20
 """Epochs that show the noise of single targets."""
@@ -92,20 +93,35 @@ class SeriesEstimator:
 
     def adjusted(self, start: State, use: Mask) -> tuple[SeriesEstimator, Estimate, Mask]:
         """Solve, find the gross errors and the targets' own noise; the series with that noise."""
-        series, s = self, self.s
+        series, s, offered = self, self.s, use
         estimate = series.solve(start, use, self.unit)
-        if not estimate.converged.all():
-            # A gross error among few targets: such an epoch must not spoil what all share.
-            use = use & estimate.converged[:, None]
+        found = estimate.converged & estimate.system.good.any()
+        if not found.all():
+            # Gross errors among few targets: such an epoch must not spoil what all share.
+            few = 2 * found.sum() < len(found)
+            use = series._screened(start, use) if few else use & estimate.converged[:, None]
+            offered = offered & use.any(axis=1, keepdims=True)
             estimate = series.solve(start, use, self.unit)
         if s.snooping_alpha > 0:
-            estimate, use = series.snoop(estimate, use)
+            estimate, use = series.snoop(estimate, use, offered)
             first_look = self.grid.weights is self.stated
             if s.target_noise and len(use) >= ENOUGH_FOR_NOISE and first_look:
                 series = series.with_target_noise(estimate, use)
                 estimate = series.solve(estimate, use, 1.0)
-                estimate, use = series.snoop(estimate, use)
+                estimate, use = series.snoop(estimate, use, use)
         return series, estimate, use
+
+    def _screened(self, start: State, use: Mask) -> Mask:
+        """Which points (E, T) take part where most epochs do not converge: what fits each one's
+        pose with the interior orientation of the start; none of an epoch that this does not help.
+        """
+        middle = np.median(start.values, axis=0)
+        s = replace(self.s, exterior="per_epoch", free=(), target_offsets=False, priors={})
+        alone = replace(self, s=s, bound=None, windows=())
+        first = State(np.tile(middle, (len(use), 1)), np.zeros_like(start.offsets), middle[EOP])
+        own = alone.solve(first, use, self.unit)
+        _, kept = alone.snoop(own, use, use)
+        return kept & own.converged[:, None]
 
     @property
     def has_offsets(self) -> bool:
@@ -142,10 +158,10 @@ class SeriesEstimator:
                 system = self._linearised(values, use, variance)
         return Estimate(values, offsets, pose, residuals, system, step.sizes < _NEAR)
 
-    def snoop(self, estimate: Estimate, use: Mask) -> tuple[Estimate, Mask]:
-        """Find the gross errors; the estimate without them and what takes part."""
+    def snoop(self, estimate: Estimate, use: Mask, offered: Mask) -> tuple[Estimate, Mask]:
+        """Find the gross errors; the estimate without them and what of the offered takes part."""
         shared = estimate.system.design.width > 0
-        return (self._snoop_together if shared else self._snoop_apart)(estimate, use)
+        return (self._snoop_together if shared else self._snoop_apart)(estimate, use, offered)
 
     def with_target_noise(self, estimate: Estimate, use: Mask) -> SeriesEstimator:
         """The series with every target's weights from the scatter of its own residuals."""
@@ -168,9 +184,11 @@ class SeriesEstimator:
         own = len(self.s.per_epoch) * int(use.any(axis=1).sum())
         return max((n - own) / max(n, 1), 0.05)
 
-    def _snoop_together(self, estimate: Estimate, use: Mask) -> tuple[Estimate, Mask]:
+    def _snoop_together(
+        self, estimate: Estimate, use: Mask, offered: Mask
+    ) -> tuple[Estimate, Mask]:
         """Data snooping where all epochs share unknowns: every round solves the series again."""
-        variance, offered = 1.0, use
+        variance = 1.0
         rejections = Rejections(use)
         typical = None
         for _ in range(_ROUNDS):
@@ -188,11 +206,11 @@ class SeriesEstimator:
             estimate = self.solve(estimate, use, variance)
         return estimate, use
 
-    def _snoop_apart(self, estimate: Estimate, use: Mask) -> tuple[Estimate, Mask]:
+    def _snoop_apart(self, estimate: Estimate, use: Mask, offered: Mask) -> tuple[Estimate, Mask]:
         """Data snooping where epochs share nothing: only those that changed are solved again."""
         values, residuals = estimate.values, estimate.residuals
         system = whole = replace(estimate.system, use=use.copy())
-        offered, use, rows = use, whole.use, np.arange(len(use))
+        use, rows = whole.use, np.arange(len(use))
         rejections = Rejections(use)
         part: slice | Index = slice(None)  # without a copy
         typical = self.typical
@@ -254,7 +272,7 @@ class SeriesEstimator:
         offsets = self.has_offsets and with_common
         return Design(
             at, own, common, known, own_prior, weight[common], self.bound is not None,
-            self._offset_prior(at) * variance if offsets else None,
+            offset_weights(self.testfield, at) * variance if offsets else None,
         )  # fmt: skip
 
     def _residuals(self, values: Array, offsets: Array, out: Array) -> Array:
@@ -267,16 +285,6 @@ class SeriesEstimator:
             out -= offsets
         return out
 
-    def _offset_prior(self, at: Partials) -> Array:
-        """Inverse covariance (T, 3) px⁻² of the offsets, from that of the object coordinates."""
-        variance = self.testfield.sigmas**2
-        tiny = 1e-12  # px²: a target without sigma has no offset
-        xx = (at.B[:, 0] ** 2 * variance).sum(axis=1) + tiny
-        yy = (at.B[:, 1] ** 2 * variance).sum(axis=1) + tiny
-        xy = (at.B[:, 0] * at.B[:, 1] * variance).sum(axis=1)
-        prior: Array = np.stack([yy, xx, -xy], axis=1) / (xx * yy - xy**2)[:, None]
-        return prior
-
     def sums(self, estimate: Estimate) -> tuple[Array, Array]:
         """Weighted sum of squares (E,) and redundancy (E,) of every epoch."""
         use = estimate.system.use
@@ -288,9 +296,3 @@ class SeriesEstimator:
     def variance(self, estimate: Estimate) -> float:
         """Variance of unit weight of the series, the median over its epochs."""
         return pooled_variance(*self.sums(estimate), estimate.system.good)
-
-
-def pooled_variance(vPv: Array, redundancy: Array, good: Mask) -> float:
-    """The median over epochs of the variance of unit weight; 1 where none has any redundancy."""
-    good = good & (redundancy > 0)
-    return float(np.median(vPv[good] / redundancy[good])) if good.any() else 1.0

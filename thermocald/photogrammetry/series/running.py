@@ -21,6 +21,8 @@ from thermocald.photogrammetry.series.mount import FEWEST_EPOCHS
 from thermocald.photogrammetry.series.normals import ObservationGrid
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from thermocald.arrays import Array, Mask
     from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.field.testfield import Observations, TestField
@@ -73,9 +75,17 @@ class RunningSeries:
         self._known: KnownSeries | None = None
         self._sums: CommonSums | None = None
 
-    def add(self, observations: Observations, values: Array) -> RunningEpoch:
-        """Take an epoch in, and adjust it; values (16,): where the first one starts."""
+    def add(
+        self, observations: Observations, values: Array, rejected: Sequence[int] = ()
+    ) -> RunningEpoch:
+        """Take an epoch in, and adjust it.
+
+        values (16,): where the first one starts; rejected: targets that the epoch's own adjustment
+        found to be wrong, which stay so.
+        """
         grid = ObservationGrid.from_observations(self._field, [observations])
+        observed = grid.observed[0]
+        grid.weights[0, list(rejected)] = 0.0
         self._recent.append(grid)
         self.epochs += 1
         known, sums, counted = self._current(values)
@@ -94,7 +104,7 @@ class RunningSeries:
         status, reasons = known.judged(block, covariance)
         return RunningEpoch(
             status[0], reasons[0], block.estimate.values[0], covariance[0], float(block.sigma0[0]),
-            int(block.redundancy[0]), (grid.observed & ~block.use)[0], block.estimate.residuals[0],
+            int(block.redundancy[0]), observed & ~block.use[0], block.estimate.residuals[0],
         )  # fmt: skip
 
     def pose(self) -> tuple[Array, Array] | None:

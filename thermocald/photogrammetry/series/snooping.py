@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     Columns = NDArray[np.int64]
 
-__all__ = ["point_tests", "snoop_series", "typical_variance"]
+__all__ = ["point_tests", "pooled_variance", "snoop_series", "typical_variance"]
 
 
 def point_tests(system: SeriesSystem, residuals: Array) -> Array:
@@ -68,6 +68,12 @@ def _test_weights(
     inverse = np.stack([vyy, vxx, -2 * vxy])
     inverse /= d
     return inverse
+
+
+def pooled_variance(vPv: Array, redundancy: Array, good: Mask) -> float:
+    """The median over epochs of the variance of unit weight; 1 where no residuals show it."""
+    good = good & (redundancy > 0)
+    return float(np.median(vPv[good] / redundancy[good])) or 1.0 if good.any() else 1.0
 
 
 def typical_variance(tests: Array, used: Mask) -> float:

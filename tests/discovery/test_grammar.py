@@ -23,7 +23,7 @@ from thermocald.reduction.adequacy import examine
 from thermocald.reduction.calibrated import calibrated_thermometers
 from thermocald.reduction.candidate import Candidate
 from thermocald.reduction.fit import HypothesisFitter
-from thermocald.reduction.hypothesis import BASE
+from thermocald.reduction.hypothesis import BASE, Term
 from thermocald.reduction.noise import with_correlated_noise
 from thermocald.reduction.reduce import reduce_together
 from thermocald.reduction.scan import Scanner
@@ -74,6 +74,18 @@ def test_a_recorded_humidity_is_a_quantity_too():
 @pytest.mark.parametrize("kind", ["smooth", pytest.param("random_walk", marks=pytest.mark.slow)])
 def test_what_was_not_recorded_gets_no_formula(kind):
     assert propose(examined(kind, 33), BASE) is None
+
+
+def test_the_error_of_a_second_thermometer_is_part_of_the_noise(above):
+    """Integrated out, it makes the coefficient less certain than the first one's error alone."""
+    term = Term("product(temperature, board_temperature)", ("c",))
+    fitter = HypothesisFitter(above.fitter.series)
+    start = np.array([*above.base.fit.coefficients, 20.0])
+    whole = fitter.fit((term,), start, 1)
+    fitter.further_operators = lambda *_: []
+    alone = fitter.fit((term,), start, 1)
+    assert len(whole.weightings[0].operators) == len(alone.weightings[0].operators) + 1
+    assert whole.covariance[-1, -1] > 1.05 * alone.covariance[-1, -1]
 
 
 def test_one_recording_gets_no_formula(above):

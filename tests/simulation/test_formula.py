@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -85,6 +87,27 @@ def test_errors_of_readings_are_carried_as_differences_say(history, text):
     mine = effect.sensitivity(short, **values).toarray()
     by_differences = Effect.sensitivity(effect, short, **values).toarray()
     assert mine == pytest.approx(by_differences, abs=0.07 * np.abs(by_differences).max())
+
+
+def test_a_product_of_two_thermometers_carries_the_errors_of_both(history):
+    """The variance by both matrices is the scatter of what noisy readings give."""
+    effect = effects.get("product(offset(temperature, a), board)")
+    values = {"a": 20.0}
+    sd = {"temperature": 0.05, "board": 0.15}
+    rng = np.random.default_rng(3)
+    drawn = [
+        effect.signal(replace(history, readings={
+            n: r + rng.normal(0, sd[n], len(r)) for n, r in history.readings.items()
+        }), **values)[:, 0]
+        for _ in range(400)
+    ]  # fmt: skip
+    first = (effect.sensitivity(history, **values) ** 2).sum(axis=1) * sd["temperature"] ** 2
+    further = effect.further_sensitivities(history, **values)
+    both = first + (further["board"] ** 2).sum(axis=1) * sd["board"] ** 2
+    scatter = float(np.mean(np.var(drawn, axis=0)))
+    assert list(further) == ["board"]
+    assert scatter == pytest.approx(float(np.mean(both)), rel=0.1)
+    assert np.mean(first) < 0.9 * scatter
 
 
 def test_every_operator_is_tried():

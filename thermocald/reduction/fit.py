@@ -48,10 +48,12 @@ class HypothesisFitter:
         self.priors: dict[str, tuple[float, float]] = {}  # of these: value known beforehand, sd
         self._trajectories: dict[Any, tuple[Array, Array | None, str]] = {}
         self._drives: dict[Any, tuple[Array, Array]] = {}
+        self._further: dict[Any, list[tuple[Array, str]]] = {}
 
     def share_trajectories(self, other: HypothesisFitter) -> None:
         """Use the trajectories that a fitter of the same histories has computed."""
         self._trajectories, self._drives = other._trajectories, other._drives
+        self._further = other._further
 
     # -- trajectories ---------------------------------------------------------------------------
 
@@ -111,6 +113,20 @@ class HypothesisFitter:
                 self._trajectories.clear()
             self._trajectories[key] = (trajectory, operator, channel)
         return self._trajectories[key]
+
+    def further_operators(self, term: Term, series: int) -> list[tuple[Array, str]]:
+        """Operators (E, states) and channels of the further columns that a signal reads."""
+        values = term.values(series)
+        if values is None:
+            return []
+        key = (series, term.effect, tuple(sorted(values.items())))
+        if key not in self._further:
+            evidence = self.series[series]
+            found = term.kind.further_sensitivities(evidence.history, **values)
+            if len(self._further) > 60:
+                self._further.clear()
+            self._further[key] = [(evidence.states(c, m), c) for c, m in found.items()]
+        return self._further[key]
 
     # -- fitting ---------------------------------------------------------------------------
 
@@ -172,6 +188,8 @@ class HypothesisFitter:
                 channel = self.series[series].history.reference
             else:
                 _, operator, channel = self.trajectories(terms[block.term], series, terms)
+                for further, name in self.further_operators(terms[block.term], series):
+                    carried = with_error_term(carried, ReadingErrorTerm(d, further, name))
             if operator is not None and d.any():
                 unresolved = self._unresolved(terms, block, series)
                 carried = with_error_term(

@@ -147,6 +147,14 @@ class Effect(ABC):
             columns[:, i] = (sides[0] - sides[1]) / (2 * step)
         return csr_array(columns)
 
+    def further_sensitivities(
+        self,
+        history: History,  # noqa: ARG002
+        **nonlinear: Any,  # noqa: ARG002
+    ) -> dict[str, csr_array]:
+        """The same by the readings of every further column that it reads, {channel: (E, R)}."""
+        return {}
+
     def propagate(self, history: History, errors: Array, **nonlinear: Any) -> Array:
         """Errors (R, m) K of the readings → errors (E, m) of drive or first signal, first order."""
         result: Array = self.sensitivity(history, **nonlinear) @ np.nan_to_num(errors)

@@ -65,6 +65,13 @@ class _OfFormula(Effect):
         evaluator, node = self._bound(history, nonlinear)
         return evaluator.sensitivity(node, self.channel(history))
 
+    def further_sensitivities(self, history: History, **nonlinear: Any) -> dict[str, csr_array]:
+        evaluator, node = self._bound(history, nonlinear)
+        first = self.channel(history)
+        others = [name for name in self.node.channels() if name != first]
+        found = {name: evaluator.sensitivity(node, name) for name in others}
+        return {name: matrix for name, matrix in found.items() if matrix.nnz}
+
     def unresolved(
         self, history: History, rate_jump: Array | None = None, **nonlinear: Any
     ) -> Array:

@@ -1,9 +1,11 @@
 """Scoring of the discovery on effects hidden in real corners.
 
     python -m tests.real_corners.score --first 500 --seeds 2 [--part nine] [--camera aviary-cam1]
+        [--check]
 
 Runs in memory through `discover_series`, the same function the command calls. Parts: `nine`, the
-nine effects of the target; `others`; `none`: no effect, 25 recordings of each camera and seed.
+nine effects of the target; `others`; `none`: no effect, 25 recordings of each camera and seed. With
+--check the exit status is 1 where a part misses its goal (`GOALS`).
 """
 
 from __future__ import annotations
@@ -34,6 +36,10 @@ from thermocald.reduction.source import series_input
 from thermocald.store.recording.reader import read_recording
 
 NONE_PER_SEED = 25
+GOALS = {"nine": 0.9, "others": 0.9, "none": 1.0}
+"""Share of a part that is named exactly or listed; without an effect, of no name at all."""
+GAP_CLOSED = 0.8
+"""Share of the excess on M2 that what was named right closes, down to the camera's own noise."""
 
 
 @dataclass
@@ -102,13 +108,28 @@ def cases(part: str, seeds: Iterable[int], cameras: Iterable[str] = CAMERAS) -> 
                     yield RealCase(camera, (effect,), seed)
 
 
+def missed(part: str, done: list[RealOutcome]) -> list[str]:
+    """What a part does not reach of its goals, in words."""
+    named = float(np.mean([o.right_or_listed for o in done]))
+    out = []
+    if named < GOALS[part]:
+        out.append(f"{part}: {named:.0%} named exactly or listed; the goal is {GOALS[part]:.0%}")
+    gaps = [o.gap_closed for o in done if o.right and o.case.effects and o.gap_closed is not None]
+    open_ = sum(g < GAP_CLOSED for g in gaps)
+    if open_ > 0.1 * len(gaps):
+        out.append(f"{part}: {open_} of {len(gaps)} close less than {GAP_CLOSED:.0%} of the gap")
+    return out
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--part", action="append")
     parser.add_argument("--camera", action="append")
+    parser.add_argument("--check", action="store_true")
     a = parser.parse_args()
+    failed: list[str] = []
     for part in a.part or ("nine", "none"):
         done = []
         for case in cases(part, range(a.first, a.first + a.seeds), a.camera or CAMERAS):
@@ -126,6 +147,9 @@ def main() -> None:
             f"{sum(o.right_or_listed for o in done)}, median "
             f"{np.median([o.seconds for o in done]):.1f} s"
         )
+        failed += missed(part, done)
+    if a.check and failed:
+        raise SystemExit("\n".join(failed))
 
 
 if __name__ == "__main__":

@@ -97,7 +97,8 @@ def jumps(fitter: HypothesisFitter, fit: Fit, series: int) -> tuple[Array, Array
     """Variance of the jumps over its expectation (P,) and the combinations W (P, P) it is of.
 
     The columns of W are orthonormal under the mean normal matrix; the thermometer's noise, which
-    jumps too, is in the expectation.
+    jumps too, is in the expectation. What trembles as a whole has a direction of its own: where one
+    is clear, the combinations are turned to it.
     """
     e = fitter.series[series]
     C, V, index = fit.designs[series]
@@ -113,16 +114,44 @@ def jumps(fitter: HypothesisFitter, fit: Fit, series: int) -> tuple[Array, Array
     observed = np.array(
         [np.mean(x[np.abs(x) <= 4 * s] ** 2) for x, s in zip(d.T, spread, strict=True)]
     )
-    expected = np.full(len(size), 6.0 / e.correlation)
-    expected = expected + _thermometer_jumps(fitter, fit, series, W)
-    return np.where(good, observed / expected, 1.0), W
+    white = 6.0 / e.correlation
+    carried = _thermometer_jumps(fitter, fit, series, W)
+    usual = np.all(np.abs(d) <= 4 * spread + 1e-12, axis=1)
+    turned = _turned(d[usual][:, good], white, carried[np.ix_(good, good)])
+    if turned is not None:
+        factors, U = turned
+        return np.concatenate([np.ones(int((~good).sum())), factors]), np.column_stack(
+            [W[:, ~good], W[:, good] @ U]
+        )
+    return np.where(good, observed / (white + np.diag(carried)), 1.0), W
+
+
+def _turned(d: Array, white: float, carried: Array) -> tuple[Array, Array] | None:
+    """Factors (m,) along orthonormal directions (m, m) in which second differences d (n, m) are
+    clearly larger than expected; None where there are none.
+
+    white: the mean square that image noise gives, carried (m, m): that of thermometers.
+    """
+    n, m = d.shape
+    if n < _FEWEST:
+        return None
+    # second differences repeat each other: of n, 18/35 are independent
+    edge = (1.0 + np.sqrt(m / (n * 18.0 / 35.0))) ** 2
+    covariance = d.T @ d / n
+    _, U = np.linalg.eigh(covariance - carried)
+    own = np.einsum("ji,jk,ki->i", U, covariance, U)
+    expected = white + np.einsum("ji,jk,ki->i", U, carried, U)
+    clear = own > _UNUSUAL * edge * expected
+    if not clear.any():
+        return None
+    return np.where(clear, (own - expected + white) / white, 1.0), U
 
 
 def _thermometer_jumps(fitter: HypothesisFitter, fit: Fit, series: int, W: Array) -> Array:
-    """Mean square of the second differences that the thermometers' noise makes in each z."""
+    """Mean products (P, P) of the second differences that the thermometers' noise makes in z."""
     e = fitter.series[series]
     second = np.diff(np.eye(len(e.times)), 2, axis=0)
-    total = np.zeros(W.shape[1])
+    total = np.zeros((W.shape[1], W.shape[1]))
     for block in fit.blocks:
         if block.trajectories > 1 or block.series not in (None, series):
             continue
@@ -131,7 +160,7 @@ def _thermometer_jumps(fitter: HypothesisFitter, fit: Fit, series: int, W: Array
             continue
         jump = (second @ operator) * e.state_sd(channel)
         share = W.T @ e.N.mean(axis=0) @ fit.direction(block)[0]
-        total += np.mean(np.sum(jump**2, axis=1)) * share**2
+        total += np.mean(np.sum(jump**2, axis=1)) * np.outer(share, share)
     return total
 
 

@@ -144,7 +144,8 @@ def _turned(d: Array, white: float, carried: Array) -> tuple[Array, Array] | Non
     clear = own > _UNUSUAL * edge * expected
     if not clear.any():
         return None
-    return np.where(clear, (own - expected + white) / white, 1.0), U
+    # what thermometers carry is an upper bound: trajectories are smoothed
+    return np.where(clear, own / white, 1.0), U
 
 
 def _thermometer_jumps(fitter: HypothesisFitter, fit: Fit, series: int, W: Array) -> Array:

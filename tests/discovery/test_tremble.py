@@ -1,0 +1,54 @@
+"""A camera that trembles from epoch to epoch while its targets' noise is white."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.blind.bridge import series_input
+from tests.blind.case import Case
+from tests.blind.generator import generate
+from thermocald.discovery.verdict.result import discover_series
+from thermocald.photogrammetry.series.normals import ObservationGrid
+from thermocald.reduction.fit import HypothesisFitter
+from thermocald.reduction.noise import jumps, with_jumps
+from thermocald.reduction.reduce import reduce_together
+
+
+def trembling(effects, px, seed):
+    """Both series of a blind case; each image shifted by px, every epoch by itself."""
+    rng = np.random.default_rng([seed, 5])
+    out = []
+    for series in generate(Case(effects, 0.3, seed))[0]:
+        found = series_input(series)
+        grid = found.grid
+        shift = px * rng.normal(size=(len(grid.points), 1, 2))
+        out.append(replace(found, grid=ObservationGrid(grid.points + shift, grid.weights)))
+    return reduce_together(out)
+
+
+@pytest.mark.parametrize(("px", "directions"), [(0.0, 0), (0.08, 2)])
+def test_a_tremble_is_found_along_its_own_directions(px, directions):
+    series = trembling((), px, 3)
+    fitter = HypothesisFitter(series)
+
+    factors, W = jumps(fitter, fitter.fit(()), 0)
+
+    clear = factors > 1.7
+    assert clear.sum() == directions
+    # a shift of 147 points in units of the noise found, 0.04 px; 178 epochs tell it to 15 %
+    expected = 1.0 + 147 * px**2 / 0.04**2 if directions else np.nan
+    assert factors[clear] == pytest.approx([expected] * directions, rel=0.4)
+    again = with_jumps(series[0], factors, W)
+    assert (again is None) is not bool(directions)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("effects", "px"), [((), 0.05), (("softening",), 0.05)])
+def test_what_trembles_is_noise_and_the_cause_is_named(effects, px):
+    found = discover_series(trembling(effects, px, 2))
+
+    assert tuple(e.effect for e in found.effects) == effects
+    assert all(a.significance < 6.0 for a in found.examination.adequacy)

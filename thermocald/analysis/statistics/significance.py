@@ -48,7 +48,7 @@ class MovingFTest:
     mean_square_sd: Array
     critical: Array
     degrees_variance: int
-    degrees_sd: Array
+    degrees_sd: NDArray[np.int32]
     left_out: int
 
     @property
@@ -124,9 +124,13 @@ def moving_f_test(
     if window < 3 or window % 2 == 0:
         raise ValueError(f"the window must be an odd number of at least 3, not {window}")
     starts = unbroken_windows(time_s, window)
-    degrees_sd = np.rint(moving_mean(redundancy, window)[starts] * window)
-    different, which = np.unique(degrees_sd, return_inverse=True)
-    critical = np.asarray(f.isf(alpha, window - 1, np.maximum(different, 1.0)))[which]
+    degrees = np.rint(moving_mean(redundancy, window)[starts] * window)
+    degrees_sd = np.maximum(degrees, 0).astype(np.int32)
+    # one quantile for every number of degrees that occurs, looked up
+    different = np.flatnonzero(np.bincount(degrees_sd))
+    quantiles = np.zeros(int(different.max(initial=0)) + 1)
+    quantiles[different] = f.isf(alpha, window - 1, np.maximum(different, 1.0))
+    critical = quantiles[degrees_sd]
     return MovingFTest(
         window,
         alpha,

@@ -19,7 +19,7 @@ from thermocald.analysis.study.measured import Clip, MeasuredSeries, Thermometer
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
-from thermocald.photogrammetry.series.spool import released
+from thermocald.photogrammetry.series.spool import ColumnSpool, released
 from thermocald.photogrammetry.series.words import Words
 from thermocald.reduction.thermometer import reading_noise
 from thermocald.store.recording.reader import open_recording
@@ -147,14 +147,16 @@ def _from_columns(
     if not ok.any():
         raise DataError(f"{source}: no epoch has a result ({_in_words(lost)})")
     count = int(ok.sum())
-    values, sds = np.empty((count, 10), order="F"), np.empty((count, 10), order="F")
+    spools = ColumnSpool(count, 10), ColumnSpool(count, 10)
     for k, name in enumerate(IOP_NAMES):
-        values[:, k] = column(name)[ok]
-        sds[:, k] = column(f"sd_{name}")[ok]
+        for spool, prefix in zip(spools, ("", "sd_"), strict=True):
+            spool.array[:, k] = column(f"{prefix}{name}")[ok]
+            spool.release()
+    values, sds = (spool.array for spool in spools)
     whole = _whole(np.ones(count, dtype=bool), values, sds, lost)
     if not whole.all():
         ok[ok] = whole
-        values, sds, count = values[whole], sds[whole], int(whole.sum())
+        values, sds, count = _columns(values, whole), _columns(sds, whole), int(whole.sum())
     if not count:
         raise DataError(f"{source}: no epoch has a result ({_in_words(lost)})")
     number = column("epoch")[ok].astype(np.int64)
@@ -234,12 +236,13 @@ def _from_table(
 
 
 def _columns(values: Array, ok: NDArray[np.bool_]) -> Array:
-    """The interior orientation (n, 10) of the epochs with a result, column by column."""
-    out = np.empty((int(ok.sum()), 10), order="F")
+    """The interior orientation (n, 10) of the epochs with a result, column by column on disk."""
+    spool = ColumnSpool(int(ok.sum()), 10)
     for k in range(10):
-        out[:, k] = values[ok, k]
+        spool.array[:, k] = values[ok, k]
         released(values)
-    return out
+        spool.release()
+    return spool.array
 
 
 def _thermometer(
@@ -292,6 +295,8 @@ def _whole(
         has = np.isfinite(sds[:, k])
         if (has & ok).any():
             whole &= has
+        released(values)
+        released(sds)
     missing = int(np.count_nonzero(ok & ~whole))
     if missing:
         lost["no standard deviation"] = missing

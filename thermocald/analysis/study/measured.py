@@ -8,11 +8,13 @@ orientation, the test field) cancels in every comparison between epochs.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
+from thermocald.photogrammetry.series.spool import released
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -90,10 +92,30 @@ class MeasuredSeries:
     def __len__(self) -> int:
         return len(self.time_s)
 
-    @property
+    @cached_property
     def free(self) -> tuple[str, ...]:
         """The IOP that were estimated, in their order."""
-        return tuple(name for k, name in enumerate(IOP_NAMES) if bool(np.any(self.sds[:, k] > 0)))
+        free = tuple(name for k, name in enumerate(IOP_NAMES) if bool(np.any(self.sds[:, k] > 0)))
+        released(self.sds)
+        return free
+
+    @cached_property
+    def mean(self) -> Array:
+        """The mean interior orientation (10,) of the epochs."""
+        mean = np.array([np.mean(self.values[:, k]) for k in range(self.values.shape[1])])
+        released(self.values)
+        return mean
+
+    def column(self, name: str) -> tuple[Array, Array]:
+        """Values and standard deviations (E,) of one parameter of the interior orientation.
+
+        Copies: those of a series of a year are on disk, and leave memory again.
+        """
+        k = IOP_NAMES.index(name)
+        values, sds = self.values[:, k].copy(), self.sds[:, k].copy()
+        released(self.values)
+        released(self.sds)
+        return values, sds
 
     @property
     def reference(self) -> Thermometer | None:

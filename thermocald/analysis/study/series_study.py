@@ -166,7 +166,7 @@ def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy
             notes.append(f"The movement of the image cannot be computed: {error}.")
     names = (*series.free, "sigma0", *(t.name for t in series.thermometers))
     columns = [
-        *(series.values[:, IOP_NAMES.index(name)] for name in series.free),
+        *(series.column(name)[0] for name in series.free),
         series.sigma0,
         *(t.values for t in series.thermometers),
     ]
@@ -225,15 +225,10 @@ def _circumstances(series: MeasuredSeries) -> list[str]:
 
 
 def _deviations(series: MeasuredSeries) -> dict[str, Deviation]:
-    columns = {
-        name: (series.values[:, k], series.sds[:, k])
-        for k, name in enumerate(IOP_NAMES)
-        if name in series.free
-    }
-    columns["sigma0"] = series.sigma0, sd_of_sigma0(series.sigma0, series.redundancy)
+    found = {name: deviation(*series.column(name)) for name in series.free}
+    found["sigma0"] = deviation(series.sigma0, sd_of_sigma0(series.sigma0, series.redundancy))
     for t in series.thermometers:
-        columns[t.name] = t.values, np.full(len(series), t.sd)
-    found = {name: deviation(values, sds) for name, (values, sds) in columns.items()}
+        found[t.name] = deviation(t.values, np.full(len(series), t.sd))
     return {name: d for name, d in found.items() if d is not None}
 
 
@@ -249,13 +244,14 @@ def _significance(
         return {}
     result = {}
     for name in series.free:
-        k = IOP_NAMES.index(name)
-        values, sds = series.values[:, k], series.sds[:, k]
+        values, sds = series.column(name)
         test = moving_f_test(
             values, sds, series.redundancy, series.time_s, settings.window, settings.alpha
         )
         drift = drift_test(values, sds, series.redundancy, settings.window)
-        course = np.column_stack([series.time_s[test.index], test.ratio])
+        ratio = test.ratio
+        some = slice(None, None, max(1, -(-len(ratio) // _COURSE)))
+        course = np.column_stack([series.time_s[test.index[some]], ratio[some]])
         result[name] = Significance(
             test.success_ratio,
             len(test.index),
@@ -263,8 +259,8 @@ def _significance(
             test.degrees_variance,
             float(np.median(test.degrees_sd)),
             float(np.median(test.critical)),
-            float(np.median(test.ratio)),
-            course[:: max(1, -(-len(course) // _COURSE))].copy(),
+            float(np.median(ratio)),
+            course,
             drift,
         )
     return _corrected(result)
@@ -305,14 +301,14 @@ def _channel(series: MeasuredSeries, thermometer: Thermometer) -> ChannelStudy:
         )
     if reason:
         return ChannelStudy(thermometer, {}, {}, {}, reason)
-    columns = {n: (series.values[:, IOP_NAMES.index(n)], series.sds[:, IOP_NAMES.index(n)])
-               for n in series.free}  # fmt: skip
-    columns["sigma0"] = series.sigma0, sd_of_sigma0(series.sigma0, series.redundancy)
-    found = {
-        column: dependence(values[have], sds[have], t, sd)
-        for column, (values, sds) in columns.items()
-        if np.ptp(values[have]) > 0
-    }
+    found = {}
+    for column in (*series.free, "sigma0"):
+        if column == "sigma0":
+            values, sds = series.sigma0, sd_of_sigma0(series.sigma0, series.redundancy)
+        else:
+            values, sds = series.column(column)
+        if np.ptp(values[have]) > 0:
+            found[column] = dependence(values[have], sds[have], t, sd)
     return ChannelStudy(
         thermometer,
         found,

@@ -100,7 +100,7 @@ def study_camera(
     """Study the series of one camera together."""
     notes: list[str] = []
     studies = tuple(study_series(one, settings) for one in series)
-    iop = np.mean([np.mean(one.values, axis=0) for one in series], axis=0)
+    iop = np.mean([one.mean for one in series], axis=0)
     sds = sds_over_time(series)
     correlations = None
     if any(len(one.correlations) for one in series):
@@ -150,8 +150,7 @@ def sds_over_time(series: Sequence[MeasuredSeries]) -> Array:
     for one in series:
         if len(one) > 1:
             for name in one.free:
-                k = IOP_NAMES.index(name)
-                squares[k] += np.var(one.values[:, k]) * len(one)
+                squares[IOP_NAMES.index(name)] += np.var(one.column(name)[0]) * len(one)
             degrees += len(one) - 1
     return np.asarray(np.sqrt(squares / max(degrees, 1)))
 

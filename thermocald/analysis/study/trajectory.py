@@ -85,7 +85,7 @@ def _distances(one: MeasuredSeries, reference: str, distance_mm: float, size: in
     rows = np.unique(np.linspace(0, len(one) - 1, min(len(one), _MOST_EPOCHS)).astype(int))
     fixed = {
         "first": one.values[0],
-        "mean": one.values.mean(axis=0),
+        "mean": one.mean,
         "last": one.values[-1],
     }[reference]
     points = image_grid(one.sensor, size)
@@ -100,12 +100,15 @@ def correlations_over_time(series: Sequence[MeasuredSeries]) -> Array:
     NaN for parameters that were held or did not change.
     """
     columns = []
-    for k, name in enumerate(IOP_NAMES):
-        within = [
-            one.values[:, k] - one.values[:, k].mean()
-            if name in one.free
-            else np.full(len(one), np.nan)
-            for one in series
-        ]
-        columns.append(np.concatenate(within))
-    return correlation_matrix(columns)
+    every = [name for name in IOP_NAMES if any(name in one.free for one in series)]
+    for name in every:
+        within = []
+        for one in series:
+            values = one.column(name)[0] if name in one.free else np.full(len(one), np.nan)
+            values -= values.mean()
+            within.append(values)
+        columns.append(within[0] if len(within) == 1 else np.concatenate(within))
+    rows = [IOP_NAMES.index(name) for name in every]
+    matrix = np.full((len(IOP_NAMES), len(IOP_NAMES)), np.nan)
+    matrix[np.ix_(rows, rows)] = correlation_matrix(columns)
+    return matrix

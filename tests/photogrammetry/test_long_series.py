@@ -113,3 +113,22 @@ def test_an_epoch_without_targets_has_a_reason(case):
     assert r.rows.status[77] == "no_observations"
     assert r.rows.reasons[77] == "no target was measured"
     assert np.isnan(r.rows.values[77]).all()
+
+
+@pytest.mark.parametrize("exterior", ["series", "mount"])
+def test_processes_do_not_matter(case, exterior):
+    """Blocks on two processes give the bits of one."""
+    field, _, grid = case
+    one, two = (
+        adjust_long_series(
+            scene.SENSOR, field, GridBlocks(grid, 60), scene.INTERIOR, scene.EXTERIOR,
+            SeriesSettings(exterior=exterior), together=120, jobs=jobs,
+        )
+        for jobs in (1, 2)
+    )  # fmt: skip
+    np.testing.assert_array_equal(two.rows.values, one.rows.values)
+    np.testing.assert_array_equal(two.rows.sd, one.rows.sd)
+    np.testing.assert_array_equal(two.rows.sigma0, one.rows.sigma0)
+    np.testing.assert_array_equal(two.level_sd, one.level_sd)
+    np.testing.assert_array_equal(two.trend_sd, one.trend_sd)
+    assert two.rows.status == one.rows.status

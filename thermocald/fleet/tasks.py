@@ -7,13 +7,13 @@ process every time costs itself and nothing else.
 
 from __future__ import annotations
 
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from importlib import import_module
-from multiprocessing import get_context
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from thermocald.errors import ServerGone, UsageError
+from thermocald.parallel import processes
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -55,9 +55,7 @@ def _processes(
 ) -> Iterator[Result]:
     """On processes of this machine; where one dies, its items are tried again one by one."""
     again: list[Item] = []
-    # not forked: OpenCV's and BLAS's threads do not survive that
-    fresh = get_context("spawn")
-    with ProcessPoolExecutor(jobs, fresh) as pool:
+    with processes(jobs) as pool:
         futures = {pool.submit(work, item): item for item in items}
         for future in as_completed(futures):
             try:
@@ -65,7 +63,7 @@ def _processes(
             except BrokenProcessPool:
                 again.append(futures[future])
     for item in again:
-        with ProcessPoolExecutor(1, fresh) as pool:
+        with processes(1) as pool:
             try:
                 yield pool.submit(work, item).result()
             except BrokenProcessPool:

@@ -28,10 +28,12 @@ def _parts(epochs: int) -> Iterator[slice]:
     return (slice(k, min(k + _PART, epochs)) for k in range(0, epochs, _PART))
 
 
-def _running_median(values: Array, part: slice, mask: Mask | None = None) -> Array:
+def _running_median(
+    values: Array, part: slice, mask: Mask | None = None, *, itself: bool = True
+) -> Array:
     """Median over time of up to five neighbours (e, T, 2) in a part of a series, NaN ignored.
 
-    mask (E, T): points that do not count.
+    mask (E, T): points that do not count; itself: whether an epoch is among its neighbours.
     """
     first, last = max(part.start - _HALF, 0), min(part.stop + _HALF, len(values))
     near = values[first:last]
@@ -41,7 +43,8 @@ def _running_median(values: Array, part: slice, mask: Mask | None = None) -> Arr
     padded = np.pad(near, ((_HALF - before, _HALF - after), (0, 0), (0, 0)),
                     constant_values=np.nan)  # fmt: skip
     width, n = 2 * _HALF + 1, part.stop - part.start
-    stack = np.stack([padded[k : k + n] for k in range(width)])
+    stack = np.stack([padded[k : k + n] for k in range(width) if itself or k != _HALF])
+    width = len(stack)
     stack.sort(axis=0)  # NaN go to the end
     count = np.isfinite(stack).sum(axis=0)
     low = np.maximum(count - 1, 0) // 2
@@ -67,7 +70,9 @@ def spikes(misclosure: Array, seen: Mask) -> Mask:
     """
     size, own = np.zeros(seen.shape), np.zeros(len(seen))
     for part in _parts(len(seen)):
-        d = misclosure[part] - _running_median(misclosure, part)
+        # Without the epoch itself: where all move one way it would be its own median, and what
+        # is usual would be nothing.
+        d = misclosure[part] - _running_median(misclosure, part, itself=False)
         for k in range(2):
             d[..., k] -= _medians(d[..., k])[:, None]  # the whole image may move
         own[part] = MAD_TO_SD * _medians(np.abs(d).reshape(len(d), -1))

@@ -107,17 +107,35 @@ class CommonSums:
         seen, of = np.unique(np.packbits(system.use[good], axis=1), axis=0, return_inverse=True)
         for k, bits in enumerate(seen):
             rows = np.flatnonzero(of.ravel() == k)
-            key = bits.tobytes()
-            if key not in self.patterns and len(self.patterns) >= _MOST_PATTERNS:
-                key = b""
-            if key not in self.patterns:
-                empty = np.zeros((len(self.design.at.A), 3)), np.zeros(len(self.design.own))
-                self.patterns[key] = _Pattern(0, empty[0], 0.0, empty[1])
-            found = self.patterns[key]
-            found.epochs += len(rows)
-            found.weights += w[rows].sum(axis=0)
-            found.times += float(t[rows].sum())
-            found.right += right[good[rows]].sum(axis=0)
+            part = _Pattern(
+                len(rows), w[rows].sum(axis=0), float(t[rows].sum()), right[good[rows]].sum(axis=0)
+            )
+            self._count(bits.tobytes(), part)
+
+    def merge(self, later: CommonSums) -> None:
+        """Add the sums over later blocks."""
+        if later.ends is None:
+            return
+        self.ends = (self.ends[0] if self.ends else later.ends[0], later.ends[1])
+        self.epochs += later.epochs
+        self.times += later.times
+        self.squares += later.squares
+        self.gradient += later.gradient
+        for key, part in later.patterns.items():
+            self._count(key, part)
+
+    def _count(self, key: bytes, part: _Pattern) -> None:
+        """Add epochs that see the same targets; those of rare patterns together."""
+        if key not in self.patterns and len(self.patterns) >= _MOST_PATTERNS:
+            key = b""
+        if key not in self.patterns:
+            self.patterns[key] = part
+            return
+        found = self.patterns[key]
+        found.epochs += part.epochs
+        found.weights = found.weights + part.weights
+        found.times += part.times
+        found.right = found.right + part.right
 
     def solved(self, known: Shared) -> Solved:
         """What is known with these sums."""

@@ -12,6 +12,7 @@ from thermocald.photogrammetry.series.words import Words
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array, Index, Mask
+    from thermocald.photogrammetry.series.block import Block
     from thermocald.photogrammetry.series.result import SeriesAdjustment
 
 
@@ -54,21 +55,18 @@ class RowWriter:
         self._word, self._reason = np.zeros((2, epochs), dtype=np.uint16)
         self._words: dict[str, int] = {"": 0}
 
-    def put(
-        self, first: int, values: Array, covariance: Array, status: list[str], reasons: list[str]
-    ) -> Mask:
-        """A block's parameters (n, 16), covariance (n, 16, 16), words and sentences; which epochs
-        (n,) have a result.
-        """
-        here = slice(first, first + len(values))
-        ok: Mask = np.array([word == "ok" for word in status], dtype=bool)
-        variance = np.diagonal(covariance, axis1=1, axis2=2)
-        usable = ok[:, None] & (variance > 0)
-        self.values[here] = np.where(ok[:, None], values, np.nan)
-        self.sd[here] = np.sqrt(np.where(usable, variance, np.nan))
-        self._ok[here] = ok
-        self._word[here], self._reason[here] = self._numbers(status), self._numbers(reasons)
-        return ok
+    def put(self, block: Block) -> None:
+        """The epochs of a block."""
+        here = slice(block.first, block.first + len(block.values))
+        self.values[here] = block.values
+        self.sd[here] = np.sqrt(np.where(block.variance > 0, block.variance, np.nan))
+        self._ok[here] = [word == "ok" for word in block.status]
+        self._word[here], self._reason[here] = (
+            self._numbers(said) for said in (block.status, block.reasons)
+        )
+        self.sigma0[here], self.redundancy[here] = block.sigma0, block.redundancy
+        self.stillness[here] = block.stillness
+        self.observed[here], self.rejected[here] = block.observed, block.rejected
 
     def _numbers(self, sentences: list[str]) -> list[int]:
         for sentence in dict.fromkeys(sentences):

@@ -11,20 +11,21 @@ Source: Helmert blocking, Wolf, H. (1978): The Helmert block method.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.parallel import in_order
 from thermocald.photogrammetry.linalg import root_of
 from thermocald.photogrammetry.series.adjustment import adjusted, result
+from thermocald.photogrammetry.series.block import Blocks, adjusted_block
 from thermocald.photogrammetry.series.blocks import gathered, spread_windows
 from thermocald.photogrammetry.series.common_sums import CommonSums, level_of
-from thermocald.photogrammetry.series.covariances import line_weights, of_slow_targets, stillness
+from thermocald.photogrammetry.series.covariances import line_weights, of_slow_targets
 from thermocald.photogrammetry.series.estimator import ENOUGH_FOR_NOISE
 from thermocald.photogrammetry.series.known import KnownSeries
 from thermocald.photogrammetry.series.long_result import LongAdjustment, RowWriter
-from thermocald.photogrammetry.series.normals import normal_matrices
 from thermocald.photogrammetry.series.target_noise import slow_errors
 
 if TYPE_CHECKING:
@@ -36,9 +37,9 @@ if TYPE_CHECKING:
     )
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.series.adjustment import Adjusted
-    from thermocald.photogrammetry.series.blocks import ObservationBlocks
+    from thermocald.photogrammetry.series.block import Blocks, adjusted_block
+from thermocald.photogrammetry.series.blocks import ObservationBlocks
     from thermocald.photogrammetry.series.common_sums import Solved
-    from thermocald.photogrammetry.series.normals import ObservationGrid
     from thermocald.photogrammetry.series.result import SeriesAdjustment, SeriesSettings
 
 
@@ -64,11 +65,13 @@ def adjust_long_series(
     exterior: ExteriorOrientation,
     settings: SeriesSettings,
     together: int | None = None,
+    jobs: int = 1,
 ) -> LongAdjustment:
     """Adjust a series of any length, from start values good to a few per cent.
 
-    together: epochs of the sample, by default as many as a day of 150 targets has. Never raises for
-    data: an epoch without a result has a status and a reason.
+    together: epochs of the sample, by default as many as a day of 150 targets has; jobs: processes
+    that adjust blocks, with the same bits for any number. Never raises for data: an epoch without a
+    result has a status and a reason.
     """
     windows = spread_windows(len(source), together or together_at_most(len(testfield)))
     sample = gathered(source, windows)
@@ -79,89 +82,58 @@ def adjust_long_series(
     found = adjusted(sensor, testfield, sample, start, settings, inside if len(inside) > 1 else ())
     rows = np.concatenate([np.arange(w.start, w.stop) for w in windows])
     whole = result(found)
-    return _Blocks.of(found, whole, len(source)).adjust(source, whole, rows)
+    blocks, out = _known(found, whole, len(source)), RowWriter(len(source))
+    for turn in range(1, _PASSES + 1):
+        solved = _walk(blocks, source, out, jobs).solved(blocks.known.shared)
+        if solved.rest <= _SAME or turn == _PASSES:
+            break
+        blocks = replace(blocks, known=replace(blocks.known, shared=solved.shared))
+    return _finished(blocks, solved, out, whole, rows, turn)
 
 
-@dataclass(frozen=True, eq=False)
-class _Blocks:
-    """The blocks of a series of so many epochs, adjusted with what the sample says; slow (16, 16):
-    covariance of a straight line over the series from slow errors of targets.
-    """
+def _known(found: Adjusted, sample: SeriesAdjustment, epochs: int) -> Blocks:
+    """What a sample of a series of so many epochs says."""
+    series, estimate, slow = found.series, found.estimate, np.zeros((16, 16))
+    if series.s.target_noise and len(found.use) >= ENOUGH_FOR_NOISE:
+        errors = slow_errors(estimate.residuals, found.use)
+        slow = of_slow_targets(estimate.system, errors, series.testfield.groups)
+    return Blocks(KnownSeries.of(found, sample)[0], epochs, slow)
 
-    known: KnownSeries
-    epochs: int
-    slow: Array
 
-    @classmethod
-    def of(cls, found: Adjusted, sample: SeriesAdjustment, epochs: int) -> _Blocks:
-        """What a sample of a series of so many epochs says."""
-        series, estimate, slow = found.series, found.estimate, np.zeros((16, 16))
-        if series.s.target_noise and len(found.use) >= ENOUGH_FOR_NOISE:
-            errors = slow_errors(estimate.residuals, found.use)
-            slow = of_slow_targets(estimate.system, errors, series.testfield.groups)
-        return cls(KnownSeries.of(found, sample)[0], epochs, slow)
+def _walk(blocks: Blocks, source: ObservationBlocks, out: RowWriter, jobs: int) -> CommonSums:
+    """One pass: every block's epochs into `out`, and the sums."""
+    sums = CommonSums(blocks.known.design)
+    for block in in_order(adjusted_block, blocks, source.blocks(), jobs):
+        out.put(block)
+        sums.merge(block.sums)
+        out.release()
+    return sums
 
-    def adjust(
-        self, source: ObservationBlocks, sample: SeriesAdjustment, sampled: Index
-    ) -> LongAdjustment:
-        """All blocks, in as many passes as it takes."""
-        out, blocks = RowWriter(self.epochs), self
-        for turn in range(1, _PASSES + 1):
-            sums = CommonSums(blocks.known.design)
-            for first, grid in source.blocks():
-                blocks._block(first, grid, sums, out)
-                out.release()
-            solved = sums.solved(blocks.known.shared)
-            if solved.rest <= _SAME or turn == _PASSES:
-                break
-            blocks = replace(blocks, known=replace(blocks.known, shared=solved.shared))
-        return blocks.finished(solved, out, sample, sampled, turn)
 
-    def _block(self, first: int, grid: ObservationGrid, sums: CommonSums, out: RowWriter) -> None:
-        """Adjust a block's epochs into `out` and the sums."""
-        known, block = self.known, self.known.adjusted(grid, self.epochs)
-        estimate, use, system = block.estimate, block.use, block.estimate.system
-        sums.add(first, system, estimate.residuals, block.right)
-        relative = known.covariance(block, known.shared.mean)
-        # Slow errors: a line through zero in the middle of the series, uncertain at its ends.
-        if self.slow.any():
-            line = (first + np.arange(len(grid))) / max(self.epochs - 1, 1) - 0.5
-            relative += (line * system.good)[:, None, None] ** 2 * self.slow
-        status, reasons = known.judged(block, relative)
-        ok = out.put(first, estimate.values, relative, status, reasons)
-        here = slice(first, first + len(grid))
-        out.sigma0[here] = np.where(ok, block.sigma0, np.nan)
-        out.redundancy[here] = block.redundancy
-        out.observed[here], out.rejected[here] = use.sum(axis=1), (grid.observed & ~use).sum(axis=1)
-        if known.s.exterior == "series":
-            N = normal_matrices(system.used(), system.design.at.A)
-            score = stillness(replace(system, N=N), estimate.residuals)
-            out.stillness[here] = score / np.where(block.redundancy > 0, block.unit, 1.0)
-
-    def finished(
-        self, solved: Solved, out: RowWriter, sample: SeriesAdjustment,
-        sampled: Index, passes: int,
-    ) -> LongAdjustment:  # fmt: skip
-        """The last change of the common unknowns on all epochs, and what is of the whole series."""
-        known, shared, design = self.known, solved.shared, self.known.design
-        own, common = design.own, design.common
-        level = level_of(shared, design, shared.mean) * known.unit
-        total = np.zeros(16)
-        total[own] += solved.own
-        total[common] += (shared.pose - known.shared.pose)[: len(common)]
-        moved = np.flatnonzero(total)
-        out.shift(moved, total[moved])
-        out.widen(common, np.diag(level)[common])
-        trend = np.zeros((16, 16))
-        if len(shared.cofactors):
-            tilt = solved.line @ root_of(shared.cofactors)
-            trend[own[:, None], own] = tilt @ tilt.T * known.unit
-        trend += self.slow
-        if known.movement.covariance.any() and len(common):
-            G = shared.mean[:, :6]
-            swayed = G @ known.movement.tilt(line_weights(out.ok)) @ G.T
-            trend[own[:, None], own] += swayed
-        return LongAdjustment(
-            out, np.sqrt(np.clip(np.diag(level), 0.0, None)), np.sqrt(np.diag(trend)), sample,
-            sampled, passes,
-        )  # fmt: skip
+def _finished(
+    blocks: Blocks, solved: Solved, out: RowWriter, sample: SeriesAdjustment,
+    sampled: Index, passes: int,
+) -> LongAdjustment:  # fmt: skip
+    """The last change of the common unknowns on all epochs, and what is of the whole series."""
+    known, shared, design = blocks.known, solved.shared, blocks.known.design
+    own, common = design.own, design.common
+    level = level_of(shared, design, shared.mean) * known.unit
+    total = np.zeros(16)
+    total[own] += solved.own
+    total[common] += (shared.pose - known.shared.pose)[: len(common)]
+    moved = np.flatnonzero(total)
+    out.shift(moved, total[moved])
+    out.widen(common, np.diag(level)[common])
+    trend = np.zeros((16, 16))
+    if len(shared.cofactors):
+        tilt = solved.line @ root_of(shared.cofactors)
+        trend[own[:, None], own] = tilt @ tilt.T * known.unit
+    trend += blocks.slow
+    if known.movement.covariance.any() and len(common):
+        G = shared.mean[:, :6]
+        swayed = G @ known.movement.tilt(line_weights(out.ok)) @ G.T
+        trend[own[:, None], own] += swayed
+    return LongAdjustment(
+        out, np.sqrt(np.clip(np.diag(level), 0.0, None)), np.sqrt(np.diag(trend)), sample,
+        sampled, passes,
+    )  # fmt: skip

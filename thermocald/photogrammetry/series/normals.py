@@ -115,6 +115,11 @@ class ObservationGrid:
     def __len__(self) -> int:
         return len(self.points)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """For another process, one component after the other there as well."""
+        parts = (np.ascontiguousarray(np.moveaxis(a, -1, 0)) for a in (self.points, self.weights))
+        return _of_planes, tuple(parts)
+
     @property
     def observed(self) -> NDArray[np.bool_]:
         """(E, T): what takes part."""
@@ -133,6 +138,11 @@ class ObservationGrid:
         weights = self.weights.copy(order="K")
         weights[mask] = 0.0
         return ObservationGrid(self.points, weights)
+
+
+def _of_planes(points: Array, weights: Array) -> ObservationGrid:
+    """The grid of components before epochs, as it is pickled."""
+    return ObservationGrid(np.moveaxis(points, 0, -1), np.moveaxis(weights, 0, -1))
 
 
 @dataclass(frozen=True, eq=False)

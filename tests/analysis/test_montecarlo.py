@@ -157,3 +157,13 @@ def test_five_million_sets_in_constant_memory_with_progress():
     assert sum(done) == 5_000_000
     assert len(done) > 100
     assert result.counts.sum() == 45_000_000
+
+
+def test_processes_do_not_matter():
+    """Sets projected on two processes give the bits of one."""
+    one, two = (
+        simulate_errors(SENSOR, IOP, SDS, CORRELATION, sets=5000, seed=3, jobs=jobs)
+        for jobs in (1, 2)
+    )
+    for name in ("counts", "mean", "largest", "mean_error", "covariance", "sample"):
+        np.testing.assert_array_equal(getattr(two, name), getattr(one, name))

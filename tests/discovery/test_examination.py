@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
+from thermocald.discovery.search.search import Search
+from thermocald.discovery.search.surrogates import surrogate_test
 from thermocald.discovery.verdict.result import discover_series
 from thermocald.output.discovery.report import report_html
+from thermocald.reduction.blocks import in_blocks
+from thermocald.reduction.fit import HypothesisFitter
 
 KEYS = {
     "effect",
@@ -130,3 +135,15 @@ def test_a_drift_of_a_few_targets_is_not_the_camera(evidence_of):
     said = found.effects[0].estimates
     assert sorted(int(v) for v in said["targets"]["value"]) == [t + 1 for t in true["targets"]]
     assert said["time"]["value"] == pytest.approx(true["time"], abs=10)
+
+
+def test_surrogates_tried_at_once_give_the_same_bits(evidence_of):
+    evidence, _ = evidence_of("permanent_set", px=0.3, seed=22)
+    search = Search(HypothesisFitter([in_blocks(e) for e in evidence]))
+    base = search.base()
+    best = search.expand(base, 3, -np.inf)[0]
+    one, two = (
+        surrogate_test(search, best.fit, base, base.score - best.score, 20, jobs=jobs)
+        for jobs in (1, 3)
+    )
+    np.testing.assert_array_equal(two.surrogates, one.surrogates)

@@ -114,6 +114,7 @@ class Calibrator:
     def reset(self) -> None:
         """Forget where the camera was."""
         self._last = None
+        self._usual = float("nan")
         self._tracker.reset()
 
     def calibrate(

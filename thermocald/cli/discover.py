@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from thermocald.cli.common import say, write_result, write_text
-from thermocald.cli.options import JsonOption
+from thermocald.cli.options import JobsOption, JsonOption
 from thermocald.errors import UsageError
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ def discover(
         Path | None, typer.Option(help="Write what was found as an effect file (YAML).")
     ] = None,
     report: Annotated[Path | None, typer.Option(help="Write a report, one HTML file.")] = None,
+    jobs: JobsOption = 1,
     plan: Annotated[
         bool,
         typer.Option("--plan", help="Which effects a set-up would show, before heating anything."),
@@ -63,7 +64,7 @@ def discover(
         return
     if recording is None:
         raise UsageError("M1 is missing: the folder of the recording to explain")
-    found = _examined(recording, verify or [], model)
+    found = _examined(recording, verify or [], model, jobs)
     written: str | None = None
     if model_out is not None:
         from thermocald.discovery.verdict.model import model_of
@@ -83,7 +84,7 @@ def discover(
             typer.echo(line)
 
 
-def _examined(recording: Path, verify: list[Path], model: Path | None) -> Discovery:
+def _examined(recording: Path, verify: list[Path], model: Path | None, jobs: int) -> Discovery:
     from thermocald.discovery.evidence.pair import load_together
     from thermocald.discovery.verdict.found import terms_of
     from thermocald.discovery.verdict.result import discover_series
@@ -91,10 +92,10 @@ def _examined(recording: Path, verify: list[Path], model: Path | None) -> Discov
     from thermocald.simulation.model_file import read_model
 
     old = read_model(model) if model is not None else None
-    inputs = load_together(recording, verify, say)
+    inputs = load_together(recording, verify, say, jobs)
     say("reducing the epochs to normal equations")
     evidence = reduce_together(inputs, old.T0 if old else None)
-    return discover_series(evidence, say, terms_of(old) if old else ())
+    return discover_series(evidence, say, terms_of(old) if old else (), jobs)
 
 
 def _write_effects(path: Path, found: Discovery) -> None:

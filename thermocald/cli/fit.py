@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from thermocald.cli.options import JsonOption
+from thermocald.cli.options import JobsOption, JsonOption
 from thermocald.errors import UsageError
 from thermocald.store.sources import require_source
 
@@ -50,6 +50,7 @@ def fit(
     code: Annotated[
         Path | None, typer.Option(help="Write the model as FILE.h (C, C++) and FILE.py too.")
     ] = None,
+    jobs: JobsOption = 1,
     json: JsonOption = None,
 ) -> None:
     """Fit a thermal model to all series of a camera, in one adjustment over all image points.
@@ -66,7 +67,7 @@ def fit(
         raise UsageError(f"--type {type_name}: effects and T0 are the type's; give no others")
     listed, T0 = _structure(effect or [], model, reference_temperature)
     with progress(None, "reading and measuring") as advance:
-        series = _read(inputs, advance)
+        series = _read(inputs, advance, jobs)
     check_names(listed, series)
     if known is not None:
         fitted = fit_with_type(series, known)
@@ -105,14 +106,16 @@ def _known_type(text: str | None) -> ThermalModel | None:
     return found
 
 
-def _read(inputs: list[Path], advance: Callable[[int], None]) -> list[ReducedSeries]:
+def _read(
+    inputs: list[Path], advance: Callable[[int], None], jobs: int
+) -> list[ReducedSeries]:
     from thermocald.reduction.reduce import reduce_series
     from thermocald.reduction.source import load_series
 
     return [
         reduce_series(s, affinity=False, strict=False)
         for path in map(require_source, inputs)
-        for s in load_series(path, advance)
+        for s in load_series(path, advance, jobs)
     ]
 
 

@@ -20,6 +20,7 @@ __all__ = [
     "ExteriorOption",
     "ExtrapolateOption",
     "FreeOption",
+    "JobsOption",
     "JsonOption",
     "ModelOption",
     "PhotosArgument",
@@ -62,6 +63,10 @@ FreeOption = Annotated[
     typer.Option(
         "--free", help="Interior orientation to estimate, separated by commas; the rest is held."
     ),
+]
+JobsOption = Annotated[
+    int,
+    typer.Option(min=1, max=256, help="Processes; the results are the same to the bit."),
 ]
 ExteriorOption = Annotated[
     str,

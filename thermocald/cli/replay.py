@@ -13,6 +13,7 @@ from thermocald.cli.options import (
     DEFAULT_FREE_TEXT,
     ExteriorOption,
     FreeOption,
+    JobsOption,
     JsonOption,
     adjustment_settings,
 )
@@ -43,6 +44,7 @@ def replay(
     ] = None,
     exterior: ExteriorOption = "auto",
     free: FreeOption = DEFAULT_FREE_TEXT,
+    jobs: JobsOption = 1,
     json: JsonOption = None,
 ) -> None:
     """Calibrate every epoch of a recording, and say what the series is worth.
@@ -59,9 +61,9 @@ def replay(
         from thermocald.analysis.series.stored import replay_into
 
         with progress(len(opened.columns), "calibrating") as advance:
-            table, found = replay_into(store, opened, settings, exterior, advance)
+            table, found = replay_into(store, opened, settings, exterior, advance, jobs)
     else:
-        table, found = settled(_recording_table(opened, settings, exterior))
+        table, found = settled(_recording_table(opened, settings, exterior, jobs))
     document = _summary(recording, store, table, found)
     if write_result(document, json):
         _tell(document)
@@ -102,6 +104,7 @@ def export(
             "the camera reported them, light, blur, the online filter.",
         ),
     ] = False,
+    jobs: JobsOption = 1,
 ) -> None:
     """One row per epoch: parameters, standard deviations, sigma0, status.
 
@@ -129,11 +132,11 @@ def export(
         raise UsageError("--units, --time, --separator and --decimal are for csv and parquet")
     settings = adjustment_settings(free)
     if require_source(source).is_dir():
-        table, _ = settled(_recording_table(open_recording(source), settings, exterior))
+        table, _ = settled(_recording_table(open_recording(source), settings, exterior, jobs))
     else:
         from thermocald.analysis.series.stored import stored_table
 
-        table, _ = stored_table(source, series, settings, exterior)
+        table, _ = stored_table(source, series, settings, exterior, jobs)
     if format_ == "csv" and style.is_plain and not extra:
         write_parts(csv_text(table), output)
     elif format_ == "json" and not extra:
@@ -160,13 +163,13 @@ def _check_exterior(exterior: str) -> None:
 
 
 def _recording_table(
-    recording: Recording, settings: AdjustmentSettings, exterior: str
+    recording: Recording, settings: AdjustmentSettings, exterior: str, jobs: int
 ) -> SeriesTable:
     """Calibrate a recording without a store."""
     from thermocald.analysis.series.recorded import recorded_table
 
     with progress(len(recording), "calibrating") as advance:
-        return recorded_table(recording, settings, exterior, advance)[0]
+        return recorded_table(recording, settings, exterior, advance, jobs)[0]
 
 
 def _summary(

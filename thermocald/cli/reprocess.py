@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from thermocald.cli.common import progress, say, write_json, write_result
-from thermocald.cli.options import DEFAULT_FREE_TEXT, FreeOption, JsonOption
+from thermocald.cli.options import DEFAULT_FREE_TEXT, FreeOption, JobsOption, JsonOption
 from thermocald.errors import DataError, OutputError, UsageError
 from thermocald.store.server.address import is_server
 from thermocald.store.sources import source_name
@@ -28,7 +28,7 @@ def reprocess(
     engine: Annotated[
         str, typer.Option(help="local, or a Dask scheduler: tcp://HOST:8786.")
     ] = "local",
-    jobs: Annotated[int, typer.Option(min=1, max=256, help="Processes of the local engine.")] = 1,
+    jobs: JobsOption = 1,
     free: FreeOption = DEFAULT_FREE_TEXT,
     sets: Annotated[
         int, typer.Option(min=100, max=10_000_000, help="Of a study's Monte-Carlo.")

@@ -14,6 +14,7 @@ from thermocald.cli.options import (
     DEFAULT_FREE_TEXT,
     ExteriorOption,
     FreeOption,
+    JobsOption,
     JsonOption,
     SeedOption,
     free_names,
@@ -68,6 +69,7 @@ def study(
     ] = None,
     exterior: ExteriorOption = "auto",
     free: FreeOption = DEFAULT_FREE_TEXT,
+    jobs: JobsOption = 1,
     reference: Annotated[
         bool,
         typer.Option("--reference", help="Study the presets instead, next to the reference study."),
@@ -98,6 +100,7 @@ def study(
         f_number=f_number,
         confusion_mm=confusion,
         thermometer_sd=thermometer_sd,
+        jobs=jobs,
     )
     from thermocald.photogrammetry.series.result import EXTERIOR_CHOICES
 
@@ -126,7 +129,9 @@ def _study(
     _refuse_duplicates([path for _, path in labelled])
     for label, path in labelled:
         with progress(_epochs(path), f"calibrating {path.name}") as advance:
-            series += load_series(path, label, settings.thermometer_sd, exterior, free, advance)
+            series += load_series(
+                path, label, settings.thermometer_sd, exterior, free, advance, settings.jobs
+            )
     _refuse_copies(series)
     cameras = len({one.label for one in series})
     with progress(settings.sets * cameras, "simulating") as advance:

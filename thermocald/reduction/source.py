@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.acquisition.calibrated_blocks import calibrated_epochs
 from thermocald.acquisition.calibrator import Calibrator
 from thermocald.errors import DataError
 from thermocald.photogrammetry.series.normals import ObservationGrid
@@ -33,15 +34,18 @@ __all__ = ["epochs_input", "load_series", "measured_epochs", "series_input"]
 
 
 def measured_epochs(
-    recording: Recording, advance: Callable[[int], None] | None = None
+    recording: Recording, advance: Callable[[int], None] | None = None, jobs: int = 1
 ) -> list[Epoch]:
-    """A recording's epochs with their observations; frames are measured where they are not."""
+    """A recording's epochs with their observations; frames are measured where they are not.
+
+    jobs: processes that measure, with the same bits for any number.
+    """
     if recording.has_observations:
         return list(recording.epochs)
     calibrator = Calibrator.of_recording(recording)
     epochs = []
-    for epoch in recording.iter_epochs():
-        epochs.append(calibrator.calibrate(epoch).epoch)
+    for done in calibrated_epochs(calibrator, recording.iter_epochs(), jobs):
+        epochs.append(done.epoch)
         if advance is not None:
             advance(1)
     return epochs
@@ -68,8 +72,10 @@ def series_input(
     recording: Recording,
     say: Callable[[str], None] | None = None,
     advance: Callable[[int], None] | None = None,
+    jobs: int = 1,
 ) -> SeriesInput:
-    """The arrays of one recording; its frames are measured where they have not been.
+    """The arrays of one recording; its frames are measured where they have not been, on `jobs`
+    processes.
 
     A long one with observations is condensed while it is read.
     """
@@ -78,7 +84,7 @@ def series_input(
         return condensed(whole, recording)
     if not recording.has_observations and say is not None:
         say(f"measuring the {len(recording.columns)} frames of {recording.path}")
-    epochs = measured_epochs(recording, advance)
+    epochs = measured_epochs(recording, advance, jobs)
     source = epochs_input(recording.head, recording.testfield, epochs, f"{recording.path}")
     return replace(source, columns=_columns(recording))
 
@@ -142,12 +148,17 @@ def _without_points(
     )
 
 
-def load_series(path: Path, advance: Callable[[int], None] | None = None) -> list[SeriesInput]:
-    """The series of a recording (a folder) or of a store (a file); advance: frames measured."""
+def load_series(
+    path: Path, advance: Callable[[int], None] | None = None, jobs: int = 1
+) -> list[SeriesInput]:
+    """The series of a recording (a folder) or of a store (a file).
+
+    advance: receives how many frames were measured; jobs: processes that measure.
+    """
     if path.is_dir():
         from thermocald.store.recording.reader import open_recording
 
-        return [series_input(open_recording(path), advance=advance)]
+        return [series_input(open_recording(path), advance=advance, jobs=jobs)]
     with open_source(path) as store:
         found = [_stored(store, s, f"{store.path}: {s.name}") for s in store.all_series()]
     if not found:

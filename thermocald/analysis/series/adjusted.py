@@ -54,12 +54,13 @@ def table_of_series(
     observations: Sequence[Observations | None] | ObservationBlocks,
     settings: SeriesSettings,
     start: Array | None = None,
+    jobs: int = 1,
 ) -> SeriesTable:
     """The series adjusted together, from the table of its epochs one by one.
 
     start (16,): where the adjustment begins, by default the medians of the epochs one by one. A
-    series of more epochs than are adjusted at once goes in blocks. Raises DataError where no epoch
-    has a result to start from.
+    series of more epochs than are adjusted at once goes in blocks, on `jobs` processes. Raises
+    DataError where no epoch has a result to start from.
     """
     ok = apart.ok
     if start is None and not ok.any():
@@ -73,8 +74,9 @@ def table_of_series(
     source = (
         observations if hasattr(observations, "blocks") else ObservedBlocks(testfield, observations)
     )
-    adjust = _together if len(source) <= together_at_most(len(testfield)) else _in_blocks
-    return adjust(head, testfield, apart, start, source, settings)
+    if len(source) <= together_at_most(len(testfield)):
+        return _together(head, testfield, apart, start, source, settings)
+    return _in_blocks(head, testfield, apart, start, source, settings, jobs)
 
 
 def _middle(values: Array, ok: NDArray[np.bool_]) -> Array:
@@ -129,12 +131,12 @@ def _as_one(
 
 def _in_blocks(
     head: Head, testfield: TestField, apart: SeriesTable, start: Array,
-    source: ObservationBlocks, settings: SeriesSettings,
+    source: ObservationBlocks, settings: SeriesSettings, jobs: int,
 ) -> SeriesTable:  # fmt: skip
     """The table of a long series."""
     found = adjust_long_series(
         head.camera.sensor, testfield, source, InteriorOrientation.from_array(start[IOP]),
-        ExteriorOrientation.from_array(start[EOP]), settings,
+        ExteriorOrientation.from_array(start[EOP]), settings, jobs=jobs,
     )  # fmt: skip
     rows, sample = found.rows, found.sample
 
@@ -142,7 +144,7 @@ def _in_blocks(
         rough = replace(settings, exterior=sample.exterior)
         fewer = WithoutTargets(source, targets)
         if not quick:
-            return _in_blocks(head, testfield, apart, start, fewer, rough)
+            return _in_blocks(head, testfield, apart, start, fewer, rough, jobs)
         rough = replace(rough, snooping_alpha=0.0, target_noise=False)
         grid = gathered(fewer, spread_windows(len(source), len(found.sampled)))
         used = grid.reject(~sample.observed)

@@ -37,12 +37,14 @@ def recorded_table(
     settings: AdjustmentSettings,
     exterior: str,
     advance: Callable[[int], None] | None = None,
+    jobs: int = 1,
 ) -> tuple[SeriesTable, Callable[[int], Observations | None]]:
     """The table of a recording adjusted as one series, and what shows an epoch's observations.
 
     Frames are measured where they are not. Of a series with observations that is too long to be
-    adjusted at once, only some epochs are calibrated by themselves. advance: told of epochs done.
-    Raises DataError where no epoch has a result.
+    adjusted at once, only some epochs are calibrated by themselves. advance: receives how many
+    epochs are done; jobs: processes, with the same bits for any number. Raises DataError where no
+    epoch has a result.
     """
     adjusted = SeriesSettings.of(settings, exterior)
     calibrator = Calibrator.of_recording(recording, settings)
@@ -51,7 +53,7 @@ def recorded_table(
         start = _start(recording, calibrator)
         source = _Watched(recording, advance)
         apart = _not_calibrated(recording)
-        table = table_of_series(head, targets, apart, source, adjusted, start)
+        table = table_of_series(head, targets, apart, source, adjusted, start, jobs)
         return table, recording.observations
     columns = recording.columns
     temperature = {}
@@ -61,10 +63,10 @@ def recorded_table(
             columns.numbers, columns.frame_time, columns.temperature_time, reference
         )
     apart, observations = calibrate_epochs(
-        recording.iter_epochs(), calibrator, temperature, advance
+        recording.iter_epochs(), calibrator, temperature, advance, jobs
     )
     return (
-        table_of_series(head, targets, apart, observations, adjusted),
+        table_of_series(head, targets, apart, observations, adjusted, jobs=jobs),
         lambda row: observations[row],
     )
 

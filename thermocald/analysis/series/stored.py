@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.acquisition.calibrated_blocks import EPOCHS_OF_A_BLOCK, calibrated_epochs
 from thermocald.acquisition.calibrator import Calibrator
 from thermocald.analysis.series.adjusted import table_of_series
 from thermocald.analysis.series.drift import settled
@@ -44,10 +46,12 @@ def replay_into(
     settings: AdjustmentSettings,
     exterior: str,
     advance: Callable[[int], None],
+    jobs: int = 1,
 ) -> tuple[SeriesTable, list[Course]]:
     """Calibrate a recording's epochs into a store, from where an earlier replay stopped.
 
-    Returns what `settled` makes of the series.
+    Returns what `settled` makes of the series. jobs: processes; of a block of epochs that was
+    interrupted those that are stored are calibrated again, so that the others are as they would be.
 
     Raises StoreError; DataError where the store's series of this name is of something else.
     """
@@ -56,22 +60,21 @@ def replay_into(
         series = _series(store, recording, settings)
         last = store.last_epoch(series)
         calibrator = Calibrator.of_recording(recording, settings)
-        for epoch in recording.iter_epochs():
-            if last is None or epoch.number > last:
-                done = calibrator.calibrate(epoch)
-                store.append(
-                    series,
-                    done.epoch,
-                    EpochResult.from_adjustment(done.adjustment),
-                    extra=done.extra,
-                )
+        stored = 0 if last is None else int(np.searchsorted(recording.columns.numbers, last + 1))
+        stored -= stored % EPOCHS_OF_A_BLOCK
+        advance(stored)
+        epochs = islice(recording.iter_epochs(), stored, None)
+        for done in calibrated_epochs(calibrator, epochs, jobs):
+            if last is None or done.epoch.number > last:
+                result = EpochResult.from_adjustment(done.adjustment)
+                store.append(series, done.epoch, result, extra=done.extra)
             advance(1)
         # while the store is open: targets are left out of a long series by reading it again
-        return settled(table_of_stored(store, series, settings, exterior))
+        return settled(table_of_stored(store, series, settings, exterior, jobs))
 
 
 def stored_table(
-    path: Path, name: str | None, settings: AdjustmentSettings, exterior: str
+    path: Path, name: str | None, settings: AdjustmentSettings, exterior: str, jobs: int = 1
 ) -> tuple[SeriesTable, list[Course]]:
     """What `settled` makes of one series of a store.
 
@@ -81,7 +84,7 @@ def stored_table(
     with open_source(path) as store:
         camera, _, series_name = (name or "").rpartition("/")
         series = store.find_series(camera or None, series_name or None)
-        return settled(table_of_stored(store, series, settings, exterior))
+        return settled(table_of_stored(store, series, settings, exterior, jobs))
 
 
 def _series(store: Store, recording: Recording, settings: AdjustmentSettings) -> StoredSeries:
@@ -106,7 +109,11 @@ def _series(store: Store, recording: Recording, settings: AdjustmentSettings) ->
 
 
 def table_of_stored(
-    store: SeriesReader, series: StoredSeries, settings: AdjustmentSettings, exterior: str
+    store: SeriesReader,
+    series: StoredSeries,
+    settings: AdjustmentSettings,
+    exterior: str,
+    jobs: int = 1,
 ) -> SeriesTable:
     """The table of a series in an open store. Raises DataError where it has no epochs."""
     names = ["epoch", "frame_time", "sigma0", "n_observations", "n_rejected", "status"]
@@ -142,6 +149,7 @@ def table_of_stored(
         apart,
         StoredBlocks(store, series, apart.number),
         SeriesSettings.of(settings, exterior),
+        jobs=jobs,
     )
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.acquisition.calibrated_blocks import calibrated_epochs
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.series.spool import released
 from thermocald.photogrammetry.series.words import Words
@@ -113,16 +114,16 @@ def calibrate_epochs(
     calibrator: Calibrator,
     temperature: Mapping[int, float],
     advance: Callable[[int], None] | None = None,
+    jobs: int = 1,
 ) -> tuple[SeriesTable, list[Observations | None]]:
     """Adjust epochs one by one; their table, and the observations for a series adjustment.
 
-    temperature: {epoch number: °C at the frame's time}.
+    temperature: {epoch number: °C at the frame's time}; jobs: processes.
     """
     rows, observations = [], []
-    for epoch in epochs:
-        done = calibrator.calibrate(epoch)
+    for done in calibrated_epochs(calibrator, epochs, jobs):
         a = done.adjustment
-        rows.append((epoch.number, epoch.frame_time, a))
+        rows.append((done.epoch.number, done.epoch.frame_time, a))
         observations.append(done.epoch.observations)
         if advance is not None:
             advance(1)

@@ -53,20 +53,22 @@ def load_series(
     exterior: str = "auto",
     free: Sequence[str] = DEFAULT_FREE,
     advance: Callable[[int], None] | None = None,
+    jobs: int = 1,
 ) -> list[MeasuredSeries]:
     """Every series of a recording (a folder) or a store (a file).
 
     label: what the study treats as one camera, by default the camera's name, in a store with the
     start condition; thermometer_sd: K, by default from the readings; free: IOP to estimate, for a
-    recording (a store knows its own); advance: receives how many epochs of a recording are done.
-    Raises DataError where nothing can be studied.
+    recording (a store knows its own); advance: receives how many epochs of a recording are done;
+    jobs: processes that calibrate. Raises DataError where nothing can be studied.
     """
     if path.is_dir():
         recording = open_recording(path)
-        return [from_recording(recording, label, thermometer_sd, exterior, free, advance)]
+        return [from_recording(recording, label, thermometer_sd, exterior, free, advance, jobs)]
     with open_source(path) as store:
         found = [
-            from_store(store, one, label, thermometer_sd, exterior) for one in store.all_series()
+            from_store(store, one, label, thermometer_sd, exterior, jobs)
+            for one in store.all_series()
         ]
     if not found:
         raise DataError(f"{path}: the store holds no series")
@@ -80,11 +82,12 @@ def from_recording(
     exterior: str = "auto",
     free: Sequence[str] = DEFAULT_FREE,
     advance: Callable[[int], None] | None = None,
+    jobs: int = 1,
 ) -> MeasuredSeries:
     """A recording, its frames measured where they are not, adjusted as one series."""
     columns, camera = recording.columns, recording.camera
     settings = AdjustmentSettings(free=tuple(free))
-    table, observations = recorded_table(recording, settings, exterior, advance)
+    table, observations = recorded_table(recording, settings, exterior, advance, jobs)
     thermometers = [
         _thermometer(
             name,
@@ -118,6 +121,7 @@ def from_store(
     label: str | None = None,
     thermometer_sd: float | None = None,
     exterior: str = "auto",
+    jobs: int = 1,
 ) -> MeasuredSeries:
     """One series of a store; DataError where no epoch has a result."""
     start = f"-{series.start}" if series.start else ""
@@ -125,7 +129,7 @@ def from_store(
     count = len(store.series_columns(series, ["epoch"])["epoch"])
     if exterior != "per_epoch" and count:
         free = tuple(series.settings.get("free", DEFAULT_FREE))
-        table = table_of_stored(store, series, AdjustmentSettings(free=free), exterior)
+        table = table_of_stored(store, series, AdjustmentSettings(free=free), exterior, jobs)
         thermometers = _stored_thermometers(store, series, table.frame_time, thermometer_sd)
         source = f"{store.path}: {series.camera}/{series.name}"
         clip = _stored_clip(store, series, table.number[table.ok])

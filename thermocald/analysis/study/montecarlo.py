@@ -20,6 +20,7 @@ import numpy as np
 from thermocald.analysis.camera.image_grid import image_grid
 from thermocald.analysis.study.object_plane import on_plane, plane_jacobian
 from thermocald.errors import GeometryError
+from thermocald.parallel import in_order
 from thermocald.photogrammetry.camera.camera_model import image_to_mm
 
 if TYPE_CHECKING:
@@ -109,11 +110,13 @@ def simulate_errors(
     grid: int = 3,
     clusters_mm: tuple[float, ...] = CLUSTERS_MM,
     progress: Callable[[int], None] | None = None,
+    jobs: int = 1,
 ) -> MonteCarlo:
     """Draw IOP about `iop` (10,) and cluster the errors on the plane.
 
     sds (10,) in the units of the IOP, correlation (10, 10); progress receives how many sets were
-    done. Raises GeometryError where the expected point of a grid point does not exist.
+    done; jobs: processes that project them, with the same bits for any number. Raises
+    GeometryError where the expected point of a grid point does not exist.
     """
     points = image_grid(sensor, grid)
     root = draw_root(sds, correlation)
@@ -125,32 +128,22 @@ def simulate_errors(
     first, second = np.zeros((k, 2)), np.zeros((k, 2, 2))
     sample: list[Array] = []
     rng = np.random.default_rng(seed)
-    done = folded = 0
-    while done < sets:
-        size = min(_CHUNK, sets - done)
-        sets_of_iop = iop + rng.standard_normal((size, len(root))) @ root
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            dx, dy, ok = project(sets_of_iop)  # a set that folds the image may run away
-        if not ok.all():
-            folded += int(np.count_nonzero(~ok))
-            dx, dy = dx[:, ok], dy[:, ok]
-        distance = np.sqrt(dx * dx + dy * dy)
-        beyond = [np.count_nonzero(distance >= limit, axis=1) for limit in limits]
-        edges = np.stack([np.full(k, distance.shape[1]), *beyond, np.zeros(k, dtype=np.int64)])
-        counts += -np.diff(edges, axis=0).T
-        total += distance.sum(axis=1)
-        np.maximum(largest, distance.max(axis=1, initial=0.0), out=largest)
-        first[:, 0] += dx.sum(axis=1)
-        first[:, 1] += dy.sum(axis=1)
-        second[:, 0, 0] += np.einsum("ij,ij->i", dx, dx)
-        second[:, 1, 1] += np.einsum("ij,ij->i", dy, dy)
-        second[:, 0, 1] += np.einsum("ij,ij->i", dx, dy)
-        if done < _SAMPLE:
-            part = slice(0, _SAMPLE - done)
-            sample.append(np.stack([dx[:, part], dy[:, part]], axis=-1).swapaxes(0, 1))
-        done += size
+    folded = 0
+    draws = (
+        (rng.standard_normal((min(_CHUNK, sets - done), len(root))), max(_SAMPLE - done, 0))
+        for done in range(0, sets, _CHUNK)
+    )
+    for part in in_order(_simulated, (project, iop, root, limits), draws, jobs):
+        folded += part.folded
+        counts += part.counts
+        total += part.total
+        np.maximum(largest, part.largest, out=largest)
+        first += part.first
+        second += part.second
+        if part.sample.size:
+            sample.append(part.sample)
         if progress is not None:
-            progress(size)
+            progress(part.sets)
     used = sets - folded
     if used < 2:
         raise GeometryError(
@@ -175,6 +168,48 @@ def simulate_errors(
         np.concatenate(sample),
         folded,
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Part:
+    """Some of the sets, as in `MonteCarlo`; total, first, second: sums, not means."""
+
+    sets: int
+    folded: int
+    counts: NDArray[np.int64]
+    total: Array
+    largest: Array
+    first: Array
+    second: Array
+    sample: Array
+
+
+def _simulated(
+    known: tuple[_PlaneErrors, Array, Array, Array], draws: tuple[Array, int]
+) -> _Part:
+    """Sets from standard normal numbers (n, r), and how many of them a sample still needs.
+
+    known: the projection, the mean IOP (10,), the root (r, 10) of their covariance, the clusters.
+    """
+    (project, iop, root, limits), (normal, wanted) = known, draws
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        dx, dy, ok = project(iop + normal @ root)  # a set that folds the image may run away
+    folded = int(np.count_nonzero(~ok))
+    if folded:
+        dx, dy = dx[:, ok], dy[:, ok]
+    k = len(dx)
+    distance = np.sqrt(dx * dx + dy * dy)
+    beyond = [np.count_nonzero(distance >= limit, axis=1) for limit in limits]
+    edges = np.stack([np.full(k, distance.shape[1]), *beyond, np.zeros(k, dtype=np.int64)])
+    second = np.zeros((k, 2, 2))
+    second[:, 0, 0] = np.einsum("ij,ij->i", dx, dx)
+    second[:, 1, 1] = np.einsum("ij,ij->i", dy, dy)
+    second[:, 0, 1] = np.einsum("ij,ij->i", dx, dy)
+    return _Part(
+        len(normal), folded, -np.diff(edges, axis=0).T, distance.sum(axis=1),
+        distance.max(axis=1, initial=0.0), np.stack([dx.sum(axis=1), dy.sum(axis=1)], axis=1),
+        second, np.stack([dx[:, :wanted], dy[:, :wanted]], axis=-1).swapaxes(0, 1),
+    )  # fmt: skip
 
 
 def plane_errors(

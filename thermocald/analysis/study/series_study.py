@@ -59,7 +59,7 @@ class StudySettings:
 
     window, alpha: of the F-test; sets, seed, distance_mm, grid, clusters_mm: of the Monte-Carlo;
     focus_mm, f_number, confusion_mm: of the depth of field, None: 1/2000 of the image diagonal;
-    thermometer_sd: None takes it from the readings themselves.
+    thermometer_sd: None takes it from the readings themselves; jobs: processes that simulate.
     """
 
     window: int = 31
@@ -73,6 +73,7 @@ class StudySettings:
     f_number: float = 2.0
     confusion_mm: float | None = None
     thermometer_sd: float | None = None
+    jobs: int = 1
 
 
 @dataclass(frozen=True, eq=False)

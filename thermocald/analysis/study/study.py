@@ -174,6 +174,7 @@ def _object_space(
         grid=s.grid,
         clusters_mm=s.clusters_mm,
         progress=progress,
+        jobs=s.jobs,
     )
     root = draw_root(sds, correlation)
     jacobian = plane_jacobian(one.sensor, iop, montecarlo.image_points, s.distance_mm)

@@ -20,9 +20,12 @@ __all__ = ["load_together"]
 
 
 def load_together(
-    first: Path, others: Sequence[Path], say: Callable[[str], None]
+    first: Path, others: Sequence[Path], say: Callable[[str], None], jobs: int = 1
 ) -> list[SeriesInput]:
-    """Read M1 and the recordings to prove it on; refuses those of another camera or thermometer."""
+    """Read M1 and the recordings to prove it on; refuses those of another camera or thermometer.
+
+    jobs: processes that measure frames.
+    """
     places = [_place(p) for p in (first, *others)]
     for k, path in enumerate(others, start=1):
         if places[k] == places[0]:
@@ -35,16 +38,16 @@ def load_together(
     out = []
     for path in (first, *others):
         say(f"reading {source_name(path)}")
-        out.append(_read(path, say))
+        out.append(_read(path, say, jobs))
     for other in out[1:]:
         _same_camera(out[0], other)
     return out
 
 
-def _read(path: Path, say: Callable[[str], None]) -> SeriesInput:
+def _read(path: Path, say: Callable[[str], None], jobs: int) -> SeriesInput:
     """One series: a recording's, or the only one of a store or of what an address selects."""
     if path.is_dir():
-        return series_input(open_recording(path), say)
+        return series_input(open_recording(path), say, jobs=jobs)
     found = load_series(require_source(path))
     if len(found) > 1:
         there = ", ".join(f"{s.camera}/{s.series}" for s in found)

@@ -86,10 +86,12 @@ def examine_series(
     series: Sequence[ReducedSeries],
     progress: Callable[[str], None] | None = None,
     given: Sequence[tuple[str, dict[str, Any]]] = (),
+    jobs: int = 1,
 ) -> Examination:
     """Examine one series, or M1 with M2, which share their physical constants.
 
-    given: effects that the model has already, with their values; they are fitted again and stay.
+    given: effects that the model has already, with their values; they are fitted again and stay;
+    jobs: candidates that surrogates try at a time.
     """
     say = progress or (lambda _: None)
     say("targets that moved")
@@ -109,9 +111,9 @@ def examine_series(
     ready = [in_blocks(with_correlated_noise(e)) for e in calibrated]
     found = None
     if max(e.correlation for e in calibrated) > _MEMORY:
-        found = _beside_mount(calibrated, say, given)
+        found = _beside_mount(calibrated, say, given, jobs)
     if found is None:
-        found = _still(ready, say, given)
+        found = _still(ready, say, given, jobs)
     return replace(
         found, displaced=tuple(displaced), noise_growth=growth, original=tuple(series),
         field_movements=tuple(field),
@@ -122,6 +124,7 @@ def _still(
     ready: list[ReducedSeries],
     say: Callable[[str], None],
     given: Sequence[tuple[str, dict[str, Any]]],
+    jobs: int,
 ) -> Examination:
     """The search where the mount stands still."""
     fitter = HypothesisFitter(ready)
@@ -130,16 +133,16 @@ def _still(
     # one effect moves the image by most of what it moves at all
     guide = min([base, *search.expand(base, _GUIDES)], key=lambda s: s.score).fit
     bent = curved(fitter, guide)
-    found = _searched(HypothesisFitter(bent) if bent else fitter, say, given)
+    found = _searched(HypothesisFitter(bent) if bent else fitter, say, given, jobs)
     if not found.adequate:
         again = curved(found.fitter, found.best.fit)
         if again is not None:
             say("curvature of the projection: once more")
-            found = _searched(HypothesisFitter(again), say, given)
+            found = _searched(HypothesisFitter(again), say, given, jobs)
     noisy = noisier(found.fitter, found.best.fit)
     if noisy is not None:
         say("noise that targets share: once more")
-        found = _searched(HypothesisFitter(noisy), say, given)
+        found = _searched(HypothesisFitter(noisy), say, given, jobs)
     return found
 
 
@@ -147,13 +150,14 @@ def _searched(
     fitter: HypothesisFitter,
     say: Callable[[str], None],
     given: Sequence[tuple[str, dict[str, Any]]],
+    jobs: int,
 ) -> Examination:
     found = search_standing(fitter, say, given)
     base, best = found.base, found.best
     blocks: list[Array] = []
     tests: tuple[SurrogateTest, ...] = ()
     if found.adequate(best):
-        best, blocks, tests = _named(found.search, base, best)
+        best, blocks, tests = _named(found.search, base, best, jobs)
     adequacy = adequacies(fitter, best)
     complete = adequate(adequacy, found.base_adequacy)
     if len(best.terms) > len(base.terms) and _unverified(fitter.series):
@@ -168,6 +172,7 @@ def _beside_mount(
     calibrated: list[ReducedSeries],
     say: Callable[[str], None],
     given: Sequence[tuple[str, dict[str, Any]]],
+    jobs: int,
 ) -> Examination | None:
     """The search alongside a mount that moves; None where the movement is not one of a mount.
 
@@ -180,10 +185,10 @@ def _beside_mount(
     if found.mount.smoothness(found.fitter, found.best.fit) > _SMOOTH:
         return None
     search = Search(found.fitter, say, found.like)
-    best, blocks, tests = _named(search, found.base, found.best)
+    best, blocks, tests = _named(search, found.base, found.best, jobs)
     if any(t.kind.is_event and t not in best.terms for t in found.best.terms):
         found = without_slips(found, len(given))  # steps that cannot be named are still there
-        best, blocks, tests = _named(search, found.base, found.best)
+        best, blocks, tests = _named(search, found.base, found.best, jobs)
     base = found.base
     if not convincing(found.fitter, base, best):
         best, blocks, tests = base, [], ()
@@ -210,7 +215,7 @@ def _unverified(series: Sequence[ReducedSeries]) -> bool:
 
 
 def _named(
-    search: Search, base: Solution, best: Solution
+    search: Search, base: Solution, best: Solution, jobs: int
 ) -> tuple[Solution, list[Array], tuple[SurrogateTest, ...]]:
     """The solution without effects that blocks left out or surrogates speak against."""
     kept = len(base.terms)
@@ -220,7 +225,7 @@ def _named(
         for i in range(kept, len(best.terms)):
             without = _without(search, base, best, i)
             gain = without.score - best.score
-            tests.append(surrogate_test(search, best.fit, without, gain))
+            tests.append(surrogate_test(search, best.fit, without, gain, jobs=jobs))
         worst = max(range(len(tests)), key=lambda i: tests[i].p)
         if tests[worst].passed:
             return best, blocks, tuple(tests)

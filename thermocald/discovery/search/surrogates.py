@@ -16,6 +16,7 @@ Biometrika 78, 301-304 (sequential p-values).
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -59,11 +60,17 @@ class SurrogateTest:
 
 
 def surrogate_test(
-    search: Search, best: Fit, without: Solution, gain: float, count: int = _COUNT
+    search: Search,
+    best: Fit,
+    without: Solution,
+    gain: float,
+    count: int = _COUNT,
+    jobs: int = 1,
 ) -> SurrogateTest:
     """Test one effect: `without` is the best solution without it, in the same fitter.
 
-    gain: by how much the penalised score improves with it.
+    gain: by how much the penalised score improves with it; jobs: candidates tried at a time, with
+    the same bits for any number.
     """
     rng = np.random.default_rng(_SEED)
     scans = _prepared(search, without)
@@ -72,7 +79,7 @@ def surrogate_test(
         if few and not np.any(tops >= gain):
             every = range(len(best.weightings))
             data = [_data(search, best, without.fit, s, rng, few) for s in every]
-            tops = np.append(tops, _largest(scans, without, data))
+            tops = np.append(tops, _largest(scans, without, data, jobs))
     return SurrogateTest(gain, tops)
 
 
@@ -153,11 +160,19 @@ def _prepared(search: Search, without: Solution) -> list[_Scan]:
     return out
 
 
-def _largest(scans: list[_Scan], without: Solution, data: list[tuple[Array, Array]]) -> Array:
+def _largest(
+    scans: list[_Scan], without: Solution, data: list[tuple[Array, Array]], jobs: int
+) -> Array:
     """The largest penalised gain (count,) of any candidate."""
+
+    def gain(scan: _Scan) -> Array:
+        return _gain_of(scan, without.fit, data) - scan.penalty
+
     top = np.full(len(data[0][0]), -np.inf)
-    for scan in scans:
-        top = np.maximum(top, _gain_of(scan, without.fit, data) - scan.penalty)
+    # threads: nearly all of it is linear algebra, and the stacks would have to be copied
+    with ThreadPoolExecutor(jobs) as pool:
+        for found in pool.map(gain, scans) if jobs > 1 else map(gain, scans):
+            top = np.maximum(top, found)
     return top
 
 

@@ -96,9 +96,13 @@ def discover_series(
     series: Sequence[ReducedSeries],
     progress: Callable[[str], None] | None = None,
     given: Sequence[tuple[str, dict[str, Any]]] = (),
+    jobs: int = 1,
 ) -> Discovery:
-    """Examine M1, or M1 and others, and put what was found into words and numbers."""
-    x = examine_series(series, progress, given)
+    """Examine M1, or M1 and others, and put what was found into words and numbers.
+
+    jobs: candidates that surrogates try at a time, with the same bits for any number.
+    """
+    x = examine_series(series, progress, given, jobs)
     return conclude(x, progress)
 
 

@@ -74,6 +74,68 @@ def test_two_hundred_kills_lose_no_committed_epoch(daemon, recording, replayed, 
     print(f"{KILLS} kills, {len(numbers)} epochs, 0 lost")
 
 
+def watched(daemon, run):
+    """What a daemon takes while it runs a script: rows of epochs stored, MB resident, open files,
+    threads, and seconds of processor time.
+    """
+    daemon.process = subprocess.Popen(
+        [sys.executable, "-c", run], cwd=daemon.folder, env=ENVIRONMENT
+    )
+    proc = Path(f"/proc/{daemon.process.pid}")
+    seen = []
+    while daemon.process.poll() is None:
+        time.sleep(1.0)
+        try:
+            status = dict(line.split(":", 1) for line in (proc / "status").read_text().splitlines())
+            live = json.loads((daemon.folder / "thermocald.db.live/status.json").read_text())
+            epoch = live["cameras"]["rpi"]["stored"]
+            files = len(list((proc / "fd").iterdir()))
+            used = sum(map(int, (proc / "stat").read_text().rpartition(")")[2].split()[11:13]))
+        except (OSError, ValueError, KeyError):
+            continue
+        if epoch:
+            resident_mb = int(status["VmRSS"].split()[0]) / 1024
+            ticks = os.sysconf("SC_CLK_TCK")
+            seen.append((epoch, resident_mb, files, int(status["Threads"]), used / ticks))
+    assert daemon.process.returncode == 0
+    return seen
+
+
+@pytest.mark.timeout(1800)
+def test_the_last_month_of_three_costs_what_the_first_did(daemon, replayed, tmp_path):
+    """Ninety days by the recording's clock, a tick every quarter of an hour, in a minute or two."""
+    ticks, period_s = 8640, 900.0
+    day = round(86_400 / period_s)
+    path = make_recording(
+        tmp_path / "days", 5 * day, per_side=2, interval=period_s,
+        temperature_of=lambda k: 25.0 + 8.0 * np.sin(2 * np.pi * k / day),
+    )  # fmt: skip
+    sections = replayed(path, period_s=period_s)
+    sections["outputs"] = []
+    sections["store"] = {"path": str(daemon.store), "durable": False}
+    document = json.dumps({**sections, "frames": {"keep": "none"}})
+    seen = watched(daemon, fast_run(document, ticks))
+    epochs, resident, files, threads, used = map(np.array, zip(*seen, strict=True))
+    cost_ms, held_mb = [], []
+    for third in range(3):
+        # the first days belong to the start: modules are loaded, windows fill
+        low, high = (ticks * (0.05 + 0.95 * (third + k) / 3) for k in (0, 1))
+        part = (epochs >= low) & (epochs <= high)
+        assert part.sum() >= 3
+        cost_ms.append(1e3 * np.ptp(used[part]) / np.ptp(epochs[part]))
+        held_mb.append(float(np.median(resident[part])))
+    print(f"ms a tick in each third {np.round(cost_ms, 2)}, MB resident {np.round(held_mb, 1)}, "
+          f"files {set(files.tolist())}, threads {set(threads.tolist())}")  # fmt: skip
+    assert held_mb[2] - held_mb[0] < 3.0
+    assert cost_ms[2] < 1.15 * cost_ms[0]
+    with Store.open(daemon.store) as store:
+        series = store.find_series()
+        assert store.last_epoch(series) == ticks
+        times = store.series_columns(series, ["frame_time"])["frame_time"]
+        assert np.ptp(times) > 89 * 86_400
+        assert (np.diff(times) > 0).all()
+
+
 @pytest.mark.timeout(7200)
 def test_a_hundred_thousand_epochs_leave_memory_files_and_threads_as_they_were(
     daemon, replayed, tmp_path
@@ -84,24 +146,8 @@ def test_a_hundred_thousand_epochs_leave_memory_files_and_threads_as_they_were(
     sections["store"] = {"path": str(daemon.store), "durable": False}
     daemon.configure(**sections)
     document = json.dumps({**sections, "frames": {"keep": "none"}})
-    run = fast_run(document, EPOCHS)
-    daemon.process = subprocess.Popen([sys.executable, "-c", run], cwd=tmp_path, env=ENVIRONMENT)
-    proc = Path(f"/proc/{daemon.process.pid}")
-    seen = []
-    while daemon.process.poll() is None:
-        time.sleep(1.0)
-        try:
-            status = dict(line.split(":", 1) for line in (proc / "status").read_text().splitlines())
-            document = json.loads((tmp_path / "thermocald.db.live/status.json").read_text())
-            epoch = document["cameras"]["rpi"]["stored"]
-            files = len(list((proc / "fd").iterdir()))
-        except (OSError, ValueError, KeyError):
-            continue
-        if epoch:
-            resident_mb = int(status["VmRSS"].split()[0]) / 1024
-            seen.append((epoch, resident_mb, files, int(status["Threads"])))
-    assert daemon.process.returncode == 0
-    epochs, resident, files, threads = map(np.array, zip(*seen, strict=True))
+    seen = watched(daemon, fast_run(document, EPOCHS))
+    epochs, resident, files, threads, _ = map(np.array, zip(*seen, strict=True))
     warm = (epochs > 0.1 * EPOCHS) & (epochs < 0.98 * EPOCHS)
     growth = resident[warm][-5:].mean() - resident[warm][:5].mean()
     print(f"{epochs[-1]} epochs: {resident.max():.0f} MB resident, growth {growth:.2f} MB, "

@@ -123,15 +123,20 @@ def _study(
 ) -> Study:
     from thermocald.analysis.study.input import load_series
     from thermocald.analysis.study.study import study as run
+    from thermocald.store.recording.reader import open_recording
 
     series: list[MeasuredSeries] = []
     labelled = [_labelled(text) for text in inputs]
     _refuse_duplicates([path for _, path in labelled])
     for label, path in labelled:
-        with progress(_epochs(path), f"calibrating {path.name}") as advance:
+        recording = open_recording(path) if path.is_dir() else None
+        epochs = None if recording is None else len(recording)
+        with progress(epochs, f"calibrating {path.name}") as advance:
             series += load_series(
-                path, label, settings.thermometer_sd, exterior, free, advance, settings.jobs
-            )
+                recording or path, label, settings.thermometer_sd, exterior, free, advance,
+                settings.jobs,
+            )  # fmt: skip
+        del recording  # its columns are not needed any more
     _refuse_copies(series)
     cameras = len({one.label for one in series})
     with progress(settings.sets * cameras, "simulating") as advance:
@@ -159,15 +164,6 @@ def _refuse_copies(series: list[MeasuredSeries]) -> None:
                 raise DataError(
                     f"{one.source} holds the same epochs as {other.source}; give each series once"
                 )
-
-
-def _epochs(path: Path) -> int | None:
-    """How many epochs a recording has; None for a store, which is read at once."""
-    if not path.is_dir():
-        return None
-    from thermocald.store.recording.reader import open_recording
-
-    return len(open_recording(path).columns)
 
 
 def _labelled(text: str) -> tuple[str | None, Path]:

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.photogrammetry.series.blocks import spread_windows
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
@@ -33,6 +35,7 @@ __all__ = [
 ]
 
 _SMOOTHING = np.logspace(-1, 5, 19)
+_MOST_FOR_NOISE = 200_000  # readings, in a dozen runs
 _OFTEN_SHARP = 0.2  # share of the intervals from which on bends are no kinks by themselves
 _KINK = 1.5  # times the usual bend that a kink then has
 
@@ -73,8 +76,13 @@ def reading_noise(times: Array, readings: Array, resolution: float | None) -> fl
 
     From third divided differences, as thermometers are not read at even intervals, cut at 2.2 sigma
     again and again, so that a switched lamp, which spoils four of them, does not count as noise. A
-    thermometer that repeats one step for long has the error of the step.
+    thermometer that repeats one step for long has the error of the step. Of very many readings runs
+    from the first to the last are taken.
     """
+    if len(readings) > _MOST_FOR_NOISE:
+        runs = spread_windows(len(readings), _MOST_FOR_NOISE)
+        times = np.concatenate([times[run] for run in runs])
+        readings = np.concatenate([readings[run] for run in runs])
     there = np.isfinite(readings) & np.isfinite(times)
     t, values = times[there], readings[there]
     floor = (resolution or 0.0) / np.sqrt(12.0)

@@ -90,15 +90,23 @@ def slope_noise(y: Array, x: Array, slope: float, sd_x: float = 0.0) -> SlopeNoi
 
     n = len(y)
     u = dct(x - x.mean(), norm="ortho")[1:]
-    r = dct(y - slope * x - (y - slope * x).mean(), norm="ortho")[1:]
+    r = y - slope * x
+    r -= r.mean()
+    r = dct(r, norm="ortho", overwrite_x=True)[1:]
     # Frequencies at which x is its own noise say nothing of the slope.
     power = u * u
     around = np.convolve(power, np.full(_NEIGHBOURS, 1.0 / _NEIGHBOURS), "same")[: n - 1]
-    known = around >= min(_ABOVE_NOISE * sd_x**2, float(around.max()))
-    uu = np.where(known, power - sd_x**2, 0.0)
-    ur = np.where(known, u * r + slope * sd_x**2, 0.0)
+    unknown = around < min(_ABOVE_NOISE * sd_x**2, float(around.max()))
+    del around
+    uu, ur = power, u  # in their place: of a year of epochs every array counts
+    uu -= sd_x**2
+    uu[unknown] = 0.0
+    ur *= r
+    ur += slope * sd_x**2
+    ur[unknown] = 0.0
+    r *= r
     frequency = np.pi * np.arange(1, n) / n
-    count, frequency, uu, ur, rr = pooled(frequency, uu, ur, r * r)
+    count, frequency, uu, ur, rr = pooled(frequency, uu, ur, r)
     phi, coloured, tau, prior = _models(max(_LONGEST, float(n)))
     spectrum = spectra(frequency, phi, coloured)
 

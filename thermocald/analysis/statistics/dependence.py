@@ -106,6 +106,7 @@ def dependence(values: Array, sds: Array, temperature: Array, temperature_sd: fl
         raise ValueError("a dependence needs four epochs, values and a temperature that vary")
     x, y = temperature - temperature.mean(), values - values.mean()
     r = float(np.clip(np.dot(x, y) / np.sqrt(np.dot(x, x) * np.dot(y, y)), -1.0, 1.0))
+    del x, y  # of a year of epochs every array counts
 
     line = fit_straight_line(temperature, values, temperature_sd, sds)
     misfit = line.misfit
@@ -120,9 +121,10 @@ def dependence(values: Array, sds: Array, temperature: Array, temperature_sd: fl
         )
     # An epoch with few targets left is no part of the noise of the others.
     usual = sds <= _UNUSUAL * float(np.median(sds))
-    if not np.ptp(temperature[usual]) > 0:
-        usual = np.ones(n, dtype=bool)
-    noise = slope_noise(values[usual], temperature[usual], line.slope, temperature_sd)
+    those: slice | NDArray[np.bool_] = usual
+    if usual.all() or not np.ptp(temperature[usual]) > 0:
+        those = slice(None)  # without a copy
+    noise = slope_noise(values[those], temperature[those], line.slope, temperature_sd)
     sd_slope = noise.sd if n >= _FEW else max(noise.sd, line.sd_slope)
     return Dependence(
         n,

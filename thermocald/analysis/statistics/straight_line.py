@@ -65,11 +65,16 @@ def fit_straight_line(
         total = float(np.sum(weight))
         xb, yb = float(np.dot(weight, u0)) / total, float(np.dot(weight, v0)) / total
         u, v = u0 - xb, v0 - yb
-        beta = weight * (u * var_y + slope * v * var_x)
+        beta = u * var_y
+        beta += slope * v * var_x
+        beta *= weight
         wb = weight * beta
         previous, slope = slope, float(np.dot(wb, v) / np.dot(wb, u))
-        if abs(slope - previous) <= _CONVERGED / np.sqrt(float(np.dot(weight, u**2))):
+        del wb, v
+        u *= u
+        if abs(slope - previous) <= _CONVERGED / np.sqrt(float(np.dot(weight, u))):
             break
+    del u
     weight = np.broadcast_to(1.0 / (var_y + slope**2 * var_x), x.shape)
     adjusted = xb + beta
     adjusted_mean = float(np.dot(weight, adjusted)) / total

@@ -8,6 +8,7 @@ its covariance matrices.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,7 +29,6 @@ from thermocald.store.sources import open_source
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
-    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -47,7 +47,7 @@ _MOST_MATRICES = 5000
 
 
 def load_series(
-    path: Path,
+    source: Path | Recording,
     label: str | None = None,
     thermometer_sd: float | None = None,
     exterior: str = "auto",
@@ -55,16 +55,24 @@ def load_series(
     advance: Callable[[int], None] | None = None,
     jobs: int = 1,
 ) -> list[MeasuredSeries]:
-    """Every series of a recording (a folder) or a store (a file).
+    """Every series of a recording (a folder, or one that is open) or a store (a file).
 
     label: what the study treats as one camera, by default the camera's name, in a store with the
     start condition; thermometer_sd: K, by default from the readings; free: IOP to estimate, for a
     recording (a store knows its own); advance: receives how many epochs of a recording are done;
     jobs: processes that calibrate. Raises DataError where nothing can be studied.
     """
-    if path.is_dir():
-        recording = open_recording(path)
-        return [from_recording(recording, label, thermometer_sd, exterior, free, advance, jobs)]
+    if isinstance(source, Path):
+        if not source.is_dir():
+            return _of_store(source, label, thermometer_sd, exterior, jobs)
+        source = open_recording(source)
+    return [from_recording(source, label, thermometer_sd, exterior, free, advance, jobs)]
+
+
+def _of_store(
+    path: Path, label: str | None, thermometer_sd: float | None, exterior: str, jobs: int
+) -> list[MeasuredSeries]:
+    """Every series of a store."""
     with open_source(path) as store:
         found = [
             from_store(store, one, label, thermometer_sd, exterior, jobs)

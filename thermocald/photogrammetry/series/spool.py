@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import mmap
 import tempfile
 from typing import TYPE_CHECKING
@@ -13,6 +14,9 @@ if TYPE_CHECKING:
 
 __all__ = ["ColumnSpool", "released"]
 
+_LONG = 2_000_000  # rows
+_MMAP_THRESHOLD, _LARGE_BYTES = -3, 1 << 24  # of malloc.h; two million numbers
+
 
 class ColumnSpool:
     """An array (rows, columns), column by column in a file without a name.
@@ -22,6 +26,8 @@ class ColumnSpool:
     """
 
     def __init__(self, rows: int, columns: int) -> None:
+        if rows > _LONG:
+            _give_back()
         size = max(rows * columns, 1) * 8
         with tempfile.TemporaryFile() as file:
             file.truncate(size)
@@ -32,6 +38,17 @@ class ColumnSpool:
     def release(self) -> None:
         """Take what was written or read out of memory."""
         self._map.madvise(mmap.MADV_DONTNEED)
+
+
+def _give_back() -> None:
+    """Have freed arrays of 16 MB and more leave this process at once.
+
+    Otherwise the C library keeps those of up to 32 MB, a column of a year, for later ones that do
+    not fit into their place, and the process holds twice what it uses.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:  # glibc
+        mallopt(_MMAP_THRESHOLD, _LARGE_BYTES)
 
 
 def released(array: Array) -> None:

@@ -82,6 +82,8 @@ class ParquetTable:
             if isinstance(cause, RecordingError):
                 raise
             raise RecordingError(f"{self.path}: is damaged: {cause}") from cause
+        finally:
+            pyarrow.default_memory_pool().release_unused()
 
     def fail(self, row: int, column: str | None, message: str) -> NoReturn:
         """Raise RecordingError for one row (from 0) and column."""

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["interpolate_readings", "temperature_at_frame", "temperatures_at_frame"]
 
 _LARGEST_GAP_IN_INTERVALS = 10.0
+_AT_ONCE = 100_000  # frames: a year of them has to fit into memory
 
 
 def interpolate_readings(
@@ -35,14 +36,26 @@ def interpolate_readings(
     frames = np.asarray(frame_times, dtype=float)
     times, values = np.asarray(reading_times, dtype=float), np.asarray(readings, dtype=float)
     good = np.isfinite(times) & np.isfinite(values)
-    times, unique = np.unique(times[good], return_index=True)
-    values = values[good][unique]
+    if not good.all():
+        times, values = times[good], values[good]
+    if (np.diff(times) <= 0).any():
+        times, unique = np.unique(times, return_index=True)
+        values = values[unique]
     if len(times) < 2:
         # one reading tells the temperature of its own time
         only = float(values[0]) if len(values) else np.nan
         return np.where(np.isin(frames, times), only, np.nan)
     interval = float(np.median(np.diff(times)))
     gap = _LARGEST_GAP_IN_INTERVALS * interval if largest_gap_s is None else largest_gap_s
+    result = np.empty(frames.shape)
+    for first in range(0, len(frames), _AT_ONCE):
+        part = slice(first, first + _AT_ONCE)
+        result[part] = _interpolated(frames[part], times, values, interval, gap)
+    return result
+
+
+def _interpolated(frames: Array, times: Array, values: Array, interval: float, gap: float) -> Array:
+    """Temperatures at some frames, from sorted readings."""
     left = np.clip(np.searchsorted(times, frames, side="right") - 1, 0, len(times) - 2)
     span = times[left + 1] - times[left]
     slope = (values[left + 1] - values[left]) / span

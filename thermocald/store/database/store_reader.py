@@ -25,11 +25,7 @@ from thermocald.store.database.epoch_table import (
 )
 from thermocald.store.database.examination import Examination, examine
 from thermocald.store.database.series_reader import StampedReader
-from thermocald.store.database.series_table import (
-    select_events,
-    select_readings,
-    select_series,
-)
+from thermocald.store.database.series_table import select_events, select_readings, select_series
 from thermocald.store.database.wal import read_wal_tail
 
 if TYPE_CHECKING:
@@ -42,11 +38,7 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import Observations
     from thermocald.store.database.blob import ObservationRows
-    from thermocald.store.database.row import (
-        Event,
-        LoggedReading,
-        StoredSeries,
-    )
+    from thermocald.store.database.row import Event, LoggedReading, StoredSeries
 
 __all__ = ["StoreReader"]
 

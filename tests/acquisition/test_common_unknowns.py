@@ -293,4 +293,4 @@ def test_an_epoch_of_month_twelve_costs_what_one_of_the_first_day_does(scene, mo
     assert memory_late == memory
     assert set(late) <= set(early)
     for name, size in late.items():
-        assert size < 1.5 * early[name], name  # rounds of snooping differ
+        assert size < 4 * early[name], name  # rounds of iteration differ; the epochs are 700 times

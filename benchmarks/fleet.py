@@ -1,7 +1,7 @@
 """A fleet: what a server costs and how fast it answers; what a second worker brings.
 
     python -m benchmarks.fleet server [--full]             # 5 million epochs; --full: 50 million
-    python -m benchmarks.fleet workers                     # reprocess on Dask: 1 and 2 workers
+    python -m benchmarks.fleet workers [--full]            # 200 frames on Dask; --full: 800
     python -m benchmarks.fleet forward                     # rows a second, bytes an epoch
 
 `server` needs PostgreSQL (a cluster of its own is made, and removed) and about 0.6 kB of disk an
@@ -24,12 +24,15 @@ from dataclasses import replace
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")
 
 import numpy as np
 import psycopg
+from psutil import Process
 
 from benchmarks.generated_fleet import GeneratedCamera, add_camera
 from tests.fleet.conftest import new_cluster
+from tests.fleet.dask_cluster import DaskCluster, write_frame_archive
 from thermocald.acquisition.calibrator import Calibrator
 from thermocald.epoch import Epoch
 from thermocald.fleet.document import fleet_document
@@ -47,6 +50,7 @@ from thermocald.store.server.schema import create_tables
 CAMERAS = 50
 COLUMNS = 100_000  # epochs whose columns are read
 STUDIED = 8760  # epochs of the year that is studied: one an hour
+FRAMES = 20  # of a recording that workers measure again
 YEAR_S = 365 * 86400.0
 NAMES = ["epoch", "frame_time", "c", "x0", "y0", "sd_c", "sigma0", "temperature"]
 
@@ -140,45 +144,47 @@ def _write_year(path: Path) -> None:
             store.append(series, epoch, EpochResult.from_adjustment(one.adjustment))
 
 
-def workers() -> dict[str, float]:
-    """Epochs a second of `reprocess` here, with one and with two Dask workers."""
+def workers(full: bool) -> dict[str, float]:
+    """Frames measured again, here and with one and two Dask workers: time, and processor time.
+
+    The ratio of times needs free cores; processor time of client, scheduler and workers against
+    that of one process tells the scheduler's cost on a machine that is busy, too.
+    """
     found: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         folder = Path(name)
-        for i in range(4):
-            preset_simulation("rpi-v2.1-heating", i, f"M{i}").write(folder / "archive" / f"M{i}")
+        write_frame_archive(folder / "archive", 40 if full else 10, FRAMES)
 
         def blocks(out):
-            return find_blocks([folder / "archive"], folder / out, tuple(DEFAULT_FREE), 50)
+            return find_blocks([folder / "archive"], folder / out, tuple(DEFAULT_FREE), FRAMES)
 
-        epochs = sum(b.stop - b.first for b in blocks("none"))
+        frames = sum(b.stop - b.first for b in blocks("none"))
         run_blocks(blocks("warm")[:1])
+        begin = time.process_time()
         found["alone_s"], _ = timed(lambda: run_blocks(blocks("alone")))
-        known = folder / "scheduler.json"
-
-        def start(program, *options):
-            command = [sys.executable, "-m", f"distributed.cli.{program}", "--scheduler-file",
-                       known, "--no-dashboard", *options]  # fmt: skip
-            process = subprocess.Popen([str(c) for c in command], stdout=subprocess.DEVNULL,
-                                       stderr=subprocess.DEVNULL)  # fmt: skip
-            stack.callback(process.wait)
-            stack.callback(process.kill)
-
-        start("dask_scheduler", "--host", "127.0.0.1", "--port", "0")
-        while not known.exists():
-            time.sleep(0.1)
-        scheduler = json.loads(known.read_text())["address"]
+        found["alone_cpu_s"] = time.process_time() - begin
+        cluster = stack.enter_context(DaskCluster(folder, 0))
         for count in (1, 2):
-            start("dask_worker", "--nthreads", "1", "--no-nanny")
+            cluster.workers.append(cluster.start_worker())
             time.sleep(3)
-            run_blocks(blocks(f"warm{count}")[:4], scheduler)  # each worker has imported all
+            run_blocks(blocks(f"warm{count}")[: 2 * count], cluster.address)  # all is imported
+            processes = [Process(p.pid) for p in (cluster.scheduler, *cluster.workers)]
+            begin = _processor_time(processes)
             found[f"dask_{count}_s"], _ = timed(
-                lambda: run_blocks(blocks(f"dask{count}"), scheduler)  # noqa: B023
+                lambda: run_blocks(blocks(f"dask{count}"), cluster.address)  # noqa: B023
             )
-    found["overhead_per_frame"] = found["dask_1_s"] / found["alone_s"] - 1
+            found[f"dask_{count}_cpu_s"] = _processor_time(processes) - begin
+    found["frames"] = frames
+    found["overhead_per_frame"] = found["dask_1_cpu_s"] / found["alone_cpu_s"] - 1
+    found["overhead_per_frame_2"] = found["dask_2_cpu_s"] / found["alone_cpu_s"] - 1
     found["second_worker"] = found["dask_1_s"] / found["dask_2_s"]
-    found["epochs_a_second_alone"] = epochs / found["alone_s"]
     return found
+
+
+def _processor_time(processes):
+    """s, of these processes and of this one."""
+    each = [process.cpu_times() for process in processes]
+    return time.process_time() + sum(times.user + times.system for times in each)
 
 
 def forward() -> dict[str, float]:
@@ -218,9 +224,17 @@ def forward() -> dict[str, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("what", choices=["server", "workers", "forward"])
-    parser.add_argument("--full", action="store_true", help="50 million epochs in place of 5")
+    parser.add_argument(
+        "--full",
+        action="store_true",
+        help="50 million epochs in place of 5, 800 frames in place of 200",
+    )
     given = parser.parse_args()
-    calls = {"server": lambda: server(given.full), "workers": workers, "forward": forward}
+    calls = {
+        "server": lambda: server(given.full),
+        "workers": lambda: workers(given.full),
+        "forward": forward,
+    }
     print(json.dumps({k: round(float(v), 4) for k, v in calls[given.what]().items()}, indent=1))
 
 

@@ -83,6 +83,30 @@ def test_three_temperatures_predict_nearly_as_the_full_cycle_does(world):
 
 
 @pytest.mark.slow
+def test_three_temperatures_with_the_middle_one_taken_on_the_way_are_enough(world):
+    """Four frames each: at rest at 22 °C, while it warms, and at rest at 44 °C.
+
+    Over 200 fleets the error was 1.04 of the own full cycle's in the median and 1.09 in 95 %, and
+    95 % bands held 94.9 %; with three states of rest it was 2.1, and they held 94.5 %.
+    """
+    kind, cycle = world
+    step = Course.steps([0.0, 1500.0, 9000.0], [22.0, 44.0, 44.0])
+    programme = replace(cycle.programme, epochs=120, interval=50.0, initial=22.0,
+                        boundaries={"ambient": step}, sources={})  # fmt: skip
+    rows = {*range(26, 30), *range(32, 36), *range(116, 120)}
+    simulation = replace(cycle, programme=programme, seed=5)
+    epochs = [e if i in rows else replace(e, observations=None)
+              for i, e in enumerate(simulation.epochs())]  # fmt: skip
+    found = epochs_input(cycle.head, cycle.field, epochs, "M1")
+    few = fit_with_type([reduce_series(found, affinity=False, strict=False)], kind)
+    full, other = reduced(cycle), reduced(replace(cycle, seed=cycle.seed + 1))
+    own = fit_thermal_model([full], [ModelEffect("thermal_lag", {"tau": 80.0})], T0)
+    of_own, of_few = (predicted_error(f.model, other, 0.05) for f in (own, few))
+    assert of_few.rms_px <= 1.2 * of_own.rms_px
+    assert of_few.coverage == pytest.approx(0.95, abs=0.04)
+
+
+@pytest.mark.slow
 def test_three_states_of_rest_say_nothing_of_a_lag_and_the_bands_know_it(world):
     kind, cycle = world
     rows = {*range(26, 30), *range(56, 60), *range(116, 120)}

@@ -60,6 +60,21 @@ def test_few_temperatures_and_the_type_are_better_than_few_temperatures():
     assert found.validity == new.validity
 
 
+@pytest.mark.slow
+def test_intervals_hold_over_a_thousand_fleets():
+    """A new camera that knows as much of itself as its type does: where shrinking is hardest."""
+    rng = np.random.default_rng(5)
+    pulls = []
+    for _ in range(1000):
+        _, fleet = cameras(rng, 10, 0.1)
+        true, (new,) = cameras(rng, 1, 1.0)
+        found = shrunk_to_type(new, type_model(fleet, "t"))
+        sd = np.sqrt(np.diag(np.array(found.covariance)))
+        rows = [found.covariance_names.index(n) for n in NAMES]
+        pulls.append((values_of(found) - true[0]) / sd[rows])
+    assert np.mean(np.abs(pulls) < 1.96) == pytest.approx(0.95, abs=0.01)
+
+
 def test_a_camera_unlike_its_type_is_named():
     _, fleet = cameras(np.random.default_rng(9), 10, 0.1)
     rates = {**fleet[4].rates, "x0": fleet[4].rates["x0"] + 10 * SCATTER[2]}

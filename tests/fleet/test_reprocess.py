@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
-import time
-from contextlib import ExitStack
 from dataclasses import replace
 
 import pytest
@@ -81,96 +78,6 @@ def test_bad_usage_is_said(archive, tmp_path):
         find_blocks([tmp_path], tmp_path, ())
     with pytest.raises(UsageError, match="there is `local`"):
         run_blocks([], "fast")
-
-
-@pytest.fixture
-def cluster(tmp_path):
-    """A real scheduler and two real worker processes: its address, and the workers."""
-    pytest.importorskip("distributed", reason="pip install thermocald[dask]")
-    known = tmp_path / "scheduler.json"
-
-    def start_worker():
-        return start("dask_worker", "--nthreads", "1", "--no-dashboard", "--no-nanny")
-
-    def start(program, *options):
-        command = [sys.executable, "-m", f"distributed.cli.{program}", "--scheduler-file", known]
-        # as Dask's own nanny starts workers: sums do not depend on the number of cores
-        return subprocess.Popen(
-            [*map(str, command), *options], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-            env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
-        )  # fmt: skip
-
-    with ExitStack() as stack:
-        scheduler = start("dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard")
-        stack.callback(scheduler.wait)
-        stack.callback(scheduler.kill)
-        deadline = time.monotonic() + 60
-        while not known.exists():
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
-        workers = [start_worker() for _ in range(2)]
-        stack.callback(lambda: [(w.kill(), w.wait()) for w in workers])
-        yield json.loads(known.read_text())["address"], workers, start_worker
-
-
-@pytest.mark.slow
-def test_a_cluster_gives_the_bits_of_one_process(archive, tmp_path, cluster):
-    """Two workers; one of them is killed while it works."""
-    address, workers, _ = cluster
-    run_blocks(blocks_of(archive, tmp_path / "one", 10))
-    out = tmp_path / "again"
-    client = subprocess.Popen(
-        [sys.executable, "-c", RUN_BLOCKS, archive, out, address], stdout=subprocess.PIPE, text=True
-    )
-    deadline = time.monotonic() + 120
-    while len(list(out.rglob("*.parquet"))) < 4:
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    workers[0].kill()
-    errors, _ = client.communicate(timeout=180)
-    assert errors.splitlines()[-1] == "[]"
-    assert files(tmp_path / "one") == files(out)
-
-
-@pytest.mark.slow
-def test_workers_that_are_killed_again_and_again_finish_with_equal_results(
-    archive, tmp_path, cluster
-):
-    """One after every few blocks, and another takes its place, as on machines that are lent."""
-    address, workers, start_worker = cluster
-    archive = archive / "M1"
-    single = [tmp_path / "one", tmp_path / "many"]
-    run_blocks(blocks_of(archive, single[0], 10))
-    command = [sys.executable, "-m", "thermocald", "reprocess", archive, "--out"]
-    whole = [*command, tmp_path / "cluster", "--engine", address, "--do", "study", "--sets", "500"]
-    client = subprocess.Popen(
-        [sys.executable, "-c", RUN_BLOCKS, archive, single[1], address],
-        stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    killed = done = 0
-    deadline = time.monotonic() + 400
-    while client.poll() is None:
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
-        if (now := len(files(single[1]))) < done + 4:
-            continue
-        done = now
-        workers[killed % 2].kill()
-        workers[killed % 2].wait()
-        workers[killed % 2] = start_worker()
-        killed += 1
-    errors, _ = client.communicate()
-    assert errors.splitlines()[-1] == "[]"
-    assert files(single[0]) == files(single[1])
-    assert killed >= 2
-    # Monte-Carlo over the fleet, on the same cluster and here
-    subprocess.run(whole, check=True, capture_output=True, timeout=200)
-    local = [*command, tmp_path / "local", "--do", "study", "--sets", "500"]
-    subprocess.run(local, check=True, capture_output=True, timeout=200)
-    assert {p.name: p.read_bytes() for p in (tmp_path / "cluster").iterdir()} == {
-        p.name: p.read_bytes() for p in (tmp_path / "local").iterdir()
-    }
-    assert len([*(tmp_path / "local").iterdir()]) == 1
 
 
 @pytest.mark.slow

@@ -1,0 +1,79 @@
+"""A real Dask scheduler with worker processes on loopback, and an archive of frames for them."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from thermocald.simulation.presets import preset_simulation
+
+
+class DaskCluster:
+    """A scheduler in a folder, and workers that a test starts and kills; ended with the block."""
+
+    def __init__(self, folder: Path, workers: int) -> None:
+        self._known = folder / "scheduler.json"
+        self._stack = ExitStack()
+        self.scheduler = self._start("dask_scheduler", "--host", "127.0.0.1", "--port", "0")
+        deadline = time.monotonic() + 60
+        while not self._known.exists():
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        self.address = json.loads(self._known.read_text())["address"]
+        self.workers = [self.start_worker() for _ in range(workers)]
+
+    def start_worker(self) -> subprocess.Popen[bytes]:
+        return self._start("dask_worker", "--nthreads", "1", "--no-nanny")
+
+    def replace_worker(self, number: int) -> None:
+        """Kill a worker as a power cut does, and start another in its place."""
+        self.workers[number].kill()
+        self.workers[number].wait()
+        self.workers[number] = self.start_worker()
+
+    def _start(self, program: str, *options: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", f"distributed.cli.{program}", "--scheduler-file",
+                   str(self._known), "--no-dashboard", *options]  # fmt: skip
+        process = subprocess.Popen(
+            command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            # as Dask's own nanny starts workers: sums do not depend on the number of cores
+            env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"},
+        )  # fmt: skip
+        self._stack.callback(process.wait)
+        self._stack.callback(process.kill)
+        return process
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._stack.close()
+
+
+def write_frame_archive(folder: Path, recordings: int, frames: int) -> None:
+    """Recordings M00, M01 … of the same rendered 8 MP frames, which lie on the disk once."""
+    simulation = preset_simulation("rpi-v2.1-heating", 1, "M00")
+    programme = replace(simulation.programme, epochs=frames)
+    first = folder / "M00"
+    replace(simulation, programme=programme).write(first, with_frames=True)
+    for i in range(1, recordings):
+        other = folder / f"M{i:02d}"
+        shutil.copytree(first, other, copy_function=os.link)
+        head = other / "recording.yaml"
+        text = head.read_text().replace("M00", other.name)
+        head.unlink()
+        head.write_text(text)

@@ -1,0 +1,133 @@
+"""A real Dask cluster gives the bits of one process, whatever happens to its workers."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+
+import pytest
+
+from tests.fleet.dask_cluster import DaskCluster, write_frame_archive
+from thermocald.fleet.reprocess import find_blocks, run_blocks
+from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE
+from thermocald.simulation.presets import preset_simulation
+
+parquet = pytest.importorskip("pyarrow.parquet", reason="pip install thermocald[parquet]")
+pytest.importorskip("distributed", reason="pip install thermocald[dask]")
+pytestmark = pytest.mark.slow
+
+RUN_BLOCKS = (
+    "import sys; from pathlib import Path;"
+    "from thermocald.fleet.reprocess import find_blocks, run_blocks;"
+    "from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE;"
+    "b = find_blocks([Path(sys.argv[1])], Path(sys.argv[2]), tuple(DEFAULT_FREE), 10);"
+    "print([o.error for o in run_blocks(b, sys.argv[3]) if o.error])"
+)
+EVERY_S = 20.0
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("archive")
+    for name in ("M1", "M2"):
+        preset_simulation("rpi-v2.1-heating", 1, name).write(folder / name)
+    return folder
+
+
+@pytest.fixture
+def dask(tmp_path):
+    with DaskCluster(tmp_path, 2) as found:
+        yield found
+
+
+def files(out, pattern="*.parquet"):
+    return {p.relative_to(out): p.read_bytes() for p in sorted(out.rglob(pattern))}
+
+
+def blocks_of(archive, out, size):
+    return find_blocks([archive], out, tuple(DEFAULT_FREE), size)
+
+
+def start_client(archive, out, dask):
+    command = [sys.executable, "-c", RUN_BLOCKS, archive, out, dask.address]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+
+
+def test_a_cluster_gives_the_bits_of_one_process(archive, tmp_path, dask):
+    """Two workers; one of them is killed while it works."""
+    run_blocks(blocks_of(archive, tmp_path / "one", 10))
+    out = tmp_path / "again"
+    client = start_client(archive, out, dask)
+    deadline = time.monotonic() + 120
+    while len(list(out.rglob("*.parquet"))) < 4:
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    dask.workers[0].kill()
+    errors, _ = client.communicate(timeout=180)
+    assert errors.splitlines()[-1] == "[]"
+    assert files(tmp_path / "one") == files(out)
+
+
+def test_workers_that_are_killed_again_and_again_finish_with_equal_results(archive, tmp_path, dask):
+    """One after every few blocks, and another takes its place, as on machines that are lent."""
+    archive = archive / "M1"
+    run_blocks(blocks_of(archive, tmp_path / "one", 10))
+    out = tmp_path / "many"
+    client = start_client(archive, out, dask)
+    killed = done = 0
+    deadline = time.monotonic() + 400
+    while client.poll() is None:
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+        if (now := len(files(out))) < done + 4:
+            continue
+        done = now
+        dask.replace_worker(killed % 2)
+        killed += 1
+    errors, _ = client.communicate()
+    assert errors.splitlines()[-1] == "[]"
+    assert files(tmp_path / "one") == files(out)
+    assert killed >= 2
+
+
+def test_a_worker_killed_every_20_s_costs_no_frame(tmp_path, dask):
+    """Frames are measured again; all recordings hold the same, so one done here is enough."""
+    write_frame_archive(tmp_path / "archive", 40, 10)
+    run_blocks(blocks_of(tmp_path / "archive" / "M00", tmp_path / "one", 10))
+    (expected,) = (tmp_path / "one").iterdir()
+    out = tmp_path / "many"
+    client = start_client(tmp_path / "archive", out, dask)
+    killed = 0
+    begin = time.monotonic()
+    while client.poll() is None:
+        assert time.monotonic() < begin + 500
+        time.sleep(0.1)
+        if time.monotonic() > begin + (killed + 1) * EVERY_S:
+            dask.replace_worker(killed % 2)
+            killed += 1
+    errors, _ = client.communicate()
+    assert errors.splitlines()[-1] == "[]"
+    assert killed >= 1
+    found = sorted(out.iterdir())
+    assert len(found) == 40
+    here = parquet.read_table(expected).drop_columns(["series"])
+    assert here.num_rows == 10
+    assert set(here.column("status").to_pylist()) == {"ok"}
+    for folder in found:
+        assert parquet.read_table(folder).drop_columns(["series"]).equals(here)
+
+
+@pytest.mark.parametrize("analysis", ["study", "discover"])
+def test_every_series_is_analysed_as_it_is_here(archive, tmp_path, dask, analysis):
+    """Monte-Carlo and surrogates included: their random numbers do not depend on the engine."""
+    command = [sys.executable, "-m", "thermocald", "reprocess", archive, "--do", analysis,
+               "--sets", "500", "--out"]  # fmt: skip
+    for options in (["local"], ["cluster", "--engine", dask.address]):
+        subprocess.run(
+            [*command, tmp_path / options[0], *options[1:]], check=True, capture_output=True,
+            timeout=300,
+        )  # fmt: skip
+    here = files(tmp_path / "local", "*.json")
+    assert {str(name) for name in here} == {"rpi-v2.1-M1.json", "rpi-v2.1-M2.json"}
+    assert files(tmp_path / "cluster", "*.json") == here

@@ -46,7 +46,8 @@ class DaskCluster:
         process = subprocess.Popen(
             command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
             # as Dask's own nanny starts workers: sums do not depend on the number of cores
-            env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"},
+            env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1",
+                 "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False"},
         )  # fmt: skip
         self._stack.callback(process.wait)
         self._stack.callback(process.kill)

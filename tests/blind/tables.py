@@ -118,6 +118,9 @@ def _interval(share: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return np.minimum(middle - half, share), np.maximum(middle + half, share)
 
 
+REAL = "## Real corners"
+
+
 def write(
     path: Path, found: dict[str, list[Outcome]], seeds: Sequence[int], partly: bool = False
 ) -> None:
@@ -126,6 +129,8 @@ def write(
     power_figure(found, path.with_name(FIGURE))
     parts = "\n".join(row(p, o) for p, o in found.items())
     matrices = "\n\n".join(f"## {p}\n\n{confusion(o)}" for p, o in found.items())
+    before = path.read_text(encoding="utf-8") if path.exists() else ""
+    kept = before[before.index(REAL) :] if REAL in before else ""  # scored by another command
     path.write_text(
         f"""# How well discovery names hidden effects
 
@@ -154,7 +159,8 @@ Bars: 68 % limits of the share.
 {power_table(found)}
 
 {matrices}
-""",
+
+{kept}""".rstrip() + "\n",
         encoding="utf-8",
     )
 

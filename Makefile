@@ -52,7 +52,7 @@ test-lowest: ## the quick tests with the lowest versions that pyproject.toml all
 
 # audit, daemon, discovery, fleet and scale take longer: each is run by itself
 BENCHMARKS := adjustment frame montecarlo object_space "prediction --seeds 1" simulation \
-  "store --epochs 200000" study thermal_model
+  store study thermal_model
 bench: $(STAMP) ## ratios to peers, in one run on one thread, within five minutes
 	@failed=; for b in $(BENCHMARKS); do echo "== $$b"; \
 	  $(BIN)/python -m benchmarks.$$b || failed="$$failed $$b"; done; \

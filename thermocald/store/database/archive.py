@@ -15,7 +15,6 @@ from thermocald.store.recording.paths import FileFolder
 from thermocald.store.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
-
     from thermocald.epoch import Epoch
     from thermocald.store.database.row import StoredSeries
     from thermocald.store.database.store import Store

@@ -119,10 +119,10 @@ def forgotten_calibrations(connection: sqlite3.Connection) -> Iterator[str]:
     listed = connection.execute("SELECT id, camera, name FROM series ORDER BY id").fetchall()
     for series, camera, name in listed:
         later = connection.execute(
-            f"SELECT number, {', '.join(compared)} FROM epoch e WHERE series_id = ?1 "
+            f"SELECT number, {', '.join(compared)} FROM epoch e WHERE series_id = :series "
             "AND revision > 0 AND revision = (SELECT max(revision) FROM epoch "
-            "WHERE series_id = ?1 AND number = e.number) ORDER BY number",
-            (series,),
+            "WHERE series_id = :series AND number = e.number) ORDER BY number",
+            {"series": series},
         ).fetchall()
         if not later:
             continue

@@ -148,11 +148,12 @@ def select_observations(
     unread.
     """
     parts = connection.execute(
-        "SELECT epoch.id, epoch.number, measured, detail_checksum, detail.id - epoch.id * ?1, data "
-        "FROM epoch LEFT JOIN detail ON detail.id >= epoch.id * ?1 "
-        "AND detail.id < (epoch.id + 1) * ?1 WHERE series_id = ?2 AND epoch.number >= ?3 "
-        "AND epoch.number <= ?4 ORDER BY epoch.number, revision, detail.id",
-        (_PARTS, series, first, last),
+        "SELECT epoch.id, epoch.number, measured, detail_checksum, "
+        "detail.id - epoch.id * :parts, data "
+        "FROM epoch LEFT JOIN detail ON detail.id >= epoch.id * :parts "
+        "AND detail.id < (epoch.id + 1) * :parts WHERE series_id = :series "
+        "AND epoch.number BETWEEN :first AND :last ORDER BY epoch.number, revision, detail.id",
+        {"parts": _PARTS, "series": series, "first": first, "last": last},
     )
     packed: dict[int, bytes] = {}
     for (_, number, measured, checksum), rows in groupby(parts, key=lambda row: row[:4]):
@@ -185,8 +186,8 @@ def select_details(connection: sqlite3.Connection, id_: int) -> tuple[bytes, byt
 
 def _parts_of(connection: sqlite3.Connection, id_: int) -> list[tuple[int, bytes]]:
     return connection.execute(
-        "SELECT id - ?1, data FROM detail WHERE id >= ?1 AND id < ?1 + ?2 ORDER BY id",
-        (id_ * _PARTS, _PARTS),
+        "SELECT id - :low, data FROM detail WHERE id >= :low AND id < :high ORDER BY id",
+        {"low": id_ * _PARTS, "high": (id_ + 1) * _PARTS},
     ).fetchall()
 
 

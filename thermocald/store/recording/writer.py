@@ -190,9 +190,7 @@ class RecordingWriter:
         )
 
 
-def write_recording(
-    path: Path, head: Head, testfield: TestField, epochs: Iterable[Epoch]
-) -> None:
+def write_recording(path: Path, head: Head, testfield: TestField, epochs: Iterable[Epoch]) -> None:
     """Write a recording from an iterable of epochs, as a stream; frames are copied.
 
     Raises RecordingError if `path` exists, or the disk is full; then nothing is left behind.

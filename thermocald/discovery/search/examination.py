@@ -110,10 +110,16 @@ def examine_series(
     calibrated = calibrated_thermometers(cleaned)
     ready = [in_blocks(with_correlated_noise(e)) for e in calibrated]
     found = None
-    if max(e.correlation for e in calibrated) > _MEMORY:
+    wanders = max(e.correlation for e in calibrated) > _MEMORY
+    if wanders:
         found = _beside_mount(calibrated, say, given, jobs)
     if found is None:
         found = _still(ready, say, given, jobs)
+        noisy = noisier(found.fitter, found.best.fit)
+        if noisy is None and not found.adequate:
+            noisy = noisier(found.fitter, found.base.fit)
+        if noisy is not None:
+            found = _shaken(noisy, calibrated if not wanders else [], say, given, jobs)
     return replace(
         found, displaced=tuple(displaced), noise_growth=growth, original=tuple(series),
         field_movements=tuple(field),
@@ -139,11 +145,27 @@ def _still(
         if again is not None:
             say("curvature of the projection: once more")
             found = _searched(HypothesisFitter(again), say, given, jobs)
-    noisy = noisier(found.fitter, found.best.fit)
-    if noisy is not None:
-        say("noise that targets share: once more")
-        found = _searched(HypothesisFitter(noisy), say, given, jobs)
     return found
+
+
+def _shaken(
+    noisy: list[ReducedSeries],
+    calibrated: list[ReducedSeries],
+    say: Callable[[str], None],
+    given: Sequence[tuple[str, dict[str, Any]]],
+    jobs: int,
+) -> Examination:
+    """The search where all targets jump together from epoch to epoch.
+
+    What a thermometer's errors take up of it depends on the effect: each is fitted with the
+    tremble that it leaves. noisy: with one noise for all effects, where that is none of a mount's.
+    """
+    if calibrated:
+        found = _beside_mount(calibrated, say, given, jobs)
+        if found is not None:
+            return found
+    say("noise that targets share: once more")
+    return _searched(HypothesisFitter(noisy), say, given, jobs)
 
 
 def _searched(

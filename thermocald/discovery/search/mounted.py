@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from thermocald.discovery.search.search import Search, Solution
+from thermocald.discovery.search.standing import with_other_delay
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES
 from thermocald.reduction.movement import Mount, combinations, estimated, first_guess
 
@@ -95,7 +96,7 @@ def search_beside_mount(
         # a scan is right to some percent, and a further effect has to be worth much
         further = any(not t.kind.is_event for t in best.terms[len(start.terms) :])
         least = _PROMISE * _least_further(plain, best) if further else 0.0
-        for solution in search.expand(best.solution, 6, least)[:_WIDTH]:
+        for solution in _with_delays(search, search.expand(best.solution, 6, least)[:_WIDTH]):
             trial = _profiled(best, solution)
             knock = _as_knock(best, trial)
             grown.append(knock or trial)
@@ -107,6 +108,18 @@ def search_beside_mount(
             break
         best = min(allowed, key=lambda g: g.score)
     return _concluded(best, len(start.terms), ranking, seen, first, False)
+
+
+def _with_delays(search: Search, solutions: list[Solution]) -> list[Solution]:
+    """The solutions, and for the first delay of the temperature the other kind of delay too: a scan
+    without the movement of the mount may leave it out.
+    """
+    for solution in solutions:
+        other = with_other_delay(search, solution)
+        if other is not None:
+            names = [s.names for s in solutions]
+            return solutions if other.names in names else [*solutions, other]
+    return solutions
 
 
 def _beside(fitter: HypothesisFitter, solution: Solution, mount: Mount, turns: int) -> Beside:

@@ -15,7 +15,15 @@ if TYPE_CHECKING:
 
     from thermocald.reduction.fit import HypothesisFitter
 
-__all__ = ["BAND", "SWAP_BAND", "Standing", "adequacies", "adequate", "search_standing"]
+__all__ = [
+    "BAND",
+    "SWAP_BAND",
+    "Standing",
+    "adequacies",
+    "adequate",
+    "search_standing",
+    "with_other_delay",
+]
 
 _EFFECTS = 3
 _COMBINATIONS = 8  # of a level that are fitted in full
@@ -114,7 +122,7 @@ def _lag_or_delay(
     thermometer's noise, a delay does not; so a smooth image, which all temperatures give, would
     speak for a lag whatever the cause. Between these two the fit alone decides.
     """
-    other = _with_the_other(search, best)
+    other = with_other_delay(search, best)
     if other is None:
         return best, seen
     if other.fit.chi2 < best.fit.chi2 - 0.5 * SWAP_BAND:
@@ -122,7 +130,7 @@ def _lag_or_delay(
     return best, [*seen, other]
 
 
-def _with_the_other(search: Search, solution: Solution) -> Solution | None:
+def with_other_delay(search: Search, solution: Solution) -> Solution | None:
     """The solution with another effect that delays the temperature in place of the one it has."""
     delays = [c for c in search.candidates if c.kind.delay]
     for i, term in enumerate(solution.terms):

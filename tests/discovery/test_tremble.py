@@ -13,7 +13,7 @@ from tests.blind.generator import generate
 from thermocald.discovery.verdict.result import discover_series
 from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.reduction.fit import HypothesisFitter
-from thermocald.reduction.noise import jumps, with_jumps
+from thermocald.reduction.noise import jumps, trembles, with_jumps
 from thermocald.reduction.reduce import reduce_together
 
 
@@ -45,10 +45,28 @@ def test_a_tremble_is_found_along_its_own_directions(px, directions):
     assert (again is None) is not bool(directions)
 
 
+@pytest.mark.parametrize(
+    ("effects", "px", "expected"),
+    [((), 0.0, False), (("thermal_lag",), 0.0, False), (("thermal_lag",), 0.01, True)],
+)
+def test_a_tremble_is_no_drift(effects, px, expected):
+    assert [trembles(e) for e in trembling(effects, px, 3)] == [expected] * 2
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(("effects", "px"), [((), 0.05), (("softening",), 0.05)])
-def test_what_trembles_is_noise_and_the_cause_is_named(effects, px):
-    found = discover_series(trembling(effects, px, 2))
+@pytest.mark.parametrize(
+    ("effects", "px", "seed"),
+    [
+        ((), 0.05, 2),
+        (("softening",), 0.02, 3),
+        (("softening",), 0.05, 2),
+        (("thermal_lag",), 0.02, 3),
+        (("thermal_lag",), 0.05, 2),
+        (("cyclic_interference",), 0.02, 3),
+    ],
+)
+def test_what_trembles_is_noise_and_the_cause_is_named(effects, px, seed):
+    found = discover_series(trembling(effects, px, seed))
 
     assert tuple(e.effect for e in found.effects) == effects
     assert all(a.significance < 6.0 for a in found.examination.adequacy)

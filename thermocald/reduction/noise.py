@@ -13,6 +13,7 @@ Bell, McCaffrey (2002), Survey Methodology 28, 169-181, for what the fit takes o
 from __future__ import annotations
 
 from dataclasses import replace
+from math import comb
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,10 +29,14 @@ if TYPE_CHECKING:
     from thermocald.reduction.hypothesis import Block, Fit
     from thermocald.reduction.series import ReducedSeries
 
-__all__ = ["jumps", "noisier", "slow_together", "trembling", "with_correlated_noise", "with_jumps"]
+__all__ = [
+    "jumps", "noisier", "slow_together", "trembles", "trembling", "with_correlated_noise",
+    "with_jumps",
+]  # fmt: skip
 
 _FEWEST = 60  # epochs that tell how much the series jumps
 _BEYOND = 1.15  # times the largest eigenvalue that noise shows (Marchenko, Pastur)
+_FAST = 8  # order of differences that leaves little but what jumps
 _UNUSUAL = 1.7  # a variance from 170 second differences has 13 % of standard deviation
 
 
@@ -117,7 +122,7 @@ def jumps(fitter: HypothesisFitter, fit: Fit, series: int) -> tuple[Array, Array
     white = 6.0 / e.correlation
     carried = _thermometer_jumps(fitter, fit, series, W)
     usual = np.all(np.abs(d) <= 4 * spread + 1e-12, axis=1)
-    turned = _turned(d[usual][:, good], white, carried[np.ix_(good, good)])
+    turned = _turned(d[usual][:, good], white, carried[np.ix_(good, good)], 2)
     if turned is not None:
         factors, U = turned
         return np.concatenate([np.ones(int((~good).sum())), factors]), np.column_stack(
@@ -126,17 +131,38 @@ def jumps(fitter: HypothesisFitter, fit: Fit, series: int) -> tuple[Array, Array
     return np.where(good, observed / (white + np.diag(carried)), 1.0), W
 
 
-def _turned(d: Array, white: float, carried: Array) -> tuple[Array, Array] | None:
-    """Factors (m,) along orthonormal directions (m, m) in which second differences d (n, m) are
-    clearly larger than expected; None where there are none.
+def trembles(evidence: ReducedSeries) -> bool:
+    """Whether all targets jump together from epoch to epoch.
+
+    From differences of so high an order that nothing is left of what follows a temperature: no
+    effect is assumed, and no thermometer's errors come in.
+    """
+    M = evidence.N.mean(axis=0)
+    size, U = np.linalg.eigh(M)
+    good = size > 1e-6 * np.median(size)
+    W = U[:, good] / np.sqrt(size[good])
+    d = np.diff((evidence.values @ M @ W)[evidence.n > 0], _FAST, axis=0)
+    if len(d) < _FEWEST:
+        return False
+    spread = np.median(np.abs(d), axis=0) * 1.4826
+    usual = np.all(np.abs(d) <= 4 * spread + 1e-12, axis=1)
+    white = comb(2 * _FAST, _FAST) / evidence.correlation
+    return _turned(d[usual], white, np.zeros((len(W.T), len(W.T))), _FAST) is not None
+
+
+def _turned(d: Array, white: float, carried: Array, order: int) -> tuple[Array, Array] | None:
+    """Factors (m,) along orthonormal directions (m, m) in which differences d (n, m) of an order
+    are clearly larger than expected; None where there are none.
 
     white: the mean square that image noise gives, carried (m, m): that of thermometers.
     """
     n, m = d.shape
     if n < _FEWEST:
         return None
-    # second differences repeat each other: of n, 18/35 are independent
-    edge = (1.0 + np.sqrt(m / (n * 18.0 / 35.0))) ** 2
+    # differences repeat each other: of n second ones 18/35 are independent
+    shared = np.array([comb(2 * order, k) for k in range(2 * order + 1)], dtype=float)
+    independent = n * shared[order] ** 2 / np.sum(shared**2)
+    edge = (1.0 + np.sqrt(m / independent)) ** 2
     covariance = d.T @ d / n
     _, U = np.linalg.eigh(covariance - carried)
     own = np.einsum("ji,jk,ki->i", U, covariance, U)

@@ -23,7 +23,7 @@ from thermocald.reduction.calibrated import calibrated_thermometers
 from thermocald.reduction.curvature import curved
 from thermocald.reduction.fit import HypothesisFitter
 from thermocald.reduction.movement import WAVES, combinations, steadied
-from thermocald.reduction.noise import noisier, trembling, with_correlated_noise
+from thermocald.reduction.noise import noisier, trembles, trembling, with_correlated_noise
 from thermocald.reduction.noise_growth import NoiseGrowth, noise_growth
 from thermocald.reduction.reduce import reweighted
 
@@ -114,12 +114,8 @@ def examine_series(
     if wanders:
         found = _beside_mount(calibrated, say, given, jobs)
     if found is None:
-        found = _still(ready, say, given, jobs)
-        noisy = noisier(found.fitter, found.best.fit)
-        if noisy is None and not found.adequate:
-            noisy = noisier(found.fitter, found.base.fit)
-        if noisy is not None:
-            found = _shaken(noisy, calibrated if not wanders else [], say, given, jobs)
+        shaking = calibrated if not wanders and any(map(trembles, calibrated)) else []
+        found = _still(ready, shaking, say, given, jobs)
     return replace(
         found, displaced=tuple(displaced), noise_growth=growth, original=tuple(series),
         field_movements=tuple(field),
@@ -128,11 +124,16 @@ def examine_series(
 
 def _still(
     ready: list[ReducedSeries],
+    shaking: list[ReducedSeries],
     say: Callable[[str], None],
     given: Sequence[tuple[str, dict[str, Any]]],
     jobs: int,
 ) -> Examination:
-    """The search where the mount stands still."""
+    """The search where the mount stands still.
+
+    shaking: the series where all targets jump together. What a thermometer's errors take up of that
+    depends on the effect; unless an effect explains it, each is fitted with the tremble it leaves.
+    """
     fitter = HypothesisFitter(ready)
     search = Search(fitter)
     base = search.base(given)
@@ -145,27 +146,15 @@ def _still(
         if again is not None:
             say("curvature of the projection: once more")
             found = _searched(HypothesisFitter(again), say, given, jobs)
+    noisy = noisier(found.fitter, found.best.fit)
+    if shaking and (noisy is not None or not found.adequate):
+        alongside = _beside_mount(shaking, say, given, jobs)
+        if alongside is not None:
+            return alongside
+    if noisy is not None:
+        say("noise that targets share: once more")
+        found = _searched(HypothesisFitter(noisy), say, given, jobs)
     return found
-
-
-def _shaken(
-    noisy: list[ReducedSeries],
-    calibrated: list[ReducedSeries],
-    say: Callable[[str], None],
-    given: Sequence[tuple[str, dict[str, Any]]],
-    jobs: int,
-) -> Examination:
-    """The search where all targets jump together from epoch to epoch.
-
-    What a thermometer's errors take up of it depends on the effect: each is fitted with the
-    tremble that it leaves. noisy: with one noise for all effects, where that is none of a mount's.
-    """
-    if calibrated:
-        found = _beside_mount(calibrated, say, given, jobs)
-        if found is not None:
-            return found
-    say("noise that targets share: once more")
-    return _searched(HypothesisFitter(noisy), say, given, jobs)
 
 
 def _searched(

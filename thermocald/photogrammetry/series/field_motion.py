@@ -37,6 +37,7 @@ OTHERS = 8.0
 _ORDERS = 14
 _PASSES = 3
 _MOST = 80.0  # per cent of the targets, which stay below what a single one does
+_SEEN = 0.3  # of the epochs: of what wanders fast, many are taken for gross errors
 _MOST_TARGETS = 0.2  # of the targets: so many do not wander by themselves
 
 
@@ -149,7 +150,7 @@ def wandering_targets(s: FieldSeries) -> list[FieldMovement]:
         v = np.nan_to_num(free.residuals) * np.sqrt(w)
         power = np.sum(np.einsum("je,etk->jtk", slow, v) ** 2, axis=(0, 2))
         count = np.sum(w[..., 0] > 0, axis=0)
-        there = count > 0.5 * len(free.times)
+        there = count >= max(FEWEST_EPOCHS, _SEEN * len(free.times))
         if not there.any():
             break
         power = np.where(there, power, 0.0)

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from thermocald.discovery.search.search import Search, Solution
-from thermocald.discovery.search.standing import with_other_delay
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES
 from thermocald.reduction.movement import Mount, combinations, estimated, first_guess
 
@@ -115,7 +114,7 @@ def _with_delays(search: Search, solutions: list[Solution]) -> list[Solution]:
     without the movement of the mount may leave it out.
     """
     for solution in solutions:
-        other = with_other_delay(search, solution)
+        other = search.with_other_delay(solution)
         if other is not None:
             names = [s.names for s in solutions]
             return solutions if other.names in names else [*solutions, other]

@@ -191,6 +191,24 @@ class Search:
                 promises.append(found)
         return _worth_fitting(promises, width)
 
+    def with_other_delay(self, solution: Solution) -> Solution | None:
+        """The solution with another kind of delay of the temperature in place of its own."""
+        delays = [c for c in self.candidates if c.kind.delay]
+        for i, term in enumerate(solution.terms):
+            if not term.kind.delay:
+                continue
+            seconds = float(dict(term.nonlinear)[term.kind.delay])
+            others = [c for c in delays if c.effect not in solution.names]
+            if seconds <= 0 or not others:
+                return None
+            found = []
+            for candidate in others:
+                swapped = candidate.term(seconds, len(self.fitter.series))
+                terms = (*solution.terms[:i], swapped, *solution.terms[i + 1 :])
+                found.append(self.refine(terms, solution.penalties))
+            return min(found, key=lambda s: s.fit.chi2)
+        return None
+
     def shrink(self, solution: Solution, kept: int = 0) -> Solution:
         """Without every effect that is no longer worth its penalty; the first `kept` stay."""
         while len(solution.terms) > kept + 1:

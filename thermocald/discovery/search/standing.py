@@ -15,15 +15,7 @@ if TYPE_CHECKING:
 
     from thermocald.reduction.fit import HypothesisFitter
 
-__all__ = [
-    "BAND",
-    "SWAP_BAND",
-    "Standing",
-    "adequacies",
-    "adequate",
-    "search_standing",
-    "with_other_delay",
-]
+__all__ = ["BAND", "SWAP_BAND", "Standing", "adequacies", "adequate", "search_standing"]
 
 _EFFECTS = 3
 _COMBINATIONS = 8  # of a level that are fitted in full
@@ -122,31 +114,12 @@ def _lag_or_delay(
     thermometer's noise, a delay does not; so a smooth image, which all temperatures give, would
     speak for a lag whatever the cause. Between these two the fit alone decides.
     """
-    other = with_other_delay(search, best)
+    other = search.with_other_delay(best)
     if other is None:
         return best, seen
     if other.fit.chi2 < best.fit.chi2 - 0.5 * SWAP_BAND:
         return other, [*seen, other]
     return best, [*seen, other]
-
-
-def with_other_delay(search: Search, solution: Solution) -> Solution | None:
-    """The solution with another effect that delays the temperature in place of the one it has."""
-    delays = [c for c in search.candidates if c.kind.delay]
-    for i, term in enumerate(solution.terms):
-        if not term.kind.delay:
-            continue
-        seconds = float(dict(term.nonlinear)[term.kind.delay])
-        others = [c for c in delays if c.effect not in solution.names]
-        if seconds <= 0 or not others:
-            return None
-        found = []
-        for candidate in others:
-            swapped = candidate.term(seconds, len(search.fitter.series))
-            terms = (*solution.terms[:i], swapped, *solution.terms[i + 1 :])
-            found.append(search.refine(terms, solution.penalties))
-        return min(found, key=lambda s: s.fit.chi2)
-    return None
 
 
 def _swapped(one: Solution, other: Solution) -> bool:

@@ -60,9 +60,7 @@ def slow_together(evidence: ReducedSeries) -> tuple[Array, Array]:
     fit has taken off a cluster's residuals is put back, so that white noise gives 1.
     """
     M = evidence.N.mean(axis=0)
-    size, U = np.linalg.eigh(M)
-    good = size > 1e-6 * np.median(size)
-    W = U / np.sqrt(np.where(good, size, 1.0))
+    W, good = _orthonormal(M)
     trajectories = cosines(evidence.history.times, ORDERS)
     trajectories /= np.linalg.norm(trajectories, axis=1, keepdims=True)
     weights = evidence.weights[..., :2]
@@ -80,6 +78,15 @@ def slow_together(evidence: ReducedSeries) -> tuple[Array, Array]:
     total[:, ~good] = 0.0
     factors, turn = np.linalg.eigh(total)
     return factors, W @ turn
+
+
+def _orthonormal(M: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Combinations W (P, P) of the parameters that are orthonormal under a normal matrix M (P, P),
+    and which of them (P,) it determines.
+    """
+    size, U = np.linalg.eigh(M)
+    good = size > 1e-6 * np.median(size)
+    return U / np.sqrt(np.where(good, size, 1.0)), good
 
 
 def _clusters(evidence: ReducedSeries) -> list[NDArray[np.int64]]:
@@ -106,13 +113,8 @@ def jumps(fitter: HypothesisFitter, fit: Fit, series: int) -> tuple[Array, Array
     is clear, the combinations are turned to it.
     """
     e = fitter.series[series]
-    C, V, index = fit.designs[series]
-    rest = e.b - np.einsum("epq,eq->ep", e.N, (C * fit.coefficients[index]) @ V.T)
-    level = np.linalg.lstsq(e.N.sum(axis=0), rest.sum(axis=0), rcond=1e-12)[0]
-    rest = rest - e.N @ level
-    size, U = np.linalg.eigh(e.N.mean(axis=0))
-    good = size > 1e-6 * np.median(size)
-    W = U / np.sqrt(np.where(good, size, 1.0))
+    rest = _left(fitter, fit, series)
+    W, good = _orthonormal(e.N.mean(axis=0))
     z = (rest @ W)[e.n > 0]
     d = np.diff(z, 2, axis=0)
     spread = np.median(np.abs(d), axis=0) * 1.4826
@@ -131,6 +133,16 @@ def jumps(fitter: HypothesisFitter, fit: Fit, series: int) -> tuple[Array, Array
     return np.where(good, observed / (white + np.diag(carried)), 1.0), W
 
 
+def _left(fitter: HypothesisFitter, fit: Fit, series: int) -> Array:
+    """What a fit and one level leave of the right-hand sides (E, P) of a series."""
+    e = fitter.series[series]
+    C, V, index = fit.designs[series]
+    rest = e.b - np.einsum("epq,eq->ep", e.N, (C * fit.coefficients[index]) @ V.T)
+    level = np.linalg.lstsq(e.N.sum(axis=0), rest.sum(axis=0), rcond=1e-12)[0]
+    out: Array = rest - e.N @ level
+    return out
+
+
 def trembles(evidence: ReducedSeries) -> bool:
     """Whether all targets jump together from epoch to epoch.
 
@@ -138,9 +150,8 @@ def trembles(evidence: ReducedSeries) -> bool:
     effect is assumed, and no thermometer's errors come in.
     """
     M = evidence.N.mean(axis=0)
-    size, U = np.linalg.eigh(M)
-    good = size > 1e-6 * np.median(size)
-    W = U[:, good] / np.sqrt(size[good])
+    W, good = _orthonormal(M)
+    W = W[:, good]
     d = np.diff((evidence.values @ M @ W)[evidence.n > 0], _FAST, axis=0)
     if len(d) < _FEWEST:
         return False
@@ -232,14 +243,11 @@ def _fast_power(
     thermometers' noise makes is taken off.
     """
     e = fitter.series[series]
-    size, U = np.linalg.eigh(e.N.mean(axis=0))
-    good = size > 1e-6 * np.median(size)
-    W = U[:, good] / np.sqrt(size[good])
-    C, V, index = fit.designs[series]
-    rest = e.b - np.einsum("epq,eq->ep", e.N, (C * fit.coefficients[index]) @ V.T)
-    level = np.linalg.lstsq(e.N.sum(axis=0), rest.sum(axis=0), rcond=1e-12)[0]
+    W, good = _orthonormal(e.N.mean(axis=0))
+    W = W[:, good]
+    rest = _left(fitter, fit, series)
     fast = waves(e.times, len(e.times) - 1)[:, slower:].T
-    z = fast @ ((rest - e.N @ level) @ W)
+    z = fast @ (rest @ W)
     power: Array = z.T @ z / len(fast)
     for block in fit.blocks:
         if block.trajectories > 1 or block.series not in (None, series):

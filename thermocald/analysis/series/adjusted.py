@@ -33,13 +33,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.analysis.series.table import SeriesTable
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import Observations, TestField
     from thermocald.photogrammetry.series.blocks import ObservationBlocks
     from thermocald.photogrammetry.series.long_result import LongAdjustment, RowWriter
     from thermocald.photogrammetry.series.normals import ObservationGrid
     from thermocald.store.recording.head import Head
-
-    Array = NDArray[np.float64]
 
 __all__ = ["table_of_series"]
 

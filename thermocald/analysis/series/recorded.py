@@ -18,14 +18,11 @@ from thermocald.photogrammetry.series.words import Words
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
     from thermocald.photogrammetry.field.testfield import Observations
     from thermocald.photogrammetry.series.normals import ObservationGrid
     from thermocald.store.recording.reader import Recording
-
-    Array = NDArray[np.float64]
 
 __all__ = ["recorded_table"]
 

@@ -30,12 +30,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.analysis.series.drift import Course
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
     from thermocald.store.database.row import StoredSeries
     from thermocald.store.database.series_reader import SeriesReader
     from thermocald.store.recording.reader import Recording
-
-    Array = NDArray[np.float64]
 
 __all__ = ["replay_into", "stored_table", "table_of_stored"]
 

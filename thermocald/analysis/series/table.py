@@ -23,12 +23,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.acquisition.calibrator import Calibrator
+    from thermocald.arrays import Array
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.field.testfield import Observations
     from thermocald.photogrammetry.series.adjustment import SeriesAdjustment
     from thermocald.photogrammetry.series.field_motion import FieldMovement
-
-    Array = NDArray[np.float64]
 
 __all__ = ["BY_EPOCH", "CSV_COLUMNS", "SeriesTable", "calibrate_epochs", "csv_text"]
 

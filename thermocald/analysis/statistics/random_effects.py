@@ -21,9 +21,8 @@ import numpy as np
 from thermocald.errors import DataError
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
+    from thermocald.arrays import Array
 
 __all__ = ["Population", "Shrunk", "odd_specimens", "population"]
 

@@ -33,13 +33,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.analysis.series.table import SeriesTable
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import Observations
     from thermocald.store.database.row import StoredSeries
     from thermocald.store.database.series_reader import SeriesReader
     from thermocald.store.recording.head import Head
     from thermocald.store.recording.reader import Recording
-
-    Array = NDArray[np.float64]
 
 __all__ = ["from_recording", "from_store", "load_series"]
 

@@ -30,16 +30,12 @@ from thermocald.reduction.reduce import reweighted
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    import numpy as np
-    from numpy.typing import NDArray
-
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.series.field_motion import FieldMovement
     from thermocald.reduction.adequacy import Adequacy
     from thermocald.reduction.hypothesis import Term
     from thermocald.reduction.movement import Mount
     from thermocald.reduction.series import ReducedSeries
-
-    Array = NDArray[np.float64]
 
 __all__ = ["Examination", "examine_series"]
 

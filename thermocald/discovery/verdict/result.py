@@ -26,13 +26,9 @@ from thermocald.simulation import effects as catalogue
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from numpy.typing import NDArray
-
     from thermocald.discovery.search.search import Solution
     from thermocald.reduction.hypothesis import Fit, Term
     from thermocald.reduction.series import ReducedSeries
-
-    Array = NDArray[np.float64]
 
 __all__ = ["Discovery", "discover_series"]
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.store.conftest import field, filled, head, make_epoch, make_result, store_path
+from thermocald.simulation.presets import preset_simulation
 from thermocald.store.server.address import ServerAddress
 
 __all__ = [
@@ -137,3 +138,12 @@ def server(cluster, template):
         connection.execute("DROP DATABASE IF EXISTS thermocald WITH (FORCE)")
         connection.execute(f"CREATE DATABASE thermocald TEMPLATE {template}")
     return cluster
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory):
+    """Two recordings of one camera."""
+    folder = tmp_path_factory.mktemp("archive")
+    for name in ("M1", "M2"):
+        preset_simulation("rpi-v2.1-heating", 1, name).write(folder / name)
+    return folder

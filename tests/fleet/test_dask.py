@@ -11,7 +11,6 @@ import pytest
 from tests.fleet.dask_cluster import DaskCluster, write_frame_archive
 from thermocald.fleet.reprocess import find_blocks, run_blocks
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE
-from thermocald.simulation.presets import preset_simulation
 
 parquet = pytest.importorskip("pyarrow.parquet", reason="pip install thermocald[parquet]")
 pytest.importorskip("distributed", reason="pip install thermocald[dask]")
@@ -25,14 +24,6 @@ RUN_BLOCKS = (
     "print([o.error for o in run_blocks(b, sys.argv[3]) if o.error])"
 )
 EVERY_S = 20.0
-
-
-@pytest.fixture(scope="module")
-def archive(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("archive")
-    for name in ("M1", "M2"):
-        preset_simulation("rpi-v2.1-heating", 1, name).write(folder / name)
-    return folder
 
 
 @pytest.fixture

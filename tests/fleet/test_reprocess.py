@@ -14,25 +14,8 @@ from thermocald.errors import DataError, UsageError
 from thermocald.fleet import reprocess
 from thermocald.fleet.reprocess import find_blocks, run_blocks
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE
-from thermocald.simulation.presets import preset_simulation
-
-RUN_BLOCKS = (
-    "import sys; from pathlib import Path;"
-    "from thermocald.fleet.reprocess import find_blocks, run_blocks;"
-    "from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE;"
-    "b = find_blocks([Path(sys.argv[1])], Path(sys.argv[2]), tuple(DEFAULT_FREE), 10);"
-    "print([o.error for o in run_blocks(b, sys.argv[3]) if o.error])"
-)
 
 parquet = pytest.importorskip("pyarrow.parquet", reason="pip install thermocald[parquet]")
-
-
-@pytest.fixture(scope="module")
-def archive(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("archive")
-    for name in ("M1", "M2"):
-        preset_simulation("rpi-v2.1-heating", 1, name).write(folder / name)
-    return folder
 
 
 def files(out):

@@ -1,8 +1,8 @@
 #!/bin/bash
 # Inside a bare Debian: install /share/first.deb, use it, upgrade to second.deb, downgrade, remove, purge.
 #
-# With ROOT, the Debian of another architecture is there: apt and dpkg run natively from here, only its own
-# programs (maintainer scripts, thermocald) are emulated.
+# With ROOT, the Debian of another architecture is there: apt and dpkg run natively from here (Debian 13's;
+# an older dpkg knows its own architecture only), its own programs (maintainer scripts, thermocald) emulated.
 set -euo pipefail
 name=${1:-here} ROOT=${ROOT:-}
 inside() { if [ -n "$ROOT" ]; then chroot "$ROOT" "$@"; else "$@"; fi; }
@@ -12,6 +12,8 @@ if [ -n "$ROOT" ]; then
 APT::Architecture "$architecture";
 APT::Architectures { "$architecture"; };
 Dir::State::status "$ROOT/var/lib/dpkg/status";
+Dir::Etc::sourcelist "$ROOT/etc/apt/sources.list";
+Dir::Etc::sourceparts "$ROOT/etc/apt/sources.list.d";
 DPkg::Options { "--root=$ROOT"; "--force-unsafe-io"; };
 END
   for folder in proc dev; do mount --bind /$folder "$ROOT/$folder"; done

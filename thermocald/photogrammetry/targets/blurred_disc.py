@@ -173,7 +173,7 @@ def blurred_disc(
     kappa *= _HALF
     d = np.subtract(_ONE, q.rho, out=q.rho)
     d /= q.slope
-    z = d / width
+    z: Single = np.divide(d, width)
     z -= np.multiply(kappa, width, out=other)
     phi = normal_cdf(z)
     b, a = p[:, 6, None], p[:, 7, None]

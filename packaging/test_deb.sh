@@ -1,5 +1,6 @@
 #!/bin/bash
 # Inside a bare Debian: install /share/first.deb, use it, upgrade to second.deb, downgrade, remove, purge.
+# `test_deb.sh NAME depends` only installs what it depends on.
 #
 # With ROOT, the Debian of another architecture is there: apt and dpkg run natively from here (Debian 13's;
 # an older dpkg knows its own architecture only), its own programs (maintainer scripts, thermocald) emulated.
@@ -28,6 +29,11 @@ apt_get() { apt-get -y -qq --no-install-recommends "$@" >/tmp/apt.log 2>&1 || { 
 began=$SECONDS
 cd /tmp
 apt-get update -qq || { echo "$name: no package lists, no network?"; exit 77; }
+if [ "${2:-}" = depends ]; then
+  apt_get satisfy "$(dpkg-deb --field /share/first.deb Depends)"
+  lap "what it depends on downloaded and installed"
+  exit
+fi
 apt_get install --download-only /share/first.deb
 lap "downloaded what it depends on"
 

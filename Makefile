@@ -36,16 +36,18 @@ lint: $(STAMP) ## ruff, mypy --strict, layers
 	@echo "== mypy --strict"
 	$(BIN)/mypy
 
-# One process more than there are cores: tests of the daemon wait for it more than they work.
+# Two cores and one process more: tests of the daemon wait for it more than they work. Files in the order of
+# tests/conftest.py.
+WORKERS := -n 3 --dist loadfile --no-loadscope-reorder
 test: $(STAMP) ## lint and the quick tests, at the same time
 	@$(MAKE) --no-print-directory --jobs=2 lint quick
 
 quick: $(STAMP)
 	@echo "== pytest"
-	$(BIN)/python -m pytest -q -n 3 --dist loadfile
+	$(BIN)/python -m pytest -q $(WORKERS)
 
 test-slow: $(STAMP) ## long statistics and browser tests
-	$(BIN)/python -m pytest -q -m slow -n 2 --dist loadfile
+	$(BIN)/python -m pytest -q -m slow $(WORKERS)
 
 test-lowest: ## the quick tests with the lowest versions that pyproject.toml allows
 	.ci/lowest

@@ -14,6 +14,31 @@ import pytest
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
+LONGEST = (
+    # of the slow suite, by `make test-slow` with --durations
+    "daemon/test_endurance", "blind/test_score", "store/test_bounds", "docs/test_commands",
+    "acquisition/test_common_unknowns", "cli/test_first_hour", "photogrammetry/test_mount",
+    "daemon/test_rhythm", "real_corners/test_real_corners",
+    # of the quick one
+    "daemon/test_faults", "daemon/test_page_attacks", "discovery/test_examination",
+    "daemon/test_sessions", "cli/test_commands", "photogrammetry/test_boards",
+    "photogrammetry/test_scale", "daemon/test_clock", "output/test_board_print",
+    "daemon/test_changes", "output/test_report_study", "analysis/test_online_filter",
+    "fleet/test_reprocess", "cli/test_discover", "cli/test_testfield", "daemon/test_session",
+    "photogrammetry/test_adjustment", "daemon/test_calibration_keys", "docs/test_site",
+    "output/test_testfield_print", "discovery/test_separable", "photogrammetry/test_ring_reading",
+    "daemon/test_telling", "simulation/test_outside_effect", "fleet/test_dask",
+)  # fmt: skip
+"""Files that take longest, in that order: so that no process is left alone with one at the end."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Longest files first; the Makefile has pytest-xdist keep the order."""
+    place = {f"{name}.py": number for number, name in enumerate(LONGEST)}
+    folder = Path(__file__).parent
+    items.sort(key=lambda i: place.get(str(i.path.relative_to(folder)), len(place)))
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """The folder of real data beside the checkout; skips where it is absent."""

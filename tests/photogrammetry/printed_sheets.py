@@ -18,6 +18,7 @@ import pytest
 from thermocald.photogrammetry.camera.camera_model import CameraModel, ExteriorOrientation
 
 GRID_PX = 8
+ROWS = 16
 BEYOND = 120.0
 
 
@@ -139,8 +140,13 @@ def _places(
         slice(p.start, min(p.start + n, p.stop)) for p, n in zip(part, (height, width), strict=True)
     ]
     size = [p.stop - p.start for p in part]
-    places = _on_sheet(sheet, exterior, *(f[: size[0], : size[1]] for f in fine))
-    return (part[0], part[1]), *(np.float32(np.clip(p, -1e6, 1e6)) for p in places)
+    places = np.empty((2, *size), np.float32)
+    for first in range(0, size[0], ROWS):  # few enough for the processor's cache
+        rows = slice(first, min(first + ROWS, size[0]))
+        found = _on_sheet(sheet, exterior, *(f[rows, : size[1]] for f in fine))
+        for place, out in zip(found, places[:, rows], strict=True):
+            np.clip(place, -1e6, 1e6, out=out, casting="same_kind")
+    return (part[0], part[1]), places[0], places[1]
 
 
 def _on_sheet(

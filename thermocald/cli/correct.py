@@ -19,6 +19,8 @@ from thermocald.cli.options import (
 from thermocald.errors import DataError, ImageError, UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from thermocald.analysis.thermal.temperature_log import TemperatureLog
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
     from thermocald.store.logger.clock import DeviceClock
@@ -105,56 +107,84 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _points(task: _Task, out: Path | None, json: str | None) -> None:
+    from thermocald.cli.common import write_parts, write_result
+
+    sums = _Sums()
+    lines = _corrected_lines(task, sums)
+    if out is not None:
+        write_parts(lines, out)
+    elif json == "-":
+        for _ in lines:
+            pass
+    else:
+        write_parts(lines, "-")
+    summary: dict[str, Any] = {
+        "format": "thermocald-correction/1",
+        "points": sums.points,
+        "corrected_to": task.corrected_to,
+        "rms_correction_px": sums.rms(sums.moved),
+        "rms_left_over_px": sums.rms(sums.left_over),
+        "extrapolated_rows": sums.extrapolated,
+    }
+    if write_result(summary, json) and out is not None:
+        typer.echo(
+            f"{out}: {sums.points} points corrected by {summary['rms_correction_px']:.3f} px (RMS);"
+            f" left over ± {summary['rms_left_over_px']:.3f} px"
+        )
+
+
+@dataclass
+class _Sums:
+    """Over the points that were corrected: squares px² of both coordinates, rows outside."""
+
+    points: int = 0
+    moved: float = 0.0
+    left_over: float = 0.0
+    extrapolated: int = 0
+
+    def rms(self, squares: float) -> float:
+        """Of one coordinate, px."""
+        return float((squares / (2 * self.points)) ** 0.5)
+
+
+def _corrected_lines(task: _Task, sums: _Sums) -> Iterator[str]:
+    """The corrected CSV, a block of rows at a time: a year of points has to fit into memory."""
     import csv
     import io
 
     import numpy as np
 
     from thermocald.analysis.thermal.correction import correct_points
-    from thermocald.analysis.thermal.temperature_log import read_rows
-    from thermocald.cli.common import write_result, write_text
+    from thermocald.analysis.thermal.temperature_log import row_blocks
 
-    header, rows, numbers = read_rows(task.path, ("time", "x", "y"), task.clock)
-    inside = task.thermal.model.sensor.contains(numbers[:, 1:])
-    if not inside.all():
-        x, y = numbers[np.argmin(inside), 1:]
-        sensor = task.thermal.model.sensor
-        raise DataError(
-            f"{task.path}: ({x:g}, {y:g}) px lies outside the model's {sensor.width}×"
-            f"{sensor.height} px; of another camera, or binned (--size)?"
-        )
-    found = correct_points(
-        task.thermal, task.log, numbers[:, 0], numbers[:, 1:], task.asked_c,
-        task.temperature_sd, task.extrapolate,
-    )  # fmt: skip
     extra = ["dx", "dy", "sd_x", "sd_y", "temperature", "extrapolated_K"]
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*header, *extra])
-    moved = found.points - numbers[:, 1:]
-    for i, row in enumerate(rows):
-        row = {**row, "x": f"{found.points[i, 0]:.5f}", "y": f"{found.points[i, 1]:.5f}"}
-        tail = [*moved[i], *found.sds[i], found.temperature[i], found.extrapolated[i]]
-        writer.writerow([*(row[n] for n in header), *(f"{v:.6g}" for v in tail)])
-    if out is not None:
-        write_text(text.getvalue(), out)
-    summary: dict[str, Any] = {
-        "format": "thermocald-correction/1",
-        "points": len(rows),
-        "corrected_to": task.corrected_to,
-        "rms_correction_px": float(np.sqrt(np.mean(moved**2))),
-        "rms_left_over_px": float(np.sqrt(np.mean(found.sds**2))),
-        "extrapolated_rows": int((found.extrapolated > 0).sum()),
-    }
-    if not write_result(summary, json):
-        return
-    if out is None:
-        typer.echo(text.getvalue(), nl=False)
-    else:
-        typer.echo(
-            f"{out}: {len(rows)} points corrected by {summary['rms_correction_px']:.3f} px (RMS); "
-            f"left over ± {summary['rms_left_over_px']:.3f} px"
-        )
+    for header, rows, numbers in row_blocks(task.path, ("time", "x", "y"), task.clock):
+        inside = task.thermal.model.sensor.contains(numbers[:, 1:])
+        if not inside.all():
+            x, y = numbers[np.argmin(inside), 1:]
+            sensor = task.thermal.model.sensor
+            raise DataError(
+                f"{task.path}: ({x:g}, {y:g}) px lies outside the model's {sensor.width}×"
+                f"{sensor.height} px; of another camera, or binned (--size)?"
+            )
+        found = correct_points(
+            task.thermal, task.log, numbers[:, 0], numbers[:, 1:], task.asked_c,
+            task.temperature_sd, task.extrapolate,
+        )  # fmt: skip
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        if not sums.points:
+            writer.writerow([*header, *extra])
+        moved = found.points - numbers[:, 1:]
+        for i, row in enumerate(rows):
+            row = {**row, "x": f"{found.points[i, 0]:.5f}", "y": f"{found.points[i, 1]:.5f}"}
+            tail = [*moved[i], *found.sds[i], found.temperature[i], found.extrapolated[i]]
+            writer.writerow([*(row[n] for n in header), *(f"{v:.6g}" for v in tail)])
+        sums.points += len(rows)
+        sums.moved += float(np.sum(moved**2))
+        sums.left_over += float(np.sum(found.sds**2))
+        sums.extrapolated += int((found.extrapolated > 0).sum())
+        yield text.getvalue()
 
 
 def _images(task: _Task, out: Path, json: str | None) -> None:

@@ -13,6 +13,7 @@ import json
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from itertools import islice
+from math import isfinite
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -266,7 +267,7 @@ def _cells(
     if np.issubdtype(values.dtype, np.integer):
         return [str(v) for v in values.tolist()]
     digits = [
-        "" if not np.isfinite(v) else f"{v:.6f}" if name == "frame_time" else repr(v)
+        "" if not isfinite(v) else f"{v:.6f}" if name == "frame_time" else repr(v)
         for v in values.tolist()
     ]
     return [d.replace(".", style.decimal) for d in digits] if style.decimal != "." else digits

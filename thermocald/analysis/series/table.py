@@ -7,6 +7,7 @@ adjusted together from their observations (`adjusted`).
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from math import isfinite
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -154,14 +155,21 @@ def csv_text(table: SeriesTable) -> Iterable[str]:
     """The table as lines of CSV (CONVENTIONS §4): a result's figures with all their digits."""
     yield ",".join(CSV_COLUMNS) + "\n"
 
-    def cell(value: float) -> str:
-        return repr(value) if np.isfinite(value) else ""
-
     for part in table.parts():
-        for i, number in enumerate(part.number.tolist()):
-            row = [str(number), f"{part.frame_time[i]:.6f}", cell(float(part.temperature[i]))]
-            row += [cell(v) for v in part.values[i].tolist()]
-            row += [cell(float(part.sigma0[i])), str(part.n_observations[i])]
-            row += [str(part.n_rejected[i]), part.status[i]]
-            row += [cell(v) for v in part.sd[i].tolist()]
-            yield ",".join(row) + "\n"
+        columns = [
+            [str(n) for n in part.number.tolist()],
+            [f"{t:.6f}" for t in part.frame_time.tolist()],
+            _cells(part.temperature),
+            *(_cells(column) for column in part.values.T),
+            _cells(part.sigma0),
+            [str(n) for n in part.n_observations.tolist()],
+            [str(n) for n in part.n_rejected.tolist()],
+            part.status,
+            *(_cells(column) for column in part.sd.T),
+        ]
+        yield from (",".join(row) + "\n" for row in zip(*columns, strict=True))
+
+
+def _cells(column: Array) -> list[str]:
+    """Numbers with all their digits, nothing where there is none."""
+    return [repr(v) if isfinite(v) else "" for v in column.tolist()]

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.statistics.noise_models import grid, pooled, spectra
+from thermocald.analysis.statistics.noise_models import Frequencies, cosines, grid, spectra
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array
@@ -86,16 +86,11 @@ def slope_noise(y: Array, x: Array, slope: float, sd_x: float = 0.0) -> SlopeNoi
     Finite values, evenly spaced; n ≥ 4; sd_x: noise of x. Gaps must be closed up by the caller:
     values on both sides of a gap then count as neighbours.
     """
-    from scipy.fft import dct
-
     n = len(y)
-    u = dct(x - x.mean(), norm="ortho")[1:]
-    r = y - slope * x
-    r -= r.mean()
-    r = dct(r, norm="ortho", overwrite_x=True)[1:]
+    u, r = cosines(x), cosines(y - slope * x)
     # Frequencies at which x is its own noise say nothing of the slope.
     power = u * u
-    around = np.convolve(power, np.full(_NEIGHBOURS, 1.0 / _NEIGHBOURS), "same")[: n - 1]
+    around = np.convolve(power, np.full(_NEIGHBOURS, 1.0 / _NEIGHBOURS), "same")[: len(u)]
     unknown = around < min(_ABOVE_NOISE * sd_x**2, float(around.max()))
     del around
     uu, ur = power, u  # in their place: of a year of epochs every array counts
@@ -105,17 +100,17 @@ def slope_noise(y: Array, x: Array, slope: float, sd_x: float = 0.0) -> SlopeNoi
     ur += slope * sd_x**2
     ur[unknown] = 0.0
     r *= r
-    frequency = np.pi * np.arange(1, n) / n
-    count, frequency, uu, ur, rr = pooled(frequency, uu, ur, r)
+    at = Frequencies.of(len(r))
+    uu, ur, rr = at.sums(uu), at.sums(ur), at.sums(r)
     phi, coloured, tau, prior = _models(max(_LONGEST, float(n)))
-    spectrum = spectra(frequency, phi, coloured)
+    spectrum = spectra(at.mean, phi, coloured)
 
     weight = 1.0 / spectrum
     information = np.maximum(weight @ uu, np.finfo(float).tiny)
     off = weight @ ur / information
-    degrees = n - 2
+    degrees = len(r) - 1
     residual = np.maximum(weight @ rr - off**2 * information, np.finfo(float).tiny)
-    deviance = degrees * np.log(residual) + np.log(spectrum) @ count + np.log(information)
+    deviance = degrees * np.log(residual) + np.log(spectrum) @ at.count + np.log(information)
     plausible = prior * np.exp(-0.5 * (deviance - deviance.min()))
     plausible /= plausible.sum()
     freedom = max(degrees - 2, 1)

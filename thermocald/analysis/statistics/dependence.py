@@ -14,7 +14,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.analysis.statistics.autocorrelation import slope_noise
-from thermocald.analysis.statistics.noise_models import MODELS, largest_p_value, pooled, spectra
+from thermocald.analysis.statistics.noise_models import (
+    MODELS,
+    Frequencies,
+    cosines,
+    largest_p_value,
+    spectra,
+)
 from thermocald.analysis.statistics.straight_line import fit_straight_line
 
 if TYPE_CHECKING:
@@ -76,19 +82,17 @@ def slope_p_value(values: Array, temperature: Array) -> float:
 
     The t-test of the slope by generalised least squares, its largest p-value over the noise models.
     """
-    from scipy.fft import dct
     from scipy.stats import t
 
-    n = len(values)
-    v, u = (dct(one - one.mean(), norm="ortho")[1:] for one in (values, temperature))
-    frequency = np.pi * np.arange(1, n) / n
-    count, frequency, uu, uv, vv = pooled(frequency, u * u, u * v, v * v)
-    spectrum = spectra(frequency, *MODELS)
+    v, u = cosines(values), cosines(temperature)
+    at = Frequencies.of(len(v))
+    vv, uv, uu = at.sums(v * v), at.sums(u * v), at.sums(u * u)
+    spectrum = spectra(at.mean, *MODELS)
     weight = 1.0 / spectrum
     information, product = weight @ uu, weight @ uv
     left = np.maximum(weight @ vv - product**2 / information, np.finfo(float).tiny)
-    degrees = n - 2
-    deviance = degrees * np.log(left) + np.log(spectrum) @ count + np.log(information)
+    degrees = len(v) - 1
+    deviance = degrees * np.log(left) + np.log(spectrum) @ at.count + np.log(information)
     p = 2 * t.sf(np.abs(product) / np.sqrt(information * left / degrees), degrees)
     return largest_p_value(np.asarray(p), deviance)
 

@@ -25,7 +25,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.statistics.noise_models import MODELS, largest_p_value, pooled, spectra
+from thermocald.analysis.statistics.noise_models import (
+    MODELS,
+    Frequencies,
+    cosines,
+    largest_p_value,
+    spectra,
+)
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array
@@ -130,19 +136,13 @@ def _without_jumps(y: Array) -> Array:
     return np.concatenate([[0.0], np.cumsum(calm)])
 
 
-def _cosines(y: Array) -> Array:
-    """Cosine coefficients (n - 1,) of a series about its mean, orthonormal."""
-    from scipy.fft import dct
-
-    return np.asarray(dct(y - y.mean(), norm="ortho")[1:])
-
-
 def _spectrum(y: Array) -> _Spectrum:
-    coefficients = _cosines(y)
-    frequency = np.pi * np.arange(1, len(y)) / len(y)
-    count, frequency, power = pooled(frequency, coefficients**2)
-    single = int(np.argmax(count > 1)) if count[-1] > 1 else len(count)
-    return _Spectrum(power, count, frequency, coefficients[:single])
+    coefficients = cosines(y)
+    at = Frequencies.of(len(coefficients))
+    single = int(np.argmax(at.count > 1)) if at.count[-1] > 1 else len(at.count)
+    return _Spectrum(
+        at.sums(coefficients**2), at.count, at.mean, coefficients[:single].copy()
+    )
 
 
 def _bands(n: int, window: int, spectrum: _Spectrum) -> list[int]:
@@ -189,7 +189,7 @@ def _without_trend(fast: _Spectrum, n: int, band: int) -> Array:
 def _trend(n: int, count: int) -> Array:
     """The first coefficients (count, 2) of a line and a parabola over n epochs."""
     t = np.linspace(-1.0, 1.0, n)
-    return np.stack([_cosines(t**k)[:count] for k in (1, 2)], axis=1)
+    return np.stack([cosines(t**k)[:count] for k in (1, 2)], axis=1)
 
 
 def _excess(whole: _Spectrum, fast: _Spectrum, band: int, redundancy: float) -> float:

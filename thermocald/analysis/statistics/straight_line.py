@@ -68,24 +68,33 @@ def fit_straight_line(
         beta = u * var_y
         beta += slope * v * var_x
         beta *= weight
-        wb = weight * beta
-        previous, slope = slope, float(np.dot(wb, v) / np.dot(wb, u))
-        del wb, v
+        weighted = weight * beta
+        previous, slope = slope, float(np.dot(weighted, v) / np.dot(weighted, u))
+        del weighted, v  # of a year of epochs every array counts
         u *= u
         if abs(slope - previous) <= _CONVERGED / np.sqrt(float(np.dot(weight, u))):
             break
     del u
     weight = np.broadcast_to(1.0 / (var_y + slope**2 * var_x), x.shape)
-    adjusted = xb + beta
+    adjusted = beta
+    adjusted += xb
     adjusted_mean = float(np.dot(weight, adjusted)) / total
-    sd_slope = float(1.0 / np.sqrt(np.dot(weight, (adjusted - adjusted_mean) ** 2)))
+    adjusted -= adjusted_mean
+    adjusted *= adjusted
+    sd_slope = float(1.0 / np.sqrt(np.dot(weight, adjusted)))
+    del adjusted, beta
     at_zero = adjusted_mean + mean_x
-    residual = v0 - yb - slope * (u0 - xb)
+    u0 -= xb
+    u0 *= slope
+    v0 -= yb
+    v0 -= u0
+    residual = v0
+    residual *= residual
     return StraightLine(
         slope,
         sd_slope,
         mean_y + yb - slope * (mean_x + xb),
         float(np.hypot(1 / np.sqrt(total), at_zero * sd_slope)),
-        float(np.dot(weight, residual**2)),
+        float(np.dot(weight, residual)),
         n - 2,
     )

@@ -20,7 +20,7 @@ from thermocald.analysis.study.measured import Clip, MeasuredSeries, Thermometer
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
-from thermocald.photogrammetry.series.spool import ColumnSpool, released
+from thermocald.photogrammetry.series.spool import ColumnSpool, give_back, released
 from thermocald.photogrammetry.series.words import Words
 from thermocald.reduction.thermometer import reading_noise
 from thermocald.store.recording.reader import open_recording
@@ -65,7 +65,9 @@ def load_series(
         if not source.is_dir():
             return _of_store(source, label, thermometer_sd, exterior, jobs)
         source = open_recording(source)
-    return [from_recording(source, label, thermometer_sd, exterior, free, advance, jobs)]
+    found = [from_recording(source, label, thermometer_sd, exterior, free, advance, jobs)]
+    give_back()
+    return found
 
 
 def _of_store(
@@ -106,7 +108,8 @@ def from_recording(
         )
         for name, channel in recording.channels.items()
     ]
-    framed = [i for i, ok in enumerate(table.ok) if ok and columns.frames[i]]
+    ok = table.ok
+    framed = [i for i, frame in enumerate(columns.frames) if frame and ok[i]]
     clip = None
     if len(framed) > 1:
         first, last = framed[0], framed[-1]

@@ -246,25 +246,27 @@ def _significance(
     result = {}
     for name in series.free:
         values, sds = series.column(name)
-        test = moving_f_test(
-            values, sds, series.redundancy, series.time_s, settings.window, settings.alpha
-        )
+        tested = _moving(series, values, sds, settings)
         drift = drift_test(values, sds, series.redundancy, settings.window)
-        ratio = test.ratio
-        some = slice(None, None, max(1, -(-len(ratio) // _COURSE)))
-        course = np.column_stack([series.time_s[test.index[some]], ratio[some]])
-        result[name] = Significance(
-            test.success_ratio,
-            len(test.index),
-            test.left_out,
-            test.degrees_variance,
-            float(np.median(test.degrees_sd)),
-            float(np.median(test.critical)),
-            float(np.median(ratio)),
-            course,
-            drift,
-        )
+        result[name] = replace(tested, drift=drift)
     return _corrected(result)
+
+
+def _moving(
+    series: MeasuredSeries, values: Array, sds: Array, settings: StudySettings
+) -> Significance:
+    """The moving F-test of one parameter, summed up."""
+    test = moving_f_test(
+        values, sds, series.redundancy, series.time_s, settings.window, settings.alpha
+    )
+    ratio = test.ratio
+    some = slice(None, None, max(1, -(-len(ratio) // _COURSE)))
+    return Significance(
+        test.success_ratio, len(test.index), test.left_out, test.degrees_variance,
+        float(np.median(test.degrees_sd)), float(np.median(test.critical)),
+        float(np.median(ratio)), np.column_stack([series.time_s[test.index[some]], ratio[some]]),
+        None,
+    )  # fmt: skip
 
 
 def _corrected(result: dict[str, Significance]) -> dict[str, Significance]:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+from array import array
 from dataclasses import dataclass
 from datetime import datetime
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,7 +22,7 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
 
-__all__ = ["TemperatureLog", "read_rows", "read_temperature_log", "read_times"]
+__all__ = ["TemperatureLog", "read_rows", "read_temperature_log", "row_blocks"]
 
 _TIME_NAMES = ("time", "temperature_time", "frame_time", "timestamp")
 _OTHER_UNITS = ("fahrenheit", "degf", "°f", "_f", "kelvin", "degk", "_k")
@@ -37,33 +39,46 @@ class TemperatureLog:
     channels: dict[str, Array]
 
 
-def read_times(path: Path, texts: list[tuple[int, str]], column: str, clock: DeviceClock) -> Array:
-    """Seconds since 1970 UTC (n,) from (line, text) of a column: numbers, or dates with times.
+class _Times:
+    """A column of times while it is read: numbers, or dates with times; of a year of rows too."""
 
-    Raises DataError for what is neither, and for a time whose zone nobody says.
-    """
-    seconds = np.full(len(texts), np.nan)
-    dated: dict[int, datetime] = {}
-    for i, (line, text) in enumerate(texts):
+    def __init__(self, path: Path, column: str) -> None:
+        self._path, self._column = path, column
+        self._seconds, self._lines = array("d"), array("q")
+        self._dated: dict[int, datetime] = {}
+
+    def __len__(self) -> int:
+        return len(self._seconds)
+
+    def where(self, row: int) -> str:
+        """A row's place in the file, as errors name it."""
+        return f"{self._path}, line {self._lines[row]}, column {self._column}"
+
+    def add(self, line: int, text: str) -> None:
+        """One more. Raises DataError for what is no time."""
+        self._lines.append(line)
+        self._seconds.append(np.nan)
         try:
-            seconds[i] = float(text)
+            seconds = float(text)
         except ValueError:
             try:
                 moment = parse_moment(text)
             except ValueError:
                 moment = None
             if not isinstance(moment, datetime):
-                raise DataError(
-                    f"{path}, line {line}, column {column}: {text!r} is not a time"
-                ) from None
-            dated[i] = moment
-        if i not in dated and not np.isfinite(seconds[i]):
-            raise DataError(f"{path}, line {line}, column {column}: {text!r} is not a time")
-    places = list(dated)
-    seconds[places] = clock.utc(
-        list(dated.values()), lambda k: f"{path}, line {texts[places[k]][0]}, column {column}"
-    )
-    return seconds
+                raise DataError(f"{self.where(-1)}: {text!r} is not a time") from None
+            self._dated[len(self) - 1] = moment
+            return
+        if not np.isfinite(seconds):
+            raise DataError(f"{self.where(-1)}: {text!r} is not a time")
+        self._seconds[-1] = seconds
+
+    def utc(self, clock: DeviceClock) -> Array:
+        """Seconds since 1970 UTC (n,). Raises DataError for a time whose zone nobody says."""
+        seconds = np.array(self._seconds)
+        places = list(self._dated)
+        seconds[places] = clock.utc(list(self._dated.values()), lambda k: self.where(places[k]))
+        return seconds
 
 
 def read_temperature_log(
@@ -91,21 +106,21 @@ def read_temperature_log(
     if not names:
         raise DataError(f"{path}: there is no temperature column")
     ordered = [reference, *(n for n in names if n != reference)] if reference else names
-    texts: list[tuple[int, str]] = []
-    values: list[list[float]] = []
+    known = _Times(path, time_column)
+    values = [array("d") for _ in ordered]
     for line, row in rows:
         if not row[time_column]:
             continue
-        texts.append((line, row[time_column]))
-        values.append([_number(path, line, n, row[n]) if row[n] else np.nan for n in ordered])
-    if not texts:
+        known.add(line, row[time_column])
+        for column, name in zip(values, ordered, strict=True):
+            column.append(_number(path, line, name, row[name]) if row[name] else np.nan)
+    if not len(known):
         raise DataError(f"{path}: holds no rows")
-    times = read_times(path, texts, time_column, clock)
+    times = known.utc(clock)
     back = np.nonzero(np.diff(times) < 0)[0]
     if len(back):
-        line = texts[int(back[0]) + 1][0]
-        raise DataError(f"{path}, line {line}, column {time_column}: time runs backwards")
-    columns = np.array(values)
+        raise DataError(f"{known.where(int(back[0]) + 1)}: time runs backwards")
+    columns = np.array(values).T
     for i, name in enumerate(ordered):
         if np.nanmin(columns[:, i], initial=np.inf) > _KELVIN_FROM:
             raise DataError(
@@ -126,44 +141,72 @@ def _is_ours(path: Path) -> bool:
 
 
 def _table(path: Path) -> tuple[list[str], Iterator[tuple[int, dict[str, str]]]]:
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as cause:
+    """The header, and the rows with their lines, which are read one by one."""
+
+    def unreadable(cause: OSError | UnicodeDecodeError) -> DataError:
         what = cause.strerror if isinstance(cause, OSError) else "is not UTF-8 text"
-        raise DataError(f"{path}: cannot be read: {what}") from cause
-    reader = csv.DictReader(text.splitlines())
-    header = [n.strip() for n in reader.fieldnames or ()]
-    reader.fieldnames = header
+        return DataError(f"{path}: cannot be read: {what}")
+
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            header = [n.strip() for n in next(csv.reader(file), [])]
+    except (OSError, UnicodeDecodeError) as cause:
+        raise unreadable(cause) from cause
 
     def rows() -> Iterator[tuple[int, dict[str, str]]]:
-        for row in reader:
-            if None in row or any(v is None for v in row.values()):
-                raise DataError(f"{path}, line {reader.line_num}: has not {len(header)} columns")
-            yield reader.line_num, {k: (v or "").strip() for k, v in row.items()}
+        try:
+            with path.open(encoding="utf-8-sig", newline="") as file:
+                reader = csv.reader(file)
+                next(reader, None)
+                for row in reader:
+                    if not row:
+                        continue
+                    if len(row) != len(header):
+                        raise DataError(
+                            f"{path}, line {reader.line_num}: has not {len(header)} columns"
+                        )
+                    yield reader.line_num, dict(zip(header, map(str.strip, row), strict=True))
+        except (OSError, UnicodeDecodeError) as cause:
+            raise unreadable(cause) from cause
 
     return header, rows()
 
 
-def read_rows(
-    path: Path, needed: tuple[str, ...], clock: DeviceClock | None = None
-) -> tuple[list[str], list[dict[str, str]], Array]:
+Rows = tuple[list[str], list[dict[str, str]], "Array"]
+
+
+def read_rows(path: Path, needed: tuple[str, ...], clock: DeviceClock | None = None) -> Rows:
     """A CSV with a time column and others: header, rows, numbers (n, len(needed)), time first.
 
     clock: of times without a zone, which are refused without.
     """
+    parts = list(row_blocks(path, needed, clock))
+    kept = [row for _, rows, _ in parts for row in rows]
+    return parts[0][0], kept, np.concatenate([numbers for _, _, numbers in parts])
+
+
+def row_blocks(
+    path: Path, needed: tuple[str, ...], clock: DeviceClock | None = None, size: int = 100_000
+) -> Iterator[Rows]:
+    """What `read_rows` reads, at most `size` rows at a time."""
     header, rows = _table(path)
     missing = [n for n in needed if n not in header]
     if missing:
         raise DataError(f"{path}: there is no column {missing[0]!r}; there are {', '.join(header)}")
-    kept, numbers, texts = [], [], []
-    for line, row in rows:
-        kept.append(row)
-        texts.append((line, row["time"]))
-        numbers.append([_number(path, line, n, row[n]) for n in needed if n != "time"])
-    if not kept:
+    others = [n for n in needed if n != "time"]
+    first = True
+    while part := list(islice(rows, size)):
+        times = _Times(path, "time")
+        for line, row in part:
+            times.add(line, row["time"])
+        numbers = np.array([[_number(path, line, n, row[n]) for n in others] for line, row in part])
+        seconds = times.utc(clock or DeviceClock())
+        yield header, [row for _, row in part], np.column_stack(
+            [seconds, numbers.reshape(len(part), -1)]
+        )
+        first = False
+    if first:
         raise DataError(f"{path}: holds no rows")
-    times = read_times(path, texts, "time", clock or DeviceClock())
-    return header, kept, np.column_stack([times, np.array(numbers).reshape(len(kept), -1)])
 
 
 def _number(path: Path, line: int, column: str, text: str) -> float:

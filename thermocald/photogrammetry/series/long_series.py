@@ -26,6 +26,7 @@ from thermocald.photogrammetry.series.covariances import line_weights, of_slow_t
 from thermocald.photogrammetry.series.estimator import ENOUGH_FOR_NOISE
 from thermocald.photogrammetry.series.known import KnownSeries
 from thermocald.photogrammetry.series.long_result import LongAdjustment, RowWriter
+from thermocald.photogrammetry.series.spool import give_back
 from thermocald.photogrammetry.series.target_noise import slow_errors
 
 if TYPE_CHECKING:
@@ -87,6 +88,7 @@ def adjust_long_series(
         if solved.rest <= _SAME or turn == _PASSES:
             break
         blocks = replace(blocks, known=replace(blocks.known, shared=solved.shared))
+    give_back()
     return _finished(blocks, solved, out, whole, rows, turn)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 if TYPE_CHECKING:
     from thermocald.arrays import Array
 
-__all__ = ["ColumnSpool", "released"]
+__all__ = ["ColumnSpool", "give_back", "released"]
 
 _LONG = 2_000_000  # rows
 _MMAP_THRESHOLD, _LARGE_BYTES = -3, 1 << 24  # of malloc.h; two million numbers
@@ -27,7 +27,7 @@ class ColumnSpool:
 
     def __init__(self, rows: int, columns: int) -> None:
         if rows > _LONG:
-            _give_back()
+            _map_large_arrays()
         size = max(rows * columns, 1) * 8
         with tempfile.TemporaryFile() as file:
             file.truncate(size)
@@ -40,7 +40,7 @@ class ColumnSpool:
         self._map.madvise(mmap.MADV_DONTNEED)
 
 
-def _give_back() -> None:
+def _map_large_arrays() -> None:
     """Have freed arrays of 16 MB and more leave this process at once.
 
     Otherwise the C library keeps those of up to 32 MB, a column of a year, for later ones that do
@@ -49,6 +49,13 @@ def _give_back() -> None:
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:  # glibc
         mallopt(_MMAP_THRESHOLD, _LARGE_BYTES)
+
+
+def give_back() -> None:
+    """Return what was freed to the system: the C library keeps what many blocks have left."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:  # glibc
+        trim(0)
 
 
 def released(array: Array) -> None:

@@ -123,6 +123,7 @@ def _study(
 ) -> Study:
     from thermocald.analysis.study.input import load_series
     from thermocald.analysis.study.study import study as run
+    from thermocald.photogrammetry.series.spool import give_back
     from thermocald.store.recording.reader import open_recording
 
     series: list[MeasuredSeries] = []
@@ -137,6 +138,7 @@ def _study(
                 settings.jobs,
             )  # fmt: skip
         del recording  # its columns are not needed any more
+        give_back()
     _refuse_copies(series)
     cameras = len({one.label for one in series})
     with progress(settings.sets * cameras, "simulating") as advance:

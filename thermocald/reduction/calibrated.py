@@ -17,7 +17,7 @@ from thermocald.reduction.fit import HypothesisFitter
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from thermocald.arrays import Array
+    from thermocald.arrays import Array, Mask
     from thermocald.reduction.series import ReducedSeries
 
 __all__ = ["calibrated_thermometers"]
@@ -40,15 +40,15 @@ def calibrated_thermometers(series: Sequence[ReducedSeries]) -> list[ReducedSeri
         precision = np.einsum("p,epq,q->e", d, e.N, d)
         ok = precision > 0
         own = instrument.noise**2
-        if ok.sum() > 20:
+        alike = _alike(e, ok)
+        if alike.sum() > 18:
             trajectory = fitter.drive_trajectory((), s)
             matrix = e.history.temperature_matrix() @ instrument.mixing
             shown = trajectory + matrix @ instrument.deviation
             # what the image says of T beyond its level, in K
             rest = (e.b @ d)[ok] / precision[ok] - shown[ok]
-            second = np.diff(rest, 2)
-            image = 6.0 * float(np.mean(1.0 / precision[ok]))
-            shown_by_image = (_clipped(second) ** 2 - image) / 6.0
+            image = 6.0 * float(np.mean(1.0 / precision[ok][1:-1][alike]))
+            shown_by_image = (_clipped(np.diff(rest, 2)[alike]) ** 2 - image) / 6.0
             if shown_by_image < 1.5 * own:
                 own = max(0.5 * (own + shown_by_image), 0.25 * own)
         variances.append(own)
@@ -62,6 +62,19 @@ def calibrated_thermometers(series: Sequence[ReducedSeries]) -> list[ReducedSeri
         channels = {**e.thermometers, name: replace(old, sd=old.sd * ratio, noise=noise)}
         out.append(replace(e, thermometers=channels))
     return out
+
+
+def _alike(series: ReducedSeries, ok: Mask) -> Mask:
+    """Which of the rows with a result (n - 2,) are like both neighbours.
+
+    In a long series that was condensed the usual mean among its like: short means are as noisy as
+    their neighbours are sharp.
+    """
+    counts = series.source.counts
+    if counts is None:
+        return np.ones(max(int(ok.sum()) - 2, 0), dtype=bool)
+    usual = counts[ok] == np.median(counts[ok])
+    return np.asarray(usual[:-2] & usual[1:-1] & usual[2:])
 
 
 def _clipped(values: Array) -> float:

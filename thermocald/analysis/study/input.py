@@ -66,6 +66,7 @@ def load_series(
             return _of_store(source, label, thermometer_sd, exterior, jobs)
         source = open_recording(source)
     found = [from_recording(source, label, thermometer_sd, exterior, free, advance, jobs)]
+    del source  # where it was opened here
     give_back()
     return found
 

@@ -95,27 +95,23 @@ class MeasuredSeries:
     @cached_property
     def free(self) -> tuple[str, ...]:
         """The IOP that were estimated, in their order."""
-        free = tuple(name for k, name in enumerate(IOP_NAMES) if bool(np.any(self.sds[:, k] > 0)))
-        released(self.sds)
-        return free
+        return tuple(n for n in IOP_NAMES if bool(np.any(self._column(self.sds, n) > 0)))
 
     @cached_property
     def mean(self) -> Array:
         """The mean interior orientation (10,) of the epochs."""
-        mean = np.array([np.mean(self.values[:, k]) for k in range(self.values.shape[1])])
-        released(self.values)
-        return mean
+        return np.array([np.mean(self._column(self.values, name)) for name in IOP_NAMES])
+
+    @staticmethod
+    def _column(values: Array, name: str) -> Array:
+        """A copy (E,): columns of a series of a year are on disk, and leave memory again."""
+        out: Array = values[:, IOP_NAMES.index(name)].copy()
+        released(values)
+        return out
 
     def column(self, name: str) -> tuple[Array, Array]:
-        """Values and standard deviations (E,) of one parameter of the interior orientation.
-
-        Copies: those of a series of a year are on disk, and leave memory again.
-        """
-        k = IOP_NAMES.index(name)
-        values, sds = self.values[:, k].copy(), self.sds[:, k].copy()
-        released(self.values)
-        released(self.sds)
-        return values, sds
+        """Values and standard deviations (E,) of one parameter of the interior orientation."""
+        return self._column(self.values, name), self._column(self.sds, name)
 
     @property
     def reference(self) -> Thermometer | None:

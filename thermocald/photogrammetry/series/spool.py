@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import mmap
 import tempfile
 from typing import TYPE_CHECKING
@@ -52,7 +53,12 @@ def _map_large_arrays() -> None:
 
 
 def give_back() -> None:
-    """Return what was freed to the system: the C library keeps what many blocks have left."""
+    """Return what is not used any more to the system.
+
+    A recording that was read is part of a circle of references, which waits to be collected; the C
+    library keeps what many blocks have left.
+    """
+    gc.collect()
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:  # glibc
         trim(0)

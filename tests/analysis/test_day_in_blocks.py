@@ -1,0 +1,99 @@
+"""A day adjusted, studied and fitted in blocks: the numbers of one block that holds all of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from benchmarks.adjustment import EXTERIOR, INTERIOR
+from benchmarks.long_recording import write_long_recording
+from thermocald.analysis.series import adjusted, recorded
+from thermocald.analysis.study.input import load_series as measured
+from thermocald.analysis.study.study import StudySettings, study
+from thermocald.analysis.thermal.thermal_model import fit_thermal_model
+from thermocald.photogrammetry.series.blocks import GridBlocks, gathered
+from thermocald.photogrammetry.series.long_series import adjust_long_series
+from thermocald.photogrammetry.series.result import SeriesSettings
+from thermocald.reduction.condense import condensed
+from thermocald.reduction.reduce import reduce_series
+from thermocald.reduction.source import load_series
+from thermocald.store.recording.reader import Recording, open_recording
+
+DAY = 8640
+SAME = 1e-9  # of the principal distance, or of a rate
+TOGETHER = 2000  # epochs of the sample, rows of the fit
+
+
+@dataclass(frozen=True)
+class Day:
+    """A recording of a day, and all its observations in one grid."""
+
+    recording: Recording
+    grid: object
+
+    def blocks(self, size):
+        """The observations, `size` epochs at a time."""
+        return GridBlocks(self.grid, size)
+
+
+@pytest.fixture(scope="module")
+def day(tmp_path_factory):
+    pytest.importorskip("pyarrow")
+    path = tmp_path_factory.mktemp("day") / "day"
+    write_long_recording(path, DAY, 21)
+    recording = open_recording(path)
+    return Day(recording, gathered(recording, [slice(0, DAY)]))
+
+
+@pytest.mark.slow
+def test_the_series(day):
+    r = day.recording
+    one, many = (
+        adjust_long_series(
+            r.camera.sensor, r.testfield, day.blocks(size), INTERIOR, EXTERIOR, SeriesSettings(),
+            together=TOGETHER,
+        )
+        for size in (DAY, 500)
+    )  # fmt: skip
+    apart = np.abs(many.rows.values - one.rows.values)[:, :10]
+    assert np.nanmax(apart[:, :3]) < SAME * INTERIOR.c
+    assert np.nanmax(apart / one.rows.sd[:, :10]) < 1e-5
+    assert many.rows.status == one.rows.status
+    np.testing.assert_allclose(many.level_sd, one.level_sd, rtol=1e-6, atol=1e-15)
+
+
+@pytest.mark.slow
+def test_the_study(day, monkeypatch):
+    for module in (adjusted, recorded):
+        monkeypatch.setattr(module, "together_at_most", lambda _: TOGETHER)
+    found = []
+    for size in (DAY, 500):
+        blocks = day.blocks(size)
+        monkeypatch.setattr(
+            Recording, "blocks", lambda _, windows=None, b=blocks: b.blocks(windows)
+        )
+        (camera,) = study(measured(day.recording), StudySettings(sets=1000)).cameras
+        found.append(camera)
+    one, many = found
+    np.testing.assert_allclose(many.iop[:3], one.iop[:3], rtol=0, atol=SAME * INTERIOR.c)
+    np.testing.assert_allclose(many.sds, one.sds, rtol=1e-5)
+    a, b = (camera.series[0] for camera in found)
+    for name in ("c", "x0", "y0"):
+        assert abs(b.deviations[name].change - a.deviations[name].change) < SAME * INTERIOR.c
+        assert b.significance[name].success_ratio == a.significance[name].success_ratio
+        slopes = [x.channels[0].dependences[name].slope for x in (a, b)]
+        assert abs(slopes[1] - slopes[0]) < SAME * INTERIOR.c  # over a kelvin
+
+
+@pytest.mark.slow
+def test_the_fit(day):
+    (series,) = load_series(day.recording.path)
+    rates = []
+    for size in (DAY, 500):
+        short = condensed(series, day.blocks(size), TOGETHER)
+        assert len(short.frame_times) < DAY / 2
+        fitted = fit_thermal_model([reduce_series(short, affinity=False, strict=False)], [])
+        rates.append([fitted.model.rates[name] for name in ("c", "x0", "y0")])
+    np.testing.assert_allclose(rates[1], rates[0], rtol=SAME)

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.linalg import MAD_TO_SD
+from thermocald.photogrammetry.series.blocks import recut
 from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.reduction.thermometer import reading_noise
 
@@ -38,6 +39,7 @@ _COARSE = 0.8  # of the rows are long means
 _SHORTEST, _LONGEST = 4, 24  # long means of a window
 _FINER = 12  # short means in a long one
 _NEIGHBOURS = 5  # epochs that tell a gross error
+_AT_ONCE = 4_000  # epochs
 _GROSS = 6.0  # standard deviations from the median of a short mean
 
 
@@ -177,7 +179,7 @@ def _averaged(
     short = fine or size
     sums = np.zeros((-(-epochs // short), 4))
     middle: Array | None = None
-    for first, grid in blocks:
+    for first, grid in recut(blocks, size * max(_AT_ONCE // size, 1)):
         w = grid.weights
         if middle is None:
             with np.errstate(invalid="ignore"):

@@ -192,8 +192,7 @@ def _simulated(
     known: the projection, the mean IOP (10,), the root (r, 10) of their covariance, the clusters.
     """
     (project, iop, root, limits), (normal, wanted) = known, draws
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        dx, dy, ok = project(iop + normal @ root)  # a set that folds the image may run away
+    dx, dy, ok = project(iop + normal @ root)
     folded = int(np.count_nonzero(~ok))
     if folded:
         dx, dy = dx[:, ok], dy[:, ok]
@@ -242,6 +241,8 @@ class _PlaneErrors:
         by_iop[:, :, 0] += self.expected / distance_mm
         self._by_iop = by_iop
 
+    # a set that folds the image may run away; it has no rays
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def __call__(self, sets: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Sets (n, 10) → errors in X and Y (k, n) mm, and which sets have rays at all (n,)."""
         step = (sets - self._iop).T

@@ -10,10 +10,11 @@ import numpy as np
 from thermocald.photogrammetry.series.normals import ObservationGrid, planes
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     "ObservedBlocks",
     "WithoutTargets",
     "gathered",
+    "recut",
     "runs",
     "spread_windows",
 ]
@@ -136,3 +138,28 @@ def gathered(source: ObservationBlocks, windows: Sequence[slice]) -> Observation
         whole.points[rows], whole.weights[rows] = grid.points, grid.weights
         done += len(grid)
     return whole or ObservationGrid(planes(2, 0, 0), planes(3, 0, 0))
+
+
+def recut(
+    blocks: Iterable[tuple[int, ObservationGrid]], length: int
+) -> Iterator[tuple[int, ObservationGrid]]:
+    """The same epochs `length` at a time, so that blocks do not depend on the reader."""
+    points: list[Array] = []
+    weights: list[Array] = []
+    begin = held = 0
+    for first, grid in blocks:
+        if not held:
+            begin = first
+        points.append(grid.points)
+        weights.append(grid.weights)
+        held += len(grid)
+        if held < length:
+            continue
+        p, w = np.concatenate(points), np.concatenate(weights)
+        whole = held // length * length
+        for k in range(0, whole, length):
+            yield begin + k, ObservationGrid(p[k : k + length], w[k : k + length])
+        begin, held = begin + whole, held - whole
+        points, weights = [p[whole:]], [w[whole:]]
+    if held:
+        yield begin, ObservationGrid(np.concatenate(points), np.concatenate(weights))

@@ -55,12 +55,12 @@ inside /usr/lib/thermocald/bin/python -c 'import sys, yaml; assert "/usr/lib/pyt
   fail "the system's modules are not seen"
 inside thermocald doctor | grep -q 'does not start with the machine' || fail "the doctor does not see the service"
 run() { inside su -s /bin/sh thermocald -c "cd /var/lib/thermocald && $1"; }
-run "thermocald simulate --preset nexus5-cold --out M1 >/dev/null 2>&1"
-lap "simulated"
-# the emulation is slow: ten epochs tell as much
-[ -z "$ROOT" ] || for table in epochs observations; do
-  sed -i -E '1!{/^([1-9]|10),/!d}' "$ROOT/var/lib/thermocald/M1/$table.csv"
-done
+if [ -d /share/M1 ]; then # the same to the bit (.ci/arm64), and an emulated minute less
+  cp -r /share/M1 "$ROOT/var/lib/thermocald"
+else
+  run "thermocald simulate --preset nexus5-cold --out M1 >/dev/null 2>&1"
+  lap "simulated"
+fi
 run "thermocald replay M1 --store series.db >/dev/null 2>&1"
 lap "first replayed epochs"
 # the bound is that of a real machine, not of an emulated one
@@ -74,9 +74,8 @@ if [ -z "$ROOT" ] && apt-cache show python3-libcamera >/dev/null 2>&1; then
 fi
 echo "# mine" >> "$ROOT/etc/thermocald/config.yaml"
 run "thermocald export series.db --output first.csv"
-schema() {
-  run "/usr/lib/thermocald/bin/python -c 'import sqlite3, sys; print(*sqlite3.connect(sys.argv[1]).execute(sys.argv[2]).fetchone())' $1 'PRAGMA user_version'"
-}
+# SQLite's user_version, where the file has it
+schema() { od -An -tu4 --endian=big -j60 -N4 "$ROOT/var/lib/thermocald/$1" | tr -d ' '; }
 old=$(schema series.db)
 
 apt_get install /share/second.deb

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import yaml
 
+from tests.daemon.forking import Forked, Forker
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import Sensor, project
 from thermocald.photogrammetry.field.testfield import Observations
@@ -43,24 +44,27 @@ def fast_run(document: str, epochs: int) -> str:
 class Daemon:
     """One `thermocald run` in a folder."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, forker: Forker) -> None:
         self.folder = folder
+        self._forker = forker
         self.store = folder / "thermocald.db"
         self.config = folder / "config.yaml"
-        self.process: subprocess.Popen[bytes] | None = None
-        self._environment = dict(ENVIRONMENT)
+        self.process: subprocess.Popen[bytes] | Forked | None = None
 
     def configure(self, **sections) -> None:
         document = {"store": {"path": str(self.store)}, "frames": {"keep": "none"}, **sections}
         self.config.write_text(yaml.safe_dump(document))
 
     def start(self, *options: str, config: bool = True, **environment: str) -> None:
-        arguments = ["--config", str(self.config)] if config else []
+        arguments = ["run", *(["--config", str(self.config)] if config else []), *options]
+        if "LD_PRELOAD" not in environment:  # which the loader reads
+            self.process = self._forker.start(self.folder, *arguments, **environment)
+            return
         log = (self.folder / "log.txt").open("ab")
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "thermocald", "run", *arguments, *options],
+            [sys.executable, "-m", "thermocald", *arguments],
             cwd=self.folder,
-            env={**self._environment, **environment},
+            env={**ENVIRONMENT, **environment},
             stdout=log,
             stderr=log,
         )
@@ -137,9 +141,17 @@ def spawn():
         process.communicate()
 
 
+@pytest.fixture(scope="session")
+def forker():
+    """What starts daemons, with everything imported."""
+    forker = Forker(ENVIRONMENT)
+    yield forker
+    forker.close()
+
+
 @pytest.fixture
-def daemon(tmp_path: Path):
-    daemon = Daemon(tmp_path)
+def daemon(tmp_path: Path, forker: Forker):
+    daemon = Daemon(tmp_path, forker)
     yield daemon
     daemon.close()
 

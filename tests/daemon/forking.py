@@ -1,6 +1,7 @@
 """Starts daemons by fork, after everything is imported: 200 starts in the time of ten.
 
-Reads one JSON list of arguments per line, forks, and prints the child's process id.
+As a program it reads one JSON document per line: {"arguments", "folder", "environment"} forks and
+prints the child's process id; {"ended": id} prints the exit status of a child that has ended.
 """
 
 from __future__ import annotations
@@ -8,26 +9,96 @@ from __future__ import annotations
 import faulthandler
 import json
 import os
+import select
 import signal
+import subprocess
 import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+
+class Forker:
+    """The program of this file, and the daemons that it starts."""
+
+    def __init__(self, environment: Mapping[str, str]) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, __file__],
+            env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert self._process.stdout.readline() == "ready\n"
+
+    def start(self, folder: Path, *arguments: str, **environment: str) -> Forked:
+        """`thermocald ARGUMENTS` in a folder, whose log.txt gets what it prints."""
+        return Forked(self, self.ask(
+            {"arguments": arguments, "folder": str(folder), "environment": environment}
+        ))  # fmt: skip
+
+    def ask(self, document: dict[str, object]) -> int:
+        self._process.stdin.write(json.dumps(document) + "\n")
+        self._process.stdin.flush()
+        return int(self._process.stdout.readline())
+
+    def close(self) -> None:
+        self._process.stdin.close()
+        self._process.wait(10)
+        self._process.stdout.close()
+
+
+class Forked:
+    """A daemon started by fork; used as a `subprocess.Popen`."""
+
+    def __init__(self, forker: Forker, pid: int) -> None:
+        self.pid = pid
+        self.returncode: int | None = None
+        self._forker = forker
+        self._handle = os.pidfd_open(pid)
+
+    def poll(self) -> int | None:
+        return self._ended(0.0)
+
+    def wait(self, timeout_s: float | None = None) -> int:
+        status = self._ended(timeout_s)
+        if status is None:
+            raise subprocess.TimeoutExpired("thermocald", timeout_s)
+        return status
+
+    def _ended(self, timeout_s: float | None) -> int | None:
+        if self.returncode is None and select.select([self._handle], [], [], timeout_s)[0]:
+            os.close(self._handle)
+            self.returncode = self._forker.ask({"ended": self.pid})
+        return self.returncode
+
+    def send_signal(self, number: int) -> None:
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        self.send_signal(signal.SIGKILL)
 
 
 def main() -> None:
     import thermocald_drivers.jsonl
+    import thermocald_drivers.mock_camera
+    import thermocald_drivers.mock_thermometer
     import thermocald_drivers.replay  # noqa: F401
 
     import thermocald.analysis.online.observer
     import thermocald.cli
     import thermocald.daemon.service
 
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # killed children are not waited for
     print("ready", flush=True)
     for line in sys.stdin:
+        asked = json.loads(line)
+        if "ended" in asked:
+            status = os.waitstatus_to_exitcode(os.waitpid(asked["ended"], 0)[1])
+            print(status, flush=True)
+            continue
         pid = os.fork()
         if pid == 0:
-            signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-            sys.stdin.close()
-            sys.argv = ["thermocald", *json.loads(line)]
+            os.chdir(asked["folder"])
+            os.environ.update(asked["environment"])
+            os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+            sys.argv = ["thermocald", *asked["arguments"]]
             log = os.open("log.txt", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
             os.dup2(log, 1)
             os.dup2(log, 2)

@@ -6,13 +6,9 @@ series' gap, or the file as damaged. THERMOCALD_CHAOS_ROUNDS=300 is the whole of
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
-import signal
 import socket
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -20,6 +16,7 @@ import numpy as np
 import pytest
 
 from tests.daemon.conftest import ENVIRONMENT
+from tests.daemon.forking import Forker
 from tests.daemon.test_page_attacks import Page
 from thermocald.errors import ThermocaldError
 from thermocald.store.database.store import Store
@@ -41,38 +38,28 @@ class Chaos:
         self.offset = offset
         self.count: dict[str, int] = {}
         self.page: Page | None = None
-        environment = {**ENVIRONMENT, "LD_PRELOAD": preload, "CLOCK_OFFSET_FILE": str(offset)}
-        self._forker = subprocess.Popen(
-            [sys.executable, str(Path(__file__).with_name("forking.py"))],
-            cwd=self.folder, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            text=True,
-        )  # fmt: skip
-        assert self._forker.stdout.readline() == "ready\n"
+        self._forker = Forker(
+            {**ENVIRONMENT, "LD_PRELOAD": preload, "CLOCK_OFFSET_FILE": str(offset)}
+        )
 
-    def start(self) -> int:
-        self._forker.stdin.write(json.dumps(["run", "--config", str(self.daemon.config)]) + "\n")
-        self._forker.stdin.flush()
-        return int(self._forker.stdout.readline())
+    def start(self) -> None:
+        self.daemon.process = self._forker.start(
+            self.folder, "run", "--config", str(self.daemon.config)
+        )
 
-    def progress(self, pid: int) -> None:
+    def progress(self) -> None:
         """Wait for a result that comes from now on."""
         size, deadline = self.results.stat().st_size, time.monotonic() + 60
         while self.results.stat().st_size == size:
             assert time.monotonic() < deadline, (self.folder / "log.txt").read_text()[-3000:]
-            assert Path(f"/proc/{pid}").exists(), (self.folder / "log.txt").read_text()[-3000:]
+            assert self.daemon.process.poll() is None, (self.folder / "log.txt").read_text()[-3000:]
             time.sleep(0.01)
-
-    def kill(self, pid: int) -> None:
-        os.kill(pid, signal.SIGKILL)
-        while Path(f"/proc/{pid}").exists():
-            time.sleep(0.005)
 
     def close(self) -> None:
         if self.page is not None:
             self.page.close()
-        self._forker.stdin.close()
-        self._forker.wait(10)
-        self._forker.stdout.close()
+        self.daemon.close()
+        self._forker.close()
 
     def told(self) -> dict[int, tuple[float, float]]:
         """What was reported as stored: {epoch: (c, frame_time)}."""
@@ -143,8 +130,8 @@ def test_what_was_reported_as_stored_is_there_and_right_or_named(chaos, tmp_path
     rng = np.random.default_rng(SEED)
     attackers: list[socket.socket] = []
     for number in range(ROUNDS):
-        pid = chaos.start()
-        chaos.progress(pid)
+        chaos.start()
+        chaos.progress()
         if chaos.page is None:
             chaos.page = Page(tmp_path, chaos.daemon.store)
         page = chaos.page
@@ -164,11 +151,11 @@ def test_what_was_reported_as_stored_is_there_and_right_or_named(chaos, tmp_path
             chosen = files if rng.random() < 0.5 else [files[int(rng.integers(len(files)))]]
             for path in chosen:
                 path.unlink(missing_ok=True)
-            chaos.progress(pid)  # what the process still has is written again with the next epoch
-            chaos.progress(pid)
+            chaos.progress()  # what the process still has is written again with the next epoch
+            chaos.progress()
             chaos.note("deletions")
         time.sleep(rng.uniform(0.0, 0.25))
-        chaos.kill(pid)
+        chaos.daemon.kill()
         chaos.note("kills")
         if rng.random() < 0.5:
             chaos.flip(rng, tmp_path / "scratch")

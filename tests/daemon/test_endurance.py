@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -23,47 +22,21 @@ KILLS = 200
 EPOCHS = int(os.environ.get("THERMOCALD_SOAK_EPOCHS", "5000"))
 
 
-@pytest.fixture
-def forker(tmp_path):
-    """A process that starts daemons in the test's folder."""
-    process = subprocess.Popen(
-        [sys.executable, str(Path(__file__).with_name("forking.py"))],
-        cwd=tmp_path,
-        env=ENVIRONMENT,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert process.stdout.readline() == "ready\n"
-
-    def start(*arguments: str) -> int:
-        process.stdin.write(json.dumps(arguments) + "\n")
-        process.stdin.flush()
-        return int(process.stdout.readline())
-
-    yield start
-    process.stdin.close()
-    process.wait(10)
-    process.stdout.close()
-
-
 @pytest.mark.timeout(1800)
-def test_two_hundred_kills_lose_no_committed_epoch(daemon, recording, replayed, forker):
+def test_two_hundred_kills_lose_no_committed_epoch(daemon, recording, replayed):
     daemon.configure(**replayed(recording))
     rng = np.random.default_rng(11)
     results = daemon.folder / "results.jsonl"
     results.touch()
     lost, restarts = 0, 0
     for kill in range(KILLS):
-        pid = forker("run", "--config", str(daemon.config))
+        daemon.start()
         size, deadline = results.stat().st_size, time.monotonic() + 30
         while results.stat().st_size == size and time.monotonic() < deadline:
             time.sleep(0.01)
         restarts += results.stat().st_size > size
         time.sleep(rng.uniform(0.0, 0.25))
-        os.kill(pid, signal.SIGKILL)
-        while Path(f"/proc/{pid}").exists():
-            time.sleep(0.005)
+        daemon.kill()
         if kill % 20 == 19:
             numbers, _ = daemon.stored()  # with an integrity check
             told = {result["epoch"] for result in daemon.results()}

@@ -94,7 +94,7 @@ class Daemon:
         lines = path.read_text().split("\n")[:-1]  # what follows the last line end is half a line
         return [json.loads(line) for line in lines]
 
-    def until(self, condition, timeout_s: float = 60.0) -> None:
+    def until(self, condition, timeout_s: float = 120.0) -> None:  # busy machines
         deadline = time.monotonic() + timeout_s
         while not condition():
             assert time.monotonic() < deadline, f"timed out; log:\n{self.log()}"

@@ -32,6 +32,7 @@ __all__ = [
     "build_missing_chunks",
     "checked_chunks",
     "forgotten_calibrations",
+    "insert_chunk",
     "loose_rows",
     "note_amended",
     "read_columns",
@@ -163,7 +164,7 @@ def build_missing_chunks(connection: sqlite3.Connection, series: int) -> None:
     ).fetchone():
         columns = latest_columns(connection, series, CHUNKED, last, end[0])
         last = end[0]
-        _insert(connection, series, first_row, last, columns)
+        insert_chunk(connection, series, first_row, last, columns)
         first_row += CHUNK
         _merge(connection, series)
 
@@ -207,16 +208,17 @@ def _merge(connection: sqlite3.Connection, series: int) -> None:
         column = columns.setdefault(name, np.full(MERGED * CHUNK, np.nan))
         column[first - first_rows[0] :][:CHUNK] = np.frombuffer(data)
     connection.execute("DELETE FROM column_chunk WHERE series_id = ? AND first_row >= ?", where)
-    _insert(connection, series, first_rows[0], last, columns)
+    insert_chunk(connection, series, first_rows[0], last, columns)
 
 
-def _insert(
+def insert_chunk(
     connection: sqlite3.Connection,
     series: int,
     first_row: int,
     last: int,
     columns: dict[str, Array],
 ) -> None:
+    """Write columns (n,) of epochs `first_row` to number `last` as one chunk."""
     connection.executemany(
         "INSERT INTO column_chunk (series_id, name, first_row, last_number, data, checksum) "
         "VALUES (?, ?, ?, ?, ?, ?)",

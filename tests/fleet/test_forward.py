@@ -44,7 +44,7 @@ def test_a_last_report_that_is_lost_is_sent_again(filled, server, monkeypatch):
         assert connection.execute("SELECT waiting FROM station").fetchone() == (0,)
 
 
-def test_server_and_store_give_the_same(filled, server, make_result):
+def test_server_and_store_give_the_same(filled, server, make_result, monkeypatch):
     store, series = filled
     store.amend(series, 5, make_result(105, "ok"))
     store.add_event(Event(1.6e9, "knock", "a \0 knock", series.id, 3, {"px": 0.4}))
@@ -60,6 +60,7 @@ def test_server_and_store_give_the_same(filled, server, make_result):
         )
         assert np.array_equal(found.testfield.points, series.testfield.points)
         names = [*store.column_names(series), "blur"]
+        monkeypatch.setattr("thermocald.store.server.columns._BLOCK", 7)  # of 20 epochs
         mine, theirs = store.series_columns(series, names), there.series_columns(found, names)
         for name in names:
             assert np.array_equal(mine[name], theirs[name], equal_nan=name != "status"), name

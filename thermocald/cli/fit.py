@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 __all__ = ["fit"]
 
+_UNSEEN = 0.5
+"""From which weight of the type on a parameter is called the type's."""
+
 
 def fit(
     inputs: Annotated[
@@ -57,7 +60,7 @@ def fit(
 
     Example: thermocald fit M1 M2 -o camera.thermal.yaml --effect thermal_lag
     """
-    from thermocald.analysis.thermal.type_model import fit_with_type
+    from thermocald.analysis.thermal.type_model import fit_with_type, weight_of_type
     from thermocald.cli.common import progress, write_result
     from thermocald.cli.effect_options import check_names
     from thermocald.simulation.model_file import write_model
@@ -72,7 +75,11 @@ def fit(
     if known is not None:
         fitted = fit_with_type(series, known)
         fitted_model, document = fitted.model, _document(fitted, [])
-        document["type"] = {"name": known.camera, "cameras": len(known.fitted_on)}
+        document["type"] = {
+            "name": known.camera,
+            "cameras": len(known.fitted_on),
+            "weights": weight_of_type(fitted_model, known),
+        }
     elif type_name is not None:
         fitted_model, document = _type(series, listed, T0, type_name)
     else:
@@ -227,6 +234,11 @@ def _say(document: dict[str, Any]) -> None:
     if "type" in document:
         kind = document["type"]
         typer.echo(f"  with what {kind['cameras']} cameras of the type {kind['name']} say of it")
+        if unseen := [name for name, weight in kind["weights"].items() if weight > _UNSEEN]:
+            typer.echo(
+                f"  these recordings show little of {', '.join(unseen)}: value and standard "
+                "deviation are the type's; record the way between two temperatures, too"
+            )
     from thermocald.output.figures.numbers import with_sd
 
     for name, rate in document["rates"].items():

@@ -31,7 +31,14 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.reduction.series import ReducedSeries
 
-__all__ = ["fit_with_type", "odd_cameras", "shrunk_to_type", "type_model"]
+__all__ = [
+    "fit_with_type",
+    "odd_cameras",
+    "require_type",
+    "shrunk_to_type",
+    "type_model",
+    "weight_of_type",
+]
 
 _FEWEST_TO_COMPARE = 3
 _NORMAL_95 = 1.959964
@@ -176,6 +183,17 @@ def shrunk_to_type(
     return _with_values(
         model, names, new.values, new.covariance * np.outer(wider, wider), str(kind.camera)
     )
+
+
+def weight_of_type(model: ThermalModel, kind: ThermalModel) -> dict[str, float]:
+    """{rate or effect's parameter: the fraction of it that is the type's}.
+
+    model: of `fit_with_type`. 1 where its recordings say nothing of the parameter, so that value
+    and standard deviation are the type's; near 0 where they say all. It is the variance of the
+    parameter over its variance among the cameras of the type.
+    """
+    names = [n for n in _names(kind) if not n.startswith("interior.") and _sd(kind, n) > 0]
+    return {n: min(1.0, (_sd(model, n) / _sd(kind, n)) ** 2) for n in names}
 
 
 def _with_values(

@@ -1,8 +1,4 @@
-"""Reading a server's store with the methods of `store.database.store.Store` that read.
-
-Columns come as whole arrays: PostgreSQL joins the binary form of all values of a column, which
-NumPy reads as it stands. COPY of the same is a message an epoch: three times the cost here.
-"""
+"""Reading a server's store with the methods of `store.database.store.Store` that read."""
 
 from __future__ import annotations
 
@@ -19,13 +15,14 @@ from thermocald.store.database.blob import (
     unpack_observations,
     unpack_rows,
 )
-from thermocald.store.database.epoch_columns import COLUMN_NAMES, sql_name
+from thermocald.store.database.epoch_columns import sql_name
 from thermocald.store.database.epoch_table import StoredEpoch, stored_epoch
 from thermocald.store.database.row import Event, LoggedReading, StoredSeries
 from thermocald.store.database.series_reader import StampedReader
 from thermocald.store.recording.head import parse_head
 from thermocald.store.recording.testfield_file import parse_testfield
 from thermocald.store.server.address import ServerAddress
+from thermocald.store.server.columns import read_columns
 from thermocald.store.server.connection import Connected, in_words
 
 if TYPE_CHECKING:
@@ -39,8 +36,6 @@ if TYPE_CHECKING:
 
 __all__ = ["ServerStore"]
 
-_JOINED = "string_agg(float8send({}), '')"
-_JOINED_TEXT = "string_agg({}, E'\\n')"
 _BLOCK = 500  # epochs fetched at a time by a server-side cursor
 _LATEST = (
     "FROM epoch e WHERE series = %s AND NOT EXISTS (SELECT 1 FROM epoch later "
@@ -95,26 +90,10 @@ class ServerStore(Connected, StampedReader):
 
     def series_columns(self, series: StoredSeries, names: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Columns (E,) over all epochs by name, as `Store.series_columns`."""
-        from psycopg import sql
-
-        wanted = list(dict.fromkeys(names))
-        values = sql.SQL(", ").join(
-            sql.SQL("{} AS {}").format(_expression(name, series), sql.Identifier(f"v{i}"))
-            for i, name in enumerate(wanted)
-        )
-        joined = sql.SQL(", ").join(
-            sql.SQL(_JOINED_TEXT if name == "status" else _JOINED).format(sql.Identifier(f"v{i}"))
-            for i, name in enumerate(wanted)
-        )
-        where = sql.SQL(_LATEST.replace("%s", "{}")).format(sql.Literal(self._keys[series.id]))
-        statement = sql.SQL("SELECT {} FROM (SELECT {} {} ORDER BY number, frame_time) ordered")
         reading = in_words(self.address, "columns cannot be read")
         with reading, self._engine.connect() as connection:
             raw: Any = connection.connection.driver_connection
-            with raw.cursor(binary=True) as cursor:
-                cursor.execute(statement.format(joined, values, where))
-                found = cursor.fetchone()
-        return {name: _column(name, data) for name, data in zip(wanted, found, strict=True)}
+            return read_columns(raw, self._keys[series.id], series, names)
 
     def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
         """(E, 16, 16) covariances of some epochs, NaN for those without a result."""
@@ -227,29 +206,3 @@ def _epoch(row: tuple[Any, ...], details: bool) -> StoredEpoch:
         unpack_covariance(bytes(covariance)) if covariance else None,
         unpack_observations(bytes(seen)) if seen else None,
     )
-
-
-def _expression(name: str, series: StoredSeries) -> Any:
-    """A column as double precision, NaN for NULL, which would be left out."""
-    from psycopg import sql
-
-    if name == "status":
-        return sql.SQL("status")
-    if name == "epoch":
-        return sql.SQL("number::float8")
-    if name == "clock_trusted":
-        return sql.SQL("clock_trusted::int::float8")
-    if name in COLUMN_NAMES:
-        return sql.SQL("coalesce({}::float8, 'NaN')").format(sql.Identifier(sql_name(name)))
-    column = "temperatures" if name in series.head.channels else "extra"
-    return sql.SQL("coalesce(({}::json->>{})::float8, 'NaN')").format(
-        sql.Identifier(column), sql.Literal(name)
-    )
-
-
-def _column(name: str, data: bytes | str | None) -> NDArray[Any]:
-    """The values (E,) that `_JOINED` or `_JOINED_TEXT` made one; none where there is no epoch."""
-    if name == "status":
-        return np.array(data.split("\n") if isinstance(data, str) else [], dtype=np.str_)
-    values = np.frombuffer(data if isinstance(data, bytes) else b"", ">f8")
-    return values.astype(np.float64)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
     from psycopg import Connection
-    from psycopg.sql import Composable
+    from psycopg.sql import Composable, Composed
 
     from thermocald.arrays import Array
     from thermocald.store.database.row import StoredSeries
@@ -52,7 +52,7 @@ def read_columns(
     statement = sql.SQL("COPY (SELECT {} FROM epoch WHERE series = {}) TO STDOUT (FORMAT BINARY)")
     values = sql.SQL(", ").join(wanted.values())
     copied = _copy(connection, statement.format(values, sql.Literal(key)), len(wanted))
-    columns = dict(zip(wanted, copied, strict=True))
+    columns: dict[str, NDArray[Any]] = dict(zip(wanted, copied, strict=True))
     rows = _latest(*(columns.pop(f" {name}") for name in _ORDER))
     if rows is not None:
         columns = {name: column[rows] for name, column in columns.items()}
@@ -61,7 +61,7 @@ def read_columns(
     return columns
 
 
-def _copy(connection: Connection[Any], statement: Composable, size: int) -> list[Array]:
+def _copy(connection: Connection[Any], statement: Composed, size: int) -> list[Array]:
     """The columns (E,) of a copy of `size` numbers a row."""
     fields = [("columns", ">i2")]
     for i in range(size):
@@ -90,12 +90,13 @@ def _latest(numbers: Array, times: Array, revisions: Array) -> NDArray[np.intp] 
     steps = np.diff(numbers)
     if np.all(steps > 0):
         return None
-    order = np.lexsort((times, numbers))
+    order: NDArray[np.intp] = np.lexsort((times, numbers))
     if not revisions.any():
         return order
     _, first, counts = np.unique(numbers[order], return_index=True, return_counts=True)
     highest = np.repeat(np.maximum.reduceat(revisions[order], first), counts)
-    return order[revisions[order] == highest]
+    latest: NDArray[np.intp] = order[revisions[order] == highest]
+    return latest
 
 
 def _expression(name: str, series: StoredSeries, words: Sequence[str]) -> Composable:

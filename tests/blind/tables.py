@@ -160,7 +160,8 @@ Bars: 68 % limits of the share.
 
 {matrices}
 
-{kept}""".rstrip() + "\n",
+{kept}""".rstrip()
+        + "\n",
         encoding="utf-8",
     )
 

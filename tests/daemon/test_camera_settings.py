@@ -34,8 +34,11 @@ def plan_of(**changes):
 def test_every_epoch_keeps_its_settings_also_when_it_is_calibrated_later(tmp_path):
     with Store.open(tmp_path / "k.db", "append") as store:
         guard = SimpleNamespace(
-            store=store, all_series=store.all_series, event=lambda event: None,
-            thin=False, away=False,
+            store=store,
+            all_series=store.all_series,
+            event=lambda event: None,
+            thin=False,
+            away=False,
         )
 
         def begun(one):

@@ -19,7 +19,6 @@ from thermocald.cli.options import JsonOption, SeedOption
 from thermocald.errors import DataError
 
 if TYPE_CHECKING:
-
     from thermocald.analysis.series.table import SeriesTable
     from thermocald.arrays import Array
 

@@ -113,9 +113,7 @@ def _known_type(text: str | None) -> ThermalModel | None:
     return found
 
 
-def _read(
-    inputs: list[Path], advance: Callable[[int], None], jobs: int
-) -> list[ReducedSeries]:
+def _read(inputs: list[Path], advance: Callable[[int], None], jobs: int) -> list[ReducedSeries]:
     from thermocald.reduction.reduce import reduce_series
     from thermocald.reduction.source import load_series
 

@@ -235,9 +235,7 @@ def as_rows(parts: Iterable[Columns]) -> Iterator[Row]:
     for columns in parts:
         lists = [
             [None if isinstance(v, float) and not np.isfinite(v) else v for v in column]
-            for column in (
-                c.tolist() if isinstance(c, np.ndarray) else c for c in columns.values()
-            )
+            for column in (c.tolist() if isinstance(c, np.ndarray) else c for c in columns.values())
         ]
         for row in zip(*lists, strict=True):
             yield dict(zip(columns, row, strict=True))

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["NoiseGrowth", "noise_growth", "noise_slope"]
 
+_CLEAR = 10.0  # in -2 log L, by which one trajectory excludes another
 _LEAST = 0.005  # fraction of the noise at T0 that is left where it is coldest
 
 
@@ -40,9 +41,16 @@ class NoiseGrowth:
     other: str
     noise: tuple[Array, ...]
 
+    @property
+    def excludes_other(self) -> bool:
+        """Whether the reference temperature explains it better than anything else."""
+        return self.gain > self.other_gain + _CLEAR
+
 
 def noise_growth(series: Sequence[ReducedSeries]) -> NoiseGrowth | None:
-    """Does the measuring noise follow the reference temperature? None where it does not change.
+    """Does the measuring noise follow the reference temperature? None where it does not.
+
+    None also where another thermometer explains it better, or time does as well.
 
     The variances of the epochs' adjustments are χ² distributed about (1 + k (T - T0))².
     """
@@ -54,10 +62,13 @@ def noise_growth(series: Sequence[ReducedSeries]) -> NoiseGrowth | None:
         if name != series[0].history.reference and all(name in e.history.readings for e in series):
             trajectory = [e.history.temperature(name) for e in series]
             others.append((_slope([c - c.mean() for c in trajectory], data)[1], name))
+    # two thermometers of a camera rise together: another one is in the way only where it is better
+    if others and gain < max(others)[0] - _CLEAR:
+        return None
     time = [(e.times - e.times.mean()) / max(float(np.ptp(e.times)), 1.0) for e in series]
-    others.append((_slope(time, data)[1], "time"))
-    other_gain, other = max(others)
-    if gain < 40.0 or gain < other_gain + 10.0:
+    by_time = _slope(time, data)[1]
+    other_gain, other = max([*others, (by_time, "time")])
+    if gain < 40.0 or gain < by_time + _CLEAR:
         return None
     rough = _roughness(temperature, data, k)
     if gain / rough < 40.0:

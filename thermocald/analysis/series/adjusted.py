@@ -96,14 +96,17 @@ def _together(
     found = _as_one(head, testfield, apart, start, grid, settings)
     assert found.adjustment is not None
     moved, still = still_field(
-        head.camera.sensor, testfield, grid, found.adjustment, start, apart.number,
+        head.camera.sensor,
+        testfield,
+        grid,
+        found.adjustment,
+        start,
+        apart.number,
         apart.frame_time,
     )
     if not moved:
         return found
-    return replace(
-        _as_one(head, testfield, apart, start, still, settings), field_movements=moved
-    )
+    return replace(_as_one(head, testfield, apart, start, still, settings), field_movements=moved)
 
 
 def _as_one(
@@ -191,9 +194,7 @@ def _count(targets: NDArray[Any]) -> NDArray[np.int64]:
     return count
 
 
-def _said(
-    status: Sequence[str], reasons: Sequence[str], apart: SeriesTable
-) -> tuple[Words, Words]:
+def _said(status: Sequence[str], reasons: Sequence[str], apart: SeriesTable) -> tuple[Words, Words]:
     """Words and sentences of the epochs; what the epoch itself said of a frame without a result
     says more than "no observations".
     """

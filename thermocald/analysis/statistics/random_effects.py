@@ -21,7 +21,6 @@ import numpy as np
 from thermocald.errors import DataError
 
 if TYPE_CHECKING:
-
     from thermocald.arrays import Array
 
 __all__ = ["Population", "Shrunk", "odd_specimens", "population"]

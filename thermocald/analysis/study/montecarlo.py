@@ -184,9 +184,7 @@ class _Part:
     sample: Array
 
 
-def _simulated(
-    known: tuple[_PlaneErrors, Array, Array, Array], draws: tuple[Array, int]
-) -> _Part:
+def _simulated(known: tuple[_PlaneErrors, Array, Array, Array], draws: tuple[Array, int]) -> _Part:
     """Sets from standard normal numbers (n, r), and how many of them a sample still needs.
 
     known: the projection, the mean IOP (10,), the root (r, 10) of their covariance, the clusters.

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from thermocald.errors import DataError, UsageError
 from thermocald.reduction.source import load_series, series_input
 from thermocald.store.recording.reader import open_recording
@@ -41,6 +43,13 @@ def load_together(
         out.append(_read(path, say, jobs))
     for other in out[1:]:
         _same_camera(out[0], other)
+    for k, (path, other) in enumerate(zip(others, out[1:], strict=True), start=1):
+        for before, same in zip((first, *others)[:k], out[:k], strict=True):
+            if np.array_equal(same.grid.points, other.grid.points, equal_nan=True):
+                raise DataError(
+                    f"{source_name(path)} holds the same observations as {source_name(before)}; "
+                    "--verify needs measurements of their own (simulated ones another --seed)"
+                )
     return out
 
 

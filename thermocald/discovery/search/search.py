@@ -165,9 +165,15 @@ class Search:
         grown = [self._with(solution, p) for p in self._promises(solution, width, least)]
         return sorted(grown, key=lambda s: s.score)
 
-    def expand_all(self, solutions: Sequence[Solution], width: int, most: int) -> list[Solution]:
-        """The best with one effect more of several solutions: `most` sets of effects at most."""
-        pairs = [(s, p) for s in solutions for p in self._promises(s, width)]
+    def expand_all(
+        self, solutions: Sequence[Solution], width: int, most: int, below: float = np.inf
+    ) -> list[Solution]:
+        """The best with one effect more of several solutions: `most` sets of effects at most.
+
+        below: the score that a scan has to promise.
+        """
+        every = [(s, p) for s in solutions for p in self._promises(s, width)]
+        pairs = [(s, p) for s, p in every if s.score - p.net < below]
         pairs.sort(key=lambda pair: pair[0].score - pair[1].net)
         grown: dict[frozenset[str], Solution] = {}
         for solution, promise in pairs:

@@ -81,22 +81,24 @@ def search_standing(
             grown = search.expand(base)
             ranking = grown
         else:
-            grown = [search.shrink(s, kept)
-                     for s in search.expand_all(frontier, 4, _COMBINATIONS)]  # fmt: skip
+            # once nothing is left over, other effects have to promise more than the best explains
+            below = best.score if complete else np.inf
+            more = search.expand_all(frontier, 4, _COMBINATIONS, below)
+            grown = [search.shrink(s, kept) for s in more]
         seen += grown
+        if complete:
+            equal = [s for s in frontier if s.score < best.score + BAND]
+            grown = [s for s in grown if _worth_it(fitter, base, best, equal, s)]
         if not grown:
             break
         champion = min(grown, key=lambda s: s.score)
         if champion.score >= best.score:
             break
-        if level > 1 and complete:
-            least = max(_LEFT_PX, _LEFT_SHARE * _size_px(fitter, base, best))
-            if _size_px(fitter, best, champion) < least:
-                break
         best = champion
         complete = adequate(adequacies(fitter, best), base_adequacy)
-        # what is adequate may still lack something too fast for the absolute test
-        frontier = [best] if complete or level > 1 else _frontier(grown)
+        # what is adequate may still lack something too fast for the absolute test, and one effect
+        # with many coefficients may stand for two others that nobody has tried together yet
+        frontier = _frontier(grown)
     # larger combinations that were not accepted are no rivals
     seen = [s for s in seen if len(s.terms) <= len(best.terms)]
     if len(best.terms) > kept:
@@ -144,6 +146,25 @@ def _contest(
     again.sort(key=lambda s: s.score)
     others = [s for s in seen if s.terms not in close]
     return again[0], [*again, *others]
+
+
+def _worth_it(
+    fitter: HypothesisFitter,
+    base: Solution,
+    best: Solution,
+    equal: Sequence[Solution],
+    champion: Solution,
+) -> bool:
+    """Whether effects are told in place of `best`, which explains all, or of one `equal` to it.
+
+    One effect more has to be worth more than the finer points of the others; others in their
+    place have to exclude them, and to fit better: a smoother temperature alone is no reason.
+    """
+    fewer = [s for s in equal if set(s.names) <= set(champion.names)]
+    if not fewer:
+        return champion.score < best.score - BAND and champion.fit.chi2 < best.fit.chi2
+    least = max(_LEFT_PX, _LEFT_SHARE * _size_px(fitter, base, best))
+    return all(_size_px(fitter, s, champion) >= least for s in fewer)
 
 
 def _size_px(fitter: HypothesisFitter, without: Solution, with_it: Solution) -> float:

@@ -78,4 +78,6 @@ def _noise_growth(e: ReducedSeries, growth: NoiseGrowth, gap: Gap) -> EffectFoun
         "next_best_gain": growth.other_gain,
     }
     statement = effect.sentence(estimates)
+    if not growth.excludes_other:
+        statement += f"; it follows {growth.other} as well"
     return EffectFound(effect.name, statement, where, estimates, evidence, [], gap, gap)

@@ -254,9 +254,13 @@ def _fast_power(
             continue
         operator, channel = _reading_operator(fitter, fit, block, series)
         if operator is not None:
-            noise = np.mean(np.sum((fast @ operator * e.state_sd(channel)) ** 2, axis=1))
+            carried = fast @ operator
+            noise = np.mean(np.sum((carried * e.state_sd(channel)) ** 2, axis=1))
+            # the fit has smoothed readings: what smoothing took off them is not in the rest
+            taken = np.mean((carried @ e.state_deviation(channel)) ** 2)
+            left = max(np.sqrt(noise) - np.sqrt(taken), 0.0) ** 2
             along = W.T @ e.N.mean(axis=0) @ fit.direction(block)[0]
-            power -= noise * np.outer(along, along)
+            power -= left * np.outer(along, along)
     return power, W
 
 

@@ -140,9 +140,7 @@ def _spectrum(y: Array) -> _Spectrum:
     coefficients = cosines(y)
     at = Frequencies.of(len(coefficients))
     single = int(np.argmax(at.count > 1)) if at.count[-1] > 1 else len(at.count)
-    return _Spectrum(
-        at.sums(coefficients**2), at.count, at.mean, coefficients[:single].copy()
-    )
+    return _Spectrum(at.sums(coefficients**2), at.count, at.mean, coefficients[:single].copy())
 
 
 def _bands(n: int, window: int, spectrum: _Spectrum) -> list[int]:

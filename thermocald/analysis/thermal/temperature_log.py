@@ -201,8 +201,10 @@ def row_blocks(
             times.add(line, row["time"])
         numbers = np.array([[_number(path, line, n, row[n]) for n in others] for line, row in part])
         seconds = times.utc(clock or DeviceClock())
-        yield header, [row for _, row in part], np.column_stack(
-            [seconds, numbers.reshape(len(part), -1)]
+        yield (
+            header,
+            [row for _, row in part],
+            np.column_stack([seconds, numbers.reshape(len(part), -1)]),
         )
         first = False
     if first:

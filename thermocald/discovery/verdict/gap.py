@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.reduction.adequacy import examine
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -140,8 +142,8 @@ def gap_of(
     rms = float(np.sqrt(sigma2 * image / free))
     floor = 1.0
     if e.movement is not None:
-        # real points are no normal deviates: what free cameras leave is measured, not one
-        floor = (within + moved + e.rank * float((e.n > 0).sum() - 1)) / free
+        # the camera's own noise, on this recording: what no smooth trajectory takes up
+        floor = chi2 - k * examine(fitter, fit, series).excess / free
     return Gap(rms, chi2, _object_mm(e, rms), floor)
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from thermocald.discovery.grammar.proposal import propose
 from thermocald.discovery.verdict.estimates import term_estimates
 from thermocald.discovery.verdict.gap import fit_first
+from thermocald.discovery.verdict.trade_off import not_separable
 from thermocald.reduction.adequacy import examine
 from thermocald.simulation import effects as catalogue
 
@@ -68,6 +69,9 @@ def proposed(
     e = found.fitter.series[0]
     estimates = term_estimates(final_fit, len(found.best.terms) - 1, e)
     sentence = catalogue.get(term.effect).sentence(estimates)
+    together = not_separable(found.fitter, final_fit, len(found.best.terms) - 1)
+    if together is not None:
+        sentence += together.sentence
     alternatives = [
         {
             "effect": t.effect,
@@ -90,6 +94,7 @@ def proposed(
         {
             **{k: v for k, v in description.evidence.items() if k != "bridge"},
             "proposal": _document(found, term, examination),
+            **({"not_separable": together.as_json()} if together is not None else {}),
         },
         alternatives,
     )

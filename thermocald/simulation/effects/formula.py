@@ -82,13 +82,21 @@ class _OfFormula(Effect):
 
     def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
         said = {
-            name: spoken(e).replace("degC", "°C")
+            name: _said(e, self.nonlinear[name]).replace("degC", "°C")
             for name, e in estimates.items()
             if name in self.nonlinear
         }
         moved = [n[2:] for n in estimates if n.startswith("a_")]
         verb = "follow" if len(moved) > 1 else "follows"
         return f"{', '.join(moved) or 'the camera'} {verb} {self.node.words(said)}"
+
+
+def _said(estimate: Mapping[str, Any], parameter: Parameter) -> str:
+    """An estimate in words; one of a positive constant that is not determined as about so much."""
+    value, sd = estimate["value"], estimate["sd"]
+    if parameter.log and sd is not None and not sd <= abs(value):
+        return f"about {value:.3g} {parameter.unit}"
+    return spoken(estimate)
 
 
 def formula_effect(text: str) -> Effect:

@@ -1,0 +1,48 @@
+"""Two time constants of which the data determine the sum alone."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.discovery.test_tremble import trembling
+from thermocald.discovery.verdict.trade_off import not_separable
+from thermocald.reduction.fit import HypothesisFitter
+from thermocald.reduction.hypothesis import BASE, Term
+from thermocald.simulation import effects as catalogue
+from thermocald.simulation.formula.expression import Node
+
+
+@pytest.fixture(scope="module")
+def lagging():
+    return HypothesisFitter(trembling(("thermal_lag",), 0.0, 3))
+
+
+def fitted(fitter, first, second):
+    T = Node("", name=fitter.series[0].history.reference)
+    twice = Node("lag", (Node("lag", (T,), (first,)),), (second,))
+    structure, values = twice.named()
+    fit = fitter.fit((Term(structure.text(), BASE, tuple(values.items())),))
+    return fitter.refine(fit, max_iterations=0)
+
+
+def test_two_equal_lags_are_said_by_their_sum(lagging):
+    fit = fitted(lagging, 30.0, 30.0)
+
+    found = not_separable(lagging, fit, 0)
+
+    assert found.value == pytest.approx(60.0)
+    assert 0.0 < found.sd < 5.0
+    assert "not separable, their sum is 60" in found.sentence
+
+
+def test_a_short_and_a_long_lag_are_separate(lagging):
+    assert not_separable(lagging, fitted(lagging, 20.0, 150.0), 0) is None
+
+
+def test_a_constant_that_is_not_determined_is_said_so():
+    estimate = {"value": 120.0, "sd": 3.1e4, "unit": "s"}
+
+    said = catalogue.get("lag(temperature, tau)").sentence({"tau": estimate, "a_c": estimate})
+
+    assert "about 1.2e+02" not in said
+    assert "about 120 s" in said

@@ -98,7 +98,7 @@ def search_standing(
         complete = adequate(adequacies(fitter, best), base_adequacy)
         # what is adequate may still lack something too fast for the absolute test, and one effect
         # with many coefficients may stand for two others that nobody has tried together yet
-        frontier = _frontier(grown)
+        frontier = _frontier(grown) if complete or level == 1 else [best]
     # larger combinations that were not accepted are no rivals
     seen = [s for s in seen if len(s.terms) <= len(best.terms)]
     if len(best.terms) > kept:

@@ -29,6 +29,7 @@ class Forker:
 
     def start(self, folder: Path, *arguments: str, **environment: str) -> Forked:
         """`thermocald ARGUMENTS` in a folder, whose log.txt gets what it prints."""
+        (folder / "log.txt").touch()  # whoever reads it need not wait for the child
         return Forked(self, self.ask(
             {"arguments": arguments, "folder": str(folder), "environment": environment}
         ))  # fmt: skip

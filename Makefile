@@ -6,6 +6,8 @@ STAMP  := $(VENV)/.installed
 # what is installed, with hashes; `make LOCK= setup` takes the newest that pyproject.toml allows
 LOCK   ?= packaging/lock/development.txt
 export OPENBLAS_NUM_THREADS ?= 1
+# tests start hundreds of processes: none of them compiles what another one has compiled
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help setup demo test quick lint test-slow test-lowest bench hil docs lock deb release clean
 

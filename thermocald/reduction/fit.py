@@ -37,6 +37,8 @@ __all__ = ["HypothesisFitter"]
 # relative standard deviation with which the readings themselves tell their noise
 _NOISE_KNOWN = 0.05
 
+_PERIODS = 1.6  # least number of periods in a series; a scan begins at 1.8
+
 
 class HypothesisFitter:
     """The series under examination, and everything that is computed once for all hypotheses."""
@@ -381,10 +383,11 @@ class HypothesisFitter:
                     terms = list(fit.terms)
                     for (i, name), d in zip(searched, damping * step, strict=True):
                         old = dict(terms[i].nonlinear)[name]
-                        terms[i] = terms[i].with_value(
-                            name,
-                            terms[i].kind.nonlinear[name].bounded(old, old + float(d), slack=0.1),
-                        )
+                        parameter = terms[i].kind.nonlinear[name]
+                        value = parameter.bounded(old, old + float(d), slack=0.1)
+                        if parameter.role == "period":
+                            value = min(value, max(old, self._longest_period()))
+                        terms[i] = terms[i].with_value(name, value)
                     trial = self.fit(terms, fit.coefficients, 2, only)
                     gain = self._with_prior(fit) - self._with_prior(trial)
                     if gain > 0:
@@ -394,6 +397,10 @@ class HypothesisFitter:
                     break
         A, _, searched = self.normal_equations(fit, only)
         return replace(fit, covariance=_inverse(A), searched=tuple(searched))
+
+    def _longest_period(self) -> float:
+        """What is seen less often than this in each series is a wander, no period."""
+        return max(float(e.times[-1]) for e in self.series) / _PERIODS
 
 
 def _drives(terms: Sequence[Term], series: int) -> list[tuple[str, dict[str, Any]]]:

@@ -35,6 +35,10 @@ _PROMISE = 0.3  # of which a scan has to promise, in the noise before
 _SHARE = 0.25  # of what the first effect gains that a further one has to gain
 _CORNERS = (0.0, 3.0)
 _REST = 0.05
+# further estimates of the movement without an effect, and the share by which one has to come nearer
+# to the score with an effect
+_TURNS = 5
+_SETTLED = 0.1
 # share of its own gain in one series by which an effect may worsen the other
 _WORSE = 0.25
 
@@ -86,8 +90,8 @@ def search_beside_mount(
     guess = first_guess(fitter, start.fit, W)
     say("movement of the mount")
     trials = [_beside(fitter, start, Mount(W, guess, corner), 4) for corner in _CORNERS]
-    plain = min(trials, key=lambda t: t.score)
-    best, ranking, seen = plain, list[Solution](), list[Solution]()
+    plain = best = min(trials, key=lambda t: t.score)
+    ranking, seen = list[Solution](), list[Solution]()
     for level in range(_LEVELS):
         say(f"alongside the mount: {', '.join(best.solution.names) or 'the base'}")
         search = Search(best.fitter, like=first)
@@ -99,8 +103,12 @@ def search_beside_mount(
             trial = _profiled(best, solution)
             knock = _as_knock(best, trial)
             grown.append(knock or trial)
+        if not grown:
+            break
         if level == 0:
             ranking = sorted((g.solution for g in grown), key=lambda s: s.score)
+            # a movement estimated to its end takes up drifts too: a scan would find nothing in it
+            plain = best = _settled(plain, ranking[0].score)
         seen += [g.solution for g in grown]
         allowed = [g for g in grown if _allowed(g, best, plain, len(start.terms))]
         if not allowed:
@@ -124,6 +132,22 @@ def _with_delays(search: Search, solutions: list[Solution]) -> list[Solution]:
 def _beside(fitter: HypothesisFitter, solution: Solution, mount: Mount, turns: int) -> Beside:
     own, fit, mount = estimated(fitter, solution.terms, mount, solution.fit.coefficients, turns)
     return Beside(Solution(fit, solution.penalties), own, mount)
+
+
+def _settled(found: Beside, best: float) -> Beside:
+    """The movement estimated again from what it leaves over, while it may come below another score:
+    a direction that the first estimate has at zero stays there.
+    """
+    for _ in range(_TURNS):
+        if found.score < best:
+            break
+        more = _profiled(found, found.solution)
+        if more.score > found.score:
+            break
+        change, found = found.score - more.score, more
+        if change < _SETTLED * (found.score - best):
+            break
+    return found
 
 
 def _profiled(best: Beside, solution: Solution) -> Beside:

@@ -28,6 +28,10 @@ _PARAMETERS = (
 )  # fmt: skip
 
 
+class Unseen(Exception):
+    """What was to be hidden does nothing under this seed's temperatures."""
+
+
 @dataclass
 class Series:
     """One recording in memory: rows of observations and of epochs."""
@@ -128,6 +132,8 @@ def generate(case: Case) -> tuple[list[Series], dict]:
                 if abs(got / case.strength_px - 1) < 1e-3:
                     break
                 size *= case.strength_px / max(got, 1e-12)
+            else:
+                raise Unseen(f"{e['effect']} {case.influence or ''} does next to nothing in M1")
         e["size"] = size
         for s in per_series:
             s[k]["size"] = size

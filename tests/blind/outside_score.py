@@ -16,6 +16,7 @@ from dataclasses import dataclass
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from tests.blind.case import OUTSIDE, Case
+from tests.blind.generator import Unseen
 from tests.blind.outside import HUMID, RECORDED, UNRECORDED
 from tests.blind.score import examine_case
 
@@ -64,7 +65,11 @@ def main() -> None:
     done = []
     for kind in a.kind or (*RECORDED, *HUMID, *UNRECORDED):
         for seed in range(a.first, a.first + a.seeds):
-            d = describe(kind, seed, a.px)
+            try:
+                d = describe(kind, seed, a.px)
+            except Unseen as why:
+                print(f"{kind:18s} {seed} {why}")
+                continue
             done.append(d)
             print(f"{kind:18s} {seed} closed {d.closed:6.3f} {d.seconds:4.1f} s  "
                   f"{d.statement[:150]}", flush=True)  # fmt: skip

@@ -139,7 +139,7 @@ def _still(
     found = _searched(HypothesisFitter(bent) if bent else fitter, say, given, jobs)
     if not found.adequate:
         again = curved(found.fitter, found.best.fit)
-        if again is not None:
+        if again is not None and _explained(again, found):
             say("curvature of the projection: once more")
             found = _searched(HypothesisFitter(again), say, given, jobs)
     noisy = noisier(found.fitter, found.best.fit)
@@ -147,10 +147,18 @@ def _still(
         alongside = _beside_mount(shaking, say, given, jobs)
         if alongside is not None:
             return alongside
-    if noisy is not None:
+    if noisy is not None and (found.adequate or _explained(noisy, found)):
         say("noise that targets share: once more")
         found = _searched(HypothesisFitter(noisy), say, given, jobs)
     return found
+
+
+def _explained(series: list[ReducedSeries], found: Examination) -> bool:
+    """Whether the effects found leave nothing over in other states of the series."""
+    fitter = HypothesisFitter(series)
+    refined = fitter.refine(fitter.fit(found.best.terms, found.best.fit.coefficients))
+    now = adequacies(fitter, replace(found.best, fit=refined))
+    return adequate(now, found.base_adequacy)
 
 
 def _searched(

@@ -215,6 +215,28 @@ class Search:
             return min(found, key=lambda s: s.fit.chi2)
         return None
 
+    def with_events_moved(self, solution: Solution) -> Solution:
+        """The solution with its events where they explain most now that the other effects are known
+        too: they were found without some of them.
+        """
+        for i, term in enumerate(solution.terms):
+            if not term.kind.is_event:
+                continue
+            same = (c for c in self.candidates if c.effect == term.effect)
+            candidate = next(c for c in same if c.parameters == term.parameters)
+            gains = self.scanner.scan(candidate, solution.fit).events
+            for s, now in enumerate(term.fresh):
+                if now is None:
+                    continue
+                time = float(self.fitter.series[s].times[int(np.argmax(gains[s])) + 1])
+                at = ((candidate.name, time),)
+                moved = replace(term, fresh=(*term.fresh[:s], at, *term.fresh[s + 1 :]))
+                terms = (*solution.terms[:i], moved, *solution.terms[i + 1 :])
+                trial = self.refine(terms, solution.penalties)
+                if trial.score < solution.score:
+                    solution, term = trial, moved
+        return solution
+
     def shrink(self, solution: Solution, kept: int = 0) -> Solution:
         """Without every effect that is no longer worth its penalty; the first `kept` stay."""
         while len(solution.terms) > kept + 1:

@@ -28,6 +28,8 @@ SWAP_BAND = 120.0
 # a second effect alongside an adequate one has to explain as much, in px RMS and as a share of the
 # first: below that, it is the first one's finer points
 _LEFT_PX, _LEFT_SHARE = 0.005, 0.15
+# px to which the curvature of the projection is known where the image moves by ten
+_CURVATURE_PX = 0.001
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +96,8 @@ def search_standing(
         champion = min(grown, key=lambda s: s.score)
         if champion.score >= best.score:
             break
-        best = champion
+        best = search.with_events_moved(champion)
+        seen.append(best)
         complete = adequate(adequacies(fitter, best), base_adequacy)
         # what is adequate may still lack something too fast for the absolute test, and one effect
         # with many coefficients may stand for two others that nobody has tried together yet
@@ -162,7 +165,8 @@ def _worth_it(
     """
     fewer = [s for s in equal if set(s.names) <= set(champion.names)]
     if not fewer:
-        return champion.score < best.score - BAND and champion.fit.chi2 < best.fit.chi2
+        more = _size_px(fitter, best, champion) >= _CURVATURE_PX
+        return more and champion.score < best.score - BAND and champion.fit.chi2 < best.fit.chi2
     least = max(_LEFT_PX, _LEFT_SHARE * _size_px(fitter, base, best))
     return all(_size_px(fitter, s, champion) >= least for s in fewer)
 

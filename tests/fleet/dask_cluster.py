@@ -17,11 +17,21 @@ from typing import Self
 from thermocald.simulation.presets import preset_simulation
 
 
+# docs/how-to/fleet.md: what idle processes do costs less
+SETTINGS = """\
+distributed:
+  worker: {profile: {enabled: false}, memory: {monitor-interval: 1s}}
+  admin: {tick: {interval: 500ms}, system-monitor: {interval: 2s, disk: false}}
+"""
+
+
 class DaskCluster:
     """A scheduler in a folder, and workers that a test starts and kills; ended with the block."""
 
     def __init__(self, folder: Path, workers: int) -> None:
         self._known = folder / "scheduler.json"
+        self._settings = folder / "dask.yaml"
+        self._settings.write_text(SETTINGS)
         self._stack = ExitStack()
         self.scheduler = self._start("dask_scheduler", "--host", "127.0.0.1", "--port", "0")
         deadline = time.monotonic() + 60
@@ -47,7 +57,7 @@ class DaskCluster:
             command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
             # as Dask's own nanny starts workers: sums do not depend on the number of cores
             env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1",
-                 "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False"},
+                 "DASK_CONFIG": str(self._settings)},
         )  # fmt: skip
         self._stack.callback(process.wait)
         self._stack.callback(process.kill)

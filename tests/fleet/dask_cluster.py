@@ -16,7 +16,6 @@ from typing import Self
 
 from thermocald.simulation.presets import preset_simulation
 
-
 # docs/how-to/fleet.md: what idle processes do costs less
 SETTINGS = """\
 distributed:

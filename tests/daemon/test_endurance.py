@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import configparser
 import json
 import os
 import subprocess
@@ -17,6 +18,7 @@ from thermocald.store.database.store import Store
 
 pytestmark = pytest.mark.slow
 
+ROOT = Path(__file__).parents[2]
 KILLS = 200
 # The whole soak takes a quarter of an hour of an idle core: THERMOCALD_SOAK_EPOCHS=100000
 EPOCHS = int(os.environ.get("THERMOCALD_SOAK_EPOCHS", "5000"))
@@ -74,10 +76,33 @@ def watched(daemon, run):
     return seen
 
 
+def test_a_daemon_that_waits_keeps_to_80_mb(daemon, replayed, tmp_path):
+    """With what its unit sets, between two epochs of 12 targets."""
+    unit = configparser.ConfigParser(strict=False, interpolation=None)
+    unit.optionxform = str
+    unit.read(ROOT / "systemd/thermocald.service")
+    own = dict(pair.split("=") for pair in unit["Service"]["Environment"].split())
+    path = make_recording(tmp_path / "short", 60, per_side=2, interval=1.0)
+    daemon.configure(**replayed(path, period_s=1.0))
+    daemon.process = subprocess.Popen(
+        [sys.executable, "-m", "thermocald", "run", "--config", str(daemon.config)],
+        cwd=daemon.folder, env={**ENVIRONMENT, **own, "HOME": str(tmp_path)},
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    while len(daemon.results()) < 12:
+        assert daemon.process.poll() is None
+        time.sleep(0.2)
+    status = Path(f"/proc/{daemon.process.pid}/status").read_text()
+    resident_mb = int(status.split("VmRSS:")[1].split()[0]) / 1024
+    print(f"{resident_mb:.1f} MB resident")
+    assert resident_mb < 80.0
+    assert daemon.stop() == 0
+
+
 @pytest.mark.timeout(1800)
 def test_the_last_month_of_three_costs_what_the_first_did(daemon, replayed, tmp_path):
-    """Ninety days by the recording's clock, a tick every half hour, in a minute."""
-    ticks, period_s = 4320, 1800.0
+    """Ninety days by the recording's clock, a tick every quarter of an hour, in two minutes."""
+    ticks, period_s = 8640, 900.0  # windows fill during the first 2,500
     day = round(86_400 / period_s)
     path = make_recording(
         tmp_path / "days", 5 * day, per_side=2, interval=period_s,

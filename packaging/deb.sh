@@ -57,6 +57,7 @@ for wheel in "$tree"/wheels/adbutils-*manylinux*.whl; do
 done
 "$python" packaging/manual.py "$tree/manual"
 cp -r packaging/debian systemd docs config.yaml README.md "$tree"
+find "$tree/docs" -name __pycache__ -prune -exec rm -rf {} +
 cat > "$tree/debian/changelog" <<END
 thermocald ($version) $release; urgency=medium
 

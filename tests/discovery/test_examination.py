@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from thermocald.discovery.evidence.image_space import displaced_targets
 from thermocald.discovery.search.search import Search
 from thermocald.discovery.search.surrogates import surrogate_test
 from thermocald.discovery.verdict.result import discover_series
@@ -135,6 +138,15 @@ def test_a_drift_of_a_few_targets_is_not_the_camera(evidence_of):
     said = found.effects[0].estimates
     assert sorted(int(v) for v in said["targets"]["value"]) == [t + 1 for t in true["targets"]]
     assert said["time"]["value"] == pytest.approx(true["time"], abs=10)
+
+
+def test_a_gross_error_near_the_end_is_no_target_that_moved(evidence_of):
+    evidence = evidence_of(seed=26)[0][0]
+    for epochs, moved in ((slice(-3, -2), 0), (slice(-4, None), 1)):
+        residuals = evidence.residuals.copy()
+        residuals[epochs, 30] += 1.0
+        groups, _ = displaced_targets(replace(evidence, residuals=residuals))
+        assert [g.rows.tolist() for g in groups] == [[30]] * moved
 
 
 def test_surrogates_tried_at_once_give_the_same_bits(evidence_of):

@@ -80,6 +80,14 @@ def _steps(evidence: ReducedSeries) -> tuple[Array, NDArray[np.int64], Array]:
     return top, best + 1, top / np.maximum(top + rest, 1e-9)
 
 
+def _lasts(residuals: Array, first: int) -> bool:
+    """Whether a step in residuals (E, 2) is in most epochs; a gross error moves a mean, too."""
+    before, after = residuals[:first], residuals[first:]
+    mean = np.nanmean(after, axis=0) - np.nanmean(before, axis=0)
+    middle = np.nanmedian(after, axis=0) - np.nanmedian(before, axis=0)
+    return bool(np.sum(mean * middle) > 0.5 * np.sum(mean**2))
+
+
 def displaced_targets(evidence: ReducedSeries) -> tuple[list[Displaced], ReducedSeries]:
     """Targets that jumped, and the series without them.
 
@@ -101,6 +109,7 @@ def displaced_targets(evidence: ReducedSeries) -> tuple[list[Displaced], Reduced
         chosen = np.flatnonzero(
             (gain > max(limit, common, 0.3 * top)) & (share > _SHARE) & (size > _STEP_PX)
         )
+        chosen = np.array([t for t in chosen if _lasts(cleaned.residuals[:, t], first[t])], int)
         if not len(chosen):
             break
         for row in chosen:

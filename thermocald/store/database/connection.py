@@ -173,6 +173,7 @@ def _bring_up_to_date(
         try:
             _backup_version(writing, path, version)
             _migrate(writing)
+            writing.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # the reader keeps the log open
         finally:
             writing.close()
         return connection

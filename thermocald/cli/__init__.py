@@ -19,17 +19,18 @@ import typer
 
 from thermocald import __version__
 from thermocald.atomic_file import cannot_write
-from thermocald.cli.commands import COMMANDS, GROUPS
+from thermocald.cli.commands import COMMANDS, GROUPS, command, group
 from thermocald.cli.common import log_to_stderr, say
 from thermocald.errors import ThermocaldError
 
 __all__ = ["application", "main"]
 
 _INTERRUPTED = 130
+_VERBOSE = ("--verbose", "-v")
 
 
-def application() -> typer.Typer:
-    """The application with every command."""
+def application(only: str | None = None) -> typer.Typer:
+    """The application with every command, or with one of them: the others are not imported."""
     app = typer.Typer(
         help="Thermal calibration of low-cost cameras: live, with true standard deviations.",
         no_args_is_help=True,
@@ -38,11 +39,19 @@ def application() -> typer.Typer:
         rich_markup_mode=None,
     )
     app.callback()(_options)
-    for name, command in COMMANDS.items():
-        app.command(name)(command)
-    for name, group in GROUPS.items():
-        app.add_typer(group, name=name)
+    for name in COMMANDS:
+        if only in (None, name):
+            app.command(name)(command(name))
+    for name in GROUPS:
+        if only in (None, name):
+            app.add_typer(group(name), name=name)
     return app
+
+
+def _called(arguments: list[str]) -> str | None:
+    """The command that is called, None where all have to be known: a help, a wrong word."""
+    word = next((word for word in arguments if word not in _VERBOSE), None)
+    return word if word in COMMANDS or word in GROUPS else None
 
 
 def _say_version(wanted: bool) -> None:
@@ -58,7 +67,7 @@ def _options(
             "--version", help="Say the version and stop.", is_eager=True, callback=_say_version
         ),
     ] = False,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log more.")] = False,
+    verbose: Annotated[bool, typer.Option(*_VERBOSE, help="Log more.")] = False,
 ) -> None:
     del version  # said already, before a command is asked for
     log_to_stderr("INFO" if verbose else "WARNING")
@@ -69,7 +78,7 @@ def main() -> None:
     with contextlib.suppress(ValueError):  # not in the main thread
         signal.signal(signal.SIGTERM, _end)  # so that nothing half-written stays
     try:
-        application()()
+        application(_called(sys.argv[1:]))()
         sys.stdout.flush()
     except ThermocaldError as error:
         say(f"error: {error}")

@@ -2,65 +2,53 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import typer
+if TYPE_CHECKING:
+    import typer
 
-from thermocald.cli import camera, server, session, testfield
-from thermocald.cli.archive import archive
-from thermocald.cli.backup import backup
-from thermocald.cli.calibrate import calibrate
-from thermocald.cli.check import check
-from thermocald.cli.convert import convert
-from thermocald.cli.correct import correct
-from thermocald.cli.demo import demo
-from thermocald.cli.devices import devices
-from thermocald.cli.discover import discover
-from thermocald.cli.doctor import doctor
-from thermocald.cli.fit import fit
-from thermocald.cli.fleet import fleet
-from thermocald.cli.forward import forward
-from thermocald.cli.import_ import import_
-from thermocald.cli.predict import predict
-from thermocald.cli.replay import export, replay
-from thermocald.cli.reprocess import reprocess
-from thermocald.cli.run import dashboard, run
-from thermocald.cli.simulate import simulate
-from thermocald.cli.status import status, top
-from thermocald.cli.study import study
+__all__ = ["COMMANDS", "GROUPS", "command", "group"]
 
-__all__ = ["COMMANDS", "GROUPS"]
-
-COMMANDS: dict[str, Callable[..., Any]] = {
-    "archive": archive,
-    "backup": backup,
-    "calibrate": calibrate,
-    "check": check,
-    "convert": convert,
-    "correct": correct,
-    "demo": demo,
-    "devices": devices,
-    "discover": discover,
-    "doctor": doctor,
-    "fit": fit,
-    "fleet": fleet,
-    "forward": forward,
-    "import": import_,
-    "predict": predict,
-    "replay": replay,
-    "export": export,
-    "reprocess": reprocess,
-    "run": run,
-    "dashboard": dashboard,
-    "simulate": simulate,
-    "status": status,
-    "top": top,
-    "study": study,
+# the module of `thermocald.cli` that has the function: only what is called is imported
+COMMANDS = {
+    "archive": "archive",
+    "backup": "backup",
+    "calibrate": "calibrate",
+    "check": "check",
+    "convert": "convert",
+    "correct": "correct",
+    "demo": "demo",
+    "devices": "devices",
+    "discover": "discover",
+    "doctor": "doctor",
+    "fit": "fit",
+    "fleet": "fleet",
+    "forward": "forward",
+    "import": "import_",
+    "predict": "predict",
+    "replay": "replay",
+    "export": "replay",
+    "reprocess": "reprocess",
+    "run": "run",
+    "dashboard": "run",
+    "simulate": "simulate",
+    "status": "status",
+    "top": "status",
+    "study": "study",
 }
-GROUPS: dict[str, typer.Typer] = {
-    "camera": camera.group,
-    "server": server.group,
-    "session": session.group,
-    "testfield": testfield.group,
-}
+GROUPS = ("camera", "server", "session", "testfield")
+
+
+def command(name: str) -> Callable[..., Any]:
+    """The function of a command of `COMMANDS`, by the command's name."""
+    module = importlib.import_module(f"thermocald.cli.{COMMANDS[name]}")
+    found: Callable[..., Any] = getattr(module, "import_" if name == "import" else name)
+    return found
+
+
+def group(name: str) -> typer.Typer:
+    """The commands below a word of `GROUPS`."""
+    found: typer.Typer = importlib.import_module(f"thermocald.cli.{name}").group
+    return found

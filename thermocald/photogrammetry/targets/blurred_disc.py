@@ -24,13 +24,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.photogrammetry.targets.outline import inverse_2x2
 from thermocald.photogrammetry.targets.scratch import scratch
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array, Single
     from thermocald.photogrammetry.targets.outline import LocalMap
 
-__all__ = ["PARAMETERS", "blurred_disc", "edge_distance", "normal_cdf"]
+__all__ = ["PARAMETERS", "blurred_disc", "normal_cdf"]
 
 PARAMETERS = ("x", "y", "m11", "m12", "m22", "blur", "background", "contrast", "gx", "gy")
 _PIXEL_VARIANCE = 1 / 12
@@ -53,29 +54,6 @@ def normal_cdf(z: Single) -> Single:
     value += _ONE
     value *= _HALF
     return value
-
-
-def edge_distance(linear: Array, ex: Single, ey: Single) -> tuple[Single, Single]:
-    """Distance d (n, k) px from ellipses' outlines, positive inside, and the radius ρ (n, k).
-
-    linear (n, 2, 2): as of `LocalMap`; ex, ey (n, k) px: pixels relative to the centres.
-    """
-    inverse = np.linalg.inv(linear)
-    M = (np.swapaxes(inverse, 1, 2) @ inverse).astype(np.float32)
-    # ρ² = eᵀ M e, so that ∇ρ = M e/ρ
-    gx = M[:, 0, 0, None] * ex + M[:, 0, 1, None] * ey
-    gy = M[:, 1, 0, None] * ex + M[:, 1, 1, None] * ey
-    rho = gx * ex
-    rho += gy * ey
-    np.sqrt(np.maximum(rho, np.float32(1e-12), out=rho), out=rho)
-    gx *= gx
-    gy *= gy
-    gx += gy
-    slope = np.sqrt(np.maximum(gx, np.float32(1e-18), out=gx), out=gx)
-    distance = _ONE - rho
-    distance *= rho
-    distance /= slope
-    return distance, rho
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,7 +79,7 @@ class _Plane:
         q = (I + m)(J⁻¹e − ½ J⁻¹ H[J⁻¹e, J⁻¹e]) = L e − P[e, e]; what is left out is of third order,
         and moves no centre. A = ∂q/∂e = L − 2 P[e, ·], and q = ½ (L + A) e.
         """
-        inverse = np.linalg.inv(maps.linear)
+        inverse = maps.inverse
         shape = m[:, [[0, 1], [1, 2]]]
         shape[:, [0, 1], [0, 1]] += 1.0
         L = shape @ inverse
@@ -122,7 +100,7 @@ class _Plane:
         v *= ex
         v += np.multiply(v2, ey, out=v2)
         if m.any():
-            back = np.linalg.inv(shape).astype(np.float32)[..., None]
+            back = inverse_2x2(shape).astype(np.float32)[..., None]
             s, t = back[:, 0, 0] * u, back[:, 1, 1] * v
             s += np.multiply(back[:, 0, 1], v, out=v2)
             t += np.multiply(back[:, 1, 0], u, out=v2)

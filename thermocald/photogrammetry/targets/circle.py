@@ -99,9 +99,7 @@ def fit_circles(
     for w in parts:
         begin = w.begin if start is None else start[w.rows]
         thin = w.thinned()
-        f = _gauss_newton(
-            thin, maps.select(w.rows), begin, noise, 1, _CONVERGED_PX, work, noise is None
-        )
+        f = _step(thin, maps.select(w.rows), begin, noise, work, noise is None)
         parameters[w.rows] = f.parameters
         if noise is None:
             greys.append(f.value[f.flat])
@@ -115,7 +113,7 @@ def fit_circles(
     top = np.iinfo(image.dtype).max
     for w in parts:
         begin = parameters[w.rows]
-        f = _gauss_newton(w, maps.select(w.rows), begin, noise, iterations, _CONVERGED_PX, work)
+        f = _gauss_newton(w, maps.select(w.rows), begin, noise, iterations, work)
         parameters[w.rows], normal[w.rows], last_step[w.rows] = f.parameters, f.normal, f.step
         pixels[w.rows] = w.weight.sum(axis=1)
         weight = w.weight / noise.variance(f.value)
@@ -142,7 +140,13 @@ class _Fit:
     residual: Single
     normal: Array
     step: Array
+    stands: NDArray[np.bool_]
     flat: NDArray[np.bool_]
+
+    def put(self, rows: NDArray[np.int64], other: _Fit) -> None:
+        """Replace some targets' fits by others."""
+        for name in ("parameters", "value", "residual", "normal", "step", "stands"):
+            getattr(self, name)[rows] = getattr(other, name)
 
 
 def _gauss_newton(
@@ -151,40 +155,55 @@ def _gauss_newton(
     begin: Array,
     noise: NoiseModel | None,
     rounds: int,
-    tolerance_px: float,
     work: Single,
-    tells_noise: bool = False,
 ) -> _Fit:
-    """Iterate until the centres stand; value and residual are those after the last step.
+    """Iterate until the centres stand; only what does not stand yet goes on.
 
     work (2, m): memory for the partials; asking the system for it again costs more than the sums.
     """
+    f = _step(w, maps, begin, noise, work)
+    for _ in range(rounds - 1):
+        left = np.flatnonzero(~f.stands)
+        if not len(left):
+            break
+        part = maps.select(left)
+        f.put(left, _step(w.select(left), part, f.parameters[left], noise, work))
+    return f
+
+
+def _step(
+    w: Windows,
+    maps: LocalMap,
+    begin: Array,
+    noise: NoiseModel | None,
+    work: Single,
+    tells_noise: bool = False,
+) -> _Fit:
+    """One step of Gauss-Newton; value and residual are those after it."""
     p = begin.copy()
     p[:, :2] -= w.origin
     shape = (10, *w.x.shape)
-    j, jw = (row[: np.prod(shape)].reshape(shape) for row in work)
-    for _ in range(max(rounds, 1)):
-        value, _ = blurred_disc(maps, p, w.x, w.y, out=j)
-        weight = w.weight if noise is None else w.weight / noise.variance(value)
-        np.multiply(j, weight, out=jw)
-        residual = w.grey - value
-        by_target = jw.transpose(1, 0, 2)
-        N = (by_target @ j.transpose(1, 2, 0)).astype(float)
-        delta = _limited(N, (by_target @ residual[..., None])[..., 0])
-        p = p + delta
-        p[:, 5] = np.clip(p[:, 5], 0.2, 6.0)
-        p[:, 2:5] = np.clip(p[:, 2:5], -0.6, 0.6)
-        step = np.abs(delta[:, :2]).max(axis=1)
-        if bool(np.all(step < tolerance_px) and np.all(np.abs(delta[:, 5]) < _BLUR_SETTLED_PX)):
-            break
-    change = (j.transpose(1, 2, 0) @ delta[..., None].astype(np.float32))[..., 0]
+    j, jw = (row[: 10 * w.x.size].reshape(shape) for row in work)
+    value, _ = blurred_disc(maps, p, w.x, w.y, out=j)
+    weight = w.weight if noise is None else w.weight / noise.variance(value)
+    np.multiply(j, weight, out=jw)
+    residual = w.grey - value
+    by_target = jw.transpose(1, 0, 2)
+    N = (by_target @ j.transpose(1, 2, 0)).astype(float)
+    delta = _limited(N, (by_target @ residual[..., None])[..., 0])
+    p += delta
+    p[:, 5] = np.clip(p[:, 5], 0.2, 6.0)
+    p[:, 2:5] = np.clip(p[:, 2:5], -0.6, 0.6)
     p[:, :2] += w.origin
+    change = (j.transpose(1, 2, 0) @ delta[..., None].astype(np.float32))[..., 0]
     flat = np.zeros(0, dtype=bool)
     if tells_noise:
         # Where a px of movement would change the grey value by next to nothing.
         slope = np.maximum(np.abs(j[0]), np.abs(j[1]))
         flat = (w.weight > 0) & (slope < _FLAT * np.abs(p[:, 7, None]))
-    return _Fit(p, value + change, residual - change, N, step, flat)
+    step = np.abs(delta[:, :2]).max(axis=1)
+    stands = (step < _CONVERGED_PX) & (np.abs(delta[:, 5]) < _BLUR_SETTLED_PX)
+    return _Fit(p, value + change, residual - change, N, step, stands, flat)
 
 
 def _limited(N: Array, rhs: NDArray[np.floating[Any]]) -> Array:
@@ -202,11 +221,11 @@ def _solve(N: Array, rhs: NDArray[np.floating[Any]]) -> Array:
 
 
 def _centre_covariance(N: Array) -> Array:
-    scale = np.sqrt(np.maximum(np.einsum("nii->ni", N), 1e-12))
-    inverse = np.linalg.inv(
-        N / (scale[:, :, None] * scale[:, None, :]) + 1e-12 * np.eye(N.shape[-1])
-    )
-    part: Array = inverse[:, :2, :2] / (scale[:, :2, None] * scale[:, None, :2])
+    """Of the first two unknowns, from normal matrices (n, p, p)."""
+    scale = 1 / np.sqrt(np.maximum(np.einsum("nii->ni", N), 1e-12))
+    scaled = N * scale[:, :, None] * scale[:, None, :] + 1e-12 * np.eye(N.shape[-1])
+    columns = np.linalg.solve(scaled, np.eye(N.shape[-1])[:, :2])
+    part: Array = columns[:, :2] * scale[:, :2, None] * scale[:, None, :2]
     return part
 
 

@@ -16,6 +16,8 @@ from thermocald.photogrammetry.targets.outline import LocalMap, from_ellipses
 from thermocald.photogrammetry.targets.scratch import scratch
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
@@ -63,26 +65,7 @@ def find_circles(image: NDArray[np.uint8], scale: int = 1, polarity: int = -1) -
     cv2.subtract(first, second, dst=mask)
     cv2.threshold(mask, _OFFSET_DN, 255, cv2.THRESH_BINARY, dst=mask)
     contours, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    longest = 4 * _LARGEST_SHARE * small.shape[1]
-    found, outlines = [], []
-    for contour in contours:
-        if not _FEWEST_CONTOUR_POINTS <= len(contour) <= longest:
-            continue
-        # Outlines have a negative, holes a positive oriented area.
-        area = -cv2.contourArea(contour, oriented=True)
-        if area * 4 * np.pi < _COMPACTNESS * cv2.arcLength(contour, True) ** 2:
-            continue
-        (x, y), (width, height), angle = cv2.fitEllipseDirect(contour)
-        ellipse = np.pi / 4 * width * height
-        if (
-            abs(area - ellipse) < _AREA_TOLERANCE * ellipse + 3.0
-            and min(width, height) >= _SMALLEST_AXIS
-            and max(width, height) + 1 <= _LARGEST_AXIS_RATIO * (min(width, height) + 1)
-        ):
-            found.append((x, y, width / 2, height / 2, np.radians(angle)))
-            outlines.append(contour)
-    e = np.array(found, dtype=float).reshape(-1, 5)
-    e = e[_are_ellipses(outlines, e)]
+    e = _ellipses(contours, 4 * _LARGEST_SHARE * small.shape[1])
     # The reduced image covers the whole one: (x + ½) grows with the true ratio of the sizes.
     ratio = np.array([image.shape[1] / small.shape[1], image.shape[0] / small.shape[0]])
     centre = (e[:, :2] + 0.5) * ratio - 0.5
@@ -93,19 +76,64 @@ def find_circles(image: NDArray[np.uint8], scale: int = 1, polarity: int = -1) -
     )
 
 
-def _are_ellipses(contours: list[Any], e: Array) -> NDArray[np.bool_]:
-    """Which contours keep to their ellipses (x, y, a, b, angle), to a pixel's raster and 3 %."""
-    if not contours:
-        return np.zeros(0, dtype=bool)
-    count = np.array([len(c) for c in contours])
-    which = np.repeat(np.arange(len(contours)), count)
-    a, b, angle = e[:, 2:].T
+def _ellipses(contours: Sequence[Any], longest: float) -> Array:
+    """Ellipses x, y, a, b, angle (n, 5) of those contours that are ellipses, to a pixel's raster
+    and 3 %: with the contour's own moments. longest: most pixels of a contour.
+    """
+    used = [c for c in contours if _FEWEST_CONTOUR_POINTS <= len(c) <= longest]
+    if not used:
+        return np.zeros((0, 5))
+    count = np.array([len(c) for c in used])
+    first = np.cumsum(count) - count
+    which = np.repeat(np.arange(len(used)), count)
+    points = np.concatenate(used)[:, 0].T.astype(float)
+    begin = points[:, first]
+    points -= begin[:, which]
+    area, length, centre, (xx, xy, yy) = _moments(points, first, count)
+    mean, difference = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+    # The semi-axes of an ellipse are twice the roots of its principal moments.
+    a, b = (2 * np.sqrt(np.maximum(mean + sign * difference, 1e-6)) for sign in (1, -1))
+    angle = np.arctan2(2 * xy, xx - yy) / 2
+    ellipse = np.pi * a * b
+    keep = (
+        (area * 4 * np.pi >= _COMPACTNESS * length**2)
+        & (np.abs(area - ellipse) < _AREA_TOLERANCE * ellipse + 3.0)
+        & (2 * b >= _SMALLEST_AXIS)
+        & (2 * a + 1 <= _LARGEST_AXIS_RATIO * (2 * b + 1))
+    )
+    # How far the contour is from the ellipse, in the plane where that is the unit circle
     c, s = np.cos(angle), np.sin(angle)
-    # to the plane of the unit circle, by what is the same for all points of a contour
-    axes = np.stack([c / a, s / a, -s / b, c / b], axis=1).astype(np.float32)[which].T
-    points = np.concatenate(contours)[:, 0] - e[:, :2].astype(np.float32)[which]
-    dx, dy = points.astype(np.float32).T
+    axes = np.stack([c / a, s / a, -s / b, c / b])[:, which]
+    dx, dy = points - centre[:, which]
     u, v = axes[0] * dx + axes[1] * dy, axes[2] * dx + axes[3] * dy
     off = np.bincount(which, np.abs(np.sqrt(u * u + v * v) - 1)) / count
-    keeps: NDArray[np.bool_] = off < _RADIUS_TOLERANCE + 0.35 / np.minimum(a, b)
-    return keeps
+    keep &= off < _RADIUS_TOLERANCE + 0.35 / b
+    found: Array = np.stack([*(centre + begin), a, b, angle], axis=1)[keep]
+    return found
+
+
+def _moments(
+    points: Array, first: NDArray[np.int64], count: NDArray[np.int64]
+) -> tuple[Array, Array, Array, tuple[Array, Array, Array]]:
+    """Of n polygons: area (positive for outlines, negative for holes), length, centre (2, n), and
+    second moments xx, xy, yy about it, each divided by the area (Green's theorem).
+
+    points (2, k): one polygon after the other, from `first` on, `count` of each.
+    """
+    after = np.arange(1, points.shape[1] + 1)
+    after[first + count - 1] = first
+    (x, y), (x1, y1) = points, points[:, after]
+    cross = x1 * y - x * y1
+
+    def integral(values: Array) -> Array:
+        total: Array = np.add.reduceat(values, first)
+        return total
+
+    area = integral(cross) / 2
+    length = integral(np.hypot(x1 - x, y1 - y))
+    per_area = 1 / np.where(area == 0, 1.0, area)
+    cx, cy = (integral((p + p1) * cross) / 6 * per_area for p, p1 in ((x, x1), (y, y1)))
+    xx, yy = (integral((p * (p + p1) + p1 * p1) * cross) / 12 for p, p1 in ((x, x1), (y, y1)))
+    xy = integral((2 * (x * y + x1 * y1) + x * y1 + x1 * y) * cross) / 24
+    about = (xx * per_area - cx * cx, xy * per_area - cx * cy, yy * per_area - cy * cy)
+    return area, length, np.stack([cx, cy]), about

@@ -58,7 +58,7 @@ def ring_misfit(
     turn = 2 * np.pi * np.arange(ANGLES) / ANGLES
     u = np.stack([np.cos(turn), np.sin(turn)])
     # How many px a radius is: across the circles, and across a radial edge at that radius.
-    across = 1 / np.linalg.norm(np.swapaxes(np.linalg.inv(maps.linear), 1, 2) @ u, axis=1)
+    across = 1 / np.linalg.norm(np.swapaxes(maps.inverse, 1, 2) @ u, axis=1)
     along = np.abs(np.linalg.det(maps.linear))[:, None] / np.linalg.norm(maps.linear @ u, axis=1)
     across, side = across.astype(np.float32), (angle * along).astype(np.float32)
     rho = np.array(RADII, dtype=np.float32)[:, None]

@@ -65,7 +65,7 @@ def sized(image: NDArray[np.uint8], maps: LocalMap, gap: Single, contrast: Singl
     radius = _EDGE_RADII[0] - step / 2 + np.clip(level, 0, 1).sum(axis=1) * step
     turn = 2 * np.pi * np.arange(COARSE_ANGLES) / COARSE_ANGLES
     across = 1 / np.linalg.norm(
-        np.swapaxes(np.linalg.inv(maps.linear), 1, 2) @ np.stack([np.cos(turn), np.sin(turn)]),
+        np.swapaxes(maps.inverse, 1, 2) @ np.stack([np.cos(turn), np.sin(turn)]),
         axis=1,
     )
     excess = np.median((radius - 1) * across, axis=1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
@@ -248,9 +249,10 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
     numbers: list[NDArray[np.int64]] = []
     times: dict[str, list[Array]] = {"frame_time": [], "temperature_time": []}
     temperatures: dict[str, list[Array]] = {name: [] for name in channels}
-    frames: list[str] = []
+    # Text is kept chunk by chunk: the garbage collector would walk through a list of a year's.
+    frames: list[tuple[str, ...]] = []
     files = FileFolder(folder)
-    extra: dict[str, list[str]] = {name: [] for name in extra_names}
+    extra: dict[str, list[tuple[str, ...]]] = {name: [] for name in extra_names}
     previous = {"epoch": -1.0, "frame_time": -np.inf, "temperature_time": -np.inf}
     for chunk in table.chunks():
         numbers.append(chunk.integers("epoch"))
@@ -282,8 +284,8 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
                 chunk.check(
                     name, readings[-1] > _KELVIN_FROM, "reads as kelvin: subtract 273.15, K to °C"
                 )
-        for row, text in enumerate(chunk.text("frame")):
-            frame = text.strip()
+        frames.append(tuple(map(str.strip, chunk.text("frame"))))
+        for row, frame in enumerate(frames[-1]):
             if frame and files.find(frame) is None:
                 chunk.fail(
                     row,
@@ -291,9 +293,8 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
                     f"{frame!r} is missing, or leads out of the recording; leave it empty if it "
                     "was not kept",
                 )
-            frames.append(frame)
         for name in extra_names:
-            extra[name].extend(chunk.text(name))
+            extra[name].append(chunk.text(name))
     if not numbers:
         raise RecordingError(f"{folder / 'epochs.csv'}: holds no epochs")
     joined = {name: np.concatenate(columns) for name, columns in times.items()}
@@ -302,8 +303,8 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
         joined["frame_time"],
         joined["temperature_time"],
         {name: np.concatenate(readings) for name, readings in temperatures.items()},
-        tuple(frames),
-        {name: tuple(values) for name, values in extra.items()},
+        tuple(chain.from_iterable(frames)),
+        {name: tuple(chain.from_iterable(values)) for name, values in extra.items()},
     )
 
 

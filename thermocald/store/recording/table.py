@@ -58,7 +58,8 @@ class Table:
         first = 0
         with self._open() as file:
             reader = csv.reader(file, strict=True)
-            content = filter(None, reader)
+            # as tuples, which the garbage collector does not come back to
+            content = map(tuple, filter(None, reader))
             try:
                 next(content, None)
                 while block := list(islice(content, rows)):
@@ -141,7 +142,7 @@ class Chunk:
 
     table: _Rows
 
-    def __init__(self, table: Table, first: int, rows: list[list[str]]) -> None:
+    def __init__(self, table: Table, first: int, rows: list[tuple[str, ...]]) -> None:
         self.table = table
         self.first = first
         self._size = len(rows)

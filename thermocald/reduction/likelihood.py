@@ -23,10 +23,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.reduction.sums import Sums, sums_of
+from thermocald.reduction.sums import Sums, still_sums_of, sums_of
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array
+    from thermocald.reduction.couplings import Couplings
     from thermocald.reduction.series import ReducedSeries
 
 __all__ = ["NormalEquations", "ReadingErrorTerm", "Weighting", "prepare", "with_error_term"]
@@ -62,9 +63,9 @@ def with_error_term(terms: list[ReadingErrorTerm], new: ReadingErrorTerm) -> lis
 class Weighting:
     """One series with a fixed covariance S: inner products of hypotheses under S⁻¹.
 
-    b (E, P), yy: data with the readings' own deviations put in; logdet: log |C| + log |M|. effects
-    (F, E, P): couplings of the random effects with the epochs' parameters; they are the first F
-    states, of which the mount's movement has the first `moving`; those of the readings follow.
+    b (E, P), yy: data with the readings' own deviations put in; logdet: log |C| + log |M|. effects:
+    couplings of the F random effects with the epochs' parameters; they are the first F states, of
+    which the mount's movement has the first `moving`; those of the readings follow.
     """
 
     N: Array
@@ -77,7 +78,7 @@ class Weighting:
     directions: tuple[Array, ...]  # d_k (P,)
     dN: tuple[Array, ...]  # d_kᵀN_e (E, P)
     moving: int
-    effects: Array
+    effects: Couplings
     factor: Array | None
     data: Array  # L⁻¹ Jᵀ b (R,)
     level: Array  # L⁻¹ Jᵀ constants (R, P)
@@ -94,8 +95,7 @@ class Weighting:
         for operator, at, dN in zip(self.operators, self.places, self.dN, strict=True):
             total[at] += operator.T @ ((dN @ directions) * trajectories)
         if len(self.effects):
-            X = trajectories[:, None, :] * directions
-            total[: len(self.effects)] = np.tensordot(self.effects, X, axes=([1, 2], [0, 1]))
+            total[: len(self.effects)] = self.effects.onto(trajectories[:, None, :] * directions)
         out: Array = solve_triangular(self.factor, total, lower=True, check_finite=False)
         return out
 
@@ -112,7 +112,7 @@ class Weighting:
                 total[at, :, a] += operator.T @ (s * h[:, a : a + 1])
         if len(self.effects):
             for a in range(k):
-                total[: len(self.effects), :, a] = (self.effects @ directions[:, a]) @ s
+                total[: len(self.effects), :, a] = self.effects.along(directions[:, a]) @ s
         out: Array = solve_triangular(
             self.factor, total.reshape(len(total), -1), lower=True, check_finite=False
         )
@@ -213,7 +213,7 @@ def prepare(
     """
     from scipy.linalg import cholesky, solve_triangular
 
-    sums = sums_of(evidence)
+    sums = _blurred(evidence, carried)
     P = sums.N.shape[1]
     fixed = len(sums.right)
     if not carried and not fixed:
@@ -233,15 +233,10 @@ def prepare(
         start += len(sd)
     # the readings' own deviation from the smooth trajectory, carried to the camera
     shift = np.zeros((len(sums.N), P))
-    blurred = False
     for item in carried:
         shift += np.outer(item.operator @ deviations[item.channel], item.direction)
-        if item.unresolved is not None and item.unresolved.any():
-            bent = np.flatnonzero(item.unresolved)
-            D = item.unresolved[bent, None, None] * item.direction[:, None]
-            sums, blurred = sums.blurred(D, bent), True
+    own = _own_factor(evidence) if sums is sums_of(evidence) else _factored(sums)
     sums = sums.shifted(shift)
-    own = _factored(sums) if blurred else _own_factor(evidence)
     states = [(c.direction, c.operator, places[c.channel]) for c in carried]
     dN = [sums.N @ c.direction for c in carried]
     factor = np.zeros((start, start))
@@ -253,7 +248,7 @@ def prepare(
         beside = np.zeros((fixed, start - fixed))
         for i, (d, Oi, at) in enumerate(states):
             here = slice(at.start - fixed, at.stop - fixed)
-            beside[:, here] += (sums.cross @ d) @ Oi
+            beside[:, here] += sums.cross.along(d) @ Oi
             for j in range(i, len(states)):
                 dj, Oj, to = states[j]
                 there = slice(to.start - fixed, to.stop - fixed)
@@ -272,7 +267,7 @@ def prepare(
     for (d, operator, at), w in zip(states, dN, strict=True):
         right[at, :P] += operator.T @ w
         right[at, P] += operator.T @ (sums.b @ d)
-    right[:fixed, :P] = sums.cross.sum(axis=1)
+    right[:fixed, :P] = sums.cross.total()
     right[:fixed, P] = sums.right
     right = solve_triangular(factor, right, lower=True, check_finite=False)
     level, data = right[:, :P], right[:, P]
@@ -287,6 +282,18 @@ def prepare(
         tuple(at for _, _, at in states), tuple(d for d, _, _ in states), tuple(dN),
         moving, sums.cross, factor, data, level, N0, k0, held,
     )  # fmt: skip
+
+
+def _blurred(evidence: ReducedSeries, carried: list[ReadingErrorTerm]) -> Sums:
+    """The sums of a series, with what no reading resolves as noise of single epochs."""
+    unresolved = [(c.direction, c.unresolved) for c in carried if c.unresolved is not None]
+    if not any(sd.any() for _, sd in unresolved):
+        return sums_of(evidence)
+    sums = still_sums_of(evidence)
+    for direction, sd in unresolved:
+        bent = np.flatnonzero(sd)
+        sums = sums.blurred(sd[bent, None, None] * direction[:, None], bent)
+    return sums.alongside(evidence.movement)
 
 
 @lru_cache(maxsize=4)

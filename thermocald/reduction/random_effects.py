@@ -143,19 +143,30 @@ class Movement:
         out: Array = self.trajectories[:, wave] * self.sd[mode, wave]
         return out
 
-    def cross(self, N: Array) -> Array:
-        """Couplings (F, E, P) with the parameters of epochs with normal matrices N (E, P, P)."""
-        by_mode = np.moveaxis(N @ self.directions, 2, 0)
-        out: Array = by_mode[self.states[0]] * self.operator.T[:, :, None]
+    @cached_property
+    def spans(self) -> tuple[tuple[int, slice], ...]:
+        """Each direction with an amplitude that counts, and where its amplitudes are."""
+        modes, first = np.unique(self.states[0], return_index=True)
+        stops = [*first[1:].tolist(), len(self)]
+        parts = zip(modes.tolist(), first.tolist(), stops, strict=True)
+        return tuple((mode, slice(start, stop)) for mode, start, stop in parts)
+
+    def own(self, N: Array) -> Array:
+        """Sums (F, F) of products of the amplitudes' shifts under normal matrices N (E, P, P)."""
+        between = self.directions.T @ N @ self.directions
+        out = np.zeros((len(self), len(self)))
+        for i, (mode, here) in enumerate(self.spans):
+            for other, there in self.spans[i:]:
+                weighted = between[:, mode, other, None] * self.operator[:, there]
+                out[here, there] = self.operator[:, here].T @ weighted
+                out[there, here] = out[here, there].T
         return out
 
-    def onto(self, cross: Array) -> Array:
+    def onto(self, data: Array) -> Array:
         """Sums (n, F) of data or couplings (n, E, P) over what each amplitude moves."""
-        along = np.moveaxis(cross @ self.directions, 2, 0)  # (m, n, E)
-        mode = self.states[0]
-        out = np.zeros((len(cross), len(self)))
-        for m in np.unique(mode):
-            out[:, mode == m] = along[m] @ self.operator[:, mode == m]
+        along = np.moveaxis(data @ self.directions, 2, 0)  # (m, n, E)
+        parts = [along[mode] @ self.operator[:, span] for mode, span in self.spans]
+        out: Array = np.concatenate(parts, axis=1)
         return out
 
     def moments(self, mean: Array, covariance: Array) -> tuple[Array, Array]:

@@ -15,13 +15,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.reduction.couplings import Couplings
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
+    from thermocald.reduction.random_effects import Movement
     from thermocald.reduction.series import ReducedSeries
 
-__all__ = ["Sums", "sums_of"]
+__all__ = ["Sums", "still_sums_of", "sums_of"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,26 +35,33 @@ class Sums:
     b: Array  # (E, P)
     yy: float
     logdet: float
-    cross: Array  # (F, E, P)
+    cross: Couplings
     normal: Array  # (F, F)
     right: Array  # (F,)
 
     def blurred(self, D: Array, epochs: NDArray[np.int64]) -> Sums:
-        """With random shifts of unit variance of some epochs (n,) along D (n, P, t): Woodbury."""
-        N, b, cross = self.N[epochs], self.b[epochs], self.cross[:, epochs]
+        """With random shifts of unit variance of some epochs (n,) along D (n, P, t): Woodbury.
+
+        Before a movement comes in, which `alongside` couples with what is left then.
+        """
+        assert not self.cross.spans
+        N, b, cross = self.N[epochs], self.b[epochs], self.cross.others[:, epochs]
         Dt = np.swapaxes(D, 1, 2)
         DtN = Dt @ N
         L = np.linalg.cholesky(np.eye(D.shape[2]) + DtN @ D)
         own = np.linalg.solve(L, DtN)  # (n, t, P)
         data = np.linalg.solve(L, Dt @ b[..., None])  # (n, t, 1)
         coupled = np.linalg.solve(L, Dt @ np.moveaxis(cross, 0, 2))  # (n, t, F)
-        out = replace(self, N=self.N.copy(), b=self.b.copy(), cross=self.cross.copy())
-        out.N[epochs] -= np.swapaxes(own, 1, 2) @ own
-        out.b[epochs] -= np.sum(own * data, axis=1)
-        out.cross[:, epochs] -= np.swapaxes(np.swapaxes(coupled, 1, 2) @ own, 0, 1)
+        whole, right, others = self.N.copy(), self.b.copy(), self.cross.others.copy()
+        whole[epochs] -= np.swapaxes(own, 1, 2) @ own
+        right[epochs] -= np.sum(own * data, axis=1)
+        others[:, epochs] -= np.swapaxes(np.swapaxes(coupled, 1, 2) @ own, 0, 1)
         wide = coupled.reshape(data.size, len(self.cross))
         return replace(
-            out,
+            self,
+            N=whole,
+            b=right,
+            cross=Couplings.still(others),
             yy=self.yy - float(np.sum(data**2)),
             logdet=self.logdet + 2 * float(np.sum(np.log(np.einsum("eii->ei", L)))),
             normal=self.normal - wide.T @ wide,
@@ -62,8 +72,22 @@ class Sums:
         """With shifts (E, P) of the parameters taken off the data."""
         moved = np.einsum("epq,eq->ep", self.N, shift)
         yy = self.yy - 2 * float(np.sum(shift * self.b)) + float(np.sum(shift * moved))
-        right = self.right - np.einsum("sep,ep->s", self.cross, shift)
+        right = self.right - self.cross.onto(shift[..., None])[:, 0]
         return Sums(self.N, self.b - moved, yy, self.logdet, self.cross, self.normal, right)
+
+
+    def alongside(self, movement: Movement | None) -> Sums:
+        """With a movement as random effects before the others."""
+        if movement is None:
+            return self
+        own = movement.own(self.N) + np.eye(len(movement))
+        between = movement.onto(self.cross.others)
+        return replace(
+            self,
+            cross=Couplings.of(movement, self.N, self.cross.others),
+            normal=np.block([[own, between.T], [between, self.normal]]),
+            right=np.concatenate([movement.onto(self.b[None])[0], self.right]),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +118,9 @@ def _trembled(still: _Still) -> Sums:
     normal = np.zeros((0, 0))
     if hidden is not None:
         cross, normal, right = hidden.cross, np.diag(hidden.normal), hidden.right.sum(axis=1)
-    sums = Sums(evidence.N, evidence.b, float(evidence.yy.sum()), 0.0, cross, normal, right)
+    sums = Sums(
+        evidence.N, evidence.b, float(evidence.yy.sum()), 0.0, Couplings.still(cross), normal, right
+    )  # fmt: skip
     if evidence.tremble is None:
         return sums
     every = np.arange(len(evidence.N))
@@ -102,18 +128,12 @@ def _trembled(still: _Still) -> Sums:
     return sums.blurred(D, every)
 
 
+def still_sums_of(evidence: ReducedSeries) -> Sums:
+    """The sums without what moves."""
+    return _trembled(_Still(evidence))
+
+
 @lru_cache(maxsize=4)
 def sums_of(evidence: ReducedSeries) -> Sums:
     """The sums with what moves: first the movement, then hidden targets."""
-    sums, movement = _trembled(_Still(evidence)), evidence.movement
-    if movement is None:
-        return sums
-    cross = movement.cross(sums.N)
-    own = movement.onto(cross) + np.eye(len(movement))
-    between = movement.onto(sums.cross)
-    return replace(
-        sums,
-        cross=np.concatenate([cross, sums.cross]),
-        normal=np.block([[own, between.T], [between, sums.normal]]),
-        right=np.concatenate([movement.onto(sums.b[None])[0], sums.right]),
-    )
+    return still_sums_of(evidence).alongside(evidence.movement)

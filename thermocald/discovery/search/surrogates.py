@@ -104,8 +104,7 @@ def _data(
     parameters = model + moved @ W.T
     w = without.weightings[series]
     b = np.einsum("epq,seq->sep", w.N, parameters)
-    hidden = np.tensordot(parameters, w.effects, axes=([1, 2], [1, 2]))
-    return b, hidden
+    return b, w.effects.onto(np.moveaxis(parameters, 0, 2)).T
 
 
 def _moved(y: Array, rng: np.random.Generator) -> Array:

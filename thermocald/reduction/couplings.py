@@ -1,0 +1,68 @@
+"""How random effects are coupled with the epochs' parameters in the normal equations.
+
+The movement of the mount has hundreds of amplitudes, but few directions, each with its cosines: its
+couplings are kept as products of the two, never written out over epochs and parameters.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from thermocald.arrays import Array
+    from thermocald.reduction.random_effects import Movement
+
+__all__ = ["Couplings"]
+
+
+@dataclass(frozen=True, eq=False)
+class Couplings:
+    """Couplings of F amplitudes of a movement, and of S other random effects.
+
+    moved (E, m, P): normal matrices times each direction of the movement; operator (E, F):
+    trajectories of its amplitudes, direction after direction; spans: those of each direction;
+    others (S, E, P): written out.
+    """
+
+    moved: Array
+    operator: Array
+    spans: tuple[slice, ...]
+    others: Array
+
+    @classmethod
+    def still(cls, others: Array) -> Couplings:
+        """Where nothing moves."""
+        _, E, P = others.shape
+        return cls(np.zeros((E, 0, P)), np.zeros((E, 0)), (), others)
+
+    @classmethod
+    def of(cls, movement: Movement, N: Array, others: Array) -> Couplings:
+        """Of a movement of epochs with normal matrices N (E, P, P)."""
+        modes = [mode for mode, _ in movement.spans]
+        moved = movement.directions[:, modes].T @ N
+        return cls(moved, movement.operator, tuple(span for _, span in movement.spans), others)
+
+    def __len__(self) -> int:
+        return self.operator.shape[1] + len(self.others)
+
+    def along(self, direction: Array) -> Array:
+        """Couplings (F + S, E) with a direction (P,) of the parameters."""
+        counts = [span.stop - span.start for span in self.spans]
+        own: Array = (self.operator * np.repeat(self.moved @ direction, counts, axis=1)).T
+        return np.concatenate([own, self.others @ direction]) if len(self.others) else own
+
+    def onto(self, shifts: Array) -> Array:
+        """Sums (F + S, R) over all epochs' shifts (E, P, R) of the parameters."""
+        others = np.tensordot(self.others, shifts, axes=([1, 2], [0, 1]))
+        return np.concatenate([*self._amplitudes(self.moved @ shifts), others])
+
+    def total(self) -> Array:
+        """Couplings (F + S, P) with the levels of the parameters."""
+        return np.concatenate([*self._amplitudes(self.moved), self.others.sum(axis=1)])
+
+    def _amplitudes(self, along: Array) -> list[Array]:
+        """Of each direction, the sums (·, R) over what its amplitudes move: along (E, m, R)."""
+        return [self.operator[:, span].T @ along[:, m] for m, span in enumerate(self.spans)]

@@ -59,6 +59,12 @@ class Couplings:
         others = np.tensordot(self.others, shifts, axes=([1, 2], [0, 1]))
         return np.concatenate([*self._amplitudes(self.moved @ shifts), others])
 
+    def driven(self, trajectories: Array, directions: Array) -> Array:
+        """Sums (F + S, R) over shifts along directions (P, R) that go as trajectories (E, R)."""
+        along = (self.moved @ directions) * trajectories[:, None, :]
+        others = np.einsum("ser,er->sr", self.others @ directions, trajectories)
+        return np.concatenate([*self._amplitudes(along), others])
+
     def total(self) -> Array:
         """Couplings (F + S, P) with the levels of the parameters."""
         return np.concatenate([*self._amplitudes(self.moved), self.others.sum(axis=1)])

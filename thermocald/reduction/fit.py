@@ -379,6 +379,7 @@ class HypothesisFitter:
                 A, g, _ = self.normal_equations(fit, only)
                 step = _solve(A, g)[len(fit.coefficients) :]
                 improved = False
+                tried: list[Term] = []
                 for damping in (1.0, 0.3, 0.1):
                     terms = list(fit.terms)
                     for (i, name), d in zip(searched, damping * step, strict=True):
@@ -388,6 +389,9 @@ class HypothesisFitter:
                         if parameter.role == "period":
                             value = min(value, max(old, self._longest_period()))
                         terms[i] = terms[i].with_value(name, value)
+                    if terms == tried:  # every parameter at its bound again
+                        continue
+                    tried = terms
                     trial = self.fit(terms, fit.coefficients, 2, only)
                     gain = self._with_prior(fit) - self._with_prior(trial)
                     if gain > 0:

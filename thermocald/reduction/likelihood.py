@@ -17,7 +17,7 @@ Processes for Machine Learning, section 2.7 for marginalised linear terms.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from thermocald.reduction.series import ReducedSeries
 
 __all__ = ["NormalEquations", "ReadingErrorTerm", "Weighting", "prepare", "with_error_term"]
+
+_MANY = 0.15  # trajectories per epoch from which on epochs are whitened, for all that follow
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +87,7 @@ class Weighting:
     level_normal: Array  # inverse-ready (P, P) of the constants, thermometer included
     level_b: Array
     level_factor: Array
+    kept: dict[bytes, Array] = field(default_factory=dict)  # of `by_epoch`
 
     def carried(self, trajectories: Array, directions: Array) -> Array:
         """L⁻¹ Jᵀ of regressors: trajectories (E, R), directions (P, R) → (states, R)."""
@@ -95,28 +98,35 @@ class Weighting:
         for operator, at, dN in zip(self.operators, self.places, self.dN, strict=True):
             total[at] += operator.T @ ((dN @ directions) * trajectories)
         if len(self.effects):
-            total[: len(self.effects)] = self.effects.onto(trajectories[:, None, :] * directions)
+            total[: len(self.effects)] = self.effects.driven(trajectories, directions)
         out: Array = solve_triangular(self.factor, total, lower=True, check_finite=False)
         return out
 
     def carried_stack(self, s: Array, directions: Array) -> Array:
         """L⁻¹ Jᵀ of every trajectory (E, G) along every direction (P, k) → (states, G k)."""
+        E, G = s.shape
+        if G < _MANY * E:
+            columns = np.repeat(s, directions.shape[1], axis=1)
+            return self.carried(columns, np.tile(directions, G))
+        parts = [self.by_epoch(d) @ s for d in directions.T]
+        return np.stack(parts, axis=2).reshape(len(parts[0]), -1)
+
+    def by_epoch(self, direction: Array) -> Array:
+        """L⁻¹ Jᵀ (states, E) of shifts of single epochs along a direction (P,); kept."""
         from scipy.linalg import solve_triangular
 
-        assert self.factor is not None
-        G, k = s.shape[1], directions.shape[1]
-        total = np.zeros((len(self.factor), G, k))
-        for operator, at, dN in zip(self.operators, self.places, self.dN, strict=True):
-            h = dN @ directions
-            for a in range(k):
-                total[at, :, a] += operator.T @ (s * h[:, a : a + 1])
-        if len(self.effects):
-            for a in range(k):
-                total[: len(self.effects), :, a] = self.effects.along(directions[:, a]) @ s
-        out: Array = solve_triangular(
-            self.factor, total.reshape(len(total), -1), lower=True, check_finite=False
-        )
-        return out
+        key = direction.tobytes()
+        if key not in self.kept:
+            assert self.factor is not None
+            total = np.zeros((len(self.factor), len(self.N)))
+            for operator, at, dN in zip(self.operators, self.places, self.dN, strict=True):
+                total[at] += (operator * (dN @ direction)[:, None]).T
+            if len(self.effects):
+                total[: len(self.effects)] = self.effects.along(direction)
+            self.kept[key] = solve_triangular(
+                self.factor, total, lower=True, overwrite_b=True, check_finite=False
+            )
+        return self.kept[key]
 
     def joint(self, trajectories: Array, directions: Array) -> tuple[Array, Array, Array]:
         """Normal equations alongside the levels: A (R, R), c (R,), K (P, R).
@@ -124,11 +134,11 @@ class Weighting:
         trajectories (E, R), directions (P, R); K couples them with the levels, whose own normal
         equations are `level_normal` and `level_b`.
         """
-        X = trajectories[:, None, :] * directions
-        NX = self.N @ X
-        A = np.tensordot(X, NX, axes=([0, 1], [0, 1]))
+        NV = self.N @ directions
+        VNV = directions.T @ NV
+        A = np.einsum("eij,ei,ej->ij", VNV, trajectories, trajectories)
         c = np.einsum("ei,ei->i", trajectories, self.b @ directions)
-        K = NX.sum(axis=0)
+        K = np.einsum("epi,ei->pi", NV, trajectories)
         if self.factor is not None:
             U = self.carried(trajectories, directions)
             A = A - U.T @ U
@@ -249,24 +259,23 @@ def prepare(
         for i, (d, Oi, at) in enumerate(states):
             here = slice(at.start - fixed, at.stop - fixed)
             beside[:, here] += sums.cross.along(d) @ Oi
-            for j in range(i, len(states)):
-                dj, Oj, to = states[j]
+            half = np.sqrt(np.maximum(dN[i] @ d, 0.0))[:, None] * Oi
+            M[here, here] += half.T @ half  # half the work of a product with another matrix
+            for dj, Oj, to in states[i + 1 :]:
                 there = slice(to.start - fixed, to.stop - fixed)
                 part = Oi.T @ ((dN[i] @ dj)[:, None] * Oj)
                 M[here, there] += part
-                if i != j:
-                    M[there, here] += part.T
+                M[there, here] += part.T
         if fixed:
             low = solve_triangular(own, beside, lower=True, check_finite=False)
             M = M - low.T @ low
             factor[fixed:, :fixed] = low.T
-        last = cholesky(M, lower=True, check_finite=False)
+        last = cholesky(M.T, lower=True, overwrite_a=True, check_finite=False)
         factor[fixed:, fixed:] = last
         logdet += 2 * float(np.sum(np.log(np.diag(last) * whole)))
     right = np.zeros((start, P + 1))
     for (d, operator, at), w in zip(states, dN, strict=True):
-        right[at, :P] += operator.T @ w
-        right[at, P] += operator.T @ (sums.b @ d)
+        right[at] += operator.T @ np.column_stack([w, sums.b @ d])
     right[:fixed, :P] = sums.cross.total()
     right[:fixed, P] = sums.right
     right = solve_triangular(factor, right, lower=True, check_finite=False)

@@ -224,7 +224,7 @@ def _amplitudes(fit: Fit) -> list[tuple[Array, Array]]:
         level = solve_triangular(F.T, right, lower=False)
         data = w.data - U @ x - w.level @ level
         Q = solve_triangular(F, w.level.T, lower=True).T
-        inverse = solve_triangular(w.factor, np.eye(len(w.factor)), lower=True)[:, : w.moving]
+        inverse = solve_triangular(w.factor, np.eye(len(w.factor), w.moving), lower=True)
         by_level = inverse.T @ Q
         by_x = inverse.T @ (U - Q @ B)
         covariance = inverse.T @ inverse + by_level @ by_level.T

@@ -9,6 +9,7 @@ import numpy as np
 
 from thermocald.reduction.grid import trial_values
 from thermocald.reduction.hypothesis import Term
+from thermocald.reduction.series import COLUMNS
 from thermocald.simulation import effects as catalogue
 
 if TYPE_CHECKING:
@@ -39,6 +40,13 @@ class Candidate:
     def kind(self) -> Effect:
         """The effect itself."""
         return catalogue.get(self.effect)
+
+    @property
+    def directions(self) -> Array:
+        """Its parameters as unit vectors (P, k)."""
+        out = np.zeros((len(COLUMNS), len(self.parameters)))
+        out[[COLUMNS.index(name) for name in self.parameters], range(len(self.parameters))] = 1.0
+        return out
 
     def term(self, value: float | None, series: int) -> Term:
         """The term at one value of the grid; `series`: how many series there are."""

@@ -65,6 +65,14 @@ class Couplings:
         others = np.einsum("ser,er->sr", self.others @ directions, trajectories)
         return np.concatenate([*self._amplitudes(along), others])
 
+    def images(self, amplitudes: Array) -> Array:
+        """What amplitudes (F + S, R) give in the epochs' right-hand sides, (E, P, R)."""
+        out: Array = np.tensordot(self.others, amplitudes[self.operator.shape[1] :], axes=(0, 0))
+        for m, span in enumerate(self.spans):
+            course = self.operator[:, span] @ amplitudes[span]
+            out += self.moved[:, m, :, None] * course[:, None, :]
+        return out
+
     def total(self) -> Array:
         """Couplings (F + S, P) with the levels of the parameters."""
         return np.concatenate([*self._amplitudes(self.moved), self.others.sum(axis=1)])

@@ -128,6 +128,31 @@ class Weighting:
             )
         return self.kept[key]
 
+    def weighted(self, parameters: Array) -> Array:
+        """Images (E, P, R) of trajectories of all parameters (E, P, R) under S⁻¹ after the levels:
+        their sums along other trajectories are inner products.
+        """
+        from scipy.linalg import cho_solve, solve_triangular
+
+        b = self.N @ parameters
+        level_b, carried = b.sum(axis=0), None
+        if self.factor is not None:
+            right = np.zeros((len(self.factor), b.shape[2]))
+            for operator, at, d in zip(self.operators, self.places, self.directions, strict=True):
+                right[at] += operator.T @ (d @ b)
+            right[: len(self.effects)] = self.effects.onto(parameters)
+            carried = solve_triangular(self.factor, right, lower=True, check_finite=False)
+            level_b = level_b - self.level.T @ carried
+        level = cho_solve((self.level_factor, True), level_b)
+        b = b - self.N @ level
+        if carried is not None:
+            left = carried - self.level @ level
+            states = solve_triangular(self.factor, left, lower=True, trans=1, check_finite=False)
+            for operator, at, dN in zip(self.operators, self.places, self.dN, strict=True):
+                b -= dN[:, :, None] * (operator @ states[at])[:, None, :]
+            b -= self.effects.images(states[: len(self.effects)])
+        return b
+
     def joint(self, trajectories: Array, directions: Array) -> tuple[Array, Array, Array]:
         """Normal equations alongside the levels: A (R, R), c (R,), K (P, R).
 

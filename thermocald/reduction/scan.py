@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.reduction.hypothesis import BASE
-from thermocald.reduction.series import COLUMNS
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array
@@ -27,12 +26,16 @@ class Scan:
     """What a scan found.
 
     gains (G,): χ² that each trial value explains, all series together; events [(G,)]: of an event,
-    in each series, at each of its epochs but the first; coefficients: how many are fitted.
+    in each series, at each of its epochs but the first; coefficients: how many are fitted; stacks,
+    parts: of each series the trajectories (G, E, m), and A (G, mk, mk), c (G, mk), B (G, mk, K)
+    alongside the whole hypothesis.
     """
 
     gains: Array
     events: tuple[Array, ...]
     coefficients: int
+    stacks: tuple[Array, ...]
+    parts: tuple[tuple[Array, Array, Array], ...]
 
     @property
     def best(self) -> int:
@@ -76,21 +79,19 @@ class Scanner:
 
     def scan(self, candidate: Candidate, fit: Fit) -> Scan:
         """One candidate added to a fitted hypothesis."""
-        directions = np.zeros((len(COLUMNS), len(candidate.parameters)))
-        for j, name in enumerate(candidate.parameters):
-            directions[COLUMNS.index(name), j] = 1.0
         K = len(fit.coefficients)
+        stacks = tuple(self.stack(candidate, s, fit) for s in range(len(self.fitter.series)))
         parts = []
         base_A, base_c = np.zeros((K, K)), np.zeros(K)
         for s in range(len(self.fitter.series)):
             C, V, index = fit.designs[s]
-            A, c, B = fit.weightings[s].scan(self.stack(candidate, s, fit), directions, (C, V))
+            A, c, B = fit.weightings[s].scan(stacks[s], candidate.directions, (C, V))
             full = np.zeros((*c.shape, K))
             full[..., index] = B
             parts.append((A, c, full))
             base_A[np.ix_(index, index)] += fit.reduced[s].A
             base_c[index] += fit.reduced[s].c
-        count = len(candidate.parameters)
+        count, whole = len(candidate.parameters), tuple(parts)
         reference = _explained(base_A, base_c)
         if candidate.kind.is_drive:
             # the drive takes the place of T: the base's own rates leave
@@ -101,14 +102,15 @@ class Scanner:
         if candidate.kind.is_event:
             events = tuple(_gain([part], base_A, base_c) for part in parts)
             finite = tuple(np.where(np.isfinite(g), g, 0.0) for g in events)
-            return Scan(np.zeros(0), finite, count)
+            return Scan(np.zeros(0), finite, count, stacks, whole)
         if candidate.kind.is_periodic and len(parts) > 1:
             gains = np.sum([_gain([p], base_A, base_c) for p in parts], axis=0)
             count *= 2 * len(parts)
         else:
             gains = _gain(parts, base_A, base_c)
             count *= 2 if candidate.kind.is_periodic else 1
-        return Scan(gains + _explained(base_A, base_c) - reference, (), count)
+        gains = gains + _explained(base_A, base_c) - reference
+        return Scan(gains, (), count, stacks, whole)
 
     def trials(self, candidate: Candidate) -> float:
         """How many independent trajectories the grid holds: its length in angles over 90°."""

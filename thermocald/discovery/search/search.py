@@ -105,7 +105,10 @@ class Search:
 
     def scan(self, candidate: Candidate, solution: Solution) -> Scanned:
         """The best place of one candidate added to a solution."""
-        found = self.scanner.scan(candidate, solution.fit)
+        return self.judged(candidate, self.scanner.scan(candidate, solution.fit))
+
+    def judged(self, candidate: Candidate, found: Scan) -> Scanned:
+        """What a scan of a candidate promises."""
         if candidate.kind.is_event:
             return self._event(candidate, found)
         value = float(candidate.grid[found.best]) if len(candidate.grid) else None

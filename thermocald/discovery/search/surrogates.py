@@ -23,14 +23,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.reduction.hypothesis import BASE
-from thermocald.reduction.series import COLUMNS
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.discovery.search.search import Search, Solution
     from thermocald.reduction.candidate import Candidate
     from thermocald.reduction.hypothesis import Fit
-    from thermocald.reduction.likelihood import Weighting
+    from thermocald.reduction.scan import Scan
 
 __all__ = ["FALSE_ALARM", "SurrogateTest", "surrogate_test"]
 
@@ -85,8 +84,10 @@ def surrogate_test(
 
 def _data(
     search: Search, best: Fit, without: Fit, series: int, rng: np.random.Generator, count: int
-) -> tuple[Array, Array]:
-    """Right-hand sides of surrogates: b (count, E, P) and of hidden targets (count, S)."""
+) -> Array:
+    """Weighted data of surrogates (E, P, count), whose sums along trajectories are right-hand
+    sides.
+    """
     e = search.fitter.series[series]
     C, V, index = best.designs[series]
     w = best.weightings[series]
@@ -103,8 +104,7 @@ def _data(
     moved = np.stack([_moved(y, rng) for _ in range(count)])
     parameters = model + moved @ W.T
     w = without.weightings[series]
-    b = np.einsum("epq,seq->sep", w.N, parameters)
-    return b, w.effects.onto(np.moveaxis(parameters, 0, 2)).T
+    return w.weighted(np.moveaxis(parameters, 0, 2))
 
 
 def _moved(y: Array, rng: np.random.Generator) -> Array:
@@ -124,50 +124,34 @@ def _moved(y: Array, rng: np.random.Generator) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Scan:
-    """What a scan of one candidate needs, whatever the data: per series the stack, directions
-    (P, k), A (G, mk, mk), B (G, mk, K); penalty.
+    """What a scan of one candidate needs, whatever the data: per series the stack, A (G, mk, mk),
+    B (G, mk, K); directions (P, k); penalty.
     """
 
     candidate: Candidate
-    stacks: list[Array]
-    directions: Array
-    parts: list[tuple[Array, Array]]
+    scan: Scan
     penalty: float
 
 
 def _prepared(search: Search, without: Solution) -> list[_Scan]:
     """The scans of all candidates but those that the solution has."""
-    fit = without.fit
-    K = len(fit.coefficients)
     out = []
     for candidate in search.candidates:
-        if candidate.effect in without.names:
-            continue
-        directions = np.zeros((len(COLUMNS), len(candidate.parameters)))
-        for j, name in enumerate(candidate.parameters):
-            directions[COLUMNS.index(name), j] = 1.0
-        stacks, parts = [], []
-        for s, own in enumerate(fit.weightings):
-            C, V, index = fit.designs[s]
-            stacks.append(search.scanner.stack(candidate, s, fit))
-            A, _, B = own.scan(stacks[-1], directions, (C, V))
-            full = np.zeros((*B.shape[:2], K))
-            full[..., index] = B
-            parts.append((A, full))
-        penalty = search.scan(candidate, without).penalty
-        out.append(_Scan(candidate, stacks, directions, parts, penalty))
+        if candidate.effect not in without.names:
+            scan = search.scanner.scan(candidate, without.fit)
+            out.append(_Scan(candidate, scan, search.judged(candidate, scan).penalty))
     return out
 
 
 def _largest(
-    scans: list[_Scan], without: Solution, data: list[tuple[Array, Array]], jobs: int
+    scans: list[_Scan], without: Solution, data: list[Array], jobs: int
 ) -> Array:
     """The largest penalised gain (count,) of any candidate."""
 
     def gain(scan: _Scan) -> Array:
         return _gain_of(scan, without.fit, data) - scan.penalty
 
-    top = np.full(len(data[0][0]), -np.inf)
+    top = np.full(data[0].shape[2], -np.inf)
     # threads: nearly all of it is linear algebra, and the stacks would have to be copied
     with ThreadPoolExecutor(jobs) as pool:
         for found in pool.map(gain, scans) if jobs > 1 else map(gain, scans):
@@ -175,20 +159,18 @@ def _largest(
     return top
 
 
-def _gain_of(scan: _Scan, fit: Fit, data: list[tuple[Array, Array]]) -> Array:
+def _gain_of(scan: _Scan, fit: Fit, data: list[Array]) -> Array:
     """The largest gain (count,) of one candidate over its grid."""
     candidate = scan.candidate
-    K, count = len(fit.coefficients), len(data[0][0])
+    K, count = len(fit.coefficients), data[0].shape[2]
     base_A, base_c = np.zeros((K, K)), np.zeros((K, count))
     parts = []
-    for s, (b, hidden) in enumerate(data):
+    for s, weighted in enumerate(data):
         C, V, index = fit.designs[s]
-        c, cb = _right_hand_sides(
-            fit.weightings[s], scan.stacks[s], scan.directions, (C, V), b, hidden
-        )
-        parts.append((scan.parts[s][0], c, scan.parts[s][1]))
+        A, _, B = scan.scan.parts[s]
+        parts.append((A, _right_hand_sides(scan.scan.stacks[s], candidate.directions, weighted), B))
         base_A[np.ix_(index, index)] += fit.reduced[s].A
-        base_c[index] += cb
+        base_c[index] += np.einsum("er,pr,eps->rs", C, V, weighted, optimize=True)
     whole = _explained(base_A, base_c)
     rest = whole
     if candidate.kind.is_drive:  # it takes the place of T: the base's own rates leave
@@ -214,44 +196,14 @@ def _explained(A: Array, c: Array) -> Array:
     return out
 
 
-def _right_hand_sides(
-    w: Weighting,
-    stack: Array,
-    directions: Array,
-    base: tuple[Array, Array],
-    b: Array,
-    hidden: Array,
-) -> tuple[Array, Array]:
-    """Right-hand sides of many data: of the candidates (G, mk, count), of the base (R, count)."""
-    from scipy.linalg import solve_triangular
-
+def _right_hand_sides(stack: Array, directions: Array, weighted: Array) -> Array:
+    """Right-hand sides (G, mk, count) of trajectories (G, E, m) along directions (P, k)."""
     G, E, m = stack.shape
-    k = directions.shape[1]
+    along = directions.T @ weighted  # (E, k, count)
+    _, k, count = along.shape
     s = np.moveaxis(stack, 0, 1).reshape(E, G * m)
-    C, V = base
-    level_b = b.sum(axis=1).T  # (P, count)
-    c = np.tensordot(s, b @ directions, axes=(0, 1))  # (G m, count, k)
-    c = np.swapaxes(c, 1, 2).reshape(G, m * k, len(b))
-    cb = np.einsum("er,ser->rs", C, b @ V, optimize=True)
-    NV = w.N @ directions
-    K = (s.T @ NV.reshape(E, -1)).reshape(G * m, -1, k).transpose(1, 0, 2).reshape(-1, G * m * k)
-    Kb = (w.N @ (C[:, None, :] * V)).sum(axis=0)
-    if w.factor is not None:
-        right = np.zeros((len(w.factor), len(b)))
-        for operator, at, d in zip(w.operators, w.places, w.directions, strict=True):
-            right[at] += operator.T @ (b @ d).T
-        right[: len(w.effects)] = hidden.T
-        data = solve_triangular(w.factor, right, lower=True, check_finite=False)
-        U = w.carried_stack(s, directions)
-        Ub = w.carried(C, V)
-        c = c - (U.T @ data).reshape(G, m * k, len(b))
-        cb = cb - Ub.T @ data
-        K, Kb = K - w.level.T @ U, Kb - w.level.T @ Ub
-        level_b = level_b - w.level.T @ data
-    Q = solve_triangular(w.level_factor, np.column_stack([K, Kb, level_b]), lower=True)
-    n, r = K.shape[1], Kb.shape[1]
-    c = c - (Q[:, :n].T @ Q[:, n + r :]).reshape(G, m * k, len(b))
-    return c, cb - Q[:, n : n + r].T @ Q[:, n + r :]
+    out: Array = (s.T @ along.reshape(E, -1)).reshape(G, m * k, count)
+    return out
 
 
 def _gains(parts: list[tuple[Array, Array, Array]], base_A: Array, base_c: Array) -> Array:

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from thermocald.arrays import Array
     from thermocald.reduction.random_effects import Movement
 
@@ -48,10 +50,25 @@ class Couplings:
     def __len__(self) -> int:
         return self.operator.shape[1] + len(self.others)
 
+    def blurred(
+        self, whitened: Array, own: Array, epochs: NDArray[np.int64]
+    ) -> tuple[Couplings, Array]:
+        """Where some epochs (n,) shift at random, and the couplings (n, t, F + S) with those shifts.
+
+        whitened (n, t, P): their directions, independent; own: these times the normal matrices.
+        """
+        by_mode = whitened @ np.swapaxes(self.moved[epochs], 1, 2)  # (n, t, m)
+        by_other = whitened @ np.moveaxis(self.others[:, epochs], 0, 2)  # (n, t, S)
+        moved, others = self.moved.copy(), self.others.copy()
+        moved[epochs] -= np.swapaxes(by_mode, 1, 2) @ own
+        others[:, epochs] -= np.moveaxis(np.swapaxes(by_other, 1, 2) @ own, 1, 0)
+        coupled = np.repeat(by_mode, self._counts, axis=2) * self.operator[epochs, None, :]
+        out = Couplings(moved, self.operator, self.spans, others)
+        return out, np.concatenate([coupled, by_other], axis=2)
+
     def along(self, direction: Array) -> Array:
         """Couplings (F + S, E) with a direction (P,) of the parameters."""
-        counts = [span.stop - span.start for span in self.spans]
-        own: Array = (self.operator * np.repeat(self.moved @ direction, counts, axis=1)).T
+        own: Array = (self.operator * np.repeat(self.moved @ direction, self._counts, axis=1)).T
         return np.concatenate([own, self.others @ direction]) if len(self.others) else own
 
     def onto(self, shifts: Array) -> Array:
@@ -76,6 +93,11 @@ class Couplings:
     def total(self) -> Array:
         """Couplings (F + S, P) with the levels of the parameters."""
         return np.concatenate([*self._amplitudes(self.moved), self.others.sum(axis=1)])
+
+    @property
+    def _counts(self) -> list[int]:
+        """How many amplitudes each direction has."""
+        return [span.stop - span.start for span in self.spans]
 
     def _amplitudes(self, along: Array) -> list[Array]:
         """Of each direction, the sums (·, R) over what its amplitudes move: along (E, m, R)."""

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.reduction.sums import Sums, still_sums_of, sums_of
+from thermocald.reduction.sums import Sums, sums_of
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array
@@ -321,13 +321,12 @@ def prepare(
 def _blurred(evidence: ReducedSeries, carried: list[ReadingErrorTerm]) -> Sums:
     """The sums of a series, with what no reading resolves as noise of single epochs."""
     unresolved = [(c.direction, c.unresolved) for c in carried if c.unresolved is not None]
-    if not any(sd.any() for _, sd in unresolved):
-        return sums_of(evidence)
-    sums = still_sums_of(evidence)
+    sums = sums_of(evidence)
     for direction, sd in unresolved:
-        bent = np.flatnonzero(sd)
-        sums = sums.blurred(sd[bent, None, None] * direction[:, None], bent)
-    return sums.alongside(evidence.movement)
+        if sd.any():
+            bent = np.flatnonzero(sd)
+            sums = sums.blurred(sd[bent, None, None] * direction[:, None], bent)
+    return sums
 
 
 @lru_cache(maxsize=4)

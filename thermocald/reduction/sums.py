@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from thermocald.reduction.random_effects import Movement
     from thermocald.reduction.series import ReducedSeries
 
-__all__ = ["Sums", "still_sums_of", "sums_of"]
+__all__ = ["Sums", "sums_of"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,30 +40,25 @@ class Sums:
     right: Array  # (F,)
 
     def blurred(self, D: Array, epochs: NDArray[np.int64]) -> Sums:
-        """With random shifts of unit variance of some epochs (n,) along D (n, P, t): Woodbury.
-
-        Before a movement comes in, which `alongside` couples with what is left then.
-        """
-        assert not self.cross.spans
-        N, b, cross = self.N[epochs], self.b[epochs], self.cross.others[:, epochs]
+        """With random shifts of unit variance of some epochs (n,) along D (n, P, t): Woodbury."""
+        N, b = self.N[epochs], self.b[epochs]
         Dt = np.swapaxes(D, 1, 2)
         DtN = Dt @ N
         L = np.linalg.cholesky(np.eye(D.shape[2]) + DtN @ D)
         own = np.linalg.solve(L, DtN)  # (n, t, P)
         data = np.linalg.solve(L, Dt @ b[..., None])  # (n, t, 1)
-        coupled = np.linalg.solve(L, Dt @ np.moveaxis(cross, 0, 2))  # (n, t, F)
-        whole, right, others = self.N.copy(), self.b.copy(), self.cross.others.copy()
+        cross, coupled = self.cross.blurred(np.linalg.solve(L, Dt), own, epochs)
+        whole, right = self.N.copy(), self.b.copy()
         whole[epochs] -= np.swapaxes(own, 1, 2) @ own
         right[epochs] -= np.sum(own * data, axis=1)
-        others[:, epochs] -= np.swapaxes(np.swapaxes(coupled, 1, 2) @ own, 0, 1)
         wide = coupled.reshape(data.size, len(self.cross))
         return replace(
             self,
             N=whole,
             b=right,
-            cross=Couplings.still(others),
             yy=self.yy - float(np.sum(data**2)),
             logdet=self.logdet + 2 * float(np.sum(np.log(np.einsum("eii->ei", L)))),
+            cross=cross,
             normal=self.normal - wide.T @ wide,
             right=self.right - wide.T @ data.ravel(),
         )
@@ -128,12 +123,7 @@ def _trembled(still: _Still) -> Sums:
     return sums.blurred(D, every)
 
 
-def still_sums_of(evidence: ReducedSeries) -> Sums:
-    """The sums without what moves."""
-    return _trembled(_Still(evidence))
-
-
 @lru_cache(maxsize=4)
 def sums_of(evidence: ReducedSeries) -> Sums:
     """The sums with what moves: first the movement, then hidden targets."""
-    return still_sums_of(evidence).alongside(evidence.movement)
+    return _trembled(_Still(evidence)).alongside(evidence.movement)

@@ -73,14 +73,13 @@ class Couplings:
 
     def onto(self, shifts: Array) -> Array:
         """Sums (F + S, R) over all epochs' shifts (E, P, R) of the parameters."""
-        others = np.tensordot(self.others, shifts, axes=([1, 2], [0, 1]))
-        return np.concatenate([*self._amplitudes(self.moved @ shifts), others])
+        return np.concatenate([*self._amplitudes(self.moved @ shifts), self._others(shifts)])
 
     def driven(self, trajectories: Array, directions: Array) -> Array:
         """Sums (F + S, R) over shifts along directions (P, R) that go as trajectories (E, R)."""
+        shifts = trajectories[:, None, :] * directions
         along = (self.moved @ directions) * trajectories[:, None, :]
-        others = np.einsum("ser,er->sr", self.others @ directions, trajectories)
-        return np.concatenate([*self._amplitudes(along), others])
+        return np.concatenate([*self._amplitudes(along), self._others(shifts)])
 
     def images(self, amplitudes: Array) -> Array:
         """What amplitudes (F + S, R) give in the epochs' right-hand sides, (E, P, R)."""
@@ -98,6 +97,10 @@ class Couplings:
     def _counts(self) -> list[int]:
         """How many amplitudes each direction has."""
         return [span.stop - span.start for span in self.spans]
+
+    def _others(self, shifts: Array) -> Array:
+        out: Array = np.tensordot(self.others, shifts, axes=([1, 2], [0, 1]))
+        return out
 
     def _amplitudes(self, along: Array) -> list[Array]:
         """Of each direction, the sums (·, R) over what its amplitudes move: along (E, m, R)."""

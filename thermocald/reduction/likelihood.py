@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 __all__ = ["NormalEquations", "ReadingErrorTerm", "Weighting", "prepare", "with_error_term"]
 
+_ROUNDING = 1e-14
 _MANY = 0.15  # trajectories per epoch from which on epochs are whitened, for all that follow
 
 
@@ -279,21 +280,15 @@ def prepare(
     logdet = sums.logdet + 2 * float(np.sum(np.log(np.diag(own))))
     if carried:
         whole = np.concatenate(sds)
+        inner = [slice(at.start - fixed, at.stop - fixed) for _, _, at in states]
         M = np.diag(1.0 / whole**2)
+        _add_products(M, [O for _, O, _ in states], inner, [d for d, _, _ in states], dN)
         beside = np.zeros((fixed, start - fixed))
-        for i, (d, Oi, at) in enumerate(states):
-            here = slice(at.start - fixed, at.stop - fixed)
-            beside[:, here] += sums.cross.along(d) @ Oi
-            half = np.sqrt(np.maximum(dN[i] @ d, 0.0))[:, None] * Oi
-            M[here, here] += half.T @ half  # half the work of a product with another matrix
-            for dj, Oj, to in states[i + 1 :]:
-                there = slice(to.start - fixed, to.stop - fixed)
-                part = Oi.T @ ((dN[i] @ dj)[:, None] * Oj)
-                M[here, there] += part
-                M[there, here] += part.T
+        for (d, operator, _), here in zip(states, inner, strict=True):
+            beside[:, here] += sums.cross.along(d) @ operator
         if fixed:
             low = solve_triangular(own, beside, lower=True, check_finite=False)
-            M = M - low.T @ low
+            M -= low.T @ low
             factor[fixed:, :fixed] = low.T
         last = cholesky(M.T, lower=True, overwrite_a=True, check_finite=False)
         factor[fixed:, fixed:] = last
@@ -316,6 +311,39 @@ def prepare(
         tuple(at for _, _, at in states), tuple(d for d, _, _ in states), tuple(dN),
         moving, sums.cross, factor, data, level, N0, k0, held,
     )  # fmt: skip
+
+
+def _add_products(
+    M: Array, operators: list[Array], places: list[slice], directions: list[Array], dN: list[Array]
+) -> None:
+    """Add JᵀN J of the readings' errors to the upper half of M.
+
+    Operators on the same states are combined by the root of what they weigh together, epoch by
+    epoch: a product of a matrix with itself takes half the work.
+    """
+    groups: dict[int, list[int]] = {}
+    for i, at in enumerate(places):
+        groups.setdefault(at.start, []).append(i)
+    own = list(groups.values())
+    for g, rows in enumerate(own):
+        weights = np.stack([[dN[i] @ directions[j] for j in rows] for i in rows])  # (k, k, E)
+        root = _roots(np.moveaxis(weights, 2, 0))
+        here = places[rows[0]]
+        for r in range(len(rows)):
+            half = sum(root[:, k, r, None] * operators[rows[k]] for k in range(r, len(rows)))
+            M[here, here] += half.T @ half
+        for others in own[g + 1 :]:
+            for i in rows:
+                far = sum((dN[i] @ directions[j])[:, None] * operators[j] for j in others)
+                M[here, places[others[0]]] += operators[i].T @ far
+
+
+def _roots(weights: Array) -> Array:
+    """Lower roots (E, k, k) of weights, which may be singular."""
+    size = np.einsum("eii->e", weights)
+    held = (_ROUNDING * size + np.finfo(float).tiny)[:, None, None] * np.eye(weights.shape[1])
+    out: Array = np.linalg.cholesky(weights + held)
+    return out
 
 
 def _blurred(evidence: ReducedSeries, carried: list[ReadingErrorTerm]) -> Sums:

@@ -130,18 +130,23 @@ def _still(
     shaking: the series where all targets jump together. What a thermometer's errors take up of that
     depends on the effect; unless an effect explains it, each is fitted with the tremble it leaves.
     """
+    say("base model")
     fitter = HypothesisFitter(ready)
-    search = Search(fitter)
+    search = Search(fitter, say)
     base = search.base(given)
     # one effect moves the image by most of what it moves at all
     guide = min([base, *search.expand(base, _GUIDES)], key=lambda s: s.score).fit
     bent = curved(fitter, guide)
-    found = _searched(HypothesisFitter(bent) if bent else fitter, say, given, jobs)
+    if bent:
+        search = Search(HypothesisFitter(bent), say)
+        base = search.base(given)
+    found = _searched(search, base, say, jobs)
     if not found.adequate:
         again = curved(found.fitter, found.best.fit)
         if again is not None and _explained(again, found):
             say("curvature of the projection: once more")
-            found = _searched(HypothesisFitter(again), say, given, jobs)
+            search = Search(HypothesisFitter(again), say)
+            found = _searched(search, search.base(given), say, jobs)
     noisy = noisier(found.fitter, found.best.fit)
     if shaking and (noisy is not None or not found.adequate):
         alongside = _beside_mount(shaking, say, given, jobs)
@@ -149,7 +154,8 @@ def _still(
             return alongside
     if noisy is not None and (found.adequate or _explained(noisy, found)):
         say("noise that targets share: once more")
-        found = _searched(HypothesisFitter(noisy), say, given, jobs)
+        search = Search(HypothesisFitter(noisy), say)
+        found = _searched(search, search.base(given), say, jobs)
     return found
 
 
@@ -162,17 +168,17 @@ def _explained(series: list[ReducedSeries], found: Examination) -> bool:
 
 
 def _searched(
-    fitter: HypothesisFitter,
+    search: Search,
+    base: Solution,
     say: Callable[[str], None],
-    given: Sequence[tuple[str, dict[str, Any]]],
     jobs: int,
 ) -> Examination:
-    found = search_standing(fitter, say, given)
-    base, best = found.base, found.best
+    found = search_standing(search, base, say)
+    fitter, best = search.fitter, found.best
     blocks: list[Array] = []
     tests: tuple[SurrogateTest, ...] = ()
     if found.adequate(best):
-        best, blocks, tests = _named(found.search, base, best, jobs)
+        best, blocks, tests = _named(search, base, best, jobs)
     adequacy = adequacies(fitter, best)
     complete = adequate(adequacy, found.base_adequacy)
     if len(best.terms) > len(base.terms) and _unverified(fitter.series):

@@ -91,6 +91,7 @@ class Search:
         self.margin = MARGIN * max(e.correlation for e in fitter.series)
         self.progress = progress or (lambda _: None)
         self._trials: dict[tuple[str, tuple[str, ...]], float] = {}
+        self._scanned: dict[Fit, list[Scanned]] = {}
         self._refined: dict[tuple[Term, ...], Fit] = {}
         self._known: dict[frozenset[tuple[str, tuple[str, ...]]], Solution] = {}
 
@@ -191,14 +192,19 @@ class Search:
 
     def _promises(self, solution: Solution, width: int, least: float = 0.0) -> list[Scanned]:
         promises = []
-        for candidate in self.candidates:
-            if candidate.effect in solution.names:
-                continue
-            found = self.scan(candidate, solution)
-            enough = found.net > (0.0 if candidate.kind.is_event else least)
+        for found in self._scans(solution):
+            enough = found.net > (0.0 if found.candidate.kind.is_event else least)
             if np.isfinite(found.gain) and enough:
                 promises.append(found)
         return _worth_fitting(promises, width)
+
+    def _scans(self, solution: Solution) -> list[Scanned]:
+        """Of every candidate that a solution does not have."""
+        if solution.fit not in self._scanned:
+            self._scanned[solution.fit] = [
+                self.scan(c, solution) for c in self.candidates if c.effect not in solution.names
+            ]
+        return self._scanned[solution.fit]
 
     def with_other_delay(self, solution: Solution) -> Solution | None:
         """The solution with another kind of delay of the temperature in place of its own."""

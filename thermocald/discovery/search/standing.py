@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.discovery.search.search import Search, Solution
+from thermocald.discovery.search.search import Solution
 from thermocald.reduction.adequacy import Adequacy, examine
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from thermocald.discovery.search.search import Search
     from thermocald.reduction.fit import HypothesisFitter
 
 __all__ = ["BAND", "SWAP_BAND", "Standing", "adequacies", "adequate", "search_standing"]
@@ -62,15 +63,9 @@ class Standing:
         return tuple(out)
 
 
-def search_standing(
-    fitter: HypothesisFitter,
-    say: Callable[[str], None],
-    given: Sequence[tuple[str, dict[str, Any]]] = (),
-) -> Standing:
+def search_standing(search: Search, base: Solution, say: Callable[[str], None]) -> Standing:
     """The search itself, in the trajectories of the parameters."""
-    say("base model")
-    search = Search(fitter, say)
-    base = search.base(given)
+    fitter = search.fitter
     kept = len(base.terms)
     base_adequacy = adequacies(fitter, base)
     best, ranking, seen = base, list[Solution](), list[Solution]()

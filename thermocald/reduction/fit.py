@@ -51,11 +51,13 @@ class HypothesisFitter:
         self._trajectories: dict[Any, tuple[Array, Array | None, str]] = {}
         self._drives: dict[Any, tuple[Array, Array]] = {}
         self._further: dict[Any, list[tuple[Array, str]]] = {}
+        self._slope_jumps: dict[int, Array] = {}
 
     def share_trajectories(self, other: HypothesisFitter) -> None:
         """Use the trajectories that a fitter of the same histories has computed."""
         self._trajectories, self._drives = other._trajectories, other._drives
         self._further = other._further
+        self._slope_jumps = other._slope_jumps
 
     # -- trajectories ---------------------------------------------------------------------------
 
@@ -212,7 +214,7 @@ class HypothesisFitter:
             values = term.values(series) or {}
             # averaged times stand for the frames of long series
             here = history.at(evidence.times)
-            left = term.kind.unresolved(here, instrument.slope_jump(evidence.times), **values)
+            left = term.kind.unresolved(here, self._slope_jump(series), **values)
             return left if left.any() else None
         drives = _drives(terms, series)
         if not drives:
@@ -223,10 +225,18 @@ class HypothesisFitter:
         if not turns.any():
             return None
         step = float(np.median(np.diff(history.reading_times[instrument.real])))
-        bend = 0.5 * step * instrument.slope_jump(evidence.times)
+        bend = 0.5 * step * self._slope_jump(series)
         shares = evidence.averaged(turns.astype(float))
         out: Array = shares * np.sqrt(instrument.noise**2 + bend**2)
         return out
+
+    def _slope_jump(self, series: int) -> Array:
+        """How uncertain the rate (E,) of the reference is where it jumps."""
+        if series not in self._slope_jumps:
+            evidence = self.series[series]
+            instrument = evidence.thermometers[evidence.history.reference]
+            self._slope_jumps[series] = instrument.slope_jump(evidence.times)
+        return self._slope_jumps[series]
 
     def fit(
         self,

@@ -162,7 +162,7 @@ class Weighting:
         """
         NV = self.N @ directions
         VNV = directions.T @ NV
-        A = np.einsum("eij,ei,ej->ij", VNV, trajectories, trajectories)
+        A = np.sum(VNV * trajectories[:, :, None] * trajectories[:, None, :], axis=0)
         c = np.einsum("ei,ei->i", trajectories, self.b @ directions)
         K = np.einsum("epi,ei->pi", NV, trajectories)
         if self.factor is not None:

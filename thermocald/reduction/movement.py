@@ -72,14 +72,14 @@ class Mount:
         About 1 for a random walk; an influence without rough parts has much more.
         """
         slow, fast = 0.0, 0.0
-        for e, (mean, covariance) in zip(fitter.series, _amplitudes(fit), strict=True):
+        for e, (mean, root) in zip(fitter.series, _amplitudes(fit), strict=True):
             assert e.movement is not None
             K = e.movement.sd.shape[1]
             mode, wave = e.movement.states
             power = np.zeros(K)
             own = mode == mode.max()  # the strongest
             k = wave[own]
-            power[k] = (mean[own] ** 2 + np.diag(covariance)[own]) * e.movement.sd[-1, k] ** 2
+            power[k] = (mean[own] ** 2 + np.sum(root[:, own] ** 2, axis=0)) * e.movement.sd[-1, k] ** 2
             power *= np.arange(1, K + 1) ** 2
             slow += float(np.mean(power[: K // 4]))
             fast += float(np.mean(power[K // 2 :]))
@@ -183,9 +183,9 @@ def _step(fitter: HypothesisFitter, fit: Fit, mount: Mount) -> Mount:
     size, directions = mount.modes()
     power = np.zeros((len(size), len(size)))
     known = np.zeros((len(size), len(size)))
-    for e, (mean, covariance) in zip(fitter.series, _amplitudes(fit), strict=True):
+    for e, (mean, root) in zip(fitter.series, _amplitudes(fit), strict=True):
         assert e.movement is not None
-        a, k = e.movement.moments(mean, covariance)
+        a, k = e.movement.moments(mean, root)
         power += a
         known += k
     # of each amplitude the data determine 1 - its variance: so many count (MacKay)
@@ -199,7 +199,8 @@ def _step(fitter: HypothesisFitter, fit: Fit, mount: Mount) -> Mount:
 
 
 def _amplitudes(fit: Fit) -> list[tuple[Array, Array]]:
-    """Mean and covariance of the movement's amplitudes (m K,) of each series given the data.
+    """Mean of the movement's amplitudes (F,) of each series given the data, and a root (·, F) of
+    their covariance: the product of its transpose with itself.
 
     Levels and coefficients are unknown too: their uncertainty is in the covariance.
     """
@@ -225,9 +226,8 @@ def _amplitudes(fit: Fit) -> list[tuple[Array, Array]]:
         data = w.data - U @ x - w.level @ level
         Q = solve_triangular(F, w.level.T, lower=True).T
         inverse = solve_triangular(w.factor, np.eye(len(w.factor), w.moving), lower=True)
-        by_level = inverse.T @ Q
-        by_x = inverse.T @ (U - Q @ B)
-        covariance = inverse.T @ inverse + by_level @ by_level.T
-        covariance = covariance + by_x @ known[np.ix_(index, index)] @ by_x.T
-        out.append((inverse.T @ data, covariance))
+        by_level = Q.T @ inverse
+        size, turn = np.linalg.eigh(known[np.ix_(index, index)])
+        by_x = (turn * np.sqrt(np.maximum(size, 0.0))).T @ (U - Q @ B).T @ inverse
+        out.append((inverse.T @ data, np.concatenate([inverse, by_level, by_x])))
     return out

@@ -169,10 +169,10 @@ class Movement:
         out: Array = np.concatenate(parts, axis=1)
         return out
 
-    def moments(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
+    def moments(self, mean: Array, root: Array) -> tuple[Array, Array]:
         """Σ over the cosines of products of amplitudes, and of their gain in precision, (m, m).
 
-        mean (F,), covariance (F, F) given the data; 0 and 1 of those left out.
+        mean (F,), root (·, F) of the covariance given the data; 0 and 1 of those left out.
         """
         mode, wave = self.states
         m, K = self.sd.shape
@@ -181,8 +181,8 @@ class Movement:
         known = np.zeros((m, m))
         for k in np.unique(wave):
             own = np.flatnonzero(wave == k)
-            part = np.eye(len(own)) - covariance[np.ix_(own, own)]
-            known[np.ix_(mode[own], mode[own])] += part
+            part = root[:, own]
+            known[np.ix_(mode[own], mode[own])] += np.eye(len(own)) - part.T @ part
         return amplitudes @ amplitudes.T, known
 
 

@@ -26,6 +26,8 @@ import numpy as np
 from thermocald.reduction.sums import Sums, sums_of
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from thermocald.arrays import Array
     from thermocald.reduction.couplings import Couplings
     from thermocald.reduction.series import ReducedSeries
@@ -250,6 +252,7 @@ def prepare(
     from scipy.linalg import cholesky, solve_triangular
 
     sums = _blurred(evidence, carried)
+    touched = _touched(sums.N, carried)
     P = sums.N.shape[1]
     fixed = len(sums.right)
     if not carried and not fixed:
@@ -262,18 +265,18 @@ def prepare(
     sds, deviations = [], {}
     start = fixed
     for name in dict.fromkeys(c.channel for c in carried):
-        sd = evidence.state_sd(name) * thermometer_factor
+        sd = evidence.state_sd(name)[touched[name]] * thermometer_factor
         places[name] = slice(start, start + len(sd))
-        deviations[name] = evidence.state_deviation(name)
+        deviations[name] = evidence.state_deviation(name)[touched[name]]
         sds.append(sd)
         start += len(sd)
     # the readings' own deviation from the smooth trajectory, carried to the camera
     shift = np.zeros((len(sums.N), P))
-    for item in carried:
-        shift += np.outer(item.operator @ deviations[item.channel], item.direction)
+    states = [(c.direction, c.operator[:, touched[c.channel]], places[c.channel]) for c in carried]
+    for item, (direction, operator, _) in zip(carried, states, strict=True):
+        shift += np.outer(operator @ deviations[item.channel], direction)
     own = _own_factor(evidence) if sums is sums_of(evidence) else _factored(sums)
     sums = sums.shifted(shift)
-    states = [(c.direction, c.operator, places[c.channel]) for c in carried]
     dN = [sums.N @ c.direction for c in carried]
     factor = np.zeros((start, start))
     factor[:fixed, :fixed] = own
@@ -311,6 +314,19 @@ def prepare(
         tuple(at for _, _, at in states), tuple(d for d, _, _ in states), tuple(dN),
         moving, sums.cross, factor, data, level, N0, k0, held,
     )  # fmt: skip
+
+
+def _touched(N: Array, carried: list[ReadingErrorTerm]) -> dict[str, NDArray[np.int64] | slice]:
+    """Of each channel the errors that reach an epoch that has weight; the others change nothing."""
+    seen = N.any(axis=(1, 2))
+    if seen.all():
+        return {c.channel: slice(None) for c in carried}
+    reached: dict[str, NDArray[np.bool_]] = {}
+    for c in carried:
+        here = c.operator[seen].any(axis=0)
+        reached[c.channel] = reached.get(c.channel, False) | here
+    # one at least, where there are no epochs at all
+    return {name: np.flatnonzero(r) if r.any() else slice(1) for name, r in reached.items()}
 
 
 def _add_products(

@@ -48,12 +48,12 @@ class Couplings:
         return cls(moved, movement.operator, tuple(span for _, span in movement.spans), others)
 
     def __len__(self) -> int:
-        return self.operator.shape[1] + len(self.others)
+        return int(self.operator.shape[1]) + len(self.others)
 
     def blurred(
         self, whitened: Array, own: Array, epochs: NDArray[np.int64]
     ) -> tuple[Couplings, Array]:
-        """Where some epochs (n,) shift at random, and the couplings (n, t, F + S) with those shifts.
+        """Where some epochs (n,) shift at random, and couplings (n, t, F + S) with those shifts.
 
         whitened (n, t, P): their directions, independent; own: these times the normal matrices.
         """

@@ -12,13 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.reduction.hypothesis import BASE, Block, Fit, Term
-from thermocald.reduction.likelihood import (
-    NormalEquations,
-    ReadingErrorTerm,
-    Weighting,
-    prepare,
-    with_error_term,
-)
+from thermocald.reduction.likelihood import ReadingErrorTerm, prepare, with_error_term
 from thermocald.reduction.series import COLUMNS
 from thermocald.simulation import effects as catalogue
 from thermocald.simulation.drive import drive, drive_matrix, driven_history
@@ -31,6 +25,7 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
     from thermocald.reduction.series import ReducedSeries
+    from thermocald.reduction.weighting import NormalEquations, Weighting
 
 __all__ = ["HypothesisFitter"]
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
-    from thermocald.reduction.likelihood import NormalEquations, Weighting
+    from thermocald.reduction.weighting import NormalEquations, Weighting
     from thermocald.simulation.effects import Effect
 
 __all__ = ["BASE", "Block", "Fit", "Term", "known_term"]

@@ -79,7 +79,9 @@ class Mount:
             power = np.zeros(K)
             own = mode == mode.max()  # the strongest
             k = wave[own]
-            power[k] = (mean[own] ** 2 + np.sum(root[:, own] ** 2, axis=0)) * e.movement.sd[-1, k] ** 2
+            power[k] = (mean[own] ** 2 + np.sum(root[:, own] ** 2, axis=0)) * e.movement.sd[
+                -1, k
+            ] ** 2
             power *= np.arange(1, K + 1) ** 2
             slow += float(np.mean(power[: K // 4]))
             fast += float(np.mean(power[K // 2 :]))

@@ -70,7 +70,6 @@ class Sums:
         right = self.right - self.cross.onto(shift[..., None])[:, 0]
         return Sums(self.N, self.b - moved, yy, self.logdet, self.cross, self.normal, right)
 
-
     def alongside(self, movement: Movement | None) -> Sums:
         """With a movement as random effects before the others."""
         if movement is None:

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.reduction.fit import HypothesisFitter
     from thermocald.reduction.hypothesis import Fit
-    from thermocald.reduction.likelihood import Weighting
     from thermocald.reduction.series import ReducedSeries
+    from thermocald.reduction.weighting import Weighting
 
 __all__ = ["Condensed", "condensed"]
 

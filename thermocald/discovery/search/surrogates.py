@@ -143,9 +143,7 @@ def _prepared(search: Search, without: Solution) -> list[_Scan]:
     return out
 
 
-def _largest(
-    scans: list[_Scan], without: Solution, data: list[Array], jobs: int
-) -> Array:
+def _largest(scans: list[_Scan], without: Solution, data: list[Array], jobs: int) -> Array:
     """The largest penalised gain (count,) of any candidate."""
 
     def gain(scan: _Scan) -> Array:

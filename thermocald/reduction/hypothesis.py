@@ -117,6 +117,11 @@ class Fit:
         out[:, [COLUMNS.index(p) for p in block.parameters]] = part
         return out
 
+    def forget(self) -> None:
+        """Let go of what was whitened for scans: of a long series, much."""
+        for weighting in self.weightings:
+            weighting.kept.clear()
+
     def chi2_of(self, series: int, coefficients: Array | None = None) -> float:
         """χ² of one series at some coefficients (default: the fitted)."""
         x = self.coefficients if coefficients is None else coefficients

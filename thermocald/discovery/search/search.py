@@ -204,6 +204,7 @@ class Search:
             self._scanned[solution.fit] = [
                 self.scan(c, solution) for c in self.candidates if c.effect not in solution.names
             ]
+            solution.fit.forget()
         return self._scanned[solution.fit]
 
     def with_other_delay(self, solution: Solution) -> Solution | None:

@@ -85,9 +85,7 @@ def surrogate_test(
 def _data(
     search: Search, best: Fit, without: Fit, series: int, rng: np.random.Generator, count: int
 ) -> Array:
-    """Weighted data of surrogates (E, P, count), whose sums along trajectories are right-hand
-    sides.
-    """
+    """Data of surrogates (E, P, count) as weighted: summed along trajectories, right-hand sides."""
     e = search.fitter.series[series]
     C, V, index = best.designs[series]
     w = best.weightings[series]
@@ -124,9 +122,7 @@ def _moved(y: Array, rng: np.random.Generator) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Scan:
-    """What a scan of one candidate needs, whatever the data: per series the stack, A (G, mk, mk),
-    B (G, mk, K); directions (P, k); penalty.
-    """
+    """A scan of one candidate, of which all but the right-hand sides serves any data; penalty."""
 
     candidate: Candidate
     scan: Scan
@@ -140,6 +136,7 @@ def _prepared(search: Search, without: Solution) -> list[_Scan]:
         if candidate.effect not in without.names:
             scan = search.scanner.scan(candidate, without.fit)
             out.append(_Scan(candidate, scan, search.judged(candidate, scan).penalty))
+    without.fit.forget()
     return out
 
 

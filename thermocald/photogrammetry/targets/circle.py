@@ -224,9 +224,8 @@ def _centre_covariance(N: Array) -> Array:
     """Of the first two unknowns, from normal matrices (n, p, p)."""
     scale = 1 / np.sqrt(np.maximum(np.einsum("nii->ni", N), 1e-12))
     scaled = N * scale[:, :, None] * scale[:, None, :] + 1e-12 * np.eye(N.shape[-1])
-    columns = np.linalg.solve(
-        scaled, np.eye(N.shape[-1])[None, :, :2]
-    )  # NumPy 1 takes (p, 2) for vectors
+    first_two = np.eye(N.shape[-1])[None, :, :2]  # NumPy 1 takes (p, 2) for vectors
+    columns = np.linalg.solve(scaled, first_two)
     part: Array = columns[:, :2] * scale[:, :2, None] * scale[:, None, :2]
     return part
 

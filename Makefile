@@ -9,7 +9,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # tests start hundreds of processes: none of them compiles what another one has compiled
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup demo test quick lint test-slow test-lowest bench hil docs lock deb release clean
+.PHONY: help setup demo test quick golden lint test-slow test-lowest bench hil docs lock deb release clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
@@ -48,6 +48,9 @@ quick: $(STAMP)
 	@echo "== pytest"
 	$(BIN)/python -m pytest -q $(WORKERS)
 
+golden: $(STAMP) ## what users see: every command's text and numbers as they were
+	$(BIN)/python -m tests.golden
+
 test-slow: $(STAMP) ## long statistics and browser tests
 	$(BIN)/python -m pytest -q -m slow $(WORKERS)
 
@@ -55,7 +58,7 @@ test-lowest: ## the quick tests with the lowest versions that pyproject.toml all
 	.ci/lowest
 
 # audit, daemon, discovery, fleet and scale take longer: each is run by itself
-BENCHMARKS := adjustment frame montecarlo object_space "prediction --seeds 1" simulation \
+BENCHMARKS := adjustment frame front_door montecarlo object_space "prediction --seeds 1" simulation \
   store study thermal_model
 bench: $(STAMP) ## ratios to peers, in one run on one thread, within five minutes
 	@failed=; for b in $(BENCHMARKS); do echo "== $$b"; \

@@ -6,7 +6,7 @@ mean square over the draws; 1 where the statement is true) or the fraction of fa
 status 1 where a ratio lies outside 0.9 to 1.1 by more than three of its own sds, or a level is
 exceeded by as much; rows that are known to be cautious have a lower bound of their own. With
 --page the tables of that page are written again.
-Seeded and array-level: the same seed prints the same rows.
+Array-level. Seeds are drawn anew each time and printed; the same seed prints the same rows.
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ SECTIONS: dict[str, Callable[[int, np.random.Generator], list[Row]]] = {
     "online": audit_camera.online,
     "significance": audit_study.significance,
     "thermal": audit_thermal.thermal,
+    "thermometer": audit_thermal.thermometer,
     "outside": audit_thermal.outside,
     "discovery": audit_thermal.discovery,
 }
@@ -60,23 +61,24 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("sections", nargs="*", metavar="SECTION", help=", ".join(SECTIONS))
     parser.add_argument("--draws", type=int, default=200)
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--seed", type=int, help="drawn anew without; the page is of seed 1")
     parser.add_argument("--page", type=Path, help="a page whose tables are written again")
     given = parser.parse_args()
     unknown = set(given.sections) - set(SECTIONS)
     if unknown:
         parser.error(f"{min(unknown)}: there are {', '.join(SECTIONS)}")
+    seed = given.seed or int(np.random.SeedSequence().generate_state(1)[0])
     missed = 0
     print(HEADER)
     for name in given.sections or SECTIONS:
         begin = time.process_time()
-        rows = SECTIONS[name](given.draws, np.random.default_rng(given.seed))
+        rows = SECTIONS[name](given.draws, np.random.default_rng(seed))
         for row in rows:
-            print(row.text(given.seed) + ("" if row.met else "  <- outside"), flush=True)
+            print(row.text(seed) + ("" if row.met else "  <- outside"), flush=True)
             missed += not row.met
         if given.page is not None:
             page = given.page.read_text(encoding="utf-8")
-            written = with_rows(page, name, [row.text(given.seed) for row in rows])
+            written = with_rows(page, name, [row.text(seed) for row in rows])
             given.page.write_text(written, encoding="utf-8")
         print(f"{name}: {time.process_time() - begin:.0f} s of processor", file=sys.stderr)
     return 1 if missed else 0

@@ -21,8 +21,7 @@ from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, adjus
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.series.adjustment import SeriesSettings, adjust_series
 from thermocald.photogrammetry.series.result import Exterior
-from thermocald.simulation.demonstration import demonstration_model
-from thermocald.simulation.testfields import corner_field
+from thermocald.physics.testfields import corner_field, demonstration_model
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -82,9 +81,7 @@ def epoch(draws: int, rng: np.random.Generator) -> list[Row]:
     return rows
 
 
-def _series(
-    scene: Scene, epochs: int, tremble_px: float, exterior: Exterior, drift=1.0, tau=10.0
-):
+def _series(scene: Scene, epochs: int, tremble_px: float, exterior: Exterior, drift=1.0, tau=10.0):
     truth = np.tile(np.concatenate([scene.iop, scene.eop]), (epochs, 1))
     warm = drift * (1 - np.exp(-np.arange(epochs) / tau))
     truth[:, :3] += warm[:, None] * np.array([2e-3, -4.5e-3, 3e-3])
@@ -144,28 +141,42 @@ def mount(draws: int, rng: np.random.Generator) -> list[Row]:
 def calibrate(draws: int, rng: np.random.Generator) -> list[Row]:
     """Four photographs before one field."""
     rows = []
-    for sigma in (0.0, 0.05):
+    for what, sigma, few, gross_px in (
+        ("field 0.0 mm", 0.0, 48, 0.0), ("field 0.05 mm", 0.05, 48, 0.0),
+        ("16 targets, 8 % gross errors of 15 px", 0.0, 16, 15.0),
+        ("48 targets, 8 % gross errors of 300 px", 0.0, 48, 300.0),
+    ):  # fmt: skip
         off, failed = [], 0
         for _ in range(draws):
             scene = Scene(rng, sigma)
-            seen = []
-            for turn in (0.0, 0.05, -0.05, 0.1):
-                eop = scene.eop + np.array([0, turn, 20 * turn, 400 * turn, 0, 0])
-                seen.append(scene.observe(scene.iop, eop))
             found = calibrate_observations(
-                ["a", "b", "c", "d"], seen, {}, scene.field, scene.sensor, AdjustmentSettings(),
-                None, InteriorOrientation.from_array(scene.iop),
+                ["a", "b", "c", "d"], photographs(scene, few, gross_px), {}, scene.field,
+                scene.sensor, AdjustmentSettings(), None, InteriorOrientation.from_array(scene.iop),
             )  # fmt: skip
             if found.interior is None or not found.estimated:
                 failed += 1
                 continue
-            sd = np.sqrt(np.diag(found.covariance)[:3])
-            off.append((found.interior.as_array()[:3] - scene.iop[:3]) / sd)
+            columns = [0, 1, 2, 5] if gross_px else [0, 1, 2]
+            sd = np.sqrt(np.diag(found.covariance)[columns])
+            off.append((found.interior.as_array() - scene.iop)[columns] / sd)
         if failed:
             print(f"({failed} of {draws} not calibrated)", file=sys.stderr)
-        rows.append(ratio("`calibrate`", f"sd of c, x0, y0; 4 photographs, field {sigma} mm",
+        names = "c, x0, y0, A3" if gross_px else "c, x0, y0"
+        rows.append(ratio("`calibrate`", f"sd of {names}; 4 photographs, {what}",
                           "noise, the field's coordinates", np.array(off)))  # fmt: skip
     return rows
+
+
+def photographs(scene: Scene, few: int, gross_px: float) -> list[Observations]:
+    """Four stations' image points of some targets, 8 % of them grossly wrong by so many px."""
+    kept = np.sort(scene.rng.choice(len(scene.field), few, replace=False))
+    seen = []
+    for turn in (0.0, 0.05, -0.05, 0.1):
+        o = scene.observe(scene.iop, scene.eop + np.array([0, turn, 20 * turn, 400 * turn, 0, 0]))
+        wrong = scene.rng.random(len(o)) < 0.08
+        o.points[wrong] += scene.rng.normal(0, gross_px, (int(wrong.sum()), 2))
+        seen.append(o.select(np.isin(o.targets, kept)))
+    return seen
 
 
 def online(draws: int, rng: np.random.Generator) -> list[Row]:

@@ -16,7 +16,7 @@ from thermocald.photogrammetry.camera.camera_model import (
 )
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.network.adjustment import Distance, Photo, adjust_network
-from thermocald.photogrammetry.survey.field import surveyed_field
+from thermocald.photogrammetry.survey import surveyed_field
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -44,9 +44,7 @@ def _stations(field: Array) -> list[ExteriorOrientation]:
     found = []
     for k in range(STATIONS):
         azimuth, tilt = 2 * np.pi * k / STATIONS + 0.1, 0.66 if k % 3 else 0.26
-        z = np.array(
-            [np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)]
-        )
+        z = np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)])
         x = np.cross([0.0, 1.0, 0.0], z)
         x /= np.linalg.norm(x)
         y = np.cross(z, x)

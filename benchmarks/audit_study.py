@@ -45,6 +45,21 @@ def significance(draws: int, rng: np.random.Generator) -> list[Row]:
         if size == 1.0:
             rows.append(share("`study`: p, within sds", what, "noise of the stated sds", excess))
         rows.append(share("`study`: p of r", what, "noise of any size and memory", r))
+    for what, coloured, phi, missing in (
+        ("AR 0.97, 40 % missing in one piece", 1.0, 0.97, 60),
+        ("AR 0.9, 17 % missing in one piece", 1.0, 0.9, 25),
+    ):
+        drift, r = [], []
+        for _ in range(draws):
+            first = int(rng.integers(10, 140 - missing))
+            t = 10.0 * np.delete(np.arange(150), slice(first, first + missing))
+            y = _noise(rng, coloured, phi)[(t / 10).astype(int)]
+            found = drift_test(y, ones[: len(t)], redundancy[: len(t)], times=t)
+            assert found is not None
+            drift.append(found.p_value <= 0.05)
+            r.append(slope_p_value(y, course[(t / 10).astype(int)], t) <= 0.05)
+        rows.append(share("`study`, `replay`: p, no drift", what, "the gap's length", drift))
+        rows.append(share("`study`, `replay`: p of r", what, "the gap's length", r))
     family = []
     for _ in range(max(draws // 4, 1)):
         tests = [drift_test(_noise(rng, 0.5, 0.97), ones, redundancy) for _ in range(8)]

@@ -10,23 +10,23 @@ import numpy as np
 from benchmarks.audit_rows import Row, ratio, share
 from thermocald.analysis.thermal.correction import correct_points
 from thermocald.analysis.thermal.prediction_test import predicted_error
-from thermocald.analysis.thermal.temperature_log import TemperatureLog
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
-from thermocald.discovery.verdict.model import model_of
-from thermocald.discovery.verdict.result import discover_series
+from thermocald.discovery.model import build_model
+from thermocald.discovery.result import discover_series
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, project
-from thermocald.reduction.reduce import reduce_series
-from thermocald.reduction.source import epochs_input
-from thermocald.simulation.course import Course
-from thermocald.simulation.model import ModelEffect
-from thermocald.simulation.presets import preset_simulation
+from thermocald.physics.heat import Course
+from thermocald.physics.model import ModelEffect
+from thermocald.physics.presets import preset_simulation
+from thermocald.store.logger.temperatures import TemperatureLog
+from thermocald.thermal.reduce import reduce_series
+from thermocald.thermal.source import epochs_input
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.analysis.thermal.result import FittedModel
-    from thermocald.reduction.series import SeriesInput
+    from thermocald.thermal.series import SeriesInput
 
     Array = NDArray[np.float64]
 
@@ -97,6 +97,40 @@ def thermal(draws: int, rng: np.random.Generator) -> list[Row]:
     ]  # fmt: skip
 
 
+NOISY_K = 0.15
+
+
+def thermometer(draws: int, rng: np.random.Generator) -> list[Row]:
+    """A thermometer with 0.15 K of noise: `correct` and `predict --log` with its own log."""
+    moved, predicted = [], []
+    for seed in _seeds(rng, draws):
+        s = simulated(seed, ())
+        source = seen(s)
+        readings = {n: v + rng.normal(0, NOISY_K, len(v)) for n, v in source.readings.items()}
+        camera = ThermalCamera(fitted(replace(source, readings=readings)).model)
+        log = TemperatureLog(source.reading_times, readings)
+        rows = rng.choice(np.arange(10, 110), 3, replace=False)
+        times = source.frame_times[rows]
+        drift = s.truth.iop[rows] - s.model.interior.as_array()
+        drift -= (camera.model.T0 - s.model.T0) * s.model.rate_vector
+        along = camera.along(log.times, dict(log.channels), times, relative_to=camera.model.T0,
+                             temperature_sd=camera.thermometer_sd)  # fmt: skip
+        off = (along.values - camera.model.interior.as_array() - drift)[:, :3]
+        predicted.append((off / along.sd[:, :3]).ravel())
+        steady = camera.model.interior.as_array()
+        eop, points = s.truth.eop[0], s.field.points[:1]
+        warm = np.concatenate([project(s.model.sensor, steady + d, eop, points) for d in drift])
+        found = correct_points(camera, log, times, warm, temperature_sd=camera.thermometer_sd)
+        off = (found.points - project(s.model.sensor, steady, eop, points)) / found.sds
+        moved.append(off.ravel())
+    return [
+        ratio("`predict --log`", "sd of the change of c, x0, y0; thermometer ± 0.15 K",
+              "the model's covariance, noise of the log", np.array(predicted)),
+        ratio("`correct`", "sd of a corrected point; thermometer ± 0.15 K",
+              "the model's covariance, noise of the log", np.array(moved)),
+    ]  # fmt: skip
+
+
 def _corrected(s: Any, camera: ThermalCamera) -> list[float]:
     """Error over sd of points seen at 40 °C, corrected to 25 °C: a log that stands still."""
     truth = s.model
@@ -154,7 +188,7 @@ def discovery(draws: int, rng: np.random.Generator) -> list[Row]:
             continue
         estimate = entry.estimates["tau"]
         tau.append((estimate["value"] - TAU) / estimate["sd"])
-        model = model_of(found)
+        model = build_model(found)
         start = s.model.interior.as_array() + (model.T0 - s.model.T0) * s.model.rate_vector
         off = model.interior.as_array() - start
         level.append([off[k] / model.sds[f"interior.{n}"] for k, n in enumerate(NAMES)])

@@ -21,8 +21,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from thermocald.acquisition.live_pipeline import AcquiredEpoch
-from thermocald.acquisition.pipeline import Pipeline
+from thermocald.acquisition.pairing import pair_readings
+from thermocald.acquisition.pipeline import AcquiredEpoch, make_epoch
 from thermocald.acquisition.scheduler import Schedule
 from thermocald.analysis.online.observer import OnlineObserver
 from thermocald.hal import SystemClock, VirtualClock, open_device
@@ -111,9 +111,9 @@ def virtual_day() -> None:
 def epoch_cost(epochs: int) -> None:
     """Frame to store, 8 MP, one thread."""
     from thermocald.acquisition.frame_folder import FrameFolder
-    from thermocald.cli.run import mock_config
     from thermocald.daemon.epoch_keeper import EpochKeeper
-    from thermocald.daemon.plan import common_unknowns, plan_cameras
+    from thermocald.daemon.given_config import mock_config
+    from thermocald.daemon.plan import plan_cameras, running_series
     from thermocald.daemon.store_guard import StoreGuard
 
     clock = VirtualClock()
@@ -126,36 +126,35 @@ def epoch_cost(epochs: int) -> None:
         assert plan.sensor is not None
         assert plan.testfield is not None
         observer = OnlineObserver(plan.sensor, plan.testfield, lambda *_: None)
-        calibrator, common = plan.calibrator, common_unknowns(plan)
+        calibrator, running = plan.calibrator, running_series(plan)
         assert calibrator is not None
-        assert common is not None
-        steps = ("decode a JPEG", "measure + adjust", "online filter", "common unknowns", "store")
+        assert running is not None
+        steps = ("decode a JPEG", "measure + adjust", "online filter", "running series", "store")
         spent: dict[str, list[float]] = {name: [] for name in steps}
         skew = []
         with plan.camera, thermometer:
-            pipeline = Pipeline(
-                plan.camera, {"temperature": thermometer}, None, clock, period_s=10.0
-            )
-            for k, (acquired, frame) in enumerate(pipeline.run(epochs)):
+            for k in range(epochs):
+                clock.sleep_until(10.0 * k)
+                frame = plan.camera.capture()
+                paired = pair_readings({"temperature": thermometer.read()}, frame.monotonic)
+                epoch = make_epoch(k + 1, frame, paired)
                 jpeg = cv2.imencode(".jpg", frame.image)[1].tobytes()
                 z = time.thread_time()
                 decode_grey(jpeg)  # what a phone's frame costs more; the mock's has grey values
                 a = time.thread_time()
-                calibrated = calibrator.calibrate(acquired.epoch, frame.image)
+                calibrated = calibrator.calibrate(epoch, frame.image)
                 b = time.thread_time()
                 observer.observe(calibrated)
                 c = time.thread_time()
                 seen = calibrated.epoch.observations
                 assert seen is not None
-                calibrated = replace(
-                    calibrated, adjustment=common.refine(seen, calibrated.adjustment)
-                )
+                calibrated = replace(calibrated, adjustment=running.refine(calibrated, seen)[0])
                 e = time.thread_time()
                 item = AcquiredEpoch(k + 1, frame, True, calibrated.epoch)
                 item.calibrated = calibrated
                 keeper.keep(item)
                 d = time.thread_time()
-                skew.append(acquired.epoch.temperature_time - acquired.epoch.frame_time)
+                skew.append(epoch.temperature_time - epoch.frame_time)
                 if k:  # the first frame is searched as a whole
                     parts = (a - z, b - a, c - b, e - c, d - e)
                     for name, seconds in zip(spent, parts, strict=True):

@@ -23,11 +23,11 @@ import numpy as np
 from tests.blind.bridge import series_input
 from tests.blind.case import SINGLE, Case
 from tests.blind.generator import generate
-from thermocald.discovery.search.candidates import candidates
-from thermocald.discovery.verdict.result import discover_series
-from thermocald.reduction.fit import HypothesisFitter
-from thermocald.reduction.reduce import reduce_series
-from thermocald.reduction.series import COLUMNS
+from thermocald.discovery.result import discover_series
+from thermocald.discovery.search import list_candidates
+from thermocald.thermal.fit import HypothesisFitter
+from thermocald.thermal.reduce import reduce_series
+from thermocald.thermal.series import COLUMNS
 
 # what a trajectory in the parameter series can show: image space is not offered to the peers
 COURSES = [e for e in SINGLE if e not in ("defocus", "target_displacement")]
@@ -52,7 +52,7 @@ def library(fitter: HypothesisFitter, series: int) -> tuple[list[str], np.ndarra
     names, columns = [], []
     base = fitter.drive_trajectory([], series)
     T = base - base.mean()
-    for candidate in candidates(fitter.series):
+    for candidate in list_candidates(fitter.series):
         grid = (
             candidate.grid[:: max(len(candidate.grid) // 8, 1)] if len(candidate.grid) else [None]
         )

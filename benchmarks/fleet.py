@@ -39,13 +39,12 @@ from thermocald.fleet.document import fleet_document
 from thermocald.fleet.forward import Forwarder
 from thermocald.fleet.reprocess import find_blocks, run_blocks
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
-from thermocald.simulation.presets import preset_simulation
-from thermocald.store.database.row import EpochResult
+from thermocald.physics.presets import preset_simulation
 from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import open_recording
-from thermocald.store.server.address import ServerAddress
+from thermocald.store.series import EpochResult
+from thermocald.store.server.connection import ServerAddress, create_tables
 from thermocald.store.server.reader import ServerStore
-from thermocald.store.server.schema import create_tables
 
 CAMERAS = 50
 COLUMNS = 100_000  # epochs whose columns are read

@@ -15,10 +15,10 @@ import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import Observations, TestField
-from thermocald.store.database.blob import pack_covariance, pack_observations
-from thermocald.store.database.row import StoredSeries
+from thermocald.store.database.epochs import pack_covariance, pack_observations
 from thermocald.store.recording.head import CameraSpec, Channel, Head, head_document
 from thermocald.store.recording.testfield_file import testfield_csv
+from thermocald.store.series import StoredSeries
 from thermocald.store.server.writer import series_key
 
 if TYPE_CHECKING:
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 PITCH = 0.00112
 TARGETS = 147
+STORE = "00000000-0000-0000-0000-000000000001"
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class GeneratedCamera:
 
     @property
     def key(self) -> UUID:
-        return series_key(self.station, self.series)
+        return series_key(self.station, UUID(STORE), self.series)
 
 
 def _field() -> TestField:
@@ -111,10 +112,10 @@ def add_camera(connection: Connection, camera: GeneratedCamera, first: int = 1) 
     execute = connection.execute
     execute("INSERT INTO testfield VALUES ('generated', %s) ON CONFLICT DO NOTHING", (csv,))
     execute(
-        "INSERT INTO series VALUES (%s, %s, %s, %s, '', %s, 'generated', %s, %s, '{}') "
+        "INSERT INTO series VALUES (%s, %s, %s, %s, %s, '', %s, 'generated', %s, %s, '{}') "
         "ON CONFLICT DO NOTHING",
         (
-            camera.key, camera.station, series.camera, series.name, series.created_utc,
+            camera.key, camera.station, STORE, series.camera, series.name, series.created_utc,
             json.dumps(head_document(series.head)), json.dumps(dict(series.identity)),
         ),
     )  # fmt: skip

@@ -21,13 +21,13 @@ import numpy as np
 from thermocald.analysis.study.reference import QUOTED
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
-from thermocald.reduction.reduce import reduce_series
-from thermocald.reduction.series import ReducedSeries
-from thermocald.reduction.source import epochs_input
-from thermocald.simulation import effects
-from thermocald.simulation.model import ModelEffect
-from thermocald.simulation.observations import Simulation
-from thermocald.simulation.presets import preset_names, preset_simulation
+from thermocald.physics import catalogue
+from thermocald.physics.model import ModelEffect
+from thermocald.physics.presets import preset_names, preset_simulation
+from thermocald.physics.simulation import Simulation
+from thermocald.thermal.reduce import reduce_series
+from thermocald.thermal.series import ReducedSeries
+from thermocald.thermal.source import epochs_input
 
 DISTANCE_MM = 10_000.0
 BOUND = 0.1
@@ -66,7 +66,7 @@ def measure(preset: str, seed: int = 1) -> Row:
     first = preset_simulation(preset, seed, "M1")
     second = preset_simulation(preset, seed + 1, "M2")
     listed = [
-        replace(e, values=dict.fromkeys(effects.get(e.name).usual, 0.0))
+        replace(e, values=dict.fromkeys(catalogue.get(e.name).usual, 0.0))
         for e in first.model.effects
         if e.name != "defocus"  # moves no point
     ]

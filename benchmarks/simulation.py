@@ -25,12 +25,12 @@ import cv2
 import numpy as np
 import simplejpeg
 
-from thermocald.simulation import effects
-from thermocald.simulation.course import Course
-from thermocald.simulation.demonstration import demonstration_field, demonstration_model
-from thermocald.simulation.history import History
-from thermocald.simulation.presets import preset_simulation
-from thermocald.simulation.scene import Scene
+from thermocald.physics import catalogue
+from thermocald.physics.heat import Course
+from thermocald.physics.history import History
+from thermocald.physics.presets import preset_simulation
+from thermocald.physics.scene import Scene
+from thermocald.physics.testfields import demonstration_field, demonstration_model
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -83,8 +83,8 @@ def day() -> bool:
 
 def courses() -> None:
     print("an effect's time course, and its matrix of sensitivity (180 and 8,640 epochs), ms")
-    for name in effects.names():
-        effect = effects.get(name)
+    for name in catalogue.names():
+        effect = catalogue.get(name)
         values = {k: p.default for k, p in effect.nonlinear.items() if not p.text}
         values.pop("phase", None)
         row = []

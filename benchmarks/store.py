@@ -27,13 +27,19 @@ import numpy as np
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import Observations, TestField
-from thermocald.store.database.columns import CHUNK, MERGED, build_missing_chunks, insert_chunk
-from thermocald.store.database.epoch_columns import CHUNKED, latest_columns
-from thermocald.store.database.epoch_table import StoredEpoch, insert_epoch
-from thermocald.store.database.row import EpochResult
+from thermocald.store.database.columns import (
+    CHUNK,
+    CHUNKED,
+    MERGED,
+    build_missing_chunks,
+    insert_chunk,
+    latest_columns,
+)
+from thermocald.store.database.epochs import insert_epoch
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head
 from thermocald.store.recording.reader import RecordingWriter, open_recording
+from thermocald.store.series import EpochResult, StoredEpoch
 
 if TYPE_CHECKING:
     from collections.abc import Callable

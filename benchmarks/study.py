@@ -18,7 +18,7 @@ import numpy as np
 
 from thermocald.analysis.study.measured import MeasuredSeries, Thermometer
 from thermocald.analysis.study.study import study
-from thermocald.output.study.report import render_report
+from thermocald.output.study.report import render_study
 from thermocald.photogrammetry.camera.camera_model import Sensor
 
 YEAR = 3_153_600
@@ -75,7 +75,7 @@ def main() -> int:
     print(f"studied in {seconds:.1f} s ({cpu_seconds:.1f} s of processor)   < 60 s")
     print(f"{memory:.0f} MB   < 1500 MB")
     begin = time.perf_counter()
-    size = len(render_report(result).encode()) / 1e6
+    size = len(render_study(result).encode()) / 1e6
     print(f"report of {size:.1f} MB in {time.perf_counter() - begin:.1f} s   < 10 MB")
     return 0 if cpu_seconds < 60 and memory < 1500 and size < 10 else 1
 

@@ -22,14 +22,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from thermocald.analysis.camera.state import CameraState
+from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.analysis.thermal.thermal_model import FittedModel, fit_thermal_model
-from thermocald.reduction.reduce import reduce_series
-from thermocald.reduction.source import epochs_input
-from thermocald.simulation.course import Course
-from thermocald.simulation.model import ModelEffect
-from thermocald.simulation.presets import preset_simulation
+from thermocald.physics.heat import Course
+from thermocald.physics.model import ModelEffect
+from thermocald.physics.presets import preset_simulation
+from thermocald.thermal.reduce import reduce_series
+from thermocald.thermal.source import epochs_input
 
 SERIES, EPOCHS = 20, 1000
 
@@ -77,7 +77,7 @@ def use(model: FittedModel) -> bool:
     return min(took) <= 50e-6 and ratio <= 2.0
 
 
-def undistorting(state: CameraState) -> float:
+def undistorting(state: Camera) -> float:
     """Time to undistort a million points over cv2.undistortPoints's, which stops earlier."""
     points = np.random.default_rng(0).uniform([0, 0], [3279, 2463], (1_000_000, 2))
     i, p = state.interior, state.sensor.pixel_pitch

@@ -17,7 +17,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 LONGEST = (
     # of the slow suite, by `make test-slow` with --durations
     "daemon/test_endurance", "blind/test_score", "store/test_bounds", "docs/test_commands",
-    "acquisition/test_common_unknowns", "cli/test_first_hour", "photogrammetry/test_mount",
+    "analysis/test_running_series", "cli/test_first_hour", "photogrammetry/test_mount",
     "daemon/test_rhythm", "real_corners/test_real_corners",
     # of the quick one
     "daemon/test_faults", "daemon/test_page_attacks", "discovery/test_examination",

@@ -85,16 +85,17 @@ def test_options_of_a_driver():
 
 
 def test_options_that_do_not_fit():
-    with pytest.raises(ConfigurationError, match=r"thermometer driver 'mock'.*'sed'"):
+    message = "thermometer driver 'mock': sed: unknown; is 'seed' meant"
+    with pytest.raises(ConfigurationError, match=message):
         open_device("thermometer", "mock", {"sed": 1}, VirtualClock())
 
 
 @pytest.mark.parametrize(
     ("kind", "driver", "options", "message"),
     [
-        ("output", "mqtt", {}, "output driver 'mqtt': host is missing"),
-        ("camera", "android", {"serial": "X"}, "width, height are missing"),
-        ("thermometer", "ds18b20", {}, "sensors is missing"),
+        ("output", "mqtt", {}, "output driver 'mqtt': host: is missing"),
+        ("camera", "android", {"serial": "X"}, r"width: is missing \(and 1 more\)"),
+        ("thermometer", "ds18b20", {}, "sensors: is missing"),
     ],
 )
 def test_a_missing_option_is_named(kind, driver, options, message):

@@ -1,4 +1,4 @@
-"""Host names and addresses: what reaches this machine alone, and how a page may be called.
+"""Host names and addresses: what reaches this machine alone, how a page may be called, secrets.
 
 A name that merely begins like an address (127.0.0.1.evil.example) is a name like any other: with it
 a foreign site makes a browser ask this machine (DNS rebinding).
@@ -7,15 +7,42 @@ a foreign site makes a browser ask this machine (DNS rebinding).
 from __future__ import annotations
 
 import ipaddress
+import logging
+import re
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-__all__ = ["HostNames", "is_loopback"]
-
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
+
+
+_ADDRESS = re.compile(r"(?P<scheme>\b[a-zA-Z][a-zA-Z0-9+.-]*:/{1,2})(?P<rest>[^\s'\"<>]*)")
+_PAIR = re.compile(r"(?i)\b(passw(?:or)?d|token|secret|api_?key)=[^\s&'\"]*")
+
+
+def without_secrets(text: str) -> str:
+    """A text without the user information and the passwords of the addresses in it."""
+    return _PAIR.sub(r"\1=…", _ADDRESS.sub(_without_user, text))
+
+
+def _without_user(found: re.Match[str]) -> str:
+    """One address; a password that holds a `/` ends what a parser takes for the host."""
+    place, slash, path = found["rest"].partition("/")
+    if "@" in place:
+        return found["scheme"] + place.rpartition("@")[2] + slash + path
+    port = place.rpartition(":")[2] if ":" in place else "0"
+    if "@" in path and not port.isdigit():
+        return found["scheme"] + path.rpartition("@")[2]
+    return found[0]
+
+
+class CleanFormatter(logging.Formatter):
+    """Leaves out the passwords of addresses, in tracebacks too: libraries quote what they got."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return without_secrets(super().format(record))
 
 
 def is_loopback(host: str) -> bool:

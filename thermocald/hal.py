@@ -2,9 +2,9 @@
 
 The daemon, the demo, a replay and a test differ only in which of these they are given. Drivers are
 found by entry point and in no other way; the groups are `thermocald.cameras`,
-`thermocald.thermometers` and `thermocald.outputs`. An entry point names a class whose constructor
-has one keyword argument per configuration key. A driver module imports no device library at its
-top: the library is imported in `open()`.
+`thermocald.thermometers` and `thermocald.outputs`. An entry point names a class whose `Options` has
+one field per configuration key. A driver module imports no device library at its top: the library
+is imported in `open()`.
 
 Nothing is inferred from a driver's name or attributes: what the program needs to know of a driver
 is a member of its class here, with a default.
@@ -16,38 +16,24 @@ caller closes and re-opens the device), a `PermanentDeviceError` is reported and
 
 from __future__ import annotations
 
-import inspect
 import threading
 import time
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self, runtime_checkable
 
-from thermocald.errors import ConfigurationError, DriverMissing
+from pydantic import ConfigDict, ValidationError
+
+from thermocald.config.section import Section, in_words, keys
+from thermocald.errors import ConfigurationError, DriverMissing, WrongDevice
+from thermocald.names import channel_fault as channel_fault
+from thermocald.names import require_channels
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     import numpy as np
     from numpy.typing import NDArray
-
-__all__ = [
-    "Camera",
-    "Clock",
-    "Device",
-    "Found",
-    "Frame",
-    "KnownScene",
-    "Output",
-    "Reading",
-    "SystemClock",
-    "Thermometer",
-    "VirtualClock",
-    "driver_names",
-    "load_driver",
-    "open_device",
-    "option_names",
-]
 
 Kind = Literal["camera", "thermometer", "output"]
 
@@ -90,7 +76,9 @@ class Frame:
 class Reading:
     """What a thermometer reported, and when.
 
-    values: {channel: °C}; a channel that could not be read is absent, never repeated or filled in.
+    values: {channel: °C}; a channel that could not be read is absent, never repeated or filled in;
+    one that is called like a column of the program, or holds a mark that separates columns
+    (`names`), is refused as WrongDevice.
     monotonic, utc: s, the time of the conversion as well as the device reports it.
     """
 
@@ -98,6 +86,14 @@ class Reading:
     monotonic: float
     utc: float
     metadata: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in self.values:
+            if fault := channel_fault(name):
+                raise WrongDevice(
+                    f"a temperature channel cannot be called {name!r}: it {fault}; give it another "
+                    "name in the configuration"
+                )
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,16 +137,36 @@ class Clock(Protocol):
         """Wait until a time of the monotonic scale; False if `wake` was set first."""
 
 
-class Device:
-    """What every driver has: `open`, `close`, and use as a context manager.
+class DriverOptions(Section):
+    """The keys of a driver's stanza: types, bounds, defaults; nothing is converted."""
 
+    model_config = ConfigDict(strict=True)
+
+    @classmethod
+    def read(cls, stanza: Mapping[str, Any], where: str = "") -> Self:
+        """Validate a stanza; ConfigurationError names the place, the key and what is wrong."""
+        try:
+            return cls.model_validate(dict(stanza))
+        except ValidationError as error:
+            raise ConfigurationError(in_words(where, error)) from error
+
+
+class Device:
+    """What every driver has: its options, `open`, `close`, and use as a context manager.
+
+    The constructor raises a ConfigurationError and does not touch hardware.
     `open` raises a DeviceError; `close` never raises and may be called twice.
     """
+
+    Options: ClassVar[type[DriverOptions]] = DriverOptions
+    options: Any
 
     device_classes: ClassVar[tuple[str, ...]] = ()
     """The nodes in /dev that it opens, as systemd's DeviceAllow= names them: `char-i2c`."""
 
-    clock: Clock
+    def __init__(self, *, clock: Clock, **options: Any) -> None:
+        self.clock = clock
+        self.options = self.Options.read(options)
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> Sequence[Found]:  # noqa: ARG003
@@ -201,6 +217,10 @@ class Thermometer(Device):
     def read(self) -> Reading:
         """Read all channels; raises a DeviceError if none could be read."""
         raise NotImplementedError
+
+    def named_channels(self) -> Sequence[str]:
+        """The channels as the options name them, before it is opened; () if the device does."""
+        return ()
 
 
 class Output(Device):
@@ -296,33 +316,22 @@ def load_driver(kind: Kind, name: str) -> type[Any]:
 
 
 def option_names(kind: Kind, name: str) -> list[str]:
-    """The options of a driver's constructor; errors as `load_driver`."""
-    return list(_options(load_driver(kind, name)))
+    """The options of a driver; errors as `load_driver`."""
+    return keys(load_driver(kind, name).Options)
 
 
 def open_device(kind: Kind, name: str, options: Mapping[str, Any], clock: Clock) -> Any:
     """Construct a driver from its configuration; the caller opens it.
 
-    Raises ConfigurationError, which names a missing or unknown option.
+    Raises ConfigurationError, which names the option that is missing, unknown or wrong.
     """
     driver = load_driver(kind, name)
-    known = _options(driver)
     where = f"{kind} driver {name!r}"
-    missing = [option for option, required in known.items() if required and option not in options]
-    if missing:
-        verb = "is" if len(missing) == 1 else "are"
-        raise ConfigurationError(f"{where}: {', '.join(missing)} {verb} missing")
-    if unknown := set(options) - set(known):
-        raise ConfigurationError(
-            f"{where}: it has no option {min(unknown)!r}; it has {', '.join(known) or 'none'}"
-        )
     try:
-        return driver(clock=clock, **options)
-    except TypeError as error:  # an option of a type that the driver did not expect
+        device = driver(clock=clock, **options)
+    except (ConfigurationError, TypeError) as error:  # TypeError: a key that is no name
         raise ConfigurationError(f"{where}: {error}") from error
-
-
-def _options(driver: type[Any]) -> dict[str, bool]:
-    """{option: whether it is required} of a driver's constructor."""
-    parameters = inspect.signature(driver).parameters.values()
-    return {p.name: p.default is p.empty for p in parameters if p.name != "clock"}
+    if kind == "thermometer":
+        for channel in device.named_channels():
+            require_channels([channel], where, ConfigurationError)
+    return device

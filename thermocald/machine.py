@@ -10,17 +10,17 @@ vcgencmd get_throttled (the bits); systemd-timesyncd(8) for the clock; kernel do
 
 from __future__ import annotations
 
+import grp
 import importlib.util
 import os
+import pwd
 import shutil
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, Self
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
-
-__all__ = ["Finding", "Machine", "State"]
 
 State = Literal["ok", "missing", "warning", "not needed"]
 
@@ -45,6 +45,8 @@ _GROUPS = {
     "dialout": ("ttyUSB*", "ttyACM*", "ttyAMA*"),
     "gpio": ("gpiochip*",),
 }
+
+_MARKS = {"ok": "ok", "missing": "MISSING", "warning": "warning", "not needed": "-"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +79,11 @@ class Machine:
     groups: frozenset[str]
     synchronised: bool | None
     has_module: Callable[[str], bool] = _has_module
+
+    @classmethod
+    def here(cls, root: Path, clock_trusted: bool | None) -> Self:
+        """The machine whose root folder is given, for the user who runs the program."""
+        return cls(root, _user_name(), os.getuid(), frozenset(_group_names()), clock_trusted)
 
     def findings(self) -> list[Finding]:
         """Everything that was looked at, in the order in which it is best mended."""
@@ -291,3 +298,35 @@ class Machine:
                 "service", "warning", "installed, but it does not start with the machine",
                 "sudo systemctl enable --now thermocald",
             )  # fmt: skip
+
+
+def finding_lines(findings: Sequence[Finding]) -> list[str]:
+    """Return one line for each finding, its remedy below, and a sentence at the end."""
+    width = max(len(finding.name) for finding in findings)
+    lines = []
+    for finding in findings:
+        lines.append(f"{_MARKS[finding.state]:>7}  {finding.name:<{width}}  {finding.text}")
+        if finding.remedy:
+            lines.append(f"{'':>9}{'':<{width}}  → {finding.remedy}")
+    missing = [finding.name for finding in findings if finding.state == "missing"]
+    lines.append("")
+    lines.append(f"to mend: {', '.join(missing)}" if missing else "nothing is missing")
+    return lines
+
+
+def _user_name() -> str:
+    """The user's name, or number where it has none (a container)."""
+    try:
+        return pwd.getpwuid(os.getuid()).pw_name
+    except KeyError:
+        return str(os.getuid())
+
+
+def _group_names() -> list[str]:
+    names = []
+    for number in {os.getgid(), *os.getgroups()}:
+        try:
+            names.append(grp.getgrgid(number).gr_name)
+        except KeyError:
+            continue
+    return names

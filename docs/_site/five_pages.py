@@ -13,10 +13,10 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 PAGES = {
     "A tick": (
         (
-            "The daemon's tick without its threads: wait for the deadline, take a frame and the "
-            "readings next to it, measure and adjust, hand over."
+            "A camera's thread hands a frame over; the readings next to it are paired, it is "
+            "measured and adjusted, and kept in the order of the frames."
         ),
-        "thermocald.acquisition.pipeline:Pipeline.run",
+        "thermocald.acquisition.pipeline:Pipeline.submit",
         "thermocald.acquisition.pipeline:calibrate_frame",
     ),
     "A series": (
@@ -29,23 +29,23 @@ PAGES = {
             "Targets that moved and the measuring noise come first, then the search: effects are "
             "added while they are worth their penalty, and removed when they no longer are."
         ),
-        "thermocald.discovery.search.examination:examine_series",
-        "thermocald.discovery.search.search:Search.expand",
-        "thermocald.discovery.search.search:Search.shrink",
+        "thermocald.discovery.examination:examine_series",
+        "thermocald.discovery.search:Search.expand",
+        "thermocald.discovery.search:Search.shrink",
     ),
     "An effect": (
         (
             "One class, used forward in the simulation, as columns of a fit, and as words in a "
             "report. Everything in which effects differ is stated here."
         ),
-        "thermocald.simulation.effects.thermal_lag:ThermalLag",
+        "thermocald.physics.effects.heat:ThermalLag",
     ),
     "A driver": (
         (
             "One class for one contract of the HAL. It gives what the hardware said, when it said "
             "it, or an error that says whether trying again can help."
         ),
-        "thermocald_drivers.tmp117:Tmp117Thermometer",
+        "thermocald_drivers.i2c:Tmp117Thermometer",
     ),
 }
 """Title: a sentence, and what is shown."""

@@ -8,7 +8,7 @@ import inspect
 import pkgutil
 import re
 import typing
-from itertools import pairwise
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -103,7 +103,8 @@ def _rows(function: Callable[..., Any]) -> Iterator[tuple[str, ...]]:
             flag = isinstance(default, bool)
             declared = [f"{option} / --no-{option[2:]}" if flag else option]
         label = ", ".join(f"`{d}`" for d in declared)
-        yield label, _values(kind, info), shown, _cell(info.help or "")
+        told = f"(advanced) {info.help}" if info.rich_help_panel else info.help or ""
+        yield label, _values(kind, info), shown, _cell(told)
 
 
 def _values(kind: Any, info: Any) -> str:
@@ -173,17 +174,24 @@ def meanings(model: type[BaseModel]) -> dict[str, str]:
 
 
 def _keys(model: type[BaseModel]) -> Iterator[tuple[str, ...]]:
-    schema, said = model.model_json_schema(by_alias=True), meanings(model)
+    said = meanings(model)
+    for name, row in zip(model.model_fields, _values_of(model), strict=True):
+        yield *row, _cell(said[name])
+
+
+def _values_of(model: type[BaseModel]) -> Iterator[tuple[str, ...]]:
+    """(key, what may stand there, default) of each key."""
+    schema = model.model_json_schema(by_alias=True)
     for name, field in model.model_fields.items():
         key = field.alias or name
         if field.is_required():
             default = "required"
         else:
             value = field.get_default(call_default_factory=True, validated_data={})
-            section = hasattr(type(value), "model_fields") or value in ({}, ())
+            section = hasattr(type(value), "model_fields") or isinstance(value, dict) or value == ()
             default = "" if value is None or section else f"`{_yaml(value)}`"
         values = _schema(schema["properties"][key], schema.get("$defs", {}))
-        yield f"`{key}`", values, default, _cell(said[name])
+        yield f"`{key}`", values, default
 
 
 def _yaml(value: Any) -> str:
@@ -228,12 +236,12 @@ def _schema(part: dict[str, Any], definitions: dict[str, Any]) -> str:
 
 
 def _effect_page() -> str:
-    from thermocald.simulation import effects
-    from thermocald.simulation.effects.parameter import EXPERIMENTS
+    from thermocald.physics import catalogue
+    from thermocald.physics.effect import EXPERIMENTS
 
     parts = []
-    for name in effects.names():
-        effect = effects.get(name)
+    for name in catalogue.names():
+        effect = catalogue.get(name)
         parts.append(f"## `{name}`\n\n{_prose(type(effect))}")
         rows = [
             (
@@ -264,22 +272,20 @@ def _driver_page() -> str:
     parts = []
     for kind in ("cameras", "thermometers", "outputs"):
         parts.append(f"## {kind.capitalize()}")
-        for point in sorted(entry_points(group=f"thermocald.{kind}"), key=lambda p: p.name):
-            if not point.value.startswith("thermocald_drivers"):
-                continue
-            cls = point.load()
-            module = importlib.import_module(cls.__module__)
-            options = [p for p in inspect.signature(cls).parameters.values() if p.name != "clock"]
-            rows = [
-                (
-                    f"`{p.name}`",
-                    "required" if p.default is inspect.Parameter.empty else f"`{p.default!r}`",
-                )
-                for p in options
-            ]
-            parts.append(f"### `{point.name}`: {kind[:-1]}\n\n{_prose(module)}")
-            if rows:
-                parts.append(_table(("option", "default"), iter(rows)))
+        points = [
+            point
+            for point in entry_points(group=f"thermocald.{kind}")
+            if point.value.startswith("thermocald_drivers")
+        ]
+        points.sort(key=lambda point: (point.module, point.name))
+        for module, group in groupby(points, key=lambda point: point.module):
+            drivers = list(group)  # several drivers of one module have one text
+            parts.append(f"### {', '.join(f'`{point.name}`' for point in drivers)}")
+            parts.append(_prose(importlib.import_module(module)))
+            for point in drivers:
+                cls = point.load()
+                parts.append(f"Options of `{point.name}`: {_prose(cls)}")
+                parts.append(_table(("option", "value", "default"), _values_of(cls.Options)))
     return "\n\n".join(parts)
 
 
@@ -314,8 +320,64 @@ def _table(head: tuple[str, ...], rows: Iterator[tuple[str, ...]]) -> str:
     return "\n".join(lines)
 
 
+# the public names
+
+
+def _python_page() -> str:
+    import thermocald
+
+    functions = [n for n in thermocald.__all__ if n[0].islower()]
+    nouns = [n for n in thermocald.__all__ if n[0].isupper()]
+    parts = ["## Functions"]
+    parts += [_public(name, getattr(thermocald, name), "###") for name in functions]
+    parts.append("## Nouns")
+    for name in nouns:
+        noun = getattr(thermocald, name)
+        parts.append(_public(name, noun, "###"))
+        parts += [
+            _public(f"{name}.{member}", value, "####")
+            for member, value in inspect.getmembers(noun)
+            if not member.startswith("_") and inspect.getdoc(value) and _is_own(noun, member)
+        ]
+    return "\n\n".join(parts)
+
+
+def _is_own(noun: type, member: str) -> bool:
+    """Whether a member is a method or a property that a class of ours has written down."""
+    for base in noun.__mro__:
+        if member in vars(base):
+            value = vars(base)[member]
+            return base.__module__.startswith("thermocald") and (
+                callable(value) or isinstance(value, property | classmethod)
+                or hasattr(value, "func")
+            )  # fmt: skip
+    return False
+
+
+def _public(name: str, value: Any, level: str) -> str:
+    """A heading, the signature of what is called, and the docstring with its examples."""
+    text = [f"{level} `{name}`"]
+    if callable(value) and not isinstance(value, type):
+        signature = inspect.signature(value)
+        taken = [p for p in map(str, signature.parameters.values()) if p != "self"]
+        written = f"({', '.join(taken)}) -> {signature.return_annotation}"
+        if len(written) > 70:
+            written = written.replace(", ".join(taken), "\n    " + ",\n    ".join(taken) + ",\n")
+        written = written.replace("'", "")
+        text.append(f"```text\n{name.rsplit('.', 1)[-1]}{written}\n```")
+    if hasattr(value, "func"):  # a cached property
+        value = value.func
+    told = (inspect.getdoc(value) or "").strip()
+    plain, mark, example = told.partition("\n>>> ")
+    text.append(plain)
+    if mark:
+        text.append(f"```pycon\n>>> {example}\n```")
+    return "\n\n".join(text)
+
+
 GENERATORS: dict[str, Callable[[], str]] = {
     "reference/cli.md": _command_page,
+    "reference/python.md": _python_page,
     "reference/config.md": _configuration_page,
     "reference/effects.md": _effect_page,
     "reference/drivers.md": _driver_page,

@@ -32,7 +32,9 @@ has none.
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import Field
 
 from thermocald.errors import (
     BadReading,
@@ -44,20 +46,11 @@ from thermocald.errors import (
     WrongDevice,
 )
 from thermocald.hal import Camera, Found, Frame
-from thermocald_drivers import (
-    photograph,
-    pixel_formats,
-    support,
-)
-from thermocald_drivers.android_phone import ADB_CLASSES, list_devices, make_phone
-from thermocald_drivers.android_thermometer import AndroidThermometer
+from thermocald_drivers import photograph, pixel_formats, support
+from thermocald_drivers.android_phone import ADB_CLASSES, AdbPhone, PhoneOptions, list_devices
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from thermocald.hal import Clock
-
-__all__ = ["AndroidCamera", "AndroidThermometer"]
+    from collections.abc import Mapping
 
 KEYS = {"camera": 27, "volume": 24}
 WAKE_KEY = 224
@@ -71,48 +64,42 @@ POLL_S = 0.1
 CLOCKS_DIFFER_S = 5.0
 
 
+class CameraOptions(PhoneOptions):
+    """As above."""
+
+    width: Annotated[int, Field(ge=64, le=20_000)]
+    height: Annotated[int, Field(ge=64, le=20_000)]
+    trigger: Literal["camera", "volume", "tap"] = "camera"
+    tap: (
+        Annotated[list[Annotated[int, Field(ge=0, le=20_000)]], Field(min_length=2, max_length=2)]
+        | None
+    ) = None
+    folder: support.Text = "/sdcard/DCIM/Camera"
+    delete: bool = False
+    refuse_unlocked: bool | None = None
+    minimum_free_mb: Annotated[float, Field(ge=0.0, le=1e6)] = 200.0
+    timeout_s: Annotated[float, Field(ge=0.1, le=600.0)] = 15.0
+
+
 class AndroidCamera(Camera):
     """The camera app of a phone, triggered through adb."""
 
     device_classes = ADB_CLASSES
+    Options = CameraOptions
 
-    def __init__(
-        self,
-        *,
-        clock: Clock,
-        serial: str,
-        width: int,
-        height: int,
-        trigger: str = "camera",
-        tap: Sequence[int] | None = None,
-        folder: str = "/sdcard/DCIM/Camera",
-        delete: bool = False,
-        refuse_unlocked: bool | None = None,
-        minimum_free_mb: float = 200.0,
-        timeout_s: float = 15.0,
-        host: str = "127.0.0.1",
-        port: int = 5037,
-        start_server: bool = True,
-    ) -> None:
-        self.clock = clock
-        self.timeout_s = support.number("timeout_s", timeout_s, 0.1, 600, "s")
-        self.phone = make_phone(serial, host, port, self.timeout_s, start_server)
-        self.width = int(support.number("width", width, 64, 20000, "px", whole=True))
-        self.height = int(support.number("height", height, 64, 20000, "px", whole=True))
-        if support.choice("trigger", trigger, ["camera", "volume", "tap"]) == "tap":
-            if tap is None or len(tap) != 2:
-                raise ConfigurationError("trigger: tap needs tap: [x, y] of the shutter button, px")
-            x, y = (int(support.number("tap", value, 0, 20000, "px")) for value in tap)
-            self.command = f"input tap {x} {y}"
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        o = self.options
+        self.timeout_s: float = o.timeout_s
+        self.phone = AdbPhone(o)
+        if o.trigger != "tap":
+            self.command = f"input keyevent {KEYS[o.trigger]}"
+        elif o.tap is None:
+            raise ConfigurationError("trigger: tap needs tap: [x, y] of the shutter button, px")
         else:
-            self.command = f"input keyevent {KEYS[trigger]}"
-        self.folder = support.text("folder", folder).rstrip("/")
-        self.delete = bool(delete)
-        if refuse_unlocked is not None and not isinstance(refuse_unlocked, bool):
-            raise ConfigurationError(f"refuse_unlocked: {refuse_unlocked!r} is not true or false")
-        self.refuse_unlocked = refuse_unlocked
+            self.command = f"input tap {o.tap[0]} {o.tap[1]}"
+        self.folder = o.folder.rstrip("/")
         self._unchecked = ""
-        self.minimum_free_mb = support.number("minimum_free_mb", minimum_free_mb, 0, 1e6, "MB")
         self._first: dict[str, Any] | None = None
         self._offset, self._zone, self._offset_half = 0.0, "", 0.0
 
@@ -139,14 +126,14 @@ class AndroidCamera(Camera):
 
     def warnings(self) -> list[str]:
         found = []
-        if self.refuse_unlocked is False:
+        if self.options.refuse_unlocked is False:
             found.append("refuse_unlocked: false accepts a phone that focuses between frames")
         if self._unchecked:
             found.append(f"{self._unchecked}: whether they stay as they are cannot be checked")
         return found
 
     def frame_size(self) -> tuple[int, int]:
-        return self.width, self.height
+        return self.options.width, self.options.height
 
     def capture(self) -> Frame:
         if "Awake" not in self.phone.shell(STATE):
@@ -158,16 +145,18 @@ class AndroidCamera(Camera):
         triggered = (triggered + time.time()) / 2.0
         path, jpeg = self._new_photograph(set(before))
         tags = photograph.exif(jpeg)
-        if (tags["width"], tags["height"]) != (self.width, self.height):
+        if (tags["width"], tags["height"]) != (self.options.width, self.options.height):
             raise WrongDevice(
-                f"{self.phone.where}: the photograph has {tags['width']}×{tags['height']} px, "
-                f"not {self.width}×{self.height}; set the camera app to its full size"
+                f"{self.phone.where}: the photograph has {tags['width']}×{tags['height']} px, not "
+                f"{self.options.width}×{self.options.height}; set the camera app to its full size"
             )
         tags |= photograph.focus_state(self.phone.shell("dumpsys media.camera"))
         locked, why = self._lock(tags)
         start, source = self._exposure_start(tags, triggered)
-        image, _ = pixel_formats.decode(memoryview(jpeg), "JPEG", self.width, self.height)
-        if self.delete:
+        image, _ = pixel_formats.decode(
+            memoryview(jpeg), "JPEG", self.options.width, self.options.height
+        )
+        if self.options.delete:
             self.phone.shell(f"rm -f '{path}'")
         middle = start + float(tags.get("exposure_s", 0.0)) / 2.0
         monotonic, utc = support.on_clock(self.clock, middle - time.time() + time.monotonic())
@@ -202,10 +191,10 @@ class AndroidCamera(Camera):
         fields = lines[-1 if lines[-1].strip() else -2].split() if len(lines) > 1 else []
         if len(fields) >= 4 and fields[3].isdigit():
             free_mb = int(fields[3]) / 1024.0
-            if free_mb < self.minimum_free_mb:
+            if free_mb < self.options.minimum_free_mb:
                 raise PermanentDeviceError(
                     f"{self.phone.where}: its storage is full ({free_mb:.0f} MB left, "
-                    f"{self.minimum_free_mb:g} wanted); delete photographs or write delete: true"
+                    f"{self.options.minimum_free_mb:g} wanted); delete photographs, or delete: true"
                 )
 
     def _new_photograph(self, before: set[str]) -> tuple[str, bytes]:
@@ -250,7 +239,9 @@ class AndroidCamera(Camera):
         moved = photograph.image_moved(self._first, tags)
         if "SCAN" in str(self._first.get("af_state", "")):
             self._first = None  # nothing to compare with: it was still focusing
-        if (locked is False and self.refuse_unlocked) or (moved and self.refuse_unlocked is None):
+        if (locked is False and self.options.refuse_unlocked) or (
+            moved and self.options.refuse_unlocked is None
+        ):
             raise BadReading(
                 f"{self.phone.where}: focus or exposure moved, {why}; set the camera app to manual "
                 "(refuse_unlocked: false accepts it)"

@@ -23,64 +23,43 @@ driver itself. See `heating` for the programme.
 from __future__ import annotations
 
 import contextlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import Field
 
 from thermocald.errors import BadReading, DeviceError
 from thermocald.hal import Output
-from thermocald_drivers import android_temperatures, support
-from thermocald_drivers.android_phone import AdbPhone
-from thermocald_drivers.heating import HeatingProgramme
+from thermocald_drivers.android_phone import ADB_CLASSES, AdbPhone, PhoneOptions
+from thermocald_drivers.android_thermometer import battery
+from thermocald_drivers.heating import HeatingOptions, HeatingProgramme
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from thermocald.hal import Clock
-
-__all__ = ["AndroidLoadOutput"]
+    from collections.abc import Mapping
 
 MARK = "thermocald_load"
+
+
+class LoadOptions(HeatingOptions, PhoneOptions):
+    """As above; a battery above 50 °C is in danger."""
+
+    limit_c: Annotated[float, Field(ge=0.0, le=50.0)]
+    processes: Annotated[int, Field(ge=1, le=16)] = 4
+    lease_s: Annotated[float, Field(ge=2.0, le=120.0)] = 30.0
+    timeout_s: Annotated[float, Field(ge=0.1, le=60.0)] = 5.0
 
 
 class AndroidLoadOutput(Output):
     """Busy loops on the phone while the programme asks for heat."""
 
-    device_classes = ("char-usb_device",)
+    device_classes = ADB_CLASSES
     heats = True
+    Options = LoadOptions
 
-    def __init__(
-        self,
-        *,
-        clock: Clock,
-        serial: str,
-        limit_c: float,
-        programme: Sequence[Mapping[str, Any]],
-        processes: int = 4,
-        lease_s: float = 30.0,
-        timeout_s: float = 5.0,
-        host: str = "127.0.0.1",
-        port: int = 5037,
-        start_server: bool = True,
-        unknown_s: float = 60.0,
-        hysteresis_k: float = 0.5,
-    ) -> None:
-        self.clock = clock
-        self.phone = AdbPhone(
-            support.text("serial", serial),
-            support.text("host", host),
-            int(support.number("port", port, 1, 65535, whole=True)),
-            support.number("timeout_s", timeout_s, 0.1, 60, "s"),
-            bool(start_server),
-        )
-        support.number("limit_c", limit_c, 0, 50, "°C")  # a battery above 50 °C is in danger
-        self.processes = int(support.number("processes", processes, 1, 16, whole=True))
-        self.lease_s = support.number("lease_s", lease_s, 2, 120, "s")
-        self.programme = HeatingProgramme(
-            limit_c=limit_c,
-            programme=programme,
-            channel="battery",
-            unknown_s=unknown_s,
-            hysteresis_k=hysteresis_k,
-        )
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.timeout_s = self.options.timeout_s
+        self.phone = AdbPhone(self.options)
+        self.programme = HeatingProgramme(self.options, "battery")
 
     def open(self) -> None:
         self.phone.connect()
@@ -95,24 +74,25 @@ class AndroidLoadOutput(Output):
         self.phone.disconnect()
 
     def emit(self, result: Mapping[str, Any]) -> None:  # noqa: ARG002 - it reads the phone
-        battery = android_temperatures.battery(self.phone.shell("dumpsys battery"))
+        found = battery(self.phone.shell("dumpsys battery"))
+        celsius = None if found is None else found[0] * found[1]
         was_tripped = self.programme.tripped
         now = self.clock.monotonic()
-        if not self.programme.decide(now - self._started, battery):
+        if not self.programme.decide(now - self._started, celsius):
             self._stop()
             if self.programme.tripped and not was_tripped:
                 raise BadReading(f"{self.phone.where}: off for good, {self.programme.tripped}")
             return
-        if now - self._renewed >= self.lease_s / 2.0:
+        if now - self._renewed >= self.options.lease_s / 2.0:
             self._stop()
             self._start()
             self._renewed = now
 
     def _start(self) -> None:
         loop = f"{MARK}=1; while :; do :; done"
-        for _ in range(self.processes):
+        for _ in range(self.options.processes):
             self.phone.shell(
-                f"timeout {self.lease_s:g} sh -c '{loop}' >/dev/null 2>&1 </dev/null &"
+                f"timeout {self.options.lease_s:g} sh -c '{loop}' >/dev/null 2>&1 </dev/null &"
             )
 
     def _stop(self) -> None:

@@ -21,12 +21,11 @@ from thermocald.errors import (
     DeviceTimeout,
     WrongDevice,
 )
+from thermocald.hal import DriverOptions
 from thermocald_drivers import support
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-__all__ = ["ADB_CLASSES", "AdbPhone", "FileEntry", "list_devices", "make_phone"]
 
 DENIED = (
     "unauthorized: unlock the phone and confirm 'Allow USB debugging' (tick 'always'); "
@@ -49,24 +48,22 @@ class FileEntry:
     size: int
 
 
-def make_phone(
-    serial: object, host: object, port: object, timeout_s: float, start_server: object
-) -> AdbPhone:
-    """A phone from the options of a stanza, bounded."""
-    return AdbPhone(
-        support.text("serial", serial),
-        support.text("host", host),
-        int(support.number("port", port, 1, 65535, whole=True)),
-        support.number("timeout_s", timeout_s, 0.1, 600, "s"),
-        bool(start_server),
-    )
+class PhoneOptions(DriverOptions):
+    """The phone, and the adb server behind which it is."""
+
+    serial: support.Text
+    host: support.Text = "127.0.0.1"
+    port: support.Port = 5037
+    start_server: bool = True
+    timeout_s: support.Seconds
 
 
 def list_devices(timeout_s: float = 1.0) -> list[tuple[str, str]]:
     """(serial, state) of what a running adb server lists; [] without one."""
     adbutils = support.library("adbutils", "android")
     try:
-        AdbPhone("", "127.0.0.1", 5037, timeout_s, start_server=False).require_server()
+        nobody = PhoneOptions(serial="none", timeout_s=timeout_s, start_server=False)
+        AdbPhone(nobody).require_server()
         return _devices(adbutils.AdbClient(socket_timeout=timeout_s))
     except (OSError, adbutils.AdbError):
         return []
@@ -85,13 +82,11 @@ def _devices(client: Any) -> list[tuple[str, str]]:
 class AdbPhone:
     """One phone: `connect` before anything else; `seen` once that has succeeded."""
 
-    def __init__(
-        self, serial: str, host: str, port: int, timeout_s: float, start_server: bool
-    ) -> None:
-        self.serial = serial
-        self.where = f"phone {serial}"
-        self._host, self._port, self._timeout_s = host, port, timeout_s
-        self._start_server = start_server
+    def __init__(self, options: PhoneOptions) -> None:
+        self.serial = options.serial
+        self.where = f"phone {self.serial}"
+        self._host, self._port = options.host, options.port
+        self._timeout_s, self._start_server = options.timeout_s, options.start_server
         self._device: Any = None
         self._lines: list[Any] = []
         self.seen = False

@@ -25,19 +25,17 @@ from __future__ import annotations
 
 import logging
 import threading
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import Field
 
 from thermocald.errors import BadReading, DeviceDenied, DeviceGone, DeviceNotFound
-from thermocald.hal import Output
+from thermocald.hal import DriverOptions, Output
 from thermocald_drivers import support
-from thermocald_drivers.heating import HeatingProgramme
+from thermocald_drivers.heating import HeatingOptions, HeatingProgramme
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from thermocald.hal import Clock
-
-__all__ = ["LedOutput", "RelayOutput"]
+    from collections.abc import Mapping
 
 GPIO_CLASSES = ("char-gpiochip",)
 """/dev/gpiochipN, which gpiozero opens through lgpio."""
@@ -45,11 +43,32 @@ GPIO_CLASSES = ("char-gpiochip",)
 log = logging.getLogger(__name__)
 
 
-def _pin(kind: str, pin: int, active_high: bool) -> Any:
+class PinOptions(DriverOptions):
+    """A pin by its BCM number."""
+
+    pin: Annotated[int, Field(ge=0, le=53)]
+    active_high: bool = True
+
+
+class LedOptions(PinOptions):
+    """As above."""
+
+    blink_s: Annotated[float, Field(ge=0.05, le=10.0)] = 0.25
+
+
+class RelayOptions(HeatingOptions, PinOptions):
+    """As above."""
+
+    watchdog_s: Annotated[float, Field(ge=0.05, le=3600.0)] = 30.0
+    channel: support.Text = "temperature"
+
+
+def _pin(kind: str, options: PinOptions) -> Any:
     """A gpiozero device; its errors are translated."""
+    pin = options.pin
     gpiozero = support.library("gpiozero", "gpio")
     try:
-        return getattr(gpiozero, kind)(pin, active_high=active_high, initial_value=False)
+        return getattr(gpiozero, kind)(pin, active_high=options.active_high, initial_value=False)
     except gpiozero.BadPinFactory as error:
         raise DeviceNotFound(f"GPIO {pin}: this machine has no usable pins ({error})") from error
     except gpiozero.GPIOPinInUse as error:
@@ -65,18 +84,11 @@ class LedOutput(Output):
     """Steady while epochs have results, blinking while they have none, dark while closed."""
 
     device_classes = GPIO_CLASSES
-
-    def __init__(
-        self, *, clock: Clock, pin: int, active_high: bool = True, blink_s: float = 0.25
-    ) -> None:
-        self.clock = clock
-        self.pin = int(support.number("pin", pin, 0, 53, whole=True))
-        self.active_high = bool(active_high)
-        self.blink_s = support.number("blink_s", blink_s, 0.05, 10, "s")
-        self._led: Any = None
+    Options = LedOptions
+    _led: Any = None
 
     def open(self) -> None:
-        self._led = _pin("LED", self.pin, self.active_high)
+        self._led = _pin("LED", self.options)
         self._good: bool | None = None
 
     def close(self) -> None:
@@ -87,7 +99,7 @@ class LedOutput(Output):
 
     def emit(self, result: Mapping[str, Any]) -> None:
         if self._led is None:
-            raise DeviceGone(f"LED at GPIO {self.pin}: not open")
+            raise DeviceGone(f"LED at GPIO {self.options.pin}: not open")
         good = result.get("status") == "ok"
         if good == self._good:
             return  # restarting at each epoch would hide the blinking
@@ -95,7 +107,9 @@ class LedOutput(Output):
         if good:
             self._led.on()
         else:
-            self._led.blink(on_time=self.blink_s, off_time=self.blink_s, background=True)
+            self._led.blink(
+                on_time=self.options.blink_s, off_time=self.options.blink_s, background=True
+            )
 
 
 class RelayOutput(Output):
@@ -103,37 +117,18 @@ class RelayOutput(Output):
 
     device_classes = GPIO_CLASSES
     heats = True
+    Options = RelayOptions
 
-    def __init__(
-        self,
-        *,
-        clock: Clock,
-        pin: int,
-        limit_c: float,
-        programme: Sequence[Mapping[str, Any]],
-        active_high: bool = True,
-        watchdog_s: float = 30.0,
-        channel: str = "temperature",
-        unknown_s: float = 60.0,
-        hysteresis_k: float = 0.5,
-    ) -> None:
-        self.clock = clock
-        self.pin = int(support.number("pin", pin, 0, 53, whole=True))
-        self.active_high = bool(active_high)
-        self.watchdog_s = support.number("watchdog_s", watchdog_s, 0.05, 3600, "s")
-        self.programme = HeatingProgramme(
-            limit_c=limit_c,
-            programme=programme,
-            channel=channel,
-            unknown_s=unknown_s,
-            hysteresis_k=hysteresis_k,
-        )
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.programme = HeatingProgramme(self.options, self.options.channel)
+        self.where = f"relay at GPIO {self.options.pin}"
         self._relay: Any = None
         self._lock = threading.Lock()
         self._watchdog: threading.Timer | None = None
 
     def open(self) -> None:
-        self._relay = _pin("DigitalOutputDevice", self.pin, self.active_high)
+        self._relay = _pin("DigitalOutputDevice", self.options)
         self.programme.reset()
         self._started = self.clock.monotonic()
 
@@ -150,19 +145,17 @@ class RelayOutput(Output):
         was_tripped = self.programme.tripped
         with self._lock:
             if self._relay is None:
-                raise DeviceGone(f"relay at GPIO {self.pin}: not open")
-            value = result.get(self.programme.channel)
+                raise DeviceGone(f"{self.where}: not open")
+            value = result.get(self.options.channel)
             temperature = float(value) if isinstance(value, int | float) else None
             heat = self.programme.decide(self.clock.monotonic() - self._started, temperature)
             self._relay.value = heat
         if self.programme.tripped:
             if not was_tripped:
-                raise BadReading(
-                    f"relay at GPIO {self.pin}: off for good, {self.programme.tripped}"
-                )
+                raise BadReading(f"{self.where}: off for good, {self.programme.tripped}")
             return
         if heat:
-            self._watchdog = threading.Timer(self.watchdog_s, self._starve)
+            self._watchdog = threading.Timer(self.options.watchdog_s, self._starve)
             self._watchdog.daemon = True
             self._watchdog.start()
 
@@ -178,4 +171,4 @@ class RelayOutput(Output):
             if self._relay is not None:
                 self._relay.off()
                 self.programme.heating = False
-        log.warning("relay at GPIO %d: no result for %g s, off", self.pin, self.watchdog_s)
+        log.warning("%s: no result for %g s, off", self.where, self.options.watchdog_s)

@@ -1,94 +1,109 @@
-"""What the I2C thermometers share: the bus, the identity register, errno, refusal of 0xFFFF and 0.
+"""Thermometers on an I2C bus: TMP117, MCP9808, the LM75 family, SHT3x, BME280.
 
     thermometers:
-      - {name: lens, driver: tmp117, bus: 1, address: 0x48}
+      - {name: lens, driver: tmp117, bus: 1, address: 0x48}            # 0x48 … 0x4b
+      - {name: air, driver: mcp9808, bus: 1, address: 0x18, channel: air}    # 0x18 … 0x1f
+      - {name: board, driver: lm75, chip: tmp102, bus: 1, address: 0x49}     # 0x48 … 0x4f
+      - {name: box, driver: sht3x, bus: 1, address: 0x44}              # 0x44, 0x45
+      - {name: room, driver: bme280, bus: 1, address: 0x76}            # 0x76, 0x77
 
 smbus2 opens /dev/i2c-N (Raspberry Pi: `dtparam=i2c_arm=on`, user in the group `i2c`). Where the
 kernel has a driver for the chip, prefer it (`hwmon`, `iio`): an address that a kernel driver holds
-is refused here with EBUSY. Word registers are sent high byte first, SMBus words low byte first:
-`_word` swaps them.
+is refused here with EBUSY. The chip's identity is checked when it is opened; 0xFFFF is a bus that
+nothing drives. `channel` (temperature) names the value.
 
-0xFFFF is a bus that nothing drives. Chips without a data-ready flag hold a fixed value from
-power-up to the end of their first conversion, mostly 0 °C: it is read again after one conversion,
-and then accepted only if a recent reading lay within 5 K.
+* TMP117 (±0.1 °C): a one-shot conversion of 8 averages per reading, its Data_Ready awaited, so that
+  no value is read twice; 0x8000 is the register before the first one (data sheet SNOSD82D, 7.6).
+* MCP9808 (±0.25 °C): bits 15–13 of the register are alert flags, bit 12 the sign (DS25095A, 5).
+* LM75 family, `chip`: lm75 (also LM75A, LM75B, which use two more bits), lm75b, tmp75, tmp102. It
+  has no identity: the bits that the chip leaves at zero are checked, and that its limits are of the
+  same grid (LM75B rev. 6.1, TMP75 SBOS288, TMP102 SBOS397H).
+* SHT3x: a single shot with high repeatability; each word has a CRC (SHT3x-DIS v6, 4.3 … 4.13).
+* BME280: a forced measurement; it warms itself and measures its board (BST-BME280-DS002 1.23, 4.2,
+  8.1). Humidity and pressure go into the metadata.
+
+MCP9808 and the LM75 family convert all the time: in shut-down they would repeat their last value
+for ever, so they are woken and one conversion awaited. What they hold from power-up (see `chips`)
+is read again after one conversion, and then accepted only if a recent reading lay within 5 K.
 """
 
 from __future__ import annotations
 
+import struct
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from thermocald.errors import BadReading, ConfigurationError, DeviceGone, WrongDevice
-from thermocald.hal import Found, Thermometer
-from thermocald_drivers import support
+from pydantic import Field
+
+from thermocald.errors import BadReading, ConfigurationError, DeviceGone, DeviceTimeout, WrongDevice
+from thermocald.hal import DriverOptions, Found, Thermometer
+from thermocald_drivers import chips, support
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
 
-    from thermocald.hal import Clock, Reading
+    from thermocald.hal import Reading
 
-__all__ = ["I2cThermometer", "signed"]
+
+class I2cOptions(DriverOptions):
+    """Where a chip is, and how its channel is called; address None: the chip's first."""
+
+    bus: Annotated[int, Field(ge=0, le=255)] = 1
+    address: int | None = None
+    channel: support.Text = "temperature"
+
+
+class Lm75Options(I2cOptions):
+    """The family has several chips."""
+
+    chip: Literal["lm75", "lm75b", "tmp75", "tmp102"] = "lm75"
 
 
 class I2cThermometer(Thermometer):
     """A thermometer at one address of one bus; a chip gives `_identify` and `_measure`."""
 
     device_classes = ("char-i2c",)
+    Options = I2cOptions
     chip: ClassVar[str]
     addresses: ClassVar[range | tuple[int, ...]]
     range_c: ClassVar[tuple[float, float]]
 
-    def __init__(
-        self,
-        *,
-        clock: Clock,
-        bus: int = 1,
-        address: int | None = None,
-        channel: str = "temperature",
-    ) -> None:
-        self.clock = clock
-        self.bus = int(support.number("bus", bus, 0, 255, whole=True))
-        chosen = self.addresses[0] if address is None else address
-        if chosen not in self.addresses:
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        chosen = self.options.address
+        self.address = self.addresses[0] if chosen is None else chosen
+        if self.address not in self.addresses:
             known = ", ".join(f"0x{a:02x}" for a in self.addresses)
-            shown = f"0x{chosen:02x}" if isinstance(chosen, int) else repr(chosen)
             raise ConfigurationError(
-                f"address: {shown} is not an address of a {self.chip} ({known})"
+                f"address: 0x{chosen:02x} is not an address of a {self.chip} ({known})"
             )
-        self.address = chosen
-        self.channel = support.text("channel", channel)
+        self.where = f"{self.chip} at 0x{self.address:02x} on /dev/i2c-{self.options.bus}"
         self._smbus: Any = None
         self._seen = False
-        self._neighbour = support.Neighbour(clock)
-
-    @property
-    def where(self) -> str:
-        """The device as the user knows it."""
-        return f"{self.chip} at 0x{self.address:02x} on /dev/i2c-{self.bus}"
+        self._neighbours = support.Neighbours(self.clock)
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:
         """Buses a chip could be on; scanning addresses could upset other chips."""
-        buses = sorted(Path(sysfs).glob("class/i2c-dev/i2c-*"))
         return [
             Found(
                 {"bus": int(path.name.split("-")[1]), "address": cls.addresses[0]},
                 f"/dev/{path.name}: if a {cls.chip} is wired to it",
                 certain=False,
             )
-            for path in buses
+            for path in sorted(Path(sysfs).glob("class/i2c-dev/i2c-*"))
         ]
 
     def open(self) -> None:
         smbus2 = support.library("smbus2")
         hint = "is I2C switched on (dtparam=i2c_arm=on), the chip wired, the user in group i2c?"
         try:
-            self._smbus = smbus2.SMBus(self.bus)
-            about = self._identify()
+            self._smbus = smbus2.SMBus(self.options.bus)
+            self._identify()
         except OSError as error:
             self.close()
             raise support.fault(error, self.where, seen=self._seen, hint=hint) from error
-        self._about = dict(about)
         self._seen = True
 
     def close(self) -> None:
@@ -96,8 +111,13 @@ class I2cThermometer(Thermometer):
         if smbus is not None:
             smbus.close()
 
+    def named_channels(self) -> list[str]:
+        return [self.options.channel]
+
     def identity(self) -> Mapping[str, str]:
-        return {"chip": self.chip, "address": f"0x{self.address:02x}", "bus": str(self.bus)}
+        return {
+            "chip": self.chip, "address": f"0x{self.address:02x}", "bus": str(self.options.bus)
+        }  # fmt: skip
 
     def read(self) -> Reading:
         if self._smbus is None:
@@ -108,9 +128,9 @@ class I2cThermometer(Thermometer):
         except OSError as error:
             raise support.fault(error, self.where, seen=True) from error
         support.believable(value, *self.range_c, self.where)
-        return support.middle_reading(self.clock, {self.channel: value}, start, about)
+        return support.middle_reading(self.clock, {self.options.channel: value}, start, about)
 
-    def _identify(self) -> Mapping[str, str]:
+    def _identify(self) -> None:
         """Check that it is this chip and make it convert; WrongDevice if it is another."""
         raise NotImplementedError
 
@@ -118,27 +138,11 @@ class I2cThermometer(Thermometer):
         """One fresh value in °C and what else the chip reports."""
         raise NotImplementedError
 
-    def _converted(self, read: Callable[[], int], power_up: int, conversion_s: float) -> int:
-        """A temperature word of a chip that has no data-ready flag; BadReading at power-up."""
-        raw = read()
-        if raw != power_up:
-            self._neighbour.measured(self._celsius(raw))
-            return raw
-        self._wait(conversion_s)
-        raw = read()
-        if raw == power_up and not self._neighbour.supports(self._celsius(raw)):
-            raise BadReading(
-                f"{self.where}: {self._celsius(raw):g} °C is its power-up value and no recent "
-                "reading was near it; the chip lost its supply, or does not convert"
-            )
-        return raw
-
-    def _celsius(self, raw: int) -> float:
-        """°C of a temperature word, for chips that use `_converted`."""
-        raise NotImplementedError
+    def _byte(self, register: int) -> int:
+        return int(self._smbus.read_byte_data(self.address, register))
 
     def _word(self, register: int) -> int:
-        """A 16-bit register, high byte first on the wire."""
+        """A 16-bit register: high byte first on the wire, where SMBus has the low one first."""
         value = int(self._smbus.read_word_data(self.address, register))
         return (value & 0xFF) << 8 | value >> 8
 
@@ -146,12 +150,11 @@ class I2cThermometer(Thermometer):
         swapped = (value & 0xFF) << 8 | value >> 8
         self._smbus.write_word_data(self.address, register, swapped)
 
-    def _data_word(self, register: int) -> int:
-        """A measurement register; 0xFFFF is a bus that nothing drives, and is refused."""
-        value = self._word(register)
-        if value == 0xFFFF:
+    def _driven(self, word: int) -> int:
+        """A measurement's word; 0xFFFF is a bus that nothing drives, and is refused."""
+        if word == 0xFFFF:
             raise BadReading(f"{self.where}: reads 0xFFFF, nothing drives the bus")
-        return value
+        return word
 
     def _expect(self, what: str, found: int, wanted: int) -> None:
         if found != wanted:
@@ -163,6 +166,279 @@ class I2cThermometer(Thermometer):
     def _wait(self, seconds: float) -> None:
         """Let a conversion finish on the driver's own clock."""
         self.clock.sleep_until(self.clock.monotonic() + seconds)
+
+    def _await(self, register: int, mask: int, wanted: int, poll_s: float) -> None:
+        """Poll a status until its bits are as wanted; DeviceTimeout after 20 looks."""
+        size = self._word if mask > 0xFF else self._byte
+        for _ in range(20):
+            if size(register) & mask == wanted:
+                return
+            self._wait(poll_s)
+        raise DeviceTimeout(f"{self.where}: the conversion did not end in {20 * poll_s:g} s")
+
+
+class Tmp117Thermometer(I2cThermometer):
+    """One TMP117, a conversion per reading."""
+
+    chip = "TMP117"
+    addresses = range(0x48, 0x4C)
+    range_c = (-55.0, 150.0)
+    TEMPERATURE, CONFIGURATION, DEVICE = 0x00, 0x01, 0x0F
+    ONE_SHOT_8_AVERAGES, DATA_READY = 0b11 << 10 | 0b01 << 5, 1 << 13
+
+    def _identify(self) -> None:
+        self._expect("the device identity", self._word(self.DEVICE) & 0x0FFF, 0x0117)
+
+    def _measure(self) -> tuple[float, Mapping[str, Any]]:
+        self._word(self.CONFIGURATION)  # reading it clears a Data_Ready left over from before
+        self._write_word(self.CONFIGURATION, self.ONE_SHOT_8_AVERAGES)
+        self._wait(0.1245)
+        self._await(self.CONFIGURATION, self.DATA_READY, self.DATA_READY, 0.01)
+        raw = self._driven(self._word(self.TEMPERATURE))
+        if raw == 0x8000:
+            raise BadReading(f"{self.where}: 0x8000, the power-on value; no conversion took place")
+        return signed(raw, 16) / 128.0, {}
+
+
+class _ConvertingThermometer(I2cThermometer):
+    """A chip without a data-ready flag that converts all the time unless it is shut down."""
+
+    conversion_s: float
+    TEMPERATURE, CONFIGURATION = 0x00, 0x01
+    SHUTDOWN = 1
+
+    def _wake(self) -> None:
+        """Leave shut-down, and wait for a conversion."""
+        configuration = self._configuration()
+        if not configuration & self.SHUTDOWN:
+            return
+        self._configure(configuration & ~self.SHUTDOWN)
+        if self._configuration() & self.SHUTDOWN:
+            raise BadReading(f"{self.where}: does not leave shut-down (locked registers?)")
+        self._wait(self.conversion_s)
+
+    def _configuration(self) -> int:
+        return self._byte(self.CONFIGURATION)
+
+    def _configure(self, value: int) -> None:
+        self._smbus.write_byte_data(self.address, self.CONFIGURATION, value)
+
+    def _measure(self) -> tuple[float, Mapping[str, Any]]:
+        self._wake()
+        value, about = self._decode(self._driven(self._word(self.TEMPERATURE)))
+        if value == 0.0:
+            self._wait(self.conversion_s)
+            value, about = self._decode(self._driven(self._word(self.TEMPERATURE)))
+        idle = "" if value else "its power-up value: it lost its supply, or does not convert"
+        return self._neighbours.judge("", value, self.where, idle), about
+
+    def _decode(self, word: int) -> tuple[float, Mapping[str, Any]]:
+        """°C of a temperature word, and what else it says."""
+        raise NotImplementedError
+
+
+class Mcp9808Thermometer(_ConvertingThermometer):
+    """One MCP9808 in continuous conversion."""
+
+    chip = "MCP9808"
+    addresses = range(0x18, 0x20)
+    range_c = (-40.0, 125.0)
+    conversion_s = 0.25
+    TEMPERATURE, MANUFACTURER, DEVICE = 0x05, 0x06, 0x07
+    SHUTDOWN = 1 << 8
+
+    def _identify(self) -> None:
+        self._expect("the manufacturer", self._word(self.MANUFACTURER), 0x0054)
+        self._expect("the device register", self._word(self.DEVICE) >> 8, 0x04)
+        self._wake()
+
+    def _configuration(self) -> int:
+        return self._word(self.CONFIGURATION)
+
+    def _configure(self, value: int) -> None:
+        self._write_word(self.CONFIGURATION, value)
+
+    def _decode(self, word: int) -> tuple[float, Mapping[str, Any]]:
+        return signed(word, 13) / 16.0, {"alert_flags": word >> 13}
+
+
+class Lm75Thermometer(_ConvertingThermometer):
+    """One chip of the family in continuous conversion."""
+
+    Options = Lm75Options
+    chip = "LM75"
+    addresses = range(0x48, 0x50)
+    range_c = (-55.0, 127.9375)
+    LIMITS: ClassVar = {0x02: "the hysteresis", 0x03: "the limit"}
+    # bits of the temperature, bits of the limits, s per conversion
+    VARIANTS: ClassVar = {
+        "lm75": (11, 9, 0.3),  # 9 bits; an LM75A or LM75B has 11, and 9 in its limits
+        "lm75b": (11, 11, 0.1),
+        "tmp75": (12, 12, 0.3),
+        "tmp102": (12, 12, 0.035),
+    }
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.bits, self.limit_bits, self.conversion_s = self.VARIANTS[self.options.chip]
+
+    def _identify(self) -> None:
+        unused = (1 << (16 - self.limit_bits)) - 1
+        # a TMP102 in extended mode has 13 bits, to 150 °C
+        extended = self.options.chip == "tmp102" and self._word(self.CONFIGURATION) & 1 << 4
+        for register, what in self.LIMITS.items():
+            limit = self._word(register)
+            if limit == 0xFFFF or (limit & unused and not extended):
+                raise WrongDevice(
+                    f"{self.where}: {what} reads 0x{limit:04x}, which a {self.options.chip} "
+                    "cannot; another chip sits at this address"
+                )
+        self._wake()
+
+    def _decode(self, word: int) -> tuple[float, Mapping[str, Any]]:
+        if self.options.chip == "tmp102" and word & 1:
+            return signed(word >> 3, 13) / 16.0, {"extended": True}
+        unused = 16 - self.bits
+        if word & ((1 << unused) - 1):
+            raise BadReading(
+                f"{self.where}: 0x{word:04x} has bits set that a {self.options.chip} leaves zero"
+            )
+        return signed(word >> unused, self.bits) / (1 << (self.bits - 8)), {}
+
+
+class Sht3xThermometer(I2cThermometer):
+    """One SHT3x, a conversion per reading."""
+
+    chip = "SHT3x"
+    addresses = (0x44, 0x45)
+    range_c = (-40.0, 125.0)
+    SINGLE_SHOT_HIGH, SERIAL_NUMBER, SOFT_RESET = 0x2400, 0x3780, 0x30A2
+
+    def _identify(self) -> None:
+        self._command(self.SOFT_RESET, 0.002)  # leave the periodic mode of an earlier user
+        self._command(self.SERIAL_NUMBER, 0.001)
+        self._words(2)
+
+    def _measure(self) -> tuple[float, Mapping[str, Any]]:
+        self._command(self.SINGLE_SHOT_HIGH, 0.0155)
+        temperature, humidity = self._words(2)
+        self._driven(temperature & humidity)
+        value = -45.0 + 175.0 * temperature / 65535.0
+        return value, {"humidity_percent": 100.0 * humidity / 65535.0}
+
+    def _command(self, command: int, wait_s: float) -> None:
+        self._smbus.write_i2c_block_data(self.address, command >> 8, [command & 0xFF])
+        self._wait(wait_s)
+
+    def _words(self, count: int) -> list[int]:
+        """Plain read of `count` words, each followed by its CRC."""
+        message = support.library("smbus2").i2c_msg.read(self.address, 3 * count)
+        self._smbus.i2c_rdwr(message)
+        data = bytes(message)
+        words = []
+        for k in range(0, 3 * count, 3):
+            if crc8(data[k : k + 2]) != data[k + 2]:
+                raise BadReading(f"{self.where}: CRC error in {data.hex(' ')}; check the wiring")
+            words.append(int.from_bytes(data[k : k + 2], "big"))
+        return words
+
+
+class Bme280Thermometer(I2cThermometer):
+    """One BME280, a forced measurement per reading."""
+
+    chip = "BME280"
+    addresses = (0x76, 0x77)
+    range_c = (-40.0, 85.0)
+    CALIBRATION_TP, IDENTITY, CALIBRATION_H = 0x88, 0xD0, 0xE1
+    CONTROL_HUMIDITY, STATUS, CONTROL, DATA = 0xF2, 0xF3, 0xF4, 0xF7
+    FORCED_X2_X1, MEASURING = 0b010 << 5 | 0b001 << 2 | 0b01, 1 << 3
+
+    def _identify(self) -> None:
+        self._expect("the identity", self._byte(self.IDENTITY), 0x60)
+        low = self._block(self.CALIBRATION_TP, 26)
+        if low in (bytes(26), b"\xff" * 26):
+            raise BadReading(f"{self.where}: the calibration registers are empty")
+        self._compensation = Compensation.from_registers(low, self._block(self.CALIBRATION_H, 7))
+
+    def _block(self, register: int, size: int) -> bytes:
+        return bytes(self._smbus.read_i2c_block_data(self.address, register, size))
+
+    def _measure(self) -> tuple[float, Mapping[str, Any]]:
+        self._smbus.write_byte_data(self.address, self.CONTROL_HUMIDITY, 0b001)
+        self._smbus.write_byte_data(self.address, self.CONTROL, self.FORCED_X2_X1)
+        self._wait(0.012)
+        self._await(self.STATUS, self.MEASURING, 0, 0.005)
+        data = self._block(self.DATA, 8)
+        pressure = data[0] << 12 | data[1] << 4 | data[2] >> 4
+        temperature = data[3] << 12 | data[4] << 4 | data[5] >> 4
+        humidity = self._driven(data[6] << 8 | data[7])
+        if chips.is_idle_word("bme280", temperature):
+            raise BadReading(f"{self.where}: 0x{temperature:05x}, the temperature was not measured")
+        fine = self._compensation.fine(temperature)
+        about: dict[str, Any] = {}
+        pascal = self._compensation.pressure(pressure, fine)
+        if pascal is not None and pressure != 0x80000:
+            about["pressure_pa"] = pascal
+        if humidity != 0x8000:
+            about["humidity_percent"] = self._compensation.humidity(humidity, fine)
+        return fine / 5120.0, about
+
+
+@dataclass(frozen=True)
+class Compensation:
+    """The BME280's factory calibration: dig_T (3), dig_P (9) and dig_H (6) of the data sheet."""
+
+    t: tuple[int, ...]
+    p: tuple[int, ...]
+    h: tuple[int, ...]
+
+    @classmethod
+    def from_registers(cls, low: bytes, high: bytes) -> Compensation:
+        """low: 0x88 … 0xA1 (26 bytes), high: 0xE1 … 0xE7 (7 bytes)."""
+        h4 = signed(high[3] << 4 | high[4] & 0x0F, 12)
+        h5 = signed(high[5] << 4 | high[4] >> 4, 12)
+        return cls(
+            t=struct.unpack("<Hhh", low[:6]),
+            p=struct.unpack("<Hhhhhhhhh", low[6:24]),
+            h=(low[25], *struct.unpack("<hB", high[:3]), h4, h5, *struct.unpack("<b", high[6:7])),
+        )
+
+    def fine(self, adc: int) -> float:
+        """t_fine of a raw temperature; t_fine / 5120 is °C."""
+        t1, t2, t3 = self.t
+        first = (adc / 16384.0 - t1 / 1024.0) * t2
+        return first + (adc / 131072.0 - t1 / 8192.0) ** 2 * t3
+
+    def pressure(self, adc: int, fine: float) -> float | None:
+        """Pa; None where the calibration would divide by zero."""
+        p1, p2, p3, p4, p5, p6, p7, p8, p9 = self.p
+        v1 = fine / 2.0 - 64000.0
+        v2 = v1 * v1 * p6 / 32768.0 + v1 * p5 * 2.0
+        v2 = v2 / 4.0 + p4 * 65536.0
+        v1 = (1.0 + (p3 * v1 * v1 / 524288.0 + p2 * v1) / 524288.0 / 32768.0) * p1
+        if v1 == 0.0:
+            return None
+        p = (1048576.0 - adc - v2 / 4096.0) * 6250.0 / v1
+        return p + (p9 * p * p / 2147483648.0 + p * p8 / 32768.0 + p7) / 16.0
+
+    def humidity(self, adc: int, fine: float) -> float:
+        """% relative humidity, within 0 … 100."""
+        h1, h2, h3, h4, h5, h6 = self.h
+        x = fine - 76800.0
+        x = (adc - (h4 * 64.0 + h5 / 16384.0 * x)) * (
+            h2 / 65536.0 * (1.0 + h6 / 67108864.0 * x * (1.0 + h3 / 67108864.0 * x))
+        )
+        return min(100.0, max(0.0, x * (1.0 - h1 * x / 524288.0)))
+
+
+def crc8(data: bytes) -> int:
+    """CRC of the SHT3x: polynomial 0x31, initial value 0xFF; BE EF gives 0x92 (table 20)."""
+    crc = 0xFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = (crc << 1 ^ 0x31) & 0xFF if crc & 0x80 else crc << 1
+    return crc
 
 
 def signed(value: int, bits: int) -> int:

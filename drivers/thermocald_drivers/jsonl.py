@@ -14,52 +14,44 @@ from __future__ import annotations
 import contextlib
 import errno
 import json
-import math
 import os
 import select
 import stat
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
+from pydantic import Field
 
 from thermocald.errors import DeviceGone, DeviceTimeout, TransientDeviceError
-from thermocald.hal import Output
+from thermocald.hal import DriverOptions, Output
 from thermocald_drivers import support
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from thermocald.hal import Clock
-
-__all__ = ["JsonLinesOutput", "encode"]
-
 
 def encode(result: Mapping[str, Any]) -> bytes:
     """One result as JSON; numpy scalars as numbers, NaN and infinities as null."""
-    return json.dumps({key: _plain(value) for key, value in result.items()}).encode()
+    return json.dumps(support.plain(dict(result))).encode()
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.generic | np.ndarray):
-        value = value.tolist()
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {str(key): _plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
-    return value if isinstance(value, str | int | bool | None) else str(value)
+class JsonLinesOptions(DriverOptions):
+    """As above."""
+
+    path: support.Text
+    timeout_s: Annotated[float, Field(ge=0.01, le=60.0)] = 1.0
 
 
 class JsonLinesOutput(Output):
     """Appends to a file, or writes into a pipe."""
 
-    def __init__(self, *, clock: Clock, path: str, timeout_s: float = 1.0) -> None:
-        self.clock = clock
-        self.path = Path(support.text("path", path))
-        self.timeout_s = support.number("timeout_s", timeout_s, 0.01, 60, "s")
+    Options = JsonLinesOptions
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.path = Path(self.options.path)
+        self.timeout_s = self.options.timeout_s
         self._file = -1
         self._seen = False
 
@@ -72,7 +64,10 @@ class JsonLinesOutput(Output):
             if error.errno == errno.ENXIO:
                 raise DeviceGone(f"{self.path}: nobody reads the pipe") from error
             raise support.fault(error, str(self.path), seen=self._seen) from error
-        self._pipe = stat.S_ISFIFO(os.fstat(self._file).st_mode)
+        mode = os.fstat(self._file).st_mode
+        self._pipe = stat.S_ISFIFO(mode)
+        if stat.S_ISREG(mode) and not mode & 0o600:  # of a umask of 777
+            os.fchmod(self._file, 0o600)
         self._seen = True
 
     def close(self) -> None:

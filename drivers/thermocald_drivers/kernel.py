@@ -10,11 +10,17 @@
 without it every temperature input is read, a single one as `temperature`. `minimum_c` and
 `maximum_c` bound what is accepted (a broken diode reads 127 °C); `sysfs` (/sys) is where the files
 are. The kernel renumbers its devices at every plug: they are looked up by name at each open, and
-the name is checked at each read. A zone of −40 °C is one that is not fitted, and the hwmon entry of
-a 1-wire sensor is refused at its power-on value: use the driver ds18b20, which sees the CRC. Inputs
-that are not connected, and chips that have not converted yet, read 0: it is accepted only if a
-recent reading lay within 5 K. A zone of a vendor's kernel may be in °C or tenths: a number up to
-1250 is refused until one above has shown that it is in thousandths, or `unit` states it.
+the name is checked at each read.
+
+What a chip gives without having measured (`chips`: 0, the ends of its scale, all ones, its value at
+power-up; of iio the raw word before offset and scale) is accepted only if a recent reading lay
+within 5 K. A zone of −40 °C is one that is not fitted, and the hwmon entry of a 1-wire sensor is
+refused at its power-on value: use the driver ds18b20, which sees the CRC.
+
+A zone of a vendor's kernel may be in °C or tenths: a number up to 1250 is refused until one above
+has shown that it is in thousandths, and then believed only within 5 K of a recent reading, or
+`unit` states it. It is refused where the number fits the last reading in another unit only: the
+unit has switched. Within 0.125 °C of zero only a reading close by tells thousandths from degrees.
 Source: Documentation/hwmon/sysfs-interface, ABI/testing/sysfs-bus-iio, driver-api/thermal.
 """
 
@@ -22,54 +28,64 @@ from __future__ import annotations
 
 import errno
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from thermocald.errors import BadReading, ConfigurationError, DeviceGone, WrongDevice
-from thermocald.hal import Found, Thermometer
-from thermocald_drivers import support
-from thermocald_drivers.android_zones import UNITS, is_temperature
+from thermocald.hal import DriverOptions, Found, Thermometer, channel_fault
+from thermocald_drivers import chips, support, zones
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from thermocald.hal import Clock, Reading
+    from thermocald.hal import Reading
 
-__all__ = ["HwmonThermometer", "IioThermometer", "ThermalZoneThermometer"]
-
-ONE_WIRE_POWER_ON_C = 85.0
 NOT_FITTED_C = -40.0
 LARGEST_OF_TENTHS = 1250  # 125 °C; what is larger can only be thousandths
+LARGEST_OF_DEGREES = 125
+
+
+class KernelOptions(DriverOptions):
+    """Which inputs are read, and what is believed of them."""
+
+    channels: dict[str, str] = {}  # noqa: RUF012 - pydantic copies it
+    minimum_c: support.Celsius = -55.0
+    maximum_c: support.Celsius = 125.0
+    sysfs: support.Text = "/sys"
+
+
+class ChipOptions(KernelOptions):
+    """A chip by its name or bus address."""
+
+    chip: support.Text
+
+
+class ZoneOptions(KernelOptions):
+    """A thermal zone by its type; unit None: thousandths, once they are certain."""
+
+    zone: support.Text
+    unit: Literal["degC", "tenths", "thousandths"] | None = None
 
 
 class _KernelThermometer(Thermometer):
     """One device folder of a sysfs class, found by its name."""
 
+    Options: ClassVar[type[DriverOptions]] = ChipOptions
+    key: ClassVar[str] = "chip"
     folder: ClassVar[str]
     prefix: ClassVar[str]
     name_file: ClassVar[str] = "name"
 
-    def __init__(
-        self,
-        *,
-        clock: Clock,
-        chip: str,
-        channels: Mapping[str, str] | None = None,
-        minimum_c: float = -55.0,
-        maximum_c: float = 125.0,
-        sysfs: str = "/sys",
-    ) -> None:
-        self.clock = clock
-        self.chip = support.text("chip", chip)
-        self.wanted = dict(channels or {})
-        self.minimum_c = support.number("minimum_c", minimum_c, -273.15, 1000, "°C")
-        self.maximum_c = support.number("maximum_c", maximum_c, -273.15, 1000, "°C")
-        if self.minimum_c >= self.maximum_c:
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        o = self.options
+        if o.minimum_c >= o.maximum_c:
             raise ConfigurationError(
-                f"minimum_c {minimum_c:g} is not below maximum_c {maximum_c:g}"
+                f"minimum_c {o.minimum_c:g} is not below maximum_c {o.maximum_c:g}"
             )
-        self.sysfs = Path(support.text("sysfs", sysfs))
+        self.chip = getattr(o, self.key)
+        self.sysfs = Path(o.sysfs)
         self._seen = False
-        self._neighbours: dict[str, support.Neighbour] = {}
+        self._neighbours = support.Neighbours(self.clock)
         self._device: Path | None = None
         self._channels: dict[str, str] = {}
         self._name = ""
@@ -91,7 +107,7 @@ class _KernelThermometer(Thermometer):
         found = list(cls.devices(Path(sysfs)))
         names = [name for _, name, _ in found]
         return [
-            Found({"chip": name if names.count(name) == 1 else address}, str(folder))
+            Found({cls.key: name if name and names.count(name) == 1 else address}, str(folder))
             for folder, name, address in found
             if cls._inputs(folder)
         ]
@@ -118,23 +134,26 @@ class _KernelThermometer(Thermometer):
         self._device = None
         self._neighbours.clear()
 
+    def named_channels(self) -> list[str]:
+        return list(self.options.channels)
+
     def identity(self) -> Mapping[str, str]:
         return {"chip": self.chip, "path": str(self._device or "")}
 
     def _select(self, inputs: dict[str, str], folder: Path) -> dict[str, str]:
         """{our channel: kernel's input}, from the option `channels`."""
-        if not self.wanted:
+        if not self.options.channels:
             if len(inputs) == 1:
                 return {"temperature": next(iter(inputs))}
-            # two inputs of one label would be one channel
-            given = list(inputs.values())
+            # two inputs of one label would be one channel, and a label may be no name of one
+            given = [*inputs.values(), *inputs]
             return {
-                label if label and given.count(label) == 1 else key: key
+                key if channel_fault(label) or given.count(label) > 1 else label: key
                 for key, label in inputs.items()
             }
         by_label = {label: key for key, label in inputs.items() if label}
         chosen = {}
-        for channel, key in self.wanted.items():
+        for channel, key in self.options.channels.items():
             if key not in inputs and key not in by_label:
                 known = ", ".join([*inputs, *by_label])
                 raise WrongDevice(f"{folder}: no input {key!r} for {channel!r}; there is {known}")
@@ -150,9 +169,9 @@ class _KernelThermometer(Thermometer):
         for channel, key in self._channels.items():
             where = f"{self._device.name} ({self.chip}) {key}"
             try:
-                value = self._convert(self._device, key)
-                value = support.believable(value, self.minimum_c, self.maximum_c, where)
-                values[channel] = self._connected(key, value, where)
+                value, idle = self._convert(self._device, key)
+                support.believable(value, self.options.minimum_c, self.options.maximum_c, where)
+                values[channel] = self._neighbours.judge(key, value, where, idle)
             except BadReading as error:
                 missing[channel] = str(error)
             except ValueError as error:
@@ -162,43 +181,32 @@ class _KernelThermometer(Thermometer):
                 if not isinstance(problem, BadReading):
                     raise problem from error
                 missing[channel] = str(problem)
-        self._same_device()
-        if not values:
-            raise BadReading("; ".join(missing.values()))
-        return support.middle_reading(
-            self.clock, values, start, {"missing": missing} if missing else {}
-        )
+        self._same_device(self._device)
+        return support.partial_reading(self.clock, values, missing, start)
 
-    def _connected(self, key: str, value: float, where: str) -> float:
-        neighbour = self._neighbours.setdefault(key, support.Neighbour(self.clock))
-        if value != 0.0:
-            neighbour.measured(value)
-        elif not neighbour.supports(value):
-            raise BadReading(
-                f"{where}: 0 °C is what an input reads that is not connected, and no recent "
-                "reading was near it"
-            )
-        return value
-
-    def _same_device(self) -> None:
+    def _same_device(self, folder: Path) -> None:
         """A kernel name is handed on: hwmon3 may be another chip after a re-plug."""
-        if self._device is None:
-            return
         try:
-            name = (self._device / self.name_file).read_text().strip()
+            name = (folder / self.name_file).read_text().strip()
         except OSError as error:
-            raise DeviceGone(f"{self._device}: unplugged ({error.strerror})") from error
+            raise DeviceGone(f"{folder}: unplugged ({error.strerror})") from error
         if name != self._name:
-            raise DeviceGone(f"{self._device} is {name!r} now and was {self._name!r}")
+            raise DeviceGone(f"{folder} is {name!r} now and was {self._name!r}")
 
     @classmethod
     def _inputs(cls, folder: Path) -> dict[str, str]:
         """{kernel's input: label or ''}."""
         raise NotImplementedError
 
-    def _convert(self, folder: Path, key: str) -> float:
-        """The input's value in °C."""
+    def _convert(self, folder: Path, key: str) -> tuple[float, str]:
+        """(The input's value in °C; in words, if it is one that the chip gives unmeasured)."""
         raise NotImplementedError
+
+    def _idle(self, value: float) -> str:
+        return UNMEASURED if chips.is_idle(self._name, value) else ""
+
+
+UNMEASURED = "what such an input gives without a sensor or before it has measured"
 
 
 def _number(path: Path) -> float:
@@ -223,14 +231,17 @@ class HwmonThermometer(_KernelThermometer):
         keys = sorted(path.name.removesuffix("_input") for path in folder.glob("temp*_input"))
         return {key: _label(folder, key) for key in keys}
 
-    def _convert(self, folder: Path, key: str) -> float:
+    def _convert(self, folder: Path, key: str) -> tuple[float, str]:
         fault = folder / f"{key}_fault"
         if fault.exists() and _number(fault) != 0:
             raise BadReading(f"{folder.name} {key}: the chip reports a broken sensor (fault flag)")
         value = _number(folder / f"{key}_input") / 1000.0
-        if value == ONE_WIRE_POWER_ON_C and self._name.startswith("w1_"):
-            raise BadReading(f"{folder.name} {key}: {value:g} °C is the 1-wire power-on value")
-        return value
+        if self._name.startswith("w1_") and value in chips.idle_celsius("ds18b20"):
+            raise BadReading(
+                f"{folder.name} {key}: {value:g} °C is a 1-wire power-on value; use driver: "
+                "ds18b20, which sees the sensor's bytes"
+            )
+        return value, self._idle(value)
 
 
 class IioThermometer(_KernelThermometer):
@@ -248,16 +259,19 @@ class IioThermometer(_KernelThermometer):
         }
         return {key: _label(folder, key) for key in sorted(keys)}
 
-    def _convert(self, folder: Path, key: str) -> float:
+    def _convert(self, folder: Path, key: str) -> tuple[float, str]:
         for fault in sorted(folder.glob("fault_*")):  # of thermocouples and PT100: an open wire
             if _number(fault) != 0:
                 raise BadReading(f"{folder.name} {key}: the chip reports a fault ({fault.name})")
         processed = folder / f"{key}_input"
         if processed.exists():
-            return _number(processed) / 1000.0
+            value = _number(processed) / 1000.0
+            return value, self._idle(value)
         raw = _number(folder / f"{key}_raw")
         offset = self._shared(folder, key, "offset", 0.0)
-        return (raw + offset) * self._shared(folder, key, "scale", None) / 1000.0
+        value = (raw + offset) * self._shared(folder, key, "scale", None) / 1000.0
+        idle = chips.is_idle_word(self._name, raw)
+        return value, f"raw {raw:g}, {UNMEASURED}" if idle else ""
 
     @staticmethod
     def _shared(folder: Path, key: str, what: str, default: float | None) -> float:
@@ -273,69 +287,63 @@ class IioThermometer(_KernelThermometer):
 class ThermalZoneThermometer(_KernelThermometer):
     """`/sys/class/thermal`: the zone's temp in 1/1000 °C; a disabled zone fails with EAGAIN."""
 
+    Options: ClassVar[type[DriverOptions]] = ZoneOptions
+    key = "zone"
     folder = "class/thermal"
     prefix = "thermal_zone"
     name_file = "type"
 
-    def __init__(
-        self,
-        *,
-        clock: Clock,
-        zone: str,
-        unit: str | None = None,
-        channels: Mapping[str, str] | None = None,
-        minimum_c: float = -55.0,
-        maximum_c: float = 125.0,
-        sysfs: str = "/sys",
-    ) -> None:
-        self.scale = UNITS[support.choice("unit", unit or "thousandths", list(UNITS))]
-        self._certain = self._stated = unit is not None
-        if unit is None and not is_temperature(zone):
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.unit = self.options.unit or "thousandths"
+        self._certain = False
+        self._watch = zones.UnitWatch(self.clock)
+        if self.options.unit is None and not zones.is_temperature(self.chip):
             raise ConfigurationError(
-                f"zone: {zone!r} holds percent, mA or mV on the machines that have it; if yours "
-                "is a temperature, write unit: thousandths (or degC, tenths)"
+                f"zone: {self.chip!r} holds percent, mA or mV on the machines that have it; if "
+                "yours is a temperature, write unit: thousandths (or degC, tenths)"
             )
-        super().__init__(
-            clock=clock,
-            chip=support.text("zone", zone),
-            channels=channels,
-            minimum_c=minimum_c,
-            maximum_c=maximum_c,
-            sysfs=sysfs,
-        )
 
     def close(self) -> None:
         super().close()
-        self._certain = self._stated
+        self._certain = False
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:
         """Configuration stanzas of what is there, for `thermocald devices`."""
-        return [
-            Found({"zone": name if name else folder.name}, str(folder))
-            for folder, name, _ in cls.devices(Path(sysfs))
-            if is_temperature(name)
-        ]
+        return [found for found in super().attached(sysfs) if zones.is_temperature(
+            str(found.options["zone"]))]  # fmt: skip
 
     @classmethod
     def _inputs(cls, folder: Path) -> dict[str, str]:
         return {"temp": ""} if (folder / "temp").exists() else {}
 
-    def _convert(self, folder: Path, key: str) -> float:
+    def _convert(self, folder: Path, key: str) -> tuple[float, str]:
         try:
             number = _number(folder / key)
         except OSError as error:
             if error.errno in (errno.EAGAIN, errno.ENODATA, errno.EINVAL):
                 raise BadReading(f"{folder.name}: the zone is disabled or asleep") from error
             raise
-        value = round(number * self.scale, 6)
+        scale = zones.UNITS[self.unit]
+        value = round(number * scale, 6)
         larger = abs(number) > LARGEST_OF_TENTHS
         self._certain |= larger and abs(value) <= LARGEST_OF_TENTHS / 10
-        if not self._certain and not larger and number != 0:
+        stated = self.options.unit is not None
+        if not stated and not self._certain and not larger and number != 0:
             raise BadReading(
                 f"{folder.name}: the unit of {number:g} is not known; write unit: degC, tenths or "
                 "thousandths"
             )
         if value == NOT_FITTED_C:
             raise BadReading(f"{folder.name}: {value:g} °C, as of a sensor that is not fitted")
-        return value
+        if self._watch.switched(key, number, scale):
+            raise BadReading(
+                f"{folder.name}: {number:g} is {value:g} °C in {self.unit} and fits the last "
+                "reading in another unit only; the kernel has switched it"
+            )
+        if not stated and not larger and not self._neighbours.support(key, value):
+            return value, f"{number:g} in a unit that is not certain (write unit: {self.unit})"
+        if self.unit == "thousandths" and 0 < abs(number) <= LARGEST_OF_DEGREES:
+            return value, f"{number:g} in thousandths, or in degrees"
+        return value, self._idle(value)

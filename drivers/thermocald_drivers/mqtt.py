@@ -1,4 +1,4 @@
-"""Results to an MQTT broker, announced to Home Assistant.
+"""Results and alerts to an MQTT broker, announced to Home Assistant.
 
     outputs:
       - name: home
@@ -13,8 +13,14 @@
         discovery: homeassistant             # null: none
         device: thermocald                   # the name of results that have none
         timeout_s: 5
+      - name: alarm
+        driver: alert_mqtt                   # thermocald/<device>/alert/<condition>; as above, and
+        host: broker.local
+        when: [{drift: c, px: 0.5}]          # as in docs/how-to/alerts.md
 
-ca, cert and key imply `tls`. Each result is one JSON object with QoS 1. `emit` waits for the
+A name that a topic or identifier cannot hold as it is gets a mark of its own: cam.1 becomes
+cam_1-d2d6, so that cam.1 and cam_1 are two. Alerts are retained: who connects later learns what is
+out. ca, cert and key imply `tls`. Each result is one JSON object with QoS 1. `emit` waits for the
 broker's acknowledgement, at most `timeout_s`, so that a loss is noticed. The last will sets the
 device to `offline`.
 Source: paho-mqtt 2 (callback API 2), Home Assistant "MQTT discovery".
@@ -22,12 +28,14 @@ Source: paho-mqtt 2 (callback API 2), Home Assistant "MQTT discovery".
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import ssl
 import threading
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import AfterValidator, Field
 
 from thermocald.errors import (
     ConfigurationError,
@@ -36,16 +44,15 @@ from thermocald.errors import (
     DeviceGone,
     DeviceTimeout,
 )
-from thermocald.hal import Output
+from thermocald.hal import DriverOptions, Output
 from thermocald_drivers import support
+from thermocald_drivers.alert import AlertOptions, AlertOutput, secret
 from thermocald_drivers.jsonl import encode
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from thermocald.hal import Clock
-
-__all__ = ["MqttLine", "MqttOutput", "discovery_messages", "node_of"]
+    from thermocald_drivers.alert import Alert
 
 SENSORS: Mapping[str, tuple[str, str | None, str | None, int | None]] = {
     # key of the result: (name, unit, Home Assistant's device class, decimals it shows)
@@ -64,8 +71,11 @@ SENSORS: Mapping[str, tuple[str, str | None, str | None, int | None]] = {
 
 
 def node_of(device: str) -> str:
-    """A device's name as topics and identifiers may hold it."""
-    return re.sub(r"[^A-Za-z0-9_-]", "_", device)
+    """A device's name as topics and identifiers may hold it; two names are never one."""
+    node = re.sub(r"[^A-Za-z0-9_-]", "_", device)
+    if node != device:  # `cam.1` must not be `cam_1`
+        node += "-" + hashlib.sha256(device.encode()).hexdigest()[:6]
+    return node
 
 
 def discovery_messages(
@@ -77,7 +87,6 @@ def discovery_messages(
     are available only while it is.
     """
     node = node_of(device)
-    about = {"identifiers": [f"thermocald-{node}"], "name": device, "manufacturer": "thermocald"}
     messages = {}
     for key, (name, unit, kind, decimals) in SENSORS.items():
         message: dict[str, Any] = {
@@ -90,7 +99,7 @@ def discovery_messages(
                 for name in dict.fromkeys((node_of(speaker), node))
             ],
             "availability_mode": "all",
-            "device": about,
+            "device": _about(device),
         }
         if unit:
             message |= {"unit_of_measurement": unit, "state_class": "measurement"}
@@ -102,46 +111,55 @@ def discovery_messages(
     return messages
 
 
+def _topic(topic: str) -> str:
+    """A topic to publish under: no wildcards, none of the broker's own."""
+    if not topic.strip("/") or any(c in topic for c in "+#\0") or topic.startswith("$"):
+        raise ConfigurationError(f"{topic!r} is not a topic: no +, no #, no $ at its beginning")
+    return topic.strip("/")
+
+
+Topic = Annotated[str, AfterValidator(_topic)]
+
+
+class BrokerOptions(DriverOptions):
+    """port None: 1883, with TLS 8883; discovery None: no announcement."""
+
+    host: support.Text
+    port: support.Port | None = None
+    username: support.Text | None = None
+    password_file: support.Text | None = None
+    tls: bool = False
+    ca: support.Text | None = None
+    cert: support.Text | None = None
+    key: support.Text | None = None
+    topic: Topic = "thermocald"
+    discovery: Topic | None = "homeassistant"
+    device: support.Text = "thermocald"
+    timeout_s: Annotated[float, Field(ge=0.05, le=60.0)] = 5.0
+
+
+class MqttAlertOptions(BrokerOptions, AlertOptions):
+    """A broker's, and `when`."""
+
+
 class MqttLine:
     """A connection to a broker, kept alive by the library's thread.
 
-    port None: 1883, with TLS 8883. Raises ConfigurationError for options that do not go together.
+    Raises ConfigurationError for options that do not go together.
     """
 
-    def __init__(
-        self,
-        host: str,
-        port: int | None,
-        username: str | None,
-        password_file: str | None,
-        timeout_s: float,
-        *,
-        tls: bool = False,
-        ca: str | None = None,
-        cert: str | None = None,
-        key: str | None = None,
-    ) -> None:
-        self.host = support.text("host", host)
-        if not isinstance(tls, bool):
-            raise ConfigurationError(f"tls: {tls!r} is neither true nor false")
-        self.tls = tls or bool(ca or cert)
-        port = (8883 if self.tls else 1883) if port is None else port
-        self.port = int(support.number("port", port, 1, 65535, whole=True))
-        if password_file and not username:
+    def __init__(self, options: BrokerOptions) -> None:
+        self.options = options
+        self.tls = options.tls or bool(options.ca or options.cert)
+        self.port = options.port or (8883 if self.tls else 1883)
+        if options.password_file and not options.username:
             raise ConfigurationError("password_file: needs a username")
-        if key and not cert:
+        if options.key and not options.cert:
             raise ConfigurationError("key: needs its certificate, cert")
-        self.username, self.password_file = username, password_file
-        self.ca, self.cert, self.key = ca, cert, key
-        self.timeout_s = timeout_s
+        self.where = f"MQTT broker {options.host}:{self.port}"
         self._client: Any = None
         self._answered = threading.Event()
         self._refusal = ""
-
-    @property
-    def where(self) -> str:
-        """The broker as the user knows it."""
-        return f"MQTT broker {self.host}:{self.port}"
 
     @property
     def connected(self) -> bool:
@@ -154,27 +172,27 @@ class MqttLine:
         self._answered.clear()
         self._refusal = ""
         client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2)
-        client.connect_timeout = self.timeout_s
+        client.connect_timeout = self.options.timeout_s
         client.on_connect = self._on_connect
         if will is not None:
             client.will_set(will, "offline", qos=1, retain=True)
-        if self.username:
-            client.username_pw_set(self.username, self._password())
+        if self.options.username:
+            password = secret("password_file", self.options.password_file)
+            client.username_pw_set(self.options.username, password)
         if self.tls:
             client.tls_set_context(self._context())
         try:
-            client.connect(self.host, self.port, keepalive=30)
+            client.connect(self.options.host, self.port, keepalive=30)
         except ssl.SSLCertVerificationError as error:
-            raise DeviceDenied(
-                f"{self.where}: its certificate is not trusted ({error.verify_message}); check ca"
-            ) from error
-        except OSError as error:
-            raise DeviceGone(f"{self.where}: cannot connect ({error})") from error
+            raise DeviceDenied(f"{self.where}: {support.reason(error)}; check ca") from error
+        except (OSError, ValueError) as error:
+            why = support.reason(error)
+            raise DeviceGone(f"{self.where}: cannot connect ({why})") from error
         self._client = client
         client.loop_start()
-        if not self._answered.wait(self.timeout_s):
+        if not self._answered.wait(self.options.timeout_s):
             self.disconnect()
-            raise DeviceTimeout(f"{self.where}: no answer in {self.timeout_s:g} s")
+            raise DeviceTimeout(f"{self.where}: no answer in {self.options.timeout_s:g} s")
         if self._refusal:
             self.disconnect()
             raise DeviceDenied(f"{self.where}: {self._refusal}; check username and password_file")
@@ -198,32 +216,25 @@ class MqttLine:
         self.require_connected()
         info = self._client.publish(topic, payload, qos=1, retain=retain)
         try:
-            info.wait_for_publish(self.timeout_s)
+            info.wait_for_publish(self.options.timeout_s)
         except (RuntimeError, ValueError) as error:
-            raise DeviceGone(f"{self.where}: {error}") from error
+            raise DeviceGone(f"{self.where}: {support.reason(error)}") from error
         if not info.is_published():
-            raise DeviceTimeout(f"{self.where}: no acknowledgement in {self.timeout_s:g} s")
+            raise DeviceTimeout(f"{self.where}: no acknowledgement in {self.options.timeout_s:g} s")
 
     def _context(self) -> ssl.SSLContext:
         try:
-            context = ssl.create_default_context(cafile=self.ca)
-            if self.cert:
-                context.load_cert_chain(self.cert, self.key)
+            context = ssl.create_default_context(cafile=self.options.ca)
+            if self.options.cert:
+                context.load_cert_chain(self.options.cert, self.options.key)
         except ssl.SSLError as error:
             raise ConfigurationError(
-                f"ca, cert, key: not certificates and key that belong together ({error})"
+                f"ca, cert, key: not certificates and key that belong together "
+                f"({error.reason or 'not readable'})"
             ) from error
         except OSError as error:
             raise support.fault(error, "ca, cert or key", seen=False) from error
         return context
-
-    def _password(self) -> str | None:
-        if self.password_file is None:
-            return None
-        try:
-            return Path(self.password_file).read_text().strip()
-        except OSError as error:
-            raise support.fault(error, f"password_file {self.password_file}", seen=False) from error
 
     def _on_connect(self, _client: Any, _data: Any, _flags: Any, code: Any, _more: Any) -> None:
         if code.is_failure:
@@ -234,40 +245,21 @@ class MqttLine:
 class MqttOutput(Output):
     """Every result as a message; devices are announced with their first."""
 
-    def __init__(
-        self,
-        *,
-        clock: Clock,
-        host: str,
-        port: int | None = None,
-        username: str | None = None,
-        password_file: str | None = None,
-        tls: bool = False,
-        ca: str | None = None,
-        cert: str | None = None,
-        key: str | None = None,
-        topic: str = "thermocald",
-        discovery: str | None = "homeassistant",
-        device: str = "thermocald",
-        timeout_s: float = 5.0,
-    ) -> None:
-        self.clock = clock
-        self.topic = support.text("topic", topic).strip("/")
-        self.discovery = discovery
-        self.device = support.text("device", device)
-        self.timeout_s = support.number("timeout_s", timeout_s, 0.05, 60, "s")
-        self._line = MqttLine(
-            host, port, username, password_file, self.timeout_s, tls=tls, ca=ca, cert=cert, key=key
-        )
+    Options = BrokerOptions
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.timeout_s = self.options.timeout_s
+        self._line = MqttLine(self.options)
         self._announced: set[str] = set()
 
     def open(self) -> None:
         self._announced = set()
-        self._line.connect(self._available_topic(self.device))
+        self._line.connect(self._available_topic(self.options.device))
 
     def close(self) -> None:
         if self._line.connected:
-            for device in self._announced or {self.device}:
+            for device in self._announced or {self.options.device}:
                 try:
                     self._line.publish(self._available_topic(device), b"offline", retain=True)
                 except DeviceError:
@@ -276,22 +268,73 @@ class MqttOutput(Output):
 
     def emit(self, result: Mapping[str, Any]) -> None:
         self._line.require_connected()
-        device = str(result.get("device", self.device))
+        device = str(result.get("device", self.options.device))
         if device not in self._announced:
             self._announce(device)
         self._line.publish(f"{self._base(device)}/result", encode(result), retain=False)
 
     def _announce(self, device: str) -> None:
-        if self.discovery:
-            messages = discovery_messages(self.discovery, self.topic, device, self.device)
+        if self.options.discovery:
+            messages = discovery_messages(
+                self.options.discovery, self.options.topic, device, self.options.device
+            )
             for topic, message in messages.items():
                 self._line.publish(topic, json.dumps(message).encode(), retain=True)
-        for name in dict.fromkeys((self.device, device)):
+        for name in dict.fromkeys((self.options.device, device)):
             self._line.publish(self._available_topic(name), b"online", retain=True)
-        self._announced |= {self.device, device}
+        self._announced |= {self.options.device, device}
 
     def _base(self, device: str) -> str:
-        return f"{self.topic}/{node_of(device)}"
+        return f"{self.options.topic}/{node_of(device)}"
 
     def _available_topic(self, device: str) -> str:
         return f"{self._base(device)}/available"
+
+
+class MqttAlert(AlertOutput):
+    """One retained message for each change."""
+
+    Options = MqttAlertOptions
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._line = MqttLine(self.options)
+        self.where = self._line.where
+
+    def reach(self) -> None:
+        self._line.connect(None)
+
+    def close(self) -> None:
+        super().close()
+        self._line.disconnect()
+
+    def emit(self, result: Mapping[str, Any]) -> None:
+        if self._opened:
+            self._line.require_connected()
+        super().emit(result)
+
+    def deliver(self, alert: Alert) -> None:
+        node, condition = node_of(alert.device), node_of(alert.condition)
+        state = f"{self.options.topic}/{node}/alert/{condition}"
+        if self.options.discovery:
+            name = f"thermocald-{node}-alert-{condition}"
+            document = {
+                "name": f"Alert {alert.condition}",
+                "unique_id": name,
+                "state_topic": state,
+                "value_template": "{{ value_json.state }}",
+                "payload_on": "out",
+                "payload_off": "in",
+                "device_class": "problem",
+                "json_attributes_topic": state,
+                "device": _about(alert.device),
+            }
+            config = f"{self.options.discovery}/binary_sensor/{name}/config"
+            self._line.publish(config, json.dumps(document).encode(), retain=True)
+        self._line.publish(state, json.dumps(alert.document()).encode(), retain=True)
+
+
+def _about(device: str) -> dict[str, Any]:
+    """The device as Home Assistant groups its sensors."""
+    identifiers = [f"thermocald-{node_of(device)}"]
+    return {"identifiers": identifiers, "name": device, "manufacturer": "thermocald"}

@@ -25,22 +25,22 @@ w1_therm.c, C. Petrich's survey of counterfeit DS18B20.
 from __future__ import annotations
 
 import re
-import threading
-from concurrent.futures import Future
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any
 
-from thermocald.errors import BadReading, ConfigurationError, DeviceError, DeviceGone, DeviceTimeout
-from thermocald.hal import Found, Thermometer
+from pydantic import Field
+
+from thermocald.errors import BadReading, DeviceError, DeviceGone, DeviceTimeout
+from thermocald.hal import DriverOptions, Found, Thermometer
 from thermocald_drivers import support
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from concurrent.futures import Future
 
-    from thermocald.hal import Clock, Reading
+    from thermocald.hal import Reading
 
-__all__ = ["Ds18b20Thermometer", "crc8", "decode", "power_on_value"]
-
+POWER_ON = "the power-on value (the sensor lost its supply, or has not converted yet)"
 POWER_ON_C = 85.0
 COUNTERFEIT_POWER_ON_C = 25.0
 _FILE = re.compile(
@@ -109,31 +109,31 @@ def _kernel_millidegrees(pad: bytes, family: str) -> int:
     return int(raw * 1000 / 16)
 
 
+class OneWireOptions(DriverOptions):
+    """sensors: {channel: ROM id}; the others as above."""
+
+    sensors: Annotated[dict[str, support.Text], Field(min_length=1)]
+    timeout_s: Annotated[float, Field(ge=0.01, le=60.0)] = 3.0
+    attempts: Annotated[int, Field(ge=1, le=10)] = 2
+    sysfs: support.Text = "/sys"
+
+
 class Ds18b20Thermometer(Thermometer):
     """One or several 1-wire thermometers, read at the same time."""
 
-    def __init__(
-        self,
-        *,
-        clock: Clock,
-        sensors: Mapping[str, str],
-        timeout_s: float = 3.0,
-        attempts: int = 2,
-        sysfs: str = "/sys",
-    ) -> None:
-        self.clock = clock
-        if not isinstance(sensors, dict) or not sensors:
-            raise ConfigurationError(
-                "sensors: write {channel: ROM id}, such as {temperature: 28-0123}"
-            )
-        self.sensors = {str(k): support.text(f"sensors.{k}", v) for k, v in sensors.items()}
-        self.timeout_s = support.number("timeout_s", timeout_s, 0.01, 60, "s")
-        self.attempts = int(support.number("attempts", attempts, 1, 10, whole=True))
-        self.root = Path(support.text("sysfs", sysfs)) / "bus/w1/devices"
+    Options = OneWireOptions
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.sensors: dict[str, str] = self.options.sensors
+        self.root = Path(self.options.sysfs) / "bus/w1/devices"
         self._seen = False
         self._open = False
         self._pending: dict[str, Future[float]] = {}
-        self._neighbours: dict[str, support.Neighbour] = {}
+        self._neighbours = support.Neighbours(self.clock)
+
+    def named_channels(self) -> list[str]:
+        return list(self.sensors)
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:
@@ -171,7 +171,7 @@ class Ds18b20Thermometer(Thermometer):
         if not self._open:
             raise DeviceGone("1-wire: not open")
         start = self.clock.monotonic()
-        patience_s = self.timeout_s * len(self.sensors)
+        patience_s = self.options.timeout_s * len(self.sensors)
         for channel in self.sensors:
             self._start(channel)
         values: dict[str, float] = {}
@@ -196,26 +196,19 @@ class Ds18b20Thermometer(Thermometer):
         late = self._pending.get(channel)
         if late is not None and not late.done():
             return
-        task: Future[float] = Future()  # an answer that came after its epoch is dropped here
-        self._pending[channel] = task
-
-        def work() -> None:
-            try:
-                task.set_result(self._read_one(channel))
-            except DeviceError as error:
-                task.set_exception(error)
-            except Exception as error:  # noqa: BLE001 - must not die silently in a thread
-                task.set_exception(BadReading(f"1-wire {channel}: {error!r}"))
-
-        threading.Thread(target=work, daemon=True, name=f"w1-{channel}").start()
+        # an answer that came after its epoch is dropped here
+        self._pending[channel] = support.in_thread(lambda: self._read_one(channel), f"w1-{channel}")
 
     def _read_one(self, channel: str) -> float:
         rom = self.sensors[channel]
         problem: DeviceError = BadReading(f"1-wire {rom}: not read")
-        for _ in range(self.attempts):
+        for _ in range(self.options.attempts):
             try:
                 content = (self.root / rom / "w1_slave").read_text()
                 value, pad = decode(content, f"1-wire {rom}", rom[:2])
+                untouched = power_on_value(pad, rom[:2]) is not None
+                idle = POWER_ON if untouched else ""
+                return self._neighbours.judge(channel, value, f"1-wire {rom}", idle)
             except BadReading as error:
                 problem = error
                 continue
@@ -224,15 +217,4 @@ class Ds18b20Thermometer(Thermometer):
                 if isinstance(problem, DeviceGone):
                     raise DeviceGone(f"1-wire {rom}: vanished from the bus") from error
                 continue
-            neighbour = self._neighbours.setdefault(channel, support.Neighbour(self.clock))
-            untouched = power_on_value(pad, rom[:2])
-            if untouched is None:
-                neighbour.measured(value)
-                return value
-            if neighbour.supports(value):
-                return value
-            problem = BadReading(
-                f"1-wire {rom}: {untouched:g} °C is the power-on value and no recent reading was "
-                "near it; the sensor lost its supply, or has not converted yet"
-            )
         raise problem

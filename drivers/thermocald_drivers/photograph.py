@@ -18,16 +18,6 @@ from thermocald_drivers import support
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-__all__ = [
-    "ExposureStart",
-    "exif",
-    "exposure_start",
-    "focus_state",
-    "image_moved",
-    "lock_verdict",
-    "settings",
-]
-
 EXIF_IFD = 0x8769
 TAGS = {
     0x829A: "exposure_s",

@@ -32,13 +32,12 @@ Source: libcamera control_ids_core.yaml, Picamera2 manual (Raspberry Pi Ltd), ap
 
 from __future__ import annotations
 
-import concurrent.futures
 import logging
-import threading
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+from pydantic import AfterValidator, Field
 
 from thermocald.errors import (
     BadReading,
@@ -48,38 +47,48 @@ from thermocald.errors import (
     DeviceTimeout,
     WrongDevice,
 )
-from thermocald.hal import Camera, Found, Frame
-from thermocald_drivers import support
-from thermocald_drivers.picamera_metadata import (
-    agrees,
-    frame_settings,
-    jsonable,
-    sensor_temperature,
-)
+from thermocald.hal import Camera, DriverOptions, Found, Frame
+from thermocald_drivers import chips, support
 from thermocald_drivers.support import AUTO
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from thermocald.hal import Clock
-
-__all__ = ["Picamera2Camera", "sensor_temperature"]
+    from collections.abc import Mapping
 
 log = logging.getLogger(__name__)
 
+_NUMBERS = (
+    # setting, libcamera's name, unit
+    ("exposure_s", "ExposureTime", 1e-6),
+    ("gain", "AnalogueGain", 1.0),
+    ("digital_gain", "DigitalGain", 1.0),
+    ("focus_dioptres", "LensPosition", 1.0),
+)
 CLOSE_S = 3.0
 MANUAL_FOCUS, CONTINUOUS_FOCUS = 0, 2
 """libcamera's AfModeManual and AfModeContinuous."""
 
 
-def _colour_gains(value: object) -> tuple[float, float] | str | None:
-    """Red and blue gain, AUTO, or None; ConfigurationError for anything else."""
-    if value is None or value == AUTO:
-        return None if value is None else AUTO
-    if not isinstance(value, list | tuple) or len(value) != 2:
-        raise ConfigurationError(f"colour_gains: {value!r} is neither [red, blue] nor {AUTO}")
-    red, blue = (support.number("colour_gains", gain, 0, 32) for gain in value)
-    return red, blue
+def _gains(value: list[float] | str | None) -> tuple[float, float] | str | None:
+    if value in (None, AUTO):
+        return value
+    if isinstance(value, str) or len(value) != 2 or not all(0 <= gain <= 32 for gain in value):
+        raise ConfigurationError(f"{value!r} is neither [red, blue] within 0 … 32 nor {AUTO}")
+    return value[0], value[1]
+
+
+class PicameraOptions(DriverOptions):
+    """None: locked as it is."""
+
+    camera: Annotated[int, Field(ge=0, le=9)] = 0
+    model: support.Text | None = None
+    width: support.Pixels = 3280
+    height: support.Pixels = 2464
+    exposure_s: Annotated[float | str, support.or_auto(1e-5, 200)] = 0.02
+    gain: Annotated[float | str, support.or_auto(1, 64)] = 1.0
+    focus_dioptres: Annotated[float | str | None, support.or_auto(0, 32)] = None
+    colour_gains: Annotated[list[float] | str | None, AfterValidator(_gains)] = None
+    tolerance: Annotated[float, Field(ge=0.0, le=1.0)] = 0.05
+    timeout_s: Annotated[float, Field(ge=0.05, le=600.0)] = 10.0
 
 
 def _current_settings(library: Any, number: int) -> dict[str, Any]:
@@ -104,44 +113,22 @@ class Picamera2Camera(Camera):
 
     device_classes = ("char-video4linux", "char-media", "char-dma_heap")
 
-    def __init__(
-        self,
-        *,
-        clock: Clock,
-        camera: int = 0,
-        model: str | None = None,
-        width: int = 3280,
-        height: int = 2464,
-        exposure_s: float | str = 0.02,
-        gain: float | str = 1.0,
-        focus_dioptres: float | str | None = None,
-        colour_gains: Sequence[float] | str | None = None,
-        tolerance: float = 0.05,
-        timeout_s: float = 10.0,
-    ) -> None:
-        self.clock = clock
-        self.number = int(support.number("camera", camera, 0, 9, whole=True))
-        self.model = model
-        self.width = int(support.number("width", width, 64, 20000, "px", whole=True))
-        self.height = int(support.number("height", height, 64, 20000, "px", whole=True))
-        self.exposure_s = support.number_or_auto("exposure_s", exposure_s, 1e-5, 200, "s")
-        self.gain = support.number_or_auto("gain", gain, 1, 64)
-        self.focus_dioptres = (
-            None
-            if focus_dioptres is None
-            else support.number_or_auto("focus_dioptres", focus_dioptres, 0, 32, "1/m")
-        )
-        self.colour_gains = _colour_gains(colour_gains)
-        self.tolerance = support.number("tolerance", tolerance, 0, 1)
-        self.timeout_s = support.number("timeout_s", timeout_s, 0.05, 600, "s")
+    Options = PicameraOptions
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.where = f"libcamera camera {self.options.camera}"
         self._camera: Any = None
         self._seen = False
         self._held: dict[str, Any] = {}
-
-    @property
-    def where(self) -> str:
-        """The device as the user knows it."""
-        return f"libcamera camera {self.number}"
+        o = self.options
+        stated = {
+            "ExposureTime": o.exposure_s if o.exposure_s == AUTO else round(o.exposure_s * 1e6),
+            "AnalogueGain": o.gain,
+            "LensPosition": o.focus_dioptres,
+            "ColourGains": o.colour_gains,
+        }
+        self._stated = {name: v for name, v in stated.items() if v not in (None, AUTO)}
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:  # noqa: ARG003
@@ -161,18 +148,18 @@ class Picamera2Camera(Camera):
     def _open(self) -> None:
         library = support.library("picamera2")
         cameras = library.Picamera2.global_camera_info()
-        if self.number >= len(cameras):
+        if self.options.camera >= len(cameras):
             names = ", ".join(str(info.get("Model")) for info in cameras) or "none"
             raise support.absent(
                 f"{self.where}: libcamera lists {len(cameras)} ({names}); "
                 "is the ribbon cable seated, camera_auto_detect=1 set?",
                 seen=self._seen,
             )
-        found = str(cameras[self.number].get("Model", ""))
-        if self.model is not None and self.model != found:
-            raise WrongDevice(f"{self.where}: this is a {found}, not a {self.model}")
+        found = str(cameras[self.options.camera].get("Model", ""))
+        if self.options.model is not None and self.options.model != found:
+            raise WrongDevice(f"{self.where}: this is a {found}, not a {self.options.model}")
         try:
-            camera = library.Picamera2(self.number)
+            camera = library.Picamera2(self.options.camera)
         except RuntimeError as error:
             raise DeviceDenied(
                 f"{self.where}: cannot be opened ({error}); does another program have it?"
@@ -185,17 +172,18 @@ class Picamera2Camera(Camera):
         self._camera = camera
 
     def _configure(self, camera: Any) -> None:
-        if tuple(camera.sensor_resolution) != (self.width, self.height):
+        if tuple(camera.sensor_resolution) != (self.options.width, self.options.height):
             have = "×".join(str(n) for n in camera.sensor_resolution)
             raise WrongDevice(
-                f"{self.where}: the sensor has {have} px, not {self.width}×{self.height}; "
+                f"{self.where}: the sensor has {have} px, not "
+                f"{self.options.width}×{self.options.height}; "
                 "a scaled image has another interior orientation"
             )
-        if self.focus_dioptres is not None and "LensPosition" not in camera.camera_controls:
+        if self.options.focus_dioptres is not None and "LensPosition" not in camera.camera_controls:
             raise WrongDevice(
                 f"{self.where}: this lens cannot be focused; leave focus_dioptres out"
             )
-        size = (self.width, self.height)
+        size = (self.options.width, self.options.height)
         camera.configure(
             camera.create_still_configuration(
                 main={"size": size, "format": "YUV420"},
@@ -208,25 +196,23 @@ class Picamera2Camera(Camera):
 
     def _controls(self, focuses: bool) -> dict[str, Any]:
         """The controls of the configuration; what is left out is locked by `_lock`."""
-        automatic = AUTO in (self.exposure_s, self.gain)
-        controls: dict[str, Any] = {"AeEnable": automatic, "AwbEnable": self.colour_gains == AUTO}
-        if not isinstance(self.exposure_s, str):
-            microseconds = round(self.exposure_s * 1e6)
-            controls["ExposureTime"] = microseconds
-            controls["FrameDurationLimits"] = (max(microseconds, 100_000),) * 2
-        if not isinstance(self.gain, str):
-            controls["AnalogueGain"] = self.gain
-        if isinstance(self.colour_gains, tuple):
-            controls["ColourGains"] = self.colour_gains
+        automatic = AUTO in (self.options.exposure_s, self.options.gain)
+        controls: dict[str, Any] = {
+            "AeEnable": automatic,
+            "AwbEnable": self.options.colour_gains == AUTO,
+        }
+        controls |= self._stated
+        if exposure := controls.get("ExposureTime"):
+            controls["FrameDurationLimits"] = (max(exposure, 100_000),) * 2
         if focuses:
-            controls["AfMode"] = CONTINUOUS_FOCUS if self.focus_dioptres == AUTO else MANUAL_FOCUS
-            if isinstance(self.focus_dioptres, int | float):
-                controls["LensPosition"] = self.focus_dioptres
+            automatic = self.options.focus_dioptres == AUTO
+            controls["AfMode"] = CONTINUOUS_FOCUS if automatic else MANUAL_FOCUS
         return controls
 
     def _lock(self, camera: Any) -> None:
         """Hold lens position and colour gains where the stanza leaves them out."""
-        wanted = {"LensPosition": self.focus_dioptres, "ColourGains": self.colour_gains}
+        o = self.options
+        wanted = {"LensPosition": o.focus_dioptres, "ColourGains": o.colour_gains}
         open_ones = [name for name, value in wanted.items() if value is None]
         if any(name not in self._held for name in open_ones):
             first = camera.capture_metadata()
@@ -248,14 +234,14 @@ class Picamera2Camera(Camera):
         return [
             f"{name}: auto lets the camera change it; every change is another camera"
             for name in options
-            if getattr(self, name) == AUTO
+            if getattr(self.options, name) == AUTO
         ]
 
     def identity(self) -> Mapping[str, str]:
-        return {"camera": str(self.number), "model": str(self.model or "")}
+        return {"camera": str(self.options.camera), "model": str(self.options.model or "")}
 
     def frame_size(self) -> tuple[int, int]:
-        return self.width, self.height
+        return self.options.width, self.options.height
 
     def capture(self) -> Frame:
         camera = self._camera
@@ -274,7 +260,7 @@ class Picamera2Camera(Camera):
         sleep_s = time.clock_gettime(time.CLOCK_BOOTTIME) - time.monotonic()  # since booting
         middle = metadata["SensorTimestamp"] * 1e-9 - sleep_s - exposure / 2.0
         monotonic, utc = support.on_clock(self.clock, middle)
-        kept = jsonable(dict(metadata))
+        kept = support.plain(dict(metadata))
         kept["sensor_temperature_c"] = sensor_temperature(metadata)
         return Frame(
             image=plane,
@@ -287,7 +273,7 @@ class Picamera2Camera(Camera):
 
     def _fresh(self, camera: Any, called_ns: int) -> tuple[Any, Mapping[str, Any]]:
         """(grey plane, metadata) of the first frame whose exposure began after the call."""
-        deadline = time.monotonic() + self.timeout_s
+        deadline = time.monotonic() + self.options.timeout_s
         while time.monotonic() < deadline and self._camera is camera:
             request = camera.capture_request()
             try:
@@ -304,54 +290,69 @@ class Picamera2Camera(Camera):
     def _plane(self, array: Any) -> Any:
         """The luminance of a YUV420 array: the top H rows, whose stride may exceed the width."""
         rows, stride = array.shape
-        if rows < self.height * 3 // 2 or stride < self.width:
+        if rows < self.options.height * 3 // 2 or stride < self.options.width:
             raise BadReading(f"{self.where}: partial frame, {stride}×{rows} bytes")
-        return np.array(array[: self.height, : self.width], np.uint8)
+        return np.array(array[: self.options.height, : self.options.width], np.uint8)
 
     def _verify(self, metadata: Mapping[str, Any]) -> None:
         """Libcamera delivers what it can, not what was asked: BadReading where they differ."""
-        asked: dict[str, Any] = dict(self._held)
-        if not isinstance(self.exposure_s, str):
-            asked["ExposureTime"] = self.exposure_s * 1e6
-        if not isinstance(self.gain, str):
-            asked["AnalogueGain"] = self.gain
-        if isinstance(self.focus_dioptres, int | float):
-            asked["LensPosition"] = self.focus_dioptres
-        if isinstance(self.colour_gains, tuple):
-            asked["ColourGains"] = self.colour_gains
-        for name, value in asked.items():
+        for name, value in (self._held | self._stated).items():
             got = metadata.get(name)
-            if not agrees(value, got, self.tolerance):
+            if not agrees(value, got, self.options.tolerance):
                 shown = f"{value:g}" if isinstance(value, int | float) else f"{value}"
                 raise BadReading(f"{self.where}: {name} was set to {shown} and is {got}")
 
     def _modes(self, metadata: Mapping[str, Any]) -> dict[str, float]:
         """Which settings are left to the camera, as 1.0 and 0.0."""
         found = {
-            "exposure_auto": float(AUTO in (self.exposure_s, self.gain)),
-            "white_balance_auto": float(self.colour_gains == AUTO),
+            "exposure_auto": float(AUTO in (self.options.exposure_s, self.options.gain)),
+            "white_balance_auto": float(self.options.colour_gains == AUTO),
         }
         if "LensPosition" in metadata:
-            found["focus_auto"] = float(self.focus_dioptres == AUTO)
+            found["focus_auto"] = float(self.options.focus_dioptres == AUTO)
         return found
 
     def _in_time(self, work: Any, what: str, timeout_s: float | None = None) -> Any:
         """Run in a thread of its own, which is left behind if it hangs."""
-        limit = self.timeout_s if timeout_s is None else timeout_s
-        task: concurrent.futures.Future[Any] = concurrent.futures.Future()
-
-        def run() -> None:
-            try:
-                task.set_result(work())
-            except BaseException as error:  # noqa: BLE001 - handed over to the caller
-                task.set_exception(error)
-
-        threading.Thread(target=run, daemon=True, name=f"picamera2-{what}").start()
+        limit = self.options.timeout_s if timeout_s is None else timeout_s
+        task = support.in_thread(work, f"picamera2-{what}")
         try:
             return task.result(limit)
-        except concurrent.futures.TimeoutError as error:
+        except TimeoutError as error:
             if task.done():
                 raise
             raise DeviceTimeout(
                 f"{self.where}: {what} hangs, given up after {limit:g} s"
             ) from error
+
+
+def sensor_temperature(metadata: Mapping[str, Any]) -> float | None:
+    """°C of the sensor; None where it is absent or a value that means "unknown"."""
+    value = metadata.get("SensorTemperature")
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    idle = chips.idle_celsius("imx708")  # its lower and upper limit, and 0
+    return float(value) if min(idle) < value < max(idle) and value not in idle else None
+
+
+def agrees(asked: Any, got: Any, tolerance: float) -> bool:
+    """Whether a value, or each of several, was reported as it was set, to a relative tolerance."""
+    if isinstance(asked, tuple | list):
+        same = isinstance(got, tuple | list) and len(got) == len(asked)
+        return same and all(agrees(a, g, tolerance) for a, g in zip(asked, got, strict=True))
+    if isinstance(got, bool) or not isinstance(got, int | float):
+        return False
+    return bool(abs(got - asked) <= tolerance * max(abs(asked), 1e-9))
+
+
+def frame_settings(metadata: Mapping[str, Any]) -> dict[str, float]:
+    """What moves the image, as the sensor reports it, under the names of the stanza."""
+    found = {
+        name: round(float(metadata[key]) * unit, 9)
+        for name, key, unit in _NUMBERS
+        if isinstance(metadata.get(key), int | float)
+    }
+    gains = metadata.get("ColourGains")
+    if isinstance(gains, tuple | list) and len(gains) == 2:
+        found["colour_gain_red"], found["colour_gain_blue"] = map(float, gains)
+    return found

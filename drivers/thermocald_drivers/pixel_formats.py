@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     Grey = NDArray[np.uint8] | NDArray[np.uint16]
 
-__all__ = ["BAYER_ORDERS", "FORMATS", "decode", "jpeg_end"]
-
 BAYER_ORDERS = {
     # V4L2's names give the first row: RG10 starts with R G
     "RGGB": "RGGB", "RG10": "RGGB", "RG12": "RGGB", "RG16": "RGGB", "pRAA": "RGGB",

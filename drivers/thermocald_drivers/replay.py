@@ -11,7 +11,7 @@ DeviceFinished. An epoch that has no frame, or no temperature, is a BadReading.
 Frames keep their recorded time: `utc` is as recorded, `monotonic` the same on the clock's monotonic
 scale. A JPEG is delivered as recorded, in `encoded`. A recording of measurements gives frames
 without an image, whose `metadata["observations"]` hold what
-`thermocald.photogrammetry.field.exchange` reads. `metadata["epoch"]` is the epoch's number.
+`thermocald.photogrammetry.field.planes` reads. `metadata["epoch"]` is the epoch's number.
 """
 
 from __future__ import annotations
@@ -20,30 +20,31 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from thermocald.errors import BadReading, DeviceFinished, DeviceGone, DeviceNotFound
-from thermocald.hal import Camera, Device, Frame, Reading, Thermometer
+from thermocald.hal import Camera, Device, DriverOptions, Frame, Reading, Thermometer
 from thermocald_drivers import support
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from thermocald.epoch import Epoch
-    from thermocald.hal import Clock
     from thermocald.store.recording.reader import Recording
 
-__all__ = ["ReplayCamera", "ReplayThermometer"]
+
+class ReplayOptions(DriverOptions):
+    """As above."""
+
+    recording: support.Text | Path
+    loop: bool = False
 
 
 class _Replay(Device):
     """The epochs of a recording in order; opening it again continues where it was."""
 
-    def __init__(self, *, clock: Clock, recording: str | Path, loop: bool = False) -> None:
-        self.clock = clock
-        self._path = (
-            Path(recording)
-            if isinstance(recording, Path)
-            else Path(support.text("recording", recording))
-        )
-        self._loop = loop
+    Options = ReplayOptions
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._path = Path(self.options.recording)
         self._recording: Recording | None = None
         self._epochs: Iterator[Epoch] | None = None
         self._shift_s = 0.0
@@ -72,7 +73,7 @@ class _Replay(Device):
         if not self._open or self._epochs is None or self._recording is None:
             raise DeviceGone(f"{self._path}: it is not open")
         epoch = next(self._epochs, None)
-        if epoch is None and self._loop:
+        if epoch is None and self.options.loop:
             times = self._recording.columns.frame_time
             self._shift_s += float(times[-1] - times[0]) + self._recording.interval
             self._epochs = self._recording.iter_epochs()
@@ -95,7 +96,7 @@ class ReplayCamera(_Replay, Camera):
         monotonic, utc = self._times(epoch.frame_time)
         metadata: dict[str, Any] = {"epoch": epoch.number}
         if epoch.observations is not None and self._recording is not None:
-            from thermocald.photogrammetry.field.exchange import observations_to_lists
+            from thermocald.photogrammetry.field.planes import observations_to_lists
 
             field = self._recording.testfield
             metadata["observations"] = observations_to_lists(epoch.observations, field)

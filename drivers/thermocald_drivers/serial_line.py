@@ -9,62 +9,115 @@ r"""Thermometers on a serial line that send lines of text.
         framing: 8N1                            # data bits, parity (N, E, O), stop bits
         command: "T?\\r\\n"                      # sent for each reading; empty: it sends by itself
         pattern: 'T=(?P<temperature>[-+]?\\d+\\.\\d+)F\\*(?P<checksum>[0-9A-F]{2})'
-        unit: F                                 # C (default), F, K
+        unit: F                                 # C (default), F, K; mA: of a 4 … 20 mA loop
         scale: 1.0                              # times the number, then
         offset: 0.0                             # added
         timeout_s: 2
         minimum_c: -60                          # and maximum_c: 125; instruments: -100 … 300
-        refuse_c: [-127, -50, -46.85, -45, -40, 85, 125]   # values that mean "no sensor"
+        chip: sht31                             # the sensor behind the firmware, if it is known
+        refuse_c: [-127, -50, -46.85, -45, 85]  # values that mean "no sensor"
         checksum: xor                           # of the text before it: xor, sum8, nmea
 
 Each named group of `pattern` is a channel, scaled and offset, then converted to °C by `unit`. The
 pattern must match the **whole** line: the rest of a line whose start was lost (`3.5C` of `+023.5C`)
 is not a reading. A decimal comma is read as a point. A `°` in the pattern matches the degree signs
-of UTF-8, Latin-1, code page 437 and LCD fonts. Instruments by name: see
-`serial_instruments`.
+of UTF-8, Latin-1, code page 437 and LCD fonts. Instruments by name: see INSTRUMENTS.
 
 Firmware prints a fixed number where its sensor does not answer: −127 and 85 (DS18B20), −45 and
-−46.85 (SHT), −50 (an input at 0 V), −40 and 125 (ends of a scale). With `pattern` these are refused
-(`refuse_c`; [] accepts all), with `instrument` the instrument's own error texts are known.
+−46.85 (SHT), −50 (an input at 0 V), −40 and 125 (ends of a scale), all in `chips`. With `pattern`
+they are refused as **printed**, before scale and offset, rounded or cut off as the line shows them
+(`refuse_c` instead of the table's; [] accepts all), and 0, what all ones give, and with `chip` its
+further values (25.00 of an LSM6DS3) only with a recent reading within 5 K. With `instrument` the
+instrument's own error texts are known. A loop in mA below 3.6 or above 21 is broken (NAMUR NE 43).
 
 A line that was in the queue before the reading was requested is never used: with `command` the
-queue is emptied first, without it the next line that *ends* after the call counts. Echo and
-garbage are skipped until `timeout_s`; the error then quotes what was received.
+line must be quiet first, and what completes an unfinished line is dropped and the command repeated;
+without it the next line that *ends* after the call counts. Echo, garbage and a prompt are skipped
+until `timeout_s`; the error then quotes what was received.
+Source: the instruments' manuals, named with each.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
+import operator
 import re
 import termios
 import time
-from typing import TYPE_CHECKING, Any
+from decimal import Decimal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import Field, model_validator
 
 from thermocald.errors import BadReading, ConfigurationError, DeviceGone, DeviceTimeout
-from thermocald.hal import Found, Reading, Thermometer
-from thermocald_drivers import support
-from thermocald_drivers.serial_instruments import (
-    CHECKSUMS,
-    INSTRUMENTS,
-    NO_SENSOR_C,
-    UNITS,
-    Instrument,
-)
+from thermocald.hal import DriverOptions, Found, Reading, Thermometer
+from thermocald_drivers import chips, support
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping
 
-    from thermocald.hal import Clock
-
-__all__ = ["SerialThermometer"]
-
+NUMBER = r"[-+]?\d+(?:\.\d+)?"
 LONGEST_LINE = 512
-NO_SENSOR_STEP_K = 0.006
 DEGREES = str.maketrans("ºø˚∘ß℃", "°°°°°°")
 """What a degree sign of another encoding becomes in Latin-1: masculine ordinal, 0xF8, 0xDF."""
 POLL_S = 0.05  # changing pyserial's time-out later would configure the port again
 QUEUE = 4000
 """Bytes that may have waited before the kernel's buffer (4096) could have lost some."""
+PROMPTS = b">#$%?]:"
+NO_SENSOR_STEP_K = 0.006
+LOOP_MA = (3.6, 21.0)
+CORRECTION = (0.5, 2.0)
+"""A scale within these corrects a temperature; another one is the number's format."""
+ALL_ONES_C = (-0.0625, -0.0078125)
+FULL_SCALE = {-1.0, 1023.0, 4095.0, 16383.0, 32767.0, 65535.0}
+
+
+def _instrument(pattern: str, **options: Any) -> dict[str, Any]:
+    """The options of an instrument; its own error texts say that nothing was measured."""
+    return {
+        "pattern": pattern, "minimum_c": -100.0, "maximum_c": 300.0, "refuse_c": [], **options
+    }  # fmt: skip
+
+
+INSTRUMENTS = {
+    # Papouch TM, TMU: sends by itself every 10 s, ends with CR alone.
+    "papouch-tm": _instrument(r"(?P<temperature>[-+]\d{3}\.\d)C", timeout_s=22.0),
+    # Vaisala HMP230/240/260 series, user's guides, appendix "Serial commands".
+    "vaisala-hmp": _instrument(
+        rf"(?:RH= *{NUMBER} *%RH +)?T= *(?P<temperature>{NUMBER}) *'C(?: .*)?",
+        command="SEND\r",
+        baud=4800,
+        framing="7E1",
+    ),
+    # Lake Shore 218, user's manual 6.2: eight inputs in one line; kelvin keeps the sign simple.
+    "lakeshore-218": _instrument(
+        ",".join(rf"(?P<input{k}>[-+]\d+\.\d+)" for k in range(1, 9)),
+        command="KRDG?\r\n",
+        framing="7O1",
+        unit="K",
+    ),
+    # Fluke 1522, user's guide 8.2.1; the unit is set at the instrument and must be C.
+    "fluke-1522": _instrument(
+        r"t: *(?P<temperature>[-+]?\d+\.\d+) C", command="read?\r", baud=2400
+    ),
+}
+
+
+def _xor(text: bytes) -> int:
+    return functools.reduce(operator.xor, text, 0)
+
+
+CHECKSUMS: Mapping[str, Callable[[bytes], int]] = {
+    "none": len,  # not called
+    "xor": _xor,
+    "sum8": lambda text: sum(text) & 0xFF,
+    "nmea": lambda text: _xor(text.strip(b"$*")),
+}
+# °C = factor · (number − zero)
+UNITS: Mapping[str, tuple[float, float]] = {
+    "C": (1.0, 0.0), "F": (1 / 1.8, 32.0), "K": (1.0, 273.15), "mA": (1.0, 0.0),
+}  # fmt: skip
 
 
 def _one_end(received: bytes) -> bytes:
@@ -72,79 +125,70 @@ def _one_end(received: bytes) -> bytes:
     return received.replace(b"\r", b"\n")
 
 
+class SerialOptions(DriverOptions):
+    """Those of an instrument stand in INSTRUMENTS."""
+
+    port: support.Text
+    instrument: Literal["papouch-tm", "vaisala-hmp", "lakeshore-218", "fluke-1522"] | None = None
+    pattern: support.Text
+    command: Annotated[str, Field(pattern=r"^[\x00-\x7f]*$")] = ""
+    baud: Annotated[int, Field(ge=50, le=4_000_000)] = 9600
+    framing: Annotated[str, Field(pattern="^[5-8][NEO][12]$")] = "8N1"
+    unit: Literal["C", "F", "K", "mA"] = "C"
+    scale: Annotated[float, Field(ge=-1e6, le=1e6)] = 1.0
+    offset: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
+    checksum: Literal["none", "xor", "sum8", "nmea"] = "none"
+    timeout_s: support.Seconds = 2.0
+    minimum_c: support.Celsius = -60.0
+    maximum_c: support.Celsius = 125.0
+    chip: support.Text | None = None
+    refuse_c: list[support.Celsius] = Field(default=list(chips.FIRMWARE_C))
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_the_instrument(cls, data: dict[str, Any]) -> dict[str, Any]:
+        name = data.get("instrument")
+        if (name is None) == (data.get("pattern") is None):
+            raise ConfigurationError(
+                f"write either instrument: ({', '.join(INSTRUMENTS)}) or pattern:"
+            )
+        own = INSTRUMENTS.get(name, {}) if isinstance(name, str) else {}
+        return {**own, **{key: value for key, value in data.items() if value is not None}}
+
+
 class SerialThermometer(Thermometer):
     """A line protocol by a pattern, or an instrument by its name."""
 
     device_classes = ("char-ttyUSB", "char-ttyACM", "char-ttyAMA", "char-ttyS")
+    Options = SerialOptions
 
-    def __init__(
-        self,
-        *,
-        clock: Clock,
-        port: str,
-        instrument: str | None = None,
-        pattern: str | None = None,
-        command: str | None = None,
-        baud: int | None = None,
-        framing: str | None = None,
-        unit: str | None = None,
-        scale: float | None = None,
-        offset: float | None = None,
-        checksum: str | None = None,
-        timeout_s: float | None = None,
-        minimum_c: float | None = None,
-        maximum_c: float | None = None,
-        refuse_c: Sequence[float] | None = None,
-    ) -> None:
-        self.clock = clock
-        self.port = support.text("port", port)
-        if (instrument is None) == (pattern is None):
-            raise ConfigurationError(
-                f"write either instrument: ({', '.join(INSTRUMENTS)}) or pattern:"
-            )
-        if instrument is not None:
-            base = INSTRUMENTS[support.choice("instrument", instrument, list(INSTRUMENTS))]
-        else:
-            base = Instrument(
-                support.text("pattern", pattern), range_c=(-60.0, 125.0), refuse_c=NO_SENSOR_C
-            )
-        self.name = instrument or "serial line"
-        self.command = (base.command if command is None else command).encode("ascii")
-        self.baud = int(support.number("baud", baud or base.baud, 50, 4_000_000, "Bd", whole=True))
-        self.framing = framing or base.framing
-        if not re.fullmatch(r"[5-8][NEO][12]", self.framing):
-            raise ConfigurationError(f"framing: {self.framing!r} is not such as 8N1 or 7E1")
-        self.unit = support.choice("unit", unit or base.unit, list(UNITS))
-        self.scale = support.number("scale", base.scale if scale is None else scale, -1e6, 1e6)
-        self.offset = support.number("offset", base.offset if offset is None else offset, -1e6, 1e6)
-        self.checksum = support.choice("checksum", checksum or base.checksum, list(CHECKSUMS))
-        wait = base.timeout_s if timeout_s is None else timeout_s
-        self.timeout_s = support.number("timeout_s", wait, 0.01, 600, "s")
-        low = base.range_c[0] if minimum_c is None else minimum_c
-        high = base.range_c[1] if maximum_c is None else maximum_c
-        self.minimum_c = support.number("minimum_c", low, -273.15, 3000, "°C")
-        self.maximum_c = support.number("maximum_c", high, -273.15, 3000, "°C")
-        refused = base.refuse_c if refuse_c is None else refuse_c
-        self.refuse_c = [support.number("refuse_c", v, -273.15, 3000, "°C") for v in refused]
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        o = self.options
+        self.where = f"{o.instrument or 'serial line'} on {o.port}"
+        self.command = o.command.encode("ascii")
+        if o.chip is not None and o.chip.lower() not in chips.names():
+            raise ConfigurationError(f"chip: {o.chip!r} is not one of {', '.join(chips.names())}")
+        if o.scale == 0.0:
+            raise ConfigurationError("scale: 0 makes every number the same")
+        if o.unit == "mA" and o.scale == 1.0:
+            raise ConfigurationError("unit: mA needs scale: (K per mA) and offset: (°C at 0 mA)")
+        self._corrects = CORRECTION[0] <= abs(o.scale) <= CORRECTION[1]
         try:
-            self.pattern = re.compile(base.pattern, re.ASCII)  # other scripts have digits too
+            self.pattern = re.compile(o.pattern, re.ASCII)  # other scripts have digits too
         except re.error as error:
-            raise ConfigurationError(f"pattern: {base.pattern!r}: {error}") from error
+            raise ConfigurationError(f"pattern: {o.pattern!r}: {error}") from error
         self.channels = [name for name in self.pattern.groupindex if name != "checksum"]
         if not self.channels:
             raise ConfigurationError("pattern: name the value, such as (?P<temperature>[-+0-9.]+)")
-        if self.checksum != "none" and "checksum" not in self.pattern.groupindex:
+        if o.checksum != "none" and "checksum" not in self.pattern.groupindex:
             raise ConfigurationError("pattern: a checksum needs a group (?P<checksum>…)")
         self._serial: Any = None
         self._seen = False
-        self._neighbours: dict[str, support.Neighbour] = {}
+        self._neighbours = support.Neighbours(self.clock)
         self._line = b""
         self._synchronous = False
-
-    @property
-    def where(self) -> str:
-        """The device as the user knows it."""
-        return f"{self.name} on {self.port}"
+        self._owed = True
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:  # noqa: ARG003
@@ -162,16 +206,16 @@ class SerialThermometer(Thermometer):
 
     def open(self) -> None:
         serial = support.library("serial")
-        data_bits, parity, stop_bits = tuple(self.framing)
+        data_bits, parity, stop_bits = tuple(self.options.framing)
         try:
             self._serial = serial.Serial(
-                self.port,
-                self.baud,
+                self.options.port,
+                self.options.baud,
                 bytesize=int(data_bits),
                 parity=parity,
                 stopbits=int(stop_bits),
                 timeout=POLL_S,
-                write_timeout=self.timeout_s,
+                write_timeout=self.options.timeout_s,
                 exclusive=True,
             )
         except ValueError as error:
@@ -181,8 +225,9 @@ class SerialThermometer(Thermometer):
                 error = OSError(16, "another program holds the port")
             hint = "is it plugged in, and the user in the group dialout?"
             raise support.fault(error, self.where, seen=self._seen, hint=hint) from error
-        self._seen = True
-        self._line, self._synchronous = b"", False
+        self._seen = self._owed = True
+        if not self.command:
+            self._line, self._synchronous = b"", False
         self._neighbours.clear()
 
     def close(self) -> None:
@@ -191,7 +236,10 @@ class SerialThermometer(Thermometer):
             port.close()
 
     def identity(self) -> Mapping[str, str]:
-        return {"instrument": self.name, "port": self.port}
+        return {"instrument": self.options.instrument or "serial line", "port": self.options.port}
+
+    def named_channels(self) -> list[str]:
+        return list(self.channels)
 
     def read(self) -> Reading:
         if self._serial is None:
@@ -199,12 +247,12 @@ class SerialThermometer(Thermometer):
         start = self.clock.monotonic()
         try:
             if self.command:
-                self._serial.reset_input_buffer()
-                self._line, self._synchronous = b"", True
-                self._serial.write(self.command)
+                self._ask()
+                start = self.clock.monotonic()
             else:
                 self._skip_queue()
             values, ended, line = self._next_values()
+            self._owed = False
         except (OSError, termios.error) as error:  # a termios.error is no OSError
             if isinstance(error, BadReading | DeviceTimeout):
                 raise
@@ -219,6 +267,20 @@ class SerialThermometer(Thermometer):
         if isinstance(error, support.library("serial").SerialTimeoutException):
             return DeviceTimeout(f"{self.where}: cannot send, the line is held")
         return DeviceGone(f"{self.where}: unplugged ({error})")
+
+    def _ask(self) -> None:
+        """Send the command once the line is quiet, and note whether a line is unfinished."""
+        late, deadline = self._line, time.monotonic() + self.options.timeout_s
+        while (self._owed or late or self._serial.in_waiting) and time.monotonic() < deadline:
+            # an answer to an earlier command may be on its way, or its rest
+            if not (more := self._serial.read(max(1, self._serial.in_waiting))):
+                break
+            late += more
+        rest = _one_end(late).rpartition(b"\n")[2].strip(b" \0")
+        # the rest of a late line would look like a whole one; a prompt is no line
+        self._synchronous = not rest or rest[-1:] in PROMPTS
+        self._line, self._owed = b"", True
+        self._serial.write(self.command)
 
     def _skip_queue(self) -> None:
         """Discard what came before now, but keep the start of the current line."""
@@ -238,13 +300,15 @@ class SerialThermometer(Thermometer):
 
     def _next_values(self) -> tuple[dict[str, float], float, str]:
         """Channels, the machine's monotonic time, and the text of the next matching line."""
-        deadline = time.monotonic() + self.timeout_s
+        deadline = time.monotonic() + self.options.timeout_s
         skipped: list[str] = []
         problem = ""
         while True:
             while b"\n" in self._line:
                 line, self._line = self._line.split(b"\n", 1)
                 whole, self._synchronous = self._synchronous, True
+                if not whole and self.command:
+                    self._serial.write(self.command)  # the answer may have hung on the late line
                 line = line.strip(b"\0")
                 if not line or not whole or line.strip() == self.command.strip():
                     continue
@@ -266,26 +330,28 @@ class SerialThermometer(Thermometer):
     def _nothing(self, skipped: list[str], problem: str) -> BadReading | DeviceTimeout:
         """The error for a time-out: what was wrong with the lines that came."""
         rest = self._line.decode("ascii", "backslashreplace")
-        self._line, self._synchronous = b"", False
+        # with a command, the next one drops the end of this line
+        self._line, self._synchronous = self._line[-1:] if self.command else b"", False
         if problem:
             return BadReading(f"{self.where}: {problem}")
         if skipped or rest:
+            o = self.options
             quoted = "; ".join(repr(text[:60]) for text in [*skipped, rest][:3] if text)
             return BadReading(
-                f"{self.where}: no line fits the pattern in {self.timeout_s:g} s, but {quoted}; "
-                f"is {self.baud} Bd {self.framing} right?"
+                f"{self.where}: no line fits the pattern in {o.timeout_s:g} s, but {quoted}; "
+                f"is {o.baud} Bd {o.framing} right?"
             )
-        return DeviceTimeout(f"{self.where}: silent for {self.timeout_s:g} s")
+        return DeviceTimeout(f"{self.where}: silent for {self.options.timeout_s:g} s")
 
     def _checksum_problem(self, match: re.Match[str], line: bytes) -> str:
-        if self.checksum == "none":
+        if self.options.checksum == "none":
             return ""
         given = match["checksum"] or ""
         if not re.fullmatch(r"[0-9A-Fa-f]{1,4}", given):
             return f"checksum {given!r} in {match.string!r} is not hexadecimal"
         # the checksum is of bytes: those before it are the line without what follows
         after = len(match.string[match.start("checksum") :].encode("latin-1", "replace"))
-        computed = CHECKSUMS[self.checksum](line[: len(line) - after])
+        computed = CHECKSUMS[self.options.checksum](line[: len(line) - after])
         if int(given, 16) == computed:
             return ""
         return f"checksum {given} in {match.string!r}, computed {computed:02X}"
@@ -307,23 +373,45 @@ class SerialThermometer(Thermometer):
         return values
 
     def _celsius(self, channel: str, text: str) -> float:
-        value = support.parse_number(text, comma=True) * self.scale + self.offset
-        where = f"{self.where}, {channel}"
-        celsius = support.believable(UNITS[self.unit](value), self.minimum_c, self.maximum_c, where)
-        if any(abs(celsius - refused) < NO_SENSOR_STEP_K for refused in self.refuse_c):
+        """°C of a number as printed; BadReading where it means that nothing was measured."""
+        number = support.parse_number(text, comma=True)
+        where = f"{self.where}, {channel}: {text}"
+        factor, zero = UNITS[self.options.unit]
+        celsius = factor * (number * self.options.scale + self.options.offset - zero)
+        if self.options.unit == "mA" and not LOOP_MA[0] <= number <= LOOP_MA[1]:
+            raise BadReading(f"{where} mA is a broken loop, not within 3.6 … 21 mA (NAMUR NE 43)")
+        support.believable(celsius, self.options.minimum_c, self.options.maximum_c, where)
+        exponent = Decimal(text.strip().replace(",", ".")).as_tuple().exponent
+        decimals = max(0, -int(exponent))
+        if any(
+            self._printed(number, decimals, refused) or abs(celsius - refused) < NO_SENSOR_STEP_K
+            for refused in self.options.refuse_c
+        ):
             raise BadReading(
-                f"{where}: {celsius:g} °C is what firmware prints without a sensor; if it is a "
-                "temperature, write refuse_c: []"
+                f"{where} is what firmware prints without a sensor; if it is a temperature, write "
+                "refuse_c: []"
             )
-        neighbour = self._neighbours.setdefault(channel, support.Neighbour(self.clock))
-        if value != 0.0 or not self.refuse_c:
-            neighbour.measured(celsius)
-        elif not neighbour.supports(celsius):
-            raise BadReading(
-                f"{where}: 0 is what firmware prints without a sensor, and no recent reading was "
-                "near it; if it is a temperature, write refuse_c: []"
-            )
-        return celsius
+        idle = self._idle(number, decimals) if self.options.refuse_c else ""
+        return self._neighbours.judge(channel, celsius, where, idle)
+
+    def _printed(self, number: float, decimals: int, celsius: float) -> bool:
+        """Whether the number is this temperature before the offset, or before the scale."""
+        factor, zero = UNITS[self.options.unit]
+        scales = {self.options.scale, 1.0} if self._corrects else {self.options.scale}
+        return any(chips.prints(number, decimals, (celsius / factor + zero) / s) for s in scales)
+
+    def _idle(self, number: float, decimals: int) -> str:
+        """In words, if this is a number that a chip gives without having measured."""
+        idle = (0.0, *chips.idle_celsius(self.options.chip or ""))
+        if decimals >= 2:
+            idle += ALL_ONES_C
+        if (
+            number == 0.0
+            or any(self._printed(number, decimals, one) for one in idle)
+            or (not self._corrects and number in FULL_SCALE)
+        ):
+            return "what is printed without a sensor (refuse_c: [] accepts it)"
+        return ""
 
 
 def _decodings(line: bytes) -> Iterator[str]:

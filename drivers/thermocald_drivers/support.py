@@ -6,10 +6,14 @@ import errno
 import importlib
 import math
 import re
+import ssl
+import threading
 import time
-from typing import TYPE_CHECKING, Any
+from concurrent.futures import Future
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from thermocald.errors import (
     BadReading,
@@ -25,32 +29,24 @@ from thermocald.errors import (
 from thermocald.hal import Reading
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from numpy.typing import NDArray
+    from collections.abc import Callable, Mapping
 
     from thermocald.hal import Clock
 
-__all__ = [
-    "AUTO",
-    "Neighbour",
-    "absent",
-    "believable",
-    "choice",
-    "denied",
-    "fault",
-    "library",
-    "middle_reading",
-    "number",
-    "number_or_auto",
-    "on_clock",
-    "parse_number",
-    "programme",
-    "text",
-]
+
+def _as_written(value: object) -> object:
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
 
 AUTO = "auto"
 """What a stanza says to leave a setting to the camera."""
+Text = Annotated[str, BeforeValidator(_as_written), Field(min_length=1)]
+"""An option that is text; whole numbers are taken as written."""
+Seconds = Annotated[float, Field(ge=0.01, le=600.0)]
+"""A time-out."""
+Celsius = Annotated[float, Field(ge=-273.15, le=3000.0)]
+Pixels = Annotated[int, Field(ge=16, le=20_000)]
+Port = Annotated[int, Field(ge=1, le=65_535)]
 CLOCK_TRIES = 10
 CLOCK_SPREAD_S = 1e-4
 NEIGHBOUR_AGE_S = 60.0
@@ -88,27 +84,17 @@ def number(
     return value
 
 
-def number_or_auto(
-    name: str, value: object, low: float, high: float, unit: str = "", *, whole: bool = False
-) -> float | str:
-    """A number as `number` bounds it, or the word AUTO."""
-    if isinstance(value, str) and value != AUTO:
-        raise ConfigurationError(f"{name}: {value!r} is neither a number nor {AUTO}")
-    return AUTO if value == AUTO else number(name, value, low, high, unit, whole=whole)
+def or_auto(low: float, high: float) -> AfterValidator:
+    """The check of an option that is a number within bounds or the word AUTO; None if left out."""
 
+    def check(value: float | str | None) -> float | str | None:
+        if isinstance(value, str) and value != AUTO:
+            raise ConfigurationError(f"{value!r} is neither a number nor {AUTO}")
+        if isinstance(value, int | float) and not low <= value <= high:
+            raise ConfigurationError(f"{value:g} is not within {low:g} … {high:g}")
+        return value
 
-def choice(name: str, value: object, allowed: Sequence[str]) -> str:
-    """An option from a list of words; ConfigurationError shows the list."""
-    if not isinstance(value, str) or value not in allowed:
-        raise ConfigurationError(f"{name}: {value!r} is not one of {', '.join(allowed)}")
-    return value
-
-
-def text(name: str, value: object) -> str:
-    """An option that must be a non-empty string; whole numbers are taken as written."""
-    if isinstance(value, bool) or not isinstance(value, str | int) or str(value) == "":
-        raise ConfigurationError(f"{name}: {value!r} is not text; put it in quotes")
-    return str(value)
+    return AfterValidator(check)
 
 
 def absent(message: str, *, seen: bool) -> DeviceError:
@@ -148,6 +134,46 @@ def fault(error: OSError, where: str, *, seen: bool, hint: str = "") -> DeviceEr
     return BadReading(f"{where}: {reason}")
 
 
+def reason(error: BaseException) -> str:
+    """What went wrong, without the library's words: they may quote an address and its secrets."""
+    cause = getattr(error, "reason", error)  # urllib's URLError wraps the real one
+    cause = cause if isinstance(cause, BaseException) else error
+    if isinstance(cause, TimeoutError):
+        return "no answer in time"
+    if isinstance(cause, ssl.SSLCertVerificationError):
+        return f"its certificate is not trusted: {cause.verify_message}"
+    if isinstance(cause, OSError) and cause.errno is not None and cause.strerror:
+        return str(cause.strerror)
+    return type(cause).__name__
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON has it: NumPy's as numbers, tuples as lists, NaN and infinities as null."""
+    if isinstance(value, np.generic | np.ndarray):
+        value = value.tolist()
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {str(key): plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(entry) for entry in value]
+    return value if isinstance(value, str | int | bool | None) else str(value)
+
+
+def in_thread(work: Callable[[], Any], name: str) -> Future[Any]:
+    """Start work in a thread of its own, which is left behind if it hangs."""
+    task: Future[Any] = Future()
+
+    def run() -> None:
+        try:
+            task.set_result(work())
+        except BaseException as error:  # noqa: BLE001 - handed over to who waits
+            task.set_exception(error)
+
+    threading.Thread(target=run, daemon=True, name=name).start()
+    return task
+
+
 def on_clock(clock: Clock, monotonic: float) -> tuple[float, float]:
     """A time of the machine's CLOCK_MONOTONIC (s) on the clock's (monotonic, utc) scales.
 
@@ -184,6 +210,15 @@ def middle_reading(
     )
 
 
+def partial_reading(
+    clock: Clock, values: Mapping[str, float], missing: Mapping[str, str], start: float
+) -> Reading:
+    """A reading of the channels that gave a value; BadReading with all reasons if none did."""
+    if not values:
+        raise BadReading("; ".join(missing.values()))
+    return middle_reading(clock, values, start, {"missing": dict(missing)} if missing else {})
+
+
 def believable(value_c: float, low_c: float, high_c: float, where: str) -> float:
     """The temperature if it is finite and within the sensor's range; otherwise BadReading."""
     if not math.isfinite(value_c) or not low_c <= value_c <= high_c:
@@ -205,45 +240,34 @@ def parse_number(text: str, *, comma: bool = False) -> float:
     return float(plain.replace(",", "."))
 
 
-class Neighbour:
-    """The last reading of a channel that was certainly measured.
+class Neighbours:
+    """The last reading of each channel that was certainly measured.
 
-    A chip that has just been powered holds a fixed value (85 °C, 25 °C, 0 °C) that is also a
-    temperature. Such a value is accepted only where a reading less than NEIGHBOUR_AGE_S old and
-    within NEIGHBOUR_STEP_K makes it likely; it never supports itself.
+    What a chip gives without having measured (see `chips`) is a temperature too. It is accepted
+    only where a reading less than NEIGHBOUR_AGE_S old and within NEIGHBOUR_STEP_K makes it likely;
+    it never supports itself.
     """
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
-        self._last: tuple[float, float] | None = None
+        self._last: dict[str, tuple[float, float]] = {}
 
-    def measured(self, value_c: float) -> None:
-        """Remember a reading that cannot be a power-on value."""
-        self._last = (self._clock.monotonic(), value_c)
+    def clear(self) -> None:
+        """Forget everything: the device was closed."""
+        self._last.clear()
 
-    def supports(self, value_c: float) -> bool:
-        """Whether a recent reading lay near enough."""
-        if self._last is None:
-            return False
-        at, last_c = self._last
+    def support(self, channel: str, value_c: float) -> bool:
+        """Whether a recent reading of the channel lay near enough."""
+        at, last_c = self._last.get(channel, (-math.inf, math.nan))
         recent = self._clock.monotonic() - at <= NEIGHBOUR_AGE_S
         return recent and abs(last_c - value_c) <= NEIGHBOUR_STEP_K
 
-
-def programme(points: object) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A list of [seconds, °C] points as times (n,) s and temperatures (n,) °C.
-
-    Raises ConfigurationError for anything else, for times that do not increase, and for
-    temperatures that do not exist.
-    """
-    try:
-        pairs = np.array(points, dtype=float)
-    except (TypeError, ValueError):
-        pairs = np.empty(0)
-    if pairs.ndim != 2 or pairs.shape[1] != 2 or not np.isfinite(pairs).all():
-        raise ConfigurationError("programme: must be a list of [seconds, °C]")
-    if np.any(np.diff(pairs[:, 0]) <= 0):
-        raise ConfigurationError("programme: its times must increase")
-    for value in pairs[:, 1]:
-        number("programme: temperature", float(value), LOWEST_C, HIGHEST_C, "°C")
-    return pairs[:, 0], pairs[:, 1]
+    def judge(self, channel: str, value_c: float, where: str, idle: str = "") -> float:
+        """The temperature; BadReading if it is `idle`, in words, and no neighbour supports it."""
+        if not idle:
+            self._last[channel] = (self._clock.monotonic(), value_c)
+        elif not self.support(channel, value_c):
+            raise BadReading(
+                f"{where}: {value_c:g} °C is {idle}, and no recent reading was near it"
+            )
+        return value_c

@@ -32,7 +32,9 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import Field
 
 from thermocald.errors import (
     BadReading,
@@ -44,9 +46,9 @@ from thermocald.errors import (
     TransientDeviceError,
     WrongDevice,
 )
-from thermocald.hal import Camera, Found, Frame
+from thermocald.hal import Camera, DriverOptions, Found, Frame
 from thermocald_drivers import pixel_formats, support
-from thermocald_drivers.v4l2_controls import CameraControls
+from thermocald_drivers.v4l2_controls import LOCKS, CameraControls
 from thermocald_drivers.v4l2_stream import (
     BUFFERS,
     OLDEST_S,
@@ -60,12 +62,31 @@ from thermocald_drivers.v4l2_stream import (
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from thermocald.hal import Clock
-
-__all__ = ["V4l2Camera"]
-
 FUTURE_S = 1.0
 """A time stamp may be this far ahead (vivid: up to a frame); beyond, it is another clock's."""
+
+
+Whole = Annotated[int | str | None, support.or_auto(0, 1e6)]
+
+
+class V4l2Options(DriverOptions):
+    """None: locked as it is."""
+
+    width: support.Pixels
+    height: support.Pixels
+    device: support.Text | None = None
+    serial: support.Text | None = None
+    card: support.Text | None = None
+    pixel_format: support.Text = "YUYV"
+    exposure_s: Annotated[float | str | None, support.or_auto(1e-5, 60)] = None
+    gain: Whole = None
+    focus: Whole = None
+    white_balance_k: Whole = None
+    controls: dict[str, Annotated[int, Field(ge=-(2**31), lt=2**31)]] = {}  # noqa: RUF012
+    strict: bool = True
+    timeout_s: Annotated[float, Field(ge=0.05, le=600.0)] = 5.0
+    backend: Literal["auto", "linuxpy", "opencv"] = "auto"
+    dev: support.Text = "/dev"
 
 
 class V4l2Camera(Camera):
@@ -73,54 +94,23 @@ class V4l2Camera(Camera):
 
     device_classes = ("char-video4linux",)
 
-    def __init__(
-        self,
-        *,
-        clock: Clock,
-        width: int,
-        height: int,
-        device: str | None = None,
-        serial: str | None = None,
-        card: str | None = None,
-        pixel_format: str = "YUYV",
-        exposure_s: float | str | None = None,
-        gain: int | str | None = None,
-        focus: int | str | None = None,
-        white_balance_k: int | str | None = None,
-        controls: Mapping[str, int] | None = None,
-        strict: bool = True,
-        timeout_s: float = 5.0,
-        backend: str = "auto",
-        dev: str = "/dev",
-    ) -> None:
-        self.clock = clock
-        self.width = int(support.number("width", width, 16, 20000, "px", whole=True))
-        self.height = int(support.number("height", height, 16, 20000, "px", whole=True))
-        if (device is None) == (serial is None):
+    Options = V4l2Options
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        o = self.options
+        if (o.device is None) == (o.serial is None):
             raise ConfigurationError("write either device: (/dev/v4l/by-id/…) or serial:")
-        self.device, self.serial, self.card = device, serial, card
         known = ["MJPG", *(name.strip() for name in pixel_formats.FORMATS)]
-        self.pixel_format = support.choice("pixel_format", pixel_format, known).ljust(4)
-        wanted = {"gain": gain, "focus": focus, "white_balance_k": white_balance_k}
-        if exposure_s is not None:
-            support.number_or_auto("exposure_s", exposure_s, 1e-5, 60, "s")
-        for name, value in wanted.items():
-            if value is not None:
-                support.number_or_auto(name, value, 0, 1e6, whole=True)
-        self._controls = CameraControls(
-            f"camera {device or serial}", {"exposure_s": exposure_s, **wanted}, dict(controls or {})
-        )
-        self.strict = bool(strict)
-        self.timeout_s = support.number("timeout_s", timeout_s, 0.05, 600, "s")
-        self.backend = support.choice("backend", backend, ["auto", "linuxpy", "opencv"])
-        self.dev = Path(dev)
+        if o.pixel_format not in known:
+            raise ConfigurationError(
+                f"pixel_format: {o.pixel_format!r} is not one of {', '.join(known)}"
+            )
+        self.where = f"camera {o.device or o.serial}"
+        wanted = {lock.option: getattr(o, lock.option) for lock in LOCKS}
+        self._controls = CameraControls(self.where, wanted, o.controls)
         self._stream: Stream | None = None
         self._seen = False
-
-    @property
-    def where(self) -> str:
-        """The device as the user knows it."""
-        return f"camera {self.device or self.serial}"
 
     @classmethod
     def attached(cls, sysfs: str = "/sys", dev: str = "/dev") -> list[Found]:
@@ -152,7 +142,7 @@ class V4l2Camera(Camera):
         try:
             self._stream = self._open_stream(path)
             self._check_card(path)
-            self._controls.apply(self._stream, strict=self.strict)
+            self._controls.apply(self._stream, strict=self.options.strict)
             self._stream.start()
         except DeviceError as error:
             self.close()
@@ -176,16 +166,16 @@ class V4l2Camera(Camera):
 
     def identity(self) -> Mapping[str, str]:
         card = self._stream.card if self._stream else ""
-        return {"device": str(self.device or self.serial), "card": card}
+        return {"device": str(self.options.device or self.options.serial), "card": card}
 
     def frame_size(self) -> tuple[int, int]:
-        return self.width, self.height
+        return self.options.width, self.options.height
 
     def capture(self) -> Frame:
         if self._stream is None:
             raise DeviceGone(f"{self.where}: not open")
         called = time.monotonic()
-        deadline = called + self.timeout_s
+        deadline = called + self.options.timeout_s
         try:
             exposure = self._exposure(self._controls.values(self._stream))
             grab, stamp, dropped = self._fresh(self._stream, called, deadline, exposure)
@@ -195,7 +185,7 @@ class V4l2Camera(Camera):
         except OSError as error:
             raise support.fault(error, self.where, seen=True) from error
         disobeyed = self._controls.deviations(values)
-        if disobeyed and self.strict:
+        if disobeyed and self.options.strict:
             raise BadReading(f"{self.where}: {'; '.join(disobeyed)}")
         middle = stamp + (0.5 if grab.start_of_exposure else -0.5) * (exposure or 0.0)
         monotonic, utc = support.on_clock(self.clock, middle)
@@ -250,7 +240,7 @@ class V4l2Camera(Camera):
                     raise BadReading(f"{self.where}: only broken frames; {broken}") from error
                 after = f", {dropped} old ones were in the queue" if dropped else ""
                 raise DeviceTimeout(
-                    f"{self.where}: no new frame in {self.timeout_s:g} s{after}"
+                    f"{self.where}: no new frame in {self.options.timeout_s:g} s{after}"
                 ) from error
             if grab is not None:
                 stamp = arrived if grab.stamp is None else grab.stamp
@@ -259,34 +249,42 @@ class V4l2Camera(Camera):
 
     def _path(self) -> str:
         """The node; a serial number is looked up among udev's names."""
-        if self.device is not None:
-            return self.device
-        links = sorted((self.dev / "v4l/by-id").glob(f"*{self.serial}*-video-index0"))
+        if self.options.device is not None:
+            return str(self.options.device)
+        links = sorted(
+            (Path(self.options.dev) / "v4l/by-id").glob(f"*{self.options.serial}*-video-index0")
+        )
         if len(links) > 1:
             names = ", ".join(link.name for link in links)
-            raise WrongDevice(f"camera {self.serial}: several fit: {names}; write device:")
+            raise WrongDevice(f"camera {self.options.serial}: several fit: {names}; write device:")
         if not links:
             raise support.absent(
-                f"camera {self.serial}: none in {self.dev}/v4l/by-id", seen=self._seen
+                f"camera {self.options.serial}: none in {self.options.dev}/v4l/by-id",
+                seen=self._seen,
             )
         return str(links[0])
 
     def _open_stream(self, path: str) -> Stream:
-        arguments = (path, self.pixel_format, self.width, self.height)
-        if self.backend == "opencv":
+        arguments = (
+            path,
+            self.options.pixel_format.ljust(4),
+            self.options.width,
+            self.options.height,
+        )
+        if self.options.backend == "opencv":
             return OpenCvStream(*arguments)
         try:
             support.library("linuxpy.video.device", "v4l2")
         except DriverMissing:
-            if self.backend == "linuxpy":
+            if self.options.backend == "linuxpy":
                 raise
             return OpenCvStream(*arguments)
         return LinuxpyStream(*arguments)
 
     def _check_card(self, path: str) -> None:
         card = self._stream.card if self._stream else ""
-        if self.card is not None and self.card not in card:
-            raise WrongDevice(f"{path}: this is {card!r}, not {self.card!r}")
+        if self.options.card is not None and self.options.card not in card:
+            raise WrongDevice(f"{path}: this is {card!r}, not {self.options.card!r}")
 
     def _exposure(self, values: Mapping[int, int]) -> float | None:
         """s, where the camera is in manual exposure and reports it."""

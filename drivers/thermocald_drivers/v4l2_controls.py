@@ -14,15 +14,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 from thermocald.errors import WrongDevice
-from thermocald_drivers import support
 from thermocald_drivers.support import AUTO
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
     Wanted = float | str | None
-
-__all__ = ["EXPOSURE", "LOCKS", "CameraControls", "Control", "standing_values"]
 
 EXPOSURE = 0x009A0902
 EXPOSURE_UNIT_S = 1e-4
@@ -148,9 +145,7 @@ class CameraControls:
             if name not in by_name:
                 known = ", ".join(sorted(by_name)) or "none"
                 raise WrongDevice(f"{self._where}: there is no control {name!r}; it has {known}")
-            self._asked[by_name[name]] = int(
-                support.number(f"controls.{name}", number, -(2**31), 2**31 - 1)
-            )
+            self._asked[by_name[name]] = number
             locked.discard(by_name[name])
         return locked
 

@@ -10,9 +10,7 @@ import errno
 import logging
 import os
 import select
-import threading
 import time
-from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -22,21 +20,11 @@ from thermocald_drivers.v4l2_controls import Control, standing_values
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from concurrent.futures import Future
 
     from thermocald_drivers.pixel_formats import Grey
 
     Accept = Callable[[float | None, bool], bool]
-
-__all__ = [
-    "BUFFERS",
-    "OLDEST_S",
-    "Control",
-    "Grab",
-    "LinuxpyStream",
-    "OpenCvStream",
-    "Stream",
-    "current_settings",
-]
 
 ERROR, TYPE_MASK, START_OF_EXPOSURE = 0x40, 0xE000, 0x10000
 OLDEST_S = 3600.0
@@ -233,10 +221,7 @@ class OpenCvStream:
 
     def grab(self, deadline: float, accept: Accept) -> Grab | None:
         if self._pending is None or self._pending.done():
-            self._pending = Future()
-            threading.Thread(
-                target=self._work, args=(self._pending,), daemon=True, name="opencv-grab"
-            ).start()
+            self._pending = support.in_thread(self._read, "opencv-grab")
         try:
             grab = self._pending.result(max(0.0, deadline - time.monotonic()))
         except OSError as error:
@@ -244,12 +229,6 @@ class OpenCvStream:
                 raise DeviceTimeout(f"{self._path}: no frame came") from None
             raise
         return grab if accept(grab.stamp, False) else None
-
-    def _work(self, task: Future[Grab]) -> None:
-        try:
-            task.set_result(self._read())
-        except (OSError, ValueError) as error:
-            task.set_exception(error)
 
     def _read(self) -> Grab:
         good, raw = self._capture.read()

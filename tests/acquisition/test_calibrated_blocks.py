@@ -7,8 +7,7 @@ from thermocald.acquisition.calibrator import Calibrator
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.field.testfield import Observations
-from thermocald.simulation.demonstration import demonstration_model
-from thermocald.simulation.testfields import corner_field
+from thermocald.physics.testfields import corner_field, demonstration_model
 
 EPOCHS = EPOCHS_OF_A_BLOCK + 40
 

@@ -1,74 +1,136 @@
-"""The tick without threads: mock devices on a virtual clock."""
+"""What is put off, what is kept, in which order, when calibration or the disk is slow."""
 
 from __future__ import annotations
 
-import math
+import threading
+import time
 
 import numpy as np
 import pytest
 
-from thermocald.acquisition.calibrator import Calibrator
+from thermocald.acquisition.calibrator import CalibratedEpoch
+from thermocald.acquisition.pairing import Readings
 from thermocald.acquisition.pipeline import Pipeline
-from thermocald.hal import Frame, VirtualClock, open_device
+from thermocald.epoch import Epoch
+from thermocald.hal import Frame, SystemClock
+from thermocald.photogrammetry.epoch.adjustment import failed
+
+
+class SlowCalibrator:
+    """Takes its time; a gate holds it up."""
+
+    def __init__(self) -> None:
+        self.gate = threading.Event()
+        self.testfield = None
+        self.seen: list[int] = []
+
+    def calibrate(self, epoch: Epoch, image=None) -> CalibratedEpoch:
+        self.gate.wait(10.0)
+        self.seen.append(epoch.number)
+        if epoch.number == 666:
+            raise RuntimeError("a bug")
+        return CalibratedEpoch(epoch, failed("ok", ""), {})
+
+    def reset(self) -> None:
+        pass
+
+
+class ListKeeper:
+    """Keeps in lists, and gives back what was put off."""
+
+    def __init__(self) -> None:
+        self.kept: list[tuple[int, bool]] = []
+        self.amended: list[int] = []
+        self.pause_s = 0.0
+
+    def keep(self, acquired) -> None:
+        time.sleep(self.pause_s)
+        self.kept.append((acquired.number, acquired.calibrated is not None))
+
+    def amend(self, calibrated) -> None:
+        self.amended.append(calibrated.epoch.number)
+
+    def backlog(self, below: int):
+        for number, calibrated in self.kept:
+            if not calibrated and number not in self.amended:
+                return Epoch(number, 0.0, 0.0)
+        return None
 
 
 @pytest.fixture
-def build():
-    """Options of camera and thermometer → (clock, camera, pipeline), devices open."""
-    opened = []
-
-    def make(camera=None, thermometer=None, calibrate=False):
-        clock = VirtualClock()
-        c = open_device("camera", "mock", {"seed": 1, **(camera or {})}, clock)
-        t = open_device("thermometer", "mock", {"seed": 2, **(thermometer or {})}, clock)
-        for device in (c, t):
-            device.open()
-            opened.append(device)
-        calibrator = Calibrator(c.model.sensor, c.field, nominal_c=3.04) if calibrate else None
-        return clock, c, Pipeline(c, {"temperature": t}, calibrator, clock, period_s=10.0)
-
-    yield make
-    for device in opened:
-        device.close()
+def pipeline():
+    keeper, calibrator = ListKeeper(), SlowCalibrator()
+    made = Pipeline(
+        "cam", calibrator, Readings({}), (), keeper, SystemClock(), depth=3, patience_s=0.0
+    )
+    made.start()
+    yield made, keeper, calibrator
+    calibrator.gate.set()
+    assert made.stop(10.0)
 
 
-def test_three_epochs_follow_the_drift_that_was_put_in(build):
-    _, camera, pipeline = build(calibrate=True)
-    given = []
-    pipeline._sinks.append(lambda calibrated, frame: given.append(frame.sequence))
-    results = list(pipeline.run(3))
-    assert given == [1, 2, 3]
-    for calibrated, frame in results:
-        truth = camera.truth(frame.monotonic).iop[0]
-        found = calibrated.adjustment
-        assert found.status == "ok"
-        off = (found.values[:3] - truth[:3]) / found.sd[:3]
-        assert np.abs(off).max() < 5
-        assert 0 < calibrated.extra["skew_s"] < 1
-    assert results[0][1].monotonic == pytest.approx(0.29, abs=1e-6)
-    assert results[2][1].monotonic == pytest.approx(20.29, abs=1e-6)
+def frame() -> Frame:
+    return Frame(np.zeros((20, 20), dtype=np.uint8), time.monotonic(), time.time())
 
 
-def test_a_camera_that_is_away_loses_its_epochs_and_nothing_else(build):
-    gone = {"faults": [{"kind": "unplugged", "at_s": 15, "for_s": 20}]}
-    _, _, pipeline = build(camera=gone)
-    times = [frame.monotonic for _, frame in pipeline.run(4)]
-    assert [round(t) for t in times] == [0, 10, 40, 50]
-    assert pipeline.lost == 2
+def until(condition) -> None:
+    deadline = time.monotonic() + 10.0
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
 
 
-def test_a_thermometer_that_is_away_leaves_the_temperature_empty(build):
-    gone = {"faults": [{"kind": "unplugged", "at_s": 5, "for_s": 10}]}
-    _, _, pipeline = build(thermometer=gone)
-    epochs = [calibrated.epoch for calibrated, _ in pipeline.run(3)]
-    assert [bool(epoch.temperatures) for epoch in epochs] == [True, False, True]
-    assert math.isnan(epochs[1].temperature_time)
+def test_too_slow_it_drops_calibration_never_acquisition_and_catches_up(pipeline):
+    made, keeper, calibrator = pipeline
+    for _ in range(20):
+        made.submit(frame())
+        time.sleep(0.005)
+    until(lambda: len(keeper.kept) == 17)  # three may wait
+    assert keeper.kept == [(n, False) for n in range(1, 18)]
+    calibrator.gate.set()
+    until(lambda: len(keeper.amended) == 17)
+    assert sorted(keeper.amended) == list(range(1, 18))
+    assert keeper.kept[17:] == [(18, True), (19, True), (20, True)]
+    assert (made.lost, made.dropped, made.caught_up) == (0, 17, 17)
 
 
-def test_garbage_is_an_epoch_with_a_reason(build):
-    clock, camera, pipeline = build(calibrate=True)
-    garbage = [b"\xff\xd8 half a picture", b"\x00" * 100, b"\x89PNG\r\n\x1a\n"]
-    camera.capture = lambda: Frame(None, clock.monotonic(), clock.utc(), encoded=garbage.pop())
-    results = [calibrated.adjustment for calibrated, _ in pipeline.run(3)]
-    assert [r.status for r in results] == ["bad_frame"] * 3
-    assert "cut off" in results[2].reason
+def test_fast_enough_everything_is_calibrated_in_order(pipeline):
+    made, keeper, calibrator = pipeline
+    calibrator.gate.set()
+    for n in range(1, 51):
+        made.submit(frame())
+        until(lambda n=n: len(keeper.kept) == n)
+    assert keeper.kept == [(n, True) for n in range(1, 51)]
+    assert made.dropped == 0
+
+
+def test_the_end_finishes_the_epoch_in_hand_and_keeps_the_others(pipeline):
+    made, keeper, calibrator = pipeline
+    for _ in range(3):
+        made.submit(frame())
+    time.sleep(0.05)
+    threading.Timer(0.1, calibrator.gate.set).start()
+    assert made.stop(10.0)
+    assert keeper.kept == [(1, True), (2, False), (3, False)]
+
+
+def test_a_disk_that_hangs_costs_frames_only_when_memory_is_used_up(pipeline):
+    made, keeper, calibrator = pipeline
+    calibrator.gate.set()
+    keeper.pause_s = 0.5
+    for _ in range(12):
+        made.submit(frame())
+    assert made.lost > 0
+    keeper.pause_s = 0.0
+    until(lambda: len(keeper.kept) == 12 - made.lost)
+    assert [n for n, _ in keeper.kept] == list(range(1, 13 - made.lost))
+
+
+def test_a_bug_in_one_epoch_does_not_end_acquisition(pipeline, caplog):
+    made, keeper, calibrator = pipeline
+    made.next_number = 666
+    calibrator.gate.set()
+    made.submit(frame())
+    made.submit(frame())
+    until(lambda: len(keeper.kept) == 2)
+    assert "epoch 666 was not calibrated" in caplog.text

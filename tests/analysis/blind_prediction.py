@@ -19,16 +19,16 @@ from tests.blind.case import SINGLE, Case
 from tests.blind.generator import generate, write
 from thermocald.analysis.thermal.prediction_test import predicted_error
 from thermocald.cli import application
-from thermocald.reduction.reduce import reduce_series
-from thermocald.reduction.source import series_input
-from thermocald.simulation.model import ModelEffect
-from thermocald.simulation.model_file import read_model
+from thermocald.physics.model import ModelEffect
+from thermocald.physics.model_file import read_model
 from thermocald.store.recording.reader import read_recording
+from thermocald.thermal.reduce import reduce_series
+from thermocald.thermal.source import series_input
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from thermocald.simulation.model import ThermalModel
+    from thermocald.physics.model import ThermalModel
 
 __all__ = ["SINGLE", "Tested", "effect_option", "pooled", "predict_case"]
 

@@ -16,10 +16,9 @@ from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.photogrammetry.series.blocks import GridBlocks, gathered
 from thermocald.photogrammetry.series.long_series import adjust_long_series
 from thermocald.photogrammetry.series.result import SeriesSettings
-from thermocald.reduction.condense import condensed
-from thermocald.reduction.reduce import reduce_series
-from thermocald.reduction.source import load_series
 from thermocald.store.recording.reader import Recording, open_recording
+from thermocald.thermal.reduce import reduce_series
+from thermocald.thermal.source import condensed, load_series
 
 DAY = 8640
 SAME = 1e-9  # of the principal distance, or of a rate

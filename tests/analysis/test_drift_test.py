@@ -124,3 +124,27 @@ def test_a_daily_cycle_of_a_long_series_is_drift():
     values = daily + np.random.default_rng(12).standard_normal(n)
     result = drift_test(values, np.ones(n), np.full(n, 280.0))
     assert result.p_value < 1e-6
+
+
+@pytest.mark.parametrize(("phi", "missing"), [(0.97, 60), (0.9, 25)])
+def test_noise_forgets_in_a_gap(phi, missing):
+    """150 epochs with a piece missing: both sides counted as neighbours, 46 % depended at 1 %."""
+    rng = np.random.default_rng(14)
+    dependent, drifting = [], []
+    for _ in range(200):
+        first = int(rng.integers(10, N - missing - 10))
+        kept = np.delete(np.arange(N), slice(first, first + missing))
+        y, m = noise(rng, 1.0, phi)[kept], len(kept)
+        dependent.append(slope_p_value(y, WARM_UP[kept], TIME_S[kept]) <= 0.01)
+        test = drift_test(y, ONES[:m], REDUNDANCY[:m], times=TIME_S[kept])
+        drifting.append(test.p_value <= 0.01)
+    assert np.mean(dependent) <= 0.035  # 99.9 % point of a share of 1 %
+    assert np.mean(drifting) <= 0.035
+
+
+def test_a_warm_up_with_a_gap_is_found():
+    rng = np.random.default_rng(15)
+    kept = np.delete(np.arange(N), slice(60, 100))
+    y = 40 * WARM_UP[kept] + noise(rng, 0, 0)[kept]
+    assert drift_test(y, ONES[kept], REDUNDANCY[kept], times=TIME_S[kept]).p_value < 1e-3
+    assert slope_p_value(y, WARM_UP[kept], TIME_S[kept]) < 1e-3

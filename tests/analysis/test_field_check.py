@@ -24,7 +24,7 @@ from thermocald.photogrammetry.camera.camera_model import (
 )
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, adjust
 from thermocald.photogrammetry.field.testfield import Observations, TestField
-from thermocald.simulation.testfields import corner_field
+from thermocald.physics.testfields import corner_field
 
 CAMERA = CameraModel(
     Sensor(3280, 2464, 0.00112), InteriorOrientation(c=3.04, x0=0.01, y0=-0.02, A1=-2e-3)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from thermocald.reduction.gross_errors import spikes
+from thermocald.thermal.reduce import find_spikes
 
 
 def drifting(rng):
@@ -15,13 +15,13 @@ def drifting(rng):
 def test_where_a_drift_turns_there_is_no_gross_error():
     """The neighbours' median was the epoch itself but at the turns, and noise beyond all there."""
     misclosure = drifting(np.random.default_rng(3))
-    assert spikes(misclosure, np.ones((300, 20), dtype=bool)).sum() == 0
+    assert find_spikes(misclosure, np.ones((300, 20), dtype=bool)).sum() == 0
 
 
 def test_a_target_that_leaps_is_found():
     misclosure = drifting(np.random.default_rng(4))
     misclosure[[50, 121, 250], [3, 7, 3]] += 0.5
-    found = np.argwhere(spikes(misclosure, np.ones((300, 20), dtype=bool)))
+    found = np.argwhere(find_spikes(misclosure, np.ones((300, 20), dtype=bool)))
     leaps = {(50, 3), (121, 7), (250, 3)}
     assert leaps <= set(map(tuple, found))
     # its neighbours may be suspected as well, until there is an adjustment

@@ -28,7 +28,7 @@ def test_a_short_series_is_whole():
 
 
 def test_the_frequencies_are_means_of_what_is_pooled():
-    at = Frequencies.of(20_000)
+    at = Frequencies.of(20_001)
     assert at.count.sum() == 20_000
     every = np.pi * np.arange(1, 20_001) / 20_001
     np.testing.assert_allclose(at.mean, at.sums(every) / at.count, rtol=1e-12)

@@ -11,11 +11,10 @@ import pytest
 from tests.analysis.test_thermal_model import LAG, for_fit, reduced, run, simulated
 from thermocald.analysis.thermal.prediction_test import predicted_error
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
-from thermocald.reduction.source import epochs_input
-from thermocald.simulation import effects
-from thermocald.simulation.effects.base import Effect
-from thermocald.simulation.effects.parameter import coefficient_units
-from thermocald.simulation.model import ModelEffect
+from thermocald.physics import catalogue
+from thermocald.physics.effect import Effect, coefficient_units
+from thermocald.physics.model import ModelEffect
+from thermocald.thermal.source import epochs_input
 
 SIZE = {"c": 3e-4, "x0": 6e-4, "y0": -4e-4}
 NOISE_PX = 0.04
@@ -119,8 +118,8 @@ CASES = {
 def outside(monkeypatch):
     """The catalogue with effects that no fit is told of."""
     own = {c.name: c() for c in (Tanh, SignedSquare, Integral, *OTHERS)}
-    inside = effects.get
-    monkeypatch.setattr(effects, "get", lambda name: own.get(name) or inside(name))
+    inside = catalogue.get
+    monkeypatch.setattr(catalogue, "get", lambda name: own.get(name) or inside(name))
 
 
 def hidden(name):
@@ -226,3 +225,40 @@ def test_the_level_is_not_as_uncertain_as_the_thermometer_is_noisy():
     """A few draws: ± 0.4 px is the field's share; 2.8 px was stated for 0.1 K of noise."""
     spread = np.sqrt(np.mean(level_pulls(4, 40)[:, :3] ** 2))
     assert 0.5 < spread < 1.6
+
+
+def short(seed, name, effects, epochs, power=9.0):
+    whole = simulated(seed, name, listed=effects, power=power)
+    return replace(whole, programme=replace(whole.programme, epochs=epochs))
+
+
+def test_what_is_not_examined_is_not_called_valid(tmp_path):
+    """Below 30 epochs: a third state, what is left beside the noise, no band where that is much."""
+    lag = ModelEffect("thermal_lag", {"tau": 60.0})
+    for effects, sound in (((), True), ((lag,), False)):
+        s = short(5, "M1", effects, 25)
+        s.write(tmp_path / f"{sound}")
+        model = tmp_path / f"{sound}.yaml"
+        out = tmp_path / f"{sound}.json"
+        fitted = run("fit", tmp_path / f"{sound}", "-o", model, "--json", out).stdout
+        said = run("predict", "--model", model, "--temperature", "30").stderr
+        document = json.loads(out.read_text())
+        assert document["effect_missing"] is None
+        assert document["not_examined"] == "fewer than 30 epochs"
+        assert "not examined" in fitted
+        assert "not examined" in said
+        assert "valid from" not in fitted
+        assert (document["left_over_in_noise"] < 1.1) == sound
+        assert document["band"] == sound
+        assert ("no 95 % band" in fitted) != sound
+        for n in ("c", "x0", "y0"):
+            rate = document["rates"][n]
+            assert abs(rate["value"] - s.model.rates[n]) < (3 if sound else 5) * rate["sd"], n
+
+
+def test_short_series_are_examined_together():
+    lag = ModelEffect("thermal_lag", {"tau": 60.0})
+    for effects, missing in (((), False), ((lag,), True)):
+        series = [reduced(short(k, f"M{k}", effects, 20, 9.0 - k)) for k in (1, 2)]
+        assert fit_thermal_model(series, []).missing.found is missing
+        assert fit_thermal_model(series[:1], []).missing.found is None

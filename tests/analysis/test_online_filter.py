@@ -17,8 +17,7 @@ from thermocald.photogrammetry.camera.camera_model import (
 )
 from thermocald.photogrammetry.epoch.adjustment import adjust
 from thermocald.photogrammetry.field.testfield import Observations, TestField
-from thermocald.simulation.demonstration import demonstration_model
-from thermocald.simulation.testfields import corner_field
+from thermocald.physics.testfields import corner_field, demonstration_model
 
 RATES = np.array([2.0e-4, -4.5e-4, -3.0e-4])
 

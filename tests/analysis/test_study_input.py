@@ -8,9 +8,9 @@ import pytest
 from thermocald.analysis.study.input import load_series
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
-from thermocald.simulation.presets import preset_simulation
-from thermocald.store.database.row import EpochResult
+from thermocald.physics.presets import preset_simulation
 from thermocald.store.database.store import Store
+from thermocald.store.series import EpochResult
 
 FREE = ("c", "x0", "y0", "A1", "A2", "B1", "B2")
 

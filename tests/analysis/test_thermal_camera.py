@@ -11,13 +11,14 @@ import pytest
 
 from benchmarks.thermal_model import undistorting
 from thermocald.analysis.camera.undistortion import ideal_points
-from thermocald.analysis.thermal.thermal_camera import ExtrapolationWarning, ThermalCamera
+from thermocald.analysis.thermal.thermal_camera import ThermalCamera
+from thermocald.analysis.thermal.validity import ExtrapolationWarning
 from thermocald.analysis.thermal.warm_up import warm_up
 from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor, rays
-from thermocald.simulation.demonstration import demonstration_field, demonstration_model
-from thermocald.simulation.model import ModelEffect
-from thermocald.simulation.model_file import write_model
+from thermocald.physics.model import ModelEffect
+from thermocald.physics.model_file import write_model
+from thermocald.physics.testfields import demonstration_field, demonstration_model
 
 
 def thermal_model(*listed):

@@ -60,7 +60,7 @@ def test_a_camera_that_heats_and_cools_is_told_by_its_range(warm_up):
     camera = study_camera("rpi", [cycle], StudySettings(sets=500))
     change = camera.series[0].deviations
     assert change["c"].range > 0.006
-    text = summary(camera)[0]
+    text = summary(camera)[1]
     assert "did not change" not in text
     assert "the principal distance grew by up to" in text
     assert "ended where it started" in text

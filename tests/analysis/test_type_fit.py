@@ -14,13 +14,13 @@ from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.analysis.thermal.type_model import fit_with_type, type_model, weight_of_type
 from thermocald.cli import application
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation
-from thermocald.reduction.reduce import reduce_series
-from thermocald.reduction.source import epochs_input, series_input
-from thermocald.simulation.course import Course
-from thermocald.simulation.model import ModelEffect, ThermalModel
-from thermocald.simulation.model_file import read_model, write_model
-from thermocald.simulation.presets import preset_simulation
+from thermocald.physics.heat import Course
+from thermocald.physics.model import ModelEffect, ThermalModel
+from thermocald.physics.model_file import read_model, write_model
+from thermocald.physics.presets import preset_simulation
 from thermocald.store.recording.reader import open_recording
+from thermocald.thermal.reduce import reduce_series
+from thermocald.thermal.source import epochs_input, series_input
 
 RATES = {"c": (3.0e-4, 5e-5), "x0": (-4.0e-4, 8e-5), "y0": (2.0e-4, 5e-5)}  # mean, scatter
 TAU = (80.0, 10.0)
@@ -202,9 +202,11 @@ def test_the_command_says_what_is_the_types(world, tmp_path):
 
 def test_a_type_that_is_none_is_said(tmp_path):
     def error(*arguments):
-        return CliRunner().invoke(application(), ["fit", "M1", "-o", "m", *map(str, arguments)])
+        command = ["fit", str(tmp_path / "M1"), "-o", "m", *map(str, arguments)]
+        return CliRunner().invoke(application(), command)
 
     assert "no such file" in str(error("--type", tmp_path / "type.yaml").exception)
+    preset_simulation("rpi-v2.1-heating", 3).write(tmp_path / "M1")
     rng = np.random.default_rng(1)
     sensor = preset_simulation("rpi-v2.1-heating", 3).model.sensor
     write_model(tmp_path / "one.yaml", specimen(rng, sensor, "one"))

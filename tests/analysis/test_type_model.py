@@ -10,7 +10,7 @@ import pytest
 from thermocald.analysis.thermal.type_model import odd_cameras, shrunk_to_type, type_model
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
-from thermocald.simulation.model import ModelEffect, ThermalModel
+from thermocald.physics.model import ModelEffect, ThermalModel
 
 NAMES = ("interior.c", "rates.c", "rates.x0", "thermal_lag.tau")
 TYPE = np.array([3.04, 3.0e-4, -4.0e-4, 80.0])

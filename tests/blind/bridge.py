@@ -9,7 +9,7 @@ from tests.blind.generator import Series
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.series.normals import ObservationGrid
-from thermocald.reduction.series import SeriesInput
+from thermocald.thermal.series import SeriesInput
 
 
 def series_input(series: Series) -> SeriesInput:

@@ -26,8 +26,8 @@ from tests.blind.case import OUTSIDE, SINGLE, Case
 from tests.blind.generator import generate
 from tests.blind.outcome import Outcome
 from tests.blind.tables import row, write
-from thermocald.discovery.verdict.result import Discovery, discover_series
-from thermocald.reduction.reduce import reduce_series
+from thermocald.discovery.result import Discovery, discover_series
+from thermocald.thermal.reduce import reduce_series
 
 NUMBERS = {
     "thermal_lag": ("tau",), "time_offset": ("d",), "hysteresis": ("half_width",),

@@ -44,19 +44,19 @@ def row(part: str, outcomes: list[Outcome]) -> str:
             f"{s['median_s']:.2f} |")  # fmt: skip
 
 
-def confusion(outcomes: list[Outcome]) -> str:
-    """Rows: what was hidden; columns: what was said."""
-    rows: dict[str, Counter[str]] = {}
-    for o in outcomes:
-        rows.setdefault("+".join(o.case.effects) or "none", Counter())[
-            "+".join(o.found) or "none"
-        ] += 1
-    said = sorted({c for r in rows.values() for c in r})
-    lines = ["| hidden | right | said instead |", "|---|---|---|"]
-    for name in rows:
-        own = "unnamed" if name == OUTSIDE else "+".join(sorted(name.split("+")))
-        wrong = ", ".join(f"{c} × {rows[name][c]}" for c in said if rows[name][c] and c != own)
-        lines.append(f"| `{name}` | {rows[name][own]} of {rows[name].total()} | {wrong} |")
+def confusion(found: dict[str, list[Outcome]]) -> str:
+    """What was said instead of what was hidden: a line for each name that was not right."""
+    lines = ["| part | hidden | right | said instead |", "|---|---|---|---|"]
+    for part, outcomes in found.items():
+        rows: dict[str, Counter[str]] = {}
+        for o in outcomes:
+            name = "+".join(o.case.effects) or "none"
+            rows.setdefault(name, Counter())["+".join(o.found) or "none"] += 1
+        for name, said in rows.items():
+            own = "unnamed" if name == OUTSIDE else "+".join(sorted(name.split("+")))
+            wrong = ", ".join(f"{c} × {n}" for c, n in sorted(said.items()) if c != own)
+            if wrong:
+                lines.append(f"| {part} | `{name}` | {said[own]} of {said.total()} | {wrong} |")
     return "\n".join(lines)
 
 
@@ -128,7 +128,6 @@ def write(
     note = "Not all of its cases have been run yet: the table says how many.\n" if partly else ""
     power_figure(found, path.with_name(FIGURE))
     parts = "\n".join(row(p, o) for p, o in found.items())
-    matrices = "\n\n".join(f"## {p}\n\n{confusion(o)}" for p, o in found.items())
     before = path.read_text(encoding="utf-8") if path.exists() else ""
     kept = before[before.index(REAL) :] if REAL in before else ""  # scored by another command
     path.write_text(
@@ -158,7 +157,11 @@ Bars: 68 % limits of the share.
 
 {power_table(found)}
 
-{matrices}
+## What was said instead
+
+All names that are not in this table were right.
+
+{confusion(found)}
 
 {kept}""".rstrip()
         + "\n",

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
 import pytest
 
+from tests.commands import call
 from thermocald.cli import _called
-from thermocald.cli.commands import COMMANDS, GROUPS, command, group
+from thermocald.cli.commands import COMMANDS, PANELS, command, group
 
 _SAY = """
 import sys
@@ -21,6 +23,9 @@ except SystemExit:
 """
 
 
+_MODULES = {f"thermocald.cli.{entry.module}" for entry in COMMANDS.values()}
+
+
 @pytest.mark.parametrize("words", [["run", "--help"], ["-v", "run", "--help"]])
 def test_the_others_are_not_imported(words):
     done = subprocess.run(
@@ -28,8 +33,47 @@ def test_the_others_are_not_imported(words):
     )
     assert "--hang-after" in done.stdout
     imported = set(done.stdout.splitlines()[-1].split("|"))
-    commands = {f"thermocald.cli.{module}" for module in {*COMMANDS.values(), *GROUPS}}
-    assert imported & commands == {"thermocald.cli.run"}
+    assert imported & _MODULES == {"thermocald.cli.run"}
+
+
+def test_the_list_imports_none_and_cuts_no_line_off():
+    """Groups in the order of work; every line whole at 80 columns."""
+    done = subprocess.run(
+        [sys.executable, "-c", _SAY, "--help"], capture_output=True, text=True, check=True,
+        env={**os.environ, "COLUMNS": "80"},
+    )  # fmt: skip
+    *lines, modules = done.stdout.splitlines()
+    assert not set(modules.split("|")) & {*_MODULES, "numpy"}
+    assert max(map(len, lines)) <= 80
+    assert [line[:-1] for line in lines if line.rstrip(":") in PANELS] == list(PANELS)
+    for name, entry in COMMANDS.items():
+        assert f"  {name:<9}  {entry.line}" in lines, name
+
+
+@pytest.mark.parametrize(
+    ("typed", "expected"),
+    [
+        ("thermocald st", ["status", "study"]),
+        ("thermocald replay --ex", ["--exterior"]),
+        ("thermocald testfield su", ["survey"]),
+    ],
+)
+def test_a_shell_completes_commands_and_options(typed, expected):
+    words = {"COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" "))}
+    done = subprocess.run(
+        [sys.executable, "-m", "thermocald"], capture_output=True, text=True, check=True,
+        env={**os.environ, "_THERMOCALD_COMPLETE": "complete_bash", **words},
+    )  # fmt: skip
+    assert done.stdout.split() == expected
+
+
+def test_options_for_experts_stand_apart():
+    """Below what everybody needs, and none of them is lost."""
+    text = call("study", "--help").stdout
+    usual, advanced = text.split("Advanced:")
+    assert "--report" in usual
+    assert "--window" in advanced
+    assert "--window" not in usual
 
 
 @pytest.mark.parametrize(
@@ -37,10 +81,10 @@ def test_the_others_are_not_imported(words):
     [
         (["study", "x.db"], "study"),
         (["--verbose", "testfield", "print"], "testfield"),
-        (["--help", "study"], None),
-        (["--version"], None),
-        (["stduy"], None),
-        ([], None),
+        (["--help", "study"], ""),
+        (["--version"], ""),
+        (["stduy"], ""),
+        ([], ""),
     ],
 )
 def test_the_called_one(words, called):
@@ -48,7 +92,8 @@ def test_the_called_one(words, called):
 
 
 def test_every_word_has_its_function():
-    for name in COMMANDS:
-        assert (command(name).__doc__ or "").strip(), name
-    for name in GROUPS:
-        assert group(name).registered_commands, name
+    for name, entry in COMMANDS.items():
+        if entry.group:
+            assert group(name).registered_commands, name
+        else:
+            assert (command(name).__doc__ or "").strip(), name

@@ -13,20 +13,20 @@ import numpy as np
 import pytest
 from gpiozero.pins.mock import MockFactory
 
-from thermocald.cli.run import mock_config
-from thermocald.cli.session_separate import Heating, separating
 from thermocald.config import parse_config
+from thermocald.daemon.given_config import mock_config
+from thermocald.daemon.separating import Heating, separating
 from thermocald.daemon.session import Session
 from thermocald.epoch import Epoch
 from thermocald.hal import VirtualClock, open_device
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.field.testfield import Observations
-from thermocald.simulation.demonstration import demonstration_field, demonstration_model
-from thermocald.simulation.history import History
-from thermocald.simulation.model import ModelEffect
-from thermocald.store.database.row import EpochResult
+from thermocald.physics.history import History
+from thermocald.physics.model import ModelEffect
+from thermocald.physics.testfields import demonstration_field, demonstration_model
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head
+from thermocald.store.series import EpochResult
 
 PIN, LIMIT_C, RATE, INTERVAL, EPOCHS = 17, 45.0, 2.0, 10.0, 180
 AMBIENT, RISE, TAU = 22.0, 35.0, 500.0
@@ -96,12 +96,9 @@ def test_the_loop_heats_within_the_limits_and_ends_when_separated(config, pin, h
     names = ",".join(ALTERNATIVES)
     heating = Heating(None, RATE, 0.8)
 
-    # a dry run plans the same and does nothing
-    assert separating(config, asked, names, None, heating, True) is None
-    assert "programme:" in capfd.readouterr().out
-    assert not config.store.path.exists()
-
-    session, watch = separating(config, asked, names, None, heating, False)
+    text, session, watch = separating(config, asked, names, None, heating, print)
+    assert "programme:" in text
+    assert not config.store.path.exists()  # a plan does nothing
     programme = [{"seconds": s.seconds, "hold_c": s.hold_c} for s in session.programme]
     clock, box, heated = VirtualClock(), Box(hidden), 0
     options = {"pin": PIN, "limit_c": LIMIT_C, "programme": programme, "channel": "housing"}

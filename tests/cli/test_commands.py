@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -13,7 +14,8 @@ import cv2
 import pytest
 
 from tests.commands import call
-from thermocald.simulation.presets import preset_simulation
+from thermocald.cli.commands import COMMANDS
+from thermocald.physics.presets import preset_simulation
 from thermocald.store.database.store import Store
 
 
@@ -89,6 +91,38 @@ def test_an_interrupted_replay_goes_on(recording, tmp_path):
     assert json.loads(run("check", store, "--json", "-").stdout)["series"][0]["last_epoch"] == 40
 
 
+@pytest.mark.parametrize("path", ["/proc/self/status", "/proc/1", "/sys", "/dev/null"])
+def test_the_system_s_files_are_nothing_to_check(path):
+    done = run("check", path)
+    assert done.returncode == 1
+    assert done.stderr.strip() == (
+        f"error: {path}: is the system's; give a recording, a config.yaml, or a store"
+    )
+
+
+def test_a_store_below_proc_is_not_sound(tmp_path):
+    (tmp_path / "config.yaml").write_text(
+        "store: {path: /proc/self/t.db}\nthermometers: [{name: a, driver: mock}]\n"
+    )
+    done = run("check", tmp_path / "config.yaml")
+    assert done.returncode == 2
+    assert "store.path: /proc/self/t.db: nothing can be kept there" in done.stderr
+
+
+def test_export_of_several_series_names_the_option(recording, tmp_path):
+    other = tmp_path / "M2"
+    shutil.copytree(recording, other)
+    head = (other / "recording.yaml").read_text()
+    (other / "recording.yaml").write_text(head.replace("series: M1", "series: M2"))
+    for folder in (recording, other):
+        assert run("replay", folder, "--store", tmp_path / "t.db").returncode == 0
+    done = run("export", tmp_path / "t.db")
+    assert done.returncode == 1
+    assert "several series fit" in done.stderr
+    assert "--series CAMERA/SERIES" in done.stderr
+    assert run("export", tmp_path / "t.db", "--series", "M2").returncode == 0
+
+
 def test_check_says_what_a_recording_is(recording):
     done = run("check", recording)
     assert done.returncode == 0
@@ -125,8 +159,8 @@ def test_wrong_use_is_one_line(recording, tmp_path, arguments, status, words):
 def test_photographs_of_markers_give_the_camera(tmp_path):
     """Three rendered photographs of a corner field: c, x0, y0 within 4 sd of the truth."""
     from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation
-    from thermocald.simulation.demonstration import demonstration_field, demonstration_model
-    from thermocald.simulation.scene import Scene
+    from thermocald.physics.scene import Scene
+    from thermocald.physics.testfields import demonstration_field, demonstration_model
     from thermocald.store.recording.testfield_file import write_testfield
 
     field = demonstration_field("markers")
@@ -201,16 +235,9 @@ def test_the_whole_demo_ends_with_the_hidden_effect(tmp_path):
 
 
 def test_every_command_has_help_with_an_example():
-    listed = run("--help").stdout.split("Commands:")[1]
-    names = [
-        line.split()[0] for line in listed.splitlines() if line.startswith("  ") and line.split()
-    ]
-    assert len(names) > 8
-    groups = {"testfield", "camera", "session"}
-    for name in names:
-        if name in groups or not name.isalpha():
-            continue
-        assert "Example" in run(name, "--help").stdout, name
+    for name, entry in COMMANDS.items():
+        if not entry.group:
+            assert "Example" in run(name, "--help").stdout, name
 
 
 def test_without_a_configuration_run_says_where_it_looked(tmp_path):

@@ -10,8 +10,9 @@ import yaml
 from typer.testing import CliRunner
 
 from tests.drivers.fakes.sysfs import Sysfs, w1_slave
-from thermocald.cli import devices
+from thermocald.cli.devices import devices as command
 from thermocald.config import parse_config
+from thermocald.daemon import probe as devices
 from thermocald.errors import ConfigurationError, DeviceError
 from thermocald.hal import load_driver, option_names
 
@@ -49,7 +50,7 @@ def sysfs(tmp_path, monkeypatch):
 def test_what_is_attached_can_be_written_as_it_is_shown(sysfs):
     found, notes = devices.attached()
     assert notes == []
-    text = "\n".join(devices._stanzas(found))
+    text = "\n".join(devices.stanzas(found))
     stanzas = yaml.safe_load(text)
     assert [(t["driver"], t.get("chip") or t.get("zone")) for t in stanzas["thermometers"]] == [
         ("hwmon", "1-0048"),
@@ -67,7 +68,7 @@ def test_what_is_attached_can_be_written_as_it_is_shown(sysfs):
 
 def test_the_command(sysfs, tmp_path):
     app = typer.Typer()
-    app.command("devices")(devices.devices)
+    app.command("devices")(command)
     app.callback()(lambda: None)
     out = tmp_path / "devices.json"
     result = CliRunner().invoke(app, ["devices", "--json", str(out)])

@@ -198,7 +198,7 @@ def test_a_phone_before_the_printed_corner_shows_the_drift(corner, monkeypatch):
                    "sensor": {"width_px": SENSOR.width, "height_px": SENSOR.height,
                               "pixel_pitch_mm": SENSOR.pixel_pitch}}  # fmt: skip
         thermometer |= mine
-        (place / "config.yaml").write_text(yaml.safe_dump(config))
+        (place / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
         monkeypatch.chdir(place)
         run("check", "config.yaml", "--probe")
         phone.taken = 0
@@ -270,14 +270,21 @@ def test_the_owner_of_a_board_finds_the_drift_between_cold_and_warm(tmp_path, ki
     (tmp_path / "camera.yaml").write_text(
         "name: rpi\nwidth: 1640\nheight: 1232\npixel_pitch: 0.00224\nprincipal_distance: 3.04\n"
     )
-    found = []
+    found, inputs = [], []
     for folder in board_photographs(tmp_path, sheet, field, kind, (20.0, 50.0)):
         told = run(
             "calibrate", *sorted(folder.glob("*.png")), "--testfield", tmp_path / "board.csv",
             "--camera", tmp_path / "camera.yaml", "--json", "-",
         )  # fmt: skip
         found.append(json.loads(told.stdout))
+        temperature = folder.name.rpartition("-")[2]
+        folder.with_suffix(".json").write_text(told.stdout)
+        inputs.append(f"{temperature}={folder.with_suffix('.json')}")
     cold, hot = found
+    fitted = run("fit", *inputs, "-o", tmp_path / "camera.thermal.yaml", "--json", "-")
+    for name, rate in json.loads(fitted.stdout)["rates"].items():
+        expected = {"c": RATE_C, "x0": RATE_X0, "y0": 0.0}[name]
+        assert abs(rate["value"] - expected) < max(4 * rate["sd"], 5e-5 / 30), name
     assert cold["status"] == hot["status"] == "ok"
     for name, rate in (("c", RATE_C), ("x0", RATE_X0), ("y0", 0.0)):
         drift = hot["interior"][name] - cold["interior"][name]

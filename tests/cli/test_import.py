@@ -78,6 +78,41 @@ def test_photographs_and_a_german_log_become_a_recording(place):
     assert all(e.frame.read_bytes() for e in recording.epochs)
 
 
+def test_every_reading_of_the_log_is_kept(place):
+    """Nine readings of six photographs; what analyses read lies between the photographs too."""
+    from thermocald.thermal.source import series_input
+
+    run(*arguments(place, "--timezone", "Europe/Berlin"))
+    columns = read_recording(place / "M1").columns
+    expected = [START - 10, *(START + 15 * i for i in range(8))]
+    assert columns.readings.times.tolist() == expected
+    assert columns.readings.channels["Temperatur °C"].tolist() == [
+        20.5, *(21 + 0.25 * i for i in range(8))
+    ]  # fmt: skip
+    (place / "M1" / "observations.csv").write_text(
+        "epoch,target,x,y,sx,sy\n" + "".join(f"{e},T0,9,9,1,1\n" for e in range(1, 7))
+    )
+    source = series_input(read_recording(place / "M1"))
+    assert len(source.frame_times) == 6
+    within = [t for t in expected if t <= START + 0.25 + 50 + 15]
+    assert source.reading_times.tolist() == within
+    (place / "M1" / "readings.csv").write_text("time,Temperatur °C\n5,20\n4,20\n")
+    with pytest.raises(ThermocaldError, match=r"readings\.csv, line 3, column time: times must"):
+        read_recording(place / "M1")
+
+
+def test_the_photographs_settle_day_and_month_and_footers_are_passed_over(place):
+    rows = "".join(f"{14}/06/2026 12:0{i}:00,2{i}.5\n" for i in range(2))
+    rows = rows.replace("14/06", "06/07") + "Average,21.0\n"
+    (place / "log.csv").write_text("Time,Celsius\n" + rows)
+    for i in range(6):
+        photograph(place / "photos" / f"{i}.jpg", f"2026:07:06 12:00:{10 * i:02d}")
+    result = run(*arguments(place, "--timezone", "Europe/Berlin"))
+    assert result.exit_code == 0, result.output
+    assert "'06/07/2026 12:00:00' is day/month: so it lies next to the photographs" in result.stderr
+    assert "1 rows hold no time: left out (line 4: 'Average')" in result.stderr
+
+
 def test_a_dry_run_shows_all_and_writes_nothing(place):
     before = sorted(place.iterdir())
     result = run(place / "photos", "--log", place / "log.csv", "--timezone", "Europe/Berlin",
@@ -141,8 +176,9 @@ def test_times_from_names(place):
 @pytest.mark.parametrize("zone", [None, "UTC", "Europe/Berlin"])
 def test_correct_and_predict_take_no_time_for_utc_that_does_not_say_so(tmp_path, zone):
     """The readers that both commands use for their --log and for the points."""
-    from thermocald.analysis.thermal.temperature_log import read_rows, read_temperature_log
-    from thermocald.cli.options import device_clock
+    from thermocald.analysis.thermal.timed_rows import row_blocks
+    from thermocald.store.logger.clock import device_clock
+    from thermocald.store.logger.temperatures import LogOptions, read_log
 
     ours, foreign = tmp_path / "ours.csv", tmp_path / "foreign.csv"
     ours.write_text("time,housing\n2026-06-14 12:00:00,21.5\n2026-06-14 12:01:00,21.6\n")
@@ -152,24 +188,25 @@ def test_correct_and_predict_take_no_time_for_utc_that_does_not_say_so(tmp_path,
     if zone is None:
         for path in (ours, foreign):
             with pytest.raises(ThermocaldError, match=r"has no time zone.*--timezone"):
-                read_temperature_log(path, clock=clock)
+                read_log(path, LogOptions(clock=clock))
         with pytest.raises(ThermocaldError, match=r"points\.csv, line 2.*--timezone"):
-            read_rows(tmp_path / "points.csv", ("time", "x", "y"), clock)
+            next(row_blocks(tmp_path / "points.csv", ("x", "y"), clock))
         return
     first = START + (7200 if zone == "UTC" else 0)
     for path in (ours, foreign):
-        log = read_temperature_log(path, clock=clock)
+        log = read_log(path, LogOptions(clock=clock))
         assert log.times.tolist() == [first, first + 60]
-    _, _, numbers = read_rows(tmp_path / "points.csv", ("time", "x", "y"), clock)
-    assert numbers.tolist() == [[first + 30, 5, 6]]
+    block = next(row_blocks(tmp_path / "points.csv", ("x", "y"), clock))
+    assert block.times.tolist() == [first + 30]
+    assert block.values.tolist() == [[5, 6]]
 
 
 def test_kelvin_in_a_log_is_refused_with_the_remedy(tmp_path):
-    from thermocald.analysis.thermal.temperature_log import read_temperature_log
+    from thermocald.store.logger.temperatures import read_log
 
     (tmp_path / "log.csv").write_text("time,housing\n1,294.5\n2,294.6\n")
-    with pytest.raises(ThermocaldError, match=r"kelvin.*subtract 273\.15"):
-        read_temperature_log(tmp_path / "log.csv")
+    with pytest.raises(ThermocaldError, match=r"294\.5 looks like kelvin: say --unit K"):
+        read_log(tmp_path / "log.csv")
 
 
 def test_the_readme_leads_to_a_plot_in_ten_commands():

@@ -6,7 +6,10 @@ Every registered command with an option that names an output is here: a new one 
 from __future__ import annotations
 
 import ctypes
+import os
 import shutil
+import socket
+import stat
 import subprocess
 import sys
 from contextlib import ExitStack, contextmanager, suppress
@@ -14,6 +17,7 @@ from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from string import Formatter
+from threading import Thread
 
 import cv2
 import numpy as np
@@ -22,13 +26,14 @@ import typer
 
 from tests.cli.test_import import photograph
 from tests.photogrammetry.network_cases import convergent_stations
-from thermocald.atomic_file import new_file
+from thermocald.atomic_file import new_file, write_text
 from thermocald.cli import application, main
 from thermocald.errors import OutputError
-from thermocald.output import camera_files
+from thermocald.photogrammetry import camera_files
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
-from thermocald.simulation.presets import preset_simulation
-from thermocald.simulation.scene import Scene
+from thermocald.physics.presets import preset_simulation
+from thermocald.physics.scene import Scene
+from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import open_recording
 from thermocald.store.recording.testfield_file import read_testfield
 
@@ -42,6 +47,7 @@ COMMANDS: dict[str, list[str]] = {
         "{photos}", "--testfield", "{field}", "--pixel-pitch", "0.00224", "--camera-out",
         "{to}/c.json",
     ],
+    "camera at": ["{model}", "--temperature", "30", "--to", "ros", "--out", "{to}/x"],
     "camera convert": ["{camera}", "--to", "ros", "--pixel-pitch", "0.001", "--out", "{to}/x"],
     "check": ["{M1}", "--json", "{to}/x.json"],
     "correct": [
@@ -276,6 +282,145 @@ def test_nothing_half_written_stays_however_it_ends(tmp_path, ending):
     assert (tmp_path / "x").read_text() == "before"
     if isinstance(ended.value, OutputError):
         assert ended.value.exit_status == 3
+
+
+# command → how it names a single file that it writes, {out}
+FILES: dict[str, list[str]] = {
+    "camera convert": [
+        "{camera}", "--to", "ros", "--pixel-pitch", "0.001", "--out", "{out}",
+    ],
+    "check": ["{M1}", "--json", "{out}"],
+    "export": ["{M1}", "--format", "csv", "--output", "{out}"],
+    "export as JSON": ["{M1}", "--format", "json", "--output", "{out}"],
+    "fit": ["{M1}", "--output", "{out}"],
+    "predict": ["--model", "{model}", "--temperature", "30", "--json", "{out}"],
+    "replay": ["{M1}", "--json", "{out}"],
+    "correct": [
+        "{points}", "--model", "{model}", "--log", "{M1}/epochs.csv", "--out", "{out}",
+    ],
+    "server dashboard": ["--output", "{out}"],
+    "testfield import": ["--chessboard", "9x6", "--square", "30", "--out", "{out}", "--force"],
+    "devices": ["--json", "{out}"],
+}  # fmt: skip
+QUICK_FILES = ["camera convert", "check", "server dashboard", "testfield import", "devices"]
+
+
+def written_to(world, monkeypatch, capsys, name: str, out: Path) -> tuple[int, str]:
+    fields = {field for part in FILES[name] for _, field, _, _ in Formatter().parse(part)}
+    values = {field: str(world[field]) for field in fields - {None, "out"}}
+    capsys.readouterr()
+    arguments = [part.format(**values, out=out) for part in FILES[name]]
+    return call_main(monkeypatch, capsys, *name.split(" as ")[0].split(), *arguments)
+
+
+def call_main(monkeypatch, capsys, *arguments: str) -> tuple[int, str]:
+    monkeypatch.setattr(sys, "argv", ["thermocald", *arguments])
+    try:
+        main()
+    except SystemExit as ended:
+        return int(ended.code or 0), capsys.readouterr().err
+    return 0, capsys.readouterr().err
+
+
+def read_pipe(path: Path) -> tuple[Thread, list[bytes]]:
+    found: list[bytes] = []
+    thread = Thread(target=lambda: found.append(path.read_bytes()), daemon=True)
+    thread.start()
+    return thread, found
+
+
+@pytest.mark.parametrize("kind", ["device", "pipe", "link", "dangling", "link to pipe", "folder"])
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=() if name in QUICK_FILES else pytest.mark.slow) for name in FILES],
+)
+def test_what_is_not_a_file_is_never_replaced(world, monkeypatch, capsys, tmp_path, name, kind):
+    out, target = tmp_path / "out", tmp_path / "folder/target.yaml"
+    target.parent.mkdir()
+    reader, found = None, [b""]
+    if kind == "device":
+        try:
+            os.mknod(out, 0o666 | stat.S_IFCHR, os.makedev(1, 3))
+        except PermissionError:
+            pytest.skip("no device can be made here")
+    elif kind == "folder":
+        out.mkdir()
+    elif "pipe" in kind:
+        os.mkfifo(target)
+        out = out if kind.startswith("link") else target
+        reader, found = read_pipe(target)
+    if "link" in kind or kind == "dangling":
+        if kind == "link":
+            target.write_text("before")
+        out.symlink_to(target)
+    before = out.lstat().st_ino, stat.S_IFMT(out.lstat().st_mode)
+    code, said = written_to(world, monkeypatch, capsys, name, out)
+    assert "Traceback" not in said
+    assert (out.lstat().st_ino, stat.S_IFMT(out.lstat().st_mode)) == before
+    if kind == "folder":
+        assert code == 2
+        assert "cannot be written" in said or "is a folder" in said or "irectory" in said
+        assert not list(out.iterdir())
+        return
+    assert code == 0, said
+    if reader is not None:
+        reader.join(30.0)
+        assert stat.S_ISFIFO(target.lstat().st_mode)
+    elif kind != "device":
+        found = [target.read_bytes()]
+        assert not target.is_symlink()
+    assert kind == "device" or len(found[0]) > 10
+    assert not [p for p in tmp_path.rglob("*") if "partial" in p.name]
+
+
+@pytest.mark.parametrize(
+    "kind", ["hard link", "mode", "planted link", "loop", "socket", "long name", "descriptor"]
+)
+def test_the_place_of_an_output_in_further_shapes(tmp_path, kind):
+    out, other = tmp_path / "out", tmp_path / "other"
+    if kind == "hard link":
+        other.write_text("other")
+        os.link(other, out)
+    elif kind == "mode":
+        out.write_text("before")
+        out.chmod(0o600)
+    elif kind == "planted link":  # somebody else's, under the name that we write to first
+        other.write_text("other")
+        (tmp_path / ".out.partial").symlink_to(other)
+    elif kind == "long name":
+        out = tmp_path / ("é" * 120)
+    if kind in ("loop", "socket"):
+        if kind == "loop":
+            out.symlink_to(out)
+        else:
+            server = socket.socket(socket.AF_UNIX)
+            server.bind(str(out))
+            server.close()
+        with pytest.raises(OutputError, match="cannot be written"):
+            write_text(out, "new")
+        assert out.is_symlink() or stat.S_ISSOCK(out.lstat().st_mode)
+        return
+    if kind == "descriptor":  # `>(command)` of a shell
+        reading, writing = os.pipe()
+        write_text(Path(f"/proc/self/fd/{writing}"), "new")
+        os.close(writing)
+        assert os.read(reading, 10) == b"new"
+        os.close(reading)
+        return
+    write_text(out, "new")
+    assert out.read_text() == "new"
+    assert stat.S_ISREG(out.lstat().st_mode)
+    if kind in ("hard link", "planted link"):
+        assert other.read_text() == "other"
+    if kind == "mode":
+        assert stat.S_IMODE(out.stat().st_mode) == 0o600
+
+
+def test_a_backup_does_not_replace_a_device(world, tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(OutputError, match="not a regular file"), Store.open(world.store) as store:
+        store.copy_to(tmp_path / "pipe")
+    assert stat.S_ISFIFO((tmp_path / "pipe").lstat().st_mode)
 
 
 def test_standard_output_on_a_full_disk_is_one_sentence(world):

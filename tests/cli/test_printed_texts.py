@@ -10,11 +10,11 @@ import pytest
 from typer.testing import CliRunner
 
 from thermocald.cli import application, common
-from thermocald.cli.session_progress import Progress
+from thermocald.daemon.desk import Progress
 from thermocald.errors import ThermocaldError
-from thermocald.output.figures.numbers import duration, with_sd
-from thermocald.simulation.presets import preset_simulation
-from thermocald.simulation.testfields import corner_field
+from thermocald.numbers import duration, with_sd
+from thermocald.physics.presets import preset_simulation
+from thermocald.physics.testfields import corner_field
 
 
 def run(*arguments, **environment):
@@ -98,7 +98,7 @@ def test_the_line_of_a_session_stays_one_line(monkeypatch):
     monkeypatch.setattr("sys.stderr", Wide())
     monkeypatch.setenv("COLUMNS", "80")
     sentence = "drifting 1.1085 ± 0.0015 px/min, ready in about 12.5667 ± 0.0067 min"
-    Progress(150).show({
+    Progress(150, print).show({
         "epoch": 1, "temperature": 25.0, "status": "ok", "c": 3.04, "sd_c": 0.000031,
         "sigma0": 1.0, "online": {"sentence": sentence},
     }, "")  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -134,3 +135,37 @@ def test_a_hand_held_board_is_called_weak(shared):
     assert result.status == "weak_geometry"
     assert result.reason
     assert not result.estimated
+
+
+def test_hand_held_photographs_of_a_chessboard(shared, tmp_path):
+    """Every photograph has its word and none ends the others; the camera is the one of the rest."""
+    folder = tmp_path / "photographs"
+    shutil.copytree(shared / "data" / "chessboard", folder)
+    images = {p.name: cv2.imread(str(p), cv2.IMREAD_GRAYSCALE) for p in sorted(folder.iterdir())}
+    opencv = [n for n, g in images.items() if cv2.findChessboardCornersSB(g, (9, 6))[0]]
+    y, x = np.mgrid[:720, :1280].astype(np.float32)
+    bent = cv2.remap(images["f240.jpg"], x + 25 * np.sin(y / 150), y, cv2.INTER_LINEAR)
+    cut = images["f090.jpg"].copy()
+    cut[:, :560] = 90
+    others = {
+        "a_turned": cv2.rotate(images["f090.jpg"], cv2.ROTATE_90_CLOCKWISE),
+        "b_upside_down": cv2.rotate(images["f090.jpg"], cv2.ROTATE_180),
+        "c_cut": cut,
+        "d_rolling_shutter": bent,
+        "e_nothing": np.full((720, 1280), 128, np.uint8),
+    }
+    for name, image in others.items():
+        cv2.imwrite(str(folder / f"{name}.jpg"), image)
+    (folder / "f_text.jpg").write_text("no image")
+    board = tmp_path / "board.csv"
+    run("testfield", "import", "--chessboard", "9x6", "--square", 25, "-o", board)
+    done = run("calibrate", folder, "--testfield", board, "--pixel-pitch", 0.003, "--json", "-")
+    assert done.returncode == 0, done.stderr
+    document = json.loads(done.stdout)
+    status = {p["image"].rsplit("/", 1)[1]: p["status"] for p in document["photographs"]}
+    assert sum(status[n] == "ok" for n in images) >= len(opencv) == 9
+    assert all(status[n] == "ok" for n in opencv)
+    assert 915 < document["interior"]["c"] / 0.003 < 975
+    words = ["wrong_size", "ok", "nothing_found", "large_residuals", "flat", "bad_image"]
+    assert [status[n] for n in sorted(status) if n[1] == "_"] == words
+    assert all(p["reason"] for p in document["photographs"] if p["status"] != "ok")

@@ -7,12 +7,12 @@ import yaml
 from typer.testing import CliRunner
 
 from thermocald.cli import application
-from thermocald.cli.run import mock_config
-from thermocald.cli.session_desk import take_on_the_desk
-from thermocald.cli.session_separate import Watch
 from thermocald.config import parse_config
+from thermocald.daemon.desk import take_on_the_desk
+from thermocald.daemon.given_config import mock_config
+from thermocald.daemon.separating import Watch
 from thermocald.daemon.session import Session
-from thermocald.discovery.separation import Separation
+from thermocald.discovery.experiment import Separation
 from thermocald.store.database.store import Store
 
 RELAY = {
@@ -88,8 +88,8 @@ def test_the_session_heats_and_ends_when_they_are_separated(config, tmp_path, mo
         programme=[{"seconds": 600.0, "hold_c": 44.0}],
     )  # fmt: skip
     seen, heated = [], []
-    monkeypatch.setattr("thermocald.cli.session_separate._FEWEST", 4)
-    watch = Watch(config.store.path, session, ("creep", "slip"), None)
+    monkeypatch.setattr("thermocald.daemon.separating._FEWEST", 4)
+    watch = Watch(config.store.path, session, ("creep", "slip"), None, print)
 
     def compared():
         with Store.open(config.store.path) as store:
@@ -98,7 +98,7 @@ def test_the_session_heats_and_ends_when_they_are_separated(config, tmp_path, mo
         return Separation("creep", "slip", 55.0, 14.0, True)
 
     monkeypatch.setattr(watch, "_compare", compared)
-    take_on_the_desk(config, session, watch)
+    take_on_the_desk(config, session, print, watch)
     watch.close()
 
     with Store.open(config.store.path) as store:

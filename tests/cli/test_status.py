@@ -25,7 +25,8 @@ def camera(**changes):
         "c": 3.040494087, "x0": 0.010896880, "y0": -0.0187439, "sd_c": 0.0003011,
         "sd_x0": 0.00050576, "sd_y0": 0.00049938, "drift_c_px": 0.3755, "sd_drift_c_px": 0.325,
         "drift_x0_px": -0.8287, "sd_drift_x0_px": 0.5458,
-        "online": {"sentence": Equilibrium("drifting", 1.1085, 0.0014757, 754.0, 0.4).sentence},
+        "online": {"sentence": Equilibrium("drifting", 1.1085, 0.0014757, 754.0, 0.4).sentence,
+                   "orientation": "the mount moves by 0.032 px about one orientation (101 epochs)"},
         **changes,
     }  # fmt: skip
     return {
@@ -39,7 +40,8 @@ def document():
     return {
         "version": "0.1.0", "pid": 30190, "utc": 1e9 + 95.0, "started": 1e9, "age_s": 0.4,
         "stalled": [], "sessions": {}, "clock": {"trusted": False}, "frames": {"paused": ""},
-        "store": {"state": "waiting", "why": f"{LONG}: database or disk is full", "waiting": 3},
+        "store": {"state": "waiting", "why": f"{LONG}: database or disk is full", "waiting": 3,
+                  "lost": 0},
         "cameras": {"pi-under-the-bridge": camera(), "a-phone-with-a-long-name": gone},
         "thermometers": {
             "housing": {"device": "open", "last": {"temperature": 27.5}, "faults": 0, "why": ""},
@@ -61,6 +63,7 @@ def test_status_fits_into_80_columns_and_breaks_no_path():
     assert "…" not in text
     assert "pi-under-the-bridge/watch: open, epoch 12345 at 27.44 °C" in lines
     assert "  c  3.04049 ± 0.00030 mm         moved 0.38 ± 0.33 px since the start" in lines
+    assert "  the mount moves by 0.032 px about one orientation (101 epochs)" in lines
     assert "for 2 minutes" in lines[0]
     assert "1 fault:" in text
 

@@ -9,7 +9,7 @@ import pytest
 
 from tests.commands import invoke
 from thermocald.errors import DataError, OutputError, ThermocaldError, UsageError
-from thermocald.simulation.presets import preset_simulation
+from thermocald.physics.presets import preset_simulation
 
 
 def written(path, seed):

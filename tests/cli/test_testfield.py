@@ -13,7 +13,7 @@ from tests.photogrammetry import network_cases as cases
 from thermocald.errors import ConfigurationError, GeometryError, ThermocaldError, UsageError
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.simulation.scene import Scene
+from thermocald.physics.scene import Scene
 from thermocald.store.recording.testfield_file import read_testfield
 
 
@@ -136,7 +136,7 @@ def test_survey_writes_the_field_and_everything_about_it(run, photographs, tmp_p
     )
     assert document["relative_accuracy"] < 1 / 20_000
     assert document["camera"]["c"] == pytest.approx(model.interior.c, rel=2e-4)
-    from thermocald.output import camera_files
+    from thermocald.photogrammetry import camera_files
 
     found = camera_files.read(camera_file)
     assert found.model.interior.c == document["camera"]["c"]
@@ -144,7 +144,7 @@ def test_survey_writes_the_field_and_everything_about_it(run, photographs, tmp_p
 
 
 def test_survey_with_a_known_camera_held(run, photographs, tmp_path):
-    from thermocald.output import camera_files
+    from thermocald.photogrammetry import camera_files
 
     folder, _, model, scale = photographs
     camera_files.write(model, tmp_path / "camera.xml", "metashape")
@@ -224,7 +224,7 @@ def test_check_json_from_a_place(run, photographs):
 
 def test_camera_convert(run, tmp_path):
     model = CameraModel(Sensor(640, 480, 0.003), InteriorOrientation(2.0, 0.01, 0.02, -1e-2))
-    from thermocald.output import camera_files
+    from thermocald.photogrammetry import camera_files
 
     camera_files.write(model, tmp_path / "a.cameramodel", "mrcal")
     result = run("camera", "convert", tmp_path / "a.cameramodel", "--to", "colmap", "--out",
@@ -241,11 +241,11 @@ def test_camera_convert(run, tmp_path):
         run("camera", "convert", tmp_path / "none.xml", "--to", "ros", "--out", tmp_path / "y")
 
 
-def test_a_turned_camera_does_not_turn_its_picture(tmp_path):
+def test_a_turned_camera_does_not_turn_itspicture_of(tmp_path):
     """The orientation that cameras write into EXIF says how to show a picture, not how the sensor
     saw it: OpenCV would turn it, and with it the principal point.
     """
-    from thermocald.cli.testfield_survey import _picture
+    from thermocald.photogrammetry.survey import picture_of
 
     grey = np.arange(48 * 64, dtype=np.uint32).reshape(48, 64) % 251
     encoded = cv2.imencode(".jpg", grey.astype(np.uint8))[1].tobytes()
@@ -255,4 +255,4 @@ def test_a_turned_camera_does_not_turn_its_picture(tmp_path):
     path = tmp_path / "turned.jpg"
     path.write_bytes(marked)
     assert cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).shape == (64, 48)  # the block is understood
-    assert _picture(path).load().shape == (48, 64)
+    assert picture_of(path).load().shape == (48, 64)

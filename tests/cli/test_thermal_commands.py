@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 
 import cv2
@@ -12,17 +14,16 @@ import yaml
 from typer.testing import CliRunner
 
 from thermocald.cli import application
-from thermocald.cli.camera_file import read_camera
 from thermocald.errors import ThermocaldError
-from thermocald.output import camera_files
+from thermocald.photogrammetry import camera_files
 from thermocald.photogrammetry.camera.camera_model import CameraModel, ExteriorOrientation, Sensor
-from thermocald.simulation.course import Course
-from thermocald.simulation.demonstration import demonstration_field, demonstration_model
-from thermocald.simulation.device import CameraDevice, default_heat
-from thermocald.simulation.model import ModelEffect
-from thermocald.simulation.observations import Simulation
-from thermocald.simulation.programme import Programme
-from thermocald.simulation.scene import Scene
+from thermocald.photogrammetry.camera_files.camera_file import read_camera
+from thermocald.physics.device import CameraDevice, Programme, default_heat
+from thermocald.physics.heat import Course
+from thermocald.physics.model import ModelEffect
+from thermocald.physics.scene import Scene
+from thermocald.physics.simulation import Simulation
+from thermocald.physics.testfields import demonstration_field, demonstration_model
 from thermocald.store.recording.testfield_file import write_testfield
 
 FORMATS = tuple(camera_files.FORMATS)
@@ -165,6 +166,24 @@ def test_a_model_is_tested_on_another_series(folder, series):
     assert 0.93 < found["coverage"] < 0.97
 
 
+def test_correct_takes_the_noise_of_the_thermometer_from_the_model(folder, tmp_path):
+    """What the fit found, not what thermometers usually have."""
+    times = np.loadtxt(folder / "M1" / "epochs.csv", delimiter=",", skiprows=1, usecols=1)
+    points = tmp_path / "points.csv"
+    points.write_text(f"time,x,y\n{times[20]:.3f},500,400\n")
+    model = yaml.safe_load((folder / "cam.yaml").read_text())
+    sds = []
+    for noise in (0.03, 0.3):
+        for one in model["fitted_on"]:
+            one["thermometer_sd_K"] = noise
+        (tmp_path / "cam.yaml").write_text(yaml.safe_dump(model, sort_keys=False))
+        done = run("correct", points, "--log", folder / "M1" / "epochs.csv",
+                   "--model", tmp_path / "cam.yaml", "--out", tmp_path / "out.csv")  # fmt: skip
+        assert done.exit_code == 0, done.exception
+        sds.append(float(np.genfromtxt(tmp_path / "out.csv", delimiter=",", names=True)["sd_x"]))
+    assert sds[1] > 5 * sds[0]
+
+
 # --- wrong use ---------------------------------------------------------------------------------
 
 
@@ -245,7 +264,8 @@ def test_the_model_s_own_thermometer_is_taken_from_a_log(folder, tmp_path):
 
     first = moved(folder / "M1" / "epochs.csv")
     assert moved(tmp_path / "log.csv") == pytest.approx(first, abs=1e-3)
-    assert abs(moved(tmp_path / "log.csv", "--column", "board_temperature") - first) > 0.1
+    other = moved(tmp_path / "log.csv", "--temperature-column", "board_temperature")
+    assert abs(other - first) > 0.1
 
 
 def test_binned_points_are_scaled(folder, tmp_path):
@@ -303,6 +323,91 @@ def test_images_are_corrected_and_said_how_much(folder, two_images):
 def test_images_are_never_overwritten(folder, two_images):
     result = correct_images(folder, two_images, two_images)
     assert "would be overwritten" in str(result.exception)
+
+
+@pytest.mark.parametrize("kind", ["jpg", "png"])
+def test_corrected_images_keep_what_exif_says(folder, tmp_path, kind):
+    """Of one that is unreadable the line is said; the other is corrected."""
+    image_module = pytest.importorskip("PIL.Image")
+    exif = image_module.Exif()
+    exif[0x0110] = "imx219"
+    exif.get_ifd(0x8769)[0x9003] = "2026:06:14 12:00:00"
+    grey = np.random.default_rng(1).integers(0, 255, (308, 410), np.uint8)
+    image_module.fromarray(grey).save(tmp_path / f"a.{kind}", exif=exif)
+    (tmp_path / f"b.{kind}").write_bytes(b"no picture")
+    times = np.loadtxt(folder / "M1" / "epochs.csv", delimiter=",", skiprows=1, usecols=1)
+    rows = f"{times[40]:.2f},b.{kind}\n{times[45]:.2f},a.{kind}\n"
+    (tmp_path / "i.csv").write_text(f"time,image\n{rows}")
+    result = run("correct", tmp_path / "i.csv", "--model", folder / "cam.yaml", "--log",
+                 folder / "M1" / "epochs.csv", "--size", "410x308", "--out", tmp_path / "out",
+                 "--json", "-")  # fmt: skip
+    assert "1 of 2 rows were not corrected: lines 2" in str(result.exception)
+    assert "is not a readable image" in json.loads(result.stdout)["refused"][0]["reason"]
+    with image_module.open(tmp_path / "out" / f"a.{kind}") as written:
+        told = written.getexif()
+        assert told[0x0110] == "imx219"
+        assert told.get_ifd(0x8769)[0x9003] == "2026:06:14 12:00:00"
+        assert np.asarray(written).shape == (308, 410)
+
+
+# --- rows that come in -------------------------------------------------------------------------
+
+
+def test_rows_of_standard_input_are_corrected_as_they_come(folder):
+    """Each is answered before the next is written; one that cannot be is named by its line."""
+    times = np.loadtxt(folder / "M1" / "epochs.csv", delimiter=",", skiprows=1, usecols=1)
+    command = [sys.executable, "-m", "thermocald", "correct", "-", "--model", folder / "cam.yaml",
+               "--log", folder / "M1" / "epochs.csv"]  # fmt: skip
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        bufsize=1,
+    ) as process:  # fmt: skip
+        assert process.stdin is not None
+        assert process.stdout is not None
+        answers = []
+        process.stdin.write(f"time,x,y,who\n{times[40]:.2f},500,400,a\n")
+        answers += [process.stdout.readline(), process.stdout.readline()]
+        for row in ("soon,500,400,b", f"{times[41]:.2f},9999,400,c", f"{times[41]:.2f},5",
+                    f"{times[-1] + 9e4:.2f},500,400,d"):  # fmt: skip
+            process.stdin.write(row + "\n")
+        process.stdin.write(f"{times[41]:.2f},600,400,e\n")
+        answers.append(process.stdout.readline())
+        process.stdin.close()
+        told = process.stderr.read()
+        assert process.stdout.read() == ""
+    assert process.returncode == 1
+    assert answers[0].startswith("time,x,y,who,dx,dy,sd_x")
+    assert [answer.split(",")[3] for answer in answers[1:]] == ["a", "e"]
+    for line, reason in ((3, "'soon' is not a time"), (4, "lies outside"), (5, "has 2 fields"),
+                         (6, "outside the temperature log")):  # fmt: skip
+        assert f"line {line}: not corrected: " in told
+        assert reason in told
+    assert "4 of 6 rows were not corrected: lines 3, 4, 5, 6" in told
+
+
+def test_a_file_and_standard_input_give_the_same(folder, tmp_path):
+    times = np.loadtxt(folder / "M1" / "epochs.csv", delimiter=",", skiprows=1, usecols=1)
+    points = "time,x,y\n" + "".join(f"{t:.2f},{500 + i},400\n" for i, t in enumerate(times))
+    (tmp_path / "p.csv").write_text(points)
+    told = ["--model", str(folder / "cam.yaml"), "--log", str(folder / "M1" / "epochs.csv")]
+    of_file = run("correct", tmp_path / "p.csv", *told)
+    piped = CliRunner().invoke(application(), ["correct", "-", *told], input=points)
+    assert piped.exit_code == 0, piped.exception
+    assert piped.stdout == of_file.stdout
+    assert len(piped.stdout.splitlines()) == len(times) + 1
+
+
+@pytest.mark.parametrize("head", ["temperature [degF]", "Temp (°F)", "T [F]", "tempF", "Temp_f"])
+def test_a_log_in_fahrenheit_is_converted_wherever_it_is_read(folder, tmp_path, head):
+    """`predict` as `correct`: the same camera as from the log in °C."""
+    for name, title, values in (("c", "temperature", (25.0, 30.0)), ("f", head, (77.0, 86.0))):
+        rows = "".join(f"2026-06-14 12:0{i}:00Z,{v}\n" for i, v in enumerate(values))
+        (tmp_path / f"{name}.csv").write_text(f"time,{title}\n{rows}")
+    found = [
+        json.loads(run("predict", "--model", folder / "cam.yaml", "--log", tmp_path / f"{n}.csv",
+                       "--json", "-").stdout)["rows"] for n in "cf"
+    ]  # fmt: skip
+    assert np.array(found[1]) == pytest.approx(np.array(found[0]), abs=1e-9)
 
 
 @pytest.mark.slow

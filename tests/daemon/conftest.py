@@ -21,9 +21,8 @@ from tests.daemon.forking import Forked, Forker
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import Sensor, project
 from thermocald.photogrammetry.field.testfield import Observations
-from thermocald.simulation.demonstration import demonstration_field, demonstration_model
-from thermocald.simulation.model_file import write_model
-from thermocald.simulation.testfields import corner_field
+from thermocald.physics.model_file import write_model
+from thermocald.physics.testfields import corner_field, demonstration_field, demonstration_model
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import Head
 from thermocald.store.recording.reader import CameraSpec, Channel, write_recording

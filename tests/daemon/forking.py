@@ -79,8 +79,7 @@ class Forked:
 
 def main() -> None:
     import thermocald_drivers.jsonl
-    import thermocald_drivers.mock_camera
-    import thermocald_drivers.mock_thermometer
+    import thermocald_drivers.mock
     import thermocald_drivers.replay  # noqa: F401
 
     import thermocald.analysis.online.observer

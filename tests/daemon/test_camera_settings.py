@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from thermocald.acquisition.link import Link
-from thermocald.acquisition.live_pipeline import AcquiredEpoch
+from thermocald.acquisition.pipeline import AcquiredEpoch
 from thermocald.config import parse_config
 from thermocald.daemon.camera_line import link_status
 from thermocald.daemon.epoch_keeper import EpochKeeper
@@ -19,8 +19,8 @@ from thermocald.epoch import Epoch
 from thermocald.errors import ConfigurationError
 from thermocald.hal import Camera, Frame, VirtualClock
 from thermocald.output.status_text import status_warnings
-from thermocald.store.database.row import EpochResult
 from thermocald.store.database.store import Store
+from thermocald.store.series import EpochResult
 
 CAMERA = {"name": "river", "driver": "v4l2", "device": "/dev/video0", "width": 64, "height": 48}
 
@@ -65,10 +65,10 @@ def test_a_setting_that_harms_is_in_the_status():
         def warnings(self):
             return ["focus: auto lets the camera focus by itself"]
 
-    link = Link("camera", "river", Focusing(), VirtualClock())
+    link = Link("camera", "river", Focusing(clock=VirtualClock()), VirtualClock())
     status = link_status(link, 0.0, 60.0)
     document = {
-        "stalled": [], "store": {"state": "ok"}, "frames": {"paused": ""},
+        "stalled": [], "store": {"state": "ok", "lost": 0}, "frames": {"paused": ""},
         "clock": {"trusted": True}, "thermometers": {}, "outputs": {},
         "cameras": {"river": {**status, "deferred": 0, "caught_up": 0}},
     }  # fmt: skip

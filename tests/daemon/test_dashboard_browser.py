@@ -31,7 +31,9 @@ def shown(daemon, devices):
     daemon.until(lambda: len(daemon.results()) > 5)
     daemon.until(lambda: _listens(port))
     yield f"http://127.0.0.1:{port}/"
-    daemon.stop()
+    if daemon.process.poll() is None:
+        daemon.stop()
+    assert "Traceback" not in daemon.log()  # a page was open when it ended
 
 
 def _listens(port: int) -> bool:
@@ -98,3 +100,14 @@ def test_the_death_of_the_page_does_not_touch_acquisition(daemon, shown):
     daemon.until(lambda: "it is started again" in daemon.log())
     numbers = [result["epoch"] for result in daemon.results()]
     assert numbers == list(range(1, len(numbers) + 1))
+
+
+def test_a_page_that_is_open_says_when_acquisition_ended(daemon, shown, page_of):
+    page = page_of(shown)
+    page.wait_for_function("() => document.querySelector('#figures dd') !== null", timeout=30000)
+    daemon.stop()
+    page.wait_for_function(
+        "() => document.querySelector('#connection').textContent"
+        ".startsWith('acquisition has ended: no daemon runs since 20')"
+    )
+    assert "what was stored is below" in page.text_content("#state")

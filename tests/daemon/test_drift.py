@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from thermocald.daemon.drift import START_EPOCHS, SeriesDrift
+from thermocald.daemon.camera_line import START_EPOCHS, SeriesDrift
 
 
 def rows(c, sd=1e-4, status="ok"):

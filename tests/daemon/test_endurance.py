@@ -76,8 +76,8 @@ def watched(daemon, run):
     return seen
 
 
-def test_a_daemon_that_waits_keeps_to_80_mb(daemon, replayed, tmp_path):
-    """With what its unit sets, between two epochs of 12 targets."""
+def test_a_daemon_that_waits_keeps_to_88_mb(daemon, replayed, tmp_path):
+    """With what its unit sets, between two epochs of 12 targets: 84 with replay's series in it."""
     unit = configparser.ConfigParser(strict=False, interpolation=None)
     unit.optionxform = str
     unit.read(ROOT / "systemd/thermocald.service")
@@ -95,7 +95,7 @@ def test_a_daemon_that_waits_keeps_to_80_mb(daemon, replayed, tmp_path):
     status = Path(f"/proc/{daemon.process.pid}/status").read_text()
     resident_mb = int(status.split("VmRSS:")[1].split()[0]) / 1024
     print(f"{resident_mb:.1f} MB resident")
-    assert resident_mb < 80.0
+    assert resident_mb < 88.0
     assert daemon.stop() == 0
 
 

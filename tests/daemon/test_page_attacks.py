@@ -17,9 +17,9 @@ from tests.daemon.conftest import ENVIRONMENT
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.store.database.row import EpochResult
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head
+from thermocald.store.series import EpochResult
 
 
 def free_port() -> int:

@@ -213,10 +213,10 @@ def test_a_programme_heats_during_the_session_and_not_after_it(daemon, devices, 
 def test_a_daemon_stops_heating_when_the_effects_are_separated(daemon, devices, live):
     """Planned and watched by the command, taken by the daemon; `test_closed_loop` compares."""
     pytest.importorskip("gpiozero")
-    from thermocald.cli.session import _take_in_the_daemon
-    from thermocald.cli.session_separate import Heating, separating
     from thermocald.config import parse_config
-    from thermocald.discovery.separation import Separation
+    from thermocald.daemon.desk import take_in_the_daemon
+    from thermocald.daemon.separating import Heating, separating
+    from thermocald.discovery.experiment import Separation
 
     sections = devices(period_s=0.3, name="phone-1")
     sections["outputs"] = [{"name": "lamp", "driver": "relay", "pin": 17, "limit_c": 60,
@@ -224,7 +224,10 @@ def test_a_daemon_stops_heating_when_the_effects_are_separated(daemon, devices, 
     daemon.configure(**sections)
     config = parse_config(yaml.safe_load(daemon.config.read_text()), daemon.config)
     asked = Session.model_validate({**SESSION, "epochs": 4000, "check": False})
-    session, watch = separating(config, asked, "creep,slip", None, Heating(40.0, 2.0, 0.8), False)
+    said: list[str] = []
+    _, session, watch = separating(
+        config, asked, "creep,slip", None, Heating(40.0, 2.0, 0.8), said.append
+    )
     assert max(s.hold_c for s in session.programme if s.hold_c) <= 40.0
     watch._store = daemon.store
     watch._compare = lambda: Separation("creep", "slip", 55.0, 14.0, True)
@@ -233,7 +236,7 @@ def test_a_daemon_stops_heating_when_the_effects_are_separated(daemon, devices, 
     daemon.start(GPIOZERO_PIN_FACTORY="mock")
     daemon.until(lambda: daemon.ask("session status") is not None)
 
-    _take_in_the_daemon(daemon.live, session, True, watch)
+    take_in_the_daemon(daemon.live, session, True, said.append, watch)
     watch.close()
 
     daemon.until(lambda: daemon.session()["state"] == "stopped")

@@ -13,15 +13,14 @@ import numpy as np
 import pytest
 
 from tests.daemon.conftest import ENVIRONMENT
-from thermocald.daemon.followed_store import FollowedStore
-from thermocald.daemon.store_guard import Row, StoreGuard
+from thermocald.daemon.store_guard import FollowedStore, Row, StoreGuard
 from thermocald.epoch import Epoch
 from thermocald.errors import StoreError
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.store.database.row import EpochResult
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head
+from thermocald.store.series import EpochResult
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ import time
 import pytest
 
 from tests.daemon.conftest import ENVIRONMENT
-from thermocald.daemon.journal import JournalHandler
+from thermocald.daemon.systemd import JournalHandler
 
 
 class Journal:
@@ -106,7 +106,7 @@ def test_the_daemon_tells_the_journal_what_a_device_did(daemon, devices, monkeyp
     sections = devices(camera=[{"kind": "unplugged", "at": 3, "for_s": 0.5}])
     daemon.configure(**sections)
     script = (
-        "import sys, thermocald.daemon.journal as j; "
+        "import sys, thermocald.daemon.systemd as j; "
         f"j._SOCKET = {journal.path!r}; j.JournalHandler.__init__.__defaults__ = (j._SOCKET,); "
         f"sys.argv = ['thermocald', 'run', '--config', {str(daemon.config)!r}]; "
         "from thermocald.cli import main; main()"

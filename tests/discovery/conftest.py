@@ -11,7 +11,7 @@ import pytest
 from tests.blind.bridge import series_input
 from tests.blind.case import Case
 from tests.blind.generator import generate
-from thermocald.reduction.reduce import reduce_together
+from thermocald.thermal.reduce import reduce_together
 
 
 @pytest.fixture

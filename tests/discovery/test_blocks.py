@@ -7,11 +7,11 @@ from datetime import UTC, datetime
 
 import pytest
 
-from thermocald.discovery.search import examination
-from thermocald.discovery.verdict.misfit import resolve
-from thermocald.discovery.verdict.result import discover_series
-from thermocald.output.discovery.report import report_html
-from thermocald.reduction.blocks import in_blocks
+from thermocald.discovery import examination
+from thermocald.discovery.result import discover_series
+from thermocald.discovery.unnamed import resolve
+from thermocald.output.discovery import report_html
+from thermocald.thermal.series import in_blocks
 
 
 @pytest.fixture
@@ -32,9 +32,9 @@ def test_an_effect_in_a_long_series(short_blocks, evidence_of):
     assert "Made on 2026-06-14 at 12:30 UTC with thermocald" in page
     source = evidence[0].source
     assert f"{source.camera}, {source.sensor.width} × {source.sensor.height} px of" in page
-    links, heads = re.findall(r"href='#(s\d+)'", page), re.findall(r"id='(s\d+)'", page)
-    assert links == heads
-    assert len(heads) >= 5
+    links = re.findall(r'href="#(chapter-1-\d)"', page)
+    assert links == re.findall(r'<details id="(chapter-1-\d)"', page)
+    assert len(links) >= 4
 
 
 def test_what_is_unexplained_in_a_long_series(short_blocks, evidence_of):

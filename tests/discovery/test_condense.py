@@ -9,8 +9,8 @@ from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.series.blocks import GridBlocks
 from thermocald.photogrammetry.series.normals import ObservationGrid
-from thermocald.reduction.condense import condensed
-from thermocald.reduction.series import SeriesInput
+from thermocald.thermal.series import SeriesInput
+from thermocald.thermal.source import condensed
 
 E, T = 7200, 9
 SIGMA = 0.05

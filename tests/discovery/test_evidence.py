@@ -11,10 +11,10 @@ from tests.blind.bridge import series_input
 from tests.blind.case import Case
 from tests.blind.generator import generate
 from thermocald.errors import DataError
-from thermocald.reduction.blocks import in_blocks
-from thermocald.reduction.fit import HypothesisFitter
-from thermocald.reduction.hypothesis import Term
-from thermocald.reduction.reduce import reduce_series
+from thermocald.thermal.fit import HypothesisFitter
+from thermocald.thermal.hypothesis import Term
+from thermocald.thermal.reduce import reduce_series
+from thermocald.thermal.series import in_blocks
 
 
 @pytest.fixture

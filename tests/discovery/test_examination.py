@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermocald.discovery.evidence.image_space import displaced_targets
-from thermocald.discovery.search.search import Search
-from thermocald.discovery.search.surrogates import surrogate_test
-from thermocald.discovery.verdict.result import discover_series
-from thermocald.output.discovery.report import report_html
-from thermocald.reduction.blocks import in_blocks
-from thermocald.reduction.fit import HypothesisFitter
+from thermocald.discovery.evidence import find_displaced_targets
+from thermocald.discovery.result import discover_series
+from thermocald.discovery.search import Search
+from thermocald.discovery.validation import compare_with_surrogates
+from thermocald.output.discovery import report_html
+from thermocald.thermal.fit import HypothesisFitter
+from thermocald.thermal.series import in_blocks
 
 KEYS = {
     "effect",
@@ -129,6 +129,9 @@ def test_document(evidence_of):
     page = report_html(found, "M1")  # the name beside what noise alone reaches
     assert "Could noise do this?" in page
     assert page.count("<svg") == 6
+    assert "≤ 1/120" in page
+    assert f"UTC, {len(evidence[0].source.frame_times)} epochs." in page
+    assert "&lt;" not in page  # no object in place of its text
 
 
 def test_a_drift_of_a_few_targets_is_not_the_camera(evidence_of):
@@ -145,7 +148,7 @@ def test_a_gross_error_near_the_end_is_no_target_that_moved(evidence_of):
     for epochs, moved in ((slice(-3, -2), 0), (slice(-4, None), 1)):
         residuals = evidence.residuals.copy()
         residuals[epochs, 30] += 1.0
-        groups, _ = displaced_targets(replace(evidence, residuals=residuals))
+        groups, _ = find_displaced_targets(replace(evidence, residuals=residuals))
         assert [g.rows.tolist() for g in groups] == [[30]] * moved
 
 
@@ -155,7 +158,7 @@ def test_surrogates_tried_at_once_give_the_same_bits(evidence_of):
     base = search.base()
     best = search.expand(base, 3, -np.inf)[0]
     one, two = (
-        surrogate_test(search, best.fit, base, base.score - best.score, 20, jobs=jobs)
+        compare_with_surrogates(search, best.fit, base, base.score - best.score, 20, jobs=jobs)
         for jobs in (1, 3)
     )
     np.testing.assert_array_equal(two.surrogates, one.surrogates)

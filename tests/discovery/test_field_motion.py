@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.blind.field_motion import BOARD, MOVED_MM, TARGET
-from thermocald.discovery.verdict.result import discover_series
+from thermocald.discovery.result import discover_series
 
 slow = pytest.mark.slow
 

@@ -14,20 +14,16 @@ from tests.blind.bridge import series_input
 from tests.blind.case import OUTSIDE, Case
 from tests.blind.generator import generate
 from tests.blind.outside import HUMID
-from thermocald.discovery.grammar.condensed import condensed
-from thermocald.discovery.grammar.library import Library
-from thermocald.discovery.grammar.proposal import propose
-from thermocald.discovery.search.search import Search
-from thermocald.discovery.verdict.result import discover_series
-from thermocald.reduction.adequacy import examine
-from thermocald.reduction.calibrated import calibrated_thermometers
-from thermocald.reduction.candidate import Candidate
-from thermocald.reduction.fit import HypothesisFitter
-from thermocald.reduction.hypothesis import BASE, Term
-from thermocald.reduction.noise import with_correlated_noise
-from thermocald.reduction.reduce import reduce_together
-from thermocald.reduction.scan import Scanner
-from thermocald.simulation.formula.expression import Node
+from thermocald.discovery.formulas import Library, condensed
+from thermocald.discovery.proposal import propose
+from thermocald.discovery.result import discover_series
+from thermocald.discovery.search import Search
+from thermocald.physics.formula import Node
+from thermocald.thermal.fit import HypothesisFitter
+from thermocald.thermal.hypothesis import BASE, Candidate, Term
+from thermocald.thermal.noise import calibrate_thermometers, weight_slow_noise
+from thermocald.thermal.reduce import reduce_together
+from thermocald.thermal.scan import Scanner, examine
 
 TEN = (
     "tanh", "sign_rate_square", "integral_above", "abs_rate", "two_lags", "product", "switch",
@@ -42,7 +38,7 @@ def reduced(kind: str, seed: int):
 
 def examined(kind: str, seed: int):
     """What an examination leaves of the base model, without the catalogue's search."""
-    ready = [with_correlated_noise(e) for e in calibrated_thermometers(reduced(kind, seed))]
+    ready = [weight_slow_noise(e) for e in calibrate_thermometers(reduced(kind, seed))]
     fitter = HypothesisFitter(ready)
     base = Search(fitter).base()
     adequacy = tuple(examine(fitter, base.fit, s) for s in range(2))

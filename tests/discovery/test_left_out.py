@@ -8,10 +8,10 @@ import pytest
 from tests.blind.bridge import series_input
 from tests.blind.case import Case
 from tests.blind.generator import generate
-from thermocald.discovery.search.cross_validation import confirmed, cross_validation, gains
-from thermocald.reduction.fit import HypothesisFitter
-from thermocald.reduction.hypothesis import Term
-from thermocald.reduction.reduce import reduce_series
+from thermocald.discovery.validation import cross_validation, is_confirmed, measure_block_gains
+from thermocald.thermal.fit import HypothesisFitter
+from thermocald.thermal.hypothesis import Term
+from thermocald.thermal.reduce import reduce_series
 
 
 def fitter(effect, seed=91):
@@ -25,15 +25,15 @@ def test_the_cause_predicts_every_block():
     lab, _ = fitter("nonlinear_expansion")
     fit = lab.refine(lab.fit([Term("nonlinear_expansion")]))
 
-    (gain,) = gains(lab, fit)
+    (gain,) = measure_block_gains(lab, fit)
 
-    assert confirmed(gain)
+    assert is_confirmed(gain)
     outside, inside = cross_validation(lab, fit)
     assert 0.95 * inside < outside < 1.1 * inside
 
 
 @pytest.mark.parametrize(
-    ("gain", "is_confirmed"),
+    ("gain", "expected"),
     [
         ([30.0, 5.0, -3.0, 0.0, 20.0, 1.0], True),
         ([30.0, 5.0, -30.0, 0.0, 20.0, 1.0], False),  # one block speaks against it
@@ -41,8 +41,8 @@ def test_the_cause_predicts_every_block():
         ([1e5, 2e4, -300.0, 10.0, 20.0, 1.0], True),  # small against what it explains
     ],
 )
-def test_what_confirms(gain, is_confirmed):
-    assert confirmed(np.array(gain)) == is_confirmed
+def test_what_confirms(gain, expected):
+    assert is_confirmed(np.array(gain)) == expected
 
 
 def test_a_course_that_follows_the_noise_predicts_nothing():
@@ -54,7 +54,7 @@ def test_a_course_that_follows_the_noise_predicts_nothing():
         for p in np.geomspace(40, 400, 60)
     ]
 
-    (gain,) = gains(lab, min(trials, key=lambda f: f.objective))
+    (gain,) = measure_block_gains(lab, min(trials, key=lambda f: f.objective))
 
     assert gain.sum() < 12  # of six coefficients
 
@@ -69,6 +69,6 @@ def test_a_step_within_the_block_left_out_is_no_fault():
     ]
     fresh = tuple(own) + (None,) * (len(lab.series) - len(own))
 
-    (gain,) = gains(lab, lab.refine(lab.fit([Term("slip", fresh=fresh)])))
+    (gain,) = measure_block_gains(lab, lab.refine(lab.fit([Term("slip", fresh=fresh)])))
 
-    assert confirmed(gain)
+    assert is_confirmed(gain)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from tests.analysis.test_thermal_model import simulated
-from thermocald.discovery.verdict.level import level_of
-from thermocald.reduction.calibrated import calibrated_thermometers
-from thermocald.reduction.fit import HypothesisFitter
-from thermocald.reduction.hypothesis import known_term
-from thermocald.reduction.reduce import reduce_series
-from thermocald.reduction.source import epochs_input
+from thermocald.discovery.model import estimate_level
+from thermocald.thermal.fit import HypothesisFitter
+from thermocald.thermal.hypothesis import make_known_term
+from thermocald.thermal.noise import calibrate_thermometers
+from thermocald.thermal.reduce import reduce_series
+from thermocald.thermal.source import epochs_input
 
 
 def pulls(draws: int, noise: float, field: float) -> np.ndarray:
@@ -25,9 +25,9 @@ def pulls(draws: int, noise: float, field: float) -> np.ndarray:
         wrong = s.field.points + rng.normal(0, field, s.field.points.shape)
         said = replace(s.field, points=wrong, sigmas=np.full(wrong.shape, field))
         reduced = reduce_series(epochs_input(s.head, said, list(s.epochs()), "M1"), 30.0)
-        fitter = HypothesisFitter(calibrated_thermometers([reduced]))
-        fit = fitter.refine(fitter.fit((known_term("thermal_lag", {"tau": 70.0}, 1),)))
-        level, sd = level_of(fitter, fit)
+        fitter = HypothesisFitter(calibrate_thermometers([reduced]))
+        fit = fitter.refine(fitter.fit((make_known_term("thermal_lag", {"tau": 70.0}, 1),)))
+        level, sd = estimate_level(fitter, fit)
         truth = s.model.interior.as_array() + (30.0 - s.model.T0) * s.model.rate_vector
         found = reduced.at.iop + (level / reduced.scale[:16])[:10]
         out.append((found - truth)[:3] / (sd / reduced.scale[:16])[:3])

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermocald.reduction.fit import HypothesisFitter
-from thermocald.reduction.hypothesis import Term
-from thermocald.reduction.series import COLUMNS
+from thermocald.thermal.fit import HypothesisFitter
+from thermocald.thermal.hypothesis import Term
+from thermocald.thermal.series import COLUMNS
 
 
 @pytest.fixture

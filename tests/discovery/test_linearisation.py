@@ -10,9 +10,9 @@ from benchmarks.long_recording import INTERVAL_S, RATES, field_of, write_long_re
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.series.normals import ObservationGrid
-from thermocald.reduction.reduce import reduce_series
-from thermocald.reduction.series import SeriesInput
-from thermocald.reduction.source import load_series
+from thermocald.thermal.reduce import reduce_series
+from thermocald.thermal.series import SeriesInput
+from thermocald.thermal.source import load_series
 
 NAMES = ("c", "x0", "y0")
 

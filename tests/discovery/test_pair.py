@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from thermocald.discovery.evidence.pair import load_together
+from thermocald.discovery.evidence import load_together
 from thermocald.errors import DataError, UsageError
-from thermocald.simulation.presets import preset_simulation
+from thermocald.physics.presets import preset_simulation
 
 
 @pytest.mark.parametrize(

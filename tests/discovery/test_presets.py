@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from thermocald.discovery.evidence.pair import load_together
-from thermocald.discovery.verdict.result import discover_series
-from thermocald.reduction.reduce import reduce_together
-from thermocald.simulation.presets import preset_simulation
+from thermocald.discovery.evidence import load_together
+from thermocald.discovery.result import discover_series
+from thermocald.physics.presets import preset_simulation
+from thermocald.thermal.reduce import reduce_together
 
 DISTORTION = [{"decentering_drift"}, {"radial_distortion_drift"}]
 

@@ -10,9 +10,9 @@ import pytest
 from tests.blind.bridge import series_input
 from tests.blind.case import Case
 from tests.blind.generator import generate
-from thermocald.reduction.fit import HypothesisFitter
-from thermocald.reduction.random_effects import Movement, waves
-from thermocald.reduction.reduce import reduce_together
+from thermocald.thermal.fit import HypothesisFitter
+from thermocald.thermal.random_effects import Movement, waves
+from thermocald.thermal.reduce import reduce_together
 
 
 def hidden_but(epochs: slice, targets: list[int]):

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermocald.discovery.verdict.result import discover_series
+from thermocald.discovery.result import discover_series
 from thermocald.errors import DataError
-from thermocald.reduction.reduce import reduce_series
-from thermocald.reduction.source import series_input
 from thermocald.store.recording.reader import read_recording
+from thermocald.thermal.reduce import reduce_series
+from thermocald.thermal.source import series_input
 
 CAMERAS = ("aviary-cam0", "aviary-cam1", "aviary-cam2", "aviary-cam6")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from thermocald.discovery.verdict.result import discover_series
+from thermocald.discovery.result import discover_series
 
 
 @pytest.mark.parametrize(

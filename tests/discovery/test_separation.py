@@ -5,8 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermocald.discovery.experiment import Body, Limits, body_of, experiments
-from thermocald.discovery.separation import alternatives, separation
+from thermocald.discovery.experiment import (
+    Body,
+    Limits,
+    compare_effects,
+    estimate_body,
+    rank_experiments,
+    read_alternatives,
+)
 from thermocald.errors import ConfigurationError, DataError, UsageError
 
 PAIRS = [("permanent_set", "self_heating"), ("thermal_lag", "hysteresis"), ("creep", "slip")]
@@ -15,7 +21,7 @@ PAIRS = [("permanent_set", "self_heating"), ("thermal_lag", "hysteresis"), ("cre
 @pytest.mark.parametrize("pair", PAIRS)
 @pytest.mark.parametrize("limits", [Limits(40.0, 1.5, 0.8), Limits(60.0, 4.0, 0.3)])
 def test_programmes_stay_within_the_limits(pair, limits):
-    for found in experiments(*pair, limits, Body(), 150, 10.0):
+    for found in rank_experiments(*pair, limits, Body(), 150, 10.0):
         holds = [h for _, h in found.steps if h is not None]
         rises = np.diff([22.0, *holds])
         assert max(holds) <= limits.max_c - 0.5
@@ -27,16 +33,16 @@ def test_programmes_stay_within_the_limits(pair, limits):
 
 def test_what_separates_is_preferred():
     """A set that stays is told from a warm-up by heating again, not by one long hold."""
-    order = [e.name for e in experiments(*PAIRS[0], Limits(55.0), Body(), 180, 10.0)]
+    order = [e.name for e in rank_experiments(*PAIRS[0], Limits(55.0), Body(), 180, 10.0)]
     assert order.index("two equal cycles") < order.index("one long hold")
-    sigmas = [e.sigmas for e in experiments(*PAIRS[0], Limits(55.0), Body(), 180, 10.0)]
+    sigmas = [e.sigmas for e in rank_experiments(*PAIRS[0], Limits(55.0), Body(), 180, 10.0)]
     assert sigmas == sorted(sigmas, reverse=True)
     assert sigmas[0] > 3 * sigmas[-1]
 
 
 def test_limits_that_allow_no_heating_are_refused():
     with pytest.raises(DataError, match=r"allow 2\.5 K of warming above 22\.0 °C; 5 K"):
-        experiments(*PAIRS[0], Limits(25.0), Body(), 150, 10.0)
+        rank_experiments(*PAIRS[0], Limits(25.0), Body(), 150, 10.0)
 
 
 def test_a_recording_tells_how_the_camera_warms():
@@ -45,21 +51,21 @@ def test_a_recording_tells_how_the_camera_warms():
     T = [20.0]
     for p in power[1:]:
         T.append(T[-1] + (20.0 + 30.0 * p - T[-1]) * (1 - np.exp(-10.0 / 420.0)))
-    body = body_of(t, np.array(T))
+    body = estimate_body(t, np.array(T))
     assert body.tau == pytest.approx(420.0, rel=0.05)
     assert body.rise == pytest.approx(30.0, rel=0.1)
 
 
 def test_two_effects_are_separated_by_a_recording(evidence_of):
     evidence, _ = evidence_of("permanent_set", px=0.1, seed=22, with_m2=False)
-    found = separation(evidence, "creep", "permanent_set")
+    found = compare_effects(evidence, "creep", "permanent_set")
     assert (found.better, found.worse, found.separated) == ("permanent_set", "creep", True)
     assert "creep is excluded" in found.sentence
 
 
 def test_nothing_is_separated_where_neither_is(evidence_of):
     evidence, _ = evidence_of(seed=23, with_m2=False, epochs=60)
-    found = separation(evidence, "creep", "permanent_set")
+    found = compare_effects(evidence, "creep", "permanent_set")
     assert not found.separated
 
 
@@ -74,4 +80,4 @@ def test_nothing_is_separated_where_neither_is(evidence_of):
 )
 def test_what_is_no_pair_is_refused(text, error, said):
     with pytest.raises(error, match=said):
-        alternatives(text)
+        read_alternatives(text)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermocald.reduction.thermometer import latent_times, reading_noise, smooth_channel
+from thermocald.thermal.thermometer import estimate_reading_noise, find_latent_times, smooth_channel
 
 
 def trajectory(t):
@@ -30,19 +30,19 @@ def test_noise_with_quantisation(readings):
         rng = np.random.default_rng(seed)
         t = 10.0 * np.arange(180) + rng.uniform(-1, 1, 180)
         y = np.round((trajectory(t) + rng.normal(0, 0.04, 180)) / 0.0625) * 0.0625
-        noises.append(reading_noise(t, y, 0.0625))
+        noises.append(estimate_reading_noise(t, y, 0.0625))
     # 177 third differences, correlated: 12 % each, so 2 % for the mean; kinks raise it a little
     assert np.mean(noises) == pytest.approx(true, rel=0.08)
 
 
 def test_a_step_is_not_better_than_itself():
-    noise = reading_noise(10.0 * np.arange(100), np.full(100, 21.0625), 0.0625)
+    noise = estimate_reading_noise(10.0 * np.arange(100), np.full(100, 21.0625), 0.0625)
     assert noise == pytest.approx(0.0625 / np.sqrt(12))
 
 
 def test_kinks_get_a_latent_instant(readings):
     t, y = readings
-    latent = latent_times(t, y, 0.0625)
+    latent = find_latent_times(t, y, 0.0625)
     assert np.min(np.abs(latent - 805)) < 12
     assert len(latent) < 15
 
@@ -68,7 +68,7 @@ def test_thermometers_are_not_read_at_even_intervals():
     rng = np.random.default_rng(3)
     t = 10.0 * np.arange(200) + rng.uniform(-1, 1, 200)
 
-    assert reading_noise(t, 20 + 0.1 * t + rng.normal(0, 0.01, 200), None) < 0.013
+    assert estimate_reading_noise(t, 20 + 0.1 * t + rng.normal(0, 0.01, 200), None) < 0.013
 
 
 def test_noise_is_seen_through_a_warm_up():
@@ -76,7 +76,8 @@ def test_noise_is_seen_through_a_warm_up():
     rng = np.random.default_rng(4)
     t = 10.0 * np.arange(150)
     warm = 25 + 12 * (1 - np.exp(-t / 400.0))
-    found = [reading_noise(t, warm + 0.05 * rng.standard_normal(150), None) for _ in range(200)]
+    noisy = [warm + 0.05 * rng.standard_normal(150) for _ in range(200)]
+    found = [estimate_reading_noise(t, readings, None) for readings in noisy]
     assert np.mean(found) == pytest.approx(0.05, rel=0.03)
 
 
@@ -84,14 +85,14 @@ def test_a_reading_without_a_time_is_no_reading():
     t = 10.0 * np.arange(400)
     y = np.random.default_rng(0).normal(20, 0.05, 400)
     t[7] = np.nan
-    assert reading_noise(t, y, None) == pytest.approx(0.05, rel=0.2)
+    assert estimate_reading_noise(t, y, None) == pytest.approx(0.05, rel=0.2)
 
 
 def test_kinks_between_sparse_readings_are_found():
     """At 30 s every interval after a lamp bends more than its noise; the switches stand out."""
     rng = np.random.default_rng(2)
     t = 30.0 * np.arange(60)
-    latent = latent_times(t, trajectory(t) + rng.normal(0, 0.04, 60), None)
+    latent = find_latent_times(t, trajectory(t) + rng.normal(0, 0.04, 60), None)
     assert np.min(np.abs(latent - 200)) < 20
     assert np.min(np.abs(latent - 805)) < 20
     assert len(latent) < 8

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 
 from tests.discovery.test_tremble import trembling
-from thermocald.discovery.verdict.trade_off import not_separable
-from thermocald.reduction.fit import HypothesisFitter
-from thermocald.reduction.hypothesis import BASE, Term
-from thermocald.simulation import effects as catalogue
-from thermocald.simulation.formula.expression import Node
+from thermocald.discovery.entries import find_trade_off
+from thermocald.physics import catalogue
+from thermocald.physics.formula import Node
+from thermocald.thermal.fit import HypothesisFitter
+from thermocald.thermal.hypothesis import BASE, Term
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def fitted(fitter, first, second):
 def test_two_equal_lags_are_said_by_their_sum(lagging):
     fit = fitted(lagging, 30.0, 30.0)
 
-    found = not_separable(lagging, fit, 0)
+    found = find_trade_off(lagging, fit, 0)
 
     assert found.value == pytest.approx(60.0)
     assert 0.0 < found.sd < 5.0
@@ -36,7 +36,7 @@ def test_two_equal_lags_are_said_by_their_sum(lagging):
 
 
 def test_a_short_and_a_long_lag_are_separate(lagging):
-    assert not_separable(lagging, fitted(lagging, 20.0, 150.0), 0) is None
+    assert find_trade_off(lagging, fitted(lagging, 20.0, 150.0), 0) is None
 
 
 def test_a_constant_that_is_not_determined_is_said_so():

@@ -10,11 +10,11 @@ import pytest
 from tests.blind.bridge import series_input
 from tests.blind.case import Case
 from tests.blind.generator import generate
-from thermocald.discovery.verdict.result import discover_series
+from thermocald.discovery.result import discover_series
 from thermocald.photogrammetry.series.normals import ObservationGrid
-from thermocald.reduction.fit import HypothesisFitter
-from thermocald.reduction.noise import jumps, trembles, with_jumps
-from thermocald.reduction.reduce import reduce_together
+from thermocald.thermal.fit import HypothesisFitter
+from thermocald.thermal.movement import detect_tremble, measure_jumps, weight_jumps_down
+from thermocald.thermal.reduce import reduce_together
 
 
 def trembling(effects, px, seed):
@@ -34,14 +34,14 @@ def test_a_tremble_is_found_along_its_own_directions(px, directions):
     series = trembling((), px, 3)
     fitter = HypothesisFitter(series)
 
-    factors, W = jumps(fitter, fitter.fit(()), 0)
+    factors, W = measure_jumps(fitter, fitter.fit(()), 0)
 
     clear = factors > 1.7
     assert clear.sum() == directions
     # a shift of 147 points in units of the noise found, 0.04 px; 178 epochs tell it to 15 %
     expected = 1.0 + 147 * px**2 / 0.04**2 if directions else np.nan
     assert factors[clear] == pytest.approx([expected] * directions, rel=0.4)
-    again = with_jumps(series[0], factors, W)
+    again = weight_jumps_down(series[0], factors, W)
     assert (again is None) is not bool(directions)
 
 
@@ -50,7 +50,7 @@ def test_a_tremble_is_found_along_its_own_directions(px, directions):
     [((), 0.0, False), (("thermal_lag",), 0.0, False), (("thermal_lag",), 0.01, True)],
 )
 def test_a_tremble_is_no_drift(effects, px, expected):
-    assert [trembles(e) for e in trembling(effects, px, 3)] == [expected] * 2
+    assert [detect_tremble(e) for e in trembling(effects, px, 3)] == [expected] * 2
 
 
 @pytest.mark.slow

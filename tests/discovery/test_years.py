@@ -7,8 +7,8 @@ import pytest
 from scipy.signal import lfilter
 from year_of_means import DAY, year
 
-from thermocald.discovery.verdict.result import discover_series
-from thermocald.reduction.blocks import in_blocks
+from thermocald.discovery.result import discover_series
+from thermocald.thermal.series import in_blocks
 
 LAG_S = 1200.0
 

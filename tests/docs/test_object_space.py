@@ -9,7 +9,7 @@ import pytest
 from benchmarks.object_space import BOUND, HEADER, measure
 from tests.docs.blocks import ROOT
 from thermocald.analysis.study.reference import QUOTED
-from thermocald.simulation.presets import preset_names
+from thermocald.physics.presets import preset_names
 
 PAGE = (ROOT / "docs/explanation/object-space.md").read_text()
 

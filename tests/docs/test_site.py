@@ -176,7 +176,7 @@ def test_the_reference_has_every_command_key_effect_and_driver(site):
     from importlib.metadata import entry_points
 
     from thermocald.config import CalibrationConfig, Config
-    from thermocald.simulation import effects
+    from thermocald.physics import catalogue
 
     folder, documents = site
 
@@ -189,7 +189,7 @@ def test_the_reference_has_every_command_key_effect_and_driver(site):
     configuration = text("config.html")
     for key in (*keys(Config), *keys(CalibrationConfig)):
         assert re.search(rf"\b{key}\b", configuration), key
-    for name in effects.names():
+    for name in catalogue.names():
         assert name in text("effects.html")
     for kind in ("cameras", "thermometers", "outputs"):
         for point in entry_points(group=f"thermocald.{kind}"):

@@ -24,13 +24,12 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     Sensor,
 )
-from thermocald.simulation.course import Course
-from thermocald.simulation.demonstration import demonstration_field, demonstration_model
-from thermocald.simulation.model import ModelEffect
-from thermocald.simulation.model_file import write_model
-from thermocald.simulation.presets import preset_simulation
-from thermocald.simulation.scene import Scene
-from thermocald.simulation.testfields import corner_field
+from thermocald.physics.heat import Course
+from thermocald.physics.model import ModelEffect
+from thermocald.physics.model_file import write_model
+from thermocald.physics.presets import preset_simulation
+from thermocald.physics.scene import Scene
+from thermocald.physics.testfields import corner_field, demonstration_field, demonstration_model
 from thermocald.store.recording.testfield_file import read_testfield, write_testfield
 
 
@@ -219,6 +218,7 @@ def tutorial_rpi(shelf: Path, folder: Path) -> None:
 World = Callable[[Path, Path], None]
 WORLDS: dict[str, World] = {
     "docs/explanation/discovery.md": lambda s, f: put_recordings(s, f, "M1", "M2"),
+    "docs/how-to/notebook.md": lambda s, f: put_recordings(s, f, "M1", "M2"),
     "docs/explanation/simulation.md": simulation,
     "docs/how-to/calibrate.md": how_to_calibrate,
     "docs/how-to/daemon.md": how_to_daemon,

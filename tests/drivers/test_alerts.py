@@ -8,7 +8,7 @@ import ssl
 import time
 
 import pytest
-from thermocald_drivers.alert_conditions import Watch, condition_of
+from thermocald_drivers.alert import Watch, condition_of
 
 from tests.drivers.fakes.alert_servers import MailServer, WebServer
 from tests.drivers.fakes.certificate import own_certificate
@@ -60,8 +60,9 @@ def test_temperature_disk_and_epochs_without_result(tmp_path):
      {"temperature": "t", "above_c": 5, "below_c": 4}],
 )  # fmt: skip
 def test_a_wrong_condition_is_named(when):
+    options = {"command": ["true"], "when": [when]}
     with pytest.raises(ConfigurationError, match="when"):
-        condition_of(when)
+        open_device("output", "alert_exec", options, VirtualClock())
 
 
 WHEN = [{"drift": "c", "px": 0.5}]
@@ -179,3 +180,102 @@ def test_mqtt_retains_what_is_out():
     assert json.loads(configuration[1])["state_topic"] == state[0]
     assert json.loads(state[1])["state"] == "out"
     assert state[2]
+
+
+@pytest.mark.parametrize(
+    "url",
+    ["http://user:SECRET@example.org/hook", "https://SECRET@example.org/", "http://a:SECRET/hook",
+     "ftp://user:SECRET@example.org", "http://[SECRET/hook", "http://example.org/SECRET hook",
+     "http://example.org/SECRET\u00e9", "SECRET", "http://:SECRET@:80", "https://u:SECRET@h:99999"],
+)  # fmt: skip
+def test_an_address_with_a_secret_is_refused_and_not_quoted(url):
+    with pytest.raises(ConfigurationError, match="url") as error:
+        open_device("output", "alert_webhook", {"url": url, "when": WHEN}, VirtualClock())
+    assert "SECRET" not in f"{error.value} {error.value!r}"
+
+
+@pytest.mark.parametrize("answer", [500, 404, 302, None])
+def test_a_secret_is_never_quoted(answer, tmp_path, caplog):
+    """Not by the address, not by the token, whatever the server or the library says."""
+    server = WebServer()
+    (tmp_path / "token").write_text("SECRET\n")
+    options = {"url": f"http://127.0.0.1:{server.port}/SECRET?key=SECRET", "when": WHEN,
+               "token_file": str(tmp_path / "token"), "timeout_s": 1.0}  # fmt: skip
+    device = open_device("output", "alert_webhook", options, VirtualClock())
+    device.open()
+    server.answer = answer or 204
+    if answer is None:
+        server.close()
+    try:
+        with pytest.raises(DeviceError) as error:
+            device.emit(OUT)
+    finally:
+        device.close()
+        if answer is not None:
+            server.close()
+    assert "SECRET" not in f"{error.value} {caplog.text} {dict(device.identity())} {device.where}"
+    assert error.value.__cause__ is None  # a log with its causes would quote the library
+
+
+@pytest.mark.parametrize("token", ["two\nlines", "naïve", "a\x00b"])
+def test_a_token_that_no_header_can_hold(token, tmp_path):
+    (tmp_path / "token").write_text(token)
+    options = {"url": "http://127.0.0.1:9/", "when": WHEN, "token_file": str(tmp_path / "token")}
+    with pytest.raises(ConfigurationError, match="is not one line") as error:
+        open_device("output", "alert_webhook", options, VirtualClock()).open()
+    assert token not in str(error.value)
+
+
+def test_a_program_gets_a_few_variables_only(tmp_path, monkeypatch):
+    monkeypatch.setenv("DATABASE_PASSWORD", "SECRET")
+    monkeypatch.setenv("LANG", "C.UTF-8")
+    script, log = tmp_path / "hook", tmp_path / "log"
+    script.write_text(f"#!/bin/sh\nenv > {log}\n")
+    script.chmod(0o755)
+    options = {"command": [str(script)], "when": WHEN}
+    with open_device("output", "alert_exec", options, VirtualClock()) as device:
+        device.emit({**OUT, "device": "cam\x00era"})
+    names = {line.partition("=")[0] for line in log.read_text().splitlines()}
+    assert "SECRET" not in log.read_text()
+    assert {"PATH", "LANG", "THERMOCALD_STATE", "THERMOCALD_TEXT"} <= names
+    allowed = {"PATH", "HOME", "LANG", "LC_ALL", "TZ", "PWD", "OLDPWD", "SHLVL", "_"}
+    assert all(name in allowed or name.startswith("THERMOCALD_") for name in names)
+
+
+def test_a_letter_that_fails_quotes_no_password(tmp_path):
+    server = MailServer()
+    (tmp_path / "password").write_text("SECRET")
+    options = {"host": "127.0.0.1", "port": server.port, "sender": "pi@example.org",
+               "recipients": ["me@example.org"], "username": "pi", "security": "tls",
+               "password_file": str(tmp_path / "password"), "when": WHEN,
+               "timeout_s": 1}  # fmt: skip
+    try:
+        with pytest.raises(DeviceError) as error:
+            open_device("output", "alert_mail", options, VirtualClock()).open()
+    finally:
+        server.close()
+    assert "SECRET" not in str(error.value)
+
+
+def test_a_webhook_with_tls_and_a_redirection_into_this_network(tmp_path, monkeypatch):
+    ca, key = own_certificate(tmp_path)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(ca, key)
+    server, inner = WebServer(context=context), WebServer()
+    url = f"https://127.0.0.1:{server.port}/SECRET"
+    options = {"url": url, "when": WHEN, "timeout_s": 5.0}
+    try:
+        with open_device("output", "alert_webhook", options, VirtualClock()) as device:
+            with pytest.raises(DeviceError, match="not trusted") as error:
+                device.emit(OUT)
+            assert "SECRET" not in str(error.value)
+            monkeypatch.setenv("SSL_CERT_FILE", str(ca))
+            device.emit(OUT)
+            assert [post[2]["state"] for post in server.posts] == ["out"]
+            server.answer, server.location = 302, f"http://127.0.0.1:{inner.port}/meta-data"
+            with pytest.raises(DeviceError, match="302"):
+                device.emit(IN)
+        assert inner.posts == []
+    finally:
+        server.close()
+        inner.close()

@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from thermocald_drivers.android_phone import AdbPhone
+from thermocald_drivers.android_phone import AdbPhone, PhoneOptions
 
 from tests.drivers.fakes.adb_server import AdbServer, FakePhone, photograph
 from thermocald import errors
@@ -120,7 +120,7 @@ def test_the_time_is_exifs_with_the_phones_clock_compared(server, phone, offset)
     ],
 )
 def test_the_phones_clock_lies_where_all_round_trips_overlap(trips, offset, half):
-    one = AdbPhone(SERIAL, "127.0.0.1", 1, 1.0, False)
+    one = AdbPhone(PhoneOptions(serial=SERIAL, port=1, timeout_s=1.0))
     left = list(trips)
 
     def ask():
@@ -391,7 +391,8 @@ def test_temperatures(server, phone, shared):
     with thermometer(server, sensors=sensors) as device:
         reading = device.read()
     assert reading.values == {"temperature": 28.7, "ap": 25.6, "soc": 37.0}
-    assert reading.metadata["missing"] == {"usb": "thermal:USB: the phone does not report it"}
+    (missing,) = reading.metadata["missing"].items()
+    assert missing == ("usb", f"phone {SERIAL}: thermal:USB: the phone does not report it")
 
 
 def test_a_zones_unit_is_kept(server, phone):
@@ -518,7 +519,7 @@ def test_the_limit_stops_the_load_for_good(server, phone):
 
 
 def test_a_limit_that_a_battery_does_not_survive(server):
-    with pytest.raises(errors.ConfigurationError, match="limit_c: 60 °C"):
+    with pytest.raises(errors.ConfigurationError, match="limit_c: is 60; input should be less"):
         open_device(
             "output",
             "android_load",

@@ -3,8 +3,15 @@
 from __future__ import annotations
 
 import pytest
-from thermocald_drivers.android_temperatures import battery, thermalservice
-from thermocald_drivers.android_zones import is_temperature, raw_zones, zone_scales
+from thermocald_drivers import android_thermometer
+from thermocald_drivers.android_thermometer import thermalservice
+from thermocald_drivers.zones import is_temperature, raw_zones, zone_scales
+
+
+def battery(text, unit=""):
+    """°C, or None."""
+    found = android_thermometer.battery(text, unit)
+    return None if found is None else pytest.approx(found[0] * found[1])
 
 
 def dump(shared, number):
@@ -24,9 +31,13 @@ def test_a_battery_that_says_nothing(text):
     assert battery(text) is None
 
 
-def test_a_battery_at_freezing_point_with_a_voltage_is_cold():
-    assert battery("  voltage: 3812\n  temperature: 0\n") == 0.0
+def test_a_battery_near_freezing_point_is_in_tenths_or_degrees():
+    for number in (0, 26, 70, -30):
+        text = f"  voltage: 3812\n  temperature: {number}\n"
+        assert battery(text) is None
+        assert battery(text, "tenths") == number / 10
     assert battery("  voltage: 3812\n  temperature: -43\n") == -4.3
+    assert battery("  voltage: 3812\n  temperature: 71\n") == 7.1
 
 
 def test_samsung_a52_without_the_sensors_that_are_not_fitted(shared):
@@ -68,9 +79,9 @@ def test_a_hal_that_is_not_ready(shared):
         ("voltage: 13\n temperature: 26", 26.0),  # a TV board: whole volts, whole degrees
         ("voltage: 4\n temperature: 268", 26.8),
         ("voltage: 4\n temperature: 85", None),  # 85 °C or 8.5 °C
-        ("voltage: 4312\n temperature: 26", 2.6),
+        ("voltage: 4312\n temperature: 26", None),  # 2.6 °C, or 26 °C of boards with mV
         ("present: false\n temperature: 25", None),
-        ("present: true\n temperature: 25", 2.5),
+        ("present: true\n temperature: 25", None),
         ("(UPDATES STOPPED -- use 'reset' to restart)\n temperature: 250", None),
         ("  voltage: 4352\r\n  temperature: 274\r\n", 27.4),
         ("temperature: 25000", None),
@@ -86,6 +97,7 @@ def test_batteries_of_other_kinds(text, celsius):
 def test_the_battery_in_a_stated_unit():
     assert battery("voltage: 4\n temperature: 85", "tenths") == 8.5
     assert battery("temperature: 25000", "thousandths") == 25.0
+    assert battery("temperature: 850", "tenths") is None  # hotter than any battery
 
 
 def record(value, kind=2, name="battery"):

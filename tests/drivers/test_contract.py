@@ -23,6 +23,7 @@ import pytest
 from thermocald.errors import ConfigurationError, DeviceError
 from thermocald.hal import (
     Camera,
+    DriverOptions,
     Output,
     Thermometer,
     driver_names,
@@ -100,7 +101,7 @@ each_driver = pytest.mark.parametrize(("kind", "name"), REGISTERED)
 def test_driver_is_what_it_is_registered_as(kind, name):
     driver = load_driver(kind, name)
     assert issubclass(driver, KINDS[kind])
-    assert "clock" in inspect.signature(driver).parameters
+    assert issubclass(driver.Options, DriverOptions)
 
 
 @each_driver
@@ -113,9 +114,9 @@ def test_driver_explains_its_stanza(kind, name):
 
 @each_driver
 def test_driver_imports_no_device_library(kind, name):
-    """At its top a driver imports the standard library, numpy, thermocald and its own helpers."""
+    """At its top a driver imports the standard library, numpy, pydantic, thermocald and its own."""
     path = Path(inspect.getfile(load_driver(kind, name)))
-    allowed = {*sys.stdlib_module_names, "numpy", "thermocald", "thermocald_drivers"}
+    allowed = {*sys.stdlib_module_names, "numpy", "pydantic", "thermocald", "thermocald_drivers"}
     for module in _imported_at_the_top(path):
         assert module.split(".")[0] in allowed
 

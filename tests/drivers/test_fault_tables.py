@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from thermocald.cli.devices import KINDS
+from thermocald.daemon.probe import KINDS
 from thermocald.hal import driver_names
 
 HERE = Path(__file__).parent

@@ -6,7 +6,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from thermocald_drivers.faults import Faults, Kind
+from thermocald_drivers.mock import Kind
 
 from thermocald import hal
 from thermocald.errors import BadReading, ConfigurationError, DeviceGone, DeviceTimeout
@@ -122,17 +122,17 @@ def test_injected_while_it_runs(clock):
 @pytest.mark.parametrize(
     ("plan", "message"),
     [
-        ([{"kind": "explode"}], "is not one of timeout, unplugged"),
-        ([{"kind": "timeout", "att": 3}], "a fault has no key 'att'"),
-        ([{"kind": "timeout", "at": 0}], "is not within 1"),
-        ([{"kind": "timeout", "at": 1.5}], "not a whole number"),
-        ([{"kind": "timeout", "at_s": -1}], "not within"),
-        (["timeout"], "must be a list of"),
+        ([{"kind": "explode"}], r"faults\[0\].kind: is 'explode'; input should be 'timeout'"),
+        ([{"kind": "timeout", "att": 3}], r"faults\[0\].att: unknown; is 'at' meant"),
+        ([{"kind": "timeout", "at": 0}], r"faults\[0\].at: is 0; .* greater"),
+        ([{"kind": "timeout", "at": 1.5}], "valid integer"),
+        ([{"kind": "timeout", "at_s": -1}], r"faults\[0\].at_s: is -1"),
+        (["timeout"], r"faults\[0\]: is 'timeout'"),
     ],
 )
 def test_a_wrong_plan_is_refused(clock, plan, message):
     with pytest.raises(ConfigurationError, match=message):
-        Faults("mock", clock, plan)
+        open_device("output", "mock", {"faults": plan}, clock)
 
 
 def test_an_output_that_fails_keeps_nothing(clock):

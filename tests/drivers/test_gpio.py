@@ -163,9 +163,9 @@ def test_permission_denied(pins, monkeypatch, clock):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"limit_c": 200}, "limit_c: 200 °C is not within"),
-        ({"limit_c": 45}, "hold_c: 45 °C is not within"),
-        ({"programme": []}, "at least one step"),
+        ({"limit_c": 200}, "limit_c: is 200; input should be less"),
+        ({"limit_c": 45}, "hold_c: 45 °C is not below the limit"),
+        ({"programme": []}, "at least 1 item"),
         ({"programme": [{"seconds": 10}]}, r"programme\[0\]"),
         ({"pin": 99}, "pin"),
     ],

@@ -6,8 +6,7 @@ import errno
 
 import pytest
 import smbus2
-from thermocald_drivers.bme280 import Compensation
-from thermocald_drivers.sht3x import crc8
+from thermocald_drivers.i2c import Compensation, crc8
 
 from tests.drivers.fakes.chips import (
     ADC_P,

@@ -105,3 +105,17 @@ def test_no_permission(tmp_path, monkeypatch):
 def test_no_folder(tmp_path):
     with pytest.raises(OSError, match="No such file"):
         output(tmp_path / "none" / "results.jsonl").open()
+
+
+@pytest.mark.parametrize("umask", [0o000, 0o077, 0o777])
+def test_a_file_can_be_written_by_us_and_not_by_others(umask, tmp_path):
+    path = tmp_path / "results.jsonl"
+    before = os.umask(umask)
+    try:
+        with open_device("output", "jsonl", {"path": str(path)}, VirtualClock()) as output:
+            output.emit({"epoch": 1})
+    finally:
+        os.umask(before)
+    mode = path.stat().st_mode & 0o777
+    assert mode & 0o600 == 0o600
+    assert not mode & 0o022

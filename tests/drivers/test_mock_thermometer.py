@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from thermocald_drivers.mock_thermometer import lagged
+from thermocald_drivers.mock import lagged
 
 from thermocald.errors import ConfigurationError
 from thermocald.hal import VirtualClock, open_device
@@ -79,11 +79,12 @@ def test_noise_has_the_stated_size_and_is_seeded():
     ("options", "message"),
     [
         ({"programme": [[0, 20], [0, 30]]}, "times must increase"),
-        ({"programme": [0, 20]}, "list of"),
-        ({"programme": "warm"}, "list of"),
-        ({"channels": {"t": {"lag": 3}}}, "channels.t: it has no 'lag'"),
-        ({"channels": {"t": {"noise_k": -1}}}, "channels.t.noise_k: -1 K is not within"),
-        ({"seed": 1.5}, "seed: 1.5 is not a whole number"),
+        ({"programme": [0, 20]}, "valid list"),
+        ({"programme": "warm"}, "valid list"),
+        ({"programme": [[0, 20, 3]]}, "list of"),
+        ({"channels": {"t": {"lag": 3}}}, "channels.t.lag: unknown; is 'lag_s' meant"),
+        ({"channels": {"t": {"noise_k": -1}}}, "channels.t.noise_k: is -1"),
+        ({"seed": 1.5}, "seed: is 1.5; .*valid integer"),
         ({"conversion_s": -1}, "conversion_s"),
     ],
 )

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 import socket
 import ssl
 import time
 
 import pytest
+from thermocald_drivers.mqtt import discovery_messages, node_of
 
 from tests.drivers.fakes.certificate import own_certificate
 from tests.drivers.fakes.mqtt_broker import Broker
@@ -37,21 +39,22 @@ def test_a_result_arrives_and_is_announced(broker):
     with output(broker) as device:
         device.emit(RESULT | {"sigma0": float("nan")})
         device.emit(RESULT)
-    results = [json.loads(p) for t, p, _ in broker.messages if t == "thermocald/rpi_1/result"]
+    topic = "thermocald/rpi_1-a6a219/result"
+    results = [json.loads(p) for t, p, _ in broker.messages if t == topic]
     assert results == [RESULT | {"sigma0": None}, RESULT]
     announced = [t for t in topics(broker) if t.startswith("homeassistant/")]
     assert len(announced) == 11 == len(set(announced))
     configuration = json.loads({t: p for t, p, _ in broker.messages}[announced[0]])
-    assert configuration["state_topic"] == "thermocald/rpi_1/result"
+    assert configuration["state_topic"] == "thermocald/rpi_1-a6a219/result"
     assert configuration["unit_of_measurement"] == "°C"
     sent = {t: json.loads(p) for t, p, _ in broker.messages if t in announced}
     drift = next(m for t, m in sent.items() if "drift_x0_px" in t)
     assert (drift["unit_of_measurement"], drift["suggested_display_precision"]) == ("px", 2)
     # the last will is left at `thermocald`: without it the device is not available either
     assert {a["topic"] for a in drift["availability"]} == {
-        "thermocald/rpi_1/available", "thermocald/thermocald/available"
+        "thermocald/rpi_1-a6a219/available", "thermocald/thermocald/available"
     }  # fmt: skip
-    available = [p for t, p, _ in broker.messages if t == "thermocald/rpi_1/available"]
+    available = [p for t, p, _ in broker.messages if t == "thermocald/rpi_1-a6a219/available"]
     assert available == [b"online", b"offline"]
 
 
@@ -128,7 +131,7 @@ def test_tls(tmp_path):
     try:
         with output(broker, ca=str(ca), timeout_s=5) as device:
             device.emit(RESULT)
-        assert "thermocald/rpi_1/result" in topics(broker)
+        assert "thermocald/rpi_1-a6a219/result" in topics(broker)
         with pytest.raises(DeviceDenied, match="not trusted"):
             output(broker, tls=True, timeout_s=5).open()
     finally:
@@ -138,3 +141,14 @@ def test_tls(tmp_path):
 def test_a_key_needs_its_certificate():
     with pytest.raises(ConfigurationError, match="cert"):
         open_device("output", "mqtt", {"host": "x", "key": "y"}, SystemClock())
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [("cam.1", "cam_1"), ("a/b", "a_b"), ("a b", "a_b"), ("ä", "ö"), ("a+", "a#"), ("a.b", "a_b.")],
+)
+def test_two_devices_never_share_a_topic(one, other):
+    topics = [{*discovery_messages("homeassistant", "t", name, "s")} for name in (one, other)]
+    assert not topics[0] & topics[1]
+    assert node_of(one) != node_of(other)
+    assert re.fullmatch("[A-Za-z0-9_-]+", node_of(one))

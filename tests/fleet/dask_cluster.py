@@ -14,7 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from thermocald.simulation.presets import preset_simulation
+from thermocald.physics.presets import preset_simulation
 
 # docs/how-to/fleet.md: what idle processes do costs less
 SETTINGS = """\

@@ -17,10 +17,10 @@ from thermocald.epoch import Epoch
 from thermocald.fleet.forward import Forwarder, forward_forever
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import Observations, TestField
-from thermocald.store.database.row import EpochResult, Event, LoggedReading
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head
-from thermocald.store.server.address import ServerAddress
+from thermocald.store.series import EpochResult, Event, LoggedReading
+from thermocald.store.server.connection import ServerAddress
 
 SPEED = 100
 INTERVAL_S = 10.0

@@ -13,9 +13,9 @@ from typer.testing import CliRunner
 pytest.importorskip("psycopg", reason="pip install thermocald[server]")
 import psycopg
 
-from benchmarks.generated_fleet import GeneratedCamera, add_camera
+from benchmarks.generated_fleet import STORE, GeneratedCamera, add_camera
 from thermocald.cli import application
-from thermocald.store.server.address import ServerAddress
+from thermocald.store.server.connection import ServerAddress
 from thermocald.store.server.writer import ServerWriter
 
 # an epoch a minute for two days: temperatures of 16 K
@@ -55,7 +55,7 @@ def fleet(server):
             add_camera(connection, camera)
     address = ServerAddress.parse(server.address(name="thermocald"))
     for camera in cameras:
-        with ServerWriter(address, camera.station) as writer:
+        with ServerWriter(address, camera.station, STORE) as writer:
             late = camera.station == "late"
             writer.report(25 if late else 0, 0, time.time() + (90 if camera == cameras[3] else 0))
     return server.address(name="thermocald")
@@ -85,7 +85,9 @@ def test_faults_are_named_and_sound_cameras_are_not(fleet, tmp_path):
     assert "no_targets" in texts["cold"]
     assert "outside of" in texts["cold"]
     html = page.read_text()
-    assert html.count("<circle") >= 3 * 14
+    drawn = [html.count(f">{name}<") for name in document["types"][0]["cameras"]]
+    assert len(drawn) >= 14
+    assert min(drawn) >= 3  # a row in the drawing of each rate
     assert "secret" not in html
     rates = {c["station"]: c["rates"] for c in document["cameras"]}
     for i, true in enumerate(RATES):

@@ -12,16 +12,15 @@ import pytest
 
 from thermocald.errors import ServerError, ServerGone, StoreVersionError, UsageError
 from thermocald.fleet.forward import Forwarder, forward_forever
-from thermocald.store.database.row import Event, LoggedReading
 from thermocald.store.database.store import Store
+from thermocald.store.series import Event, LoggedReading
 
 pytest.importorskip("psycopg", reason="pip install thermocald[server]")
 import psycopg
 
 from tests.fleet.conftest import address, count
-from thermocald.store.server.address import ServerAddress, is_server
+from thermocald.store.server.connection import ServerAddress, grant, is_server
 from thermocald.store.server.reader import ServerStore
-from thermocald.store.server.schema import grant
 from thermocald.store.server.writer import ServerWriter
 
 
@@ -60,7 +59,7 @@ def test_server_and_store_give_the_same(filled, server, make_result, monkeypatch
         )
         assert np.array_equal(found.testfield.points, series.testfield.points)
         names = [*store.column_names(series), "blur"]
-        monkeypatch.setattr("thermocald.store.server.columns._BLOCK", 7)  # of 20 epochs
+        monkeypatch.setattr("thermocald.store.server.reader._BLOCK", 7)  # of 20 epochs
         mine, theirs = store.series_columns(series, names), there.series_columns(found, names)
         for name in names:
             assert np.array_equal(mine[name], theirs[name], equal_nan=name != "status"), name
@@ -147,7 +146,7 @@ def test_what_a_person_must_mend_is_said(filled, server, user, name, words):
 def test_a_server_of_another_version_is_refused(filled, server):
     store, _ = filled
     with psycopg.connect(server.address(name="thermocald")) as connection:
-        connection.execute("UPDATE alembic_version SET version_num = '0000'")
+        connection.execute("UPDATE thermocald_version SET version = 0")
     with pytest.raises(StoreVersionError, match="server init"):
         Forwarder(store.path, address(server), "bank").send_waiting()
 
@@ -254,35 +253,6 @@ def test_a_month_whose_first_batch_failed_is_made_by_the_next(server, filled):
         assert found.fetchall() == [("epoch_2020_09",)]
 
 
-def test_an_older_database_is_brought_up_to_date_with_its_rows_and_roles(cluster, tmp_path, filled):
-    from thermocald.store.server.schema import create_tables
-
-    with psycopg.connect(cluster.address(), autocommit=True) as connection:
-        connection.execute("DROP DATABASE IF EXISTS thermocald WITH (FORCE)")
-        connection.execute("CREATE DATABASE thermocald")
-        connection.execute("DROP ROLE IF EXISTS reader")
-        connection.execute("CREATE ROLE reader LOGIN PASSWORD 'r'")
-    create_tables(address(cluster), "0001")
-    store, _ = filled
-    with psycopg.connect(cluster.address(name="thermocald")) as connection:
-        for table in ("epoch", "series", "testfield", "event", "reading", "alembic_version"):
-            connection.execute(f"GRANT SELECT ON {table} TO reader")
-        connection.execute("INSERT INTO event VALUES ('bank', 1, 5, 'knock', 'x', NULL, 1, '{}')")
-    with pytest.raises(StoreVersionError, match="run `thermocald server init` there"):
-        Forwarder(store.path, address(cluster), "bank").send_waiting()
-    try:
-        create_tables(address(cluster))
-        assert Forwarder(store.path, address(cluster), "bank").send_waiting().rows == 20
-        assert count(cluster, "event") == 1
-        with psycopg.connect(cluster.address(user="reader:r", name="thermocald")) as connection:
-            assert connection.execute("SELECT waiting FROM station").fetchone() == (0,)
-            assert connection.execute("SELECT sum(epochs) FROM summary").fetchone() == (20,)
-    finally:
-        with psycopg.connect(cluster.address(name="thermocald"), autocommit=True) as connection:
-            connection.execute("DROP OWNED BY reader")
-            connection.execute("DROP ROLE reader")
-
-
 def test_two_forwarders_at_once_do_no_harm(filled, server, tmp_path):
     store, _ = filled
     errors = []
@@ -323,7 +293,7 @@ def test_addresses():
     assert is_server(path)
     assert not is_server(Path("postgresql.db"))
     assert (parsed.camera, parsed.series, parsed.station) == ("a b", "M1", None)
-    assert parsed.url == "postgresql+psycopg://u:p@h:5433/db?sslmode=verify-full"
+    assert parsed.url == "postgresql://u:p@h:5433/db?sslmode=verify-full"
     assert str(parsed) == "postgresql://u@h:5433/db"
     for wrong in ("postgresql://h:port/db", "sqlite:///x"):
         with pytest.raises(UsageError):

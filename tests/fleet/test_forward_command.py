@@ -80,5 +80,3 @@ def test_another_address_is_refused(configured):
 
 def test_what_is_missing_is_said():
     assert "give STORE and --to" in str(run("forward").exception)
-    wrong = run("forward", "k.db", "--to", "postgresql://h/d", "--frames", ".", "--choose", "best")
-    assert "there are events, every_n, all" in str(wrong.exception)

@@ -123,7 +123,7 @@ def test_the_server_refuses_a_frame_that_is_not_what_was_read(server, station, m
 
 
 def test_a_role_that_may_only_insert_sends_frames(server, station):
-    from thermocald.store.server.schema import grant
+    from thermocald.store.server.connection import grant
 
     store, folder = station
     with psycopg.connect(server.address(), autocommit=True) as connection:

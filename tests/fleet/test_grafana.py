@@ -13,10 +13,9 @@ from typer.testing import CliRunner
 pytest.importorskip("psycopg", reason="pip install thermocald[server]")
 import psycopg
 
-from benchmarks.generated_fleet import GeneratedCamera, add_camera
+from benchmarks.generated_fleet import STORE, GeneratedCamera, add_camera
 from thermocald.cli import application
-from thermocald.store.server.address import ServerAddress
-from thermocald.store.server.schema import grant
+from thermocald.store.server.connection import ServerAddress, grant
 from thermocald.store.server.writer import ServerWriter
 
 # what Grafana's PostgreSQL source puts in the place of its macros and variables
@@ -64,7 +63,7 @@ def test_every_query_runs_and_finds_something(server, dashboard):
         connection.execute("CREATE ROLE grafana LOGIN PASSWORD 'g'")
     address = ServerAddress.parse(server.address(name="thermocald"))
     grant(address, "grafana", writes=False)
-    with ServerWriter(address, "bank") as writer:
+    with ServerWriter(address, "bank", STORE) as writer:
         writer.report(0, 0, now)
     values = {"first": str(now - 7200), "last": str(now)}
     try:

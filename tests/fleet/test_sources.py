@@ -10,12 +10,12 @@ import pytest
 from typer.testing import CliRunner
 
 from thermocald.cli import application
-from thermocald.discovery.evidence.pair import load_together
+from thermocald.discovery.evidence import load_together
 from thermocald.fleet.forward import Forwarder
-from thermocald.simulation.presets import preset_simulation
+from thermocald.physics.presets import preset_simulation
 from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import open_recording
-from thermocald.store.server.address import ServerAddress
+from thermocald.store.server.connection import ServerAddress
 
 
 def run(*arguments):
@@ -89,7 +89,8 @@ def test_several_series_at_an_address_are_said(server, tmp_path):
         (tmp_path / "k.db", "thermocald archive"),
     ):
         result = CliRunner().invoke(application(), ["discover", str(place)])
-        assert "several series (rpi-v2.1/M1, rpi-v2.1/M2)" in str(result.exception)
+        assert "several series fit" in str(result.exception)
+        assert str(result.exception).startswith(("postgresql://", str(tmp_path)))
         assert words in str(result.exception)
         assert "secret" not in str(result.exception)
 

@@ -16,7 +16,6 @@ import psycopg
 from benchmarks.generated_fleet import GeneratedCamera, add_camera
 from tests.fleet.conftest import address
 from thermocald.store.server.fleet_reader import SPREAD, FleetReader
-from thermocald.store.server.migrations.versions import v0003
 from thermocald.store.server.writer import ServerWriter
 
 SLOT_S = 21600.0
@@ -87,7 +86,7 @@ def test_late_repeated_and_revised_rows_count_exactly_once(server, filled):
     def send(seed):
         mine = np.random.default_rng(seed)
         try:
-            with ServerWriter(address(server), "bank") as writer:
+            with ServerWriter(address(server), "bank", store.identity) as writer:
                 order = mine.permutation(len(rows))
                 for batch in np.array_split(order, 12):
                     # in the order of the store, as a forwarder sends them
@@ -105,13 +104,11 @@ def test_late_repeated_and_revised_rows_count_exactly_once(server, filled):
     assert sum(found[0] for found in expected.values()) == 150
     assert len(expected) >= 6
     assert summary(server) == expected
-    # what an older server is given when it is brought up to date, and what is made again
     again = "SELECT thermocald_summarise(series, array_agg(DISTINCT thermocald_slot(frame_time))) "
-    for made in (v0003._FILL, f"{again} FROM epoch GROUP BY series"):
-        with psycopg.connect(server.address(name="thermocald")) as connection:
-            connection.execute("DELETE FROM summary")
-            connection.execute(made)
-        assert summary(server) == expected
+    with psycopg.connect(server.address(name="thermocald")) as connection:
+        connection.execute("DELETE FROM summary")
+        connection.execute(f"{again} FROM epoch GROUP BY series")
+    assert summary(server) == expected
 
 
 @pytest.mark.parametrize("days", [20, 100])

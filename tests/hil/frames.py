@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import Sensor
-from thermocald.simulation.demonstration import demonstration_field, demonstration_model
-from thermocald.simulation.history import History
-from thermocald.simulation.scene import Scene
+from thermocald.physics.history import History
+from thermocald.physics.scene import Scene
+from thermocald.physics.testfields import demonstration_field, demonstration_model
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.photogrammetry.field.testfield import TestField
-    from thermocald.simulation.model import ThermalModel
+    from thermocald.physics.model import ThermalModel
 
 __all__ = ["heating", "subject"]
 

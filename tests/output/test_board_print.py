@@ -18,7 +18,7 @@ from thermocald.output.testfield.layout import TRIM
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 from thermocald.photogrammetry.frame.measurement import measure
 from thermocald.photogrammetry.targets import ring_code
-from thermocald.photogrammetry.targets.dictionary import corner_shift
+from thermocald.photogrammetry.targets.markers import corner_shift
 from thermocald.store.recording.testfield_file import read_testfield
 
 CAMERA = CameraModel(Sensor(1640, 1232, 0.00224), InteriorOrientation(3.05, 0.02, -0.01, A1=-2e-3))

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import json
+import signal
+import socket
+import subprocess
+import sys
 
 import httpx
 import numpy as np
@@ -14,11 +18,12 @@ from thermocald.errors import ConfigurationError
 from thermocald.output.dashboard import serve
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.store.database.row import EpochResult, Event
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head
+from thermocald.store.series import EpochResult, Event
 
 TOKEN = "a-token-of-enough-characters"
+_CSV_REQUEST = b"GET /api/series.csv?camera=rpi&series=M1 HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
 DEVICE = {"device": "open", "why": "", "faults": 0}
 
 
@@ -52,7 +57,8 @@ def folders(tmp_path, store_path):
     camera = {**DEVICE, "series": "M1", "period_s": 10.0, "last": last, "stored": 1200}
     status = {
         "version": "0", "pid": 1, "utc": 0.0, "started": 0.0, "stalled": [],
-        "clock": {"trusted": True}, "store": {"state": "ok", "waiting": 0, "path": str(path)},
+        "clock": {"trusted": True},
+        "store": {"state": "ok", "waiting": 0, "lost": 0, "path": str(path)},
         "frames": {"paused": ""}, "cameras": {"rpi": camera}, "thermometers": {"housing": DEVICE},
         "outputs": {},
     }  # fmt: skip
@@ -197,6 +203,42 @@ def test_with_a_token_nothing_is_shown_without_it(client_of):
     assert client.get("/").status_code == 200  # the cookie
 
 
+@pytest.mark.parametrize(
+    "token", ["tökän", "пароль", "秘密", "😀 four", "a b", 'quo"te;,=\\']
+)  # fmt: skip
+def test_a_token_may_hold_any_mark(client_of, token):
+    client = client_of(token, "0.0.0.0", "http://station.example")
+    assert client.get("/", params={"token": token + "x"}).status_code == 401
+    bearer = [(b"authorization", b"Bearer " + token.encode())]
+    assert client.get("/api/status", headers=bearer).status_code == 200
+    moved = client.get("/", params={"token": token}, follow_redirects=False)
+    assert moved.status_code == 303
+    assert token not in moved.headers["set-cookie"]
+    assert client.get("/").status_code == 200  # the cookie
+
+
+@pytest.mark.parametrize(
+    ("value", "status"),
+    [("Bearer {}", 200), ("bearer {}", 200), ("BEARER  {}", 200), ("{}", 401), ("Basic {}", 401),
+     ("Bearer{}", 401), ("Token {}", 401)],
+)  # fmt: skip
+def test_authorization_needs_its_scheme(client_of, value, status):
+    client = client_of(TOKEN, "0.0.0.0", "http://station.example")
+    found = client.get("/", headers={"authorization": value.format(TOKEN)})
+    assert found.status_code == status
+
+
+@pytest.mark.parametrize("path", ["//evil.com/", "///evil.com", "//evil.com/%2e%2e", "/\\evil.com"])
+def test_the_token_leads_nowhere_else(client_of, path):
+    client = client_of(TOKEN, "0.0.0.0", "http://station.example")
+    url = f"http://station.example{path}?token={TOKEN}"
+    moved = client.get(url, follow_redirects=False)
+    assert moved.status_code in (303, 404)
+    location = moved.headers.get("location", "/")
+    assert location.startswith("/")
+    assert location[1:2] not in ("/", "\\")
+
+
 def test_another_host_name_is_refused(client_of):
     client = client_of(base="http://evil.example")
     assert client.get("/api/status").status_code == 400
@@ -225,6 +267,34 @@ def test_with_a_token_a_foreign_origin_is_refused(client_of):
     assert client.get("/", headers={**bearer, "origin": "http://evil.com"}).status_code == 403
     own = {**bearer, "origin": "http://station.example"}
     assert client.get("/", headers=own).status_code == 200
+
+
+def test_a_page_that_is_open_hears_the_end(folders, tmp_path):
+    """SIGTERM with a stream open: it is told when acquisition ended, and nothing is logged."""
+    store, live = folders
+    with Store.open(store, "append") as opened:
+        opened.add_event(Event(1.7e9, "stopped", "thermocald stopped"))
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = [sys.executable, "-m", "thermocald", "dashboard", "--store", str(store)]
+    command += ["--live", str(live), "--port", str(port)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as server:
+        assert "the page is at" in server.stderr.readline()
+        address = f"http://127.0.0.1:{port}/api/"
+        with (
+            httpx.stream("GET", address + "stream", timeout=20) as page,
+            socket.create_connection(("127.0.0.1", port)) as stuck,
+        ):
+            stuck.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            stuck.sendall(_CSV_REQUEST)  # of which it takes up nothing
+            told = (line for line in page.iter_lines() if line.startswith("data: "))
+            assert json.loads(next(told)[6:])["pid"] == 1
+            (live / "status.json").unlink()
+            server.send_signal(signal.SIGTERM)
+            assert json.loads(next(told)[6:]) == {"stopped": 1.7e9}
+            assert next(told, None) is None
+        assert server.stderr.read() == ""
 
 
 def test_a_series_is_read_page_by_page(client_of, monkeypatch):

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from thermocald.output.figures.draw import draw_panel
-from thermocald.output.figures.panels import Curve, Panel
+from thermocald.figures import Curve, Panel, draw_panel
 
 
 @pytest.mark.parametrize("lowest", [-11.8, -1234.0, -0.0123, -3.0, 5e-5, -9.9e-5, 3.0405])

@@ -17,7 +17,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     Sensor,
 )
-from thermocald.simulation.model import ModelEffect, ThermalModel
+from thermocald.physics.model import ModelEffect, ThermalModel
 
 SENSOR = Sensor(3280, 2464, 0.00112)
 INTERIOR = InteriorOrientation(3.04, 0.012, -0.018, A1=-4e-3, A2=5e-4, A3=-2e-5, B1=1e-4, B2=-2e-4)

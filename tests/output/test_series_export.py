@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 from thermocald.cli import application
 from thermocald.errors import UsageError
 from thermocald.output.series_export import style_of
-from thermocald.simulation.presets import preset_simulation
-from thermocald.simulation.testfields import corner_field
+from thermocald.physics.presets import preset_simulation
+from thermocald.physics.testfields import corner_field
 from thermocald.store.database.store import Store
 from thermocald.store.logger.temperatures import read_log
 from thermocald.store.recording.reader import read_recording

@@ -12,7 +12,7 @@ import json
 from pathlib import Path
 
 import pytest
-from thermocald_drivers import picamera, picamera_metadata
+from thermocald_drivers import picamera
 
 from thermocald.errors import DeviceDenied, DeviceGone, ThermocaldError, WrongDevice
 from thermocald.hal import SystemClock
@@ -31,9 +31,7 @@ def names_in(module) -> set[str]:
     return {t for t in texts if isinstance(t, str) and t.isidentifier() and t[:1].isupper()}
 
 
-@pytest.mark.parametrize(
-    "name", sorted((names_in(picamera) | names_in(picamera_metadata)) - NO_CONTROLS)
-)
+@pytest.mark.parametrize("name", sorted(names_in(picamera) - NO_CONTROLS))
 def test_every_control_that_the_driver_names_exists(name):
     assert hasattr(controls, name)
 

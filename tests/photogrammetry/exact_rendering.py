@@ -1,6 +1,6 @@
 """Frames by exact area coverage: what a target measurement is tested against.
 
-Shares no code with `thermocald.simulation`. A shape is a polygon whose vertices go through the full
+Shares no code with `thermocald.physics`. A shape is a polygon whose vertices go through the full
 camera model one by one; the area that it covers of each sub-pixel is computed exactly (Green's
 theorem, segments split at the grid lines), the sub-pixel image is blurred with a sampled Gaussian
 and averaged over the pixels. So nothing is approximated but the outline by its vertices (720 of

@@ -1,6 +1,6 @@
 """Photographs of a printed test field, taken of the PDF itself: pages rasterised, sheets put up.
 
-Shares nothing with the drawing or with `thermocald.simulation` but the page: every pixel's ray is
+Shares nothing with the drawing or with `thermocald.physics` but the page: every pixel's ray is
 cut with the sheets' planes and looks up the rasterised page there. Four rays a pixel and a Gaussian
 make it a lens.
 """

@@ -269,3 +269,17 @@ def test_twelve_clean_targets_pass_the_global_test():
     assert adjust(scene.SENSOR, field, few, scene.INTERIOR, scene.EXTERIOR).status in (
         "global_test", "too_many_rejected",
     )  # fmt: skip
+
+
+@pytest.mark.parametrize(("factor", "most"), [(1.0, 1.0), (2.0, 0.45), (3.0, 0.1)])
+def test_noise_larger_than_stated_does_not_pass_by_rejecting_targets(factor, most):
+    """Twelve targets: with noise of three times the stated sigmas 19 % of the epochs were `ok`."""
+    field = scene.corner_field().subset(range(3, 147, 12))
+    rng = np.random.default_rng(41)
+    passed = []
+    for _ in range(60):
+        o = scene.observe(field, rng)
+        o.points[:] += np.sqrt(factor**2 - 1) * scene.SIGMA_PX * rng.standard_normal(o.points.shape)
+        passed.append(adjust(scene.SENSOR, field, o, scene.INTERIOR, scene.EXTERIOR).ok)
+    assert np.mean(passed) <= most
+    assert factor > 1 or np.mean(passed) > 0.9

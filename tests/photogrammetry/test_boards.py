@@ -14,7 +14,7 @@ from tests.photogrammetry.printed_sheets import photograph
 from thermocald.errors import TestFieldError
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 from thermocald.photogrammetry.frame.measurement import measure
-from thermocald.photogrammetry.targets import boards, dictionary
+from thermocald.photogrammetry.targets import boards, markers
 from thermocald.store.recording.board_file import read_board, read_rings
 
 CAMERA = CameraModel(Sensor(1640, 1232, 0.00224), InteriorOrientation(3.05, 0.02, -0.01, A1=-2e-3))
@@ -70,7 +70,7 @@ def drawn_exactly(field, columns, rows, size, spacing):
             rectangle(x, y, gap, gap)
     for tag in range(columns * rows):
         x, y = field.points[field.index[f"{tag}.1"], :2]  # lower left
-        cells = np.rot90(dictionary.marker_cells("DICT_APRILTAG_36h11", tag, 2), 2)
+        cells = np.rot90(markers.marker_cells("DICT_APRILTAG_36h11", tag, 2), 2)
         for j, row in enumerate(cells):
             edges = np.flatnonzero(np.diff(np.concatenate([[0], row.astype(int), [0]])))
             for a, b in edges.reshape(-1, 2):
@@ -97,7 +97,7 @@ def test_standard_deviations_of_an_aprilgrid_are_true_however_obliquely_it_is_se
 
 def test_the_tags_of_an_aprilgrid_are_those_of_its_makers():
     """Drawn from the published word, not from OpenCV's picture."""
-    cells = dictionary.marker_cells("DICT_APRILTAG_36h11", 0)[1:7, 1:7]
+    cells = markers.marker_cells("DICT_APRILTAG_36h11", 0)[1:7, 1:7]
     word = "".join("01"[int(not black)] for black in cells[::-1, ::-1].ravel())
     assert int(word, 2) == images.APRIL_TAG_0
 

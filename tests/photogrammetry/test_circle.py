@@ -10,7 +10,7 @@ from tests.photogrammetry.exact_rendering import Scene, noisy
 from tests.photogrammetry.fields import PI_CAMERA, PI_SENSOR
 from tests.photogrammetry.single_targets import AT_ORIGIN, SIZE, SingleTargets, single_targets
 from thermocald.photogrammetry.targets.circle import fit_circles
-from thermocald.photogrammetry.targets.noise import NoiseModel
+from thermocald.photogrammetry.targets.frame_status import NoiseModel
 from thermocald.photogrammetry.targets.outline import local_maps
 
 NOISE = 2.0

@@ -8,7 +8,7 @@ import pytest
 from tests.photogrammetry.single_targets import SingleTargets, single_targets
 from thermocald.photogrammetry.frame.gradient_weights import GradientWeights
 from thermocald.photogrammetry.targets.circle import fit_circles
-from thermocald.photogrammetry.targets.noise import NoiseModel
+from thermocald.photogrammetry.targets.frame_status import NoiseModel
 
 NOISE = NoiseModel(4 + 1 / 12)
 

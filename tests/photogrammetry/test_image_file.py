@@ -12,9 +12,8 @@ from tests.photogrammetry.fields import SMALL_CAMERA, SMALL_SENSOR, draw, small_
 from thermocald.errors import ImageError
 from thermocald.photogrammetry.frame.measurement import Prior
 from thermocald.photogrammetry.frame.tracking import Tracker
-from thermocald.photogrammetry.targets import image_file, jpeg_parts
-from thermocald.photogrammetry.targets.image_file import EncodedImage, decode_grey
-from thermocald.photogrammetry.targets.jpeg_parts import decode_parts
+from thermocald.photogrammetry.targets import image_file
+from thermocald.photogrammetry.targets.image_file import EncodedImage, decode_grey, decode_parts
 
 WIDTH, HEIGHT = 331, 247  # of units cut off at both edges
 BOXES = np.array([[40, 30, 60, 50], [200, 100, 231, 117], [320, 200, 400, 230], [-9, -9, 3, 3]])
@@ -68,7 +67,7 @@ def test_segments_give_the_same_grey_values(units, grey, monkeypatch):
         decoded.append(len(part))
         return original(part, **options)
 
-    monkeypatch.setattr(jpeg_parts.simplejpeg, "decode_jpeg", decode)
+    monkeypatch.setattr(image_file.simplejpeg, "decode_jpeg", decode)
     found = decode_parts(data, BOXES)
     whole = _opencv(data)
     assert found is not None

@@ -8,8 +8,7 @@ import pytest
 from tests.photogrammetry import network_cases as cases
 from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera.camera_model import CameraModel
-from thermocald.photogrammetry.network.adjustment import Distance, Photo, adjust_network
-from thermocald.photogrammetry.network.checks import advice
+from thermocald.photogrammetry.network.adjustment import Distance, Photo, adjust_network, advice
 
 
 def _survey(field, stations, sigma, seed, distances=None, **options):

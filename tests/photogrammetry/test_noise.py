@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermocald.photogrammetry.targets.noise import NoiseModel, estimate_noise
+from thermocald.photogrammetry.targets.frame_status import NoiseModel, estimate_noise
 
 
 def _residuals(floor: float, gain: float, rng: np.random.Generator):

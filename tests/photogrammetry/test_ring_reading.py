@@ -12,7 +12,7 @@ from tests.photogrammetry.fields import PI_SENSOR
 from tests.photogrammetry.single_targets import single_targets
 from thermocald.photogrammetry.targets import ring_code
 from thermocald.photogrammetry.targets.detection import find_circles
-from thermocald.photogrammetry.targets.ring_reading import read_codes
+from thermocald.photogrammetry.targets.ring_code import read_codes
 
 
 def _codes(image, ink=-1, **options) -> set[tuple[int, int]]:

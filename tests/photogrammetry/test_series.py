@@ -208,3 +208,31 @@ def test_a_gross_error_among_twelve_targets_of_a_series():
     assert r.sigma0[r.ok].max() < 3
     z = ((r.values - truth) / r.sd)[r.ok][:, :3]
     assert np.sqrt(np.mean(z**2)) < 1.4
+
+
+@pytest.mark.parametrize(
+    ("seed", "gross_px", "exterior"),
+    [(14, 1500, "per_epoch"), (36, 1500, "auto"), (23, 30, "series")],
+)
+def test_gross_errors_among_twelve_targets_end_in_a_status(seed, gross_px, exterior):
+    """8 % gross errors of any size: an epoch has a result that is true, or a reason."""
+    field, truth, observations = series(
+        np.random.default_rng(seed), coordinate_error=0.0, epochs=25
+    )
+    rng = np.random.default_rng(seed)
+    targets = np.sort(rng.choice(len(field), 12, replace=False))
+    few = [o.select(np.isin(o.targets, targets)) for o in observations]
+    for o in few:
+        wrong = rng.random(len(o)) < 0.08
+        o.points[wrong] += rng.uniform(-gross_px, gross_px, (int(wrong.sum()), 2))
+    r = adjust_series(
+        scene.SENSOR, field, few, scene.INTERIOR, scene.EXTERIOR, SeriesSettings(exterior=exterior)
+    )
+    assert all(bool(why) != (word == "ok") for word, why in zip(r.status, r.reasons, strict=True))
+    assert np.isfinite(r.values[r.ok]).all()
+    assert (r.sd[r.ok][:, :3] > 0).all()
+    if gross_px < 100:
+        assert r.ok.sum() >= 12
+        off = (r.values - truth)[r.ok][:, :3]
+        z = (off - np.median(off, axis=0)) / r.sd[r.ok][:, :3]
+        assert np.sqrt(np.mean(z**2)) < 1.3

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from thermocald.photogrammetry.field.sheets import field_sheets
+from thermocald.photogrammetry.field.planes import field_sheets
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.simulation.testfields import corner_field
+from thermocald.physics.testfields import corner_field
 
 
 def grid(origin, a, b, n=4, step=50.0):

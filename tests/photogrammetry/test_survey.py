@@ -12,8 +12,8 @@ from thermocald.output.testfield.layout import TRIM, Design, field_of, lay_out, 
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.network.adjustment import Distance
-from thermocald.photogrammetry.survey.survey import Picture, survey
-from thermocald.simulation.scene import Scene
+from thermocald.photogrammetry.survey import Picture, survey
+from thermocald.physics.scene import Scene
 
 # The binned mode of a Raspberry Pi camera v2.1.
 CAMERA = CameraModel(

@@ -7,8 +7,8 @@ import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.series.normals import ObservationGrid
-from thermocald.reduction.reduce import reduce_together
-from thermocald.reduction.series import SeriesInput
+from thermocald.thermal.reduce import reduce_together
+from thermocald.thermal.series import SeriesInput
 
 DAY = 86_400.0
 RATES = {0: 2e-4, 1: 4e-4, 2: -3e-4}  # mm/K

@@ -29,11 +29,11 @@ from tests.real_corners.generator import (
     RealSeries,
     generate,
 )
-from thermocald.discovery.verdict.result import Discovery, discover_series
-from thermocald.reduction.reduce import reduce_together
-from thermocald.reduction.series import SeriesInput
-from thermocald.reduction.source import series_input
+from thermocald.discovery.result import Discovery, discover_series
 from thermocald.store.recording.reader import read_recording
+from thermocald.thermal.reduce import reduce_together
+from thermocald.thermal.series import SeriesInput
+from thermocald.thermal.source import series_input
 
 NONE_PER_SEED = 25
 GOALS = {"nine": 0.9, "others": 0.9, "none": 1.0}

@@ -12,15 +12,15 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     Sensor,
 )
-from thermocald.simulation import effects
-from thermocald.simulation.effects.base import Effect
-from thermocald.simulation.history import History
-from thermocald.simulation.model import ModelEffect, ThermalModel
-from thermocald.simulation.operators import play, play_turns
-from thermocald.simulation.testfields import corner_field
+from thermocald.physics import catalogue
+from thermocald.physics.effect import Effect
+from thermocald.physics.history import History
+from thermocald.physics.model import ModelEffect, ThermalModel
+from thermocald.physics.operators import play, play_turns
+from thermocald.physics.testfields import corner_field
 
 T0 = 25.0
-NAMES = effects.names()
+NAMES = catalogue.names()
 
 
 def history(epochs=400, step=5.0, fine=0.25, T=None, board=None):
@@ -78,7 +78,7 @@ def test_catalogue_is_complete():
         "target_displacement",
     }
     assert set(NAMES) == wanted
-    assert all(effects.get(name).name == name for name in NAMES)
+    assert all(catalogue.get(name).name == name for name in NAMES)
 
 
 OFF = {
@@ -96,7 +96,7 @@ OFF = {
 
 @pytest.mark.parametrize("name", NAMES)
 def test_switched_off_changes_nothing(name):
-    effect, h, field = effects.get(name), history(), corner_field("circles", 3, 200.0)
+    effect, h, field = catalogue.get(name), history(), corner_field("circles", 3, 200.0)
     values = OFF.get(name) or dict.fromkeys(effect.usual, 0.0)
     on, off = model(ModelEffect(name, values)).predict(h, field), model().predict(h, field)
     # a lag of a microsecond is not off: it may differ by rate × tau × dT/dt = 1e-11 mm
@@ -111,11 +111,11 @@ def test_thermal_lag_of_a_ramp_and_a_sine():
     h = history(T=lambda s: T0 + 0.02 * s)
     t = h.times
     expected = T0 + 0.02 * (t - tau * (1 - np.exp(-t / tau)))
-    np.testing.assert_allclose(effects.get("thermal_lag").drive(h, tau=tau), expected, atol=1e-10)
+    np.testing.assert_allclose(catalogue.get("thermal_lag").drive(h, tau=tau), expected, atol=1e-10)
     h = history()
     wt = w * tau
     expected = T0 + 12 * (np.sin(w * t) - wt * np.cos(w * t) + wt * np.exp(-t / tau)) / (1 + wt**2)
-    np.testing.assert_allclose(effects.get("thermal_lag").drive(h, tau=tau), expected, atol=2e-6)
+    np.testing.assert_allclose(catalogue.get("thermal_lag").drive(h, tau=tau), expected, atol=2e-6)
     added = shift(h, ModelEffect("thermal_lag", {"tau": tau}))
     np.testing.assert_allclose(
         added[:, column("x0")], -4e-4 * (expected - T0 - 12 * np.sin(w * t)), atol=1e-9
@@ -125,12 +125,12 @@ def test_thermal_lag_of_a_ramp_and_a_sine():
 
 def test_mount_motion_follows_late_by_its_lag():
     h = history()
-    late = effects.get("thermal_lag").drive(h, tau=400.0) - T0
+    late = catalogue.get("thermal_lag").drive(h, tau=400.0) - T0
     added = shift(h, ModelEffect("mount_motion", {"tau": 400.0, "kappa": 1e-5, "X0": 3e-3}))
     np.testing.assert_allclose(added[:, column("kappa")], 1e-5 * late, atol=1e-15)
     np.testing.assert_allclose(added[:, column("X0")], 3e-3 * late, atol=1e-12)
     assert np.all(added[:, :10] == 0)
-    assert "with a lag of" in effects.get("mount_motion").sentence(
+    assert "with a lag of" in catalogue.get("mount_motion").sentence(
         {"tau": {"value": 400.0, "sd": 9.0, "unit": "s"}}
     )
 
@@ -138,7 +138,7 @@ def test_mount_motion_follows_late_by_its_lag():
 def test_time_offset_is_a_pure_delay():
     h = history()
     expected = T0 + 12 * np.sin(np.maximum(h.times - 37.0, 0.0) / 300.0)
-    np.testing.assert_allclose(effects.get("time_offset").drive(h, d=37.0), expected, atol=2e-6)
+    np.testing.assert_allclose(catalogue.get("time_offset").drive(h, d=37.0), expected, atol=2e-6)
 
 
 def test_hysteresis_of_a_triangle():
@@ -148,7 +148,7 @@ def test_hysteresis_of_a_triangle():
     T = up_down(h.times)
     expected = np.where(h.times < 500, np.maximum(T - r, T0), np.minimum(T0 + 10 - r, T + r))
     np.testing.assert_allclose(
-        effects.get("hysteresis").drive(h, half_width=r), expected, atol=1e-10
+        catalogue.get("hysteresis").drive(h, half_width=r), expected, atol=1e-10
     )
 
 
@@ -233,7 +233,7 @@ def test_target_displacement_moves_its_targets_alone():
         model(ModelEffect("target_displacement", {**values, "targets": "nobody"})).predict(h, field)
 
 
-READING = [n for n in NAMES if effects.get(n).kind != "image" or n in ("defocus",)]
+READING = [n for n in NAMES if catalogue.get(n).kind != "image" or n in ("defocus",)]
 
 
 @pytest.mark.parametrize("name", READING)
@@ -247,7 +247,7 @@ def test_sensitivity_is_the_derivative(name, coarse):
     T[[7, 8, 60]] = np.nan
     frames = np.arange(0, 120) * step
     h = History(frames, t, {"temperature": T, "board": T[::-1].copy()}, "temperature", T0)
-    effect = effects.get(name)
+    effect = catalogue.get(name)
     values = {k: p.default for k, p in effect.nonlinear.items() if not p.text}
     values.pop("phase", None)
     if name == "second_heat_source":
@@ -266,7 +266,7 @@ def test_cheap_enough_to_search(name):
     """A course of 180 epochs in less than 1 ms, of a day in less than 20 ms."""
     import time
 
-    effect = effects.get(name)
+    effect = catalogue.get(name)
     values = {k: p.default for k, p in effect.nonlinear.items() if not p.text}
     values.pop("phase", None)
     for epochs, limit in ((180, 1e-3), (8640, 20e-3)):
@@ -290,14 +290,15 @@ def test_two_drives_follow_each_other():
         ModelEffect("time_offset", {"d": 20.0}), ModelEffect("thermal_lag", {"tau": 60.0})
     ).drive(h)
     delayed = history(T=lambda s: T0 + 12 * np.sin(np.maximum(s - 20.0, 0) / 300.0))
-    np.testing.assert_allclose(both, effects.get("thermal_lag").drive(delayed, tau=60.0), atol=1e-5)
+    lagged = catalogue.get("thermal_lag").drive(delayed, tau=60.0)
+    np.testing.assert_allclose(both, lagged, atol=1e-5)
 
 
 def test_past_begins_with_the_series():
     h = history(T=lambda s: np.full_like(s, T0 + 7.0))
     for name, values in (("thermal_lag", {"tau": 500.0}), ("time_offset", {"d": 100.0}),
                          ("hysteresis", {"half_width": 3.0})):  # fmt: skip
-        np.testing.assert_allclose(effects.get(name).drive(h, **values), T0 + 7.0, rtol=1e-14)
+        np.testing.assert_allclose(catalogue.get(name).drive(h, **values), T0 + 7.0, rtol=1e-14)
 
 
 @pytest.mark.parametrize(
@@ -320,7 +321,7 @@ def test_unknown_effect_suggests_the_nearest():
 
 
 def test_words():
-    lag, play = effects.get("thermal_lag"), effects.get("hysteresis")
+    lag, play = catalogue.get("thermal_lag"), catalogue.get("hysteresis")
     said = lag.sentence({"tau": {"value": 84.13, "sd": 1.92, "unit": "s"}})
     assert said == "the camera follows the thermometer with a lag of 84.1 ± 1.9 s"
     assert lag.experiment_against(play) == (
@@ -329,12 +330,12 @@ def test_words():
     )
     for a in NAMES:
         for b in NAMES:
-            assert a == b or effects.get(a).experiment_against(effects.get(b))
+            assert a == b or catalogue.get(a).experiment_against(catalogue.get(b))
 
 
 def test_names_of_iop_and_units_agree():
     for name in NAMES:
-        effect = effects.get(name)
+        effect = catalogue.get(name)
         if effect.kind == "signal":
             assert set(effect.linear) <= set(PARAMETER_NAMES)
             assert set(effect.usual) <= set(effect.linear)

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from thermocald.errors import ConfigurationError, DataError
-from thermocald.simulation import effects
-from thermocald.simulation.effect_file import read_effects, write_effects
-from thermocald.simulation.effects.base import Effect
-from thermocald.simulation.formula.expression import parse
-from thermocald.simulation.formula.operators import OPERATORS
-from thermocald.simulation.history import History
-from thermocald.simulation.model import ModelEffect
+from thermocald.physics import catalogue
+from thermocald.physics.effect import Effect
+from thermocald.physics.formula import parse
+from thermocald.physics.history import History
+from thermocald.physics.model import ModelEffect
+from thermocald.physics.model_file import read_effects, write_effects
+from thermocald.physics.operators import OPERATORS
 
 SECONDS = np.arange(1200.0)
 T = 25.0 + 8.0 * np.sin(SECONDS / 190.0) + 3.0 * np.sin(SECONDS / 47.0)
@@ -66,7 +66,7 @@ CASES = {
 @pytest.mark.parametrize("text", CASES)
 def test_a_formula_is_what_numpy_makes_of_it(history, text):
     values, expected = CASES[text]
-    effect = effects.get(text)
+    effect = catalogue.get(text)
     found = effect.signal(history, **values)[:, 0]
     if expected is None:  # a backlash: never further away than its half-width, and it moves
         assert np.max(np.abs(found - T[::10])) == pytest.approx(1.5, abs=1e-6)
@@ -79,7 +79,7 @@ def test_a_formula_is_what_numpy_makes_of_it(history, text):
 @pytest.mark.parametrize("text", CASES)
 def test_errors_of_readings_are_carried_as_differences_say(history, text):
     values, _ = CASES[text]
-    effect = effects.get(text)
+    effect = catalogue.get(text)
     short = History(
         history.times[:20], SECONDS[:190:10] + 3.0,
         {n: r[:190:10] for n, r in history.readings.items()}, "temperature", 25.0, history.columns,
@@ -91,7 +91,7 @@ def test_errors_of_readings_are_carried_as_differences_say(history, text):
 
 def test_a_product_of_two_thermometers_carries_the_errors_of_both(history):
     """The variance by both matrices is the scatter of what noisy readings give."""
-    effect = effects.get("product(offset(temperature, a), board)")
+    effect = catalogue.get("product(offset(temperature, a), board)")
     values = {"a": 20.0}
     sd = {"temperature": 0.05, "board": 0.15}
     rng = np.random.default_rng(3)
@@ -138,20 +138,20 @@ def test_text_and_tree_are_the_same():
 )
 def test_what_is_no_formula_is_refused(text, said):
     with pytest.raises(ConfigurationError, match=said):
-        effects.get(text)
+        catalogue.get(text)
 
 
 def test_units_and_words():
-    effect = effects.get("integral(above(temperature, k))")
+    effect = catalogue.get("integral(above(temperature, k))")
     assert effect.units()["k"] == "degC"
     assert effect.units()["x0"] == "mm/(K s)"
     estimates = {"k": {"value": 30.0, "sd": 0.1, "unit": "degC"}, "a_c": {}}
     assert effect.sentence(estimates) == "c follows ∫ (T − 30.00 ± 0.10 °C)₊ dt"
-    assert effects.get("signed_square(rate(temperature))").units()["c"] == "mm/(K2/s2)"
+    assert catalogue.get("signed_square(rate(temperature))").units()["c"] == "mm/(K2/s2)"
 
 
 def test_a_column_that_was_not_recorded_is_named(history):
-    effect = effects.get('lag(column("pressure"), tau)')
+    effect = catalogue.get('lag(column("pressure"), tau)')
     with pytest.raises(DataError, match=r"no recorded column 'pressure'.*humidity"):
         effect.signal(history, tau=30.0)
 
@@ -169,3 +169,17 @@ def test_an_effect_file_is_read_as_it_was_written(tmp_path):
     path.write_text(path.read_text().replace("tau: ", "tua: "))
     with pytest.raises(ConfigurationError, match="tua"):
         read_effects(path)
+
+
+def test_a_constant_that_was_never_seen_is_not_stated_to_a_tenth_of_a_kelvin():
+    """The tail of a tanh is an exponential: middle, width and size lie on a ridge."""
+    effect = catalogue.get("saturation(temperature, k, w)")
+    k, w = effect.nonlinear
+    width = {"value": 288.2, "sd": 1.7, "unit": "K"}
+    near = {k: {"value": 38.0, "sd": 0.11, "unit": "degC"}, w: width}
+    far = {k: {"value": 3783.7, "sd": 0.11, "unit": "degC"}, w: width}
+    assert "38.00 ± 0.11 °C" in effect.sentence({"a_c": {}, **near})
+    assert "combination" not in effect.sentence({"a_c": {}, **near})
+    said = effect.sentence({"a_c": {}, **far})
+    assert "± 0.11" not in said
+    assert "only a combination is known" in said

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from thermocald.errors import ConfigurationError
-from thermocald.simulation.course import Course
-from thermocald.simulation.heat import HeatNetwork, Link
+from thermocald.physics.heat import Course, HeatNetwork, Link
 
 AIR = {"ambient": Course.constant(22.0)}
 TIMES = np.arange(0.0, 1500.0, 7.3)

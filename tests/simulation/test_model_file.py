@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from thermocald.errors import ConfigurationError
-from thermocald.simulation.demonstration import demonstration_field, demonstration_model
-from thermocald.simulation.device import read_camera_device
-from thermocald.simulation.model import ModelEffect
-from thermocald.simulation.model_file import model_document, parse_model, read_model, write_model
-from thermocald.simulation.programme import read_programme
+from thermocald.physics.device import read_camera_device, read_programme
+from thermocald.physics.model import ModelEffect
+from thermocald.physics.model_file import model_document, parse_model, read_model, write_model
+from thermocald.physics.testfields import demonstration_field, demonstration_model
 from thermocald.yaml_file import dump_yaml
 
 

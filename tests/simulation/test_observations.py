@@ -9,13 +9,11 @@ import pytest
 
 from thermocald.errors import ConfigurationError, GeometryError
 from thermocald.photogrammetry.camera.camera_model import Sensor
-from thermocald.simulation.course import Course
-from thermocald.simulation.demonstration import demonstration_field, demonstration_model
-from thermocald.simulation.device import CameraDevice, Measuring, default_heat
-from thermocald.simulation.model import ModelEffect
-from thermocald.simulation.observations import Simulation
-from thermocald.simulation.programme import Programme
-from thermocald.simulation.thermometer import SimulatedThermometer
+from thermocald.physics.device import CameraDevice, Measuring, Programme, default_heat
+from thermocald.physics.heat import Course, SimulatedThermometer
+from thermocald.physics.model import ModelEffect
+from thermocald.physics.simulation import Simulation
+from thermocald.physics.testfields import demonstration_field, demonstration_model
 from thermocald.store.recording.reader import read_recording
 
 
@@ -160,8 +158,8 @@ def test_a_day(tmp_path):
     code = (
         "import resource, sys, time; from pathlib import Path; sys.path.insert(0, sys.argv[1]);"
         "import numpy as np;"
-        "from thermocald.simulation.presets import preset_simulation;"
-        "from dataclasses import replace; from thermocald.simulation.course import Course;"
+        "from thermocald.physics.presets import preset_simulation;"
+        "from dataclasses import replace; from thermocald.physics.heat import Course;"
         "s = preset_simulation('rpi-v2.1-heating');"
         "p = replace(s.programme, epochs=int(sys.argv[2]));"
         "p = replace(p, sources={'housing': Course.constant(4.)});"

@@ -9,15 +9,15 @@ import sys
 from pathlib import Path
 
 import thermocald
-from thermocald.simulation import effects
+from thermocald.physics import catalogue
 
 OUTSIDE = '''
 """Saturation: a spring that gives less and less."""
 
 import numpy as np
 
-from thermocald.simulation.effects.base import Effect, Steady
-from thermocald.simulation.effects.parameter import Parameter, coefficient_units
+from thermocald.physics.effect import Effect, Steady
+from thermocald.physics.effect import Parameter, coefficient_units
 
 
 class Saturation(Effect):
@@ -43,13 +43,13 @@ import os
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 from dataclasses import replace
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
-from thermocald.cli.effect_options import parse_effect
-from thermocald.discovery.verdict.result import discover_series
-from thermocald.reduction.reduce import reduce_together
-from thermocald.reduction.source import series_input
-from thermocald.simulation.course import Course
-from thermocald.simulation.model import ModelEffect
-from thermocald.simulation.presets import preset_simulation
+from thermocald.thermal.effect_options import parse_effect
+from thermocald.discovery.result import discover_series
+from thermocald.thermal.reduce import reduce_together
+from thermocald.thermal.source import series_input
+from thermocald.physics.heat import Course
+from thermocald.physics.model import ModelEffect
+from thermocald.physics.presets import preset_simulation
 from thermocald.store.recording.reader import read_recording
 from tests.analysis.test_thermal_model import reduced
 
@@ -107,7 +107,7 @@ def test_a_class_that_is_no_effect_is_refused(tmp_path):
     outside(tmp_path)
     (tmp_path / "saturation.py").write_text("class Saturation:\n    pass\n")
     ran = python(
-        tmp_path, "-c", "from thermocald.simulation import effects; effects.get('saturation')"
+        tmp_path, "-c", "from thermocald.physics import catalogue; catalogue.get('saturation')"
     )
     assert "ConfigurationError" in ran.stderr
     assert "saturation:Saturation, which is not an Effect" in ran.stderr
@@ -116,13 +116,13 @@ def test_a_class_that_is_no_effect_is_refused(tmp_path):
 def test_no_module_outside_the_catalogue_names_an_effect():
     """Neither as a string nor as a class; modules that cannot reach the catalogue may use words."""
     root = Path(thermocald.__file__).parent
-    names = set(effects.names())
-    classes = {type(effects.get(name)).__name__ for name in names}
+    names = set(catalogue.names())
+    classes = {type(catalogue.get(name)).__name__ for name in names}
     found = []
     for path in sorted(root.rglob("*.py")):
         source = path.read_text(encoding="utf-8")
-        if root / "simulation" / "effects" in path.parents or not re.search(
-            r"thermocald\.(simulation|reduction|discovery|analysis\.thermal)", source
+        if root / "physics" / "effects" in path.parents or not re.search(
+            r"thermocald\.(physics|thermal|discovery|analysis\.thermal)", source
         ):
             continue
         for node in ast.walk(ast.parse(source)):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from thermocald.errors import ConfigurationError
-from thermocald.simulation.presets import PRESETS, preset_names, preset_simulation
+from thermocald.physics.presets import PRESETS, preset_names, preset_simulation
 
 # preset: principal point px, principal distance mm, where it goes (right, up), as the text has it
 REFERENCE = {

@@ -14,16 +14,15 @@ import numpy as np
 import pytest
 
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
-from thermocald.reduction.reduce import reduce_series
-from thermocald.reduction.source import series_input
-from thermocald.simulation import effects
-from thermocald.simulation.course import Course
-from thermocald.simulation.demonstration import demonstration_field, demonstration_model
-from thermocald.simulation.device import CameraDevice, default_heat
-from thermocald.simulation.model import ModelEffect
-from thermocald.simulation.observations import Simulation
-from thermocald.simulation.programme import Programme
+from thermocald.physics import catalogue
+from thermocald.physics.device import CameraDevice, Programme, default_heat
+from thermocald.physics.heat import Course
+from thermocald.physics.model import ModelEffect
+from thermocald.physics.simulation import Simulation
+from thermocald.physics.testfields import demonstration_field, demonstration_model
 from thermocald.store.recording.reader import read_recording
+from thermocald.thermal.reduce import reduce_series
+from thermocald.thermal.source import series_input
 
 PX = 0.00112
 
@@ -85,7 +84,7 @@ def record(tmp_path, effect, seed=8):
 
 
 def test_every_effect_is_here():
-    assert set(CASES) == set(effects.names())
+    assert set(CASES) == set(catalogue.names())
 
 
 @pytest.mark.slow
@@ -94,7 +93,7 @@ def test_parameters_are_found_again(tmp_path, name):
     true, known = CASES[name]
     simulation, recording = record(tmp_path, ModelEffect(name, true))
     series = reduce_series(series_input(recording), affinity=False, strict=False)
-    kind = effects.get(name)
+    kind = catalogue.get(name)
     start = {**dict.fromkeys(kind.usual, 0.0), **known}
     fitted = fit_thermal_model([series], [ModelEffect(name, start)], T0=simulation.model.T0)
     (found,) = fitted.model.effects

@@ -16,12 +16,15 @@ from thermocald.photogrammetry.camera.camera_model import (
 )
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.targets.markers import measure_markers
-from thermocald.simulation import portable
-from thermocald.simulation.demonstration import demonstration_field, demonstration_model
-from thermocald.simulation.raster import coverage, windows_around
-from thermocald.simulation.scene import Look, Scene
-from thermocald.simulation.shapes import surface_normals
-from thermocald.simulation.testfields import corner_field, corner_view
+from thermocald.physics import shapes as portable
+from thermocald.physics.scene import Look, Scene, coverage, windows_around
+from thermocald.physics.shapes import surface_normals
+from thermocald.physics.testfields import (
+    corner_field,
+    corner_view,
+    demonstration_field,
+    demonstration_model,
+)
 
 SENSOR = Sensor(3280, 2464, 0.00112)
 CLEAN = Look(noise_dn=0.0, vignetting=0.0)

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from thermocald.cli import application
 from thermocald.errors import ThermocaldError
-from thermocald.simulation.presets import preset_names, preset_simulation
+from thermocald.physics.presets import preset_names, preset_simulation
 from thermocald.store.recording.reader import read_recording
 from thermocald.yaml_file import dump_yaml
 

@@ -10,10 +10,10 @@ import pytest
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import Observations, TestField
-from thermocald.store.database.row import EpochResult
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head
 from thermocald.store.recording.reader import write_recording
+from thermocald.store.series import EpochResult
 
 if TYPE_CHECKING:
     from pathlib import Path

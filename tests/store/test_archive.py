@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermocald.store.database.archive import archive_series
-from thermocald.store.database.times import clock_corrections
+from thermocald.store.database.archive import archive_series, archive_store
+from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import read_recording
+from thermocald.store.series import clock_corrections
 
 
 def test_a_series_becomes_a_recording(filled, tmp_path, make_epoch):
@@ -80,3 +81,17 @@ def test_what_was_taken_before_the_time_was_learned_moves_by_that_step():
     off = right.copy()
     off[9:] += 1.0e7
     assert not clock_corrections(off, 10.0, trusted, []).any()
+
+
+def test_two_series_never_share_a_folder(tmp_path, head, field, make_epoch):
+    """`a-b`/`c` and `a`/`b-c`: with --skip-existing the second would never be archived."""
+    with Store.open(tmp_path / "s.db", "append") as store:
+        for camera, name in (("a-b", "c"), ("a", "b-c"), ("a", "b")):
+            one = replace(head, series=name, camera=replace(head.camera, name=camera))
+            store.append(store.create_series(one, field), make_epoch(1))
+    for _ in range(2):
+        found = archive_store(
+            tmp_path / "s.db", tmp_path / "out", None, None, False, True, lambda _: None
+        )
+    assert found["recordings"] == []  # all are there
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["a--b-c", "a-b", "a-b--c"]

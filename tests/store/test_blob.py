@@ -7,7 +7,7 @@ import pytest
 
 from thermocald.errors import StoreError
 from thermocald.photogrammetry.field.testfield import Observations
-from thermocald.store.database.blob import (
+from thermocald.store.database.epochs import (
     POINT_QUANTUM_PX,
     pack_covariance,
     pack_observations,

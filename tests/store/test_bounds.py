@@ -55,7 +55,7 @@ READ = textwrap.dedent(
 
     before = peak_mb()
     if sys.argv[2] == "stream":
-        module._STREAMED_ABOVE_BYTES = 0
+        module.LONG_FROM_BYTES = 0
         epochs = module.open_recording(Path(sys.argv[1])).iter_epochs()
     else:
         epochs = module.read_recording(Path(sys.argv[1])).epochs

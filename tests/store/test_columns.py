@@ -7,8 +7,8 @@ import pytest
 
 from thermocald.epoch import Epoch
 from thermocald.store.database import columns
-from thermocald.store.database.row import EpochResult
 from thermocald.store.database.store import Store
+from thermocald.store.series import EpochResult
 
 CHUNK = 16
 MERGED = 4
@@ -122,7 +122,12 @@ def test_chunks_can_be_rebuilt(store, series):
         store.append(series, epoch(i), result(i), extra={"blur": 0.5 * i})
     store.amend(series, 1, result(1))
     before = read(store, series)
-    store._db.execute("UPDATE column_chunk SET data = zeroblob(length(data)), checksum = NULL")
+    for *row, data in store._db.execute(
+        "SELECT id, series_id, name, first_row, last_number, data FROM column_chunk"
+    ).fetchall():
+        id_, data = row.pop(0), bytes(len(data))
+        sealed = (data, columns._checksum(*row, data), id_)
+        store._db.execute("UPDATE column_chunk SET data = ?, checksum = ? WHERE id = ?", sealed)
     assert read(store, series) != before
     store.rebuild_columns(series)
     assert read(store, series) == before

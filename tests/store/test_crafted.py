@@ -9,19 +9,35 @@ import sqlite3
 import pytest
 
 from thermocald.errors import RecordingError, StoreError
+from thermocald.store.database import columns
 from thermocald.store.database.archive import archive_readings, archive_series
-from thermocald.store.database.row import LoggedReading
+from thermocald.store.database.columns import row_checksum, sql_name
 from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import read_recording
+from thermocald.store.series import LoggedReading
 
 
 def change(path, statement: str, *values) -> None:
+    """Change rows as a clever hand would: with the checksums that belong to what they hold then."""
     database = sqlite3.connect(path)
-    for name in ("series_update", "epoch_update", "reading_update"):
-        database.execute(f"DROP TRIGGER {name}")
+    for table in ("series", "epoch", "reading"):
+        database.execute(f"DROP TRIGGER IF EXISTS {table}_update")
     database.execute(statement, values)
-    for table in ("series", "epoch", "reading"):  # as a file of an older version, or a clever hand
-        database.execute(f"UPDATE {table} SET checksum = NULL")
+    numbers, texts = [[*map(sql_name, names)] for names in (columns._NUMBERS, columns._TEXTS)]
+    sealed = {
+        "epoch": (numbers, texts),
+        "reading": (["utc", "clock_trusted"], ["thermometer", "temperatures"]),
+        "series": (
+            ["created_utc"], ["camera", "name", "start", "head", "identity", "settings", "digest"],
+        ),
+    }  # fmt: skip
+    for table, (numbers, texts) in sealed.items():
+        join = " JOIN testfield ON testfield.id = testfield_id" if table == "series" else ""
+        listed = ", ".join(f"{name}" for name in [*numbers, *texts])
+        query = f"SELECT {table}.id, {listed} FROM {table}{join}"
+        for id_, *row in database.execute(query).fetchall():
+            found = row_checksum(row[: len(numbers)], row[len(numbers) :])
+            database.execute(f"UPDATE {table} SET checksum = ? WHERE id = ?", (found, id_))
     database.commit()
     database.close()
 
@@ -79,12 +95,7 @@ def test_a_link_among_the_frames_is_not_followed_out(crafted, tmp_path):
     (tmp_path / "frames/away").symlink_to(tmp_path)
     (tmp_path / "frames/kept.jpg").write_bytes(b"kept")
     for number, frame in ((3, "link.jpg"), (4, "away/secret.jpg"), (5, "kept.jpg")):
-        database = sqlite3.connect(crafted)
-        database.execute("DROP TRIGGER IF EXISTS epoch_update")
-        query = "UPDATE epoch SET frame = ?, checksum = NULL WHERE number = ?"
-        database.execute(query, (frame, number))
-        database.commit()
-        database.close()
+        change(crafted, "UPDATE epoch SET frame = ? WHERE number = ?", frame, number)
     with Store.open(crafted) as store:
         archive_series(store, store.find_series(), tmp_path / "out", tmp_path / "frames")
     kept = {p.name: p.read_bytes() for p in (tmp_path / "out/frames").iterdir()}

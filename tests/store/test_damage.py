@@ -9,8 +9,8 @@ import pytest
 
 from thermocald.errors import StoreError, ThermocaldError
 from thermocald.store.database import columns
-from thermocald.store.database.row import Event
 from thermocald.store.database.store import Store
+from thermocald.store.series import Event
 
 EPOCHS = 40
 NAMES = ["epoch", "frame_time", "c", "sd_x0", "status", "temperature", "blur"]

@@ -13,10 +13,10 @@ import pytest
 from thermocald.epoch import Epoch
 from thermocald.errors import StoreError, StoreVersionError
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
-from thermocald.store.database.row import NOT_CALIBRATED, EpochResult, Event
 from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import read_recording, temperature_at_frame, write_recording
 from thermocald.store.recording.testfield_file import parse_testfield
+from thermocald.store.series import NOT_CALIBRATED, EpochResult, Event
 
 
 def test_an_epoch_comes_back_as_it_was(filled, make_epoch, make_result):
@@ -99,6 +99,7 @@ def test_resume_where_it_stopped(filled, store_path, head, field):
     assert store.last_epoch(series) == 20
     other = store.create_series(replace(head, series="M2"), field)
     assert store.last_epoch(other) is None
+    store.close()
     with Store.open(store_path, "append") as again:
         assert again.last_epoch(again.find_series("rpi", "M1")) == 20
 
@@ -256,7 +257,7 @@ def test_parameters_in_the_schema_follow_the_model(filled):
 def test_no_store(tmp_path):
     with pytest.raises(StoreError, match="there is no such store"):
         Store.open(tmp_path / "none.db")
-    with pytest.raises(StoreError, match="does its folder exist"):
+    with pytest.raises(StoreError, match="its folder does not exist"):
         Store.open(tmp_path / "nowhere" / "none.db", "append")
     assert list(tmp_path.iterdir()) == []
 

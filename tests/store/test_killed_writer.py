@@ -26,7 +26,7 @@ WRITER = textwrap.dedent(
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.field.testfield import Observations
     from thermocald.store.database.store import Store
-    from thermocald.store.database.row import EpochResult
+    from thermocald.store.series import EpochResult
 
     with Store.open(Path(sys.argv[1]), "append", durable=False) as store:
         series = store.find_series()
@@ -165,7 +165,7 @@ FULL = textwrap.dedent(
     from thermocald.photogrammetry.field.testfield import Observations, TestField
     from thermocald.store.database.store import Store
     from thermocald.store.recording.head import CameraSpec, Head
-    from thermocald.store.database.row import EpochResult
+    from thermocald.store.series import EpochResult
 
     disk = Path(sys.argv[1])
     (disk / "filler").write_bytes(bytes(600_000))

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from tests.cli.test_import import photograph
-from thermocald.cli.camera_file import read_camera
 from thermocald.cli.common import printable
 from thermocald.errors import (
     ConfigurationError,
@@ -21,9 +20,9 @@ from thermocald.errors import (
     TestFieldError,
     ThermocaldError,
 )
-from thermocald.output.camera_files.file_text import number
-from thermocald.photogrammetry.targets.image_file import decode_grey
-from thermocald.photogrammetry.targets.image_header import image_size
+from thermocald.photogrammetry.camera_files.camera_file import read_camera
+from thermocald.photogrammetry.camera_files.file_text import number
+from thermocald.photogrammetry.targets.image_file import decode_grey, image_size
 from thermocald.store.logger.photographs import read_photograph
 from thermocald.store.recording.reader import read_recording
 from thermocald.store.recording.table import Table

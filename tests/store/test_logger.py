@@ -11,7 +11,8 @@ import pytest
 from thermocald.errors import DataError, UsageError
 from thermocald.store.logger.clock import DeviceClock, clock_error, time_zone
 from thermocald.store.logger.moments import MomentFormat, parse_moment
-from thermocald.store.logger.temperatures import LogOptions, read_log
+from thermocald.store.logger.temperatures import LogOptions, log_options, read_log
+from thermocald.store.logger.units import stated_unit
 
 BERLIN = DeviceClock(time_zone("Europe/Berlin"))
 JUNE = datetime(2026, 6, 14, 10, 0, tzinfo=UTC).timestamp()  # 12:00 in Berlin
@@ -57,6 +58,133 @@ DIALECTS = {
 }
 
 
+VENDORS = {
+    # EL-USB: day first, what belongs to the logger in the first row alone, constant alarm levels
+    "Lascar EasyLog": (
+        "garden,Time,Celsius(°C),High Alarm,Low Alarm,Serial Number\n"
+        "1,14/06/2026 12:00:00,21.5,30.0,0.0,10012345\n2,14/06/2026 12:01:00,21.75,30.0,0.0\n"
+    ).encode("cp1252"),
+    # Comfort Software: statistics below the rows
+    "Testo": (
+        "Datum/Zeit;Temperatur[°C];Feuchte[%rF]\n14.06.2026 12:00:00;21,50;45,1\n"
+        "14.06.2026 12:01:00;21,75;45,0\n\nMinimum;21,50;45,0\nMaximum;21,75;45,1\n"
+        "Mittelwert;21,63;45,1\n"
+    ).encode("cp1252"),
+    # history as CSV: UTC, a sensor that was away, at the beginning too
+    "Home Assistant": (
+        b"entity_id,state,last_changed\n"
+        b"sensor.box_temperature,unavailable,2026-06-14T09:59:00.000Z\n"
+        b"sensor.box_temperature,21.5,2026-06-14T10:00:00.000Z\n"
+        b"sensor.box_temperature,unknown,2026-06-14T10:00:30.000Z\n"
+        b"sensor.box_temperature,21.75,2026-06-14T10:01:00.000Z\n"
+    ),
+    # Elitech's and others' Chinese programs
+    "GB 18030": (
+        "设备名称,RC-5\n序号,时间,温度(℃),湿度(%RH)\n1,2026-06-14 12:00:00,21.5,45\n"
+        "2,2026-06-14 12:01:00,21.75,45\n"
+    ).encode("gb18030"),
+    "months as words": (
+        b'Timestamp,Temperature (C)\n"Jun 14, 2026 12:00 PM",21.5\n"Jun 14, 2026 12:01 PM",21.75\n'
+    ),
+    # Campbell Scientific TOA5: four lines of header, all in quotes
+    "TOA5": (
+        b'"TOA5","box","CR300","1234","CR300.Std.10","CPU:box.CR3","55","Table1"\n'
+        b'"TIMESTAMP","RECORD","BattV","AirTC"\n"TS","RN","Volts","Deg C"\n"","","Min","Avg"\n'
+        b'"2026-06-14 12:00:00",1,12.9,21.5\n"2026-06-14 12:01:00",2,12.9,21.75\n'
+    ),
+    # T&D Thermo Recorder: the time again as a spreadsheet's day number
+    "T&D Ondotori": (
+        b'"Date/Time","Date/Time","No.1"\n"","","Temp.(C)"\n'
+        b'"2026/06/14 12:00:00","46187.5","21.5"\n"2026/06/14 12:01:00","46187.5006944","21.75"\n'
+    ),
+    # Maxim OneWireViewer: the unit in a column
+    "Thermochron iButton": (
+        b"1-Wire/iButton Part Number: DS1922L\nMission Start: Sun Jun 14 11:58:00 CEST 2026\n\n"
+        b"Date/Time,Unit,Value\n14/06/26 12:00:00 PM,C,21.5\n14/06/26 12:01:00 PM,C,21.75\n"
+    ),
+    # a panel's "download CSV": readings with their unit
+    "Grafana": (
+        '"Time","box"\n"2026-06-14 12:00:00","21.5 °C"\n"2026-06-14 12:01:00","21.75 °C"\n'
+    ).encode(),
+    "HOBO in °F": HOBO.replace("°C", "°F")
+    .replace("21.5", "70.7")
+    .replace("21.75", "71.15")
+    .encode(),
+    "Govee": (
+        b"Timestamp for sample frequency every 1 min min,Temperature_Fahrenheit,Relative_Humidity\n"
+        b"2026-06-14 12:00:00,70.7,45.1\n2026-06-14 12:01:00,71.15,45.0\n"
+    ),
+    "LogTag, rows that end with a separator": (
+        b"Index;Date;Time;Temperature\n1;14-Jun-2026;12:00:00;21,5;\n2;14-Jun-2026;12:01:00;21,75;\n"
+    ),
+    "kelvin": b"time,T [K]\n2026-06-14 12:00,294.65\n2026-06-14 12:01,294.9\n",
+}
+"""As the vendors' manuals and programs have them."""
+
+
+@pytest.mark.parametrize("name", VENDORS)
+def test_a_vendor_s_file_is_read_without_an_option(tmp_path, name):
+    found = logged(tmp_path, VENDORS[name])
+    (values,) = found.channels.values()
+    there = np.isfinite(values)
+    assert found.times[there].tolist() == [JUNE, JUNE + 60]
+    assert values[there] == pytest.approx([21.5, 21.75])
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("Testo", "3 rows hold no time: left out (line 5: 'Minimum')"),
+        ("Home Assistant", "2 readings of 'state' are none ('unavailable', 'unknown'): left empty"),
+        ("HOBO in °F", "is converted from degF, as its head says"),
+        ("kelvin", "is converted from K"),
+    ],
+)
+def test_what_is_passed_over_or_converted_is_said(tmp_path, name, said):
+    assert any(said in note for note in logged(tmp_path, VENDORS[name]).notes)
+
+
+def test_sensors_below_one_another_are_channels(tmp_path):
+    """As Home Assistant writes them; a humidity is none."""
+    rows = [
+        ("sensor.box_temperature", 21.5, "10:00:00"), ("sensor.box_humidity", 45.0, "10:00:10"),
+        ("sensor.air_temperature", 19.5, "10:00:20"), ("sensor.box_temperature", 21.75, "10:01:00"),
+    ]  # fmt: skip
+    data = "entity_id,state,last_changed\n" + "".join(
+        f"{name},{value},2026-06-14T{time}.000Z\n" for name, value, time in rows
+    )
+    found = logged(tmp_path, data)
+    assert list(found.channels) == ["sensor.box_temperature", "sensor.air_temperature"]
+    box, air = found.channels.values()
+    assert box[np.isfinite(box)].tolist() == [21.5, 21.75]
+    assert air[np.isfinite(air)].tolist() == [19.5]
+
+
+AMBIGUOUS = "time,temp\n06/07/2026 12:00,21\n06/07/2026 12:01,21\n"
+
+
+@pytest.mark.parametrize(("order", "month"), [("dmy", 7), ("mdy", 6)])
+def test_photographs_settle_the_order_of_day_and_month(tmp_path, order, month):
+    day = 6 if order == "dmy" else 7
+    first = datetime(2026, month, day, 10, tzinfo=UTC).timestamp()
+    (tmp_path / "log.csv").write_text(AMBIGUOUS)
+    found = read_log(tmp_path / "log.csv", LogOptions(clock=BERLIN), (first + 20, first + 40))
+    assert found.times.tolist() == [first, first + 60]
+    assert any("so it lies next to the photographs" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(("rows", "first"), [
+    (("06/07/2026 23:59", "07/07/2026 00:01"), datetime(2026, 7, 6, 21, 59, tzinfo=UTC)),
+    (("07/06/2026 23:59", "07/07/2026 00:01"), datetime(2026, 7, 6, 21, 59, tzinfo=UTC)),
+    (("07/07/2026 12:00", "07/07/2026 12:01"), datetime(2026, 7, 7, 10, 0, tzinfo=UTC)),
+])  # fmt: skip
+def test_rows_settle_the_order_of_day_and_month(tmp_path, rows, first):
+    """A log that runs past midnight goes on by a day, not by a month."""
+    found = logged(tmp_path, "time,temp\n" + "".join(f"{row},21\n" for row in rows))
+    assert found.times[0] == first.timestamp()
+    assert found.times[-1] - found.times[0] <= 120
+
+
 @pytest.mark.parametrize("name", DIALECTS)
 def test_a_log_is_the_same_in_every_dialect(tmp_path, name):
     found = logged(tmp_path, DIALECTS[name])
@@ -72,8 +200,8 @@ def test_a_log_is_the_same_in_every_dialect(tmp_path, name):
         (GERMAN, {"clock": DeviceClock()}, "no time zone: say which with --timezone"),
         (b"time,temp\n06/07/2026 12:00,21\n06/07/2026 12:01,21\n", {}, "--date-order dmy or mdy"),
         (b"time,temp\n2026-06-14 12:00,294.5\n2026-06-14 12:01,294.6\n", {}, "--unit K"),
-        (b"time,temp K (Kelvin)\n2026-06-14 12:00,20\n2026-06-14 12:01,20\n", {}, "--unit K"),
-        ("time;T °F\n2026-06-14 12:00;70,1\n2026-06-14 12:01;70,1\n", {}, "--unit degF"),
+        (b"time,temp K (Kelvin)\n2026-06-14 12:00,20\n2026-06-14 12:01,20\n", {}, "20 K is -253"),
+        (b"time,T (F)\n2026-06-14 12:00,20 C\n2026-06-14 12:01,20 C\n", {}, "at once.*--unit"),
         (b"time,a,b\n2026-06-14 12:00,20,21\n2026-06-14 12:01,20,21\n", {}, "--temperature-column"),
         (PLAIN.replace("21.75", "2_5.0"), {"temperatures": ("temperature",)}, "is not a number"),
         (b"time,temp\n2026-06-14 12:00,20\n2026-06-14 12:01,1e300\n", {}, "Another unit"),
@@ -190,3 +318,47 @@ def test_a_zone_in_the_header_is_not_overruled_by_that_of_times_without_one(tmp_
     forced = logged(tmp_path, standard, clock=DeviceClock(time_zone("+02:00"), forced=True))
     assert forced.times.tolist() == [JUNE, JUNE + 60]
     assert any("was given instead" in note for note in forced.notes)
+
+
+@pytest.mark.parametrize(
+    ("head", "unit"),
+    [
+        *((head, "degF") for head in (
+            "(F)", "T °F", "degF", "TempF", "[F]", "tempf", "temp_f", "Temperature, F", "Temp. (F)",
+            "deg. F", "Degrees F", "T ℉", "TºF", "Fahrenheit", "housing_f", "T_degF")),
+        *((head, "degC") for head in (
+            "Celsius(°C)", "Temperatur[°C]", "TempC", "温度(℃)", "T_degC")),
+        *((head, "K") for head in ("T [K]", "kelvin", "degK", "(K)", "housing_k")),
+        *((head, None) for head in (
+            "temperature", "Tempfühler", "Temp Fan", "offset", "state", "temperature_factory",
+            "board_temperature", "Probe F")),
+    ],
+)  # fmt: skip
+def test_one_pattern_reads_the_unit_of_a_head(head, unit):
+    assert stated_unit(head) == unit
+
+
+TWO = """"Plot Title: x"
+"#","Date Time, GMT+02:00","Temp, °C (LGR S/N: 1, SEN S/N: 1, LBL: housing)","Temp, °C (LGR S/N: 1, SEN S/N: 2)"
+1,06/14/26 12:00:00 PM,21.5,21.0
+2,06/14/26 12:01:00 PM,21.75,21.0
+"""  # noqa: E501
+
+
+def test_columns_are_called_as_their_owner_calls_them(tmp_path):
+    path = tmp_path / "hobo.csv"
+    path.write_text(TWO, encoding="utf-8")
+    assert list(read_log(path, LogOptions(clock=BERLIN)).channels) == ["housing", "Temp"]
+    given = log_options(timezone="Europe/Berlin", name=["Temp, °C (LGR S/N: 1, SEN S/N: 2)=相机"])
+    assert list(read_log(path, given).channels) == ["housing", "相机"]
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("Temp", "COLUMN=LABEL"), ("Temp=c", "column of this program"),
+                        ("lens=x", "no column 'lens'")]
+)  # fmt: skip
+def test_a_name_that_cannot_be_given_is_refused(tmp_path, name, words):
+    path = tmp_path / "hobo.csv"
+    path.write_text(TWO, encoding="utf-8")
+    with pytest.raises((UsageError, DataError), match=words):
+        read_log(path, log_options(timezone="Europe/Berlin", name=[name]))

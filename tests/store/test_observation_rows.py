@@ -8,9 +8,9 @@ from thermocald.errors import StoreError
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.series.normals import ObservationGrid
-from thermocald.store.database.row import EpochResult
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head
+from thermocald.store.series import EpochResult
 from thermocald.store.sources import open_source
 from thermocald.store.stored_blocks import StoredBlocks
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from thermocald.errors import StoreError
-from thermocald.store.database import copies
+from thermocald.store.database import file
 from thermocald.store.database.store import Store
 
 
@@ -70,8 +70,8 @@ def test_through_a_link_too(read_only, tmp_path):
 def test_without_a_wal_it_is_read_in_place(with_wal, monkeypatch):
     with Store.open(with_wal, "append"):
         pass  # the -wal file is moved into the store
-    monkeypatch.setattr(copies.tempfile, "mkdtemp", None)
-    copies.open_copy(with_wal).close()
+    monkeypatch.setattr(file.tempfile, "mkdtemp", None)
+    file.open_copy(with_wal).close()
 
 
 def test_a_file_that_is_being_written_is_not_copied_torn(with_wal, monkeypatch):
@@ -82,6 +82,6 @@ def test_a_file_that_is_being_written_is_not_copied_torn(with_wal, monkeypatch):
         with Path(source).open("ab") as file:
             file.write(b"x")
 
-    monkeypatch.setattr(copies.shutil, "copyfile", written_meanwhile)
+    monkeypatch.setattr(file.shutil, "copyfile", written_meanwhile)
     with pytest.raises(StoreError, match="being written"):
-        copies.open_copy(with_wal)
+        file.open_copy(with_wal)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from thermocald.epoch import Epoch
 from thermocald.errors import RecordingError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation
 from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.store.recording import observation_file, parquet_table
 from thermocald.store.recording import reader as module
 from thermocald.store.recording.reader import (
     RecordingWriter,
@@ -58,7 +60,7 @@ def test_head_keeps_interior_and_unknown_keys(tmp_path, field, head, make_epoch)
 
 def test_stream_gives_the_same_epochs(recording_path, monkeypatch):
     whole = read_recording(recording_path).epochs
-    monkeypatch.setattr(module, "_STREAMED_ABOVE_BYTES", 0)
+    monkeypatch.setattr(module, "LONG_FROM_BYTES", 0)
     monkeypatch.setattr(module.Table.chunks, "__defaults__", (7,))  # epochs span chunks
     streamed = list(open_recording(recording_path).iter_epochs())
     assert [e.number for e in streamed] == [e.number for e in whole]
@@ -232,3 +234,75 @@ def test_files_as_windows_writes_them(recording_path):
     assert found.testfield.names == expected.testfield.names
     for a, b in zip(found.epochs, expected.epochs, strict=True):
         assert same(a.observations, b.observations)
+
+
+@pytest.fixture
+def long_from_nothing(tmp_path, monkeypatch):
+    """Every recording counts as long; the user's cache, a folder of the test."""
+    monkeypatch.setattr(module, "LONG_FROM_BYTES", 0)
+    monkeypatch.setattr(observation_file, "LONG_FROM_BYTES", 0)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "thermocald"
+
+
+def test_long_text_is_parsed_once(recording_path, long_from_nothing, monkeypatch):
+    """The second reading does not see the text; every number is the text's to the bit."""
+    monkeypatch.setattr(observation_file, "LONG_FROM_BYTES", 10**9)
+    from_text = list(open_recording(recording_path).iter_epochs())
+    monkeypatch.setattr(observation_file, "LONG_FROM_BYTES", 0)
+    first = list(open_recording(recording_path).iter_epochs())
+    assert len(list(long_from_nothing.glob("*.parquet"))) == 1
+    monkeypatch.setattr(parquet_table, "_parse", None)
+    second = list(open_recording(recording_path).iter_epochs())
+    for a, b, c in zip(from_text, first, second, strict=True):
+        assert same(a.observations, b.observations)
+        assert same(a.observations, c.observations)
+
+
+def test_text_that_was_changed_is_parsed_again(recording_path, long_from_nothing):
+    before = next(open_recording(recording_path).iter_epochs()).observations.points[0, 0]
+    file = recording_path / "observations.csv"
+    lines = file.read_text().splitlines()
+    fields = lines[1].split(",")
+    column = lines[0].split(",").index("x")
+    fields[column] = str(float(fields[column]) + 1)
+    file.write_text("\n".join([lines[0], ",".join(fields), *lines[2:]]) + "\n")
+    after = next(open_recording(recording_path).iter_epochs()).observations.points[0, 0]
+    assert after == pytest.approx(before + 1, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "words"),
+    [("x", "12,5e", "fields"), ("x", "", "is empty"), ("x", "nan", "finite"),
+     ("sx", "0", "above 0 px"), ("target", "nobody", "does not stand in testfield.csv"),
+     ("epoch", "99", "does not stand in epochs.csv"), ("epoch", "1.5", "not an integer")],
+)  # fmt: skip
+def test_a_copy_says_where_the_text_is_wrong(
+    recording_path, long_from_nothing, column, value, words
+):
+    """What is found in the binary copy is said of the line of the text."""
+    file = recording_path / "observations.csv"
+    lines = file.read_text().splitlines()
+    fields = lines[3].split(",")
+    fields[lines[0].split(",").index(column)] = value
+    lines[3] = ",".join(fields)
+    file.write_text("\n".join(lines) + "\n")
+    with pytest.raises(RecordingError, match=r"observations\.csv, line 4") as error:
+        list(open_recording(recording_path).iter_epochs())
+    assert words in str(error.value)
+
+
+def test_without_a_place_for_the_copy_the_text_is_read(
+    recording_path, long_from_nothing, monkeypatch
+):
+    expected = list(open_recording(recording_path).iter_epochs())
+    (copy,) = long_from_nothing.glob("*.parquet")
+    copy.unlink()
+    monkeypatch.setattr(parquet_table, "_cache", lambda: Path("/proc/nowhere"))
+    monkeypatch.setattr(parquet_table.shutil, "disk_usage", raise_full)
+    for a, b in zip(expected, open_recording(recording_path).iter_epochs(), strict=True):
+        assert same(a.observations, b.observations)
+
+
+def raise_full(_: object) -> None:
+    raise OSError(28, "No space left on device")

@@ -12,10 +12,10 @@ import pytest
 from tests.store.conftest import N_TARGETS
 from thermocald.analysis.study.input import load_series as load_study
 from thermocald.cli import application
-from thermocald.reduction.source import load_series
-from thermocald.store.database.row import Event
 from thermocald.store.database.store import Store
+from thermocald.store.series import Event
 from thermocald.store.sources import open_source
+from thermocald.thermal.source import load_series
 
 EPOCHS = 40
 # name → {first epoch, last epoch: seconds that its times are wrong by}; the step that was followed

@@ -39,7 +39,7 @@ def test_what_a_crash_cut_off_is_no_damage(crashed):
     assert read_wal_tail(wal) == WalTail()
     for size in (0, 20, 32, 33, len(whole) // 2, len(whole) - 1):
         wal.write_bytes(whole[:size])
-        assert read_wal_tail(wal) == WalTail()
+        assert read_wal_tail(wal) == WalTail(unfinished=size > 32)
 
 
 def test_every_flip_that_loses_epochs_is_reported(crashed):
@@ -130,3 +130,28 @@ def test_the_daemon_says_so_and_keeps_a_copy(crashed):
     (copy,) = crashed.parent.glob("*-wal-damaged-*")
     assert copy.read_bytes() == bytes(data)
     guard.close()
+
+
+@pytest.mark.parametrize("part", [0.1, 0.35, 0.5, 2 / 3, 0.8, 0.999])
+def test_a_wal_file_that_was_cut_off_in_copying_is_said(crashed, capsys, part):
+    """Whole transactions may be gone: that cannot be known, but that the file was cut can."""
+    wal = crashed.with_name(f"{crashed.name}-wal")
+    data, _ = frames(wal)
+    wal.write_bytes(data[: round(len(data) * part)])
+    wal.with_name(f"{crashed.name}-shm").unlink(missing_ok=True)
+    assert read_wal_tail(wal) == WalTail(unfinished=True)
+    application()(["check", str(crashed)], standalone_mode=False)
+    assert "cut off" in capsys.readouterr().out
+
+
+def test_of_a_cut_file_the_index_knows_what_is_missing(store_path, head, field, make_epoch):
+    wal = store_path.with_name(f"{store_path.name}-wal")
+    with Store.open(store_path, "append", durable=False) as store:
+        series = store.create_series(head, field)
+        for i in range(1, 4):
+            store.append(series, make_epoch(i))
+        data, step = frames(wal)
+        assert read_wal_tail(wal) == WalTail()
+        wal.write_bytes(data[: 24 + 2 * step])
+        assert read_wal_tail(wal).lost == 1
+        wal.write_bytes(data)

@@ -8,9 +8,11 @@ again, since it may be plugged in later.
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
+from thermocald.addresses import without_secrets
 from thermocald.errors import (
     DeviceFinished,
     DeviceNotFound,
@@ -51,8 +53,8 @@ class LinkEvent:
 class Link:
     """One device and its state; used by one thread, looked at by others.
 
-    Attributes for the status: state; why: the last fault; out_since: monotonic s; faults: calls
-    that failed.
+    Attributes for the status: state; why: the last fault; out_since: monotonic s; since: UTC s,
+    when it went away or ended, NaN while it has not; faults: calls that failed.
     """
 
     def __init__(
@@ -72,6 +74,7 @@ class Link:
         self.state: LinkState = "open" if is_open else "closed"
         self.why = ""
         self.out_since = 0.0
+        self.since = math.nan
         self.faults = 0
         self.error: PermanentDeviceError | None = None
         self._clock = clock
@@ -141,16 +144,19 @@ class Link:
             log.info(text, extra={"device": self.name, "event": "device_back"})
             self._tell("device_back", text)
         self.state = "open"
+        self.since = math.nan
         self.why = ""
         self._pause_s = 0.0
 
     def _out(self, why: str, longest_s: float) -> None:
         self.device.close()
+        why = without_secrets(why)  # a library may quote an address
         self.faults += 1
         self.why = why
         if self.state != "out":
             self.state = "out"
             self.out_since = self._clock.monotonic()
+            self.since = self._clock.utc()
             text = f"{self.kind} {self.name} is out: {why}"
             log.warning(text, extra={"device": self.name, "event": "device_out"})
             self._tell("device_out", text)
@@ -165,14 +171,15 @@ class Link:
             return
         self.device.close()
         self.error = error
-        self.why = str(error)
+        self.since = self._clock.utc()
+        self.why = without_secrets(str(error))
         # a recording that has been played to its end is not a failure
         finished = isinstance(error, DeviceFinished)
         self.state = "finished" if finished else "failed"
         level = logging.INFO if finished else logging.ERROR
         kind = f"device_{self.state}"
-        log.log(level, "%s %s: %s", self.kind, self.name, error, extra={"event": kind})
-        self._tell(kind, f"{self.kind} {self.name}: {error}")
+        log.log(level, "%s %s: %s", self.kind, self.name, self.why, extra={"event": kind})
+        self._tell(kind, f"{self.kind} {self.name}: {self.why}")
 
     def _tell(self, kind: str, text: str) -> None:
         if self._on_event is not None:

@@ -12,12 +12,12 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from thermocald.names import require_channels
+
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from thermocald.hal import Reading
-
-__all__ = ["PairedReadings", "Readings", "pair_readings"]
 
 _REMEMBERED = 16
 _OLDEST_IN_PERIODS = 1.5
@@ -54,6 +54,26 @@ def pair_readings(readings: Mapping[str, Reading | None], frame_monotonic: float
     if reference is None:
         return PairedReadings(math.nan, {}, math.nan)
     return PairedReadings(reference.utc, temperatures, reference.monotonic - frame_monotonic)
+
+
+def require_columns(thermometers: Mapping[str, Iterable[str]], error: type[Exception]) -> list[str]:
+    """The columns of an epoch for {thermometer: its channels}, the reference first.
+
+    Raises `error` where one has the name of another, or of a column of this program.
+    """
+    columns = [
+        _column(name, channel, len(thermometers))
+        for name, channels in thermometers.items()
+        for channel in channels
+    ]
+    where = f"thermometers {', '.join(thermometers)}"
+    require_channels(columns, where, error)
+    if "temperature" in columns[1:]:
+        raise error(
+            f"{where}: `temperature` is what the reference is called, the first of the channels "
+            f"({', '.join(columns)}); make it the first, or rename it"
+        )
+    return columns
 
 
 def _column(thermometer: str, channel: str, thermometers: int) -> str:

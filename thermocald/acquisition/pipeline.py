@@ -1,48 +1,42 @@
-"""From a camera and its thermometers to calibrated epochs, one tick after the other.
+"""One camera's frames on their way to the store, in bounded memory: calibration may be dropped,
+acquisition not.
 
-This is the daemon's tick without its threads: what a virtual clock, a desk and a test want. A
-camera that warms up for 25 minutes:
+    submit (the camera's thread) ─► waiting ─► calibrated ─► kept, in the order of their numbers
+                                      └─► too many wait: kept uncalibrated, with the frame, and
+                                          calibrated when there is time
 
-    clock = VirtualClock()
-    camera = open_device("camera", "mock", {"seed": 1}, clock)
-    thermometer = open_device("thermometer", "mock", {"seed": 2}, clock)
-    with camera, thermometer:
-        calibrator = Calibrator(camera.model.sensor, camera.field, nominal_c=3.04)
-        pipeline = Pipeline(camera, {"temperature": thermometer}, calibrator, clock, period_s=10.0)
-        for calibrated, frame in pipeline.run(150):
-            ...                                    # or sinks=[f]: f(calibrated, frame)
-
-`calibrated.epoch` has the times and temperatures, `calibrated.adjustment` the result or the reason
-why there is none. A tick in which the camera fails for the moment gives no epoch and is counted in
-`pipeline.lost`; one in which a thermometer fails gives an epoch without its temperature.
+Two threads, one calibrates and one keeps, so that a slow disk or a slow adjustment never holds the
+camera up.
 """
 
 from __future__ import annotations
 
+import logging
 import math
-from dataclasses import replace
-from typing import TYPE_CHECKING
+import threading
+from collections import deque
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Literal, Protocol
 
 from thermocald.acquisition.calibrator import CalibratedEpoch
-from thermocald.acquisition.link import Link
-from thermocald.acquisition.pairing import pair_readings
-from thermocald.acquisition.scheduler import Schedule
 from thermocald.epoch import Epoch
 from thermocald.errors import DataError
 from thermocald.photogrammetry.epoch.adjustment import failed
-from thermocald.photogrammetry.field.exchange import observations_from_lists
+from thermocald.photogrammetry.field.planes import observations_from_lists
 from thermocald.photogrammetry.targets.image_file import EncodedImage
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     from thermocald.acquisition.calibrator import Calibrator
-    from thermocald.acquisition.pairing import PairedReadings
-    from thermocald.hal import Camera, Clock, Frame, Thermometer
+    from thermocald.acquisition.pairing import PairedReadings, Readings
+    from thermocald.hal import Clock, Frame
 
-    Sink = Callable[[CalibratedEpoch, Frame], None]
+log = logging.getLogger(__name__)
 
-__all__ = ["Pipeline", "calibrate_frame", "make_epoch"]
+_DEPTH = 3
+_PATIENCE_S = 2.0
+_IDLE_S = 0.5
 
 
 def make_epoch(number: int, frame: Frame, paired: PairedReadings) -> Epoch:
@@ -62,72 +56,243 @@ def calibrate_frame(calibrator: Calibrator, epoch: Epoch, frame: Frame) -> Calib
     return calibrator.calibrate(epoch, image)
 
 
-class Pipeline:
-    """One camera's ticks: capture, read, calibrate, hand over; the devices must be open.
+@dataclass(eq=False)
+class AcquiredEpoch:
+    """An epoch on its way: the frame, and what became of it so far.
 
-    calibrator: None if epochs are only acquired. first: number of the first epoch.
+    calibrated: None while it waits, and for good if calibration was dropped.
+    """
+
+    number: int
+    frame: Frame
+    clock_trusted: bool
+    epoch: Epoch | None = None
+    skew_s: float = float("nan")
+    calibrated: CalibratedEpoch | None = None
+    state: Literal["waiting", "calibrating", "done", "dropped"] = field(default="waiting")
+
+
+class Keeper(Protocol):
+    """Who keeps epochs; called by one thread, in the order of their numbers."""
+
+    def keep(self, acquired: AcquiredEpoch) -> None:
+        """Keep an epoch; `acquired.epoch` is set."""
+
+    def amend(self, calibrated: CalibratedEpoch) -> None:
+        """Keep the calibration of an epoch that was kept without."""
+
+    def backlog(self, below: int) -> Epoch | None:
+        """An epoch numbered below, kept without calibration, with the path of its frame."""
+
+
+class Pipeline:
+    """The queue, the calibrating and the keeping thread of one camera.
+
+    calibrator: None if epochs are only acquired. observe: (a calibrated epoch, whether it comes in
+    order) → the epoch as it is kept. depth: epochs that may wait. patience_s: to wait for a reading
+    that is being taken, at most half a period. columns: of an epoch's temperatures, the reference
+    first, as far as they are known. on_lost: told why an epoch that was taken is not kept.
     """
 
     def __init__(
         self,
-        camera: Camera,
-        thermometers: Mapping[str, Thermometer],
+        name: str,
         calibrator: Calibrator | None,
+        readings: Readings,
+        thermometers: Sequence[str],
+        keeper: Keeper,
         clock: Clock,
         *,
-        period_s: float = 10.0,
-        sinks: Sequence[Sink] = (),
         first: int = 1,
+        period_s: float = 10.0,
+        depth: int = _DEPTH,
+        patience_s: float | None = None,
+        trusted: Callable[[], bool] = lambda: True,
+        observe: Callable[[CalibratedEpoch, bool], CalibratedEpoch] = lambda epoch, _: epoch,
+        columns: Callable[[], Sequence[str]] = tuple,
+        on_lost: Callable[[str], None] = lambda _: None,
     ) -> None:
-        self.lost = 0
-        self._camera = camera
-        self._thermometers = dict(thermometers)
-        self._camera_link = Link("camera", "camera", camera, clock, period_s=period_s, is_open=True)
-        self._thermometer_links = {
-            name: Link("thermometer", name, device, clock, period_s=period_s, is_open=True)
-            for name, device in thermometers.items()
-        }
-        self._calibrator = calibrator
-        self._schedule = Schedule(clock, period_s)
-        self._sinks = list(sinks)
-        self._number = first
+        self.name = name
+        self.calibrator = calibrator
+        self.dropped = 0  # epochs whose calibration was deferred
+        self.caught_up = 0
+        self.lost = 0  # epochs that were taken and not handed over to be kept
+        self.next_number = first
+        self._readings = readings
+        self._thermometers = list(thermometers)
+        self._keeper = keeper
+        self._clock = clock
+        self._patience_s = min(_PATIENCE_S, 0.5 * period_s) if patience_s is None else patience_s
+        self._depth = depth
+        self._trusted = trusted
+        self._observe = observe
+        self._columns = columns
+        self._on_lost = on_lost
+        self._items: deque[AcquiredEpoch] = deque()
+        self._amended: deque[CalibratedEpoch] = deque()
+        self._changed = threading.Condition()
+        self._stopping = False
+        self._busy_since: dict[str, float] = {}
+        self._threads = [
+            threading.Thread(target=self._calibrate_all, name=f"calibrate {name}", daemon=True),
+            threading.Thread(target=self._keep_all, name=f"keep {name}", daemon=True),
+        ]
 
-    def run(self, epochs: int | None = None) -> Iterator[tuple[CalibratedEpoch, Frame]]:
-        """Run until so many epochs are there (None: for ever); yields each after the sinks had it.
+    def start(self) -> None:
+        """Start both threads."""
+        for thread in self._threads:
+            thread.start()
 
-        A recording that has been played ends the run; what else is not recoverable is raised, as a
-        PermanentDeviceError.
-        """
-        done = 0
-        while epochs is None or done < epochs:
-            if self._schedule.wait() is None:
+    def submit(self, frame: Frame) -> None:
+        """Take a frame over; returns at once."""
+        with self._changed:
+            if len(self._items) > 2 * self._depth:
+                self._lose("it cannot be kept fast enough")
                 return
-            frame = self._camera_link.call(self._camera.capture)
-            if frame is None:
-                if self._camera_link.state == "finished":
-                    return
-                if self._camera_link.error is not None:
-                    raise self._camera_link.error
-                self.lost += 1
-                continue
-            readings = {
-                name: self._thermometer_links[name].call(device.read)
-                for name, device in self._thermometers.items()
-            }
-            epoch = make_epoch(self._number, frame, pair_readings(readings, frame.monotonic))
-            calibrated = self._calibrate(epoch, frame)
-            self._number += 1
-            done += 1
-            for sink in self._sinks:
-                sink(calibrated, frame)
-            yield calibrated, frame
+            self._items.append(AcquiredEpoch(self.next_number, frame, self._trusted()))
+            self.next_number += 1
+            self._changed.notify_all()
 
-    def _calibrate(self, epoch: Epoch, frame: Frame) -> CalibratedEpoch:
-        if self._calibrator is None:
+    def _lose(self, why: str) -> None:
+        self.lost += 1
+        self._on_lost(f"camera {self.name}: {why}")
+
+    def wait_for_room(self, timeout_s: float) -> bool:
+        """Wait until nothing need be deferred for one more epoch: for what can be replayed."""
+        with self._changed:
+            return self._changed.wait_for(lambda: len(self._items) < self._depth, timeout_s)
+
+    def drain(self, timeout_s: float) -> bool:
+        """Wait until all that was submitted is calibrated and handed over to be kept."""
+        with self._changed:
+            return self._changed.wait_for(lambda: not self._items and not self._amended, timeout_s)
+
+    def stop(self, grace_s: float) -> bool:
+        """Finish the current epoch, keep the others as they are; False if that took too long."""
+        with self._changed:
+            self._stopping = True
+            self._changed.notify_all()
+        deadline = self._clock.monotonic() + grace_s
+        for thread in self._threads:
+            thread.join(max(0.0, deadline - self._clock.monotonic()))
+        with self._changed:
+            while self._items:
+                self._items.popleft()
+                self._lose("it was still waiting to be kept at the end")
+        return not any(thread.is_alive() for thread in self._threads)
+
+    def waiting(self) -> int:
+        """How many epochs are on their way."""
+        return len(self._items)
+
+    def busy_s(self) -> float:
+        """For how long a thread has not finished one thing; 0 if none is busy."""
+        now = self._clock.monotonic()
+        return max((now - since for since in list(self._busy_since.values())), default=0.0)
+
+    def _calibrate_all(self) -> None:
+        while (item := self._next_to_calibrate()) is not None:
+            self._busy_since["calibrate"] = self._clock.monotonic()
+            if isinstance(item, AcquiredEpoch):
+                self._calibrate(item)
+            else:
+                result = self._safely(item, None)
+                with self._changed:
+                    self._amended.append(result)
+                    self.caught_up += 1
+                    self._changed.notify_all()
+            self._busy_since.pop("calibrate", None)
+
+    def _next_to_calibrate(self) -> AcquiredEpoch | Epoch | None:
+        """The oldest that waits; if there is none, one that was deferred; None at the end."""
+        while True:
+            with self._changed:
+                if self._stopping:
+                    return None
+                item = next((i for i in self._items if i.state == "waiting"), None)
+                if item is not None:
+                    item.state = "calibrating"
+                    return item
+                idle = not self._items and not self._amended
+                below = self.next_number
+            if idle and self.calibrator is not None:
+                old = self._keeper.backlog(below)
+                if old is not None:
+                    return old
+            with self._changed:
+                if not self._stopping and not any(i.state == "waiting" for i in self._items):
+                    self._changed.wait(_IDLE_S)
+
+    def _calibrate(self, item: AcquiredEpoch) -> None:
+        self._pair(item, self._patience_s)
+        assert item.epoch is not None
+        result = self._safely(item.epoch, item.frame)
+        if item.skew_s == item.skew_s:
+            result = replace(result, extra={**result.extra, "skew_s": item.skew_s})
+        with self._changed:
+            if item.state == "dropped":  # it took so long that it was kept without
+                self._amended.append(result)
+                self.caught_up += 1
+            else:
+                item.calibrated = result
+                item.state = "done"
+            self._changed.notify_all()
+
+    def _safely(self, epoch: Epoch, frame: Frame | None) -> CalibratedEpoch:
+        """Calibrate from the frame, or from the file that the epoch names."""
+        if self.calibrator is None:
             why = failed("not_measured", "no test field is configured for this camera")
             return CalibratedEpoch(epoch, why, {})
-        calibrated = calibrate_frame(self._calibrator, epoch, frame)
-        skew = epoch.temperature_time - epoch.frame_time
-        if math.isfinite(skew):
-            calibrated = replace(calibrated, extra={**calibrated.extra, "skew_s": skew})
-        return calibrated
+        try:
+            if frame is None:
+                return self._observe(self.calibrator.calibrate(epoch), False)
+            return self._observe(calibrate_frame(self.calibrator, epoch, frame), True)
+        except Exception as error:
+            # one epoch that breaks the program must not end months of acquisition
+            log.exception("camera %s: epoch %d was not calibrated", self.name, epoch.number)
+            self.calibrator.reset()
+            return CalibratedEpoch(epoch, failed("program_error", str(error)), {})
+
+    def _pair(self, item: AcquiredEpoch, patience_s: float) -> None:
+        paired = self._readings.around(self._thermometers, item.frame.monotonic, patience_s)
+        # a reference that was not read leaves its place empty: no other takes it
+        columns = dict.fromkeys(self._columns(), math.nan)
+        paired = replace(paired, temperatures={**columns, **paired.temperatures})
+        item.epoch = make_epoch(item.number, item.frame, paired)
+        item.skew_s = paired.skew_s
+
+    def _keep_all(self) -> None:
+        while (item := self._next_to_keep()) is not None:
+            self._busy_since["keep"] = self._clock.monotonic()
+            try:
+                if isinstance(item, CalibratedEpoch):
+                    self._keeper.amend(item)
+                else:
+                    if item.epoch is None:
+                        self._pair(item, 0.0)
+                    self._keeper.keep(item)
+            except Exception as error:
+                log.exception("camera %s: an epoch was not kept", self.name)
+                if isinstance(item, AcquiredEpoch):
+                    self._lose(f"epoch {item.number}: {error}")
+            self._busy_since.pop("keep", None)
+
+    def _next_to_keep(self) -> AcquiredEpoch | CalibratedEpoch | None:
+        with self._changed:
+            while True:
+                if self._amended:
+                    self._changed.notify_all()
+                    return self._amended.popleft()
+                if self._items:
+                    first = self._items[0]
+                    deferred = len(self._items) > self._depth
+                    deferred |= self._stopping and first.state == "waiting"
+                    if deferred and first.state != "done":
+                        first.state = "dropped"
+                        self.dropped += 1
+                    if first.state in ("done", "dropped"):
+                        self._changed.notify_all()
+                        return self._items.popleft()
+                elif self._stopping and not self._threads[0].is_alive():
+                    return None
+                self._changed.wait(_IDLE_S)

@@ -6,6 +6,7 @@ Exit status: 0 done, 1 the data do not allow it, 2 wrong usage or configuration,
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import signal
 import sys
@@ -19,39 +20,43 @@ import typer
 
 from thermocald import __version__
 from thermocald.atomic_file import cannot_write
-from thermocald.cli.commands import COMMANDS, GROUPS, command, group
+from thermocald.cli.commands import COMMANDS, Group, add_commands
 from thermocald.cli.common import log_to_stderr, say
 from thermocald.errors import ThermocaldError
-
-__all__ = ["application", "main"]
 
 _INTERRUPTED = 130
 _VERBOSE = ("--verbose", "-v")
 
 
-def application(only: str | None = None) -> typer.Typer:
-    """The application with every command, or with one of them: the others are not imported."""
+def application(loaded: str | None = None) -> typer.Typer:
+    """Return the application with every command.
+
+    loaded: the only one that is imported, "" for none; the others are listed.
+    """
     app = typer.Typer(
+        cls=Group,
         help="Thermal calibration of low-cost cameras: live, with true standard deviations.",
         no_args_is_help=True,
-        add_completion=False,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
     )
     app.callback()(_options)
-    for name in COMMANDS:
-        if only in (None, name):
-            app.command(name)(command(name))
-    for name in GROUPS:
-        if only in (None, name):
-            app.add_typer(group(name), name=name)
+    add_commands(app, lambda name: loaded in (None, name))
     return app
 
 
-def _called(arguments: list[str]) -> str | None:
-    """The command that is called, None where all have to be known: a help, a wrong word."""
-    word = next((word for word in arguments if word not in _VERBOSE), None)
-    return word if word in COMMANDS or word in GROUPS else None
+def _words() -> list[str]:
+    """Return what is typed after `thermocald`, also where a shell asks how it goes on."""
+    if "_THERMOCALD_COMPLETE" in os.environ:
+        typed = os.environ.get("_TYPER_COMPLETE_ARGS") or os.environ.get("COMP_WORDS", "")
+        return typed.split()[1:]
+    return sys.argv[1:]
+
+
+def _called(arguments: list[str]) -> str:
+    """Return the command that is called, "" where it is none: a help, a wrong word."""
+    word = next((word for word in arguments if word not in _VERBOSE), "")
+    return word if word in COMMANDS else ""
 
 
 def _say_version(wanted: bool) -> None:
@@ -77,8 +82,9 @@ def main() -> None:
     """Run the command line; every foreseen error is one line, none is a traceback."""
     with contextlib.suppress(ValueError):  # not in the main thread
         signal.signal(signal.SIGTERM, _end)  # so that nothing half-written stays
+    _settle_process()
     try:
-        application(_called(sys.argv[1:]))()
+        application(_called(_words()))(prog_name="thermocald")
         sys.stdout.flush()
     except ThermocaldError as error:
         say(f"error: {error}")
@@ -100,6 +106,14 @@ def main() -> None:
         with contextlib.suppress(OSError):
             sys.stdout.close()  # else Python writes what is left in it again, and fails again
         sys.exit(failed.exit_status)
+
+
+def _settle_process() -> None:
+    """Let no file be written by everybody, or read by nobody, and no output fail for its script."""
+    given = os.umask(0o077)
+    os.umask((given | 0o002) & ~0o700)
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def _end(*_: object) -> None:

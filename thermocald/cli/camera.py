@@ -1,4 +1,4 @@
-"""`thermocald camera convert`: a camera file of one program for another."""
+"""`thermocald camera`: one at a temperature, two compared, files of other programs."""
 
 from __future__ import annotations
 
@@ -7,15 +7,11 @@ from typing import Annotated
 
 import typer
 
-from thermocald.cli.options import JsonOption
-
-__all__ = ["group"]
+from thermocald.cli.commands import expert, subcommands
+from thermocald.cli.common import say, warnings_said, write_result
+from thermocald.cli.options import ExtrapolateOption, JsonOption, PixelPitchOption
 
 _FORMATS = "opencv, ros, colmap, mrcal, kalibr, metashape, aicon, json"
-
-
-def _group() -> None:
-    """Camera files of other programs."""
 
 
 def convert(
@@ -23,7 +19,7 @@ def convert(
     to: Annotated[str, typer.Option(help=f"Format to write: {_FORMATS}.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="The file to write.")],
     from_: Annotated[
-        str | None, typer.Option("--from", help="Format of FILE; default: told by its content.")
+        str | None, expert("--from", help="Format of FILE; default: told by its content.")
     ] = None,
     pixel_pitch: Annotated[
         float | None, typer.Option(help="Size of a pixel in mm, where FILE does not say it.")
@@ -35,8 +31,7 @@ def convert(
 
     Example: thermocald camera convert calibration.xml --to opencv --out camera.yaml
     """
-    from thermocald.cli.common import write_json
-    from thermocald.output import camera_files
+    from thermocald.photogrammetry import camera_files
 
     camera = camera_files.read(source, from_, pixel_pitch)
     read = "exact" if camera.exact else f"fitted, largest residual {camera.largest_px:.3g} px"
@@ -45,29 +40,84 @@ def convert(
         f"converted from {source.name} ({camera.format}, {read})", camera.name,
     )  # fmt: skip
     interior = camera.model.interior
-    if json is not None:
-        sensor = camera.model.sensor
-        document = {
-            "format": "thermocald-camera-conversion/1",
-            "source": str(source),
-            "source_format": camera.format,
-            "exact_import": camera.exact,
-            "largest_px": camera.largest_px,
-            "rms_px": camera.rms_px,
-            "out": str(out),
-            "out_format": to,
-            "statement": statement,
-            "width": sensor.width,
-            "height": sensor.height,
-            "pixel_pitch": sensor.pixel_pitch,
-            **{name: getattr(interior, name) for name in type(interior).__dataclass_fields__},
-        }
-        write_json(document, json)
-    if json != "-":
+    sensor = camera.model.sensor
+    document = {
+        "format": "thermocald-camera-conversion/1",
+        "source": str(source),
+        "source_format": camera.format,
+        "exact_import": camera.exact,
+        "largest_px": camera.largest_px,
+        "rms_px": camera.rms_px,
+        "out": str(out),
+        "out_format": to,
+        "statement": statement,
+        "width": sensor.width,
+        "height": sensor.height,
+        "pixel_pitch": sensor.pixel_pitch,
+        **{name: getattr(interior, name) for name in type(interior).__dataclass_fields__},
+    }
+    if write_result(document, json):
         typer.echo(f"{source} ({camera.format}): {read}")
         typer.echo(f"{out} ({to}): {statement}")
 
 
-group = typer.Typer(help="Camera files of other programs.", no_args_is_help=True)
-group.callback()(_group)
-group.command("convert")(convert)
+def at(
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="A thermal model, from `fit`.")],
+    temperature: Annotated[float, typer.Option(help="°C: a camera that has long been there.")],
+    to: Annotated[str, typer.Option(help=f"Format to write: {_FORMATS}.")] = "json",
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="The file to write.")] = None,
+    extrapolate: ExtrapolateOption = False,
+    json: JsonOption = None,
+) -> None:
+    """Give the camera at one temperature, as a file of any program.
+
+    Example: thermocald camera at camera.thermal.yaml --temperature 35 --to ros -o cam.yaml
+    """
+    import thermocald as tc
+    from thermocald.analysis.thermal.predictions import describe_camera
+    from thermocald.photogrammetry import camera_files
+
+    thermal = tc.load_camera(model)
+    if thermal.warning:
+        say(f"warning: {thermal.warning}")
+    with warnings_said():
+        camera = thermal.at(temperature, extrapolate=extrapolate)
+    document, lines = describe_camera(thermal, camera, 10.0)
+    if out is not None:
+        comment = f"{thermal.model.camera} at {temperature:g} °C, of {model.name}"
+        statement = camera_files.write(
+            camera.model, out, to, camera.covariance, comment, thermal.model.camera
+        )
+        document |= {"out": str(out), "out_format": to, "statement": statement}
+        lines.append(f"{out} ({to}): {statement}")
+    if write_result(document, json):
+        typer.echo("\n".join(lines))
+
+
+def diff(
+    cold: Annotated[Path, typer.Argument(help="A camera file of any format.")],
+    warm: Annotated[Path, typer.Argument(help="Another, of the same sensor.")],
+    pixel_pitch: PixelPitchOption = None,
+    report: Annotated[
+        Path | None, typer.Option(help="Draw where in the image they differ, one HTML file.")
+    ] = None,
+    json: JsonOption = None,
+) -> None:
+    """Compare two cameras: parameters, and by how much the image differs (WARM minus COLD).
+
+    With standard deviations where both files have a covariance.
+
+    Example: thermocald camera diff cold.json warm.json
+    """
+    from thermocald.analysis.camera.difference import CameraDifference
+    from thermocald.photogrammetry import camera_files
+
+    a, b = (camera_files.read(path, pixel_pitch=pixel_pitch) for path in (cold, warm))
+    found = CameraDifference((str(cold), str(warm)), a.model, b.model, (a.covariance, b.covariance))
+    if report is not None:
+        found.report(report)
+    if write_result(found.as_dict(), json):
+        typer.echo(str(found))
+
+
+group = subcommands(at=at, convert=convert, diff=diff)

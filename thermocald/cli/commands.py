@@ -1,54 +1,147 @@
-"""Every command, by the name that it is called by, in the order of `thermocald --help`."""
+"""Every command with its line in `thermocald --help`, in the order of the work."""
 
 from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
-if TYPE_CHECKING:
-    import typer
+import typer
+from typer.core import TyperCommand, TyperGroup
 
-__all__ = ["COMMANDS", "GROUPS", "command", "group"]
+ADVANCED = "Advanced"
+"""The section of options that only experts need."""
 
-# the module of `thermocald.cli` that has the function: only what is called is imported
-COMMANDS = {
-    "archive": "archive",
-    "backup": "backup",
-    "calibrate": "calibrate",
-    "check": "check",
-    "convert": "convert",
-    "correct": "correct",
-    "demo": "demo",
-    "devices": "devices",
-    "discover": "discover",
-    "doctor": "doctor",
-    "fit": "fit",
-    "fleet": "fleet",
-    "forward": "forward",
-    "import": "import_",
-    "predict": "predict",
-    "replay": "replay",
-    "export": "replay",
-    "reprocess": "reprocess",
-    "run": "run",
-    "dashboard": "run",
-    "simulate": "simulate",
-    "status": "status",
-    "top": "status",
-    "study": "study",
+
+def expert(*names: str, **told: Any) -> Any:
+    """Return an option of the advanced ones; arguments as those of `typer.Option`."""
+    return typer.Option(*names, rich_help_panel=ADVANCED, **told)
+
+
+class Entry(NamedTuple):
+    """A command: the module of `thermocald.cli` that has it, and what it does in one line."""
+
+    module: str
+    line: str
+    group: bool = False
+
+
+# only the module of the command that is called is imported
+PANELS = {
+    "Measure": {
+        "demo": Entry("demo", "Try it all on a rendered camera, without hardware"),
+        "devices": Entry("devices", "List attached cameras, thermometers and outputs"),
+        "session": Entry("session", "Take one measurement series, from check to report", True),
+        "run": Entry("run", "Acquire, calibrate and keep epochs until told to end"),
+        "status": Entry("status", "Say how the daemon is doing"),
+        "top": Entry("status", "Say so again every second"),
+        "dashboard": Entry("run", "Serve the daemon's web page"),
+        "import": Entry("import_", "Make a recording from photographs and a logger's file"),
+        "simulate": Entry("simulate", "Make a recording of a simulated camera that warms up"),
+    },
+    "Analyse": {
+        "replay": Entry("replay", "Calibrate every epoch of a recording, and say how it drifts"),
+        "export": Entry("replay", "Write one row per epoch as CSV, JSON or Parquet"),
+        "study": Entry("study", "Test how the camera changes with its temperature; report it"),
+        "discover": Entry("discover", "Find which effect a model misses, name it, prove it"),
+        "fit": Entry("fit", "Fit a thermal model to all series of a camera"),
+        "calibrate": Entry("calibrate", "Calibrate a camera from photographs of a test field"),
+    },
+    "Use": {
+        "predict": Entry("predict", "Predict the camera at a temperature, or along a log"),
+        "correct": Entry("correct", "Correct image points or images for the temperature"),
+        "measure": Entry("measure", "Measure in metres on a water surface, a plane, a staff"),
+        "camera": Entry("camera", "Convert and compare cameras; one at a temperature", True),
+    },
+    "Test field": {
+        "testfield": Entry("testfield", "Print, import, survey and check a test field", True),
+    },
+    "Many cameras": {
+        "forward": Entry("forward", "Send a store's rows to a server"),
+        "fleet": Entry("fleet", "Show all cameras of a server, and which need a look"),
+        "reprocess": Entry("reprocess", "Calibrate or analyse whole archives again"),
+        "server": Entry("server", "Make a server's tables, and let stations write to them", True),
+    },
+    "Look after": {
+        "doctor": Entry("doctor", "Say what this machine lacks, and what mends it"),
+        "check": Entry("check", "Say whether a recording, configuration or store is sound"),
+        "backup": Entry("backup", "Copy a store that is in use, and verify the copy"),
+        "archive": Entry("archive", "Write a store's series as recordings; delete old frames"),
+        "convert": Entry("convert", "Rewrite a recording's observations as Parquet or CSV"),
+    },
 }
-GROUPS = ("camera", "server", "session", "testfield")
+COMMANDS = {name: entry for panel in PANELS.values() for name, entry in panel.items()}
+
+
+class Command(TyperCommand):
+    """A command whose help has its expert's options in a section of their own."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write arguments, options, and last the advanced ones."""
+        sections: dict[str, list[tuple[str, str]]] = {}
+        for parameter in self.get_params(ctx):
+            if (record := parameter.get_help_record(ctx)) is not None:
+                usual = "Arguments" if parameter.param_type_name == "argument" else "Options"
+                title = getattr(parameter, "rich_help_panel", None) or usual
+                sections.setdefault(title, []).append(record)
+        for title in sorted(sections, key=["Arguments", "Options", ADVANCED].index):
+            with formatter.section(title):
+                formatter.write_dl(sections[title])
+
+
+class Group(TyperGroup):
+    """Commands listed by panels, each with its whole line."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write one section for each panel."""
+        sections: dict[str, list[tuple[str, str]]] = {}
+        for name in self.list_commands(ctx):
+            command = self.get_command(ctx, name)
+            assert command is not None
+            panel = getattr(command, "rich_help_panel", None)
+            title = panel if isinstance(panel, str) else "Commands"
+            line = command.short_help or (command.help or "").split("\n\n")[0]
+            sections.setdefault(title, []).append((name, " ".join(line.split())))
+        widest = max(len(name) for rows in sections.values() for name, _ in rows)
+        for title, rows in sections.items():
+            with formatter.section(title):
+                formatter.write_dl([(f"{name:<{widest}}", line) for name, line in rows])
+
+
+def add_commands(app: typer.Typer, load: Callable[[str], bool]) -> None:
+    """Add every command to an application; those that `load` does not want, by their line only."""
+    for panel, entries in PANELS.items():
+        for name, entry in entries.items():
+            told: dict[str, Any] = {"short_help": entry.line, "rich_help_panel": panel}
+            if not entry.group:
+                function = command(name) if load(name) else _not_loaded
+                app.command(name, cls=Command, **told)(function)
+            elif load(name):
+                app.add_typer(group(name), name=name, cls=Group, **told)
+            else:
+                app.command(name, cls=Command, **told)(_not_loaded)
 
 
 def command(name: str) -> Callable[..., Any]:
-    """The function of a command of `COMMANDS`, by the command's name."""
-    module = importlib.import_module(f"thermocald.cli.{COMMANDS[name]}")
+    """Return the function of a command, by the command's name."""
+    module = importlib.import_module(f"thermocald.cli.{COMMANDS[name].module}")
     found: Callable[..., Any] = getattr(module, "import_" if name == "import" else name)
     return found
 
 
 def group(name: str) -> typer.Typer:
-    """The commands below a word of `GROUPS`."""
+    """Return the commands below a word."""
     found: typer.Typer = importlib.import_module(f"thermocald.cli.{name}").group
     return found
+
+
+def subcommands(**functions: Callable[..., Any]) -> typer.Typer:
+    """Return the commands below a word; a name that Python keeps for itself ends in `_`."""
+    app = typer.Typer(no_args_is_help=True)
+    for name, function in functions.items():
+        app.command(name.rstrip("_"), cls=Command)(function)
+    return app
+
+
+def _not_loaded() -> None:
+    raise AssertionError("a command that is only listed was called")

@@ -4,34 +4,21 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 import sys
+import warnings
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from thermocald import atomic_file
+from thermocald.addresses import CleanFormatter, without_secrets
+from thermocald.result import jsonable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-__all__ = [
-    "CONFIG_PLACES",
-    "default_config",
-    "jsonable",
-    "log_to_stderr",
-    "printable",
-    "progress",
-    "say",
-    "write_json",
-    "write_parts",
-    "write_result",
-    "write_text",
-]
-
 CONFIG_PLACES = (Path("config.yaml"), Path("/etc/thermocald/config.yaml"))
+_NOTICES = ("thermocald.output.dashboard", "thermocald.store.database.file")
 _LINES = 10  # progress lines where there is no terminal
 
 
@@ -40,7 +27,7 @@ def say(text: str) -> None:
 
     Control characters, which a file's name may hold and a terminal would obey, are shown as codes.
     """
-    sys.stderr.write(printable(text) + "\n")
+    sys.stderr.write(printable(without_secrets(text)) + "\n")
     sys.stderr.flush()
 
 
@@ -54,9 +41,19 @@ def printable(text: str) -> str:
 
 def log_to_stderr(level: str = "WARNING") -> None:
     """Let the program's log be seen."""
-    logging.basicConfig(
-        level=level, stream=sys.stderr, format="%(levelname)s %(name)s: %(message)s", force=True
-    )
+    logging.basicConfig(level=level, stream=sys.stderr, force=True)
+    for handler in logging.getLogger().handlers:
+        handler.setFormatter(_LogLine("%(levelname)s %(name)s: %(message)s"))
+    for name in _NOTICES:  # said to whoever calls the command, and no fault
+        logging.getLogger(name).setLevel("INFO")
+
+
+class _LogLine(CleanFormatter):
+    """A notice is its sentence; what is wrong has its level and where it comes from."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        notice = record.levelno == logging.INFO and record.name in _NOTICES
+        return record.getMessage() if notice else super().format(record)
 
 
 @contextmanager
@@ -95,21 +92,14 @@ def progress(total: int | None, label: str) -> Iterator[Callable[[int], None]]:
     yield advance
 
 
-def jsonable(value: Any) -> Any:
-    """A value as JSON has it: arrays as lists, NaN and infinity as null, paths as text."""
-    if isinstance(value, dict):
-        return {str(key): jsonable(inner) for key, inner in value.items()}
-    if isinstance(value, np.ndarray):
-        return jsonable(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [jsonable(inner) for inner in value]
-    if isinstance(value, np.generic):
-        return jsonable(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, Path):
-        return str(value)
-    return value
+@contextmanager
+def warnings_said() -> Iterator[None]:
+    """Say warnings of the program as lines on standard error, each once."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        yield
+    for text in dict.fromkeys(str(w.message) for w in caught):
+        say(f"warning: {text}")
 
 
 def default_config() -> Path | None:
@@ -140,7 +130,8 @@ def write_text(text: str, destination: str | Path) -> None:
 def write_parts(parts: Iterable[str], destination: str | Path) -> None:
     """Write a text that comes in parts, as `write_text` does."""
     if str(destination) == "-":
-        sys.stdout.writelines(parts)
-        sys.stdout.flush()
+        for part in parts:
+            sys.stdout.write(part)
+            sys.stdout.flush()  # whoever reads it waits for it
         return
     atomic_file.write_parts(Path(destination), parts)

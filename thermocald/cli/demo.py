@@ -19,8 +19,9 @@ from thermocald.cli.options import JsonOption, SeedOption
 from thermocald.errors import DataError
 
 if TYPE_CHECKING:
-    from thermocald.analysis.series.table import SeriesTable
+    from thermocald.analysis.series.epochs import Epochs
     from thermocald.arrays import Array
+    from thermocald.daemon.station import Station
 
 __all__ = ["demo"]
 
@@ -69,66 +70,55 @@ def demo(
         write_json(document, json)
 
 
+def _acquire(out: Path, epochs: int, seed: int) -> _Run:
+    """Have the daemon take the epochs on a virtual clock, then write their recording."""
+    from thermocald.acquisition.steady_clock import SteadyClock
+    from thermocald.analysis.series.stored import table_of_stored
+    from thermocald.daemon.given_config import demo_config
+    from thermocald.daemon.service import Service
+    from thermocald.daemon.systemd import set_up_logging
+    from thermocald.hal import VirtualClock, open_device
+    from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
+    from thermocald.store.database.archive import archive_series
+    from thermocald.store.database.store import Store
+    from thermocald.store.sources import open_source
+
+    make_folder(out)
+    config = demo_config(out, seed)
+    machine = VirtualClock()
+    begin = machine.utc() - machine.monotonic()
+    clock = SteadyClock(machine, synchronised=lambda: True)
+    taken = 0
+    set_up_logging("warning")
+    with progress(epochs, "epochs") as advance:
+
+        def look(station: Station) -> bool:
+            nonlocal taken
+            run = station.cameras[0].run
+            now = 0 if run is None else run.taken
+            advance(now - taken)
+            taken = now
+            return False
+
+        Service(config, epochs=epochs, until_finished=True, on_turn=look, clock=clock).run()
+        advance(epochs - taken)
+    with Store.open(config.store.path) as store:
+        archive_series(store, store.find_series(), out / "M1")
+    with open_source(config.store.path) as source:
+        series = source.find_series()
+        table = table_of_stored(source, series, AdjustmentSettings(), "series")
+    with open_device("camera", "mock", {"seed": seed}, VirtualClock()) as camera:
+        states = [camera.truth(float(utc) - begin) for utc in table.frame_time]
+    truth = np.array([np.concatenate([at.iop[0], at.eop[0]]) for at in states])
+    return _Run(table, truth, series.head.camera.sensor.pixel_pitch, len(series.testfield))
+
+
 @dataclass(frozen=True, eq=False)
 class _Run:
-    table: SeriesTable
+    table: Epochs
     truth: Array  # (E, 16) at the frames' times
     pitch: float
     targets: int
-
-
-def _acquire(out: Path, epochs: int, seed: int) -> _Run:
-    """The pipeline on a virtual clock, kept in a store and a recording."""
-    from thermocald.acquisition.calibrator import Calibrator
-    from thermocald.acquisition.pipeline import Pipeline
-    from thermocald.analysis.series.stored import table_of_stored
-    from thermocald.hal import VirtualClock, open_device
-    from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
-    from thermocald.store.database.row import EpochResult
-    from thermocald.store.database.store import Store
-    from thermocald.store.recording.reader import CameraSpec, Channel, Head, RecordingWriter
-    from thermocald.store.sources import open_source
-
-    clock = VirtualClock()
-    camera = open_device("camera", "mock", {"seed": seed}, clock)
-    thermometer = open_device("thermometer", "mock", {"seed": seed + 1}, clock)
-    make_folder(out)
-    with camera, thermometer:
-        sensor, field = camera.model.sensor, camera.field
-        settings = AdjustmentSettings()
-        head = Head(
-            "demo-M1",
-            "M1",
-            10.0,
-            CameraSpec("demo", sensor, 3.04, None),
-            {"temperature": Channel("degC", 0.0625)},
-        )
-        calibrator = Calibrator(sensor, field, settings, nominal_c=3.04)
-        pipeline = Pipeline(camera, {"temperature": thermometer}, calibrator, clock, period_s=10.0)
-        truth = []
-        with (
-            Store.open(out / "demo.db", "append", durable=False) as store,
-            RecordingWriter(out / "M1", head, field) as recording,
-            progress(epochs, "epochs") as advance,
-        ):
-            series = store.create_series(
-                head,
-                field,
-                start="cold",
-                identity=camera.identity(),
-                settings={"exterior": "per_epoch", "free": list(settings.free)},
-                created_utc=clock.utc(),
-            )
-            for done, frame in pipeline.run(epochs):
-                result = EpochResult.from_adjustment(done.adjustment)
-                store.append(series, done.epoch, result, extra=done.extra)
-                recording.append(done.epoch)
-                at = camera.truth(frame.monotonic)
-                truth.append(np.concatenate([at.iop[0], at.eop[0]]))
-                advance(1)
-    with open_source(out / "demo.db") as source:
-        table = table_of_stored(source, source.find_series(), settings, "series")
-    return _Run(table, np.array(truth), sensor.pixel_pitch, len(field))
 
 
 def _compare(run: _Run) -> list[dict[str, Any]]:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from thermocald.cli.commands import expert
 from thermocald.cli.common import log_to_stderr, say, write_result
 from thermocald.cli.options import JsonOption, StoreArgument
 from thermocald.config import Config, load_config
@@ -26,19 +27,11 @@ def forward(
     config: Annotated[
         Path | None, typer.Option("--config", "-c", help="Store and `forward:` of this file.")
     ] = None,
-    station: Annotated[
-        str | None, typer.Option(help="This station's name; default: the host's.")
-    ] = None,
-    frames: Annotated[Path | None, typer.Option(help="Send frames from this folder too.")] = None,
-    choose: Annotated[str, typer.Option(help="Which of them: events, every_n, all.")] = "events",
-    every_n: Annotated[int, typer.Option(min=1, help="With every_n: one of so many.")] = 360,
-    frames_mb: Annotated[
-        float, typer.Option(min=0.001, help="Frames beyond it wait for tomorrow.")
-    ] = 200.0,
+    station: Annotated[str | None, expert(help="This station's name; default: the host's.")] = None,
     once: Annotated[
         bool, typer.Option("--once", help="Send what waits, then end; else go on for ever.")
     ] = False,
-    cursor: Annotated[Path | None, typer.Option(help="Where it keeps how far it has sent.")] = None,
+    cursor: Annotated[Path | None, expert(help="Where it keeps how far it has sent.")] = None,
     json: JsonOption = None,
 ) -> None:
     """Send epochs, events, readings and chosen frames to a PostgreSQL server, each of them once.
@@ -52,7 +45,7 @@ def forward(
     import threading
 
     from thermocald.fleet.forward import Forwarder, forward_forever
-    from thermocald.store.server.address import ServerAddress
+    from thermocald.store.server.connection import ServerAddress
 
     rule: FrameRule | None = None
     if config is not None:
@@ -63,8 +56,6 @@ def forward(
         if to is None:
             say(f"{config}: forward.to is null: nothing is sent")
             return
-    if frames is not None:
-        rule = _rule(frames, choose, every_n, frames_mb)
     if store is None or to is None:
         raise UsageError("give STORE and --to ADDRESS, or --config FILE")
     address = ServerAddress.parse(to)
@@ -83,17 +74,10 @@ def forward(
 
 
 def _configured(config: Config) -> FrameRule | None:
+    from thermocald.fleet.frames import FrameRule
+
     section = config.forward
     if section.frames == "none":
         return None
-    folder = config.frames.folder
-    return _rule(folder, section.frames, section.every_n, section.frames_mb_per_day)
-
-
-def _rule(folder: Path, choose: str, every_n: int, mb: float) -> FrameRule:
-    from thermocald.fleet.frames import FrameRule
-
-    for name in ("events", "every_n", "all"):
-        if choose == name:
-            return FrameRule(folder, name, every_n, int(mb * 1e6))
-    raise UsageError(f"--choose {choose}: there are events, every_n, all")
+    most = int(section.frames_mb_per_day * 1e6)
+    return FrameRule(config.frames.folder, section.frames, section.every_n, most)

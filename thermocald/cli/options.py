@@ -2,36 +2,18 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import typer
 
+from thermocald.cli.commands import expert
 from thermocald.errors import UsageError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
-
-if TYPE_CHECKING:
-    from thermocald.store.logger.clock import DeviceClock
-
-__all__ = [
-    "DEFAULT_FREE_TEXT",
-    "ConfigOption",
-    "ExteriorOption",
-    "ExtrapolateOption",
-    "FreeOption",
-    "JobsOption",
-    "JsonOption",
-    "ModelOption",
-    "PhotosArgument",
-    "PixelPitchOption",
-    "SeedOption",
-    "StoreArgument",
-    "TimezoneOption",
-    "adjustment_settings",
-    "device_clock",
-    "free_names",
-]
 
 JsonOption = Annotated[
     str | None, typer.Option("--json", help="Write the result as JSON; - for standard output.")
@@ -51,22 +33,21 @@ PixelPitchOption = Annotated[
 ]
 ModelOption = Annotated[Path, typer.Option("--model", help="The thermal model.")]
 ExtrapolateOption = Annotated[
-    bool, typer.Option("--extrapolate", help="Allow temperatures far outside the fit.")
+    bool, expert("--extrapolate", help="Allow temperatures far outside the fit.")
 ]
-SeedOption = Annotated[int, typer.Option("--seed", min=0, help="Of all random numbers.")]
+SeedOption = Annotated[int, expert("--seed", min=0, help="Of all random numbers.")]
 TimezoneOption = Annotated[
     str | None,
     typer.Option("--timezone", help="Of times without a zone: Europe/Berlin, UTC, +02:00."),
 ]
 FreeOption = Annotated[
     str,
-    typer.Option(
+    expert(
         "--free", help="Interior orientation to estimate, separated by commas; the rest is held."
     ),
 ]
 JobsOption = Annotated[
-    int,
-    typer.Option(min=1, max=256, help="Processes; the results are the same to the bit."),
+    int, expert(min=1, max=256, help="Processes; the results are the same to the bit.")
 ]
 ExteriorOption = Annotated[
     str,
@@ -78,11 +59,76 @@ ExteriorOption = Annotated[
 ]
 
 
-def device_clock(timezone: str | None) -> DeviceClock:
-    """The clock that `--timezone` describes; without it times without a zone are refused."""
-    from thermocald.store.logger.clock import DeviceClock, time_zone
+LOG_OPTIONS: dict[str, tuple[Any, Any]] = {
+    "timezone": (TimezoneOption, None),
+    "temperature_column": (
+        Annotated[
+            list[str] | None,
+            typer.Option(help="Of the log; the first is the reference; repeatable."),
+        ],
+        None,
+    ),
+    "name": (
+        Annotated[
+            list[str] | None,
+            typer.Option(metavar="COLUMN=LABEL", help="What a column of the log is called."),
+        ],
+        None,
+    ),
+    "unit": (
+        Annotated[
+            str | None, typer.Option(help="Of the log where it does not say: degC, K, degF.")
+        ],
+        None,
+    ),
+    "date_order": (Annotated[str | None, typer.Option(help="Of 06/07/2026: dmy or mdy.")], None),
+    "time_column": (
+        Annotated[list[str] | None, expert(help="Of the log; twice for a date and a time.")],
+        None,
+    ),
+    "log_timezone": (Annotated[str | None, expert(help="The logger's own.")], None),
+    "log_clock": (
+        Annotated[str, expert(help="How far the logger's clock was ahead: +00:03:12.")],
+        "0",
+    ),
+    "ambiguous": (
+        Annotated[
+            str,
+            expert(
+                help="The hour that comes twice in autumn: order (of rows), earlier, later, refuse."
+            ),
+        ],
+        "order",
+    ),
+    "separator": (Annotated[str | None, expert(help="Of the log's columns: ';' ',' tab.")], None),
+    "decimal": (Annotated[str | None, expert(help="The log's decimal mark: , or .")], None),
+}
+"""How a logger's file is to be read, wherever a command reads one: annotation and default."""
 
-    return DeviceClock(None if timezone is None else time_zone(timezone), ambiguous="order")
+
+def takes_log_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the options of `LOG_OPTIONS`, which it receives as `log_options`.
+
+    Those that its own signature names it receives by themselves too.
+    """
+    own = inspect.signature(command, eval_str=True).parameters
+    kept = [p for name, p in own.items() if name not in LOG_OPTIONS and name != "log_options"]
+    added = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+        for name, (kind, default) in LOG_OPTIONS.items()
+    ]
+
+    @functools.wraps(command)
+    def called(**given: Any) -> None:
+        from thermocald.store.logger.temperatures import log_options
+
+        said = {name: given[name] if name in own else given.pop(name) for name in LOG_OPTIONS}
+        command(**given, log_options=log_options(**said))
+
+    last = kept[-1].replace(kind=inspect.Parameter.KEYWORD_ONLY)
+    called.__signature__ = inspect.Signature([*kept[:-1], *added, last])  # type: ignore[attr-defined]
+    called.__annotations__ = {p.name: p.annotation for p in [*kept, *added]}
+    return called
 
 
 def free_names(text: str) -> tuple[str, ...]:
@@ -102,3 +148,11 @@ def adjustment_settings(free: str) -> AdjustmentSettings:
 
 
 DEFAULT_FREE_TEXT = ",".join(DEFAULT_FREE)
+
+
+def check_exterior(exterior: str) -> None:
+    """Raise UsageError for a word of `--exterior` that there is not."""
+    from thermocald.photogrammetry.series.result import EXTERIOR_CHOICES
+
+    if exterior not in EXTERIOR_CHOICES:
+        raise UsageError(f"--exterior {exterior}: must be one of {', '.join(EXTERIOR_CHOICES)}")

@@ -7,10 +7,11 @@ from typing import Annotated
 
 import typer
 
+from thermocald.cli.commands import expert
 from thermocald.cli.common import progress, say, write_json, write_result
 from thermocald.cli.options import DEFAULT_FREE_TEXT, FreeOption, JobsOption, JsonOption
 from thermocald.errors import DataError, OutputError, UsageError
-from thermocald.store.server.address import is_server
+from thermocald.store.server.connection import is_server
 from thermocald.store.sources import source_name
 
 __all__ = ["reprocess"]
@@ -25,13 +26,11 @@ def reprocess(
     do: Annotated[
         str, typer.Option(help="calibrate every epoch, or discover, study every series.")
     ] = "calibrate",
-    engine: Annotated[
-        str, typer.Option(help="local, or a Dask scheduler: tcp://HOST:8786.")
-    ] = "local",
+    engine: Annotated[str, expert(help="local, or a Dask scheduler: tcp://HOST:8786.")] = "local",
     jobs: JobsOption = 1,
     free: FreeOption = DEFAULT_FREE_TEXT,
     sets: Annotated[
-        int, typer.Option(min=100, max=10_000_000, help="Of a study's Monte-Carlo.")
+        int, expert(min=100, max=10_000_000, help="Of a study's Monte-Carlo.")
     ] = 100_000,
     json: JsonOption = None,
 ) -> None:

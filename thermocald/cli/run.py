@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from thermocald.cli.common import default_config
+from thermocald.cli.commands import expert
+from thermocald.cli.common import default_config, say
 from thermocald.cli.options import ConfigOption
 from thermocald.errors import StoreError, UsageError
 
 if TYPE_CHECKING:
-    from thermocald.config import Config
-
-__all__ = ["dashboard", "mock_config", "recording_config", "run"]
+    pass
 
 
 def run(
@@ -30,10 +29,10 @@ def run(
     ] = None,
     epochs: Annotated[int, typer.Option(min=0, help="End after so many epochs per camera.")] = 0,
     fast: Annotated[
-        bool, typer.Option("--fast", help="Play the recording as fast as it can be calibrated.")
+        bool, expert("--fast", help="Play the recording as fast as it can be calibrated.")
     ] = False,
     hang_after: Annotated[
-        float, typer.Option(min=0.5, help="A device that does not return for so many s hangs.")
+        float, expert(min=0.5, help="A device that does not return for so many s hangs.")
     ] = 60.0,
     dashboard: Annotated[bool, typer.Option("--dashboard", help="Show the web page too.")] = False,
 ) -> None:
@@ -44,8 +43,9 @@ def run(
     import os
 
     from thermocald.config import load_config
-    from thermocald.daemon.journal import set_up_logging
+    from thermocald.daemon.given_config import mock_config, recording_config
     from thermocald.daemon.service import Service
+    from thermocald.daemon.systemd import set_up_logging
     from thermocald.hal import option_names
 
     if sum([config is not None, mock, recording is not None]) > 1:
@@ -82,88 +82,24 @@ def run(
         until_finished=bool(epochs) or recording is not None,
         hang_after_s=hang_after,
     )
-    if not service.run():
-        os._exit(0)  # a driver that hangs in the kernel would keep the interpreter from ending
-
-
-def mock_config() -> Config:
-    """A camera and a thermometer without hardware."""
-    return _config(
-        {
-            "store": {"path": "thermocald-mock.db"},
-            "frames": {"keep": "none", "folder": "thermocald-mock-frames", "min_free_gb": 0.1},
-            "cameras": [
-                {
-                    "name": "mock",
-                    "driver": "mock",
-                    "principal_distance_mm": 3.04,
-                    "thermometers": ["housing"],
-                    "options": {"seed": 1},
-                }
-            ],
-            "thermometers": [{"name": "housing", "driver": "mock", "seed": 2}],
-        }
-    )
-
-
-def recording_config(path: Path, *, loop: bool = False) -> Config:
-    """A recording as camera and thermometer."""
-    from thermocald.store.recording.head import read_head
-
-    head = read_head(path)
-    sensor = head.camera.sensor
-    replay = {"driver": "replay", "recording": str(path.absolute()), "loop": loop}
-    period = max(0.05, head.interval)
-    return _config(
-        {
-            "store": {"path": f"{path.absolute().name}.db", "durable": False},
-            "frames": {"keep": "none", "folder": f"{path.absolute().name}-frames"},
-            "cameras": [
-                {
-                    "name": _name(head.camera.name),
-                    "series": _name(head.series),
-                    "period_s": period,
-                    "sensor": {
-                        "width_px": sensor.width,
-                        "height_px": sensor.height,
-                        "pixel_pitch_mm": sensor.pixel_pitch,
-                    },
-                    "principal_distance_mm": head.camera.principal_distance,
-                    "testfield": str((path / "testfield.csv").absolute()),
-                    "thermometers": ["recorded"] if head.channels else [],
-                    **replay,
-                }
-            ],
-            "thermometers": [{"name": "recorded", "period_s": period, **replay}],
-        }
-    )
-
-
-def _config(document: dict[str, Any]) -> Config:
-    from thermocald.config import parse_config
-
-    return parse_config(document, Path("config.yaml"))
-
-
-def _name(text: str) -> str:
-    """Text as a configuration takes it for a name."""
-    import re
-
-    return re.sub(r"[^A-Za-z0-9_.-]", "-", text).lstrip("_.-")[:64] or "camera"
+    released = service.run()
+    if service.lost:
+        say(f"error: {service.lost}")
+    if not released:
+        # a driver that hangs in the kernel would keep the interpreter from ending
+        os._exit(1 if service.lost else 0)
+    if service.lost:
+        raise typer.Exit(1)
 
 
 def dashboard(
     store: Annotated[Path | None, typer.Option(help="The daemon's store.")] = None,
-    live: Annotated[
-        Path | None, typer.Option(help="The folder of the daemon's live state.")
-    ] = None,
-    host: Annotated[
-        str, typer.Option(help="Elsewhere than here needs --token-file.")
-    ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=1, max=65535)] = 8437,
-    token_file: Annotated[Path | None, typer.Option(help="A file that holds the token.")] = None,
+    live: Annotated[Path | None, expert(help="The folder of the daemon's live state.")] = None,
+    host: Annotated[str, expert(help="Elsewhere than here needs --token-file.")] = "127.0.0.1",
+    port: Annotated[int, expert(min=1, max=65535)] = 8437,
+    token_file: Annotated[Path | None, expert(help="A file that holds the token.")] = None,
     name: Annotated[
-        list[str] | None, typer.Option(help="A further name of the page; repeatable.")
+        list[str] | None, expert(help="A further name of the page; repeatable.")
     ] = None,
     config: Annotated[
         Path | None, typer.Option("--config", "-c", help="All of these from a configuration.")

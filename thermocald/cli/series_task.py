@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from thermocald.atomic_file import make_folder, write_text
-from thermocald.cli.common import jsonable
 from thermocald.errors import DataError, OutputError, ThermocaldError, UsageError
-from thermocald.store.server.address import ServerAddress, is_server
+from thermocald.result import jsonable
+from thermocald.store.server.connection import ServerAddress, is_server
 from thermocald.store.sources import source_name
 
 __all__ = ["ANALYSES", "SeriesOutcome", "SeriesTask", "analyse", "find_series_tasks", "lost"]
@@ -87,20 +87,15 @@ def lost(task: SeriesTask, why: str) -> SeriesOutcome:
 
 
 def _discovered(task: SeriesTask) -> dict[str, Any]:
-    from thermocald.discovery.evidence.pair import load_together
-    from thermocald.discovery.verdict.result import discover_series
-    from thermocald.reduction.reduce import reduce_together
+    import thermocald as tc
 
-    inputs = load_together(task.source, (), lambda _: None)
-    return discover_series(reduce_together(inputs, None), lambda _: None).as_json(None)
+    return tc.discover(tc.open(task.source)).as_dict()
 
 
 def _studied(task: SeriesTask) -> dict[str, Any]:
-    from thermocald.analysis.study.input import load_series
-    from thermocald.analysis.study.study import StudySettings, study
-    from thermocald.output.study.document import study_document
+    import thermocald as tc
 
-    return study_document(study(load_series(task.source), StudySettings(sets=task.sets)))
+    return tc.study(*tc.open_all(task.source), sets=task.sets).as_dict()
 
 
 def _recordings(folder: Path) -> list[tuple[str, Path]]:

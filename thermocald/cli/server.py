@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from thermocald.cli.commands import subcommands
 from thermocald.cli.common import say, write_text
 
 __all__ = ["group"]
@@ -17,19 +18,12 @@ _Address = Annotated[
 ]
 
 
-_HELP = """The database of a fleet.
-
-Example: thermocald server init postgresql://owner@db.example/thermocald
-"""
-
-
 def init(address: _Address) -> None:
     """Make the tables, or bring older ones up to date.
 
     Example: thermocald server init postgresql://owner@db.example/thermocald
     """
-    from thermocald.store.server.address import ServerAddress
-    from thermocald.store.server.schema import create_tables
+    from thermocald.store.server.connection import ServerAddress, create_tables
 
     parsed = ServerAddress.parse(address)
     create_tables(parsed)
@@ -47,8 +41,8 @@ def grant(
 
     Example: thermocald server grant postgresql://owner@db.example/thermocald gauge7 --forward
     """
-    from thermocald.store.server.address import ServerAddress
-    from thermocald.store.server.schema import grant as give
+    from thermocald.store.server.connection import ServerAddress
+    from thermocald.store.server.connection import grant as give
 
     parsed = ServerAddress.parse(address)
     give(parsed, role, writes=forward)
@@ -65,11 +59,8 @@ def dashboard(
     Example: thermocald server dashboard -o fleet.json
     """
     path = Path(output) if output != "-" else output
-    text = (files("thermocald.output.fleet") / "grafana.json").read_text(encoding="utf-8")
+    text = (files("thermocald.output") / "templates" / "grafana.json").read_text(encoding="utf-8")
     write_text(text, path)
 
 
-group = typer.Typer(no_args_is_help=True, help=_HELP)
-group.command("init")(init)
-group.command("grant")(grant)
-group.command("dashboard")(dashboard)
+group = subcommands(init=init, grant=grant, dashboard=dashboard)

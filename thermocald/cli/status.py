@@ -20,8 +20,6 @@ from thermocald.cli.options import JsonOption
 from thermocald.errors import DataError
 from thermocald.output.status_text import status_lines
 
-__all__ = ["keys", "read_status", "status", "top"]
-
 ConfigOption = Annotated[
     Path | None, typer.Option("--config", "-c", help="The daemon's configuration.")
 ]
@@ -29,7 +27,9 @@ StoreOption = Annotated[Path | None, typer.Option("--store", help="The daemon's 
 
 
 def status(config: ConfigOption = None, store: StoreOption = None, json: JsonOption = None) -> None:
-    """How the daemon is doing: cameras, thermometers, store; exit status 1 if it does not run.
+    """How the daemon is doing: cameras, thermometers, store.
+
+    Exit status 1 if it does not run, or if an epoch that it took is lost.
 
     Example: thermocald status --config /etc/thermocald/config.yaml
     """
@@ -37,6 +37,8 @@ def status(config: ConfigOption = None, store: StoreOption = None, json: JsonOpt
     if write_result(document, json):
         for line in status_lines(document):
             typer.echo(line)
+    if document["store"]["lost"]:
+        raise DataError(f"{document['store']['lost']} epochs were lost, taken and not kept")
 
 
 def top(
@@ -105,22 +107,9 @@ def keys() -> Iterator[Callable[[float], str]]:
 
 
 def read_status(config: Path | None, store: Path | None) -> dict[str, Any]:
-    """The running daemon's status; DataError if none runs for that store."""
-    from thermocald.daemon.live_state import find_state, read_state
+    from thermocald.daemon.live_state import running_status
 
-    path = _store(config, store)
-    folder = find_state(path)
-    document = read_state(folder)
-    if not document:
-        raise DataError(f"no daemon runs for {path} (there is no {folder}/status.json)")
-    # the daemon's own clock may be stepped; how old the file is tells the machine's alone
-    age_s = time.time() - (folder / "status.json").stat().st_mtime
-    document["age_s"] = max(0.0, age_s)
-    if not _alive(int(document.get("pid", 0))):
-        raise DataError(
-            f"the daemon that wrote {path} was killed {age_s:.0f} s ago; start it again"
-        )
-    return document
+    return running_status(_store(config, store))
 
 
 def _store(config: Path | None, store: Path | None) -> Path:
@@ -135,7 +124,3 @@ def _store(config: Path | None, store: Path | None) -> Path:
     from thermocald.config import load_config
 
     return load_config(config).store.path
-
-
-def _alive(pid: int) -> bool:
-    return pid > 0 and Path(f"/proc/{pid}").exists()

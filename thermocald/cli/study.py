@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 
 from thermocald.atomic_file import make_folder
-from thermocald.cli.common import progress, write_json
+from thermocald.cli.commands import expert
+from thermocald.cli.common import progress, write_result
 from thermocald.cli.options import (
     DEFAULT_FREE_TEXT,
     ExteriorOption,
@@ -17,18 +17,15 @@ from thermocald.cli.options import (
     JobsOption,
     JsonOption,
     SeedOption,
+    check_exterior,
     free_names,
 )
-from thermocald.errors import DataError, UsageError
-from thermocald.store.server.address import is_server
+from thermocald.errors import UsageError
+from thermocald.store.server.connection import is_server
 from thermocald.store.sources import require_source
 
 if TYPE_CHECKING:
-    from thermocald.analysis.study.measured import MeasuredSeries
-    from thermocald.analysis.study.reference import Comparison
-    from thermocald.analysis.study.study import Study, StudySettings
-
-__all__ = ["study"]
+    from thermocald.results import Study
 
 
 def study(
@@ -45,41 +42,36 @@ def study(
     figures: Annotated[
         Path | None, typer.Option(help="Write all figures as SVG and PNG here.")
     ] = None,
-    title: Annotated[str, typer.Option(help="Of the report.")] = "Thermal study of a camera",
-    window: Annotated[int, typer.Option(min=3, help="Epochs in the F-test's window, odd.")] = 31,
-    alpha: Annotated[float, typer.Option(min=1e-6, max=0.5, help="Level of the F-test.")] = 0.05,
-    sets: Annotated[
-        int, typer.Option(min=2, help="Interior orientations drawn (Monte-Carlo).")
-    ] = 50_000,
+    window: Annotated[int, expert(min=3, help="Epochs in the F-test's window, odd.")] = 31,
+    alpha: Annotated[float, expert(min=1e-6, max=0.5, help="Level of the F-test.")] = 0.05,
+    sets: Annotated[int, expert(min=2, help="Interior orientations drawn (Monte-Carlo).")] = 50_000,
     seed: SeedOption = 0,
-    distance: Annotated[float, typer.Option(min=0.01, help="Of the object plane, m.")] = 10.0,
+    distance: Annotated[float, expert(min=0.01, help="Of the object plane, m.")] = 10.0,
     grid: Annotated[
-        int,
-        typer.Option("--grid", "--raster", min=2, max=9, help="Image points per row and column."),
+        int, expert("--grid", min=2, max=9, help="Image points per row and column.")
     ] = 3,
     focus: Annotated[
-        float, typer.Option(min=0.01, help="Focus distance for the depth of field, m.")
+        float, expert(min=0.01, help="Focus distance for the depth of field, m.")
     ] = 1.0,
-    f_number: Annotated[float, typer.Option(min=0.1, help="Of the lens.")] = 2.0,
+    f_number: Annotated[float, expert(min=0.1, help="Of the lens.")] = 2.0,
     confusion: Annotated[
-        float | None, typer.Option(min=1e-6, help="Circle of confusion, mm [diagonal/2000].")
+        float | None, expert(min=1e-6, help="Circle of confusion, mm [diagonal/2000].")
     ] = None,
     thermometer_sd: Annotated[
-        float | None, typer.Option(min=0.0, help="Noise of the thermometers, K [estimated].")
+        float | None, expert(min=0.0, help="Noise of the thermometers, K [estimated].")
     ] = None,
     exterior: ExteriorOption = "auto",
     free: FreeOption = DEFAULT_FREE_TEXT,
     jobs: JobsOption = 1,
     reference: Annotated[
-        bool,
-        typer.Option("--reference", help="Study the presets instead, next to the reference study."),
+        bool, expert("--reference", help="Study the presets instead, next to the reference study.")
     ] = False,
 ) -> None:
     """How the camera changes with its temperature, whether that is significant, what it does.
 
     Example: thermocald study M1 M2 --report study.html --json study.json
     """
-    from thermocald.analysis.study.study import StudySettings
+    import thermocald as tc
 
     if reference == bool(inputs):
         raise UsageError(
@@ -89,83 +81,54 @@ def study(
         )
     if window % 2 == 0:
         raise UsageError(f"--window is {window}; it must be odd, so that it has a centre")
-    settings = StudySettings(
-        window=window,
-        alpha=alpha,
-        sets=sets,
-        seed=seed,
-        distance_mm=1000 * distance,
-        grid=grid,
-        focus_mm=1000 * focus,
-        f_number=f_number,
-        confusion_mm=confusion,
-        thermometer_sd=thermometer_sd,
-        jobs=jobs,
-    )
-    from thermocald.photogrammetry.series.result import EXTERIOR_CHOICES
-
-    if exterior not in EXTERIOR_CHOICES:
-        raise UsageError(f"--exterior {exterior}: must be one of {', '.join(EXTERIOR_CHOICES)}")
+    settings: dict[str, Any] = {
+        "window": window,
+        "alpha": alpha,
+        "sets": sets,
+        "seed": seed,
+        "distance_mm": 1000 * distance,
+        "grid": grid,
+        "focus_mm": 1000 * focus,
+        "f_number": f_number,
+        "confusion_mm": confusion,
+        "thermometer_sd": thermometer_sd,
+        "jobs": jobs,
+    }
+    check_exterior(exterior)
     # Refused before the work, not after it.
     for path in (report, figures):
         if path is not None:
             make_folder(path.absolute().parent)
-    comparisons: list[Comparison] = []
     if reference:
-        result, comparisons = _reference(settings)
+        with progress(None, "simulating, adjusting, studying") as advance:
+            result = tc.reference_study(progress=advance, **settings)
     else:
         result = _study(inputs or [], settings, exterior, free_names(free))
-    _write(result, comparisons, json, report, figures, title)
+    written = []
+    if report is not None:
+        written.append(str(result.report(report)))
+    if figures is not None:
+        written.append(f"{len(result.save_figures(figures))} figures in {figures}")
+    if write_result(result.as_dict(), json):
+        typer.echo("\n".join([str(result), *(f"written: {line}" for line in written)]))
 
 
 def _study(
-    inputs: list[str], settings: StudySettings, exterior: str, free: tuple[str, ...]
+    inputs: list[str], settings: dict[str, Any], exterior: str, free: tuple[str, ...]
 ) -> Study:
-    from thermocald.analysis.study.input import load_series
-    from thermocald.analysis.study.study import study as run
-    from thermocald.photogrammetry.series.spool import give_back
-    from thermocald.store.recording.reader import open_recording
+    import thermocald as tc
 
-    series: list[MeasuredSeries] = []
-    labelled = [_labelled(text) for text in inputs]
-    _refuse_duplicates([path for _, path in labelled])
-    for label, path in labelled:
-        recording = open_recording(path) if path.is_dir() else None
-        epochs = None if recording is None else len(recording)
-        with progress(epochs, f"calibrating {path.name}") as advance:
-            series += load_series(
-                recording or path, label, settings.thermometer_sd, exterior, free, advance,
-                settings.jobs,
-            )  # fmt: skip
-        del recording  # its columns are not needed any more
-        give_back()
-    _refuse_copies(series)
-    cameras = len({one.label for one in series})
-    with progress(settings.sets * cameras, "simulating") as advance:
-        return run(series, settings, advance)
-
-
-def _refuse_duplicates(paths: list[Path]) -> None:
-    """UsageError where one series is given twice: it would count as two that agree."""
-    seen: dict[Path, Path] = {}
-    for path in paths:
-        real = path.resolve()
-        if real in seen:
-            raise UsageError(
-                f"{path} is the same series as {seen[real]}; give each series once (a copy would "
-                "count as a second measurement that agrees perfectly)"
-            )
-        seen[real] = path
-
-
-def _refuse_copies(series: list[MeasuredSeries]) -> None:
-    """DataError where two inputs hold the same epochs."""
-    for i, one in enumerate(series):
-        for other in series[:i]:
-            if len(one) > 1 and len(one) == len(other) and np.array_equal(one.values, other.values):
-                raise DataError(
-                    f"{one.source} holds the same epochs as {other.source}; give each series once"
-                )
+    labels: list[str | None] = []
+    series: list[tc.Series] = []
+    for label, path in map(_labelled, inputs):
+        found = tc.open_all(path)
+        labels += [label] * len(found)
+        series += found
+    cameras = len({label or one.camera for label, one in zip(labels, series, strict=True)})
+    with progress(settings["sets"] * cameras, "calibrating and simulating") as advance:
+        return tc.study(
+            *series, labels=labels, **settings, exterior=exterior, free=free, progress=advance
+        )
 
 
 def _labelled(text: str) -> tuple[str | None, Path]:
@@ -175,83 +138,3 @@ def _labelled(text: str) -> tuple[str | None, Path]:
     if not equals or Path(text).exists() or is_server(text):
         label, rest = "", text
     return label or None, require_source(Path(rest))
-
-
-def _reference(settings: StudySettings) -> tuple[Study, list[Comparison]]:
-    from thermocald.analysis.study.reference import QUOTED, SERIES, compare, reference_studies
-    from thermocald.analysis.study.study import Study
-
-    with progress(len(QUOTED) * len(SERIES), "simulating, adjusting, studying") as advance:
-        cameras = reference_studies(settings, advance=advance)
-    return Study(settings, tuple(cameras)), [c for camera in cameras for c in compare(camera)]
-
-
-def _write(
-    result: Study,
-    comparisons: list[Comparison],
-    json: str | None,
-    report: Path | None,
-    figures: Path | None,
-    title: str,
-) -> None:
-    from thermocald.output.study.document import study_document
-
-    if json is not None:
-        document = study_document(result)
-        if comparisons:
-            document["reference"] = [_comparison(c) for c in comparisons]
-        write_json(document, json)
-    written = []
-    if report is not None:
-        from thermocald.output.study.report import render_report, write_report
-
-        write_report(report, render_report(result, title))
-        written.append(str(report))
-    if figures is not None:
-        from thermocald.output.study.report import save_figures
-
-        written.append(f"{len(save_figures(result, figures))} figures in {figures}")
-    if json == "-":
-        return
-    if comparisons:
-        _print_comparisons(comparisons)
-    else:
-        _print_summary(result)
-    for line in written:
-        typer.echo(f"written: {line}")
-
-
-def _comparison(c: Comparison) -> dict[str, Any]:
-    return {
-        "camera": c.camera,
-        "quantity": c.quantity,
-        "unit": c.unit,
-        "reference": c.text,
-        "ours": c.ours,
-        "reproduced": c.reproduced,
-    }
-
-
-def _print_comparisons(comparisons: list[Comparison]) -> None:
-    """Reference alongside ours, one line per figure."""
-    typer.echo(f"{'camera':17}{'quantity':43}{'reference':>12}{'ours':>9}  met")
-    for c in comparisons:
-        unit = f" {c.unit}" if c.unit else ""
-        typer.echo(
-            f"{c.camera:17}{c.quantity + unit:43}{c.text:>12}{c.ours:>9.3g}  "
-            f"{'yes' if c.reproduced else 'NO'}"
-        )
-
-
-def _print_summary(result: Study) -> None:
-    from thermocald.output.study.summary import summary
-
-    for camera in result.cameras:
-        typer.echo(camera.label)
-        for sentence in summary(camera):
-            typer.echo(f"  {sentence}")
-        for study_of_series in camera.series:
-            for note in study_of_series.notes:
-                typer.echo(f"  note, {study_of_series.series.name}: {note}")
-        for note in camera.notes:
-            typer.echo(f"  note: {note}")

@@ -2,18 +2,391 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
 import typer
 
-from thermocald.cli.testfield_check import check
-from thermocald.cli.testfield_import import import_
-from thermocald.cli.testfield_print import print_
-from thermocald.cli.testfield_survey import survey
+from thermocald.cli.commands import expert, subcommands
+from thermocald.cli.common import say, write_result
+from thermocald.cli.options import JsonOption, PhotosArgument, PixelPitchOption
+from thermocald.errors import UsageError
 
-__all__ = ["group"]
+if TYPE_CHECKING:
+    from thermocald.output.testfield.board import Board
+    from thermocald.output.testfield.layout import Design
+    from thermocald.photogrammetry.network.bundle import Distance
+
+CameraFile = Annotated[
+    Path | None,
+    typer.Option("--camera", help="A camera file of any format that `camera convert` reads."),
+]
+Paper = Annotated[str, typer.Option("--paper", help="A4, A3, A2, A1, A0, or WIDTHxHEIGHT in mm.")]
+Flat = Annotated[
+    bool,
+    typer.Option(
+        "--flat/--corner",
+        help="One flat sheet instead of the three of a corner. A fixed camera cannot be calibrated "
+        "from one flat sheet.",
+    ),
+]
+Landscape = Annotated[
+    bool | None,
+    expert("--landscape/--portrait", help="Default: landscape for a corner, else portrait."),
+]
+Diameter = Annotated[
+    float | None, typer.Option("--diameter", help="Of the discs, mm; default by paper size.")
+]
+Charuco = Annotated[str | None, typer.Option("--charuco", help="A ChArUco board: 11x8 squares.")]
+Chessboard = Annotated[
+    str | None, typer.Option("--chessboard", help="A chessboard: 9x6 inner corners.")
+]
+AprilGrid = Annotated[str | None, typer.Option("--aprilgrid", help="Kalibr's AprilGrid: 6x6 tags.")]
+Square = Annotated[
+    float | None, typer.Option("--square", min=0.1, help="Of a board: side of a square, mm.")
+]
+MarkerSide = Annotated[
+    float | None, typer.Option("--marker", min=0.1, help="Of a board: side of a marker or tag, mm.")
+]
+Spacing = Annotated[float, expert("--spacing", help="Of an AprilGrid, over the side of a tag.")]
+Dictionary = Annotated[str, expert("--dictionary", help="Of a ChArUco board: OpenCV's name.")]
+Legacy = Annotated[bool, expert("--legacy", help="ChArUco as OpenCV drew it before 4.6.")]
+Point = tuple[float, float, float]
+
+_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".pgm"}
 
 
-group = typer.Typer(help="Test fields: print, import, survey, check.", no_args_is_help=True)
-group.command("print")(print_)
-group.command("import")(import_)
-group.command("survey")(survey)
-group.command("check")(check)
+def print_(
+    out: Annotated[Path, typer.Option("--out", "-o", help="The folder to write into.")],
+    paper: Paper = "A3",
+    flat: Flat = False,
+    landscape: Landscape = None,
+    diameter: Diameter = None,
+    bits: Annotated[int | None, expert(help="Of the ring codes: 12, 14, or 0 for none.")] = None,
+    plain: Annotated[
+        bool, expert("--plain/--no-plain", help="Plain circles between the coded ones.")
+    ] = True,
+    markers: Annotated[
+        str | None, expert(help="Markers too, of a dictionary: DICT_APRILTAG_36h11.")
+    ] = None,
+    light: Annotated[bool, expert("--light", help="White targets on black.")] = False,
+    first_code: Annotated[int, expert(min=0, help="Skip so many codes: for a second field.")] = 0,
+    pitch: Annotated[float | None, expert(help="Distance of the coded targets, mm.")] = None,
+    charuco: Charuco = None,
+    chessboard: Chessboard = None,
+    aprilgrid: AprilGrid = None,
+    square: Square = None,
+    marker: MarkerSide = None,
+    spacing: Spacing = 0.3,
+    dictionary: Dictionary = "DICT_5X5_1000",
+    legacy: Legacy = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace a test field that was printed before.")
+    ] = False,
+    json: JsonOption = None,
+) -> None:
+    """Draw a test field: a PDF, an SVG per sheet, and the testfield.csv that belongs to it.
+
+    By default it is a corner of three sheets; the last page of the PDF shows how to put it up.
+    Print without scaling ("actual size"), measure the rulers, then survey what you have built.
+
+    With --charuco, --chessboard or --aprilgrid it is one board of that kind, as large as the paper
+    allows unless sizes are given.
+
+    Example: thermocald testfield print --paper A3 --out field
+    Example: thermocald testfield print --aprilgrid 6x6 --paper A2 --out board
+    """
+    from thermocald.output.testfield import print as sheets
+    from thermocald.output.testfield.layout import PAPERS, paper_size
+
+    board = _board(charuco, chessboard, aprilgrid, square, marker, spacing, dictionary, legacy)
+    if board is not None:  # the page lies as the board does unless it is said how
+        wide = board.columns > board.rows and paper.strip().upper() in PAPERS
+        page = paper_size(paper, landscape=wide if landscape is None else landscape)
+        printed = sheets.print_board(board.filled(page), page, out, replace_printed=force)
+    else:
+        design = replace(
+            _design(paper, flat, landscape, diameter),
+            bits=bits, plain=plain, dictionary=markers, light=light, first_code=first_code,
+            pitch=pitch,
+        )  # fmt: skip
+        printed = sheets.print_testfield(design, out, replace_printed=force)
+    if write_result(printed.as_dict(), json):
+        typer.echo("\n".join(printed.lines()))
+        if printed.is_flat:
+            say(sheets.ONE_PLANE)
+
+
+def import_(
+    source: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[FILE]",
+            help="Kalibr's target.yaml, OpenCV's parameters, a file of calib.io's, or a list.",
+        ),
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="The testfield.csv to write.")] = Path(
+        "testfield.csv"
+    ),
+    charuco: Charuco = None,
+    chessboard: Chessboard = None,
+    aprilgrid: AprilGrid = None,
+    rings: Annotated[
+        int | None, expert(help="FILE lists targets with ring codes of 12 or 14 bits.")
+    ] = None,
+    square: Square = None,
+    marker: MarkerSide = None,
+    spacing: Spacing = 0.3,
+    dictionary: Dictionary = "DICT_5X5_1000",
+    legacy: Legacy = False,
+    diameter: Annotated[
+        float | None, typer.Option(min=0.1, help="Of ring-coded discs, mm.")
+    ] = None,
+    sigma: Annotated[
+        float | None, typer.Option(min=1e-4, help="Of a coordinate, mm, if measured.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    json: JsonOption = None,
+) -> None:
+    """Make a testfield.csv of a board that you own: ChArUco, chessboard, AprilGrid, coded rings.
+
+    One flat board calibrates a camera from several poses (`thermocald calibrate`); for a series of
+    a camera that stands still put several boards at an angle and survey them together.
+
+    Example: thermocald testfield import april_6x6.yaml --out aprilgrid.csv
+    Example: thermocald testfield import --charuco 11x8 --square 30 --marker 22 --dictionary
+    DICT_5X5_250 --out charuco.csv
+    """
+    from thermocald.store.recording.board_file import read_board, read_rings
+    from thermocald.store.recording.testfield_file import write_testfield
+
+    board = _board(charuco, chessboard, aprilgrid, square, marker, spacing, dictionary, legacy)
+    if (source is None) == (board is None):
+        raise UsageError(
+            "give a file, or one of --charuco, --chessboard, --aprilgrid with its sizes"
+        )
+    if out.exists() and not force:
+        raise UsageError(f"{out}: exists already: give another name, or --force to replace it")
+    if source is not None and rings is not None:
+        if diameter is None:
+            raise UsageError("--rings needs the --diameter of the discs, mm")
+        if rings not in (12, 14):
+            raise UsageError(f"--rings {rings}: there are codes of 12 and of 14 bits")
+        field, said = read_rings(source, rings, diameter, sigma), f"rings of {rings} bits"
+    elif source is not None:
+        field, said = read_board(source, sigma)
+    else:
+        assert board is not None
+        for option, size in (("--square", square), ("--marker", marker)):
+            needless = {"--square": "aprilgrid", "--marker": "chessboard"}[option]
+            if size is None and board.kind != needless:
+                raise UsageError(f"{option} is missing (mm)")
+        field, said = board.field(sigma), board.name
+    out.absolute().parent.mkdir(parents=True, exist_ok=True)
+    write_testfield(out, field)
+    extent = [float(v) for v in field.points.max(axis=0) - field.points.min(axis=0)]
+    document = {
+        "format": "thermocald-testfield-import/1", "testfield": out, "what": said,
+        "targets": len(field), "extent": extent,
+    }  # fmt: skip
+    if write_result(document, json):
+        typer.echo(f"{out}: {said}, {len(field)} targets, {extent[0]:.1f} × {extent[1]:.1f} mm")
+
+
+def survey(
+    photos: PhotosArgument,
+    out: Annotated[Path, typer.Option("--out", "-o", help="The testfield.csv to write.")],
+    scale: Annotated[
+        tuple[str, str, float] | None,
+        typer.Option(metavar="A B MM", help="Two targets and their measured distance."),
+    ] = None,
+    scale_sd: Annotated[float, expert(min=1e-6, help="Its standard deviation, mm.")] = 0.1,
+    distances: Annotated[
+        Path | None, expert(help="More of them, a CSV: a, b, length, sigma in mm.")
+    ] = None,
+    field: Annotated[
+        Path | None, typer.Option(help="The nominal testfield.csv, as printed; for plain circles.")
+    ] = None,
+    camera: CameraFile = None,
+    hold_camera: Annotated[
+        bool, expert("--hold-camera", help="Trust --camera and do not calibrate it again.")
+    ] = False,
+    pixel_pitch: PixelPitchOption = None,
+    camera_out: Annotated[
+        Path | None, typer.Option(help="Write the camera that was found (JSON).")
+    ] = None,
+    json: JsonOption = None,
+) -> None:
+    """Measure a test field from photographs of it: coordinates and their standard deviations.
+
+    Take 8 to 12 photographs with one camera, focus and zoom untouched, from all sides, the camera
+    turned by 90° in some. Do not let a program rotate or crop them afterwards.
+
+    Example: thermocald testfield survey photos/ --field field/testfield.csv --scale R65 R89 340.12
+    --out surveyed.csv
+    """
+    from thermocald.photogrammetry import camera_files
+    from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
+    from thermocald.photogrammetry.survey import picture_of
+    from thermocald.photogrammetry.survey import survey as run
+    from thermocald.store.recording.testfield_file import read_testfield, write_testfield
+
+    measured = _distances(scale, scale_sd, distances)
+    pictures = [picture_of(path) for path in _photos(photos)]
+    known = None if camera is None else camera_files.read(camera, pixel_pitch=pixel_pitch).model
+    if hold_camera and known is None:
+        raise UsageError("--hold-camera needs --camera")
+    pitch = known.sensor.pixel_pitch if known is not None else pixel_pitch
+    if pitch is None:
+        pitch = 0.001
+        say("pixel pitch not given: 0.001 mm assumed, the camera's mm are only as good")
+    result = run(
+        pictures,
+        measured,
+        pitch,
+        nominal=None if field is None else read_testfield(field),
+        interior=None if known is None else known.interior,
+        free=() if hold_camera else IOP_NAMES,
+        progress=say,
+    )
+    write_testfield(out, result.field)
+    if camera_out is not None:
+        network = result.network
+        comment = f"self-calibration in the survey of {out.name}, sigma0 {network.sigma0:.2f}"
+        camera_files.write(network.camera, camera_out, "json", network.interior_covariance, comment)
+    if write_result({**result.as_dict(), "testfield": str(out)}, json):
+        typer.echo(f"{out}: " + "\n".join(result.lines()))
+
+
+def check(
+    field: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[FIELD]", help="A testfield.csv; without it what `print` would draw."
+        ),
+    ] = None,
+    paper: Paper = "A3",
+    flat: Flat = False,
+    landscape: Landscape = None,
+    diameter: Diameter = None,
+    camera: CameraFile = None,
+    pixel_pitch: PixelPitchOption = None,
+    place: Annotated[
+        Point | None,
+        typer.Option("--from", metavar="X Y Z", help="Where the camera stands, mm."),
+    ] = None,
+    at: Annotated[
+        Point | None,
+        expert(metavar="X Y Z", help="What it looks at; default the field's middle."),
+    ] = None,
+    roll: Annotated[float, expert(help="Turned about its axis, degrees.")] = 0.0,
+    sigma: Annotated[float, expert(min=1e-4, help="Of an image coordinate, px.")] = 0.03,
+    report: Annotated[Path | None, typer.Option(help="Write a report, one HTML file.")] = None,
+    json: JsonOption = None,
+) -> None:
+    """Assess a test field: what a camera sees of it, how well it would be calibrated, what to add.
+
+    Without FIELD it is the field that `testfield print` would draw with the same --paper, --flat,
+    --landscape and --diameter, so that you know before you print. Without --from the camera stands
+    where the field just fills its image; without --camera it is a Raspberry Pi camera v2.1.
+
+    Example: thermocald testfield check --paper A4
+    Example: thermocald testfield check field/testfield.csv --from 900 900 700
+    """
+    from thermocald.analysis.field.advice import assess_field
+    from thermocald.output.testfield.layout import field_of, lay_out
+    from thermocald.photogrammetry import camera_files
+    from thermocald.photogrammetry.camera.camera_model import RASPBERRY_PI_V2
+    from thermocald.store.recording.testfield_file import read_testfield
+
+    if field is None:
+        targets = field_of(lay_out(_design(paper, flat, landscape, diameter)))
+    else:
+        targets = read_testfield(field)
+    if camera is not None:
+        model = camera_files.read(camera, pixel_pitch=pixel_pitch).model
+    else:
+        model = RASPBERRY_PI_V2
+        say(
+            "no --camera: a Raspberry Pi camera v2.1 (3280 × 2464 px of 1.12 µm, 3.04 mm) is "
+            "assumed"
+        )
+    found = assess_field(targets, model, place, at, roll, sigma)
+    if report is not None:
+        from thermocald.atomic_file import write_text
+        from thermocald.output.field_check import render_field_check
+
+        write_text(report, render_field_check(found))
+    if write_result(found.as_dict(), json):
+        typer.echo("\n".join(found.lines()))
+
+
+def _board(
+    charuco: str | None, chessboard: str | None, aprilgrid: str | None, square: float | None,
+    marker: float | None, spacing: float, dictionary: str, legacy: bool,
+) -> Board | None:  # fmt: skip
+    """The board that these options describe, None where none does; its sizes are 0 where they are
+    not given. UsageError for two boards, or counts that are none.
+    """
+    from thermocald.output.testfield.board import KINDS, Board, counts_of
+
+    given = [(k, n) for k, n in zip(KINDS, (charuco, chessboard, aprilgrid), strict=True) if n]
+    if len(given) > 1:
+        raise UsageError(f"--{given[0][0]} and --{given[1][0]}: one board at a time")
+    if not given:
+        return None
+    kind, counts = given[0]
+    columns, rows = counts_of(f"--{kind}", counts)
+    return Board(kind, columns, rows, square or 0.0, marker or 0.0, spacing, dictionary, legacy)
+
+
+def _design(paper: str, flat: bool, landscape: bool | None, diameter: float | None) -> Design:
+    """The print that these options describe; UsageError for paper that there is not."""
+    from thermocald.output.testfield.layout import Design, paper_size
+    from thermocald.output.testfield.print import default_diameter
+
+    page = paper_size(paper, landscape=not flat if landscape is None else landscape)
+    if landscape is None and "x" in paper.lower().replace("×", "x"):
+        page = paper_size(paper)  # a size in mm says itself how it lies
+    return Design(
+        page, diameter if diameter is not None else default_diameter(page), sheets=1 if flat else 3
+    )
+
+
+def _photos(paths: list[Path]) -> list[Path]:
+    """The files, folders replaced by the pictures in them; UsageError for what is not there."""
+    found: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in _SUFFIXES)
+            if not inside:
+                raise UsageError(f"{path}: the folder holds no pictures")
+            found += inside
+        elif path.is_file():
+            found.append(path)
+        else:
+            raise UsageError(f"{path}: there is no such file")
+    if len(set(found)) < len(found):
+        raise UsageError("a photograph is given twice")
+    return found
+
+
+def _distances(
+    scale: tuple[str, str, float] | None, sigma: float, file: Path | None
+) -> list[Distance]:
+    from thermocald.photogrammetry.network.bundle import Distance
+    from thermocald.store.recording.board_file import read_distances
+
+    found = [] if scale is None else [Distance(scale[0], scale[1], scale[2], sigma)]
+    if file is not None:
+        found += read_distances(file)
+    if not found:
+        raise UsageError("the scale is missing: --scale A B MM, or --distances FILE")
+    for d in found:
+        if not (d.length > 0 and d.sigma > 0) or d.a == d.b:
+            raise UsageError(f"{d.a} to {d.b}, {d.length:g} ± {d.sigma:g} mm, is not a distance")
+    return found
+
+
+group = subcommands(print_=print_, import_=import_, survey=survey, check=check)

@@ -47,10 +47,9 @@ class Prior(Section):
 class CalibrationConfig(Section):
     """How epochs are adjusted.
 
-    exterior: one orientation `per_epoch`, or one for the `series` of a camera that stands still,
-    estimated from all its epochs so far (an epoch that contradicts it has the status `moved`, the
-    second in a row starts again), or that and movements of the `mount` whose size the epochs show;
-    `auto` is `mount`, held where nothing moves;
+    exterior: how an epoch's result in its series is estimated, which is stored next to its own:
+    one orientation `per_epoch`, or one for the `series` of a camera that stands still, or that and
+    movements of the `mount` whose size the epochs show; `auto`: what the epochs so far show;
     target_offsets: a constant offset per target, estimated from all epochs so far with the test
     field's sigmas as prior, else these are noise of each epoch;
     free: what is estimated; fixed: values of what is not; priors: values with their sd; the

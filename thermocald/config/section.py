@@ -9,6 +9,8 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, model_validator
 from pydantic_core import PydanticCustomError
 
+from thermocald.addresses import without_secrets
+
 __all__ = [
     "Name",
     "Period",
@@ -71,25 +73,28 @@ def nearest(key: str, known: list[str]) -> str:
     return f"; is {near[0]!r} meant?" if near else f"; known are: {', '.join(known) or 'none'}"
 
 
-def in_words(path: Path, error: ValidationError) -> str:
-    """The first error, as file, dotted key, value and what is allowed."""
+def in_words(path: Path | str, error: ValidationError) -> str:
+    """The first error, as file or place (or none), dotted key, value and what is allowed."""
     first = error.errors()[0]
     where = "".join(
         f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]
     ).lstrip(".")
+    place = f"{path}: " if str(path) else ""
     context = first.get("ctx", {})
     if first["type"] == "unknown_key":
         where = f"{where}.{context['key']}".lstrip(".")
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-    message = first["msg"]
+    message = without_secrets(first["msg"])
     if first["type"] == "missing":
-        return f"{path}: {where}: is missing{more}"
+        return f"{place}{where}: is missing{more}"
+    if first["type"] == "value_error":  # of a check that is shared with others
+        return f"{place}{where + ': ' if where else ''}{context['error']}{more}"
     if first["type"] in ("thermocald", "unknown_key"):
-        return f"{path}: {where + ': ' if where else ''}{message}{more}"
+        return f"{place}{where + ': ' if where else ''}{message}{more}"
     message = message[0].lower() + message[1:]
-    return f"{path}: {where}: is {_short(first['input'])}; {message}{more}"
+    return f"{place}{where}: is {_short(first['input'])}; {message}{more}"
 
 
 def _short(value: Any) -> str:
-    text = repr(value)
+    text = without_secrets(repr(value))
     return text if len(text) <= 60 else f"{text[:57]}…"

@@ -84,7 +84,11 @@ class ForwardConfig(Section):
     @field_validator("to")
     @classmethod
     def _without_password(cls, value: str | None) -> str | None:
-        parts = urlsplit(value or "")
+        try:
+            parts = urlsplit(value or "")
+            _ = parts.port
+        except ValueError:
+            raise wrong("is not a valid address: postgresql://USER@HOST/DATABASE") from None
         if parts.password is not None or "password=" in parts.query:
             raise wrong("holds a password; write it to the service's ~/.pgpass, or use passfile=")
         return value

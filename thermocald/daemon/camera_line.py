@@ -9,40 +9,120 @@ Where neither wants frames, the device is closed: a phone cools down for a cold 
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
-import numpy as np
-
+from thermocald.acquisition.calibrator import CalibratedEpoch
 from thermocald.acquisition.device_loop import DeviceLoop
 from thermocald.acquisition.frame_check import check_frame
 from thermocald.acquisition.link import Link
-from thermocald.acquisition.live_pipeline import LivePipeline
-from thermocald.daemon.drift import START_EPOCHS, SeriesDrift
+from thermocald.acquisition.pipeline import Pipeline
 from thermocald.daemon.epoch_keeper import EpochKeeper
-from thermocald.daemon.plan import common_unknowns
+from thermocald.daemon.plan import running_series
 from thermocald.errors import ConfigurationError
-from thermocald.store.database.row import Event
+from thermocald.photogrammetry.parameters import PARAMETER_NAMES, PRINCIPAL
+from thermocald.store.series import Event
 
 if TYPE_CHECKING:
-    from thermocald.acquisition.calibrator import CalibratedEpoch
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+
     from thermocald.acquisition.frame_check import FrameCheck
-    from thermocald.acquisition.live_pipeline import AcquiredEpoch
+    from thermocald.acquisition.frame_folder import FrameFolder
+    from thermocald.acquisition.link import LinkEvent
+    from thermocald.acquisition.pairing import Readings
+    from thermocald.acquisition.pipeline import AcquiredEpoch
+    from thermocald.acquisition.steady_clock import SteadyClock
+    from thermocald.daemon.live_state import LiveState
+    from thermocald.daemon.output_loop import OutputLoop
     from thermocald.daemon.plan import CameraPlan
-    from thermocald.daemon.resources import Resources
+    from thermocald.daemon.store_guard import StoreGuard
     from thermocald.hal import Frame
     from thermocald.photogrammetry.field.testfield import Observations
 
-__all__ = ["CameraLine", "SeriesRun", "link_status"]
+START_EPOCHS = 10
+"""The start of a series is the mean of so many of its first epochs with a result."""
+_NAMES = PARAMETER_NAMES[PRINCIPAL]
+
+
+class SeriesDrift:
+    """Columns `drift_c_px`, `sd_drift_c_px` …, `pixel_pitch` for the rows of one series.
+
+    pixel_pitch: mm; earlier: the first epochs of the series that are stored already, as rows. The
+    standard deviation takes the epochs as independent: where they share a level that cancels in
+    the difference, it is too large rather than too small.
+    """
+
+    def __init__(self, pixel_pitch: float, earlier: Iterable[dict[str, Any]] = ()) -> None:
+        self._pitch = pixel_pitch
+        self._start: list[dict[str, float]] = []
+        for row in earlier:
+            self._learn(row)
+
+    def columns(self, row: dict[str, Any]) -> dict[str, float]:
+        """The columns for one epoch; NaN without a result, and until the start is known."""
+        self._learn(row)
+        known = len(self._start) == START_EPOCHS and row.get("status") == "ok"
+        result = {"pixel_pitch": self._pitch}
+        for name in _NAMES:
+            drift = sd = math.nan
+            if known:
+                drift = (row[name] - sum(s[name] for s in self._start) / START_EPOCHS) / self._pitch
+                start = sum(s[f"sd_{name}"] ** 2 for s in self._start) / START_EPOCHS**2
+                sd = math.sqrt(row[f"sd_{name}"] ** 2 + start) / self._pitch
+            result |= {f"drift_{name}_px": drift, f"sd_drift_{name}_px": sd}
+        return result
+
+    def _learn(self, row: dict[str, Any]) -> None:
+        if len(self._start) < START_EPOCHS and row.get("status") == "ok":
+            self._start.append({k: float(row[k]) for n in _NAMES for k in (n, f"sd_{n}")})
+
+
+class Resources(Protocol):
+    """Clock, store, frames, readings and outputs, shared by the cameras of a station.
+
+    fast, virtual, epochs, hang_after_s, start_condition: as of `Station`; preview: whether a page
+    may look.
+    """
+
+    guard: StoreGuard
+    clock: SteadyClock
+    live: LiveState
+    frames: FrameFolder
+    readings: Readings
+    outputs: list[OutputLoop]
+    fast: bool
+    virtual: bool
+    epochs: int
+    hang_after_s: float
+    start_condition: str
+    preview: bool
+
+    def on_link_event(self, event: LinkEvent) -> None:
+        """A device went away or came back."""
+
+    def identity_of(self, line: Any) -> Callable[[], Mapping[str, Any]]:
+        """What a camera and its thermometers say they are, asked when a series begins."""
+
+    def columns_of(self, plan: CameraPlan) -> list[str]:
+        """The columns of a camera's temperatures, the reference first, as far as known."""
+
+    def make_observer(self, plan: CameraPlan, keeper: EpochKeeper) -> Any:
+        """The online estimate of a camera; None if it is only acquired."""
+
+    def read_now(self, names: Sequence[str]) -> None:
+        """Read thermometers in the caller's thread."""
+
 
 log = logging.getLogger(__name__)
 
 _PREVIEW_EVERY_S = 5.0
 _SHOW_EVERY_S = 0.5
 _SWITCH_GRACE_S = 20.0
-_REMEMBERED = 200  # epochs
+_VIRTUAL_PATIENCE_S = 60.0  # real seconds that a tick of a virtual clock waits for room
+_REMEMBERED = 200  # epochs, as many as a running series keeps
 
 
 class SeriesRun:
@@ -62,10 +142,10 @@ class SeriesRun:
             plan, station.guard, station.frames, self._kept, station.identity_of(line), start=start
         )
         self.observer = station.make_observer(plan, self.keeper)
-        self.common = common_unknowns(plan)
+        self.running = running_series(plan)
         self._remembered = False
         self.first = self.keeper.first_number
-        self.pipeline = LivePipeline(
+        self.pipeline = Pipeline(
             plan.name,
             plan.calibrator,
             station.readings,
@@ -77,6 +157,8 @@ class SeriesRun:
             patience_s=0.0 if station.fast else None,
             trusted=station.clock.trusted,
             observe=self._observe,
+            columns=lambda: station.columns_of(plan),
+            on_lost=station.guard.lose,
         )
         self.drift: SeriesDrift | None = None
         self.last: dict[str, Any] = {}
@@ -99,39 +181,66 @@ class SeriesRun:
         return self.pipeline.stop(max(0.1, deadline - time.monotonic()))
 
     def _observe(self, calibrated: CalibratedEpoch, in_order: bool) -> CalibratedEpoch:
-        """Test the epoch against the series, then adjust it with what all its epochs share."""
+        """Test the epoch against those before, then adjust it with what all of them tell."""
         seen = calibrated.epoch.observations
         extra = self.observer.observe(calibrated) if self.observer and in_order else {}
         adjusted = calibrated.adjustment
-        if self.common is not None and seen is not None:
-            if in_order and self.first > 1 and not self.common.epochs:
+        if self.running is not None and seen is not None:
+            if in_order and self.first > 1 and not self.running.epochs:
                 self._remember()
-            if "event" in extra:
-                self.common.reset()
-            moved = extra.get("innovation_chi2", 0.0) > extra.get("innovation_bound", np.inf)
-            adjusted = self.common.refine(self._weighed(seen), adjusted, moved=moved)
+            hurried = self.pipeline.waiting() > 1 and not self._line.station.fast
+            try:
+                adjusted, columns = self.running.refine(
+                    calibrated, self._weighed(seen), hurried=hurried
+                )
+            except Exception:
+                # what breaks in the series must not cost an epoch that has a result of its own
+                log.exception("camera %s: the series was not adjusted", self.plan.name)
+                self.running.reset()
+                columns = {"series_restarted": 1.0}
+            extra |= columns
+            if "series_restarted" in columns:
+                self._tell_restart(calibrated)
         return replace(calibrated, adjustment=adjusted, extra={**calibrated.extra, **extra})
+
+    def _tell_restart(self, calibrated: CalibratedEpoch) -> None:
+        epoch = calibrated.epoch
+        text = (
+            f"camera {self.plan.name}: several epochs in a row contradict what the earlier ones of "
+            "their series say of camera and targets; the common adjustment begins again"
+        )
+        log.warning("%s", text, extra={"event": "series_restarted"})
+        series = self.keeper.series
+        known = None if series is None else series.id
+        self._line.station.guard.event(
+            Event(epoch.frame_time, "series_restarted", text, known, epoch.number)
+        )
 
     def _weighed(self, seen: Observations) -> Observations:
         assert self.plan.calibrator is not None
         return self.plan.calibrator.weighed(seen)
 
     def _remember(self) -> None:
-        """After a restart, learn from the last epochs of the store what they share."""
+        """After a restart, go on with the last epochs of the store."""
         if self._remembered:
             return
         self._remembered = True
-        assert self.common is not None
+        assert self.running is not None
         assert self.plan.calibrator is not None
-        for seen, event in self.keeper.recent(_REMEMBERED):
-            if event:
-                self.common.reset()
-            self.common.refine(self._weighed(seen), self.plan.calibrator.adjust(seen))
+        for epoch, reported, begun in self.keeper.recent(_REMEMBERED):
+            if begun:
+                self.running.reset()
+                continue
+            assert epoch.observations is not None
+            seen = self._weighed(epoch.observations)
+            alone = CalibratedEpoch(epoch, self.plan.calibrator.adjust(seen), {})
+            self.running.remember(alone, seen, reported)
 
     def _kept(self, acquired: AcquiredEpoch, row: dict[str, Any]) -> None:
         """Tell outputs and the live state; the epoch is in the store already."""
         station, name = self._line.station, self.plan.name
         report = {} if self.observer is None else self.observer.report()
+        report |= {} if self.running is None else self.running.report()
         row["state"] = report.get("state", "unknown")
         row |= self._drift(row)
         self.last = {**row, "online": report}
@@ -171,7 +280,7 @@ class CameraLine:
         )  # fmt: skip
         self.loop = DeviceLoop(
             self.link, self._capture, station.clock, plan.config.period_s, begin,
-            free_running=station.fast, idle=lambda: not self.taking,
+            free_running=station.fast and not station.virtual, idle=lambda: not self.taking,
         )  # fmt: skip
         self.run: SeriesRun | None = None
         self.take(plan.config.series, station.start_condition)
@@ -215,7 +324,11 @@ class CameraLine:
 
     def _capture(self) -> None:
         station, run = self.station, self.run
-        if run is not None and (run.full or (station.fast and not run.pipeline.wait_for_room(1.0))):
+        # of a virtual clock each tick is an epoch, however long those before take
+        patience_s = _VIRTUAL_PATIENCE_S if station.virtual else 1.0
+        if run is not None and (
+            run.full or (station.fast and not run.pipeline.wait_for_room(patience_s))
+        ):
             return
         frame = self.plan.camera.capture()
         if station.fast:
@@ -270,7 +383,6 @@ class CameraLine:
             "lost": self.loop.lost + (0 if pipeline is None else pipeline.lost),
             "waiting": self.waiting(),
             "deferred": deferred,
-            "put_off": deferred,  # its name until the next version
             "caught_up": 0 if pipeline is None else pipeline.caught_up,
             "stored": 0 if run is None else run.keeper.stored,
             "frames_kept": 0 if run is None else run.keeper.kept_frames,
@@ -283,6 +395,7 @@ def link_status(link: Link, busy_s: float, hang_after_s: float) -> dict[str, Any
     return {
         "device": "hung" if busy_s > hang_after_s else link.state,
         "why": link.why,
+        "since": link.since,
         "warnings": link.warnings(),
         "faults": link.faults,
     }

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from thermocald.config import Name  # noqa: TC001 - pydantic reads it at run time
-from thermocald.daemon.live_state import plain
+from thermocald.config import Config, Name  # noqa: TC001 - pydantic reads it at run time
+from thermocald.daemon.live_state import find_state, plain
 from thermocald.daemon.session import Session  # noqa: TC001
 from thermocald.errors import DataError, DeviceError, ThermocaldError, UsageError
 
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-__all__ = ["FORMAT", "ControlSocket", "DaemonBusy", "Request", "ask"]
 
 log = logging.getLogger(__name__)
 
@@ -230,3 +229,24 @@ def _short(folder: Path) -> Iterator[str]:
         yield f"/proc/self/fd/{handle}/{_NAME}"
     finally:
         os.close(handle)
+
+
+def enforce_retention(config: Config) -> list[str]:
+    """Have the running daemon delete what may go, or where none runs, do it; both log it."""
+    told = ask(find_state(config.store.path), "retention")
+    if told is not None:
+        return [str(sentence) for sentence in told["deleted"]]
+    from thermocald.acquisition.frame_folder import FrameFolder
+    from thermocald.acquisition.steady_clock import machine_clock_trusted
+    from thermocald.daemon.store_guard import StoreGuard
+    from thermocald.store.series import Event
+
+    guard = StoreGuard(config.store.path)
+    try:
+        now = time.time() if machine_clock_trusted() else None
+        sentences = [deleted.text for deleted in FrameFolder(config.frames).enforce(now)]
+        for sentence in sentences:
+            guard.event(Event(time.time(), "frames_deleted", sentence))
+    finally:
+        guard.close()
+    return sentences

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
     from thermocald.config import DashboardConfig
 
-__all__ = ["DashboardProcess"]
 
 log = logging.getLogger(__name__)
 
@@ -63,7 +62,8 @@ class DashboardProcess:
             command += ["--token-file", str(config.token_file)]
         environment = {k: v for k, v in os.environ.items() if k not in _PRIVATE}
         try:
-            self._child = subprocess.Popen(command, env=environment)
+            # a group of its own: Ctrl-C ends the daemon, which then ends the page
+            self._child = subprocess.Popen(command, env=environment, process_group=0)
         except OSError as error:
             log.error("the dashboard cannot be started: %s", error)
 

@@ -11,21 +11,20 @@ from thermocald.daemon.plan import check_series, series_head
 from thermocald.daemon.store_guard import Row
 from thermocald.errors import StoreError
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
-from thermocald.store.database.row import NOT_CALIBRATED, EpochResult, Event, StoredSeries
+from thermocald.store.series import NOT_CALIBRATED, EpochResult, Event, StoredSeries
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
     from thermocald.acquisition.calibrator import CalibratedEpoch
     from thermocald.acquisition.frame_folder import FrameFolder
-    from thermocald.acquisition.live_pipeline import AcquiredEpoch
+    from thermocald.acquisition.pipeline import AcquiredEpoch
+    from thermocald.arrays import Array
     from thermocald.daemon.plan import CameraPlan
     from thermocald.daemon.store_guard import StoreGuard
     from thermocald.epoch import Epoch
-    from thermocald.photogrammetry.field.testfield import Observations
-    from thermocald.store.database.epoch_table import StoredEpoch
+    from thermocald.store.series import StoredEpoch
 
-__all__ = ["EpochKeeper", "result_row"]
 
 log = logging.getLogger(__name__)
 
@@ -88,17 +87,19 @@ class EpochKeeper:
         series = self.series
         return 1 if series is None else self._guard.last_epoch(series) + 1
 
-    def recent(self, count: int) -> Iterator[tuple[Observations, bool]]:
-        """The last epochs with a result: observations, and whether the camera changed then."""
+    def recent(self, count: int) -> Iterator[tuple[Epoch, Array, bool]]:
+        """The last epochs with a result: observations and values (16,), and whether the running
+        series began again after it.
+        """
         series = self.series
         if series is None:
             return
         first = max(1, self.first_number - count)
         try:
             for stored in self._guard.epochs(series, first):
-                seen = stored.epoch.observations
-                if seen is not None and stored.result.status == "ok":
-                    yield seen, "event" in stored.extra
+                if stored.epoch.observations is not None and stored.result.status == "ok":
+                    begun = "series_restarted" in stored.extra
+                    yield stored.epoch, stored.result.values, begun
         except StoreError as error:
             log.warning("earlier epochs cannot be read: %s", error)
 
@@ -126,7 +127,11 @@ class EpochKeeper:
             not calibrated.adjustment.ok or "event" in calibrated.extra
         )
         result = None
-        extra = {f"camera_{name}": value for name, value in acquired.frame.settings.items()}
+        extra = {
+            key: value
+            for name, value in acquired.frame.settings.items()
+            if (key := f"camera_{name}") not in epoch.temperatures  # of a thermometer `camera`
+        }
         path = None
         if self._frames.wanted(epoch.number, eventful) or deferred:
             path = self._frames.keep(self.plan.name, self.plan.series, epoch.number, acquired.frame)
@@ -141,7 +146,7 @@ class EpochKeeper:
 
         def told(stored: bool) -> None:
             self.stored += stored
-            self._on_kept(acquired, {**values, "stored": stored})
+            self._on_kept(acquired, {**values, "stored": stored, "lost": self._guard.lost})
 
         self._guard.append(Row(series, epoch, result, extra, acquired.clock_trusted, told))
 
@@ -212,7 +217,7 @@ class EpochKeeper:
         """The series; a new one is made with its first row, as soon as the store can be written."""
         if self._series is None:
             assert acquired.epoch is not None
-            channels = list(acquired.epoch.temperatures) or list(self.plan.config.thermometers)
+            channels = acquired.epoch.temperatures
             head, field, settings = series_head(self.plan, acquired.frame, channels)
             utc = acquired.frame.utc
             self._series = StoredSeries(

@@ -12,6 +12,7 @@ import json
 import logging
 import math
 import os
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from thermocald.hal import Frame
     from thermocald.photogrammetry.field.testfield import TestField
 
-__all__ = ["LiveState", "find_state", "plain", "read_state"]
 
 log = logging.getLogger(__name__)
 
@@ -165,3 +165,23 @@ def read_state(folder: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return document if isinstance(document, dict) else {}
+
+
+def running_status(path: Path) -> dict[str, Any]:
+    """Return the status of the daemon that writes a store; DataError if none runs."""
+    folder = find_state(path)
+    document = read_state(folder)
+    if not document:
+        raise DataError(f"no daemon runs for {path} (there is no {folder}/status.json)")
+    # the daemon's own clock may be stepped; how old the file is tells the machine's alone
+    age_s = time.time() - (folder / "status.json").stat().st_mtime
+    document["age_s"] = max(0.0, age_s)
+    if not _alive(int(document.get("pid", 0))):
+        raise DataError(
+            f"the daemon that wrote {path} was killed {age_s:.0f} s ago; start it again"
+        )
+    return document
+
+
+def _alive(pid: int) -> bool:
+    return pid > 0 and Path(f"/proc/{pid}").exists()

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from thermocald.acquisition.link import LinkEvent
     from thermocald.hal import Clock, Output
 
-__all__ = ["OutputLoop"]
 
 log = logging.getLogger(__name__)
 

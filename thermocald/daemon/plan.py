@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.acquisition.calibrator import Calibrator
-from thermocald.acquisition.common_unknowns import CommonUnknowns
+from thermocald.acquisition.pairing import require_columns
 from thermocald.errors import ConfigurationError
 from thermocald.hal import open_device
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
@@ -19,19 +19,11 @@ from thermocald.store.recording.head import CameraSpec, Channel, Head
 from thermocald.store.recording.reader import read_testfield
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Mapping, Sequence
 
+    from thermocald.analysis.online.running_series import RunningSeries
     from thermocald.config import CalibrationConfig, CameraConfig, Config
     from thermocald.hal import Camera, Clock, Frame
-
-__all__ = [
-    "CameraPlan",
-    "adjustment_settings",
-    "check_series",
-    "common_unknowns",
-    "plan_cameras",
-    "series_head",
-]
 
 _UNKNOWN_PITCH_MM = 0.001
 
@@ -60,6 +52,14 @@ class CameraPlan:
 def plan_cameras(config: Config, clock: Clock) -> list[CameraPlan]:
     """Build the cameras; nothing is opened. Raises ConfigurationError."""
     return [_plan(config, camera, clock) for camera in config.cameras]
+
+
+def require_thermometer_columns(
+    config: Config, channels: Mapping[str, Sequence[str]], error: type[Exception]
+) -> None:
+    """Raise `error` where channels {thermometer: …} cannot all be columns of a camera's epochs."""
+    for camera in config.cameras:
+        require_columns({name: channels.get(name, ()) for name in camera.thermometers}, error)
 
 
 def _plan(config: Config, one: CameraConfig, clock: Clock) -> CameraPlan:
@@ -115,19 +115,20 @@ def adjustment_settings(calibration: CalibrationConfig) -> AdjustmentSettings:
     )
 
 
-def common_unknowns(plan: CameraPlan) -> CommonUnknowns | None:
-    """What the epochs of a series of this camera share; None if nothing."""
+def running_series(plan: CameraPlan) -> RunningSeries | None:
+    """The series of this camera as it is adjusted while it is taken; None if nothing is shared."""
     if plan.sensor is None or plan.testfield is None:
         return None
-    common = CommonUnknowns(
+    from thermocald.analysis.online.running_series import RunningSeries
+
+    running = RunningSeries(
         plan.sensor,
         plan.testfield,
         adjustment_settings(plan.calibration),
         exterior=plan.calibration.exterior,
         offsets=plan.calibration.target_offsets,
-        interval_s=plan.config.period_s,
     )
-    return common if common.any else None
+    return running if running.any else None
 
 
 def _held(one: CameraConfig, calibration: CalibrationConfig) -> InteriorOrientation | None:

@@ -23,18 +23,18 @@ from thermocald.config import load_config
 from thermocald.daemon.control import ControlSocket, StartRequest, StopRequest
 from thermocald.daemon.dashboard_process import DashboardProcess
 from thermocald.daemon.live_state import LiveState
-from thermocald.daemon.notify import (
+from thermocald.daemon.session import Sessions
+from thermocald.daemon.station import Station
+from thermocald.daemon.store_guard import StoreGuard
+from thermocald.daemon.systemd import (
     notify,
     notify_ready,
     notify_reloading,
     watchdog_interval_s,
 )
-from thermocald.daemon.session import Sessions
-from thermocald.daemon.station import Station
-from thermocald.daemon.store_guard import StoreGuard
 from thermocald.errors import DataError, ThermocaldError
 from thermocald.hal import option_names
-from thermocald.store.database.row import Event
+from thermocald.store.series import Event
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from thermocald.config import Config
     from thermocald.daemon.control import Request
 
-__all__ = ["Service"]
 
 log = logging.getLogger(__name__)
 
@@ -59,7 +58,8 @@ class Service:
 
     path: of the configuration, which SIGHUP reads again; until_finished: end when all recordings
     have been played or all epochs taken; else it takes requests at its control socket; on_turn:
-    called in every turn, True ends the service. Other arguments as `Station`.
+    called in every turn, True ends the service; clock: a virtual one, on which rendered devices
+    take no time. Other arguments as `Station`.
     """
 
     def __init__(
@@ -73,13 +73,15 @@ class Service:
         hang_after_s: float = 60.0,
         start_condition: str = "",
         on_turn: Callable[[Station], bool] | None = None,
+        clock: SteadyClock | None = None,
     ) -> None:
         self.config = config
-        self.clock = SteadyClock()
+        self.clock = clock or SteadyClock()
         self.live = LiveState.beside(config.store.path)
         self._path = path
         self._options: dict[str, Any] = {
-            "fast": fast,
+            "fast": fast or clock is not None,
+            "virtual": clock is not None,
             "epochs": epochs,
             "hang_after_s": hang_after_s,
             "start_condition": start_condition,
@@ -121,12 +123,20 @@ class Service:
                     notify("STOPPING=1")
                     control.close()
                     done = self._station.stop(_GRACE_S)
-                    self._dashboard.stop()
                     self._tell("stopped", "thermocald stopped")
+                    self._guard.flush()
+                    self.live.remove()  # before the page ends, which tells who looks at it
+                    self._dashboard.stop()
         finally:
             self._guard.close()
             self.live.remove()
         return done
+
+    @property
+    def lost(self) -> str:
+        """How many epochs were taken and not kept, and why the last; empty where none was."""
+        store = self._guard.status()
+        return f"{store['lost']} epochs were lost: {store['lost_why']}" if store["lost"] else ""
 
     def _build(self, config: Config) -> Station:
         return Station(config, self._guard, self.clock, self.live, **self._options)

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from thermocald.config import Name  # noqa: TC001 - pydantic reads it at run time
 from thermocald.errors import ConfigurationError, DataError, ThermocaldError, UsageError
-from thermocald.store.database.row import Event
+from thermocald.store.series import Event
 
 if TYPE_CHECKING:
     from thermocald.daemon.camera_line import CameraLine
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from thermocald.daemon.store_guard import StoreGuard
     from thermocald.hal import Clock
 
-__all__ = ["HeatingStep", "Session", "Sessions"]
 
 log = logging.getLogger(__name__)
 

@@ -12,18 +12,19 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from thermocald.acquisition.device_loop import DeviceLoop
 from thermocald.acquisition.frame_folder import FrameFolder
 from thermocald.acquisition.link import Link
-from thermocald.acquisition.pairing import Readings
+from thermocald.acquisition.pairing import Readings, require_columns
 from thermocald.daemon.camera_line import CameraLine, link_status
 from thermocald.daemon.output_loop import OutputLoop
-from thermocald.daemon.plan import plan_cameras
-from thermocald.errors import ConfigurationError
+from thermocald.daemon.plan import plan_cameras, require_thermometer_columns
+from thermocald.errors import ConfigurationError, WrongDevice
 from thermocald.hal import load_driver, open_device
-from thermocald.store.database.row import Event, LoggedReading
+from thermocald.store.series import Event, LoggedReading
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -35,10 +36,9 @@ if TYPE_CHECKING:
     from thermocald.daemon.live_state import LiveState
     from thermocald.daemon.plan import CameraPlan
     from thermocald.daemon.store_guard import StoreGuard
-    from thermocald.hal import Thermometer
-    from thermocald.store.database.row import StoredSeries
+    from thermocald.hal import Reading, Thermometer
+    from thermocald.store.series import StoredSeries
 
-__all__ = ["Station"]
 
 log = logging.getLogger(__name__)
 
@@ -50,7 +50,8 @@ _LEAD_S = 0.1
 class Station:
     """Built from a configuration, started, stopped; raises ConfigurationError when built.
 
-    fast: a recording is played as fast as it can be calibrated; epochs: after how many new ones
+    fast: a recording is played as fast as it can be calibrated; virtual: so are the ticks of a
+    virtual clock; epochs: after how many new ones
     a camera stops, 0 for never; start_condition: kept with a series that begins.
     """
 
@@ -62,6 +63,7 @@ class Station:
         live: LiveState,
         *,
         fast: bool = False,
+        virtual: bool = False,
         epochs: int = 0,
         hang_after_s: float = 60.0,
         start_condition: str = "",
@@ -71,6 +73,7 @@ class Station:
         self.clock = clock
         self.live = live
         self.fast = fast
+        self.virtual = virtual
         self.epochs = epochs
         self.hang_after_s = hang_after_s
         self.start_condition = start_condition
@@ -84,6 +87,7 @@ class Station:
         self.cameras: list[CameraLine] = []
         begin = clock.monotonic() + _LEAD_S
         self._thermometers: dict[str, tuple[Thermometer, Link]] = {}
+        self._channels: dict[str, tuple[str, ...]] = {}  # as named, then as read
         for one in config.thermometers:
             thermometer = open_device("thermometer", one.driver, one.options, clock)
             link = Link(
@@ -91,6 +95,8 @@ class Station:
                 period_s=one.period_s, on_event=self.on_link_event,
             )  # fmt: skip
             self._thermometers[one.name] = (thermometer, link)
+            self._channels[one.name] = tuple(thermometer.named_channels())
+        require_thermometer_columns(config, self._channels, ConfigurationError)
         self.outputs = [self._output(o, o.options) for o in config.outputs]
         self.cameras = [CameraLine(plan, self, begin) for plan in plan_cameras(config, clock)]
         self.loops = [
@@ -136,10 +142,7 @@ class Station:
     def read_now(self, names: Sequence[str]) -> None:
         """Read thermometers in the caller's thread: a recording's come with its frames."""
         for name in names:
-            thermometer, link = self._thermometers[name]
-            reading = link.call(thermometer.read)
-            if reading is not None:
-                self.readings.add(name, reading)
+            self._thermometers[name][1].call(partial(self._read, name))
 
     def stalled(self) -> list[str]:
         """Threads that have not come back for too long, or are gone."""
@@ -257,11 +260,8 @@ class Station:
         return next((loop.busy_s() for loop in self.loops if loop.link is link), 0.0)
 
     def _reader(self, name: str) -> Callable[[], None]:
-        thermometer, _ = self._thermometers[name]
-
         def read() -> None:
-            reading = thermometer.read()
-            self.readings.add(name, reading)
+            reading = self._read(name)
             self.last_readings[name] = dict(reading.values)
             if not self._in_epochs(name):
                 trusted = self.clock.trusted()
@@ -269,6 +269,20 @@ class Station:
                 self.logged += 1
 
         return read
+
+    def _read(self, name: str) -> Reading:
+        reading: Reading = self._thermometers[name][0].read()
+        if new := [c for c in reading.values if c not in self._channels[name]]:
+            channels = {**self._channels, name: (*self._channels[name], *new)}
+            require_thermometer_columns(self.config, channels, WrongDevice)
+            self._channels = channels
+        self.readings.add(name, reading)
+        return reading
+
+    def columns_of(self, plan: CameraPlan) -> list[str]:
+        """The columns of a camera's temperatures, the reference first, as far as known."""
+        channels = {name: self._channels[name] for name in plan.config.thermometers}
+        return require_columns(channels, ConfigurationError)
 
     def _in_epochs(self, thermometer: str) -> bool:
         """Whether a camera that gives frames takes the thermometer's readings into its epochs."""

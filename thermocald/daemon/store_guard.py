@@ -1,10 +1,17 @@
-"""The store under hard conditions: a full disk loses observations before results, and results wait
-in memory for a store that cannot be written.
+"""The store under hard conditions: a full disk loses observations before results, results wait in
+memory for a store that cannot be written, and the file is followed when it goes away underneath.
+
+A deleted file lives on in the process that has it open, and a deleted -wal or -shm file makes other
+processes see another state of the store: so all three are watched, what they held is brought to the
+path again, and the store is opened once more.
 """
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import math
+import os
 import shutil
 import threading
 import time
@@ -12,9 +19,11 @@ from collections import deque
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-from thermocald.daemon.followed_store import FollowedStore
-from thermocald.errors import StoreError, StoreFullError
-from thermocald.store.database.row import Event
+from thermocald.errors import OutputError, StoreError, StoreFullError
+from thermocald.store.database.file import StoreFile
+from thermocald.store.database.store import Store
+from thermocald.store.database.wal import read_wal_tail
+from thermocald.store.series import Event
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -22,13 +31,144 @@ if TYPE_CHECKING:
 
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.field.testfield import Observations
-    from thermocald.store.database.epoch_table import StoredEpoch
-    from thermocald.store.database.row import EpochResult, LoggedReading, StoredSeries
-    from thermocald.store.database.store import Store
-
-__all__ = ["Row", "StoreGuard"]
+    from thermocald.store.series import EpochResult, LoggedReading, StoredEpoch, StoredSeries
 
 log = logging.getLogger(__name__)
+
+
+class FollowedStore:
+    """An open store and its file; used under one lock. Raises StoreError.
+
+    notice: what happened to the file, empty if nothing; events: what is to be stored about that.
+    """
+
+    def __init__(self, path: Path, *, durable: bool = True) -> None:
+        self.path = path
+        self.notice = ""
+        self.events: list[Event] = []
+        self._durable = durable
+        self._open()
+
+    def _open(self) -> None:
+        self._file = StoreFile(self.path)
+        tail = read_wal_tail(self._file.wal_path)
+        kept = self._keep_damaged_wal() if tail.lost else ""
+        try:
+            self.store = Store.open(self.path, "append", durable=self._durable, claimed=True)
+        except BaseException:
+            self._file.discard_empty()
+            self._file.release()
+            raise
+        self._file.remember_helpers()
+        if self._file.names > 1:
+            text = f"the file has {self._file.names} names (hard links): write it under this alone"
+            self._note("store_linked", text)
+        if tail.lost:
+            many = "all transactions" if tail.lost < 0 else f"{tail.lost} transactions"
+            text = f"its -wal file was damaged, {many} in it were lost; a copy is in {kept}"
+            self._note("wal_damaged", text)
+        elif tail.unfinished:
+            text = "the last write was cut off when its writer ended; it had not been committed"
+            log.info("%s: %s", self.path, text, extra={"event": "wal_unfinished"})
+            self.events.append(Event(time.time(), "wal_unfinished", text))
+
+    def _note(self, kind: str, text: str) -> None:
+        self.notice = text
+        log.error("%s: %s", self.path, text, extra={"event": kind})
+        self.events.append(Event(time.time(), kind, f"{self.path.name}: {text}"))
+
+    def _keep_damaged_wal(self) -> str:
+        """A copy of the -wal file for who wants to look into it."""
+        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+        copy = self.path.with_name(f"{self.path.stem}-wal-damaged-{stamp}")
+        try:
+            shutil.copyfile(self._file.wal_path, copy)
+        except OSError as error:
+            return f"nowhere: {error.strerror}"
+        return str(copy)
+
+    @property
+    def in_place(self) -> bool:
+        """Whether what was committed is in the files that are at their paths."""
+        return self._file.there and self._file.helpers_there
+
+    def watch(self) -> bool:
+        """Look whether the files are where they were, and go on with what is there.
+
+        Returns whether the store at the path now holds all that was committed before; raises
+        StoreError where nothing can be opened there, and tries again when called again.
+        """
+        try:
+            if self.store.closed:
+                self._open()
+                return False
+            self._file.remember_helpers()
+            return self.in_place or self._follow()
+        except OSError as error:
+            raise StoreError(f"{self.path}: cannot be written: {error.strerror}") from error
+        except OutputError as error:
+            raise StoreError(str(error)) from error
+
+    def _follow(self) -> bool:
+        file, copy = self._file, None
+        # else what is in a -wal file that has no name any more would be lost with the connection
+        if file.deleted or not self._emptied_wal():
+            copy = self._rescued()
+        there, other = file.there, self.path.exists()
+        if there:
+            text = "its -wal or -shm file was deleted; what it held was moved into the store"
+        elif file.deleted and not other:
+            text = "was deleted; it was written again with all that it held"
+        else:
+            gone = "replaced by another file" if file.deleted else "moved away"
+            what = ", which is used now" if file.deleted else "; the file at its path is used now"
+            rest = "" if copy is None else f"; what it held is in {copy}"
+            text = f"was {gone}{what if other else '; a new store was begun'}{rest}"
+        carried = there or (file.deleted and not other)
+        self.close()
+        if carried and copy is not None:
+            os.replace(copy, self.path.resolve())  # a link stays one
+        self._open()
+        self._note("store_followed", text)
+        return carried
+
+    def _emptied_wal(self) -> bool:
+        """Whether all of the -wal file could be moved into the file."""
+        try:
+            return self.store.checkpoint()
+        except StoreError as error:
+            log.debug("%s", error)
+            return False
+
+    def _rescued(self) -> Path:
+        """A copy of all that the open store holds, beside where it was."""
+        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+        target = self.path.resolve()
+        copy = target.with_name(f"{target.stem}-rescued-{stamp}.db")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        self.store.copy_to(copy)
+        return copy
+
+    def close(self) -> None:
+        """Close the store and give its lock back; may be called twice.
+
+        If the files were not in place, the helper files at the path are removed too: they would be
+        taken for those of the next database there. Those of another store are left alone.
+        """
+        if self.store.closed:
+            return
+        foreign = not self._file.there and self.path.exists() and not self._file.wal_there
+        stale = not self.in_place and not foreign
+        try:
+            self.store.close()
+        except StoreError as error:
+            log.error("%s", error)
+        if stale:
+            for name in (self._file.wal_path, self._file.shm_path):
+                with contextlib.suppress(OSError):
+                    name.unlink(missing_ok=True)
+        self._file.release()
+
 
 # Results alone take about 1.2 kB an epoch: this is more than a day at one every 10 s.
 _RESERVE_BYTES = 16_000_000
@@ -73,7 +213,9 @@ class StoreGuard:
 
     def __init__(self, path: Path, *, durable: bool = True) -> None:
         self.path = path
-        self.lost = 0
+        self.lost = 0  # epochs that were taken and not kept, for whatever reason
+        self._lost_at = -math.inf
+        self._lost_why = ""
         self.away = ""  # why the store cannot be written, empty while it can
         self.thin = False
         self._waiting: deque[Row] = deque()
@@ -108,8 +250,8 @@ class StoreGuard:
         """Try once more to keep what waits, and close."""
         with self._lock:
             self.flush()
-            if self._waiting:
-                log.error("%s: %d epochs could not be kept", self.path, len(self._waiting))
+            while self._waiting:
+                self.lose(f"epoch {self._waiting.popleft().epoch.number}: {self.away}")
             self._file.close()
 
     def series(self, wanted: StoredSeries) -> StoredSeries:
@@ -185,6 +327,13 @@ class StoreGuard:
             self._events.append(event)
             self._flush_events()
 
+    def lose(self, why: str) -> None:
+        """Count an epoch that was taken and will not be kept, and tell of it."""
+        self.lost += 1
+        self._lost_at, self._lost_why = time.monotonic(), why
+        log.error("an epoch is lost: %s", why, extra={"event": "epoch_lost"})
+        self._events.append(Event(time.time(), "epoch_lost", why))
+
     def reading(self, reading: LoggedReading) -> None:
         """Keep a reading that belongs to no epoch with the next `flush`; returns at once."""
         self._readings.append(reading)
@@ -206,8 +355,7 @@ class StoreGuard:
                     self._back()
                 elif self._takes_all_but(error):
                     self._waiting.popleft()
-                    self.lost += 1
-                    log.error("epoch %d was not kept: %s", row.epoch.number, error)
+                    self.lose(f"epoch {row.epoch.number} of {row.series.camera}: {error}")
                 else:
                     self._refused(error)
                     return
@@ -294,8 +442,7 @@ class StoreGuard:
                 -1 - _MOST_WITH_OBSERVATIONS
             ].thin()
         if len(self._waiting) > _MOST_WAITING:
-            self._waiting.popleft()
-            self.lost += 1
+            self.lose(f"epoch {self._waiting.popleft().epoch.number}: too many wait: {error}")
 
     def _back(self) -> None:
         if self.away:
@@ -333,5 +480,7 @@ class StoreGuard:
             "why": self.away,
             "waiting": self.waiting,
             "lost": self.lost,
+            "lost_why": self._lost_why,
+            "lost_s_ago": time.monotonic() - self._lost_at if self.lost else None,
             "notice": self.notice,
         }

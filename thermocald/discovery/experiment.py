@@ -1,4 +1,4 @@
-"""The experiment: which heating programme separates two effects best, within limits.
+"""The experiment that separates two effects best within limits, and whether it has separated them.
 
 Programmes of some kinds (a long hold, two cycles, a staircase, slow and fast, pulses) are run on a
 body with one time constant, as a relay with a thermostat would heat it. Each effect is then what
@@ -12,18 +12,99 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.errors import DataError
-from thermocald.simulation import effects as catalogue
-from thermocald.simulation.history import History
+from thermocald.discovery import criteria
+from thermocald.discovery.search import Search
+from thermocald.errors import DataError, UsageError
+from thermocald.physics import catalogue
+from thermocald.physics.history import History
+from thermocald.thermal.fit import HypothesisFitter
+from thermocald.thermal.noise import calibrate_thermometers, weight_slow_noise
+from thermocald.thermal.series import in_blocks
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from thermocald.arrays import Array
-    from thermocald.simulation.effects import Effect
-    from thermocald.simulation.effects.parameter import Parameter
+    from thermocald.discovery.search import Solution
+    from thermocald.physics.effect import Effect, Parameter
+    from thermocald.thermal.series import ReducedSeries
 
-__all__ = ["Body", "Experiment", "Limits", "body_of", "experiments"]
+
+@dataclass(frozen=True)
+class Separation:
+    """How two alternatives compare on what was recorded.
+
+    difference: by how much the worse one scores worse; needed: the difference at which it is
+    excluded; there: whether the better one explains more than the base model does.
+    """
+
+    better: str
+    worse: str
+    difference: float
+    needed: float
+    there: bool
+
+    @property
+    def separated(self) -> bool:
+        """Whether one of the two is excluded."""
+        return self.there and self.difference > self.needed
+
+    @property
+    def sentence(self) -> str:
+        """For people."""
+        if not self.there:
+            return f"neither {self.better} nor {self.worse} shows yet"
+        if self.separated:
+            return (
+                f"{self.better}: {self.worse} is excluded, its score is {self.difference:.0f} "
+                f"worse (needed {self.needed:.0f})"
+            )
+        return (
+            f"{self.better} scores {self.difference:.0f} better than {self.worse}; "
+            f"needed are {self.needed:.0f}"
+        )
+
+
+def read_alternatives(text: str) -> tuple[str, str]:
+    """Read the two effects of `A,B`; UsageError where a series of epochs does not show both."""
+    names = [n.strip() for n in text.split(",")]
+    if len(names) != 2 or names[0] == names[1]:
+        raise UsageError(f"--until-separated {text}: write two effects, such as A,B")
+    for name in names:
+        if catalogue.get(name).seen_in != "trajectory":
+            raise UsageError(
+                f"--until-separated {text}: {name} is seen in the image, not in the time series of "
+                "the camera's parameters; heating differently does not separate it"
+            )
+    return names[0], names[1]
+
+
+def compare_effects(series: Sequence[ReducedSeries], first: str, second: str) -> Separation:
+    """Compare two effects, each with the constants that fit it best, on all series together."""
+    ready = [in_blocks(weight_slow_noise(e)) for e in calibrate_thermometers(series)]
+    search = Search(HypothesisFitter(ready))
+    base = search.base()
+    found = sorted(
+        (_find_best(search, base, name) for name in (first, second)), key=lambda s: s.score
+    )
+    drives = all(catalogue.get(name).is_drive for name in (first, second))
+    better, worse = found
+    return Separation(
+        better.names[-1], worse.names[-1], worse.score - better.score,
+        criteria.DRIVES_BAND if drives else criteria.BAND, better.score < base.score,
+    )  # fmt: skip
+
+
+def _find_best(search: Search, base: Solution, name: str) -> Solution:
+    """Find the best solution with one effect, over the sets of parameters that it may act on."""
+    promises = [search.scan(c, base) for c in search.candidates if c.effect == name]
+    if not promises:
+        raise UsageError(
+            f"{name} cannot be looked for in this series: it needs a quantity that was not recorded"
+        )
+    best = max(promises, key=lambda p: p.net)
+    return search.refine((*base.terms, best.term), (*base.penalties, best.penalty))
+
 
 _STEP_S = 60.0  # of a ramp, which a thermostat follows as a staircase
 _FINE_S = 2.0
@@ -86,12 +167,12 @@ class Experiment:
     sigmas: float
 
     def programme(self) -> list[dict[str, Any]]:
-        """The steps as a session takes them."""
+        """Return the steps as a session takes them."""
         return [{"seconds": s, "hold_c": h} for s, h in self.steps]
 
 
-def body_of(times: Array, temperature: Array) -> Body:
-    """How a camera warmed and cooled in a recording; the usual where it hardly did.
+def estimate_body(times: Array, temperature: Array) -> Body:
+    """Estimate how a camera warmed and cooled in a recording; the usual where it hardly did.
 
     times (R,) s, temperature (R,) °C.
     """
@@ -107,7 +188,7 @@ def body_of(times: Array, temperature: Array) -> Body:
     return Body(usual.ambient, max(fastest * tau, float(np.ptp(temperature))), tau)
 
 
-def experiments(
+def rank_experiments(
     first: str,
     second: str,
     limits: Limits,
@@ -116,7 +197,7 @@ def experiments(
     interval: float,
     strength_px: float = 0.1,
 ) -> list[Experiment]:
-    """All programmes within the limits, the one that separates best first.
+    """Rank all programmes within the limits, the one that separates best first.
 
     strength_px: what each effect leaves of itself to the base model under two equal cycles. Raises
     DataError where the limits allow no heating worth it.
@@ -133,16 +214,16 @@ def experiments(
             f"{_LEAST_S / 60:.0f} min or more to separate effects: take more epochs"
         )
     times = interval * np.arange(epochs, dtype=np.float64)
-    runs = {name: _within(name, limits, body, times, highest) for name in _KINDS}
+    runs = {name: _limit_programme(name, limits, body, times, highest) for name in _KINDS}
     usual = runs["two equal cycles"]
     sizes = {
-        n: _size(n, _history(times, usual[1], body)) / strength_px for n in (first, second)
+        n: _measure_size(n, _history(times, usual[1], body)) / strength_px for n in (first, second)
     }  # fmt: skip
     out = []
     for name, (steps, temperature, duty) in runs.items():
         history = _history(times, temperature, body)
         sigmas = min(
-            _left(a, b, history) / max(sizes[a], 1e-300)
+            _measure_left(a, b, history) / max(sizes[a], 1e-300)
             for a, b in ((first, second), (second, first))
         )
         sigmas *= np.sqrt(epochs) / _NOISE_PX
@@ -153,13 +234,13 @@ def experiments(
 # -- heating -----------------------------------------------------------------------------------
 
 
-def _within(
+def _limit_programme(
     name: str, limits: Limits, body: Body, times: Array, highest: float
 ) -> tuple[tuple[tuple[float, float | None], ...], Array, float]:
-    """The programme of one kind, as hot as duty allows: steps, temperature (E,), duty."""
+    """Make the programme of one kind as hot as duty allows: steps, temperature (E,), duty."""
     while True:
         steps = tuple(_steps(name, limits, body, float(times[-1]), highest))
-        temperature, duty = _run(steps, body, times)
+        temperature, duty = _simulate(steps, body, times)
         if duty <= limits.max_duty or highest - body.ambient < _LEAST_K + 1.0:
             return steps, temperature, duty
         highest -= 1.0
@@ -168,7 +249,7 @@ def _within(
 def _steps(
     name: str, limits: Limits, body: Body, duration: float, highest: float
 ) -> Iterator[tuple[float, float | None]]:
-    """The kind's profile as steps of a thermostat, none rising faster than the limit."""
+    """Yield the kind's profile as steps of a thermostat, none rising faster than the limit."""
     shares, levels = np.array(((0.0, 0.0), *_KINDS[name])).T
     at = np.arange(0.0, duration + _STEP_S, _STEP_S)
     wanted = np.interp(at, shares * duration, body.ambient + levels * (highest - body.ambient))
@@ -186,14 +267,14 @@ def _steps(
 
 
 def _hold(value: float, body: Body) -> float | None:
-    """A step's temperature, 0.1 °C; None where there is nothing to heat."""
+    """Return a step's temperature, 0.1 °C; None where there is nothing to heat."""
     return round(value, 1) if value > body.ambient + 0.5 else None
 
 
-def _run(
+def _simulate(
     steps: tuple[tuple[float, float | None], ...], body: Body, times: Array
 ) -> tuple[Array, float]:
-    """Temperature (E,) at some times and share of time with heat, under a thermostat."""
+    """Simulate temperature (E,) at some times and share of time with heat, under a thermostat."""
     fine = np.arange(0.0, times[-1] + _FINE_S, _FINE_S)
     ends = np.cumsum([s for s, _ in steps])
     which = np.minimum(np.searchsorted(ends, fine, side="right"), len(steps) - 1)
@@ -222,7 +303,7 @@ def _history(times: Array, temperature: Array, body: Body) -> History:
 
 
 def _trajectories(name: str, history: History) -> list[Array]:
-    """What an effect looks like (E, m) at each of its trial constants."""
+    """Return what an effect looks like (E, m) at each of its trial constants."""
     effect = catalogue.get(name)
     trials: list[dict[str, Any]] = [{}]
     for key, parameter in effect.nonlinear.items():
@@ -260,7 +341,7 @@ def _values(parameter: Parameter, history: History) -> Array:
     return np.linspace(parameter.low, parameter.high, 20)
 
 
-def _residual(columns: Array, y: Array) -> Array:
+def _remove_columns(columns: Array, y: Array) -> Array:
     columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
     out: Array = y - columns @ np.linalg.lstsq(columns, y, rcond=1e-9)[0]
     return out
@@ -270,19 +351,19 @@ def _base(history: History) -> Array:
     return np.column_stack([np.ones(len(history.times)), history.temperature()])
 
 
-def _typical(name: str, history: History) -> Array:
-    """One trajectory (E,) in the middle of an effect's trial constants."""
+def _choose_typical(name: str, history: History) -> Array:
+    """Return one trajectory (E,) in the middle of an effect's trial constants."""
     every = _trajectories(name, history)
     return every[len(every) // 3][:, 0]
 
 
-def _size(name: str, history: History) -> float:
-    """RMS that the base model leaves of an effect."""
-    return float(np.std(_residual(_base(history), _typical(name, history))))
+def _measure_size(name: str, history: History) -> float:
+    """Return the RMS that the base model leaves of an effect."""
+    return float(np.std(_remove_columns(_base(history), _choose_typical(name, history))))
 
 
-def _left(name: str, other: str, history: History) -> float:
-    """RMS that the base model with another effect leaves of an effect, at its best constants."""
-    y, base = _typical(name, history), _base(history)
-    left = [_residual(np.hstack([base, t]), y) for t in _trajectories(other, history)]
+def _measure_left(name: str, other: str, history: History) -> float:
+    """Return the RMS that the base model and another effect leave of one, at its best constants."""
+    y, base = _choose_typical(name, history), _base(history)
+    left = [_remove_columns(np.hstack([base, t]), y) for t in _trajectories(other, history)]
     return min(float(np.std(r)) for r in left)

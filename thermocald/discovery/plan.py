@@ -14,27 +14,25 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.discovery.search.candidates import candidates
-from thermocald.discovery.search.examination import examine_series
-from thermocald.discovery.verdict.found import terms_of
+from thermocald.discovery.entries import terms_of
+from thermocald.discovery.examination import examine_series
+from thermocald.discovery.search import list_candidates
 from thermocald.errors import UsageError
-from thermocald.reduction.fit import HypothesisFitter
-from thermocald.reduction.hypothesis import Term
-from thermocald.reduction.reduce import reduce_series
-from thermocald.reduction.series import COLUMNS, ReducedSeries, SeriesInput
-from thermocald.reduction.source import series_input
-from thermocald.simulation import effects as catalogue
-from thermocald.simulation.model import ModelEffect
+from thermocald.physics import catalogue
+from thermocald.physics.model import ModelEffect
+from thermocald.thermal.fit import HypothesisFitter
+from thermocald.thermal.hypothesis import Term
+from thermocald.thermal.reduce import reduce_series
+from thermocald.thermal.series import COLUMNS, ReducedSeries, SeriesInput
+from thermocald.thermal.source import series_input
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from thermocald.arrays import Array
-    from thermocald.reduction.candidate import Candidate
-    from thermocald.simulation.history import History
-    from thermocald.simulation.observations import Simulation
-
-__all__ = ["Plan", "SetUp", "plan_power", "set_ups"]
+    from thermocald.physics.history import History
+    from thermocald.physics.simulation import Simulation
+    from thermocald.thermal.hypothesis import Candidate
 
 
 @dataclass(frozen=True)
@@ -46,13 +44,17 @@ class Plan:
     strength_px: float
 
     def power(self, effect: str) -> float:
-        """Share of repetitions in which an effect was found, alone or with others not excluded."""
+        """Return the share of repetitions that found an effect, alone or with others not
+        excluded.
+        """
         said = self.found[effect]
         right = sum(n for name, n in said.items() if effect in name.replace("?", "").split(" or "))
         return right / max(sum(said.values()), 1)
 
     def ambiguous(self) -> list[tuple[str, str, str]]:
-        """Pairs that this set-up leaves open, with the experiment that would tell them apart."""
+        """List pairs that this set-up leaves open, with the experiment that would tell them
+        apart.
+        """
         pairs: dict[tuple[str, str], str] = {}
         for effect, said in self.found.items():
             for name in said:
@@ -63,7 +65,7 @@ class Plan:
         return [(a, b, experiment) for (a, b), experiment in sorted(pairs.items())]
 
     def as_json(self) -> dict[str, Any]:
-        """The plan as a document."""
+        """Return the plan as a document."""
         return {
             "format": "thermocald-plan/1",
             "strength_px": self.strength_px,
@@ -77,7 +79,7 @@ class Plan:
         }
 
     def lines(self) -> list[str]:
-        """The plan for people."""
+        """Write the plan for people."""
         out = [f"effects of {self.strength_px:g} px RMS, {self.repetitions} recordings each:"]
         for name, said in self.found.items():
             words = ", ".join(f"{k} × {n}" for k, n in sorted(said.items()))
@@ -99,13 +101,13 @@ class SetUp:
         return [] if self.simulation is None else terms_of(self.simulation.model)
 
     def following(self, term: Term) -> SeriesInput | None:
-        """The recording as it is when the camera follows a drive; None where nothing simulates."""
+        """Return the recording of a camera that follows a drive; None where nothing simulates."""
         if self.simulation is None:
             return None
         model = self.simulation.model
         effect = ModelEffect(term.effect, dict(term.nonlinear))
         changed = replace(model, effects=(*model.effects, effect))
-        return _recorded(replace(self.simulation, model=changed))
+        return _record(replace(self.simulation, model=changed))
 
 
 def set_ups(
@@ -116,7 +118,7 @@ def set_ups(
     programme: Path | None,
     seeds: int,
 ) -> list[SetUp]:
-    """Recordings of the set-up with no effect but the model's, one per seed.
+    """Prepare recordings of the set-up with no effect but the model's, one per seed.
 
     A recording may stand for the set-up: then its own epochs and noise are used, once.
     """
@@ -130,12 +132,12 @@ def set_ups(
         )
     out = []
     for seed in range(seeds):
-        simulation = _simulation(model, preset, testfield, programme, seed)
-        out.append(SetUp(_recorded(simulation), simulation))
+        simulation = _set_up_simulation(model, preset, testfield, programme, seed)
+        out.append(SetUp(_record(simulation), simulation))
     return out
 
 
-def _recorded(simulation: Simulation) -> SeriesInput:
+def _record(simulation: Simulation) -> SeriesInput:
     from thermocald.store.recording.reader import read_recording
 
     with tempfile.TemporaryDirectory() as folder:
@@ -144,15 +146,14 @@ def _recorded(simulation: Simulation) -> SeriesInput:
         return series_input(read_recording(path))
 
 
-def _simulation(
+def _set_up_simulation(
     model: Path | None, preset: str | None, testfield: str | None, programme: Path | None, seed: int
 ) -> Simulation:
-    from thermocald.simulation.demonstration import load_field
-    from thermocald.simulation.device import CameraDevice, default_heat
-    from thermocald.simulation.model_file import read_model
-    from thermocald.simulation.observations import Simulation
-    from thermocald.simulation.presets import preset_simulation
-    from thermocald.simulation.programme import read_programme
+    from thermocald.physics.device import CameraDevice, default_heat, read_programme
+    from thermocald.physics.model_file import read_model
+    from thermocald.physics.presets import preset_simulation
+    from thermocald.physics.simulation import Simulation
+    from thermocald.physics.testfields import load_field
 
     field = load_field(testfield) if testfield is not None else None
     if preset is not None:
@@ -177,23 +178,23 @@ def plan_power(inputs: Sequence[SetUp], strength_px: float, advance: Callable[[]
         evidence = reduce_series(set_up.source)
         fitter = HypothesisFitter([evidence])
         done: set[str] = set()
-        for candidate in candidates([evidence]):
+        for candidate in list_candidates([evidence]):
             if candidate.effect in done:
                 continue
             done.add(candidate.effect)
             if candidate.kind.is_drive:
-                changed = _with_drive(set_up, fitter, candidate, strength_px)
+                changed = _put_drive(set_up, fitter, candidate, strength_px)
             else:
-                changed = _with_effect(fitter, candidate, strength_px, rng)
-            said = _said(changed, set_up.given)
+                changed = _put_effect(fitter, candidate, strength_px, rng)
+            said = _say(changed, set_up.given)
             row = found.setdefault(candidate.effect, {})
             row[said] = row.get(said, 0) + 1
             advance()
     return Plan(found, len(inputs), strength_px)
 
 
-def _said(evidence: ReducedSeries, given: Sequence[tuple[str, dict[str, Any]]]) -> str:
-    """What an examination says beyond the effects that the model has."""
+def _say(evidence: ReducedSeries, given: Sequence[tuple[str, dict[str, Any]]]) -> str:
+    """Say what an examination finds beyond the effects that the model has."""
     x = examine_series([evidence], given=given)
     if not x.adequate:
         return "unexplained"
@@ -202,13 +203,13 @@ def _said(evidence: ReducedSeries, given: Sequence[tuple[str, dict[str, Any]]]) 
     return " or ".join(dict.fromkeys("+".join(names[known:]) or "none" for names in every))
 
 
-def _with_effect(
+def _put_effect(
     fitter: HypothesisFitter, candidate: Candidate, strength_px: float, rng: np.random.Generator
 ) -> ReducedSeries:
-    """The series with one effect in its normal equations, scaled to what the base leaves over."""
+    """Put one effect into the normal equations, scaled to what the base leaves over."""
     e = fitter.series[0]
-    seen = HypothesisFitter([replace(e, history=_as_read(e))])
-    value = _place(candidate, e, rng)
+    seen = HypothesisFitter([replace(e, history=_restore_readings(e))])
+    value = _choose_place(candidate, e, rng)
     term = candidate.term(value, 1)
     if candidate.kind.is_event:
         term = Term(term.effect, term.parameters, (), (((candidate.name, value or 0.0),),))
@@ -216,27 +217,27 @@ def _with_effect(
     direction = np.zeros(len(COLUMNS))
     direction[[COLUMNS.index(p) for p in term.parameters]] = rng.normal(size=len(term.parameters))
     moved = trajectory[:, None] * direction[None]
-    return _moved(e, moved * (strength_px / max(_left_over(fitter, moved), 1e-12)))
+    return _move(e, moved * (strength_px / max(_measure_left(fitter, moved), 1e-12)))
 
 
-def _moved(e: ReducedSeries, moved: Array) -> ReducedSeries:
-    """The series with its parameters moved (E, P), px-scaled."""
-    b = e.b + np.einsum("epq,eq->ep", e.N, moved)
-    values = e.values + moved
-    return replace(e, b=b, values=values, yy=np.einsum("ep,ep->e", values, b))
+def _move(e: ReducedSeries, moved: Array) -> ReducedSeries:
+    """Move the parameters of the series (E, P), px-scaled."""
+    return e.with_values(e.values + moved)
 
 
-def _as_read(evidence: ReducedSeries) -> History:
-    """The readings themselves, where the evidence has them smoothed: a camera feels every kink."""
+def _restore_readings(evidence: ReducedSeries) -> History:
+    """Return the readings themselves, where the evidence has them smoothed: a camera feels every
+    kink.
+    """
     h = evidence.history
     readings = {n: h.readings[n] + c.deviation for n, c in evidence.thermometers.items()}
     return replace(h, readings=readings)
 
 
-def _with_drive(
+def _put_drive(
     set_up: SetUp, fitter: HypothesisFitter, candidate: Candidate, strength_px: float
 ) -> ReducedSeries:
-    """The series when the camera follows a drive, at the value that leaves the strength.
+    """Let the camera follow a drive, at the value that leaves the strength.
 
     Simulated again where that can be: the truth behind the readings is not in them.
     """
@@ -248,15 +249,15 @@ def _with_drive(
     for value in np.geomspace(max(float(sizes.min()), 0.01), float(sizes.max()), 60):
         term = candidate.term(float(value), 1)
         moved = (fitter.drive_trajectory([term], 0) - follows)[:, None] * rates[None]
-        off = abs(float(np.log(max(_left_over(fitter, moved), 1e-9) / strength_px)))
+        off = abs(float(np.log(max(_measure_left(fitter, moved), 1e-9) / strength_px)))
         trials.append((off, term, moved))
     _, term, moved = min(trials, key=lambda t: t[0])
     source = set_up.following(term)
-    return _moved(fitter.series[0], moved) if source is None else reduce_series(source)
+    return _move(fitter.series[0], moved) if source is None else reduce_series(source)
 
 
-def _place(candidate: Candidate, e: ReducedSeries, rng: np.random.Generator) -> float | None:
-    """A non-linear parameter where the effect is well seen, None where there is none."""
+def _choose_place(candidate: Candidate, e: ReducedSeries, rng: np.random.Generator) -> float | None:
+    """Choose a non-linear parameter where the effect is well seen, None where there is none."""
     if not len(candidate.grid):
         return None
     if candidate.kind.nonlinear[candidate.name].role == "period":
@@ -264,8 +265,10 @@ def _place(candidate: Candidate, e: ReducedSeries, rng: np.random.Generator) -> 
     return float(candidate.grid[int(len(candidate.grid) * rng.uniform(0.4, 0.6))])
 
 
-def _left_over(fitter: HypothesisFitter, moved: Array) -> float:
-    """RMS px that the base model, fitted, leaves of a movement (E, P) of the parameters."""
+def _measure_left(fitter: HypothesisFitter, moved: Array) -> float:
+    """Return the RMS px that the base model, fitted, leaves of a movement (E, P) of the
+    parameters.
+    """
     e = fitter.series[0]
     T = fitter.drive_trajectory([], 0)
     T = T - T.mean()

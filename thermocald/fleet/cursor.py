@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING, Self
 
 from thermocald.atomic_file import write_text
 from thermocald.errors import StoreError
-from thermocald.store.database.changes import KEPT
+from thermocald.store.database.examination import KEPT
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from thermocald.store.database.store import Store
 
-__all__ = ["Cursor"]
 
 _COUNTED = (*KEPT, "frame")
 
@@ -27,16 +26,17 @@ _COUNTED = (*KEPT, "frame")
 class Cursor:
     """The last ids sent of each growing table, to one server and from one store.
 
-    inode, started: of the store's file and its first series, since another store under the old
-    name is sent from its start; sent: {table: id}, `frame`: the last epoch whose frame was looked
-    at; refused: rows that the server does not take, {table: ids}, for a person to look at; day,
-    frame_bytes: what frames have taken on that day (UTC, days since 1970).
+    server: its whole address but a password; identity, inode: of the store and its file, since
+    another store under the old name, or a restored one, is sent from its start; sent: {table: id},
+    `frame`: the last epoch whose frame was looked at; refused: rows that the server does not take,
+    {table: ids}, for a person to look at; day, frame_bytes: what frames have taken on that day
+    (UTC, days since 1970).
     """
 
     server: str
     station: str
+    identity: str
     inode: int
-    started: float = 0.0
     sent: dict[str, int] = field(default_factory=lambda: dict.fromkeys(_COUNTED, 0))
     refused: dict[str, list[int]] = field(default_factory=dict)
     day: int = 0
@@ -52,12 +52,11 @@ class Cursor:
             inode = store.path.stat().st_ino
         except OSError as error:
             raise StoreError(f"{store.path}: cannot be read: {error.strerror}") from error
-        started = next((one.created_utc for one in store.all_series()), 0.0)
-        fresh = cls(server, station, inode, started)
+        fresh = cls(server, station, store.identity, inode)
         try:
             found = cls(**json.loads(path.read_text(encoding="utf-8")))
-            same = (found.server, found.station, found.inode, found.started) == (
-                server, station, inode, started,
+            same = (found.server, found.station, found.identity, found.inode) == (
+                server, station, fresh.identity, inode,
             )  # fmt: skip
             found.sent = {**fresh.sent, **found.sent}
             sound = {*found.sent} == {*_COUNTED} and all(

@@ -4,7 +4,7 @@
 thermometer that gives nothing, the same for hours, or what cannot be; `calibrate`: no result, an
 old one, a temperature outside what was calibrated, a camera that moved; `odd`: rates unlike those
 of the other cameras of its type; `clock`: a station whose clock is not that of the server;
-`refused`: rows that the server does not take.
+`refused`: rows that the server does not take; `twins`: two stations of one name.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
     from thermocald.fleet.overview import CameraOverview, TypeOverview
 
-__all__ = ["add_findings"]
 
 _LATE_INTERVALS, _LATE_S = 20.0, 900.0
 _SILENT_S = 600.0
@@ -72,6 +71,12 @@ def _late(camera: CameraOverview, now: float) -> Iterator[Finding]:
             yield Finding(
                 "late", f"{since}, though its station reports: the camera or its daemon stands"
             )
+    if camera.state is not None and camera.state.stores > 1:
+        yield Finding(
+            "twins",
+            f"{camera.state.stores} stores report under its station's name: the card of one is a "
+            "copy; give each station its own name (forward.station)",
+        )
     if camera.state is not None and camera.state.refused:
         yield Finding(
             "refused",

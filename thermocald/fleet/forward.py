@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from thermocald.errors import ServerError, ServerGone, StoreVersionError
 from thermocald.fleet.cursor import Cursor
 from thermocald.fleet.frames import FrameSender
-from thermocald.store.database.changes import KEPT
+from thermocald.store.database.examination import KEPT
 from thermocald.store.database.store import Store
 from thermocald.store.server.writer import ServerWriter
 
@@ -27,10 +27,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from thermocald.fleet.frames import FrameRule
-    from thermocald.store.database.row import StoredSeries
-    from thermocald.store.server.address import ServerAddress
+    from thermocald.store.series import StoredSeries
+    from thermocald.store.server.connection import ServerAddress
 
-__all__ = ["Forwarder", "Progress", "forward_forever"]
 
 log = logging.getLogger(__name__)
 
@@ -86,11 +85,11 @@ class Forwarder:
         StoreError.
         """
         with Store.open(self.store) as store:
-            cursor = Cursor.read(self._path, store, str(self.address), self.station)
+            cursor = Cursor.read(self._path, store, self.address.place, self.station)
             before = cursor.rows_refused
             count = {**dict.fromkeys(KEPT, 0), "frame": 0}
             if self._waits(store, cursor):
-                with ServerWriter(self.address, self.station) as writer:
+                with ServerWriter(self.address, self.station, store.identity) as writer:
                     self._send_all(store, writer, cursor, count, stop)
             return Progress(count, cursor.rows_refused - before)
 
@@ -212,7 +211,7 @@ def forward_forever(
                 return
             continue
         if trouble:
-            log.warning("%s is reached again, %d rows sent", forwarder.address, progress.rows)
+            log.info("%s is reached again, %d rows sent", forwarder.address, progress.rows)
         pause, trouble = _FIRST_PAUSE_S, ""
         report(progress, "")
         if wait(_IDLE_S):

@@ -13,19 +13,18 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 from thermocald.errors import ServerError, ServerGone
-from thermocald.store.recording.paths import FileFolder
+from thermocald.names import FileFolder
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
     from thermocald.fleet.cursor import Cursor
-    from thermocald.store.database.changes import KeptFrame
-    from thermocald.store.database.row import StoredSeries
+    from thermocald.store.database.examination import KeptFrame
     from thermocald.store.database.store import Store
+    from thermocald.store.series import StoredSeries
     from thermocald.store.server.writer import ServerWriter
 
-__all__ = ["FrameRule", "FrameSender"]
 
 log = logging.getLogger(__name__)
 

@@ -25,19 +25,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
-    from thermocald.store.server.address import ServerAddress
+    from thermocald.store.server.connection import ServerAddress
     from thermocald.store.server.fleet_reader import CameraRecord, StationState
 
-__all__ = [
-    "ODD",
-    "RATED",
-    "CameraOverview",
-    "Finding",
-    "Rate",
-    "TypeOverview",
-    "camera_types",
-    "read_overview",
-]
 
 RATED = ("c", "x0", "y0")
 ODD = 0.01

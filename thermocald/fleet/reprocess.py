@@ -19,20 +19,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.acquisition.calibrator import Calibrator
-from thermocald.atomic_file import cannot_write, make_folder
 from thermocald.errors import DataError, OutputError, ThermocaldError
 from thermocald.fleet.tasks import run_tasks
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
-from thermocald.store.database.row import EpochResult
 from thermocald.store.recording.parquet_table import write_parquet
 from thermocald.store.recording.reader import open_recording
+from thermocald.store.series import EpochResult
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-__all__ = ["Block", "Outcome", "calibrate_block", "find_blocks", "run_blocks"]
 
 log = logging.getLogger(__name__)
 
@@ -101,11 +99,7 @@ def calibrate_block(block: Block) -> Outcome:
     except (ThermocaldError, OSError) as error:
         return Outcome(block, 0, 0, str(error))
     try:
-        make_folder(block.target.parent)
-        try:
-            write_parquet(block.target, columns)
-        except OSError as error:
-            raise cannot_write(block.target, error) from error
+        write_parquet(block.target, columns)
     except OutputError as error:
         return Outcome(block, 0, 0, str(error), error.exit_status)
     return Outcome(block, block.stop - block.first, calibrated)
@@ -154,7 +148,7 @@ def _columns(block: Block) -> tuple[dict[str, Any], int]:
         "series": [recording.series] * len(epochs),
         "epoch": np.array([d.epoch.number for d in epochs], dtype=np.int64),
         "frame_time": np.array([d.epoch.frame_time for d in epochs]),
-        **temperatures,
+        **{n if n != "camera" else "temperature camera": t for n, t in temperatures.items()},
         **{name: values[:, i] for i, name in enumerate(PARAMETER_NAMES)},
         **{f"sd_{name}": sds[:, i] for i, name in enumerate(PARAMETER_NAMES)},
         "sigma0": np.array([r.sigma0 for r in results]),

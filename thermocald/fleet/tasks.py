@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     Item = TypeVar("Item")
     Result = TypeVar("Result")
 
-__all__ = ["run_tasks"]
 
 _ROUNDS = 3
 """How often an item is handed to a cluster whose workers died of it, or of something else."""

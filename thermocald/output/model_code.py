@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING
 
-from thermocald.errors import UsageError
+from thermocald.atomic_file import write_text
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -166,15 +166,11 @@ def python_module(camera: ThermalCamera, name: str) -> str:
 
 
 def write_code(camera: ThermalCamera, path: Path) -> tuple[Path, Path]:
-    """Write PATH.h and PATH.py; UsageError where they cannot be written."""
+    """Write PATH.h and PATH.py; OutputError where they cannot be written."""
     header, module = path.with_suffix(".h"), path.with_suffix(".py")
     texts = {header: c_header(camera, path.stem), module: python_module(camera, path.stem)}
-    try:
-        path.absolute().parent.mkdir(parents=True, exist_ok=True)
-        for file, text in texts.items():
-            file.write_text(text, encoding="utf-8")
-    except OSError as cause:
-        raise UsageError(f"{path}: cannot be written: {cause.strerror}") from cause
+    for file, text in texts.items():
+        write_text(file, text)
     return header, module
 
 

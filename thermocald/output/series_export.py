@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.series.table import CSV_COLUMNS, csv_text
+from thermocald.analysis.series.epochs import CSV_COLUMNS, csv_text
 from thermocald.atomic_file import make_folder, new_file
 from thermocald.errors import DriverMissing, UsageError
 from thermocald.photogrammetry.parameters import PARAMETER_NAMES
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from thermocald.analysis.series.table import SeriesTable
+    from thermocald.analysis.series.epochs import Epochs
     from thermocald.arrays import Array
-    from thermocald.store.database.epoch_table import StoredEpoch
+    from thermocald.store.series import StoredEpoch
 
     Columns = dict[str, NDArray[np.integer] | Array | Sequence[str]]
     Row = dict[str, float | int | str | None]
@@ -142,7 +142,7 @@ def besides(
 
 
 def column_parts(
-    table: SeriesTable, style: ExportStyle, others: Besides | None = None
+    table: Epochs, style: ExportStyle, others: Besides | None = None
 ) -> Iterator[Columns]:
     """The columns of `columns_of`, some thousand rows at a time: a year has to fit into memory."""
     others, done = others or Besides(), 0
@@ -168,7 +168,7 @@ def _extra_of(epochs: Iterable[StoredEpoch], known: NDArray[np.int64]) -> dict[s
 
 
 def columns_of(
-    table: SeriesTable,
+    table: Epochs,
     style: ExportStyle,
     others: Besides | None = None,
 ) -> Columns:
@@ -241,7 +241,7 @@ def as_rows(parts: Iterable[Columns]) -> Iterator[Row]:
             yield dict(zip(columns, row, strict=True))
 
 
-def plain_rows(table: SeriesTable) -> Iterator[Row]:
+def plain_rows(table: Epochs) -> Iterator[Row]:
     """The rows of CONVENTIONS §4; what is not known is null."""
     for line in islice(csv_text(table), 1, None):
         cells = zip(CSV_COLUMNS, line.rstrip("\n").split(","), strict=True)

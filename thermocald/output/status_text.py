@@ -10,7 +10,7 @@ import math
 import textwrap
 from typing import Any
 
-from thermocald.output.figures.numbers import duration, with_sd
+from thermocald.numbers import duration, with_sd
 
 __all__ = ["WIDTH", "status_lines", "status_warnings"]
 
@@ -64,6 +64,8 @@ def _camera(name: str, camera: dict[str, Any]) -> list[str]:
         if last.get("status") == "ok":
             lines += _orientation(last)
             lines += _wrapped(f"  {_movement(last)}")
+            if said := (last.get("online") or {}).get("orientation"):
+                lines += _wrapped(f"  {said}")
         else:
             lines += _wrapped(f"  {last.get('status', '')}: {last.get('reason', '')}")
     late = 1000 * camera["late_p99_s"]
@@ -120,6 +122,8 @@ def status_warnings(document: dict[str, Any]) -> list[str]:
     store = document["store"]
     if store["state"] != "ok":
         found.append(f"store: {store['state']}: {store['why']} ({store['waiting']} epochs wait)")
+    if store["lost"]:
+        found.append(f"{store['lost']} epochs are lost, taken and not kept: {store['lost_why']}")
     if store.get("notice"):
         found.append(f"store: {store['notice']}")
     if document.get("dashboard", {}).get("why"):

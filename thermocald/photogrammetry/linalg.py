@@ -17,15 +17,20 @@ if TYPE_CHECKING:
 
 __all__ = [
     "MAD_TO_SD",
+    "best_level",
     "correlation_matrix",
     "diagonal_scale",
+    "eliminate",
+    "explained",
     "inverse_of_determined",
     "mad_sd",
+    "orthonormal_combinations",
     "root_of",
     "scaled_inverse",
     "scaled_solve",
     "stacked_inverses",
     "symmetric_power",
+    "unit_diagonal",
 ]
 
 MAD_TO_SD = 1.4826
@@ -39,32 +44,78 @@ def diagonal_scale(N: Array) -> Array:
     return scale
 
 
-def scaled_inverse(N: Array) -> Array:
-    """Inverse of one symmetric matrix (p, p). Raises numpy.linalg.LinAlgError if singular."""
-    scale = diagonal_scale(N)
-    both = np.outer(scale, scale)
-    inverse: Array = np.linalg.inv(N * both) * both
-    return 0.5 * (inverse + inverse.T)
+def unit_diagonal(N: Array, ridge: float = 0.0) -> tuple[Array, Array]:
+    """Scale matrices (..., p, p) to a unit diagonal; return them and the factors (..., p).
 
-
-def scaled_solve(N: Array, b: Array, ridge: float = 0.0) -> Array:
-    """Solution of N x = b for one or stacked symmetric matrices (..., p, p), b (..., p).
-
-    ridge: added to the unit diagonal, so that undetermined unknowns stay near 0.
+    ridge: added to the unit diagonal, so that undetermined unknowns stay near 0; an unknown without
+    any weight then has weight 1.
     """
     scale = diagonal_scale(N)
     scaled = N * scale[..., :, None] * scale[..., None, :]
     if ridge:
-        scaled = scaled + ridge * np.eye(N.shape[-1])
-    x: Array = scale * np.linalg.solve(scaled, (scale * b)[..., None])[..., 0]
-    return x
+        empty = np.diagonal(N, axis1=-2, axis2=-1) <= 0
+        scaled = scaled + (ridge + empty)[..., None] * np.eye(N.shape[-1])
+    return scaled, scale
+
+
+def scaled_inverse(N: Array, ridge: float = 0.0) -> Array:
+    """Invert one symmetric matrix (p, p). Raises numpy.linalg.LinAlgError if singular.
+
+    ridge: as in `unit_diagonal`.
+    """
+    scaled, scale = unit_diagonal(N, ridge)
+    inverse: Array = np.linalg.inv(scaled) * np.outer(scale, scale)
+    return 0.5 * (inverse + inverse.T)
+
+
+def scaled_solve(N: Array, b: Array, ridge: float = 0.0) -> Array:
+    """Solve N x = b for one or stacked symmetric matrices (..., p, p), b (..., p) or (..., p, k).
+
+    ridge: as in `unit_diagonal`.
+    """
+    scaled, scale = unit_diagonal(N, ridge)
+    if b.ndim < N.ndim:
+        x: Array = scale * np.linalg.solve(scaled, (scale * b)[..., None])[..., 0]
+        return x
+    columns: Array = scale[..., None] * np.linalg.solve(scaled, scale[..., None] * b)
+    return columns
+
+
+def explained(N: Array, b: Array, ridge: float = 0.0) -> Array:
+    """Return the χ² that unknowns explain: bᵀN⁻¹b for N and b as in `scaled_solve`."""
+    total: Array = np.sum(b * scaled_solve(N, b, ridge), axis=-1 if b.ndim < N.ndim else -2)
+    return total
+
+
+def eliminate(N: Array, b: Array, kept: int, ridge: float = 1e-12) -> tuple[Array, Array]:
+    """Reduce normal equations (p, p), (p,) to their first `kept` unknowns."""
+    beside = N[:kept, kept:]
+    X = scaled_solve(N[kept:, kept:], np.column_stack([beside.T, b[kept:]]), ridge)
+    return N[:kept, :kept] - beside @ X[:, :kept], b[:kept] - beside @ X[:, kept]
+
+
+def orthonormal_combinations(N: Array, least: float = 1e-6) -> tuple[Array, NDArray[np.bool_]]:
+    """Find combinations W (p, p) of unknowns that are orthonormal under a normal matrix N (p, p).
+
+    Returns W and which of its columns (p,) N determines: those with more than `least` of the median
+    eigenvalue.
+    """
+    size, U = np.linalg.eigh(N)
+    good = size > least * np.median(size)
+    return U / np.sqrt(np.where(good, size, 1.0)), good
+
+
+def best_level(N: Array, b: Array) -> Array:
+    """Return the values (p,) that epochs with normal equations (E, p, p), (E, p) have in common."""
+    level: Array = np.linalg.lstsq(N.sum(axis=0), b.sum(axis=0), rcond=1e-12)[0]
+    return level
 
 
 def inverse_of_determined(N: Array) -> Array:
     """Inverse of one matrix, restricted to the combinations of unknowns that it determines."""
     if len(N) == 0:
         return N
-    scale = 1.0 / np.sqrt(np.clip(np.diag(N), 1e-300, None))
+    scale = diagonal_scale(N)
     both = np.outer(scale, scale)
     try:
         factor = np.linalg.cholesky(N * both)

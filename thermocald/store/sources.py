@@ -5,109 +5,34 @@ Analyses read times that are corrected where the clock was wrong; the store has 
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from thermocald.errors import StoreError
-from thermocald.store.database.series_reader import SeriesReader
-from thermocald.store.database.times import SeriesTimes, series_times
-from thermocald.store.server.address import ServerAddress, is_server
+from thermocald.store.server.connection import ServerAddress, is_server
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
-    from thermocald.store.database.blob import ObservationRows
-    from thermocald.store.database.epoch_table import StoredEpoch
-    from thermocald.store.database.row import StoredSeries
-    from thermocald.store.database.series_reader import StampedReader
-
-    Array = NDArray[Any]
-
-__all__ = [
-    "CorrectedSource",
-    "is_store",
-    "open_source",
-    "require_source",
-    "source_name",
-]
+    from thermocald.store.series import SeriesReader
 
 _SQLITE = b"SQLite format 3\0"
 
 
-class CorrectedSource(SeriesReader):
-    """An open store whose times are corrected, `database.times`; else as it is."""
-
-    def __init__(self, stamped: StampedReader) -> None:
-        self.path = stamped.path
-        self._stamped = stamped
-        self._times: dict[int, SeriesTimes | None] = {}
-
-    def close(self) -> None:
-        """Close the store."""
-        self._stamped.close()
-
-    def all_series(self) -> list[StoredSeries]:
-        """As the store's."""
-        return self._stamped.all_series()
-
-    def find_series(self, camera: str | None = None, name: str | None = None) -> StoredSeries:
-        """As the store's."""
-        return self._stamped.find_series(camera, name)
-
-    def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
-        """As the store's."""
-        return self._stamped.covariances(series, numbers)
-
-    def observation_rows(self, series: StoredSeries, first: int, last: int) -> ObservationRows:
-        """As the store's."""
-        return self._stamped.observation_rows(series, first, last)
-
-    def series_columns(self, series: StoredSeries, names: Sequence[str]) -> dict[str, Array]:
-        """As the store's, with corrected times."""
-        columns = self._stamped.series_columns(series, names)
-        timed = {"frame_time", "temperature_time"} & set(names)
-        if timed and (times := self._corrected(series)) is not None:
-            corrected = {"frame_time": times.frame, "temperature_time": times.reading}
-            columns |= {name: corrected[name] for name in timed}
-        return columns
-
-    def _epochs(
-        self, series: StoredSeries, first: int, last: int | None, details: bool
-    ) -> Iterator[StoredEpoch]:
-        times = self._corrected(series)
-        for stored in self._stamped.epochs(series, first, last, details=details):
-            if times is None:
-                yield stored
-                continue
-            frame_time, temperature_time = times.of(stored.epoch.number)
-            epoch = replace(stored.epoch, frame_time=frame_time, temperature_time=temperature_time)
-            yield replace(stored, epoch=epoch)
-
-    def _corrected(self, series: StoredSeries) -> SeriesTimes | None:
-        """The times of a series; None where they are as they were stamped."""
-        if series.id not in self._times:
-            times = series_times(self._stamped, series)
-            self._times[series.id] = times if np.any(times.corrections) else None
-        return self._times[series.id]
-
-
 def open_source(source: Path) -> SeriesReader:
-    """Open a store for reading: a file, or `postgresql://…?camera=…&series=…`.
+    """Open a store for reading: a file, or `postgresql://…?camera=…&series=…`; times are corrected.
 
     Raises StoreError, for a server also UsageError, ServerGone, ServerError.
     """
     if is_server(source):
         from thermocald.store.server.reader import ServerStore
 
-        return CorrectedSource(ServerStore.open(source))
-    from thermocald.store.database.store import Store
+        opened: SeriesReader = ServerStore.open(source)
+    else:
+        from thermocald.store.database.store import Store
 
-    return CorrectedSource(Store.open(source))
+        opened = Store.open(source)
+    opened.corrected = True
+    return opened
 
 
 def is_store(source: Path) -> bool:

@@ -15,10 +15,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from thermocald.store.database.row import StoredSeries
-    from thermocald.store.database.series_reader import SeriesReader
+    from thermocald.store.series import SeriesReader, StoredSeries
 
-__all__ = ["StoredBlocks"]
 
 _GRID_POINTS, _GRID_EPOCHS = 300_000, 4_000  # of a block: 12 MB
 

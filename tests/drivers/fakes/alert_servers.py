@@ -31,10 +31,10 @@ class _Started:
 
 
 class WebServer(_Started):
-    """`posts` holds (path, headers, document)."""
+    """`posts` holds (path, headers, document); context: for TLS."""
 
-    def __init__(self, port=0):
-        self.posts, self.answer = [], 204
+    def __init__(self, port=0, context=None):
+        self.posts, self.answer, self.location = [], 204, "/elsewhere"
         outer = self
 
         class Handler(BaseHTTPRequestHandler):
@@ -43,7 +43,7 @@ class WebServer(_Started):
                 outer.posts.append((self.path, dict(self.headers), json.loads(body)))
                 self.send_response(outer.answer)
                 if outer.answer == 302:
-                    self.send_header("Location", "/elsewhere")
+                    self.send_header("Location", outer.location)
                 self.send_header("Content-Length", "0")
                 self.end_headers()
 
@@ -55,7 +55,10 @@ class WebServer(_Started):
             def log_message(self, *_):
                 pass
 
-        self._start(ThreadingHTTPServer(("127.0.0.1", port), Handler))
+        server = ThreadingHTTPServer(("127.0.0.1", port), Handler)
+        if context is not None:
+            server.socket = context.wrap_socket(server.socket, server_side=True)
+        self._start(server)
 
 
 class MailServer(_Started):

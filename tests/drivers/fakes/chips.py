@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from thermocald_drivers.sht3x import crc8
+from thermocald_drivers.i2c import crc8
 
 from tests.drivers.fakes.smbus import Chip
 

@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from thermocald.errors import ConfigurationError, UsageError
-from thermocald.output import camera_files
+from thermocald.photogrammetry import camera_files
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, CameraModel, Sensor
 
 TOLERANCE_PX = 1e-6

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.errors import GeometryError, ImageError
+from thermocald.errors import GeometryError, ImageError, UsageError
+from thermocald.photogrammetry.camera.camera_model import Sensor
+from thermocald.photogrammetry.camera_files.camera_file import CameraFile
 from thermocald.photogrammetry.epoch.cold_start import cold_start, pose_only
 from thermocald.photogrammetry.epoch.common_interior import CommonInterior, adjust_common_interior
 from thermocald.photogrammetry.frame.measurement import Prior, measure
@@ -24,12 +28,16 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.camera.camera_model import (
         ExteriorOrientation,
         InteriorOrientation,
-        Sensor,
     )
     from thermocald.photogrammetry.epoch.adjustment import Adjustment, AdjustmentSettings
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
-__all__ = ["PhotographResult", "Photographs", "calibrate_observations", "calibrate_photographs"]
+_IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".tif", ".tiff", ".webp"})
+_ASSUMED_PITCH = 0.001
+
+_POOR = 4.0  # times the residuals of the usual photograph
+_FEWEST_TO_COMPARE = 4  # photographs
+_ENOUGH_TARGETS = 20  # for residuals that a pose of its own does not take up
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +95,9 @@ def calibrate_photographs(
     for k, path in enumerate(paths):
         try:
             found = measure(decode_grey(path), testfield, prior)
-        except ImageError as error:
-            failures[k] = ("bad_image", str(error))
+        except (ImageError, GeometryError) as error:
+            word = "bad_image" if isinstance(error, ImageError) else "no_orientation"
+            failures[k] = (word, str(error))
             measured.append(None)
         else:
             measured.append(found.observations)
@@ -119,26 +128,24 @@ def calibrate_observations(
     interior: InteriorOrientation | None = None,
 ) -> Photographs:
     """The same from image points; failures: {position: (status, reason)} known beforehand."""
+    failures = dict(failures)
     good = [k for k, o in enumerate(measured) if o is not None and k not in failures]
-    together: CommonInterior | None = None
     reason = "no photograph shows enough targets"
     if settings.free and good:
-        rows, starts = _starts(sensor, testfield, measured, good, settings, nominal_c, interior)
-        if starts:
-            try:
-                together = adjust_common_interior(
-                    sensor,
-                    testfield,
-                    [o for k in rows if (o := measured[k]) is not None],
-                    starts[0][0],
-                    [exterior for _, exterior in starts],
-                    settings,
-                )
-                reason = "; ".join(together.reasons)
-            except GeometryError as error:
-                reason = str(error)
-        if together is not None and not together.reasons:
-            return _estimated(names, measured, failures, testfield, rows, together)
+        try:
+            start = _first_camera(sensor, testfield, measured, good, settings, nominal_c, interior)
+            rows, together = _together(sensor, testfield, measured, good, settings, start)
+            if poor := _poor(measured, rows, together):
+                failures |= poor
+                good = [k for k in good if k not in poor]
+                start = together.interior
+                rows, together = _together(sensor, testfield, measured, good, settings, start)
+        except GeometryError as error:
+            reason = str(error)
+        else:
+            reason = "; ".join(together.reasons)
+            if not reason:
+                return _estimated(names, measured, failures, testfield, rows, together)
     elif not settings.free:
         reason = "the interior orientation is held (--free none)"
     results = []
@@ -165,7 +172,7 @@ def calibrate_observations(
     )
 
 
-def _starts(
+def _first_camera(
     sensor: Sensor,
     testfield: TestField,
     measured: Sequence[Observations | None],
@@ -173,37 +180,70 @@ def _starts(
     settings: AdjustmentSettings,
     nominal_c: float | None,
     interior: InteriorOrientation | None,
-) -> tuple[list[int], list[tuple[InteriorOrientation, ExteriorOrientation]]]:
-    """Start values: the camera of the best photograph, and with it the pose of each."""
-    best = max(good, key=lambda k: 0 if (o := measured[k]) is None else len(o))
-    o = measured[best]
-    assert o is not None
+) -> InteriorOrientation:
+    """Return the camera of the photograph with most targets, to start from."""
+    o = max((o for k in good if (o := measured[k]) is not None), key=len)
     first = cold_start(sensor, testfield, o, settings, nominal_c, interior)
     start = first.interior or interior
     if start is None:
-        try:
-            start, _, _ = approximate_orientation(
-                sensor, testfield.points[o.targets], o.points, nominal_c
-            )
-        except GeometryError:
-            return [], []
+        points = testfield.points[o.targets]
+        start = approximate_orientation(sensor, points, o.points, nominal_c)[0]
     if not first.ok and interior is None:
         # Distortion from a weak photograph would only mislead the others.
         start = start.with_values(A1=0.0, A2=0.0, A3=0.0, B1=0.0, B2=0.0, x0=0.0, y0=0.0)
-    rows, found = [], []
+    return start
+
+
+def _together(
+    sensor: Sensor,
+    testfield: TestField,
+    measured: Sequence[Observations | None],
+    good: Sequence[int],
+    settings: AdjustmentSettings,
+    interior: InteriorOrientation,
+) -> tuple[list[int], CommonInterior]:
+    """Adjust the photographs whose targets a pose explains; returns which, and the result."""
+    poses: dict[int, ExteriorOrientation] = {}
+    chosen, fitting = [], []
     for k in good:
-        obs = measured[k]
-        if obs is None:
+        if (o := measured[k]) is None:
             continue
-        try:
-            _, exterior, _ = approximate_orientation(
-                sensor, testfield.points[obs.targets], obs.points, interior=start
+        with suppress(GeometryError):
+            points = testfield.points[o.targets]
+            _, poses[k], fits = approximate_orientation(sensor, points, o.points, interior=interior)
+            chosen.append(o)
+            fitting.append(fits)
+    if not chosen:
+        raise GeometryError("no pose explains the targets of any photograph")
+    start = list(poses.values())
+    return list(poses), adjust_common_interior(
+        sensor, testfield, chosen, interior, start, settings, fitting
+    )
+
+
+def _poor(
+    measured: Sequence[Observations | None],
+    rows: Sequence[int],
+    together: CommonInterior,
+) -> dict[int, tuple[str, str]]:
+    """Return {position: (status, reason)} of photographs whose residuals are not the others'."""
+    size = {
+        k: float(np.sqrt(np.median(np.sum((r / o.sigmas) ** 2, axis=1))))
+        for k, r in zip(rows, together.residuals, strict=True)
+        if (o := measured[k]) is not None and len(o) >= _ENOUGH_TARGETS
+    }
+    if together.reasons or len(size) < _FEWEST_TO_COMPARE:
+        return {}
+    usual = max(float(np.median(list(size.values()))), 1.0)
+    poor = {}
+    for k, r in zip(rows, together.residuals, strict=True):
+        if (ratio := size.get(k, 0.0) / usual) > _POOR:
+            why = (
+                f"residuals of {np.sqrt(np.mean(r**2)):.2f} px, {ratio:.0f} times those of the "
+                "other photographs: moved while exposed, or a board that was bent; left out"
             )
-        except GeometryError:
-            continue
-        rows.append(k)
-        found.append((start, exterior))
-    return rows, found
+            poor[k] = ("large_residuals", why)
+    return poor
 
 
 def _estimated(
@@ -271,3 +311,38 @@ def _posed(
         pose.residuals,
         kept,
     )
+
+
+def images_of(given: Sequence[Path]) -> list[Path]:
+    """Files as given, folders as the images that they hold, by name; UsageError where none."""
+    images: list[Path] = []
+    for path in given:
+        if not path.is_dir():
+            images.append(path)
+            continue
+        found = sorted(p for p in path.iterdir() if p.suffix.lower() in _IMAGES)
+        if not found:
+            raise UsageError(f"{path}: the folder holds no image ({', '.join(sorted(_IMAGES))})")
+        images += found
+    if not images:
+        raise UsageError("give at least one photograph")
+    return images
+
+
+def unknown_camera(images: Sequence[Path], pixel_pitch: float | None) -> CameraFile:
+    """A camera of which no file says anything, its image size that of most photographs; without
+    its pitch a pixel counts as 1 µm.
+    """
+    first: ImageError | None = None
+    sizes: Counter[tuple[int, ...]] = Counter()
+    for path in images:
+        try:
+            sizes[decode_grey(path).shape] += 1
+        except ImageError as error:
+            first = first or error
+    if not sizes:
+        assert first is not None
+        raise first
+    height, width = sizes.most_common(1)[0][0]
+    pitch = _ASSUMED_PITCH if pixel_pitch is None else pixel_pitch
+    return CameraFile("camera", Sensor(width, height, pitch), None, None)

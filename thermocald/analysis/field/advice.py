@@ -2,24 +2,124 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.analysis.field.check import CELLS, MIN_SIZE_PX, FieldCheck, precision
+from thermocald.analysis.field.check import (
+    CELLS,
+    FREE,
+    MIN_SIZE_PX,
+    FieldCheck,
+    check_field,
+    precision,
+    station_at,
+    usual_station,
+)
+from thermocald.photogrammetry.camera.camera_model import EOP_NAMES
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import CameraModel, ExteriorOrientation
     from thermocald.photogrammetry.field.testfield import TestField
 
-__all__ = ["advise"]
-
+_NONE = 1e300  # a standard deviation that does not exist
 _WORTH = 0.85  # a proposal must bring a standard deviation below this share of what it is
 _RAISED = 0.25  # of the distance: how far in front of the field proposed targets stand
 _GOOD_SIZE_PX = 12.0
 _FEW = 40
 _FLAT = 0.02  # depth of a field over its distance below which it is a plane
+
+
+@dataclass(frozen=True, eq=False)
+class FieldAssessment:
+    """What a camera gets out of a field from one place, and what would be better.
+
+    sigma_px: of an image coordinate; advice: sentences, the most helpful first.
+    """
+
+    field: TestField
+    camera: CameraModel
+    sigma_px: float
+    check: FieldCheck
+    advice: list[str]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the document that `testfield check` writes with `--json`."""
+        check = self.check
+        sds = {}
+        for kind in ("epoch", "series", "level"):
+            values = getattr(check.precision, kind)
+            named = zip(FREE, values, strict=True)
+            sds[kind] = {f"sd_{n}": float(v) if v < _NONE else None for n, v in named}
+        sizes = sorted(check.sizes)
+        return {
+            "format": "thermocald-testfield-check/1",
+            "targets": len(self.field),
+            "visible": [self.field.names[i] for i in check.visible],
+            "hidden": check.hidden,
+            "station": dict(zip(EOP_NAMES, check.station.as_array().tolist(), strict=True)),
+            "distance": check.distance,
+            "depth_relief": check.depth_relief,
+            "coverage": check.coverage,
+            "cells": check.cells.tolist(),
+            "median_size_px": float(sizes[len(sizes) // 2]) if sizes else None,
+            "sigma_px": self.sigma_px,
+            "pixel_pitch": self.camera.sensor.pixel_pitch,
+            **sds,
+            "calibrates": not check.weak,
+            "weak": list(check.weak),
+            "advice": self.advice,
+        }
+
+    def lines(self) -> list[str]:
+        """Return the lines that `testfield check` prints."""
+        check = self.check
+        X, Y, Z = check.station.centre
+        reasons = list(check.hidden.values())
+        lines = ["good: every image from there can be calibrated by itself"]
+        if check.weak:
+            lines = ["NOT ENOUGH: a series of a fixed camera gets no result from there"]
+            lines += [f"  because: {reason}" for reason in check.weak]
+        lines.append(
+            f"{len(check.visible)} of {len(self.field)} targets visible from ({X:.0f}, {Y:.0f}, "
+            f"{Z:.0f}) mm, {check.distance:.0f} mm away; they cover {check.coverage:.0%} of the "
+            f"image, depth relief {check.depth_relief:.0%} of the distance"
+        )
+        lines += [f"  {reasons.count(reason)} {reason}" for reason in sorted(set(reasons))]
+        lines.append(
+            "  standard deviations in px    one image    in a series    with the field's own"
+        )
+        for name, row in check.precision.pixels(self.camera.sensor.pixel_pitch).items():
+            cells = [f"{v:.3g}" if v < _NONE else "none" for v in row]
+            lines.append(f"    {name:<24} {cells[0]:>12} {cells[1]:>14} {cells[2]:>20}")
+        return lines + [f"  better: {note}" for note in self.advice]
+
+
+def assess_field(
+    field: TestField,
+    camera: CameraModel,
+    place: tuple[float, float, float] | None = None,
+    look_at: tuple[float, float, float] | None = None,
+    roll: float = 0.0,
+    sigma_px: float = 0.03,
+) -> FieldAssessment:
+    """Assess a test field for a camera at a place X, Y, Z mm, roll degrees about its axis.
+
+    Without a place it stands where the field just fills its image, without a point to look at it
+    looks at the field's middle.
+    """
+    middle = (field.points.min(axis=0) + field.points.max(axis=0)) / 2
+    target = middle if look_at is None else np.array(look_at)
+    if place is not None:
+        station = station_at(np.array(place), target, np.radians(roll))
+    else:
+        station = usual_station(camera, field)
+        if look_at is not None or roll:
+            station = station_at(station.centre, target, np.radians(roll))
+    check = check_field(camera, field, station, sigma_px)
+    return FieldAssessment(field, camera, sigma_px, check, advise(camera, field, check, sigma_px))
 
 
 def advise(

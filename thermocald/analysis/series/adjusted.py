@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from thermocald.analysis.series.table import SeriesTable
+    from thermocald.analysis.series.epochs import Epochs
     from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import Observations, TestField
     from thermocald.photogrammetry.series.blocks import ObservationBlocks
@@ -49,12 +49,12 @@ _AS_READ = ("number", "frame_time", "temperature")
 def table_of_series(
     head: Head,
     testfield: TestField,
-    apart: SeriesTable,
+    apart: Epochs,
     observations: Sequence[Observations | None] | ObservationBlocks,
     settings: SeriesSettings,
     start: Array | None = None,
     jobs: int = 1,
-) -> SeriesTable:
+) -> Epochs:
     """The series adjusted together, from the table of its epochs one by one.
 
     start (16,): where the adjustment begins, by default the medians of the epochs one by one. A
@@ -69,6 +69,7 @@ def table_of_series(
         raise DataError(f"{head.name}: no epoch has a result; most often: {why}")
     if start is None:
         start = _middle(apart.values, ok)
+    apart = replace(apart, head=head)
     settings = replace(settings, drift_period=drift_period(apart.frame_time, apart.temperature))
     source = (
         observations if hasattr(observations, "blocks") else ObservedBlocks(testfield, observations)
@@ -88,9 +89,9 @@ def _middle(values: Array, ok: NDArray[np.bool_]) -> Array:
 
 
 def _together(
-    head: Head, testfield: TestField, apart: SeriesTable, start: Array,
+    head: Head, testfield: TestField, apart: Epochs, start: Array,
     source: ObservationBlocks, settings: SeriesSettings,
-) -> SeriesTable:  # fmt: skip
+) -> Epochs:  # fmt: skip
     """The table of a series that is adjusted as one, its field put back where it moved."""
     grid = gathered(source, [slice(0, len(source))])
     found = _as_one(head, testfield, apart, start, grid, settings)
@@ -110,16 +111,16 @@ def _together(
 
 
 def _as_one(
-    head: Head, testfield: TestField, apart: SeriesTable, start: Array,
+    head: Head, testfield: TestField, apart: Epochs, start: Array,
     grid: ObservationGrid, settings: SeriesSettings,
-) -> SeriesTable:  # fmt: skip
+) -> Epochs:  # fmt: skip
     """The table of one adjustment of all epochs."""
     result = adjust_series(
         head.camera.sensor, testfield, grid, InteriorOrientation.from_array(start[IOP]),
         ExteriorOrientation.from_array(start[EOP]), settings,
     )  # fmt: skip
 
-    def without(rows: NDArray[np.int64], quick: bool) -> SeriesTable:
+    def without(rows: NDArray[np.int64], quick: bool) -> Epochs:
         rough = replace(settings, exterior=result.exterior)
         mask = np.zeros(result.observed.shape, dtype=bool)
         if quick:
@@ -132,9 +133,9 @@ def _as_one(
 
 
 def _in_blocks(
-    head: Head, testfield: TestField, apart: SeriesTable, start: Array,
+    head: Head, testfield: TestField, apart: Epochs, start: Array,
     source: ObservationBlocks, settings: SeriesSettings, jobs: int,
-) -> SeriesTable:  # fmt: skip
+) -> Epochs:  # fmt: skip
     """The table of a long series."""
     found = adjust_long_series(
         head.camera.sensor, testfield, source, InteriorOrientation.from_array(start[IOP]),
@@ -142,7 +143,7 @@ def _in_blocks(
     )  # fmt: skip
     rows, sample = found.rows, found.sample
 
-    def without(targets: NDArray[np.int64], quick: bool) -> SeriesTable:
+    def without(targets: NDArray[np.int64], quick: bool) -> Epochs:
         rough = replace(settings, exterior=sample.exterior)
         fewer = WithoutTargets(source, targets)
         if not quick:
@@ -163,9 +164,9 @@ def _in_blocks(
 
 
 def _table(
-    apart: SeriesTable, testfield: TestField, rows: SeriesAdjustment | RowWriter,
+    apart: Epochs, testfield: TestField, rows: SeriesAdjustment | RowWriter,
     whole: SeriesAdjustment | LongAdjustment, sample: SeriesAdjustment,
-) -> SeriesTable:  # fmt: skip
+) -> Epochs:  # fmt: skip
     """The table of adjusted epochs (`rows`), of the series as a whole, and of epochs in full."""
     rejected = _count(rows.rejected)
     status, reasons = _said(rows.status, rows.reasons, apart)
@@ -194,7 +195,7 @@ def _count(targets: NDArray[Any]) -> NDArray[np.int64]:
     return count
 
 
-def _said(status: Sequence[str], reasons: Sequence[str], apart: SeriesTable) -> tuple[Words, Words]:
+def _said(status: Sequence[str], reasons: Sequence[str], apart: Epochs) -> tuple[Words, Words]:
     """Words and sentences of the epochs; what the epoch itself said of a frame without a result
     says more than "no observations".
     """

@@ -9,7 +9,7 @@ import numpy as np
 
 from thermocald.acquisition.calibrator import Calibrator
 from thermocald.analysis.series.adjusted import table_of_series
-from thermocald.analysis.series.table import SeriesTable, calibrate_epochs, frame_temperatures
+from thermocald.analysis.series.epochs import Epochs, calibrate_epochs, frame_temperatures
 from thermocald.errors import DataError
 from thermocald.photogrammetry.series.long_series import together_at_most
 from thermocald.photogrammetry.series.result import SeriesSettings
@@ -35,7 +35,7 @@ def recorded_table(
     exterior: str,
     advance: Callable[[int], None] | None = None,
     jobs: int = 1,
-) -> tuple[SeriesTable, Callable[[int], Observations | None]]:
+) -> tuple[Epochs, Callable[[int], Observations | None]]:
     """The table of a recording adjusted as one series, and what shows an epoch's observations.
 
     Frames are measured where they are not. Of a series with observations that is too long to be
@@ -55,10 +55,8 @@ def recorded_table(
     columns = recording.columns
     temperature = {}
     if recording.channels:
-        reference = columns.temperatures[next(iter(recording.channels))]
-        temperature = frame_temperatures(
-            columns.numbers, columns.frame_time, columns.temperature_time, reference
-        )
+        readings = columns.readings_of(next(iter(recording.channels)))
+        temperature = frame_temperatures(columns.numbers, columns.frame_time, *readings)
     apart, observations = calibrate_epochs(
         recording.iter_epochs(), calibrator, temperature, advance, jobs
     )
@@ -87,13 +85,13 @@ def _start(recording: Recording, calibrator: Calibrator) -> Array:
     return start
 
 
-def _not_calibrated(recording: Recording) -> SeriesTable:
+def _not_calibrated(recording: Recording) -> Epochs:
     """The table of a recording's epochs that nobody has calibrated one by one."""
     columns, E = recording.columns, len(recording)
     nothing, none = np.broadcast_to(np.nan, (E, 16)), np.broadcast_to(np.int64(0), (E,))
     channel = next(iter(recording.channels), None)
     temperature = np.full(E, np.nan) if channel is None else columns.at_frame(channel)
-    return SeriesTable(
+    return Epochs(
         columns.numbers, columns.frame_time, temperature, nothing, nothing, nothing[:, 0],
         none, none, Words.repeated("ok", E), Words.repeated("", E),
         "per_epoch",

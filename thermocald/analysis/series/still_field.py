@@ -10,17 +10,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.field.sheets import field_sheets
+from thermocald.photogrammetry.field.planes import field_sheets
 from thermocald.photogrammetry.parameters import EOP, IOP
 from thermocald.photogrammetry.series.board_motion import board_movements
 from thermocald.photogrammetry.series.field_motion import (
+    FEWEST_EPOCHS,
     FieldMovement,
     FieldSeries,
     put_back,
     wandering_targets,
 )
 from thermocald.photogrammetry.series.normals import ObservationGrid, linearise
-from thermocald.reduction.gross_errors import spikes
+from thermocald.thermal.reduce import find_spikes
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -42,9 +43,11 @@ def still_field(
     result: of a first adjustment; camera (16,): where it is linearised; numbers, time_s (E,): the
     epochs'.
     """
+    if len(numbers) < FEWEST_EPOCHS:
+        return (), grid
     at = linearise(sensor, testfield, camera[IOP], camera[EOP])
     # what data snooping rejects after a knock is the board; single leaps are not
-    good = grid.observed & ~spikes(result.residuals, grid.observed)
+    good = grid.observed & ~find_spikes(result.residuals, grid.observed)
     residuals = np.where(good[..., None], result.residuals, np.nan)
     ratio = result.noise_ratio if np.isfinite(result.noise_ratio) else 1.0
     weights = grid.weights / max(ratio, 1e-6) ** 2

@@ -11,16 +11,15 @@ import numpy as np
 from thermocald.acquisition.calibrated_blocks import EPOCHS_OF_A_BLOCK, calibrated_epochs
 from thermocald.acquisition.calibrator import Calibrator
 from thermocald.analysis.series.adjusted import table_of_series
-from thermocald.analysis.series.drift import settled
-from thermocald.analysis.series.table import SeriesTable
+from thermocald.analysis.series.drift import with_drifts
+from thermocald.analysis.series.epochs import Epochs
 from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.series.result import SeriesSettings
 from thermocald.photogrammetry.series.spool import ColumnSpool
 from thermocald.photogrammetry.series.words import Words
-from thermocald.store.database.row import EpochResult
 from thermocald.store.database.store import Store
-from thermocald.store.sources import open_source
+from thermocald.store.series import EpochResult
 from thermocald.store.stored_blocks import StoredBlocks
 
 if TYPE_CHECKING:
@@ -29,14 +28,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from thermocald.analysis.series.drift import Course
     from thermocald.arrays import Array
     from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
-    from thermocald.store.database.row import StoredSeries
-    from thermocald.store.database.series_reader import SeriesReader
     from thermocald.store.recording.reader import Recording
-
-__all__ = ["replay_into", "stored_table", "table_of_stored"]
+    from thermocald.store.series import SeriesReader, StoredSeries
 
 
 def replay_into(
@@ -46,10 +41,10 @@ def replay_into(
     exterior: str,
     advance: Callable[[int], None],
     jobs: int = 1,
-) -> tuple[SeriesTable, list[Course]]:
+) -> Epochs:
     """Calibrate a recording's epochs into a store, from where an earlier replay stopped.
 
-    Returns what `settled` makes of the series. jobs: processes; of a block of epochs that was
+    Returns the epochs with their drifts. jobs: processes; of a block of epochs that was
     interrupted those that are stored are calibrated again, so that the others are as they would be.
 
     Raises StoreError; DataError where the store's series of this name is of something else.
@@ -69,21 +64,7 @@ def replay_into(
                 store.append(series, done.epoch, result, extra=done.extra)
             advance(1)
         # while the store is open: targets are left out of a long series by reading it again
-        return settled(table_of_stored(store, series, settings, exterior, jobs))
-
-
-def stored_table(
-    path: Path, name: str | None, settings: AdjustmentSettings, exterior: str, jobs: int = 1
-) -> tuple[SeriesTable, list[Course]]:
-    """What `settled` makes of one series of a store.
-
-    name: `CAMERA/SERIES`, `SERIES`, None: the only one; exterior: `stored` for the epochs as they
-    were stored, else how the series is adjusted again.
-    """
-    with open_source(path) as store:
-        camera, _, series_name = (name or "").rpartition("/")
-        series = store.find_series(camera or None, series_name or None)
-        return settled(table_of_stored(store, series, settings, exterior, jobs))
+        return with_drifts(table_of_stored(store, series, settings, exterior, jobs))
 
 
 def _series(store: Store, recording: Recording, settings: AdjustmentSettings) -> StoredSeries:
@@ -113,7 +94,7 @@ def table_of_stored(
     settings: AdjustmentSettings,
     exterior: str,
     jobs: int = 1,
-) -> SeriesTable:
+) -> Epochs:
     """The table of a series in an open store. Raises DataError where it has no epochs."""
     names = ["epoch", "frame_time", "sigma0", "n_observations", "n_rejected", "status"]
     columns = store.series_columns(series, names)
@@ -127,7 +108,7 @@ def table_of_stored(
         for stored in store.epochs(series, details=False):
             if stored.epoch.number in rows:
                 reasons[rows[stored.epoch.number]] = stored.result.reason
-    apart = SeriesTable(
+    apart = Epochs(
         columns["epoch"].astype(np.int64),
         columns["frame_time"],
         next(iter(store.temperatures_at_frame(series).values()), np.full(size, np.nan)),
@@ -139,6 +120,7 @@ def table_of_stored(
         Words.of(columns["status"].tolist()),
         Words.of(reasons),
         "per_epoch",
+        head=series.head,
     )
     if not ok.any() or exterior == "stored":
         return apart

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.statistics.noise_models import Frequencies, cosines, grid, spectra
+from thermocald.analysis.statistics.noise_models import Frequencies, grid
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array
@@ -80,14 +80,17 @@ def _models(longest: float) -> tuple[Array, Array, Array, Array]:
     return phi, coloured, tau, weight
 
 
-def slope_noise(y: Array, x: Array, slope: float, sd_x: float = 0.0) -> SlopeNoise:
+def slope_noise(
+    y: Array, x: Array, slope: float, sd_x: float = 0.0, times: Array | None = None
+) -> SlopeNoise:
     """The standard deviation of `slope`, a straight line's through x, y (n,), and its noise.
 
-    Finite values, evenly spaced; n ≥ 4; sd_x: noise of x. Gaps must be closed up by the caller:
-    values on both sides of a gap then count as neighbours.
+    Finite values; n ≥ 4; sd_x: noise of x; times (n,): evenly spaced by default; the noise forgets
+    in a gap as it does between epochs.
     """
     n = len(y)
-    u, r = cosines(x), cosines(y - slope * x)
+    at = Frequencies.of(n, times)
+    u, r = at.coefficients(x), at.coefficients(y - slope * x)
     # Frequencies at which x is its own noise say nothing of the slope.
     power = u * u
     around = np.convolve(power, np.full(_NEIGHBOURS, 1.0 / _NEIGHBOURS), "same")[: len(u)]
@@ -100,10 +103,9 @@ def slope_noise(y: Array, x: Array, slope: float, sd_x: float = 0.0) -> SlopeNoi
     ur += slope * sd_x**2
     ur[unknown] = 0.0
     r *= r
-    at = Frequencies.of(len(r))
     uu, ur, rr = at.sums(uu), at.sums(ur), at.sums(r)
     phi, coloured, tau, prior = _models(max(_LONGEST, float(n)))
-    spectrum = spectra(at.mean, phi, coloured)
+    spectrum = at.spectra(phi, coloured)
 
     weight = 1.0 / spectrum
     information = np.maximum(weight @ uu, np.finfo(float).tiny)

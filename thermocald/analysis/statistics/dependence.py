@@ -17,9 +17,7 @@ from thermocald.analysis.statistics.autocorrelation import slope_noise
 from thermocald.analysis.statistics.noise_models import (
     MODELS,
     Frequencies,
-    cosines,
     largest_p_value,
-    spectra,
 )
 from thermocald.analysis.statistics.straight_line import fit_straight_line
 
@@ -77,17 +75,18 @@ def pearson_p_value(r: float, n: float) -> float:
     return float(2 * t.sf(abs(r) * np.sqrt((n - 2) / (1 - r * r)), n - 2))
 
 
-def slope_p_value(values: Array, temperature: Array) -> float:
+def slope_p_value(values: Array, temperature: Array, times: Array | None = None) -> float:
     """Two-sided p-value of no linear dependence, whatever the memory of the noise.
 
-    The t-test of the slope by generalised least squares, its largest p-value over the noise models.
+    times (n,): evenly spaced by default. The t-test of the slope by generalised least squares, its
+    largest p-value over the noise models.
     """
     from scipy.stats import t
 
-    v, u = cosines(values), cosines(temperature)
-    at = Frequencies.of(len(v))
+    at = Frequencies.of(len(values), times)
+    v, u = at.coefficients(values), at.coefficients(temperature)
     vv, uv, uu = at.sums(v * v), at.sums(u * v), at.sums(u * u)
-    spectrum = spectra(at.mean, *MODELS)
+    spectrum = at.spectra(*MODELS)
     weight = 1.0 / spectrum
     information, product = weight @ uu, weight @ uv
     left = np.maximum(weight @ vv - product**2 / information, np.finfo(float).tiny)
@@ -97,10 +96,13 @@ def slope_p_value(values: Array, temperature: Array) -> float:
     return largest_p_value(np.asarray(p), deviance)
 
 
-def dependence(values: Array, sds: Array, temperature: Array, temperature_sd: float) -> Dependence:
+def dependence(
+    values: Array, sds: Array, temperature: Array, temperature_sd: float, times: Array | None = None
+) -> Dependence:
     """Correlation and slope of values (n,) with sds (n,) on temperature (n,) °C.
 
-    All finite, in order of time; temperature_sd: noise of the thermometer, K. Raises ValueError for
+    All finite, in order of time; temperature_sd: noise of the thermometer, K; times (n,) s, evenly
+    spaced by default: noise forgets in a gap. Raises ValueError for
     fewer than 4 epochs, or where values or temperature are constant.
     """
     from scipy.stats import chi2
@@ -128,7 +130,10 @@ def dependence(values: Array, sds: Array, temperature: Array, temperature_sd: fl
     those: slice | Mask = usual
     if usual.all() or not np.ptp(temperature[usual]) > 0:
         those = slice(None)  # without a copy
-    noise = slope_noise(values[those], temperature[those], line.slope, temperature_sd)
+    noise = slope_noise(
+        values[those], temperature[those], line.slope, temperature_sd,
+        None if times is None else times[those],
+    )  # fmt: skip
     sd_slope = noise.sd if n >= _FEW else max(noise.sd, line.sd_slope)
     return Dependence(
         n,
@@ -136,7 +141,7 @@ def dependence(values: Array, sds: Array, temperature: Array, temperature_sd: fl
         pearson_p_value(r, n),
         noise.n_effective,
         noise.lag_one,
-        slope_p_value(values, temperature),
+        slope_p_value(values, temperature, times),
         line.slope,
         sd_slope,
         misfit,

@@ -20,7 +20,6 @@ Sources: Whittle (1953), Estimation and information in stationary time series; M
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,9 +27,7 @@ import numpy as np
 from thermocald.analysis.statistics.noise_models import (
     MODELS,
     Frequencies,
-    cosines,
     largest_p_value,
-    spectra,
 )
 
 if TYPE_CHECKING:
@@ -68,24 +65,33 @@ class DriftTest:
 
 @dataclass(frozen=True, eq=False)
 class _Spectrum:
-    """Squared cosine coefficients, pooled: sums (m,), how many (m,), mean frequency (m,).
+    """Squared cosine coefficients, pooled: sums (m,), at which frequencies.
 
     first (k,): the coefficients themselves, of those frequencies that are not pooled.
     """
 
     power: Array
-    count: Array
-    frequency: Array
+    at: Frequencies
     first: Array
 
+    @property
+    def count(self) -> Array:
+        return self.at.count
 
-def drift_test(values: Array, sds: Array, redundancy: Array, window: int = 31) -> DriftTest | None:
+
+def drift_test(
+    values: Array,
+    sds: Array,
+    redundancy: Array,
+    window: int = 31,
+    times: Array | None = None,
+) -> DriftTest | None:
     """Test a series for drift, and for variation beyond its standard deviations.
 
     values, sds (n,): parameter and its standard deviations, finite, in order of time; redundancy
     (n,): degrees of freedom of each standard deviation; window: epochs, what changes more slowly
-    than two of them is slow. None for fewer than 8 epochs or constant values. Epochs on both sides
-    of a gap count as neighbours.
+    than two of them is slow; times (n,): evenly spaced by default; noise forgets in a gap. None for
+    fewer than 8 epochs or constant values.
     """
     n = len(values)
     if n < _LEAST_VALUES or not np.ptp(values) > 0:
@@ -94,9 +100,11 @@ def drift_test(values: Array, sds: Array, redundancy: Array, window: int = 31) -
     standardised = (values - values.mean()) / np.sqrt(np.mean(sds**2))
     standardised = _without_spikes(standardised)
     calm = _without_jumps(standardised)
-    whole, fast = _spectrum(standardised), _spectrum(calm)
+    at = Frequencies.of(n, times)
+    whole, fast = _spectrum(standardised, at), _spectrum(calm, at)
     bands = _bands(n, window, whole)
-    results = [_slow_against_fast(whole, fast, n, band) for band in bands]
+    trend = _trend(at, np.arange(n, dtype=float) if times is None else times, len(fast.first))
+    results = [_slow_against_fast(whole, fast, trend, band) for band in bands]
     noise_ratio, sd_noise_ratio = _noise(values, sds)
     mean_square = float(np.mean(sds**2))
     return DriftTest(
@@ -136,11 +144,10 @@ def _without_jumps(y: Array) -> Array:
     return np.concatenate([[0.0], np.cumsum(calm)])
 
 
-def _spectrum(y: Array) -> _Spectrum:
-    coefficients = cosines(y)
-    at = Frequencies.of(len(coefficients))
+def _spectrum(y: Array, at: Frequencies) -> _Spectrum:
+    coefficients = at.coefficients(y)
     single = int(np.argmax(at.count > 1)) if at.count[-1] > 1 else len(at.count)
-    return _Spectrum(at.sums(coefficients**2), at.count, at.mean, coefficients[:single].copy())
+    return _Spectrum(at.sums(coefficients**2), at, coefficients[:single].copy())
 
 
 def _bands(n: int, window: int, spectrum: _Spectrum) -> list[int]:
@@ -153,12 +160,12 @@ def _bands(n: int, window: int, spectrum: _Spectrum) -> list[int]:
     return [int(np.searchsorted(reached, end)) + 1 for end in ends]
 
 
-def _slow_against_fast(whole: _Spectrum, fast: _Spectrum, n: int, band: int) -> float:
+def _slow_against_fast(whole: _Spectrum, fast: _Spectrum, trend: Array, band: int) -> float:
     """p-value of the slow band, continued from the fast one."""
     from scipy.stats import f
 
-    models = spectra(whole.frequency, *MODELS)
-    high = _without_trend(fast, n, band)
+    models = whole.at.spectra(*MODELS)
+    high = _without_trend(fast, trend, band)
     degrees = float(fast.count[band:].sum()) - 2.0
     if degrees < _LEAST_FAST:
         return 1.0
@@ -170,7 +177,7 @@ def _slow_against_fast(whole: _Spectrum, fast: _Spectrum, n: int, band: int) -> 
     return largest_p_value(np.asarray(f.sf(ratio, slow, degrees)), deviance)
 
 
-def _without_trend(fast: _Spectrum, n: int, band: int) -> Array:
+def _without_trend(fast: _Spectrum, trend: Array, band: int) -> Array:
     """Power of the fast part without what a trend leaks into it.
 
     Cosines end flat; a drift that does not is a line and a parabola more, which are taken out.
@@ -178,23 +185,22 @@ def _without_trend(fast: _Spectrum, n: int, band: int) -> Array:
     power = fast.power[band:].copy()
     high = fast.first[band:]
     if len(high) > 2:
-        basis, _ = np.linalg.qr(_trend(n, len(fast.first))[band:])
+        basis, _ = np.linalg.qr(trend[band:])
         power[: len(high)] = (high - basis @ (basis.T @ high)) ** 2
     return power
 
 
-@lru_cache(maxsize=2)
-def _trend(n: int, count: int) -> Array:
-    """The first coefficients (count, 2) of a line and a parabola over n epochs."""
-    t = np.linspace(-1.0, 1.0, n)
-    return np.stack([cosines(t**k)[:count] for k in (1, 2)], axis=1)
+def _trend(at: Frequencies, times: Array, count: int) -> Array:
+    """The first coefficients (count, 2) of a line and a parabola over times (n,)."""
+    t = 2.0 * (times - times[0]) / max(float(times[-1] - times[0]), 1e-9) - 1.0
+    return np.stack([at.coefficients(t**k)[:count] for k in (1, 2)], axis=1)
 
 
 def _excess(whole: _Spectrum, fast: _Spectrum, band: int, redundancy: float) -> float:
     """p-value of the variance of the standardised series, which the sds say is 1."""
     from scipy.stats import f
 
-    models = spectra(whole.frequency, *MODELS)
+    models = whole.at.spectra(*MODELS)
     deviance = (fast.power[band:] / models[:, band:]).sum(axis=1)
     deviance = deviance + np.log(models[:, band:]) @ fast.count[band:]
     # A sum of squares of unequal variances: Satterthwaite's degrees of freedom.

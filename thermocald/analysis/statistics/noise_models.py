@@ -13,7 +13,7 @@ p-value of each is combined, by Fisher's method, with the model's own likelihood
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -42,6 +42,9 @@ def grid(phi: ArrayLike, coloured: ArrayLike) -> tuple[Array, Array]:
     return np.append(0.0, phis), np.append(0.0, parts)
 
 
+_GAP = 3.0  # usual intervals between neighbours: a longer one ends a stretch
+_TYPICAL_PHI = 0.97
+
 MODELS = grid(_PHI, _COLOURED)
 """φ (g,) and the coloured part a (g,) of the models that tests run through."""
 
@@ -55,30 +58,108 @@ def spectra(frequency: Array, phi: Array, coloured: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Frequencies:
-    """The frequencies of the coefficients of n epochs, neighbours at high frequencies pooled.
+    """The cosine coefficients of a series with gaps, pooled at high frequencies, lowest first.
 
-    starts (m,): the first coefficient of each; count (m,): how many; mean (m,) rad.
+    pieces: the rows of each stretch without a gap; contrasts (K - 1, K): orthonormal combinations
+    of the stretches' scaled means; pauses (K, K): from the end of one to the begin of another, in
+    intervals; order: of the coefficients by frequency; starts (m,): the first coefficient of each
+    pool; count (m,): how many; mean (m,) rad, 0 for a contrast.
     """
 
+    pieces: tuple[slice, ...]
+    contrasts: Array
+    pauses: Array
+    order: NDArray[np.int64] | None
     starts: NDArray[np.int64]
     count: Array
     mean: Array
 
     @classmethod
-    def of(cls, coefficients: int) -> Frequencies:
-        """The frequencies of so many coefficients without the constant one, as of `cosines`."""
-        m = coefficients
+    def of(cls, n: int, times: Array | None = None) -> Frequencies:
+        """The frequencies of n values at times (n,), evenly spaced by default."""
+        pieces, pauses = _pieces(n, times)
+        lengths = [p.stop - p.start for p in pieces]
+        each = [np.arange(1, size) / size for size in lengths]
+        K = len(pieces)
+        if K == 1:
+            order, m = None, lengths[0] - 1
+            own = np.zeros(0)
+        else:
+            own = np.concatenate([np.zeros(K - 1), *each])
+            order, m = np.argsort(own, kind="stable"), len(own)
         if m <= _SINGLE_FREQUENCIES + _POOLED_FREQUENCIES:
             starts = np.arange(m)
         else:
             edges = np.geomspace(_SINGLE_FREQUENCIES, m, _POOLED_FREQUENCIES + 1)[:-1].astype(int)
             starts = np.concatenate([np.arange(_SINGLE_FREQUENCIES), np.unique(edges)])
         count = np.diff(starts, append=m).astype(float)
-        return cls(starts, count, np.pi * (starts + (count + 1) / 2) / (m + 1))
+        if order is None:
+            mean = np.pi * (starts + (count + 1) / 2) / (m + 1)
+        else:
+            mean = np.pi * np.add.reduceat(own[order], starts) / count
+        found = cls(pieces, np.zeros((0, K)), pauses, order, starts, count, mean)
+        if K == 1:
+            return found
+        # orthonormal, orthogonal to a constant, and independent for noise with a long memory
+        root = np.sqrt(np.array(lengths) / sum(lengths))
+        flat = np.linalg.svd(root[None])[2][1:]
+        slow = found.means_covariance(_TYPICAL_PHI, 1.0)
+        return replace(found, contrasts=np.linalg.eigh(flat @ slow @ flat.T)[1].T @ flat)
+
+    def means_covariance(self, phi: float, coloured: float) -> Array:
+        """Covariance (K, K) of the stretches' means, times √length, of noise of unit variance."""
+        size = np.array([p.stop - p.start for p in self.pieces], dtype=float)
+        phi = min(phi, 1.0 - 1e-9)
+        geometric = (1.0 - phi**size) / (1.0 - phi)
+        own = (size * (1 + phi) - 2 * phi * geometric) / (1.0 - phi) / size
+        scaled = geometric / np.sqrt(size)
+        between = scaled[:, None] * scaled[None] * phi**self.pauses
+        np.fill_diagonal(between, own)
+        return np.asarray(coloured * between + (1 - coloured) * np.eye(len(size)))
+
+    def coefficients(self, y: Array) -> Array:
+        """Orthonormal coefficients of a series about its mean, without the constant one."""
+        if self.order is None:
+            return cosines(y)
+        sizes = np.array([p.stop - p.start for p in self.pieces])
+        means = np.array([y[p].mean() for p in self.pieces])
+        slow = self.contrasts @ (means * np.sqrt(sizes))
+        every = np.concatenate([slow, *(cosines(y[p]) for p in self.pieces)])
+        return np.asarray(every[self.order])
 
     def sums(self, power: Array) -> Array:
         """Sums (m,) of something per coefficient."""
         return power if len(self.starts) == len(power) else np.add.reduceat(power, self.starts)
+
+    def spectra(self, phi: Array, coloured: Array) -> Array:
+        """Mean variances (g, m) of the coefficients of noise of unit variance."""
+        out = spectra(self.mean, phi, coloured)
+        for k, (one, part) in enumerate(zip(phi, coloured, strict=True)):
+            if len(self.contrasts):
+                C = self.contrasts
+                out[k, : len(C)] = np.einsum("ij,jk,ik->i", C, self.means_covariance(one, part), C)
+        return out
+
+
+def _pieces(n: int, times: Array | None) -> tuple[tuple[slice, ...], Array]:
+    """The stretches between gaps, and the pauses (K, K) between them in intervals."""
+    whole = (slice(0, _with_small_factors(n)),)
+    if times is None or n < 3:
+        return whole, np.zeros((1, 1))
+    t = times
+    steps = np.diff(t)
+    usual = float(np.median(steps))
+    at = np.flatnonzero(steps > _GAP * usual) + 1
+    if not len(at) or not usual > 0:
+        return whole, np.zeros((1, 1))
+    inside = np.ones(n - 1, dtype=bool)
+    inside[at - 1] = False
+    interval = float(steps[inside].mean()) if inside.any() else usual
+    first, last = np.append(0, at), np.append(at, n)
+    pauses = np.maximum(t[first][None] - t[last - 1][:, None], 0.0) / interval
+    pauses = np.maximum(pauses, pauses.T)
+    lengths = [_with_small_factors(int(k - i)) for i, k in zip(first, last, strict=True)]
+    return tuple(slice(int(i), int(i) + m) for i, m in zip(first, lengths, strict=True)), pauses
 
 
 def cosines(y: Array) -> Array:

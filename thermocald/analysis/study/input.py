@@ -22,27 +22,34 @@ from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
 from thermocald.photogrammetry.series.spool import ColumnSpool, give_back, released
 from thermocald.photogrammetry.series.words import Words
-from thermocald.reduction.thermometer import reading_noise
 from thermocald.store.recording.reader import open_recording
 from thermocald.store.recording.readings import interpolate_readings
 from thermocald.store.sources import open_source
+from thermocald.thermal.thermometer import estimate_reading_noise
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from thermocald.analysis.series.table import SeriesTable
+    from thermocald.analysis.series.epochs import Epochs
     from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import Observations
-    from thermocald.store.database.row import StoredSeries
-    from thermocald.store.database.series_reader import SeriesReader
     from thermocald.store.recording.head import Head
     from thermocald.store.recording.reader import Recording
-
-__all__ = ["from_recording", "from_store", "load_series"]
+    from thermocald.store.series import SeriesReader, StoredSeries
 
 _MOST_MATRICES = 5000
+
+
+def refuse_copies(series: Sequence[MeasuredSeries]) -> None:
+    """Raise DataError where two series hold the same epochs."""
+    for i, one in enumerate(series):
+        for other in series[:i]:
+            if len(one) > 1 and len(one) == len(other) and np.array_equal(one.values, other.values):
+                raise DataError(
+                    f"{one.source} holds the same epochs as {other.source}; give each series once"
+                )
 
 
 def load_series(
@@ -102,8 +109,7 @@ def from_recording(
         _thermometer(
             name,
             columns.frame_time,
-            columns.temperature_time,
-            columns.temperatures[name],
+            *columns.readings_of(name),
             channel.resolution,
             thermometer_sd,
         )
@@ -204,7 +210,7 @@ def _from_columns(
 def _from_table(
     head: Head,
     source: str,
-    table: SeriesTable,
+    table: Epochs,
     thermometers: Sequence[Thermometer],
     label: str,
     clip: Clip | None,
@@ -269,7 +275,7 @@ def _thermometer(
     sd: float | None,
 ) -> Thermometer:
     values = interpolate_readings(frame_time, reading_time, readings)
-    known = reading_noise(reading_time, readings, resolution) if sd is None else sd
+    known = estimate_reading_noise(reading_time, readings, resolution) if sd is None else sd
     return Thermometer(name, values, known)
 
 

@@ -11,13 +11,13 @@ from __future__ import annotations
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermocald.analysis.study.input import from_recording
 from thermocald.analysis.study.study import StudySettings, study_camera
-from thermocald.simulation.presets import PRESETS, preset_simulation
+from thermocald.physics.presets import PRESETS, preset_simulation
 from thermocald.store.recording.reader import open_recording
 
 if TYPE_CHECKING:
@@ -108,6 +108,17 @@ class Comparison:
     def reproduced(self) -> bool:
         """Whether ours lies within the bounds."""
         return self.low <= self.ours <= self.high
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the entry of a document."""
+        return {
+            "camera": self.camera,
+            "quantity": self.quantity,
+            "unit": self.unit,
+            "reference": self.text,
+            "ours": self.ours,
+            "reproduced": self.reproduced,
+        }
 
 
 def reference_series(

@@ -247,7 +247,7 @@ def _significance(
     for name in series.free:
         values, sds = series.column(name)
         tested = _moving(series, values, sds, settings)
-        drift = drift_test(values, sds, series.redundancy, settings.window)
+        drift = drift_test(values, sds, series.redundancy, settings.window, series.time_s)
         result[name] = replace(tested, drift=drift)
     return _corrected(result)
 
@@ -311,7 +311,7 @@ def _channel(series: MeasuredSeries, thermometer: Thermometer) -> ChannelStudy:
         else:
             values, sds = series.column(column)
         if np.ptp(values[have]) > 0:
-            found[column] = dependence(values[have], sds[have], t, sd)
+            found[column] = dependence(values[have], sds[have], t, sd, series.time_s[have])
     return ChannelStudy(
         thermometer,
         found,

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.analysis.camera.undistortion import ideal_points
-from thermocald.analysis.thermal.temperature_log import TemperatureLog
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import partials, project, rays
 
@@ -26,14 +25,7 @@ if TYPE_CHECKING:
     from thermocald.analysis.thermal.thermal_camera import Along, ThermalCamera
     from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
-
-__all__ = [
-    "Corrected",
-    "ImageCorrection",
-    "TemperatureLog",
-    "correct_points",
-    "image_corrections",
-]
+    from thermocald.store.logger.temperatures import TemperatureLog
 
 _BLOCK = 100_000
 _SAMPLE = 997  # points of an image that tell how much it is corrected
@@ -65,7 +57,7 @@ def correct_points(
     temperature_sd K: of a reading of the log. DataError for times outside the log.
     """
     target = camera.model.T0 if to is None else to
-    _inside(log, times)
+    require_inside(log, times)
     unique, place = np.unique(times, return_inverse=True)
     along = camera.along(
         log.times, dict(log.channels), unique, extrapolate, relative_to=target,
@@ -87,7 +79,8 @@ def correct_points(
     return Corrected(corrected, sds, along.temperatures[place], along.extrapolated[place])
 
 
-def _inside(log: TemperatureLog, times: Array) -> None:
+def require_inside(log: TemperatureLog, times: Array) -> None:
+    """Raise DataError for times (n,) s that a temperature log does not cover."""
     begin, end = float(log.times[0]), float(log.times[-1])
     step = float(np.median(np.diff(log.times))) if len(log.times) > 1 else 0.0
     outside = (times < begin - step) | (times > end + step)
@@ -123,7 +116,7 @@ def image_corrections(
     extrapolate: bool = False,
 ) -> Iterator[ImageCorrection]:
     """One correction per time; arguments as those of `correct_points`, errors before the first."""
-    _inside(log, times)
+    require_inside(log, times)
     target = camera.model.T0 if to is None else to
     steady = camera.at(target, extrapolate=True).values
     along = camera.along(

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
-    from thermocald.reduction.series import ReducedSeries
+    from thermocald.thermal.series import ReducedSeries
 
 __all__ = ["Moved", "moved_targets"]
 

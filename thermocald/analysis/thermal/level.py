@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
-    from thermocald.reduction.series import ReducedSeries
-    from thermocald.simulation.model import Prediction, ThermalModel
+    from thermocald.physics.model import Prediction, ThermalModel
+    from thermocald.thermal.series import ReducedSeries
 
 __all__ = ["FREE_INTERIOR", "Level", "estimate_level", "series_means"]
 

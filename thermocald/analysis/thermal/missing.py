@@ -9,42 +9,45 @@ unknowns, and into the interior orientation that the model predicts.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermocald.photogrammetry.linalg import inverse_of_determined
-from thermocald.reduction.adequacy import examine
+from thermocald.thermal.scan import examine
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array
-    from thermocald.reduction.adequacy import Adequacy
-    from thermocald.reduction.fit import HypothesisFitter
-    from thermocald.reduction.hypothesis import Fit
+    from thermocald.thermal.fit import HypothesisFitter
+    from thermocald.thermal.hypothesis import Fit
+    from thermocald.thermal.scan import Adequacy
 
 __all__ = ["Missing", "missing"]
 
 # of the image noise: a rest that is significant but smaller widens the covariance, and leaves the
 # 95 % bands what they say
 _MATERIAL = 0.2
-_FEWEST = 30  # epochs of a series below which no trajectory of 14 orders can be examined
+_FEWEST = 30  # epochs, of one series or of the short ones together, that a test needs
+_FEWEST_TO_CARRY = 6  # epochs whose rest can be carried into the covariance, tested or not
 
 
 @dataclass(frozen=True, eq=False)
 class Missing:
     """What a model leaves over in its series.
 
-    found: whether an effect is missing; misfit_px: RMS of the smooth rest, the worst series';
-    significance: in standard deviations; unknowns (K + L, K + L), parameters (8, 8): what it adds
-    to the covariance of the fit's unknowns and of the interior orientation, px-scaled.
+    found: whether an effect is missing, None where a series was not examined and no other misses
+    one; misfit_px: RMS of the smooth rest, the worst series'; significance: in standard deviations;
+    unknowns (K + L, K + L), parameters (8, 8): what it adds to the covariance of the fit's unknowns
+    and of the interior orientation, px-scaled; left_over: what the worst series leaves, in noise.
     """
 
-    found: bool
+    found: bool | None
     misfit_px: float
     significance: float
     unknowns: Array
     parameters: Array
+    left_over: float = 1.0
 
     def as_mapping(self) -> dict[str, Any]:
         """As the evidence of a model file has it."""
@@ -52,30 +55,50 @@ class Missing:
             "effect_missing": self.found,
             "misfit_px": round(float(self.misfit_px), 5),
             "significance_sigmas": round(float(self.significance), 1),
+            "not_examined": None if self.found is not None else f"fewer than {_FEWEST} epochs",
+            "left_over_in_noise": round(float(self.left_over), 3),
         }
 
 
 def missing(fitter: HypothesisFitter, fit: Fit, free: list[int]) -> Missing:
-    """Test every series; free: columns of the interior orientation that take the rest up."""
+    """Test every series, the short ones together; free: columns of the interior orientation that
+    take the rest up.
+    """
     size = len(fit.covariance)
     unknowns, parameters = np.zeros((size, size)), np.zeros((len(free), len(free)))
     found, misfit, significance = False, 0.0, 0.0
-    for s, e in enumerate(fitter.series):
-        if int((e.n > 0).sum()) < _FEWEST:
-            continue
-        a = examine(fitter, fit, s)
+    epochs = [int((e.n > 0).sum()) for e in fitter.series]
+    tests = {
+        s: examine(fitter, fit, s) for s, count in enumerate(epochs) if count >= _FEWEST_TO_CARRY
+    }
+    short = [s for s in tests if epochs[s] < _FEWEST]
+    together = _together([tests[s] for s in short])
+    examined = sum(epochs[s] for s in short) >= _FEWEST
+    for s, alone in tests.items():
+        a = replace(alone, significance=together) if s in short else alone
+        e = fitter.series[s]
         misfit = max(misfit, a.misfit_px)
         significance = max(significance, a.significance)
         if a.adequate:
             continue
-        found = found or a.misfit_px > _MATERIAL * e.sigma_px
+        found = found or (a.misfit_px > _MATERIAL * e.sigma_px and (examined or s not in short))
         power = _power(a)
         unknowns += _carried(fitter, fit, s, a, power)
         N = e.N.mean(axis=0)
         taken = inverse_of_determined(N[np.ix_(free, free)]) @ N[free] @ a.directions
         half = np.mean(a.trajectories**2, axis=1)
         parameters += taken @ np.einsum("j,jde->de", half, power) @ taken.T / len(fitter.series)
-    return Missing(found, misfit, significance, unknowns, parameters)
+    unseen = min(epochs) < _FEWEST and (not examined or min(epochs) < _FEWEST_TO_CARRY)
+    return Missing(
+        None if unseen and not found else found, misfit, significance, unknowns, parameters
+    )
+
+
+def _together(tests: list[Adequacy]) -> float:
+    """The significance of several tests as one, in standard deviations."""
+    free = sum(a.scores.size for a in tests)
+    total = sum(float(np.sum(a.scores**2)) for a in tests)
+    return (total - free) / float(np.sqrt(2.0 * free)) if free else 0.0
 
 
 def _power(a: Adequacy) -> Array:

@@ -12,18 +12,17 @@ import numpy as np
 
 from thermocald.analysis.thermal.terms import event_worth
 from thermocald.photogrammetry.linalg import scaled_solve
-from thermocald.reduction.candidate import candidate_of
-from thermocald.reduction.fit import HypothesisFitter
-from thermocald.reduction.hypothesis import BASE, Term, known_term
-from thermocald.reduction.scan import Scanner
-from thermocald.reduction.series import COLUMNS
-from thermocald.simulation import effects
+from thermocald.physics import catalogue
+from thermocald.thermal.fit import HypothesisFitter
+from thermocald.thermal.hypothesis import BASE, Term, make_candidate, make_known_term
+from thermocald.thermal.scan import Scanner
+from thermocald.thermal.series import COLUMNS
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array
-    from thermocald.reduction.hypothesis import Fit
-    from thermocald.reduction.series import ReducedSeries
-    from thermocald.simulation.model import ModelEffect, ThermalModel
+    from thermocald.physics.model import ModelEffect, ThermalModel
+    from thermocald.thermal.hypothesis import Fit
+    from thermocald.thermal.series import ReducedSeries
 
 __all__ = ["with_own"]
 
@@ -32,17 +31,17 @@ _ROUNDS = 3  # phases and events look for each other
 
 def with_own(model: ThermalModel, series: ReducedSeries) -> ThermalModel:
     """The model with the phases and events of a series; its T₀ and reference are the model's."""
-    listed = {e.name: e for e in model.effects if effects.get(e.name).seen_in == "trajectory"}
+    listed = {e.name: e for e in model.effects if catalogue.get(e.name).seen_in == "trajectory"}
     own = [e for e in listed if Term(e).is_separate]
     if not own:
         return model
     fitter = HypothesisFitter([series])
     for e in own:
-        if effects.get(e).is_event:
+        if catalogue.get(e).is_event:
             listed[e] = _nothing(listed[e])
     for _ in range(_ROUNDS):
         for name in own:
-            find = _phase if effects.get(name).is_periodic else _event
+            find = _phase if catalogue.get(name).is_periodic else _event
             listed[name] = find(fitter, model, listed, name)
     return replace(model, effects=tuple(listed.get(e.name, e) for e in model.effects))
 
@@ -50,7 +49,7 @@ def with_own(model: ThermalModel, series: ReducedSeries) -> ThermalModel:
 def _nothing(effect: ModelEffect) -> ModelEffect:
     """An event that did not happen."""
     return replace(
-        effect, values={**effect.values, **dict.fromkeys(effects.get(effect.name).linear, 0.0)}
+        effect, values={**effect.values, **dict.fromkeys(catalogue.get(effect.name).linear, 0.0)}
     )
 
 
@@ -58,7 +57,7 @@ def _known(
     fitter: HypothesisFitter, model: ThermalModel, listed: dict[str, ModelEffect]
 ) -> tuple[Fit, Array]:
     """A fit of some effects, and their coefficients as the model has them, px-scaled."""
-    fit = fitter.fit([known_term(e.name, e.values, 1) for e in listed.values()])
+    fit = fitter.fit([make_known_term(e.name, e.values, 1) for e in listed.values()])
     scale = fitter.series[0].scale
     x = fit.coefficients.copy()
     for block in fit.blocks:
@@ -67,7 +66,7 @@ def _known(
             x[block.start : block.stop] = [model.rates.get(p, 0.0) for p in BASE] * units
             continue
         effect = listed[fit.terms[block.term].effect]
-        kind = effects.get(effect.name)
+        kind = catalogue.get(effect.name)
         names = {kind.column(n): n for n in kind.linear}
         weights = np.array([kind.weights(effect.values, names[p]) for p in block.parameters])
         x[block.start : block.stop] = (weights * units[:, None]).T.ravel()
@@ -85,7 +84,7 @@ def _phase(
     A = reduced.A[np.ix_(inside, inside)]
     right = reduced.c[inside] - reduced.A[np.ix_(inside, ~inside)] @ x[index[~inside]]
     pair = x[block.start : block.stop].reshape(2, -1)
-    key = next(k for k in listed[name].values if k in effects.get(name).fresh)
+    key = next(k for k in listed[name].values if k in catalogue.get(name).fresh)
     phase = float(listed[name].values[key])
     amplitude = pair[0] * np.cos(phase) + pair[1] * np.sin(phase)
     angles = np.linspace(-np.pi, np.pi, 1440, endpoint=False)
@@ -101,9 +100,9 @@ def _event(
 ) -> ModelEffect:
     """An event where it explains most, or none."""
     fit, x = _known(fitter, model, {n: e for n, e in listed.items() if n != name})
-    effect, kind = listed[name], effects.get(name)
+    effect, kind = listed[name], catalogue.get(name)
     linear = tuple(n for n in kind.linear if n in effect.values)
-    candidate = candidate_of(kind, linear, fitter.series)
+    candidate = make_candidate(kind, linear, fitter.series)
     directions = np.eye(len(COLUMNS))[:, [COLUMNS.index(p) for p in candidate.parameters]]
     C, V, index = fit.designs[0]
     stack = Scanner(fitter).stack(candidate, 0, fit)

@@ -22,15 +22,15 @@ from thermocald.analysis.thermal.sensitivity import derivatives, reading_operato
 from thermocald.analysis.thermal.thermal_model import targets_of
 from thermocald.errors import ConfigurationError, DataError
 from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation
-from thermocald.reduction.reduce import without_targets
-from thermocald.simulation import effects
+from thermocald.physics import catalogue
+from thermocald.thermal.reduce import without_targets
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
-    from thermocald.reduction.series import ReducedSeries
-    from thermocald.simulation.model import ThermalModel
+    from thermocald.physics.model import ThermalModel
+    from thermocald.thermal.series import ReducedSeries
 
 __all__ = ["PredictedError", "predicted_error"]
 
@@ -119,7 +119,7 @@ def _of_series(model: ThermalModel, series: ReducedSeries, rows: NDArray[np.int6
         m = moved_targets(others, rows)
         listed = []
         for e in model.effects:
-            kind = effects.get(e.name)
+            kind = catalogue.get(e.name)
             if kind.seen_in == "targets":
                 time = {n: m.time for n, p in kind.nonlinear.items() if p.role == "event"}
                 vector = dict(zip(kind.linear, m.vector.tolist(), strict=True))
@@ -186,5 +186,5 @@ def _parameters(series: ReducedSeries, model: ThermalModel) -> Array:
 
 def _fresh(name: str) -> tuple[str, ...]:
     """The numbers of an effect that a series has of its own."""
-    kind = effects.get(name)
+    kind = catalogue.get(name)
     return (*kind.fresh, *kind.linear) if kind.is_event else kind.fresh

@@ -23,9 +23,9 @@ from thermocald.photogrammetry.camera.camera_model import (
 )
 from thermocald.photogrammetry.linalg import scaled_inverse
 from thermocald.photogrammetry.series.normals import chunks
-from thermocald.reduction.series import COLUMNS
-from thermocald.simulation import effects
-from thermocald.simulation.model import RATED, ModelEffect, ThermalModel
+from thermocald.physics import catalogue
+from thermocald.physics.model import RATED, ModelEffect, ThermalModel
+from thermocald.thermal.series import COLUMNS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -33,10 +33,10 @@ if TYPE_CHECKING:
     from thermocald.analysis.thermal.displacement import Moved
     from thermocald.analysis.thermal.terms import Unknown
     from thermocald.arrays import Array
-    from thermocald.reduction.fit import HypothesisFitter
-    from thermocald.reduction.hypothesis import Fit
-    from thermocald.reduction.noise_growth import NoiseGrowth
-    from thermocald.reduction.series import ReducedSeries
+    from thermocald.thermal.fit import HypothesisFitter
+    from thermocald.thermal.hypothesis import Fit
+    from thermocald.thermal.noise import NoiseGrowth
+    from thermocald.thermal.series import ReducedSeries
 
 __all__ = ["FittedModel", "SeriesFit", "fitted_model"]
 
@@ -46,7 +46,8 @@ _EXTERIOR = [COLUMNS.index(n) for n in EOP_NAMES]
 
 @dataclass(frozen=True, slots=True)
 class SeriesFit:
-    """How well one series is explained: RMS px of the image points, thermometer's noise K.
+    """How well one series is explained: RMS px of the image points, thermometer's noise K, what
+    the noise of both leaves, px.
 
     means: on how many means of epochs a long series was fitted, and the RMS is of; else None.
     """
@@ -56,6 +57,12 @@ class SeriesFit:
     rms_px: float
     thermometer_sd: float
     means: int | None = None
+    noise_px: float = float("nan")
+
+    @property
+    def left_over(self) -> float:
+        """The RMS over what noise alone leaves."""
+        return self.rms_px / self.noise_px
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +108,7 @@ class _Parts:
 
     def effect(self, e: ModelEffect, k: int) -> ModelEffect:
         """One effect with the values of series k."""
-        kind = effects.get(e.name)
+        kind = catalogue.get(e.name)
         if kind.seen_in == "noise":
             assert self.growth is not None
             (key,) = kind.linear
@@ -171,9 +178,9 @@ class _Parts:
         own = [*range(n), *range(len(names) - 6 * len(self.series), len(names))]
         covariance[np.ix_(own, own)] += level.field
         for k, m in enumerate(self.moved):
-            e = next(e for e in self.listed if effects.get(e.name).seen_in == "targets")
+            e = next(e for e in self.listed if catalogue.get(e.name).seen_in == "targets")
             suffix = f"@{k}" if k else ""
-            names += [f"{e.name}.{key}{suffix}" for key in effects.get(e.name).linear]
+            names += [f"{e.name}.{key}{suffix}" for key in catalogue.get(e.name).linear]
             old = len(covariance)
             covariance = np.pad(covariance, (0, 3))
             covariance[old:, old:] = m.covariance
@@ -190,6 +197,25 @@ class _Parts:
             total += float(np.sum(s.n[ok] / w / rise**2))
             count += int(s.n[ok].sum())
         return float(np.sqrt(total / count))
+
+    def fit_of(self, k: int, level: Level, sigma: float) -> SeriesFit:
+        """How well series k is explained; sigma px: noise of an image coordinate at T₀."""
+        s, model = self.series[k], self.model(k, level)
+        averaged = float(np.sqrt(np.median(s.source.per_row)))
+        reading = self.fitter.series[k].thermometers[s.history.reference].noise * averaged
+        # a constant of each target is taken off: of the thermometer's noise nothing else is
+        drift = s.at.A[..., :10] @ model.rate_vector
+        noise = np.hypot(sigma / averaged, reading / averaged * np.sqrt(np.mean(drift**2)))
+        if self.growth is not None:
+            noise *= float(np.sqrt(np.mean(self.growth.noise[k] ** 2)))
+        return SeriesFit(
+            s.source.series or s.source.name,
+            s.source.epochs(s.n > 0),
+            _rms(s, model),
+            reading,
+            None if s.source.counts is None else int((s.n > 0).sum()),
+            float(noise),
+        )
 
 
 def fitted_model(
@@ -211,17 +237,8 @@ def fitted_model(
     kept = [names.index(n) for n in written]
     sigma = parts.image_sigma()
     stated = np.concatenate([s.source.grid.weights[s.source.grid.observed][:, 0] for s in series])
-    fits = tuple(
-        SeriesFit(
-            s.source.series or s.source.name,
-            s.source.epochs(s.n > 0),
-            _rms(s, parts.model(k, level)),
-            fitter.series[k].thermometers[s.history.reference].noise
-            * float(np.sqrt(np.median(s.source.per_row))),
-            None if s.source.counts is None else int((s.n > 0).sum()),
-        )
-        for k, s in enumerate(series)
-    )
+    fits = tuple(parts.fit_of(k, level, sigma) for k in range(len(series)))
+    gap = replace(gap, left_over=max(f.left_over for f in fits))
     first = parts.model(0, level)
     channels = dict.fromkeys(c for s in series for c in s.source.readings)
     model = replace(
@@ -292,7 +309,7 @@ def _rms(series: ReducedSeries, model: ThermalModel) -> float:
 
 
 def _with_sds(effect: ModelEffect, sd: dict[str, float], series: ReducedSeries) -> ModelEffect:
-    kind = effects.get(effect.name)
+    kind = catalogue.get(effect.name)
     if kind.seen_in == "noise":
         return effect
     found: dict[str, Any] = {

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, PARAMETER_NAMES
-from thermocald.simulation import effects
-from thermocald.simulation.drive import drive_matrix
+from thermocald.physics import catalogue
+from thermocald.physics.catalogue import drive_matrix
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
-    from thermocald.simulation.history import History
-    from thermocald.simulation.model import Prediction, ThermalModel
+    from thermocald.physics.history import History
+    from thermocald.physics.model import Prediction, ThermalModel
 
 __all__ = ["derivatives", "reading_operators", "unresolved"]
 
@@ -44,7 +44,7 @@ def derivatives(
             place = next(i for i, e in enumerate(model.effects) if e.name == group)
             effect = model.effects[place]
             value = float(effect.values[key])
-            kind = effects.get(group)
+            kind = catalogue.get(group)
             searched = kind.nonlinear.get(key)
             step = searched.difference_step(value) if searched else 1e-3 * max(abs(value), 1e-6)
             sides = []
@@ -75,7 +75,7 @@ def reading_operators(history: History, model: ThermalModel) -> list[tuple[Array
         assert operator is not None
         found.append((rates, history.reference, operator))
     for effect in model.effects:
-        kind = effects.get(effect.name)
+        kind = catalogue.get(effect.name)
         nonlinear, coefficients = kind.split(effect.values)
         if kind.is_drive or kind.seen_in == "noise" or not any(coefficients.values()):
             continue
@@ -92,7 +92,7 @@ def unresolved(
     """What the readings' times leave open: weights (22,) and standard deviations (E,)."""
     found = []
     for effect in model.effects:
-        kind = effects.get(effect.name)
+        kind = catalogue.get(effect.name)
         nonlinear, coefficients = kind.split(effect.values)
         if kind.kind == "image":
             continue
@@ -112,5 +112,5 @@ def _rates(model: ThermalModel) -> Array:
 def _weights(name: str, coefficients: Mapping[str, float]) -> Array:
     weights = np.zeros(len(_COLUMNS))
     for key, value in coefficients.items():
-        weights[_COLUMNS.index(effects.get(name).column(key))] = value
+        weights[_COLUMNS.index(catalogue.get(name).column(key))] = value
     return weights

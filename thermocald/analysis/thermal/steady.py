@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
-from thermocald.simulation import effects
+from thermocald.physics import catalogue
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from thermocald.arrays import Array
-    from thermocald.simulation.effects.base import Steady
-    from thermocald.simulation.model import ModelEffect, ThermalModel
+    from thermocald.physics.effect import Steady
+    from thermocald.physics.model import ModelEffect, ThermalModel
 
 __all__ = ["SteadyCamera", "steady_camera"]
 
@@ -74,7 +74,7 @@ def steady_camera(
         if n in model.rates:
             add(f"rates.{n}", model.rates[n], row, 1)
     for effect in model.effects:
-        kind = effects.get(effect.name)
+        kind = catalogue.get(effect.name)
         steady = kind.steady(effect.values, model.T0, channels)
         own = [
             (k, IOP_NAMES.index(k)) for k in kind.linear if k in effect.values and k in IOP_NAMES

@@ -7,18 +7,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.reduction.candidate import candidate_of
-from thermocald.reduction.hypothesis import BASE, Term
-from thermocald.reduction.scan import Scanner
-from thermocald.reduction.series import COLUMNS
-from thermocald.simulation import effects
+from thermocald.physics import catalogue
+from thermocald.thermal.hypothesis import BASE, Term, make_candidate
+from thermocald.thermal.scan import Scanner
+from thermocald.thermal.series import COLUMNS
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array
-    from thermocald.reduction.fit import HypothesisFitter
-    from thermocald.reduction.hypothesis import Block, Fit
-    from thermocald.reduction.series import ReducedSeries
-    from thermocald.simulation.model import ModelEffect
+    from thermocald.physics.model import ModelEffect
+    from thermocald.thermal.fit import HypothesisFitter
+    from thermocald.thermal.hypothesis import Block, Fit
+    from thermocald.thermal.series import ReducedSeries
 
 __all__ = [
     "Unknown",
@@ -50,7 +49,7 @@ def term_of(fitter: HypothesisFitter, fit: Fit, effect: ModelEffect, search: boo
     search: its non-linear parameters are looked for over their whole range, but for those that
     `fitter.held` names; the time of an event always is, in each series.
     """
-    kind = effects.get(effect.name)
+    kind = catalogue.get(effect.name)
     given = tuple(n for n in kind.linear if n in effect.values) or kind.usual
     names = BASE if kind.is_drive else given
     text = {k: effect.values[k] for k, p in kind.nonlinear.items() if p.text and k in effect.values}
@@ -60,7 +59,7 @@ def term_of(fitter: HypothesisFitter, fit: Fit, effect: ModelEffect, search: boo
         if k in effect.values and not p.text and k not in kind.fresh
     }
     held = {k: v for k, v in numbers.items() if f"{effect.name}.{k}" in fitter.held}
-    candidate = candidate_of(kind, names, fitter.series, (*text.items(), *held.items()))
+    candidate = make_candidate(kind, names, fitter.series, (*text.items(), *held.items()))
     if kind.is_event:
         found = Scanner(fitter).scan(candidate, fit)
         fresh: list[tuple[tuple[str, Any], ...] | None] = []

@@ -16,38 +16,49 @@ is refused, unless extrapolation is asked for by name.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from thermocald.analysis.camera.state import CameraState
+from thermocald.analysis.camera.camera import Camera
+from thermocald.analysis.thermal.live_camera import LiveCamera
+from thermocald.analysis.thermal.model_text import model_lines
 from thermocald.analysis.thermal.steady import SteadyCamera, steady_camera
-from thermocald.analysis.thermal.validity import ExtrapolationWarning, Validity
+from thermocald.analysis.thermal.validity import Validity
 from thermocald.errors import ConfigurationError, UsageError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
-from thermocald.simulation import effects
-from thermocald.simulation.history import History
-from thermocald.simulation.model_file import read_model
+from thermocald.physics import catalogue
+from thermocald.physics.history import History
+from thermocald.physics.model_file import model_document, read_model, write_model
+from thermocald.result import Result, jsonable, new_figure
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from matplotlib.figure import Figure
     from numpy.typing import ArrayLike
 
     from thermocald.arrays import Array
-    from thermocald.simulation.model import ThermalModel
-
-__all__ = ["Along", "ExtrapolationWarning", "ThermalCamera"]
+    from thermocald.physics.model import ThermalModel
 
 _CHUNK = 20_000  # times in one go
+_TOLD = ("effect_missing", "misfit_px", "significance_sigmas")
+
+
+def seconds(times: ArrayLike) -> Array:
+    """Return times in s, of which datetime64 and pandas' are since 1970-01-01 UTC."""
+    given = np.asarray(times)
+    if np.issubdtype(given.dtype, np.datetime64):
+        given = given.astype("datetime64[us]").astype(np.int64) * 1e-6
+    return np.asarray(given, dtype=float)
 
 
 @dataclass(frozen=True, eq=False)
 class Along:
-    """The camera along a history; `[i]` is a CameraState.
+    """The camera along a history; `[i]` is a Camera.
 
     times (E,) s, temperatures (E,) °C; values (E, 10); covariance (E, 10, 10); extrapolated (E,) K.
     """
@@ -62,8 +73,8 @@ class Along:
     def __len__(self) -> int:
         return len(self.times)
 
-    def __getitem__(self, i: int) -> CameraState:
-        return CameraState(
+    def __getitem__(self, i: int) -> Camera:
+        return Camera(
             self.sensor,
             float(self.temperatures[i]),
             self.values[i],
@@ -77,16 +88,87 @@ class Along:
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
 
-@dataclass(frozen=True)
-class ThermalCamera:
-    """A thermal model ready for use."""
+@dataclass(frozen=True, repr=False)
+class ThermalCamera(Result):
+    """A camera whose interior orientation is known at any temperature and history.
+
+    model: the thermal model; fitted: what `fit` said of it, None for one from a file.
+
+    >>> camera = tc.load_camera("camera.yaml")
+    >>> bool(camera.at(45.0).interior.c != camera.at(25.0).interior.c)
+    True
+    """
 
     model: ThermalModel
+    fitted: Mapping[str, Any] | None = field(default=None, compare=False)
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
         """Read a model file; ConfigurationError names file and key."""
         return cls(read_model(Path(path)))
+
+    def save(self, path: Path | str) -> Path:
+        """Write the model file (YAML), whole or not at all; returns its path.
+
+        >>> tc.load_camera("camera.yaml").save("copy.yaml").name
+        'copy.yaml'
+        """
+        write_model(Path(path), self.model)
+        return Path(path)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `thermocald fit --json` writes; of a camera from a file its model alone."""
+        document: dict[str, Any] = jsonable(dict(self.fitted or self._document()))
+        return document
+
+    def lines(self) -> list[str]:
+        """Return what `thermocald fit` prints."""
+        return model_lines(self.fitted or self._document())
+
+    def _document(self) -> dict[str, Any]:
+        written = model_document(self.model)
+        evidence = self.model.evidence.get("fit") or {}
+        return {
+            "format": "thermocald-fit/1",
+            "camera": self.model.camera,
+            "reference_temperature": self.model.T0,
+            **{k: written.get(k) or {} for k in ("interior", "rates", "effects", "validity")},
+            **{k: evidence[k] for k in _TOLD if k in evidence},
+        }
+
+    def plot(self) -> Figure:
+        """Draw c, x0 and y0 of the steady camera against the temperature, µm from those at T0.
+
+        The range is that which the model was fitted on, with a band of one standard deviation.
+        """
+        limits = next(iter(self.model.validity.values()), (self.model.T0 - 15, self.model.T0 + 15))
+        T = np.linspace(*limits, 60)
+        states = [self.at(t) for t in T.tolist()]
+        base = self.at(self.model.T0, extrapolate=True)
+        figure, axes = new_figure(3)
+        for k, axis in enumerate(axes[:, 0]):
+            y = 1e3 * np.array([s.values[k] - base.values[k] for s in states])
+            sd = 1e3 * np.array([np.sqrt(s.covariance[k, k]) for s in states])
+            axis.plot(T, y)
+            axis.fill_between(T, y - sd, y + sd, alpha=0.3)
+            axis.set_ylabel(f"change of {IOP_NAMES[k]} in µm")
+            axis.grid(alpha=0.3)
+        axes[0, 0].set_title(f"{self.model.camera}, from {self.model.T0:g} °C")
+        axes[-1, 0].set_xlabel("temperature in °C")
+        return figure
+
+    def live(self, size: tuple[int, int] | None = None) -> LiveCamera:
+        """Return the camera as it follows a thermometer, reading by reading.
+
+        size: width and height px of the frames; by default the model's. Raises ConfigurationError
+        for a size that is no binning of the model's.
+
+        >>> live = tc.load_camera("camera.yaml").live()
+        >>> now = live.update(0.0, 25.0)
+        >>> now.temperature
+        25.0
+        """
+        return LiveCamera(self if size is None else self.for_images(*size))
 
     def for_images(self, width: int, height: int, camera: str | None = None) -> ThermalCamera:
         """The camera for images of a size px: as it is, or scaled where pixels were binned.
@@ -110,7 +192,35 @@ class ThermalCamera:
         sensor = Sensor(width, height, mine.pixel_pitch * factor)
         # a target is measured to the same share of the image
         sigma = self.model.image_sigma / factor
-        return ThermalCamera(replace(self.model, sensor=sensor, image_sigma=sigma))
+        return replace(self, model=replace(self.model, sensor=sensor, image_sigma=sigma))
+
+    @property
+    def warning(self) -> str:
+        """What its user must know where the model's own fit found that an effect is missing, or
+        did not examine it.
+        """
+        found = self.model.evidence.get("fit") or {}
+        if why := found.get("not_examined"):
+            return (
+                f"not examined whether the model misses an effect ({why}): it left "
+                f"{found['left_over_in_noise']:.1f} times the noise in its own series"
+                + ("; no 95 % band is stated" if self.model.misses_an_effect else "")
+            )
+        if not self.model.misses_an_effect:
+            return ""
+        return (
+            f"the model misses an effect: it left {found['misfit_px']:.3f} px in its own series. "
+            "Standard deviations hold what it left there, not what it leaves elsewhere; thermocald "
+            "discover looks for the effect"
+        )
+
+    @property
+    def thermometer_sd(self) -> float | None:
+        """The noise of a reading K that the fit found; None for a model that no fit has made."""
+        known = [
+            float(f["thermometer_sd_K"]) for f in self.model.fitted_on if "thermometer_sd_K" in f
+        ]
+        return float(np.median(known)) if known else None
 
     @cached_property
     def parameters(self) -> tuple[str, ...]:
@@ -135,15 +245,15 @@ class ThermalCamera:
         temperature_sd: float = 0.0,
         channels: Mapping[str, float] | None = None,
         extrapolate: bool = False,
-    ) -> CameraState:
-        """The camera that has long been at one temperature °C.
+    ) -> Camera:
+        """Return the camera that has long been at one temperature °C.
 
         temperature_sd K: is carried into the covariance; channels: °C of other thermometers, for a
         model that uses them. Warns outside the model's validity; raises UsageError far outside it
         (unless `extrapolate`), and for what looks like fahrenheit.
         """
         T = float(temperature)
-        beyond = self._validity.beyond(T, extrapolate) if self._validity else 0.0
+        beyond = self.validity.beyond(T, extrapolate) if self.validity else 0.0
         plain = channels is None and not self._uses_channels
         values, slope, J = (self._steady if plain else self._with(channels)).at(T)
         covariance = J @ self.covariance @ J.T
@@ -151,7 +261,7 @@ class ThermalCamera:
             covariance += temperature_sd**2 * np.outer(slope, slope)
         if beyond:
             covariance += np.diag((slope * beyond) ** 2)
-        return CameraState(self.model.sensor, T, values, covariance, beyond)
+        return Camera(self.model.sensor, T, values, covariance, beyond, self.model.camera)
 
     def along(
         self,
@@ -162,23 +272,29 @@ class ThermalCamera:
         relative_to: float | None = None,
         temperature_sd: float = 0.0,
     ) -> Along:
-        """The camera along a temperature log.
+        """Return the camera along a temperature log, effects with a memory in force.
 
-        times (R,) s; temperatures (R,) °C of the reference, or {channel: (R,)}, the first is the
-        reference; at (E,): the times asked for, by default `times`. The past begins with the first
-        time. relative_to °C: the covariance is that of the difference to the steady camera at this
-        temperature; temperature_sd K: of a reading, is carried into the covariance.
+        times (R,) s or datetime64; temperatures (R,) °C of the reference, or {channel: (R,)}, the
+        first is the reference; at (E,): the times asked for, by default `times`. The past begins
+        with the first time. relative_to °C: the covariance is that of the difference to the steady
+        camera at this temperature; temperature_sd K: of a reading, is carried into the covariance
+        (as if nothing had a memory, which would average it). Raises UsageError far outside the
+        model's validity (unless `extrapolate`).
+
+        >>> along = tc.load_camera("camera.yaml").along([0.0, 60.0, 120.0], [25.0, 30.0, 35.0])
+        >>> along.values.shape, along.sd.shape
+        ((3, 10), (3, 10))
         """
-        t = np.asarray(times, dtype=float)
+        t = seconds(times)
         columns = temperatures if isinstance(temperatures, dict) else {"temperature": temperatures}
         readings = {str(n): np.asarray(c, dtype=float) for n, c in columns.items()}
-        instants = t if at is None else np.asarray(at, dtype=float)
+        instants = t if at is None else seconds(at)
         begin = float(min(t[0], instants[0]))
         reference = next(iter(readings))
         history = History(instants - begin, t - begin, readings, reference, self.model.T0)
         outside = np.zeros(len(instants))
-        if self._validity is not None:
-            outside = self._validity.outside(history.temperature(), extrapolate)
+        if self.validity is not None:
+            outside = self.validity.outside(history.temperature(), extrapolate)
         values, covariance = [], []
         steady = None if relative_to is None else self._steady.at(relative_to)[2]
         for first in range(0, len(instants), _CHUNK):
@@ -186,7 +302,8 @@ class ThermalCamera:
             found, matrix = self._propagated(part, outside[first : first + _CHUNK], steady)
             if temperature_sd:
                 rates = self.model.rate_vector
-                matrix += temperature_sd**2 * np.outer(rates, rates)
+                share = _noise_share(t - begin, part.times) * temperature_sd**2
+                matrix += share[:, None, None] * np.outer(rates, rates)
             values.append(found)
             covariance.append(matrix)
         return Along(
@@ -236,13 +353,14 @@ class ThermalCamera:
         return np.asarray((sides[0] - sides[1]) / (2.0 * step))
 
     @cached_property
-    def _validity(self) -> Validity | None:
+    def validity(self) -> Validity | None:
+        """The temperatures that the model was fitted on, None where it does not say."""
         limits = next(iter(self.model.validity.values()), None)
         return None if limits is None else Validity(*limits)
 
     @cached_property
     def _uses_channels(self) -> bool:
-        return any("channel" in effects.get(e.name).nonlinear for e in self.model.effects)
+        return any("channel" in catalogue.get(e.name).nonlinear for e in self.model.effects)
 
     @cached_property
     def _steady(self) -> SteadyCamera:
@@ -265,3 +383,24 @@ class ThermalCamera:
         ten parameters.
         """
         return tuple((knee, *rate.tolist()) for knee, rate, _, _ in self._steady.knees)
+
+
+def _noise_share(times: Array, at: Array) -> Array:
+    """Variance (E,) of what is interpolated between readings at times (R,), in that of one."""
+    if len(times) < 2:
+        return np.ones(len(at))
+    after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
+    step = np.maximum(times[after] - times[after - 1], 1e-9)
+    share = np.clip((at - times[after - 1]) / step, 0.0, 1.0)
+    return share**2 + (1.0 - share) ** 2
+
+
+def load_camera(path: Path | str) -> ThermalCamera:
+    """Load a thermal camera from the model file that `fit` wrote.
+
+    Raises ConfigurationError naming file and key.
+
+    >>> tc.load_camera("camera.yaml").at(35.0).temperature
+    35.0
+    """
+    return ThermalCamera.load(Path(path).expanduser())

@@ -21,21 +21,20 @@ from thermocald.analysis.thermal.displacement import moved_targets
 from thermocald.analysis.thermal.result import FittedModel, fitted_model
 from thermocald.analysis.thermal.terms import term_of, without_chance_events
 from thermocald.errors import DataError
-from thermocald.reduction.blocks import in_blocks
-from thermocald.reduction.calibrated import calibrated_thermometers
-from thermocald.reduction.curvature import curved
-from thermocald.reduction.fit import HypothesisFitter
-from thermocald.reduction.noise import noisier, with_correlated_noise
-from thermocald.reduction.noise_growth import noise_slope
-from thermocald.reduction.reduce import reweighted, without_targets
-from thermocald.simulation import effects
+from thermocald.physics import catalogue
+from thermocald.thermal.fit import HypothesisFitter
+from thermocald.thermal.movement import add_jumps_to_noise
+from thermocald.thermal.noise import calibrate_thermometers, estimate_noise_slope, weight_slow_noise
+from thermocald.thermal.reduce import reweight, without_targets
+from thermocald.thermal.scan import remove_curvature
+from thermocald.thermal.series import in_blocks
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from thermocald.reduction.hypothesis import Fit
-    from thermocald.reduction.series import ReducedSeries
-    from thermocald.simulation.model import ModelEffect
+    from thermocald.physics.model import ModelEffect
+    from thermocald.thermal.hypothesis import Fit
+    from thermocald.thermal.series import ReducedSeries
 
 __all__ = ["fit_thermal_model", "targets_of"]
 
@@ -67,9 +66,9 @@ def fit_thermal_model(
     rows = [index[t] for t in targets_of(listed) if t in index]
     others = [without_targets(s, np.array(rows)) for s in checked] if rows else checked
     growth = None
-    if any(effects.get(e.name).seen_in == "noise" for e in listed):
-        growth = noise_slope(others)
-        others = [reweighted(s, n) for s, n in zip(others, growth.noise, strict=True)]
+    if any(catalogue.get(e.name).seen_in == "noise" for e in listed):
+        growth = estimate_noise_slope(others)
+        others = [reweight(s, n) for s, n in zip(others, growth.noise, strict=True)]
     fitter, fit = _fitted(others, listed, search, frozenset(fixed), dict(priors or {}))
     moved = [moved_targets(s, np.array(rows)) for s in others] if rows else []
     return fitted_model(fitter, fit, others, listed, growth, moved)
@@ -92,18 +91,18 @@ def _fitted(
     priors: dict[str, tuple[float, float]],
 ) -> tuple[HypothesisFitter, Fit]:
     """The hypothesis of all effects that act on trajectories, fitted."""
-    ready = [in_blocks(with_correlated_noise(s)) for s in calibrated_thermometers(series)]
+    ready = [in_blocks(weight_slow_noise(s)) for s in calibrate_thermometers(series)]
     fitter = HypothesisFitter(ready)
     fitter.held, fitter.priors = held, priors
     fit = fitter.fit(())
     for effect in listed:
-        if effects.get(effect.name).seen_in == "trajectory":
+        if catalogue.get(effect.name).seen_in == "trajectory":
             fit = fitter.fit((*fit.terms, term_of(fitter, fit, effect, search)))
     fit = fitter.refine(fit, max_iterations=20)
     terms = without_chance_events(fitter, fit)
     if terms != fit.terms:
         fit = fitter.refine(fitter.fit(terms), max_iterations=20)
-    for again in (curved, noisier):
+    for again in (remove_curvature, add_jumps_to_noise):
         better = again(fitter, fit)
         if better is not None:
             fitter = HypothesisFitter(better)
@@ -144,7 +143,7 @@ def _checked(
         )
     moved = targets_of(listed)
     for e in listed:
-        if effects.get(e.name).seen_in == "targets" and not any(
+        if catalogue.get(e.name).seen_in == "targets" and not any(
             t in first.field.index for t in moved
         ):
             raise DataError(

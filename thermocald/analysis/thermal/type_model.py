@@ -21,15 +21,15 @@ from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, InteriorOrientation
 from thermocald.photogrammetry.linalg import scaled_inverse
-from thermocald.simulation import effects
-from thermocald.simulation.model import RATED, ModelEffect, ThermalModel
+from thermocald.physics import catalogue
+from thermocald.physics.model import RATED, ModelEffect, ThermalModel
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from thermocald.analysis.thermal.result import FittedModel
     from thermocald.arrays import Array
-    from thermocald.reduction.series import ReducedSeries
+    from thermocald.thermal.series import ReducedSeries
 
 __all__ = [
     "fit_with_type",
@@ -53,7 +53,7 @@ def type_model(models: Sequence[ThermalModel], name: str) -> ThermalModel:
         raise DataError("a type model needs at least two cameras")
     # what happened to one camera at one time is nothing of the type
     models = [
-        replace(m, effects=tuple(e for e in m.effects if not effects.get(e.name).is_event))
+        replace(m, effects=tuple(e for e in m.effects if not catalogue.get(e.name).is_event))
         for m in models
     ]
     first = models[0]
@@ -112,12 +112,12 @@ def fit_with_type(series: Sequence[ReducedSeries], kind: ThermalModel) -> Fitted
         f"{e.name}.{key}": (float(value), float(sd[e.name][key]))
         for e in kind.effects
         for key, value in e.values.items()
-        if key in effects.get(e.name).nonlinear and sd[e.name].get(key, 0.0) > 0
+        if key in catalogue.get(e.name).nonlinear and sd[e.name].get(key, 0.0) > 0
     }
     fixed = [
         f"{e.name}.{key}"
         for e in kind.effects
-        for key in effects.get(e.name).nonlinear
+        for key in catalogue.get(e.name).nonlinear
         if f"{e.name}.{key}" not in priors
     ]
     fitted = fit_thermal_model(series, kind.effects, kind.T0, False, fixed, priors)

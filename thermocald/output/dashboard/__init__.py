@@ -49,7 +49,7 @@ def serve(
         ) from error
     with bind(host, port) as listening:
         application = build_application(store, live, token, host, names)
-        log.warning("the page is at http://%s:%d/", f"[{host}]" if ":" in host else host, port)
+        log.info("the page is at http://%s:%d/", f"[{host}]" if ":" in host else host, port)
         run_server(application, listening)
 
 

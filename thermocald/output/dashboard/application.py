@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import gzip
+import hashlib
 import hmac
 import io
 import json
@@ -81,6 +82,7 @@ def build_application(
         exception_handlers={ThermocaldError: _refuse},
     )
     application.state.view = View(store, live)
+    application.state.ends = lambda: False  # whether the server is about to end
     return application
 
 
@@ -139,17 +141,25 @@ class _Guard:
         assert self._token is not None
         asked = request.query_params.get("token")
         if asked is not None and _same(asked, self._token):
-            moved = RedirectResponse(request.url.path, 303)
-            moved.set_cookie(_COOKIE, self._token, httponly=True, samesite="strict")
+            moved = RedirectResponse("/" + request.url.path.lstrip("/"), 303)  # //host is another
+            moved.set_cookie(_COOKIE, _digest(self._token), httponly=True, samesite="strict")
             return moved
-        bearer = request.headers.get("authorization", "").removeprefix("Bearer ")
-        if _same(bearer, self._token) or _same(request.cookies.get(_COOKIE, ""), self._token):
+        scheme, _, bearer = request.headers.get("authorization", "").partition(" ")
+        bearer = bearer.strip().encode("latin-1").decode(errors="replace")
+        if scheme.lower() == "bearer" and _same(bearer, self._token):
+            return None
+        if _same(request.cookies.get(_COOKIE, ""), _digest(self._token)):
             return None
         return JSONResponse({"error": "a token is needed"}, 401, {"www-authenticate": "Bearer"})
 
 
 def _same(a: str, b: str) -> bool:
-    return hmac.compare_digest(a.encode(), b.encode())
+    return hmac.compare_digest(a.encode(errors="replace"), b.encode(errors="replace"))
+
+
+def _digest(token: str) -> str:
+    """What the cookie holds: a header cannot hold every token, and nobody need read it there."""
+    return hashlib.sha256(token.encode(errors="replace")).hexdigest()
 
 
 def _refuse(_: Request, error: Exception) -> Response:
@@ -193,25 +203,28 @@ def _plotly(_: Request) -> Response:
 
 
 def _status(request: Request) -> Response:
-    return JSONResponse(_view(request).status())
+    return JSONResponse(_view(request).shown())
 
 
 async def _stream(request: Request) -> Response:
     view = _view(request)
 
     async def events() -> AsyncIterator[str]:
-        seen, silent = -1.0, 0
-        while not await request.is_disconnected():
+        seen, silent, ends = -1.0, 0, False
+        while not (ends or await request.is_disconnected()):
+            # once more when the server ends, which is how the page hears that the daemon has
+            ends = request.app.state.ends()
             changed = view.changed()
             silent += 1
             if changed != seen:
                 seen, silent = changed, 0
-                document = await asyncio.to_thread(view.status)
+                document = await asyncio.to_thread(view.shown)
                 yield f"data: {json.dumps(document)}\n\n"
             elif silent >= _ALIVE_EVERY:
                 silent = 0
                 yield ": still here\n\n"
-            await asyncio.sleep(_STREAM_EVERY_S)
+            if not ends:
+                await asyncio.sleep(_STREAM_EVERY_S)
 
     return StreamingResponse(events(), media_type="text/event-stream")
 

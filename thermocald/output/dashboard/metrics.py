@@ -19,7 +19,6 @@ _CAMERA = {
     "lost": "Ticks in which the camera gave no frame.",
     "waiting": "Epochs on their way to the store.",
     "deferred": "Epochs whose calibration was deferred.",
-    "put_off": "The same as deferred: its name until the next version.",
     "caught_up": "Epochs that were calibrated later.",
     "stored": "Epochs stored by this process.",
 }
@@ -56,6 +55,7 @@ class _StatusCollector:
         store = status["store"]
         yield _single("store_ok", "Whether the store takes everything.", store["state"] == "ok")
         yield _single("store_waiting", "Epochs waiting in memory.", store["waiting"])
+        yield _single("store_lost", "Epochs taken and not kept.", store["lost"])
         yield _single("clock_trusted", "Whether UTC is known.", status["clock"]["trusted"])
         up = GaugeMetricFamily("thermocald_device_up", "Open and working.", labels=["kind", "name"])
         for kind in ("cameras", "thermometers", "outputs"):

@@ -22,6 +22,7 @@ from thermocald.errors import ConfigurationError, ThermocaldError
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    from starlette.applications import Starlette
     from starlette.types import ASGIApp, Receive, Scope, Send
 
 __all__ = ["Limits", "bind", "run_server"]
@@ -31,6 +32,7 @@ log = logging.getLogger(__name__)
 _CONNECTIONS = 100
 _LOOK_EVERY_S = 2.0
 _REQUEST_S = 10.0  # for a request's head to arrive
+_END_S = 1.0  # for answers to come to their end
 _STUCK_S = 20.0  # for a client to take up 64 kB
 _SEND_BUFFER_BYTES = 131_072  # what the kernel holds of an answer, else up to 4 MB a connection
 # path → (requests served at once, requests that may wait for that)
@@ -63,8 +65,8 @@ def bind(host: str, port: int) -> socket.socket:
     return listening
 
 
-def run_server(application: ASGIApp, listening: socket.socket) -> None:
-    """Serve until ended by a signal."""
+def run_server(application: Starlette, listening: socket.socket) -> None:
+    """Serve until ended by a signal; what is being answered has a second to come to its end."""
     config = uvicorn.Config(
         application,
         http=_Connection,
@@ -75,9 +77,27 @@ def run_server(application: ASGIApp, listening: socket.socket) -> None:
         server_header=False,
         backlog=64,
         limit_concurrency=_CONNECTIONS,
-        timeout_graceful_shutdown=1,
+        timeout_graceful_shutdown=2,
     )
-    uvicorn.Server(config).run(sockets=[listening])
+    server = _Server(config)
+    application.state.ends = lambda: server.should_exit
+    server.run(sockets=[listening])
+
+
+class _Server(uvicorn.Server):
+    """Hangs up on whoever still has not taken up an answer, rather than cancel it half-way.
+
+    A request that is cancelled is a traceback in the journal.
+    """
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        hang_up = asyncio.get_running_loop().call_later(_END_S, self._hang_up)
+        await super().shutdown(sockets)
+        hang_up.cancel()
+
+    def _hang_up(self) -> None:
+        for connection in list(self.server_state.connections):
+            connection.transport.abort()
 
 
 class _Connection(H11Protocol):

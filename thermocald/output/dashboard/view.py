@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.errors import DataError, StoreError
+from thermocald.errors import DataError, StoreError, ThermocaldError
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.store.database.store import Store
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from thermocald.store.database.row import StoredSeries
+    from thermocald.store.series import StoredSeries
 
 __all__ = ["View"]
 
@@ -28,6 +28,7 @@ _SHOWN = ("c", "x0", "y0")
 _MOST_POINTS = 2000
 _ROWS_AT_ONCE = 500
 _OLD_S = 30.0
+_LOST_S = 3600.0  # for so long after an epoch was lost the daemon is not well
 
 
 class View:
@@ -49,6 +50,17 @@ class View:
             return {}
         return {**document, "age_s": max(0.0, age_s)}
 
+    def shown(self) -> dict[str, Any]:
+        """The status; without a daemon only `stopped`, when the last one ended, where known."""
+        if status := self.status():
+            return status
+        try:
+            with Store.open(self._store) as store:
+                ends = [e.utc for e in store.events() if e.kind == "stopped"]
+        except ThermocaldError:
+            return {}
+        return {"stopped": ends[-1]} if ends else {}
+
     def healthy(self) -> tuple[bool, str]:
         """(whether the daemon runs and nothing hangs, why not)."""
         status = self.status()
@@ -60,6 +72,9 @@ class View:
             return False, "; ".join(status["stalled"])
         if status.get("store", {}).get("state") == "out":
             return False, "the store cannot be written"
+        ago = status.get("store", {}).get("lost_s_ago")
+        if ago is not None and ago < _LOST_S:
+            return False, "an epoch was lost: " + status["store"]["lost_why"]
         return True, ""
 
     def changed(self) -> float:
@@ -122,8 +137,6 @@ class View:
                 column = store.series_columns(found, [name])[name][: len(times)]
                 averaged[name] = _means(column, bins)
         return {
-            "camera": camera,
-            "series": series,
             "epochs": len(rows),
             "per_point": int(max((len(b) for b in bins), default=0)),
             "channels": channels,
@@ -144,13 +157,10 @@ class View:
         with Store.open(self._store) as store:
             found = store.find_series(camera, series)
             names = _csv_names(found)
-            yield ",".join(names) + "\n"
+            yield _line(names)
             for page in store.column_pages(found, names, _ROWS_AT_ONCE):
-                text = io.StringIO()
-                writer = csv.writer(text, lineterminator="\n")
                 columns = [page[name].tolist() for name in names]
-                writer.writerows(list(map(_cell, row)) for row in zip(*columns, strict=True))
-                yield text.getvalue()
+                yield "".join(_line(map(_cell, row)) for row in zip(*columns, strict=True))
 
     def require(self, camera: str, series: str) -> None:
         """Raise StoreError if there is no such series."""
@@ -174,6 +184,12 @@ def _csv_names(series: StoredSeries) -> list[str]:
         "epoch", "frame_time", "temperature_time", *series.head.channels, *PARAMETER_NAMES,
         *(f"sd_{n}" for n in PARAMETER_NAMES), "sigma0", "n_observations", "n_rejected", "status",
     ]  # fmt: skip
+
+
+def _line(cells: Iterable[Any]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerow(cells)
+    return text.getvalue()
 
 
 def _cell(value: Any) -> Any:

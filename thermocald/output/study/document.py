@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from thermocald.output.study.summary import rate_in_px_and_mm
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
+from thermocald.result import jsonable
 
 if TYPE_CHECKING:
+    from thermocald.analysis.statistics.dependence import Dependence
     from thermocald.analysis.study.series_study import ChannelStudy, SeriesStudy, Significance
     from thermocald.analysis.study.study import CameraStudy, Study
 
@@ -21,30 +23,17 @@ FORMAT = "thermocald-study/1"
 def study_document(study: Study) -> dict[str, Any]:
     """Everything the study computed; null where something could not be, `notes` says why."""
     s = study.settings
-    document: dict[str, Any] = _finite(
+    document: dict[str, Any] = jsonable(
         {
             "format": FORMAT,
-            "settings": {
-                "window": s.window,
-                "alpha": s.alpha,
-                "sets": s.sets,
-                "seed": s.seed,
-                "distance_mm": s.distance_mm,
-                "grid": s.grid,
-                "raster": s.grid,  # its name until the next version
-                "clusters_mm": list(s.clusters_mm),
-                "focus_mm": s.focus_mm,
-                "f_number": s.f_number,
-                "confusion_mm": s.confusion_mm,
-                "thermometer_sd": s.thermometer_sd,
-            },
-            "cameras": [_camera(camera) for camera in study.cameras],
+            "settings": {k: v for k, v in jsonable(s).items() if k != "jobs"},
+            "cameras": [_camera(camera, s.distance_mm) for camera in study.cameras],
         }
     )
     return document
 
 
-def _camera(camera: CameraStudy) -> dict[str, Any]:
+def _camera(camera: CameraStudy, distance_mm: float) -> dict[str, Any]:
     correlations = None
     if camera.correlations is not None:
         correlations = {
@@ -56,7 +45,7 @@ def _camera(camera: CameraStudy) -> dict[str, Any]:
         }
     return {
         "label": camera.label,
-        "series": [_series(one) for one in camera.series],
+        "series": [_series(one, distance_mm) for one in camera.series],
         "interior_orientation": dict(zip(IOP_NAMES, camera.iop.tolist(), strict=True)),
         "sd_over_time": dict(zip(IOP_NAMES, camera.sds.tolist(), strict=True)),
         "iop_correlations": correlations,
@@ -79,7 +68,7 @@ def _camera(camera: CameraStudy) -> dict[str, Any]:
     }
 
 
-def _series(study: SeriesStudy) -> dict[str, Any]:
+def _series(study: SeriesStudy, distance_mm: float) -> dict[str, Any]:
     s = study.series
     focus = study.focus
     return {
@@ -95,18 +84,7 @@ def _series(study: SeriesStudy) -> dict[str, Any]:
         "field_movements": [m.as_json() for m in s.field_movements],
         "exterior": s.exterior,
         "free": list(s.free),
-        "deviations": {
-            name: {
-                "first": d.first,
-                "last": d.last,
-                "change": d.change,
-                "sd_change": d.sd_change,
-                "largest": d.largest,
-                "range": d.range,
-                "sd_over_time": d.sd_over_time,
-            }
-            for name, d in study.deviations.items()
-        },
+        "deviations": {name: jsonable(d) for name, d in study.deviations.items()},
         "depth_of_field": None
         if focus is None
         else {
@@ -123,7 +101,8 @@ def _series(study: SeriesStudy) -> dict[str, Any]:
         else {"points": study.grid.tolist(), "displacement": study.displacement.tolist()},
         "significance": {name: _significance(t) for name, t in study.significance.items()},
         "temperature_dependence": {
-            channel.thermometer.name: _channel(channel) for channel in study.channels
+            channel.thermometer.name: _channel(study, channel, distance_mm)
+            for channel in study.channels
         },
         "correlation_matrix": {"columns": list(study.columns), "r": study.matrix.tolist()},
         "notes": list(study.notes),
@@ -154,7 +133,7 @@ def _significance(test: Significance) -> dict[str, Any]:
     }
 
 
-def _channel(channel: ChannelStudy) -> dict[str, Any]:
+def _channel(study: SeriesStudy, channel: ChannelStudy, distance_mm: float) -> dict[str, Any]:
     return {
         "sd_thermometer": channel.thermometer.sd,
         "reason": channel.reason or None,
@@ -170,12 +149,26 @@ def _channel(channel: ChannelStudy) -> dict[str, Any]:
                 "p_holm": channel.p_holm[name],
                 "slope": d.slope,
                 "sd_slope": d.sd_slope,
+                **_rate_seen(study, name, d, distance_mm),
                 "too_short": d.too_short,
                 "scatter_over_noise": d.misfit,
             }
             for name, d in channel.dependences.items()
         },
     }
+
+
+def _rate_seen(
+    study: SeriesStudy, name: str, d: Dependence, distance_mm: float
+) -> dict[str, float]:
+    """A rate of c, x0 or y0 in px/K, and in mm/K on the object plane."""
+    if name not in ("c", "x0", "y0"):
+        return {}
+    (px, mm), (sd_px, sd_mm) = (
+        rate_in_px_and_mm(study, name, rate, distance_mm) for rate in (d.slope, d.sd_slope)
+    )
+    seen = {"slope_px": px, "sd_slope_px": sd_px}
+    return {**seen, "slope_on_plane_mm": mm, "sd_slope_on_plane_mm": sd_mm}
 
 
 def _object_space(camera: CameraStudy) -> dict[str, Any] | None:
@@ -188,7 +181,6 @@ def _object_space(camera: CameraStudy) -> dict[str, Any] | None:
         "distance_mm": mc.distance_mm,
         "clusters_mm": list(mc.clusters_mm),
         "fractions": mc.fractions.tolist(),
-        "shares": mc.fractions.tolist(),  # its name until the next version
         "mean_mm": mc.overall_mean,
         "mean_of_maxima_mm": mc.mean_largest,
         "folded_sets": mc.folded,
@@ -211,19 +203,7 @@ def _object_space(camera: CameraStudy) -> dict[str, Any] | None:
         ],
         "first_order": {
             "fractions": first.fractions.tolist(),
-            "shares": first.fractions.tolist(),  # its name until the next version
             "mean_mm": float(first.mean.mean()),
             "mean_of_maxima_mm": float(first.expected_largest.mean()),
         },
     }
-
-
-def _finite(value: Any) -> Any:
-    """The same with null for NaN and infinity, which JSON does not have."""
-    if isinstance(value, dict):
-        return {key: _finite(v) for key, v in value.items()}
-    if isinstance(value, list):
-        return [_finite(v) for v in value]
-    if isinstance(value, float | np.floating):
-        return float(value) if math.isfinite(value) else None
-    return value

@@ -10,26 +10,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.output.figures.numbers import UNITS, parameter_label, plain, superscript
-from thermocald.output.figures.panels import PALETTE, Curve, Figure, Panel, thin
+from thermocald.figures import BAND, PALETTE, Arrows, Curve, Figure, Panel, thin
+from thermocald.numbers import UNITS, parameter_label, percent, plain, superscript
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from thermocald.analysis.study.series_study import SeriesStudy
     from thermocald.analysis.study.study import CameraStudy
+    from thermocald.arrays import Array
 
-__all__ = [
-    "deviation_figure",
-    "extent",
-    "free_parameters",
-    "movement_figure",
-    "principal_point_figure",
-    "scaled",
-    "significance_figure",
-]
-
-_BAND = 1.96
 _DECADES = 30.0
-_ARROW_SHARE = 0.12  # of the image width, for the longest arrow
+_DRAWN = 400  # errors of a cloud
 
 
 def deviation_figure(camera: CameraStudy) -> Figure:
@@ -63,10 +56,10 @@ def _time_panel(camera: CameraStudy, title: str, unit: str, k: int) -> Panel:
     curves = []
     for i, study in enumerate(camera.series):
         s = study.series
-        value, band = scale * (s.values[:, k] - s.values[0, k]), scale * _BAND * s.sds[:, k]
+        value, band = scale * (s.values[:, k] - s.values[0, k]), scale * BAND * s.sds[:, k]
         t, value, band = thin(s.time_s / 60, value, band)
         curves.append(Curve(s.name, t, value, "band", PALETTE[i % 7], value - band, value + band))
-    return Panel(f"Δ{title}", "time in min", f"Δ{title}{label}", tuple(curves))
+    return Panel(f"Δ{title}", "time in min", f"Δ{title}{label or ' (no unit)'}", tuple(curves))
 
 
 def extent(camera: CameraStudy, k: int) -> float:
@@ -90,26 +83,24 @@ def _sigma0_panel(camera: CameraStudy) -> Panel:
         s = study.series
         t, ratio = thin(s.time_s / 60, s.sigma0 / s.sigma0[0])
         curves.append(Curve(s.name, t, ratio, "line", PALETTE[i % 7]))
-    return Panel("σ₀ / first σ₀", "time in min", "ratio", tuple(curves))
+    return Panel("σ₀ / first σ₀", "time in min", "ratio (no unit)", tuple(curves))
 
 
 def _temperature_panels(camera: CameraStudy) -> list[Panel]:
-    names = dict.fromkeys(t.name for study in camera.series for t in study.series.thermometers)
-    panels = []
-    for name in names:
-        curves = []
-        for i, study in enumerate(camera.series):
-            for t in study.series.thermometers:
-                if t.name == name:
-                    time_min, values = thin(study.series.time_s / 60, t.values)
-                    curves.append(
-                        Curve(study.series.name, time_min, values, "line", PALETTE[i % 7])
-                    )
-        panels.append(Panel(parameter_label(name), "time in min", "°C", tuple(curves)))
-    return panels
+    by_name: dict[str, list[Curve]] = {}
+    for i, study in enumerate(camera.series):
+        for t in study.series.thermometers:
+            if np.isfinite(t.values).any():
+                time_min, values = thin(study.series.time_s / 60, t.values)
+                curve = Curve(study.series.name, time_min, values, "line", PALETTE[i % 7])
+                by_name.setdefault(t.name, []).append(curve)
+    return [
+        Panel(parameter_label(name), "time in min", "temperature in °C", tuple(curves))
+        for name, curves in by_name.items()
+    ]
 
 
-def principal_point_figure(camera: CameraStudy) -> Figure | None:
+def principal_point_figure(camera: CameraStudy, name: str = "principal-point") -> Figure | None:
     """The path of the principal point on the sensor (the reference's Figures 4 and 6)."""
     if not {"x0", "y0"} <= set(free_parameters(camera)):
         return None
@@ -133,7 +124,7 @@ def principal_point_figure(camera: CameraStudy) -> Figure | None:
         equal=True,
     )
     return Figure(
-        "principal-point",
+        name,
         "Principal point",
         f"Where the principal point has gone from its first position (black dot). "
         f"{'; '.join(words)}.",
@@ -143,39 +134,28 @@ def principal_point_figure(camera: CameraStudy) -> Figure | None:
 
 def movement_figure(camera: CameraStudy) -> Figure | None:
     """Directional zoom: how the image of a still scene moves (Figures 4 and 6)."""
-    panels, words = [], []
-    for study in camera.series:
-        if study.displacement is None:
-            continue
-        longest = float(np.max(np.linalg.norm(study.displacement, axis=1)))
-        if longest == 0:
-            continue
-        width = study.series.sensor.width
-        factor = _round_factor(_ARROW_SHARE * width / longest)
-        start, end = study.grid, study.grid + factor * study.displacement
-        height = study.series.sensor.height
-        curves = [
-            Curve("", np.array([a[0], b[0]]), height - np.array([a[1], b[1]]), "line", PALETTE[1])
-            for a, b in zip(start, end, strict=True)
-        ]
-        curves.append(Curve("first epoch", start[:, 0], height - start[:, 1], "points", "#000000"))
-        panels.append(
-            Panel(
-                f"{study.series.name}, {factor:g} times enlarged",
-                "px",
-                "px",
-                tuple(curves),
-                equal=True,
-            )
-        )
-        words.append(f"{plain(longest, 'px', 3)} in {study.series.name}")
-    if not panels:
+    moved = [
+        (study.series, study.grid, study.displacement)
+        for study in camera.series
+        if study.displacement is not None and np.any(study.displacement)
+    ]
+    if not moved:
         return None
+    lengths = [float(np.max(np.linalg.norm(vectors, axis=1))) for *_, vectors in moved]
+    panels = []
+    for i, (series, grid, vectors) in enumerate(moved):
+        frame = (series.sensor.width, series.sensor.height)
+        arrows = Arrows(grid, vectors, frame, PALETTE[i % 7], max(lengths))
+        panels.append(Panel(series.name, "x in px", "y in px, down", (), arrows=arrows))
+    words = [
+        f"{plain(length, 'px', 3)} in {series.name}"
+        for length, (series, *_) in zip(lengths, moved, strict=True)
+    ]
     return Figure(
         "movement",
         "Movement of the image",
         "How points of a scene that stands still move in the image from the first to the last "
-        "epoch, because the interior orientation changes (dots: first position). The largest "
+        "epoch, because the interior orientation changes. The largest "
         f"movement is {' and '.join(words)}. Equal arrows are a shift of the principal point; "
         "arrows that point outwards are a longer principal distance.",
         tuple(panels),
@@ -208,7 +188,7 @@ def significance_figure(camera: CameraStudy) -> Figure | None:
                 Panel(
                     parameter_label(name),
                     "time in min",
-                    "variance ratio",
+                    "variance ratio (no unit)",
                     tuple(curves),
                     log_y=_spans_decades(curves),
                     horizontal=((critical, "limit"),),
@@ -264,12 +244,184 @@ def _direction(x: float, y: float) -> str:
     return f"{plain(length, 'px', 3)} to the {words}"
 
 
-def _round_factor(factor: float) -> float:
-    """The next lower 1, 2, 5 times a power of ten."""
-    power = 10.0 ** np.floor(np.log10(factor))
-    return float(max(m for m in (1.0, 2.0, 5.0) if m * power <= factor) * power)
-
-
 def free_parameters(camera: CameraStudy) -> list[str]:
     """IOP that are free in any series."""
     return [n for n in IOP_NAMES if any(n in study.series.free for study in camera.series)]
+
+
+def dependence_figure(
+    camera: CameraStudy, name: str = "temperature-dependence", only: Sequence[str] = ()
+) -> Figure | None:
+    """Parameters over the reference temperature with the fitted lines (Figure 7).
+
+    name: of the figure; only: parameters to show, by default all.
+    """
+    figure_name = name
+    panels, words = [], []
+    for name in only or [*free_parameters(camera), "sigma0"]:
+        curves = []
+        scale, label = 1.0, ""
+        if name != "sigma0":
+            scale, label = scaled(UNITS[name], extent(camera, IOP_NAMES.index(name)))
+        for i, study in enumerate(camera.series):
+            if not study.channels or name not in study.channels[0].dependences:
+                continue
+            curves += _dependence_curves(study, name, scale, PALETTE[i % 7])
+        if curves:
+            reference = camera.series[0].channels[0].thermometer.name
+            delta = "" if name == "sigma0" else "Δ"
+            panels.append(
+                Panel(
+                    parameter_label(name),
+                    f"{parameter_label(reference)} in °C",
+                    f"{delta}{parameter_label(name)}{label or ' (no unit)'}",
+                    tuple(curves),
+                )
+            )
+            r = [
+                s.channels[0].dependences[name].r
+                for s in camera.series
+                if s.channels and name in s.channels[0].dependences
+            ]
+            if min(abs(v) for v in r) >= 0.9:
+                words.append(parameter_label(name))
+    if not panels:
+        return None
+    follow = (
+        f" {', '.join(words)} follow{'s' if len(words) == 1 else ''} it closely (|r| ≥ 0.9)."
+        if words
+        else " No parameter follows it closely (|r| ≥ 0.9)."
+    )
+    return Figure(
+        figure_name,
+        "Dependence on the temperature",
+        "Each parameter against the reference temperature, with the straight line that counts the "
+        "noise of both." + follow,
+        tuple(panels),
+    )
+
+
+def _dependence_curves(study: SeriesStudy, name: str, scale: float, colour: str) -> list[Curve]:
+    s = study.series
+    temperature = s.thermometers[0].values
+    if name == "sigma0":
+        value = s.sigma0
+    else:
+        column = s.values[:, IOP_NAMES.index(name)]
+        value = scale * (column - column[0])
+    rows = np.flatnonzero(np.isfinite(temperature))
+    t, v = temperature[rows], value[rows]
+    ends = np.array([t.min(), t.max()])
+    slope = scale * study.channels[0].dependences[name].slope
+    shown = np.unique(np.linspace(0, len(t) - 1, min(len(t), 400)).astype(int))
+    return [
+        Curve(s.name, t[shown], v[shown], "points", colour),
+        Curve("", ends, v.mean() + slope * (ends - t.mean()), "line", colour),
+    ]
+
+
+def error_figure(camera: CameraStudy) -> Figure | None:
+    """Error clouds on the object plane, one panel per grid point (Figures 10 and 11)."""
+    mc, first = camera.montecarlo, camera.first_order
+    if mc is None or first is None:
+        return None
+    limits = mc.clusters_mm
+    colours = ("#1b7837", "#7fbf7b", "#e6a800", "#d6278a", "#7b3294", "#000000")
+    size = round(np.sqrt(len(mc.image_points)))
+    panels = []
+    for k in range(len(mc.image_points)):
+        errors = mc.sample[:_DRAWN, k]
+        distance = np.linalg.norm(errors, axis=1)
+        cluster = np.searchsorted(limits, distance, side="right")
+        curves = [
+            Curve(
+                _cluster_name(limits, j),
+                errors[cluster == j, 0] / 10,
+                errors[cluster == j, 1] / 10,
+                "points",
+                colours[min(j, 5)],
+            )
+            for j in range(len(limits) + 1)
+            if np.any(cluster == j)
+        ]
+        x, y = _ellipse(mc.covariance[k], mc.mean_error[k])
+        curves.append(Curve("95 %, simulated", x / 10, y / 10, "line", "#000000"))
+        x, y = _ellipse(first.covariance[k], np.zeros(2))
+        curves.append(Curve("95 %, first order", x / 10, y / 10, "line", "#d55e00", dashed=True))
+        panels.append(Panel(_place(k, size), "ΔX in cm", "ΔY in cm", tuple(curves), equal=True))
+    worst = int(np.argmax(mc.largest))
+    return Figure(
+        "object-space-errors",
+        f"Errors on a plane at {mc.distance_mm / 1000:g} m",
+        f"Where {mc.sets:,} drawn interior orientations put each image point on a plane at "
+        f"{mc.distance_mm / 1000:g} m, relative to where it belongs ({min(_DRAWN, mc.sets)} are "
+        f"drawn). {percent(float(mc.fractions[0]))} of all errors are below {limits[0] / 10:g} cm, "
+        f"the mean is {mc.overall_mean / 10:.2f} cm; the largest, {mc.largest[worst] / 10:.1f} cm, "
+        f"arises at the {_place(worst, size)}.",
+        tuple(panels),
+        columns=size,
+    )
+
+
+def point_figure(camera: CameraStudy) -> Figure | None:
+    """Mean and largest error of each grid point, and the mean of the largest (Figure 11)."""
+    mc, first = camera.montecarlo, camera.first_order
+    if mc is None or first is None:
+        return None
+    number = np.arange(1.0, len(mc.image_points) + 1)
+    panel = Panel(
+        "Mean and largest error",
+        "image point from top left (number)",
+        "error in cm",
+        (
+            Curve("largest", number, mc.largest / 10, "line", "#7fbf7b"),
+            Curve("mean", number, mc.mean / 10, "line", "#1b7837"),
+            Curve(
+                "largest, first order",
+                number,
+                first.expected_largest / 10,
+                "line",
+                "#d55e00",
+                dashed=True,
+            ),
+            Curve("mean, first order", number, first.mean / 10, "line", "#000000", dashed=True),
+        ),
+        horizontal=((mc.mean_largest / 10, "mean of the largest"),),
+    )
+    k = int(np.argmin(mc.largest))
+    return Figure(
+        "errors-by-point",
+        "Errors by image point",
+        f"Mean and largest error of each image point, and the mean of the largest, "
+        f"{mc.mean_largest / 10:.1f} cm. The largest error is least at the "
+        f"{_place(k, round(np.sqrt(len(number))))}. A "
+        "shifting principal point moves all points alike, a changing principal distance those "
+        "at the image's edges most.",
+        (panel,),
+    )  # fmt: skip
+
+
+def _cluster_name(limits: tuple[float, ...], j: int) -> str:
+    if j == 0:
+        return f"< {limits[0] / 10:g} cm"
+    if j == len(limits):
+        return f"> {limits[-1] / 10:g} cm"
+    return f"{limits[j - 1] / 10:g}–{limits[j] / 10:g} cm"
+
+
+def _place(k: int, size: int) -> str:
+    """Name of a grid point."""
+    if size != 3:
+        return f"row {k // size + 1}, column {k % size + 1}"
+    vertical, horizontal = ("top", "", "bottom")[k // 3], ("left", "", "right")[k % 3]
+    name = " ".join(word for word in (vertical, horizontal) if word)
+    return name + (" corner" if vertical and horizontal else " edge") if name else "image centre"
+
+
+def _ellipse(covariance: Array, centre: Array) -> tuple[Array, Array]:
+    """Outline of the 95 % ellipse."""
+    values, vectors = np.linalg.eigh(covariance)
+    angle = np.linspace(0, 2 * np.pi, 73)
+    scale = np.sqrt(5.991 * np.maximum(values, 0))  # chi-square with 2 degrees of freedom
+    x, y = vectors @ (scale[:, None] * np.stack([np.cos(angle), np.sin(angle)]))
+    return x + centre[0], y + centre[1]

@@ -1,118 +1,102 @@
-"""The report of a study: one HTML file that works offline, prints, and needs no other knowledge.
+"""The report of a study: how the camera follows its temperature, and what that does.
 
-Drawings are SVG in the page; the script of plotly, embedded too, is only used when a reader looks
-closer. `save_figures` writes the same drawings for a paper.
+`save_figures` writes the drawings of the page for a paper.
 """
 
 from __future__ import annotations
 
-import base64
-import gzip
-import json
-from dataclasses import dataclass, field
-from datetime import UTC, datetime
-from importlib.metadata import version
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from thermocald import __version__
-from thermocald.atomic_file import make_folder, write_text
-from thermocald.output.figures.clips import clip_png, cut_clip, data_uri
-from thermocald.output.figures.draw import draw_figure, draw_matrix, draw_panel, inline_svg, save
-from thermocald.output.figures.numbers import parameter_label
-from thermocald.output.figures.panels import Figure, document
-from thermocald.output.page import render_page
+import numpy as np
+
+from thermocald.atomic_file import make_folder
+from thermocald.errors import ImageError
+from thermocald.figures import Figure, draw_figure, draw_matrix, save
+from thermocald.numbers import parameter_label, plain
 from thermocald.output.study import figures, tables
-from thermocald.output.study import object_space_figures as object_space
-from thermocald.output.study.dependence import dependence_figure, dependence_tables
-from thermocald.output.study.object_space_tables import cluster_table, point_table
-from thermocald.output.study.summary import summary
+from thermocald.output.study.summary import answer_sentences, detail_sentences
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
+from thermocald.report import (
+    Answer,
+    Chapter,
+    Drawing,
+    Section,
+    Table,
+    day,
+    of_figure,
+    of_matrix,
+    render_report,
+)
 
 if TYPE_CHECKING:
-    from thermocald.analysis.study.study import CameraStudy, Study
-    from thermocald.output.study.tables import Table
+    from collections.abc import Sequence
+    from datetime import datetime
+    from pathlib import Path
 
-__all__ = ["render_report", "save_figures", "write_report"]
+    from numpy.typing import NDArray
 
-_TEMPLATES = Path(__file__).parent / "templates"
+    from thermocald.analysis.study.study import CameraStudy, Study, StudySettings
+    from thermocald.arrays import Array
+
 _CLIP_PX = 96
-_A_YEAR = 31_557_600.0
+_CLIP_LONGEST_PX = 480
 _LEAD = (
-    "How the interior orientation of this camera changes with its temperature, whether the changes "
-    "are significant, and what they do to measurements in object space. The analysis is that of "
+    "How the interior orientation of a camera changes with its temperature, whether the changes "
+    "are significant, and what they do to measurements in object space; the analysis is that of "
     "Elias, Eltner, Liebold and Maas (2020), Sensors 20, 643, section 4."
 )
 
 
-@dataclass(frozen=True)
-class _Drawing:
-    """A figure as the template shows it."""
-
-    id: str
-    kind: str
-    title: str
-    caption: str
-    svgs: tuple[str, ...] = ()
-    images: tuple[dict[str, str], ...] = ()
-    columns: int = 3
-    data: str = ""
-
-
-@dataclass(frozen=True)
-class _Part:
-    title: str
-    figures: tuple[_Drawing, ...] = ()
-    tables: tuple[Table, ...] = ()
-
-
-@dataclass(frozen=True)
-class _Matrix:
-    """A correlation matrix to be drawn."""
-
-    name: str
-    title: str
-    caption: str
-    names: tuple[str, ...]
-    values: Any = field(repr=False)
-
-
-def render_report(
+def render_study(
     study: Study, title: str = "Thermal study of a camera", made: datetime | None = None
 ) -> str:
-    """The report as HTML text.
-
-    made: the time that it bears, by default now.
-    """
-    from plotly.offline import get_plotlyjs
-
-    cameras = [
-        {
-            "id": f"camera-{i}",
-            "label": camera.label,
-            "device": _device(camera),
-            "summary": summary(camera),
-            "notes": _notes(camera),
-            "parts": _parts(camera, study, f"c{i}"),
-        }
+    """Return the report as HTML text; made: the time that it bears, by default now."""
+    chapters = [
+        Chapter(
+            camera.label,
+            _answer(camera, f"c{i}-"),
+            tuple(_sections(camera, study.settings, f"c{i}-")),
+            (_device(camera),),
+            tuple(_notes(camera)),
+        )
         for i, camera in enumerate(study.cameras)
     ]
-    return render_page(
-        _TEMPLATES / "study.html.j2",
-        title=title,
-        lead=_LEAD,
-        cameras=cameras,
-        script=(_TEMPLATES / "study.js").read_text(encoding="utf-8"),
-        plotly=_packed(get_plotlyjs()),
-        made=_made(made),
+    return render_report(title, chapters, _LEAD, made)
+
+
+def _answer(camera: CameraStudy, prefix: str) -> Answer:
+    sentences = answer_sentences(camera)
+    proof = figures.dependence_figure(camera, "proof", ("c", "x0", "y0"))
+    if proof is None:
+        proof = figures.principal_point_figure(camera, "proof")
+    first = sentences[0] if sentences else "Nothing can be said about change."
+    return Answer(
+        first,
+        of_figure(proof, prefix) if proof is not None else None,
+        tuple(sentences[1:]),
+        _next_steps(camera),
+        _not_covered(),
     )
 
 
-def _made(at: datetime | None) -> str:
-    """When and with what the report was made."""
-    at = at or datetime.now(tz=UTC)
-    versions = ", ".join(f"{name} {version(name)}" for name in ("numpy", "scipy"))
-    return f"Made on {at:%Y-%m-%d at %H:%M} UTC with thermocald {__version__} ({versions})."
+def _next_steps(camera: CameraStudy) -> tuple[str, ...]:
+    steps = []
+    if any(c.dependences for study in camera.series for c in study.channels):
+        steps.append("Fit a thermal model to correct measurements with: thermocald fit.")
+        steps.append("See what a straight line leaves, and why: thermocald discover.")
+    else:
+        steps.append("Record a temperature with the frames; without one nothing can be corrected.")
+    if len(camera.series) < 2:
+        steps.append("Measure a second series on another day: only that shows what repeats.")
+    return tuple(steps)
+
+
+def _not_covered() -> tuple[str, ...]:
+    return (
+        "Temperatures other than those measured, and changes faster than the epochs.",
+        "Errors of the camera model itself, and focus or lens moved by hand.",
+        "How another specimen of this camera behaves: that is measured with it.",
+    )
 
 
 def _device(camera: CameraStudy) -> str:
@@ -120,7 +104,7 @@ def _device(camera: CameraStudy) -> str:
     sensor = camera.series[0].series.sensor
     names = ", ".join(dict.fromkeys(study.series.camera for study in camera.series))
     measured = "; ".join(
-        f"{s.name} {_day(s.start_utc)}" for s in (study.series for study in camera.series)
+        f"{s.name} {day(s.start_utc)}" for s in (study.series for study in camera.series)
     )
     return (
         f"{names}, {sensor.width} × {sensor.height} px of {sensor.pixel_pitch * 1000:g} µm. "
@@ -128,34 +112,16 @@ def _device(camera: CameraStudy) -> str:
     )
 
 
-def _day(start_utc: float) -> str:
-    """The start of a series, or that it has no date: simulated recordings count from 1970."""
-    if not start_utc > _A_YEAR:
-        return "(no date)"
-    return f"{datetime.fromtimestamp(start_utc, tz=UTC):%Y-%m-%d %H:%M} UTC"
-
-
-def write_report(path: Path, html: str) -> None:
-    """Write the file whole or not at all; OutputError if it cannot be."""
-    write_text(path, html)
-
-
-def _packed(script: str) -> str:
-    """A script as base64 of its gzip: a third of the size, unpacked by the reader's browser."""
-    return base64.b64encode(gzip.compress(script.encode(), 9, mtime=0)).decode("ascii")
-
-
 def save_figures(study: Study, folder: Path) -> list[Path]:
-    """Every figure as SVG and PNG in `folder`, which is made; returns the files."""
+    """Write every figure as SVG and PNG in `folder`, which is made; return the files."""
     make_folder(folder)
     paths = []
     for camera in study.cameras:
         prefix = _file_name(camera.label) + "-" if len(study.cameras) > 1 else ""
         for figure in _panel_figures(camera):
             paths += save(draw_figure(figure), folder, prefix + figure.name)
-        for matrix in _matrices(camera):
-            drawing = draw_matrix(matrix.values, matrix.names, matrix.title)
-            paths += save(drawing, folder, prefix + matrix.name)
+        for name, (values, names, title, _) in _matrices(camera).items():
+            paths += save(draw_matrix(values, names, title), folder, prefix + name)
     return paths
 
 
@@ -165,107 +131,103 @@ def _panel_figures(camera: CameraStudy) -> list[Figure]:
         figures.principal_point_figure(camera),
         figures.movement_figure(camera),
         figures.significance_figure(camera),
-        dependence_figure(camera),
-        object_space.error_figure(camera),
-        object_space.point_figure(camera),
+        figures.dependence_figure(camera),
+        figures.error_figure(camera),
+        figures.point_figure(camera),
     )
     return [figure for figure in made if figure is not None]
 
 
-def _matrices(camera: CameraStudy) -> list[_Matrix]:
-    made = [
-        _Matrix(
-            f"correlation-{_file_name(study.series.name)}",
-            study.series.name,
-            "Pearson's correlation over the epochs among parameters, σ₀ and temperatures. Red: "
-            "they rise together; blue: one rises as the other falls.",
-            tuple(parameter_label(n) for n in study.columns),
+def _matrices(camera: CameraStudy) -> dict[str, tuple[Array, list[str], str, str]]:
+    """By file name: correlations, what they are of, title, caption."""
+    made = {
+        f"correlation-{_file_name(study.series.name)}": (
             study.matrix,
+            [parameter_label(n) for n in study.columns],
+            study.series.name,
+            (
+                "Pearson's correlation over the epochs among parameters, σ₀ and temperatures. Red: "
+                "they rise together; blue: one rises as the other falls."
+            ),
         )
         for study in camera.series
         if len(study.series) > 2
-    ]
-    if camera.correlations is not None:
-        free = [k for k in range(10) if camera.sds[k] > 0]
-        if free:
-            made.append(
-                _Matrix(
-                    "iop-correlations",
-                    "Within the adjustments",
-                    "Correlation of the estimated parameters within an epoch's adjustment: median "
-                    f"over {camera.correlations.epochs} epochs. High values belong to the geometry "
-                    "of the calibration, not to the temperature.",
-                    tuple(parameter_label(IOP_NAMES[k]) for k in free),
-                    camera.correlations.median[free][:, free],
-                )
-            )
+    }
+    free = [k for k in range(10) if camera.sds[k] > 0]
+    if camera.correlations is not None and free:
+        noise = camera.correlations.noise[free][:, free]
+        made["iop-correlations"] = (
+            camera.correlations.median[free][:, free],
+            [parameter_label(IOP_NAMES[k]) for k in free],
+            "Within the adjustments",
+            (
+                "Correlation of the estimated parameters within an epoch's adjustment: median over "
+                f"{camera.correlations.epochs} epochs, of which the noise (sd) is "
+                f"{plain(float(np.max(noise)), digits=2)} at most. High values belong to the "
+                "geometry of the calibration, not to the temperature."
+            ),
+        )
     return made
 
 
-def _parts(camera: CameraStudy, study: Study, prefix: str) -> list[_Part]:
-    drawn = {figure.name: _drawing(figure, prefix) for figure in _panel_figures(camera)}
-    matrices = [_matrix_drawing(m, f"{prefix}-{m.name}") for m in _matrices(camera)]
-    over_time = tuple(m for m in matrices if not m.id.endswith("iop-correlations"))
-    within = tuple(m for m in matrices if m.id.endswith("iop-correlations"))
+def _sections(camera: CameraStudy, settings: StudySettings, prefix: str) -> list[Section]:
+    drawn = {figure.name: of_figure(figure, prefix) for figure in _panel_figures(camera)}
+    matrices = {
+        name: of_matrix(values, names, f"{prefix}{name}", f"Correlation matrix, {title}", caption)
+        for name, (values, names, title, caption) in _matrices(camera).items()
+    }
+    within = [matrices.pop("iop-correlations")] if "iop-correlations" in matrices else []
 
-    def pick(*names: str) -> tuple[_Drawing, ...]:
-        return tuple(drawn[name] for name in names if name in drawn)
+    def section(
+        title: str, names: tuple[str, ...], found: Sequence[Table | None],
+        more: list[Drawing] | None = None, text: tuple[str, ...] = (), folded: bool = False,
+    ) -> Section:  # fmt: skip
+        shown = [drawn[name] for name in names if name in drawn] + (more or [])
+        rows = tuple(t for t in found if t is not None and t.rows)
+        return Section(title, text, tuple(shown), rows, folded=folded)
 
-    def some(*made: Table | None) -> tuple[Table, ...]:
-        return tuple(t for t in made if t is not None and t.rows)
-
-    s = study.settings
     parts = [
-        _Part("What was measured", (), some(tables.overview_table(camera))),
-        _Part(
-            "How the camera changed",
-            (*pick("deviations", "principal-point", "movement"), *_clips(camera, prefix)),
-            some(tables.deviation_table(camera), tables.focus_table(camera, s)),
+        section(
+            "How the camera changed", ("deviations", "principal-point", "movement"),
+            [tables.deviation_table(camera)], _clips(camera, prefix),
         ),
-        _Part(
-            "Whether the changes are significant",
-            pick("significance"),
-            some(tables.significance_table(camera, s)),
+        section(
+            "How it depends on the temperature", ("temperature-dependence",),
+            tables.dependence_tables(camera), list(matrices.values()),
+            tuple(detail_sentences(camera)),
         ),
-        _Part(
-            "How it depends on the temperature",
-            (*pick("temperature-dependence"), *over_time),
-            some(*dependence_tables(camera)),
+        section(
+            "What it means in object space", ("object-space-errors", "errors-by-point"),
+            [tables.cluster_table(camera), tables.point_table(camera)],
         ),
-        _Part(
-            "Correlations of the parameters", within, some(tables.correlation_noise_table(camera))
+        section(
+            "Whether the changes are significant", ("significance",),
+            [tables.significance_table(camera, settings)], folded=True,
         ),
-        _Part(
-            "What it means in object space",
-            pick("object-space-errors", "errors-by-point"),
-            some(cluster_table(camera), point_table(camera)),
+        section("Correlations of the parameters", (), [], within, folded=True),
+        section(
+            "What was measured and assumed", (), [tables.overview_table(camera)],
+            text=_assumed(camera, settings), folded=True,
         ),
-    ]
+    ]  # fmt: skip
     return [part for part in parts if part.figures or part.tables]
 
 
-def _drawing(figure: Figure, prefix: str) -> _Drawing:
-    name = f"{prefix}-{figure.name}"
-    svgs = tuple(
-        inline_svg(draw_panel(panel, legend=i == 0), f"{name}-{i}", panel.title)
-        for i, panel in enumerate(figure.panels)
-    )
-    # "<" inside a script element could end it.
-    data = json.dumps(document(figure), ensure_ascii=False, separators=(",", ":"), allow_nan=False)
-    data = data.replace("<", "\\u003c")
-    columns = min(figure.columns, len(figure.panels))
-    return _Drawing(name, "panels", figure.title, figure.caption, svgs, (), columns, data)
+def _assumed(camera: CameraStudy, settings: StudySettings) -> tuple[str, ...]:
+    """What follows from values that nobody measured: said, not given as a result."""
+    changes = [
+        f"{plain(study.focus.change, 'mm', 2)} in {study.series.name}"
+        for study in camera.series
+        if study.focus is not None
+    ]
+    if not changes:
+        return ()
+    lens = f"f/{settings.f_number:g} and focused at {settings.focus_mm / 1000:g} m"
+    change = f"its depth of field would change by {' and '.join(changes)}"
+    return (f"If the lens were {lens}, {change}. Neither was measured.",)
 
 
-def _matrix_drawing(matrix: _Matrix, name: str) -> _Drawing:
-    svg = inline_svg(draw_matrix(matrix.values, matrix.names, matrix.title), name, matrix.title)
-    title = f"Correlation matrix, {matrix.title[0].lower() + matrix.title[1:]}"
-    if not name.endswith("iop-correlations"):
-        title = f"Correlation matrix, {matrix.title}"
-    return _Drawing(name, "matrix", title, matrix.caption, (svg,), (), 1)
-
-
-def _clips(camera: CameraStudy, prefix: str) -> tuple[_Drawing, ...]:
+def _clips(camera: CameraStudy, prefix: str) -> list[Drawing]:
     """First and last image around one target, side by side, for every series that has frames."""
     made = []
     for i, study in enumerate(camera.series):
@@ -273,25 +235,59 @@ def _clips(camera: CameraStudy, prefix: str) -> tuple[_Drawing, ...]:
         if clip is None:
             continue
         images = tuple(
-            {
-                "uri": data_uri(clip_png(cut_clip(path, clip.centre, _CLIP_PX))),
-                "label": f"{study.series.name}, epoch {epoch}",
-            }
+            (f"{study.series.name}, epoch {epoch}", clip_png(cut_clip(path, clip.centre, _CLIP_PX)))
             for path, epoch in ((clip.first, clip.first_epoch), (clip.last, clip.last_epoch))
         )
         made.append(
-            _Drawing(
-                f"{prefix}-clips-{i}",
-                "clips",
+            Drawing(
+                f"{prefix}clips-{i}",
                 f"Image around target {clip.target}",
                 f"The same {_CLIP_PX} × {_CLIP_PX} px of the first and the last frame; the cross "
                 "is where the target was in the first.",
-                (),
-                images,
-                2,
+                images=images,
+                columns=2,
             )
         )
-    return tuple(made)
+    return made
+
+
+def cut_clip(path: Path, centre: tuple[float, float], size: int) -> NDArray[np.uint8]:
+    """Return a square of `size` px about `centre` (px), grey; black beyond the image's edge.
+
+    Raises ImageError for what is not an image.
+    """
+    import cv2
+
+    try:
+        data = np.fromfile(path, dtype=np.uint8)
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
+    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
+    if image is None:
+        raise ImageError(f"{path}: is not an image")
+    left, top = (round(v - (size - 1) / 2) for v in centre)
+    clip = np.zeros((size, size), dtype=np.uint8)
+    height, width = image.shape
+    x0, x1 = max(left, 0), min(left + size, width)
+    y0, y1 = max(top, 0), min(top + size, height)
+    if x0 < x1 and y0 < y1:
+        clip[y0 - top : y1 - top, x0 - left : x1 - left] = image[y0:y1, x0:x1]
+    return clip
+
+
+def clip_png(clip: NDArray[np.uint8]) -> bytes:
+    """Return a clip as PNG, enlarged by whole pixels, with a cross at its centre."""
+    import cv2
+
+    factor = max(1, _CLIP_LONGEST_PX // len(clip))
+    large = cv2.cvtColor(np.kron(clip, np.ones((factor, factor), np.uint8)), cv2.COLOR_GRAY2BGR)
+    middle = len(large) // 2
+    cv2.line(large, (middle, 0), (middle, len(large)), (0, 94, 213), 1)
+    cv2.line(large, (0, middle), (len(large), middle), (0, 94, 213), 1)
+    done, png = cv2.imencode(".png", large)
+    if not done:
+        raise ImageError("an image clip could not be written as PNG")
+    return bytes(png.tobytes())
 
 
 def _notes(camera: CameraStudy) -> list[str]:

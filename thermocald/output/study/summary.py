@@ -6,41 +6,70 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.output.figures.numbers import (
+from thermocald.numbers import (
     coefficient,
     duration,
     parameter_label,
     percent,
     plain,
+    signed,
+    with_sd,
 )
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 
 if TYPE_CHECKING:
-    from thermocald.analysis.study.deviations import Deviation
-    from thermocald.analysis.study.series_study import SeriesStudy
-    from thermocald.analysis.study.study import CameraStudy
+    from collections.abc import Sequence
 
-__all__ = ["summary"]
+    from thermocald.analysis.study.deviations import Deviation
+    from thermocald.analysis.study.reference import Comparison
+    from thermocald.analysis.study.series_study import SeriesStudy
+    from thermocald.analysis.study.study import CameraStudy, Study
 
 _CLOSE = 0.9
 _TOGETHER = 0.9
 _NOISE_AGREES = 1.15
+_SIGNIFICANT = 0.05
+_DISTANCE_MM = 10_000.0
 _FIXED = {
-    "first": "with that of the first epoch",
-    "mean": "with the mean",
-    "last": "with that of the last epoch",
+    "first": "the first epoch's interior orientation",
+    "mean": "the mean",
+    "last": "the last epoch's",
 }
 
 
+def study_lines(study: Study, comparisons: Sequence[Comparison] = ()) -> list[str]:
+    """Return what `thermocald study` prints; comparisons: with the reference study, instead."""
+    if comparisons:
+        rows = [f"{'camera':17}{'quantity':43}{'reference':>12}{'ours':>9}  met"]
+        for c in comparisons:
+            quantity = f"{c.quantity} {c.unit}" if c.unit else c.quantity
+            met = "yes" if c.reproduced else "NO"
+            rows.append(f"{c.camera:17}{quantity:43}{c.text:>12}{c.ours:>9.3g}  {met}")
+        return rows
+    lines = []
+    for camera in study.cameras:
+        lines.append(camera.label)
+        lines += [f"  {sentence}" for sentence in summary(camera)]
+        for one in camera.series:
+            lines += [f"  note, {one.series.name}: {note}" for note in one.notes]
+        lines += [f"  note: {note}" for note in camera.notes]
+    return lines
+
+
 def summary(camera: CameraStudy) -> list[str]:
-    """Sentences; none that the data do not support."""
-    sentences = [s for study in camera.series if (s := _change(study))]
-    sentences += [s for study in camera.series if (s := _dependence(study))]
-    sentences += [s for study in camera.series if (s := _noise(study))]
+    """Return sentences, the rates first; none that the data do not support."""
+    return [*answer_sentences(camera), *detail_sentences(camera)]
+
+
+def answer_sentences(camera: CameraStudy) -> list[str]:
+    """Return what the camera does and what follows from it."""
     mc = camera.montecarlo
+    distance = mc.distance_mm if mc is not None else _DISTANCE_MM
+    sentences = [s for study in camera.series if (s := rates(study, distance))]
+    sentences += [s for study in camera.series if (s := _change(study))]
     if mc is not None:
         sentences.append(
-            f"In object space, at {mc.distance_mm / 1000:g} m, interior orientations drawn from "
+            f"On a plane at {mc.distance_mm / 1000:g} m, interior orientations drawn from "
             "independent normal distributions about the series' mean (the reference's procedure) "
             f"make errors of {mc.overall_mean / 10:.2f} cm on average and up to "
             f"{mc.mean_largest / 10:.1f} cm (mean of the largest of {mc.sets:,} draws); "
@@ -50,16 +79,72 @@ def summary(camera: CameraStudy) -> list[str]:
     return sentences
 
 
+def detail_sentences(camera: CameraStudy) -> list[str]:
+    """Return what depends on the temperature, and where the noise is not the stated one."""
+    sentences = [s for study in camera.series if (s := _dependence(study))]
+    return sentences + [s for study in camera.series if (s := _noise(study))]
+
+
+def rates(study: SeriesStudy, distance_mm: float) -> str:
+    """Return how fast c, x0 and y0 follow the reference temperature; empty where none does.
+
+    In px/K and µm/K with their standard deviations, and in mm/K on a plane at a distance: of x0
+    and y0 everywhere, of c at the image's left and right edge.
+    """
+    channel = next((c for c in study.channels if c.dependences), None)
+    if channel is None:
+        return ""
+    found = [
+        (name, rate_in_px_and_mm(study, name, d.slope, distance_mm), d)
+        for name, d in channel.dependences.items()
+        if name in ("c", "x0", "y0") and channel.p_holm[name] < _SIGNIFICANT
+    ]
+    if not found:
+        return ""
+    found.sort(key=lambda one: -abs(one[1][0]))
+    parts = []
+    for name, (px, _), d in found:
+        sd_px = abs(px * d.sd_slope / d.slope)
+        parts.append(f"{parameter_label(name)} by {signed(px, sd_px, 'px/K')}")
+    name, (_, mm), d = found[0]
+    edge = " at the image's edge" if name == "c" else ""
+    parts[0] = parts[0].replace(" by ", " moves by ", 1) + (
+        f" ({signed(1000 * d.slope, 1000 * d.sd_slope, 'µm/K')}; at {distance_mm / 1000:g} m "
+        f"{plain(abs(mm), 'mm/K', 3)}{edge})"
+    )
+    T = channel.thermometer.values
+    low, high = float(np.nanmin(T)), float(np.nanmax(T))
+    joined = parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
+    rough = " (so short a series gives these standard deviations only roughly)"
+    return (
+        f"{study.series.name}: between {low:.0f} and {high:.0f} °C "
+        f"({parameter_label(channel.thermometer.name)}) {joined}"
+        f"{rough if any(d.too_short for *_, d in found) else ''}."
+    )
+
+
+def rate_in_px_and_mm(
+    study: SeriesStudy, name: str, rate: float, distance_mm: float
+) -> tuple[float, float]:
+    """Return a rate of c, x0 or y0 in mm/K as px/K and as mm/K on a plane at a distance."""
+    s = study.series
+    c = float(np.mean(s.values[:, 0]))
+    lever = 0.5 * s.sensor.width * s.sensor.pixel_pitch / c if name == "c" else 1.0
+    return rate / s.sensor.pixel_pitch, rate * lever / c * distance_mm
+
+
 def _trajectory(camera: CameraStudy, limit_mm: float) -> list[str]:
     """The camera's own path alongside the draws, and what the draws leave out."""
     if not camera.trajectories:
         return []
     parts = [
-        f"{percent(float(one.fractions[0]))} {_FIXED[one.reference]}" for one in camera.trajectories
+        f"{percent(float(one.fractions[0]))} with {_FIXED[one.reference]}"
+        for one in camera.trajectories
     ]
+    parts[0] = parts[0].replace(" with", " of the points with") + " held fixed"
     text = (
-        f"The camera itself, along its own path, stays below {limit_mm / 10:g} cm in "
-        f"{', '.join(parts[:-1])} and {parts[-1]} as the fixed interior orientation."
+        f"The camera, along its own path, stays within {limit_mm / 10:g} cm at "
+        f"{', '.join(parts[:-1])} and {parts[-1]}."
     )
     strong = []
     for i, j in ((1, 2), (0, 1), (0, 2)):
@@ -93,7 +178,7 @@ def _change(study: SeriesStudy) -> str:
                 f"{plain(moved, 'px', 3)} from where it started"
             )
         elif moved > 3 * sd:
-            words.append(f"the principal point moved by {plain(moved, 'px', 3)}")
+            words.append(f"the principal point moved by {with_sd(moved, sd, 'px')}")
         else:
             words.append(f"the principal point stayed within {plain(3 * sd, 'px', 2)}")
     if "c" in d:
@@ -117,7 +202,10 @@ def _distance(c: Deviation) -> str:
         )
     if abs(c.change) > 3 * c.sd_change:
         grew = "grew" if c.change > 0 else "shrank"
-        return f"the principal distance {grew} by {plain(1000 * abs(c.change), 'µm', 2)}"
+        return (
+            f"the principal distance {grew} by "
+            f"{with_sd(1000 * abs(c.change), 1000 * c.sd_change, 'µm')}"
+        )
     return "the principal distance did not change beyond its uncertainty"
 
 
@@ -154,7 +242,7 @@ def _dependence(study: SeriesStudy) -> str:
     if channel is None:
         return ""
     close = [parameter_label(n) for n, d in channel.dependences.items() if abs(d.r) >= _CLOSE]
-    significant = [parameter_label(n) for n, p in channel.p_holm.items() if p < 0.05]
+    significant = [parameter_label(n) for n, p in channel.p_holm.items() if p < _SIGNIFICANT]
     name = parameter_label(channel.thermometer.name)
     if not significant:
         return f"{study.series.name}: no parameter depends significantly on {name}."

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.output.figures.numbers import (
+from thermocald.numbers import (
     UNITS,
     coefficient,
     duration,
@@ -19,34 +19,19 @@ from thermocald.output.figures.numbers import (
     with_sd,
 )
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
+from thermocald.report import Table
 
 if TYPE_CHECKING:
     from thermocald.analysis.study.deviations import Deviation
     from thermocald.analysis.study.series_study import (
+        ChannelStudy,
         SeriesStudy,
         Significance,
         StudySettings,
     )
     from thermocald.analysis.study.study import CameraStudy
 
-__all__ = [
-    "Table",
-    "correlation_noise_table",
-    "deviation_table",
-    "focus_table",
-    "overview_table",
-    "significance_table",
-]
-
-
-@dataclass(frozen=True, slots=True)
-class Table:
-    """Headings and rows of text; note: what the columns mean."""
-
-    title: str
-    headings: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    note: str = ""
+_FIXED = {"first": "first epoch", "mean": "mean", "last": "last epoch"}
 
 
 def overview_table(camera: CameraStudy) -> Table:
@@ -151,30 +136,6 @@ def _in_pixels(name: str, d: Deviation, pitch: float) -> str:
     return with_sd(d.change / pitch, d.sd_change / pitch) if name in ("c", "x0", "y0") else ""
 
 
-def focus_table(camera: CameraStudy, settings: StudySettings) -> Table | None:
-    """Change of the depth of field."""
-    rows = [
-        (
-            study.series.name,
-            f"{f.first.near:.0f} to {plain(f.first.far, digits=4)} mm",
-            f"{f.last.near:.0f} to {plain(f.last.far, digits=4)} mm",
-            with_sd(f.change, f.sd_change, "mm"),
-        )
-        for study in camera.series
-        if (f := study.focus) is not None
-    ]
-    if not rows:
-        return None
-    confusion = next(s.focus.confusion for s in camera.series if s.focus is not None)
-    return Table(
-        f"Depth of field, focused at {settings.focus_mm / 1000:g} m",
-        ("series", "sharp at first", "sharp at last", "change ± sd"),
-        tuple(rows),
-        f"For f/{settings.f_number:g} and a circle of confusion of {confusion * 1000:.1f} µm, the "
-        "principal distance taken as focal length.",
-    )
-
-
 def significance_table(camera: CameraStudy, settings: StudySettings) -> Table | None:
     """Success ratios of the F-test and the p-value of the whole series (Tables 4 and 5)."""
     tested = [study for study in camera.series if study.significance]
@@ -232,29 +193,132 @@ def _drift_cells(test: Significance) -> tuple[str, str, str]:
     return (p_text(test.p_holm), p_text(test.p_excess_holm), noise)
 
 
-def correlation_noise_table(camera: CameraStudy) -> Table | None:
-    """Noise of the correlation coefficients over the epochs (section 4.3)."""
-    if camera.correlations is None:
-        return None
-    free = [k for k in range(10) if camera.sds[k] > 0]
-    median, noise, largest = (
-        camera.correlations.median,
-        camera.correlations.noise,
-        camera.correlations.largest,
-    )
-    rows = [
-        (
-            f"{parameter_label(IOP_NAMES[i])}, {parameter_label(IOP_NAMES[j])}",
-            coefficient(float(median[i, j])),
-            f"{noise[i, j]:.4f}",
-            f"{largest[i, j]:.4f}",
-        )
-        for a, i in enumerate(free)
-        for j in free[a + 1 :]
+def dependence_tables(camera: CameraStudy) -> list[Table]:
+    """Correlation and slope on each thermometer (the reference's section 4.3)."""
+    return [
+        _dependence_table(study, channel)
+        for study in camera.series
+        for channel in study.channels
+        if channel.dependences
     ]
+
+
+def _dependence_table(study: SeriesStudy, channel: ChannelStudy) -> Table:
+    rows = []
+    for name, d in channel.dependences.items():
+        k, unit = (1000.0, "µm") if UNITS[name] == "mm" else (1.0, UNITS[name])
+        pitch = study.series.sensor.pixel_pitch
+        in_px = with_sd(d.slope / pitch, d.sd_slope / pitch) if name in ("c", "x0", "y0") else ""
+        rows.append(
+            (
+                parameter_label(name),
+                coefficient(d.r),
+                f"{d.n}",
+                f"{d.n_effective:.0f}",
+                p_text(channel.p_naive_holm[name]),
+                p_text(channel.p_holm[name]),
+                with_sd(k * d.slope, k * d.sd_slope, f"{unit}/K" if unit else "1/K"),
+                in_px,
+                f"{d.misfit:.1f}",
+            )
+        )
+    t = channel.thermometer
     return Table(
-        "Correlations of the interior orientation",
-        ("pair", "median", "noise (sd)", "largest deviation"),
+        f"Dependence on {parameter_label(t.name)}, {study.series.name}",
+        (
+            "parameter",
+            "r",
+            "n",
+            "n effective",
+            "p naive",
+            "p",
+            "slope ± sd",
+            "px/K",
+            "scatter / noise",
+        ),
         tuple(rows),
-        f"From {camera.correlations.epochs} covariance matrices of the adjustments.",
+        f"r: Pearson's correlation. p naive counts every epoch as independent; p holds whatever "
+        "the memory of the noise; both are corrected for the number of parameters (Holm). n "
+        "effective: independent epochs that the series is worth. The slope counts the "
+        f"thermometer's noise of {plain(t.sd, 'K', 2)}, its sd the memory of the noise. "
+        "Scatter / noise above 1: the straight line does not explain all.",
+    )
+
+
+def cluster_table(camera: CameraStudy) -> Table | None:
+    """Fractions of the errors, means, maxima (Table 7), and of the camera's own path."""
+    mc, first = camera.montecarlo, camera.first_order
+    if mc is None or first is None:
+        return None
+    cm = [limit / 10 for limit in mc.clusters_mm]
+    names = [f"< {cm[0]:g} cm"]
+    names += [f"{a:g}–{b:g} cm" for a, b in pairwise(cm)]
+    names.append(f"> {cm[-1]:g} cm")
+
+    def row(label: str, fractions: object, mean: float, largest: float) -> tuple[str, ...]:
+        shown = [percent(float(v), 1) for v in np.asarray(fractions, dtype=float)]
+        return (label, *shown, f"{mean / 10:.2f} cm", f"{largest / 10:.1f} cm")
+
+    return Table(
+        f"Errors on a plane at {mc.distance_mm / 1000:g} m",
+        ("", *names, "mean", "mean of maxima"),
+        (
+            row("simulated", mc.fractions, mc.overall_mean, mc.mean_largest),
+            row(
+                "first order",
+                np.maximum(first.fractions, 0.0),
+                float(first.mean.mean()),
+                float(first.expected_largest.mean()),
+            ),
+            *(
+                row(f"own path, {_FIXED[t.reference]} fixed", t.fractions, t.mean, t.mean_largest)
+                for t in camera.trajectories
+            ),
+        ),
+        f"{mc.sets:,} sets of interior orientation, seed {mc.seed}, {len(mc.image_points)} image "
+        "points. First order is the analytic propagation of the same covariance: where it differs "
+        "from the simulation, linear error propagation fails. The mean of maxima depends on the "
+        "number of sets and, by some per cent, on the seed. The draws are normal about the series' "
+        "mean, with the correlations of the adjustments; the own path is that of the measured "
+        "epochs, against one interior orientation that is held fixed.",
+    )
+
+
+def point_table(camera: CameraStudy) -> Table | None:
+    """Errors per grid point (Figure 11)."""
+    mc, first = camera.montecarlo, camera.first_order
+    if mc is None or first is None:
+        return None
+    rows = []
+    for k, point in enumerate(mc.image_points):
+        values, vectors = np.linalg.eigh(mc.covariance[k])
+        major = vectors[:, 1]
+        angle = float(np.degrees(np.arctan2(major[1], major[0]))) % 180
+        rows.append(
+            (
+                f"{point[0]:.0f}, {point[1]:.0f}",
+                f"{mc.mean[k] / 10:.2f}",
+                f"{first.mean[k] / 10:.2f}",
+                f"{mc.largest[k] / 10:.1f}",
+                f"{first.expected_largest[k] / 10:.1f}",
+                f"{np.sqrt(values[1]) / 10:.2f} × {np.sqrt(max(values[0], 0.0)) / 10:.2f}",
+                f"{angle:.0f}°",
+                f"{np.linalg.norm(mc.mean_error[k]):.2f}",
+            )
+        )
+    return Table(
+        "Errors by image point",
+        (
+            "image point px",
+            "mean cm",
+            "mean cm, first order",
+            "largest cm",
+            "largest cm, first order",
+            "ellipse sd cm",
+            "direction",
+            "bias mm",
+        ),
+        tuple(rows),
+        "Direction of the longer axis, from X (right) towards Y (up) as the camera looks. "
+        "Bias is what the mean error vector keeps: an effect of second order.",
     )

@@ -15,7 +15,7 @@ from thermocald.errors import UsageError
 from thermocald.output.testfield.layout import STRIP, TRIM
 from thermocald.output.testfield.pen import Pen, crop_marks, draw_marker, rectangle, rulers
 from thermocald.photogrammetry.targets import boards
-from thermocald.photogrammetry.targets.dictionary import marker_cells
+from thermocald.photogrammetry.targets.markers import marker_cells
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.photogrammetry.field.testfield import TestField
-
-__all__ = ["KINDS", "Board", "draw_board"]
 
 KINDS = ("charuco", "chessboard", "aprilgrid")
 _APRIL_DICTIONARY = "DICT_APRILTAG_36h11"
@@ -172,6 +170,16 @@ class Board:
     @property
     def _april(self) -> bool:
         return self.kind == "aprilgrid"
+
+
+def counts_of(option: str, text: str) -> tuple[int, int]:
+    """Return columns and rows of 9x6; UsageError that names the option."""
+    columns, _, rows = text.lower().replace("×", "x").partition("x")
+    if not (columns.isascii() and columns.isdigit() and rows.isascii() and rows.isdigit()):
+        raise UsageError(f"{option} {text}: write COLUMNSxROWS, such as 9x6")
+    if not 0 < int(columns[:6]) <= 1000 or not 0 < int(rows[:6]) <= 1000:
+        raise UsageError(f"{option} {text}: counts up to 1000 are possible")
+    return int(columns), int(rows)
 
 
 def _room(page: tuple[float, float]) -> tuple[float, float]:

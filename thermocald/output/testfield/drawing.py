@@ -16,8 +16,8 @@ from thermocald.errors import DriverMissing
 from thermocald.output.testfield.layout import STRIP
 from thermocald.output.testfield.pen import GREY, Pen, crop_marks, draw_marker, rulers, square
 from thermocald.output.testfield.plan import draw_plan
-from thermocald.photogrammetry.targets import ring_code
-from thermocald.photogrammetry.targets.dictionary import marker_cells
+from thermocald.photogrammetry.targets import outline, ring_code
+from thermocald.photogrammetry.targets.markers import marker_cells
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -45,7 +45,7 @@ def draw(sheet: Sheet) -> Any:
         pen.fill(_circle(target.x, target.y, r), pen.colour)
         for begin, end in _arcs(target):
             pen.fill(_ring_segment(target, r, begin, end), pen.colour)
-        below = (ring_code.RING_OUTER if target.code else 1.0) * r
+        below = (outline.RING_OUTER if target.code else 1.0) * r
         _label(pen, target.x, target.y - below, target.name, r)
     for marker in sheet.markers:
         if sheet.design.light:  # a marker is black on white, whatever the circles are
@@ -94,7 +94,7 @@ def _ring_segment(target: Target, r: float, begin: float, end: float) -> Any:
 
     arc = Curve.arc(-360 * end, -360 * begin, n=max(2, int(np.ceil(16 * (end - begin)))))
     unit = np.asarray(arc.vertices, dtype=float)
-    outer, inner = unit * ring_code.RING_OUTER * r, unit[::-1] * ring_code.RING_INNER * r
+    outer, inner = unit * outline.RING_OUTER * r, unit[::-1] * outline.RING_INNER * r
     codes = np.concatenate(
         [
             np.asarray(arc.codes),

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from thermocald.atomic_file import cannot_write
+from thermocald.atomic_file import cannot_write, new_file
 from thermocald.errors import UsageError
 from thermocald.output.testfield.board import draw_board
 from thermocald.output.testfield.drawing import (
@@ -28,16 +28,85 @@ if TYPE_CHECKING:
     from thermocald.output.testfield.layout import Design, Sheet
     from thermocald.photogrammetry.field.testfield import TestField
 
-__all__ = ["Printed", "default_diameter", "print_board", "print_testfield"]
+ONE_PLANE = (
+    "one flat sheet calibrates a camera from photographs in several poses (thermocald calibrate); "
+    "a camera that stands still before it gets no result: for series print the corner, or put up "
+    "two or three sheets at an angle and survey them"
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Printed:
-    """What was written: the files, the sheets (none of a board), the nominal field."""
+    """What was written: the files, the sheets (none of a board), the nominal field, the board.
 
+    page: width, height mm.
+    """
+
+    folder: Path
     files: tuple[Path, ...]
     sheets: tuple[Sheet, ...]
     field: TestField
+    page: tuple[float, float]
+    board: Board | None = None
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether it is one sheet."""
+        return len(self.sheets) <= 1
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the document that `testfield print` writes with `--json`."""
+        document: dict[str, Any] = {
+            "format": "thermocald-testfield-print/1",
+            "files": [str(path) for path in self.files],
+            "sheets": len(self.sheets) or 1,
+            "targets": len(self.field),
+        }
+        if self.board is not None:
+            board = self.board
+            return document | {
+                "board": board.kind, "square": board.square, "marker": board.marker
+            }  # fmt: skip
+        circles = [t for sheet in self.sheets for t in sheet.targets]
+        bars = []
+        for sheet in self.sheets:
+            if sheet.scale_bar is not None:
+                a, b = sheet.scale_bar
+                length = ((b.x - a.x) ** 2 + (b.y - a.y) ** 2) ** 0.5
+                bars.append({"sheet": sheet.title, "a": a.name, "b": b.name, "nominal": length})
+        return document | {
+            "diameter": self.sheets[0].design.diameter,
+            "coded": sum(bool(t.code) for t in circles),
+            "plain": sum(not t.code for t in circles),
+            "markers": sum(len(sheet.markers) for sheet in self.sheets),
+            "scale_bars": bars,
+        }
+
+    def lines(self) -> list[str]:
+        """Return the lines that `testfield print` prints."""
+        size = f"{self.page[0]:g} × {self.page[1]:g} mm"
+        if self.board is not None:
+            return [
+                (
+                    f"{self.folder}: {self.board.name} ({self.board.measures}) on {size}, "
+                    f"{len(self.field)} targets"
+                )
+            ]
+        found = self.as_dict()
+        sheets = "1 sheet" if self.is_flat else "3 sheets of a corner (and how to put it up)"
+        return [
+            (
+                f"{self.folder}: {sheets} of {size}, {found['coded']} coded and {found['plain']} "
+                f"plain circles of {found['diameter']:g} mm, {found['markers']} markers"
+            ),
+            *(
+                (
+                    f"  {bar['sheet']}: measure {bar['a']} to {bar['b']} (nominal "
+                    f"{bar['nominal']:.2f} mm) for --scale {bar['a']} {bar['b']} MM"
+                )
+                for bar in found["scale_bars"]
+            ),
+        ]
 
 
 def default_diameter(page: tuple[float, float]) -> float:
@@ -55,7 +124,7 @@ def print_testfield(design: Design, folder: Path, *, replace_printed: bool = Fal
     field = field_of(sheets)
     require_matplotlib()
     files = _publish(pages_of(sheets), len(sheets), field, folder, replace_printed)
-    return Printed(files, sheets, field)
+    return Printed(folder, files, sheets, field, design.page)
 
 
 def print_board(
@@ -69,7 +138,7 @@ def print_board(
     require_matplotlib()
     field = board.field()
     files = _publish([draw_board(board, page)], 1, field, folder, replace_printed)
-    return Printed(files, (), field)
+    return Printed(folder, files, (), field, page, board)
 
 
 def _publish(
@@ -96,7 +165,11 @@ def _publish(
         write_testfield(work / "testfield.csv", field)
         names.append("testfield.csv")
         for name in names:
-            os.replace(work / name, folder / name)
+            if not os.path.lexists(folder / name):
+                os.replace(work / name, folder / name)
+                continue
+            with new_file(folder / name) as file:
+                shutil.copyfile(work / name, file)
     except OSError as cause:
         raise cannot_write(folder, cause) from cause
     finally:

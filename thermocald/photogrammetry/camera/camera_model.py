@@ -41,6 +41,7 @@ __all__ = [
     "InteriorOrientation",
     "Sensor",
     "camera_coordinates",
+    "distort",
     "image_to_mm",
     "image_to_px",
     "partials",
@@ -229,8 +230,11 @@ def _as_px(sensor: Sensor, x: Array, y: Array) -> Array:
     return out.transpose(*range(1, out.ndim), 0)
 
 
-def _distort(iop: Array, x: Array, y: Array) -> tuple[Array, Array]:
-    """Ideal points (mm, about the principal point) → measured points (mm, about the centre)."""
+def distort(iop: Array, x: Array, y: Array) -> tuple[Array, Array]:
+    """Ideal points (mm, about the principal point) → measured points (mm, about the centre).
+
+    iop (..., 10), x, y (..., n). Element by element, so that its last bit is the same everywhere.
+    """
     _, x0, y0, A1, A2, A3, B1, B2, C1, C2 = (iop[..., None, j] for j in range(10))
     # x' = x·h + B1·r² + ..., y' = y·h + B2·r² + ...: what both have in common, and in place
     r2, other = x * x, y * y
@@ -268,7 +272,7 @@ def project(sensor: Sensor, iop: ArrayLike, eop: ArrayLike, points: ArrayLike) -
     if not (z < 0).all():
         z = np.where(z < 0, z, np.nan)
     scale = -i[..., 0, None] / z
-    x, y = _distort(i, scale * x, scale * y)
+    x, y = distort(i, scale * x, scale * y)
     return _as_px(sensor, x, y)
 
 
@@ -406,7 +410,7 @@ def rays(sensor: Sensor, iop: ArrayLike, image_points: ArrayLike) -> Array:
     tolerance = _RAY_TOLERANCE_PX * sensor.pixel_pitch
     size = np.full_like(x, np.inf)
     for _ in range(_RAY_ITERATIONS):
-        xd, yd = _distort(i, x, y)
+        xd, yd = distort(i, x, y)
         jxx, jxy, jyx, jyy = _distortion_jacobian(i, x, y)
         determinant = jxx * jyy - jxy * jyx
         rx, ry = xm - xd, ym - yd
@@ -435,3 +439,7 @@ def rays(sensor: Sensor, iop: ArrayLike, image_points: ArrayLike) -> Array:
     direction = np.stack([x, y, np.broadcast_to(-i[..., None, 0], x.shape)], axis=-1)
     unit: Array = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
     return unit
+
+
+RASPBERRY_PI_V2 = CameraModel(Sensor(3280, 2464, 0.00112), InteriorOrientation(c=3.04))
+"""What most people point at a test field: nominal values of the Raspberry Pi camera v2.1."""

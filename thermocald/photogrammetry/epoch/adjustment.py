@@ -194,26 +194,36 @@ def adjust(
     exterior: ExteriorOrientation,
     settings: AdjustmentSettings | None = None,
     suspects: Mask | None = None,
+    known: Array | None = None,
 ) -> Adjustment:
     """Adjust one epoch from start values.
 
-    suspects: mask (n,) of observations to leave out at first; they come back where they fit.
+    suspects: mask (n,) of observations to leave out at first; they come back where they fit; known:
+    covariance (10, 10) of `interior`, which then is observed as a whole, its priors are not used.
     Never raises for data: an epoch without a result has a status and a reason.
     """
     s = settings or _USUAL
     unknowns = s.unknowns
     n = len(observations)
-    if 2 * n + len(s.priors) - len(unknowns) < s.bounds.minimum_redundancy:
+    priors = len(s.priors) if known is None else len(s.free)
+    if 2 * n + priors - len(unknowns) < s.bounds.minimum_redundancy:
         return failed(
             "too_few_targets",
             f"{n} targets for {len(unknowns)} unknowns leave a redundancy of "
-            f"{2 * n + len(s.priors) - len(unknowns)}; at least {s.bounds.minimum_redundancy} "
+            f"{2 * n + priors - len(unknowns)}; at least {s.bounds.minimum_redundancy} "
             "is needed: show more targets or hold parameters fixed",
             observations,
             s.free,
         )
     start = np.concatenate([interior.as_array(), exterior.as_array()])
-    problem = Problem.build(sensor, testfield, observations, unknowns, s.priors, s.target_sigmas)
+    of_camera = None
+    if known is not None:
+        whole = np.zeros((16, 16))
+        whole[IOP, IOP] = known
+        of_camera = start, whole
+    problem = Problem.build(
+        sensor, testfield, observations, unknowns, s.priors, s.target_sigmas, of_camera
+    )
     use = np.ones(n, dtype=bool) if suspects is None else ~suspects
     most = most_rejected(s.max_rejected, 2 * n - len(unknowns))
     try:
@@ -240,7 +250,7 @@ def adjust(
         return failed("weak_geometry", str(error), observations, s.free)
     except NoConvergenceError as error:
         return failed("no_convergence", str(error), observations, s.free)
-    return _result(problem, solution, s, use, *tests)
+    return _result(problem, solution, s, use, priors, *tests)
 
 
 def _result(
@@ -248,17 +258,18 @@ def _result(
     solution: Solution,
     s: AdjustmentSettings,
     use: Mask,
+    priors: int,
     test: Array,
     redundancy_numbers: Array,
 ) -> Adjustment:
     u, n = problem.unknowns, int(np.count_nonzero(use))
-    redundancy = 2 * n + len(s.priors) - len(u)
+    redundancy = 2 * n + priors - len(u)
     v, points, observed = solution.whitened[-1], problem.points, problem.observations.points
     rejected: tuple[int, ...] = ()
     if n < len(use):
         v, points, observed = v[:, use], points[use], observed[use]
         rejected = tuple(problem.observations.targets[~use].tolist())
-    sigma0 = sqrt(problem.cost(v, solution.values) / redundancy)
+    sigma0 = sqrt(problem.cost(v, solution.values) / redundancy) if redundancy else 0.0
     factor = sigma0**2 if s.scale == "posterior" else 1.0
     if redundancy < TRUSTED_REDUNDANCY:
         factor = max(1.0, factor)  # a handful of residuals may be small by luck
@@ -283,11 +294,12 @@ def _result(
         rejected,
     )
     few = redundancy < TRUSTED_REDUNDANCY
-    if few and s.snooping_alpha > 0 and fails_global_test(sigma0**2, redundancy):
+    gross = n < len(use)
+    if few and s.snooping_alpha > 0 and fails_global_test(sigma0**2, redundancy, gross):
         why = (
             f"the residuals are {sigma0:.1f} times as large as their sigmas say, and a redundancy "
-            f"of {redundancy} does not show which target is wrong: show more targets, or state "
-            "larger sigmas"
+            f"of {redundancy} does not show which target is wrong, or whether the noise is larger "
+            "than stated: show more targets, or state larger sigmas"
         )
         return replace(result, status="global_test", reason=why)
     reasons = weaknesses(

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
-__all__ = ["cold_start", "pose_only"]
+__all__ = ["NO_BOUNDS", "cold_start", "mirror_pose", "pose_only"]
 
-_NO_BOUNDS = GeometryBounds(0, 2.0, 1e9, 1e9, 0.0, 0.0)
+NO_BOUNDS = GeometryBounds(0, 2.0, 1e9, 1e9, 0.0, 0.0)
 _FEWEST_FOR_POSE = 8  # two markers: one alone has two poses, and few redundant observations
 _AMBIGUITY = 2.0  # a second pose must fit this much worse to be excluded
 _GROSS = 6.0  # times the median residual: left out at first, may come back
@@ -60,7 +60,7 @@ def cold_start(
     suspects = ~fits
     if len(first) < len(s.free):
         loose = replace(
-            s, free=first, snooping_alpha=0.0, bounds=_NO_BOUNDS, scale="posterior", priors={}
+            s, free=first, snooping_alpha=0.0, bounds=NO_BOUNDS, scale="posterior", priors={}
         )
         rough = adjust(
             sensor, testfield, observations, start_interior, start_exterior, loose, suspects
@@ -107,7 +107,7 @@ def pose_only(
     result = adjust(sensor, testfield, observations, interior, exterior, s, ~fits)
     if not result.ok:
         return result
-    other = _mirror_pose(sensor, testfield, observations, interior)
+    other = mirror_pose(sensor, testfield, observations, interior)
     if other is not None and other < _AMBIGUITY**2:
         return failed(
             "ambiguous_pose",
@@ -118,7 +118,7 @@ def pose_only(
     return result
 
 
-def _mirror_pose(
+def mirror_pose(
     sensor: Sensor,
     testfield: TestField,
     observations: Observations,

@@ -20,13 +20,14 @@ if TYPE_CHECKING:
 
 __all__ = ["ray_tests", "snoop_rays", "weaknesses_together"]
 
-_UNTESTABLE = 1e-6  # of its variance: a ray whose residual its target takes up
+_UNTESTABLE = 1e-6  # of its variance: a ray whose residual the unknowns take up
 _LARGEST_OBLIQUENESS_NEEDED_DEG = 20.0
 
 
-def ray_tests(r: Array, B: Array, P: Array, Q: Array, mask: Mask) -> Array:
-    """Chi-square (2) of residuals (n, 2), what they share with their target's coordinates known."""
-    share = np.einsum("nik,nkl,njl->nij", B, Q, B)
+def ray_tests(r: Array, share: Array, P: Array, mask: Mask) -> Array:
+    """Chi-square (2) of residuals (n, 2) of weights P (n, 2, 2), of which the unknowns explain a
+    covariance `share` (n, 2, 2).
+    """
     V = np.linalg.inv(P) + np.where(mask, -1.0, 1.0)[:, None, None] * share
     determinant = np.linalg.det(V) * np.linalg.det(P)
     testable = determinant > _UNTESTABLE
@@ -38,10 +39,7 @@ def ray_tests(r: Array, B: Array, P: Array, Q: Array, mask: Mask) -> Array:
 def snoop_rays(
     tests: Sequence[Array], photographs: Sequence[Observations], used: Sequence[Mask], alpha: float
 ) -> list[Mask]:
-    """Which image points stay; of the rays of one target only the worst goes at a time.
-
-    The leverage on the camera's parameters is neglected, as hundreds of points share few unknowns.
-    """
+    """Which image points stay; of the rays of one target only the worst goes at a time."""
     if alpha <= 0:
         return list(used)
     offered = np.concatenate([test[m] for test, m in zip(tests, used, strict=True)])

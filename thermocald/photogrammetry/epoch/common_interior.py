@@ -87,7 +87,8 @@ class _State:
 class _System:
     """Normal equations N (u, u), b (u,) of interior (q) and exteriors (6 each) with the targets
     eliminated; what gives the targets' own step: Q (T, 3, 3), C (u, T, 3), d (T, 3); the weighted
-    sum of squares; residuals px and tests (chi-square, 2) of each photograph.
+    sum of squares; residuals px of each photograph; its rays: partials (n, 2, q + 6) by the
+    camera, (n, 2, 3) by the targets, and weights (n, 2, 2).
     """
 
     N: Array
@@ -97,7 +98,7 @@ class _System:
     d: Array
     cost: float
     residuals: tuple[Array, ...]
-    tests: tuple[Array, ...]
+    rays: tuple[tuple[Array, Array, Array], ...]
 
 
 def adjust_common_interior(
@@ -107,10 +108,12 @@ def adjust_common_interior(
     interior: InteriorOrientation,
     exteriors: Sequence[ExteriorOrientation],
     settings: AdjustmentSettings | None = None,
+    fitting: Sequence[Mask] | None = None,
 ) -> CommonInterior:
     """Adjust photographs that share an interior orientation, from start values.
 
-    Raises GeometryError where the adjustment does not converge or is singular.
+    fitting: masks of the observations that take part at first, per photograph; what fits the result
+    comes back. Raises GeometryError where the adjustment does not converge or is singular.
     """
     s = settings or AdjustmentSettings()
     problem = _Problem(
@@ -118,10 +121,12 @@ def adjust_common_interior(
     )
     eops = np.array([e.as_array() for e in exteriors])
     state = _State(interior.as_array(), eops, np.zeros((len(testfield), 3)))
-    used = [np.ones(len(o), dtype=bool) for o in photographs]
+    everything = [np.ones(len(o), dtype=bool) for o in photographs]
+    used = everything if fitting is None or s.snooping_alpha <= 0 else list(fitting)
     for _ in range(_ROUNDS):
         state, system = problem.solve(state, used)
-        kept = snoop_rays(system.tests, photographs, used, s.snooping_alpha)
+        tests = problem.tests(system, used)
+        kept = snoop_rays(tests, photographs, used, s.snooping_alpha)
         if all(np.array_equal(a, b) for a, b in zip(kept, used, strict=True)):
             break
         used = kept
@@ -179,9 +184,9 @@ class _Problem:
                 raise GeometryError("targets came to lie behind the camera during the iteration")
             P, r = _inverse_covariances(obs), obs.points - predicted
             residuals.append(r)
-            rays.append((B, P))
-            cost += float(np.einsum("ni,nij,nj->", r[mask], P[mask], r[mask]))
             columns = np.concatenate([self.free, EOP_COLUMNS])
+            rays.append((A[..., columns], B, P))
+            cost += float(np.einsum("ni,nij,nj->", r[mask], P[mask], r[mask]))
             rows = np.concatenate([np.arange(q), q + 6 * k + np.arange(6)])
             Au, Bu, Pu, ru = A[mask][..., columns], B[mask], P[mask], r[mask]
             PA = Pu @ Au
@@ -195,14 +200,24 @@ class _Problem:
         d[~uncertain] = 0.0
         Q: Array = np.linalg.inv(M).astype(np.float64, copy=False)
         Q[~uncertain] = 0.0
-        tests = tuple(
-            ray_tests(r, B, P, Q[obs.targets], mask)
-            for r, (B, P), obs, mask in zip(residuals, rays, self.photographs, used, strict=True)
-        )
         CQ = np.einsum("utk,tkl->utl", C, Q).reshape(u, -1)
         N -= CQ @ C.reshape(u, -1).T
         b -= CQ @ d.ravel()
-        return _System(N, b, Q, C, d, cost, tuple(residuals), tests)
+        return _System(N, b, Q, C, d, cost, tuple(residuals), tuple(rays))
+
+    def tests(self, system: _System, used: Sequence[Mask]) -> list[Array]:
+        """Chi-square (2) of every image point of each photograph against all the others."""
+        q, Qx = len(self.free), _inverse(system.N)
+        tests = []
+        for k, (obs, mask) in enumerate(zip(self.photographs, used, strict=True)):
+            A, B, P = system.rays[k]
+            Q = system.Q[obs.targets]
+            # by the camera, its target following: A − B Q Cᵀ
+            D = -np.einsum("nij,njk,unk->niu", B, Q, system.C[:, obs.targets])
+            D[..., np.concatenate([np.arange(q), q + 6 * k + np.arange(6)])] += A
+            share = (D @ Qx) @ np.swapaxes(D, 1, 2) + B @ Q @ np.swapaxes(B, 1, 2)
+            tests.append(ray_tests(system.residuals[k], share, P, mask))
+        return tests
 
     def _priors(self, state: _State) -> tuple[Array, Array, Mask, float]:
         """Normal equations (T, 3, 3), (T, 3) of the targets' sigmas, which targets are uncertain,

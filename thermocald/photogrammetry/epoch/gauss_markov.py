@@ -38,6 +38,7 @@ __all__ = [
 _ITERATIONS = 30
 _SMALL = 0.3  # standard deviations: a last step that leaves less than 1e-3 px in c, x0, y0
 _LINEAR = 10.0  # standard deviations that a solution may move without new partials
+_SINGULAR = 1e-8  # of a correlation matrix's eigenvalues
 _NO_PRIORS = np.empty(0)
 
 
@@ -50,8 +51,8 @@ class Problem:
     """Observations and unknowns of one adjustment.
 
     points (n, 3) mm; observations in the same order; target_variances (n, 3) mm² or None;
-    unknowns (u,): positions in `PARAMETER_NAMES`; prior_weight, prior_value (u,): parameters
-    observed beforehand, weight 0 where there is none; (0,) where there are no priors at all.
+    unknowns (u,): positions in `PARAMETER_NAMES`; prior_weight (u, u), prior_value (u,): parameters
+    observed beforehand, weight 0 where there is none; empty where there are no priors at all.
     """
 
     sensor: Sensor
@@ -71,15 +72,22 @@ class Problem:
         unknowns: NDArray[np.int64],
         priors: Mapping[str, tuple[float, float]],
         target_sigmas: bool,
+        known: tuple[Array, Array] | None = None,
     ) -> Problem:
-        """Collect what the iteration needs."""
+        """Collect what the iteration needs.
+
+        known: values (16,) and covariance (16, 16) of a camera whose free parameters are known.
+        """
         weight = value = _NO_PRIORS
         if priors:
-            weight, value = np.zeros(len(unknowns)), np.zeros(len(unknowns))
+            weight, value = np.zeros((len(unknowns),) * 2), np.zeros(len(unknowns))
             for row, parameter in enumerate(unknowns):
                 if PARAMETER_NAMES[parameter] in priors:
                     value[row], sd = priors[PARAMETER_NAMES[parameter]]
-                    weight[row] = sd**-2
+                    weight[row, row] = sd**-2
+        if known is not None:
+            value = known[0][unknowns]
+            weight = _weight_of(known[1][np.ix_(unknowns, unknowns)])
         variances = None
         if target_sigmas and field.sigmas.any():
             variances = field.sigmas[observations.targets] ** 2
@@ -105,8 +113,8 @@ class Problem:
         products = flat[:-1] @ flat.T
         N, gradient = products[:, :-1], products[:, -1]
         if len(self.prior_weight):
-            N.flat[:: len(N) + 1] += self.prior_weight
-            gradient += self.prior_weight * (self.prior_value - values[self.unknowns])
+            N += self.prior_weight
+            gradient += self.prior_weight @ (self.prior_value - values[self.unknowns])
         return N, gradient, float(residuals @ residuals)
 
     def cost(self, v: Array, values: Array) -> float:
@@ -114,8 +122,23 @@ class Problem:
         flat = v.ravel()
         square = float(flat @ flat)
         if len(self.prior_weight):
-            square += float(self.prior_weight @ (values[self.unknowns] - self.prior_value) ** 2)
+            difference = values[self.unknowns] - self.prior_value
+            square += float(difference @ self.prior_weight @ difference)
         return square
+
+
+def _weight_of(covariance: Array) -> Array:
+    """Weight (u, u) of parameters of which some are known, and perhaps only together.
+
+    Directions in which a covariance is next to nothing are held to 1e-4 of the parameters' sds.
+    """
+    weight = np.zeros(covariance.shape)
+    some = np.flatnonzero(covariance.diagonal() > 0)
+    scale = np.sqrt(covariance.diagonal()[some])
+    share, vectors = np.linalg.eigh(covariance[np.ix_(some, some)] / np.outer(scale, scale))
+    rows = (vectors / np.sqrt(np.maximum(share, _SINGULAR))) / scale[:, None]
+    weight[np.ix_(some, some)] = rows @ rows.T
+    return weight
 
 
 @dataclass(frozen=True, eq=False)

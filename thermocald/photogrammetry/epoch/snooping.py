@@ -32,6 +32,7 @@ TRUSTED_REDUNDANCY = 20
 _MOST_OF_FEW = 0.15  # one of 7 to 13 targets, two of 14 and more
 _CHI2_MEDIAN = 2 * log(2)  # with two degrees of freedom
 _GLOBAL_TEST_NORMAL = 3.09  # quantile of the normal distribution: error probability 0.1 %
+_AFTER_REJECTION_NORMAL = 1.28  # 10 %
 
 
 def chi2_2d(alpha: float) -> float:
@@ -39,15 +40,19 @@ def chi2_2d(alpha: float) -> float:
     return -2.0 * log(alpha) if alpha > 0 else float("inf")
 
 
-def fails_global_test(unit: ArrayLike, redundancy: ArrayLike) -> NDArray[np.bool_]:
+def fails_global_test(
+    unit: ArrayLike, redundancy: ArrayLike, after_rejection: bool = False
+) -> NDArray[np.bool_]:
     """Whether residuals are too large for their sigmas, where they are too few to tell the noise.
 
     unit: variance of unit weight; redundancy: its degrees of freedom. Chi-square at 0.1 %, by
-    Wilson and Hilferty's approximation (1931).
+    Wilson and Hilferty's approximation (1931); at 10 % where a target was rejected on the word of
+    the stated noise alone: noise three times as large looks the same, and takes the worst with it.
     """
+    quantile = _AFTER_REJECTION_NORMAL if after_rejection else _GLOBAL_TEST_NORMAL
     r = np.maximum(np.asarray(redundancy, dtype=float), 1.0)
     ninth = 2.0 / (9.0 * r)
-    bound = (1.0 - ninth + _GLOBAL_TEST_NORMAL * np.sqrt(ninth)) ** 3
+    bound = (1.0 - ninth + quantile * np.sqrt(ninth)) ** 3
     return np.asarray((np.asarray(redundancy) < TRUSTED_REDUNDANCY) & (np.asarray(unit) > bound))
 
 

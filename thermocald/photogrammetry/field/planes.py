@@ -1,4 +1,4 @@
-"""The plane that each target of a field lies in, from its neighbours.
+"""The planes and sheets of a test field, and its exchange with other programs.
 
 A test field's file has no normals. Targets are printed on sheets, so sheets are looked for: of all
 planes through a target and two of its neighbours the one that holds most targets nearby is a sheet;
@@ -6,23 +6,38 @@ its targets are taken away, and the search goes on. (Majorities among neighbours
 corner, where a plane across the edge holds the outermost rows of both sheets.) The normal is that
 of the plane through a target's nearest on its own sheet, so that a sheet may be bent a little. A
 target on no sheet has no normal: its eccentricity cannot be known, and is left out.
+
+A test field's file does not say what is mounted on what. Planes are looked for that hold most
+targets, with the tolerance that their coordinates' errors ask for; what lies in one plane but far
+apart is taken for two boards. Boards that touch in one plane count as one.
+
+Source: planes one after the other as Fischler, Bolles (1981), Comm. ACM 24, 381-395 (RANSAC), with
+every target as a seed instead of a random one.
+
+A camera that replays measurements instead of pictures gives a Frame whose metadata hold, under
+`observations`, {"target": [name …], "x": [px …], "y": […], "sx": […], "sy": […]} and, where it is
+known, "sxy" px². Names, not rows: the receiver has a test field of its own.
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
 from itertools import combinations
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from thermocald.errors import TestFieldError
+from thermocald.photogrammetry.field.testfield import Observations
+
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import ArrayLike, NDArray
 
     from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
 
-__all__ = ["field_normals", "plane_fit", "target_normals"]
 
 _NEIGHBOURS = 8
 _FLATNESS = 0.03  # of the distance between neighbours
@@ -133,3 +148,126 @@ def plane_fit(points: ArrayLike, tolerance: float = 0.002) -> tuple[Array, Array
     (a, b, c), (d, e, f) = axes[0], axes[1]
     axes[2] = (b * f - c * e, c * d - a * f, a * e - b * d)  # right-handed
     return centre, axes, bool(s2[0] <= tolerance**2 * max(s2[2], 1e-300))
+
+
+FEWEST_ON_A_SHEET = 6
+"""Targets on a board; three always are in a plane, five sometimes by chance."""
+
+_SEED = 12  # nearest targets that give a first plane
+_SHEET_FLATNESS = 0.05  # of the distance between neighbours
+_SIGMAS = 4.0  # of the coordinates
+_APART = 2.5  # times the distance between neighbours: another board
+_SEEDS = 60
+
+
+@lru_cache(maxsize=16)
+def field_sheets(testfield: TestField) -> NDArray[np.int64]:
+    """Label (n,) of the board of each target, -1 where it is on none."""
+    points = testfield.points
+    labels = np.full(len(points), -1, dtype=np.int64)
+    if len(points) < FEWEST_ON_A_SHEET:
+        return labels
+    near, spacing = _neighbours(points)
+    tolerance = max(_SHEET_FLATNESS * spacing, _SIGMAS * float(np.median(testfield.sigmas)))
+    left = np.ones(len(points), dtype=bool)
+    count = 0
+    while left.sum() >= FEWEST_ON_A_SHEET:
+        rest = np.flatnonzero(left)
+        seeds = rest[:: max(len(rest) // _SEEDS, 1)]
+        planes = [_plane(points, near[s], left, tolerance) for s in seeds]
+        best = max(planes, key=len, default=np.zeros(0, dtype=np.int64))
+        if len(best) < FEWEST_ON_A_SHEET:
+            break
+        left[best] = False
+        for board in _apart(points, best, _APART * spacing):
+            if len(board) >= FEWEST_ON_A_SHEET:
+                labels[board] = count
+                count += 1
+    labels.setflags(write=False)
+    return labels
+
+
+def _neighbours(points: Array) -> tuple[NDArray[np.int64], float]:
+    """The nearest targets of each, and the usual distance of the third: of the next marker."""
+    # not SciPy's tree, whose import costs the daemon 25 MB
+    k = min(_SEED, len(points) - 1)
+    near = np.empty((len(points), k + 1), dtype=np.int64)
+    third = np.empty(len(points))
+    for row, point in enumerate(points):
+        distance = np.linalg.norm(points - point, axis=1)
+        near[row] = np.argsort(distance, kind="stable")[: k + 1]
+        third[row] = distance[near[row, min(3, k)]]
+    return near, float(np.median(third))
+
+
+def _plane(
+    points: Array, near: NDArray[np.int64], left: NDArray[np.bool_], tolerance: float
+) -> NDArray[np.int64]:
+    """The remaining targets in the plane of a target and some of its neighbours."""
+    inside = near[left[near]]
+    found = np.zeros(0, dtype=np.int64)
+    # of growing neighbourhoods the largest that is flat: at an edge two boards meet
+    for size in (4, 6, _SEED + 1):
+        some = inside[:size]
+        if len(some) < 4:
+            break
+        centre, axes, _ = plane_fit(points[some])
+        if np.abs((points[some] - centre) @ axes[2]).max() > tolerance:
+            break
+        found = some
+    if not len(found):
+        return found
+    for _ in range(3):
+        centre, axes, _ = plane_fit(points[found])
+        off = np.abs((points - centre) @ axes[2])
+        found = np.flatnonzero(left & (off <= tolerance))
+        if len(found) < 3:
+            return np.zeros(0, dtype=np.int64)
+    return found
+
+
+def _apart(points: Array, rows: NDArray[np.int64], distance: float) -> list[NDArray[np.int64]]:
+    """Targets of one plane that hang together by steps up to a distance."""
+    left, groups = np.ones(len(rows), dtype=bool), []
+    while left.any():
+        group, ends = np.zeros(len(rows), dtype=bool), [int(np.argmax(left))]
+        group[ends] = True
+        while ends:
+            steps = np.linalg.norm(points[rows] - points[rows[ends.pop()]], axis=1)
+            reached = np.flatnonzero((steps <= distance) & ~group)
+            group[reached] = True
+            ends += reached.tolist()
+        groups.append(rows[group])
+        left &= ~group
+    return groups
+
+
+def observations_to_lists(seen: Observations, field: TestField) -> dict[str, Any]:
+    """Observations → lists by name, JSON-able."""
+    lists: dict[str, Any] = {
+        "target": [field.names[row] for row in seen.targets.tolist()],
+        "x": seen.points[:, 0].tolist(),
+        "y": seen.points[:, 1].tolist(),
+        "sx": seen.sigmas[:, 0].tolist(),
+        "sy": seen.sigmas[:, 1].tolist(),
+    }
+    if seen.covariances is not None:
+        lists["sxy"] = seen.covariances.tolist()
+    return lists
+
+
+def observations_from_lists(lists: Mapping[str, Any], field: TestField) -> Observations:
+    """The inverse of `observations_to_lists`; TestFieldError for a foreign target."""
+    rows = [field.index.get(name, -1) for name in lists["target"]]
+    if -1 in rows:
+        name = lists["target"][rows.index(-1)]
+        raise TestFieldError(
+            f"target {name!r} was measured but is not in the test field; is it the right field?"
+        )
+    n = len(rows)
+    return Observations(
+        np.array(rows, dtype=np.int64),
+        np.array([lists["x"], lists["y"]], dtype=float).T.reshape(n, 2),
+        np.array([lists["sx"], lists["sy"]], dtype=float).T.reshape(n, 2),
+        np.array(lists["sxy"], dtype=float) if "sxy" in lists else None,
+    )

@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from thermocald.photogrammetry.targets.blurred_disc import blurred_disc
-from thermocald.photogrammetry.targets.windows import windows
+from thermocald.photogrammetry.targets.circle import blurred_disc
+from thermocald.photogrammetry.targets.outline import windows
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Image, Single
-    from thermocald.photogrammetry.targets.noise import NoiseModel
+    from thermocald.photogrammetry.targets.frame_status import NoiseModel
     from thermocald.photogrammetry.targets.outline import LocalMap
 
 __all__ = ["GradientWeights", "LinearStep"]

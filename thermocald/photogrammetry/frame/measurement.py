@@ -23,15 +23,16 @@ from thermocald.photogrammetry.orientation.identification import Orientation, or
 from thermocald.photogrammetry.targets import ring_code
 from thermocald.photogrammetry.targets.chessboard import find_chessboards, locate_chess_corners
 from thermocald.photogrammetry.targets.circle import fit_circles
-from thermocald.photogrammetry.targets.coded_circles import find_coded
 from thermocald.photogrammetry.targets.frame_status import OK, FrameStatus, inspect_frame
-from thermocald.photogrammetry.targets.marker_order import corners_turned_deg
 from thermocald.photogrammetry.targets.markers import (
     MarkerCorners,
+    corners_turned_deg,
+    is_marker,
     locate_markers,
     measure_corners,
     predicted_markers,
 )
+from thermocald.photogrammetry.targets.ring_code import find_coded
 
 if TYPE_CHECKING:
     from typing import Any
@@ -139,15 +140,17 @@ def _by_orientation(
     missed: dict[int, str],
 ) -> Observations:
     """Corners that detection does not give, where the orientation from the others has them: those
-    of markers whose outline it got wrong, and of the squares of ChArUco boards.
+    of markers and chessboards that it placed wrongly, and of the squares of ChArUco boards.
     """
     again = [row for row, why in missed.items() if why in _WORTH_A_SECOND_LOOK]
-    chess = any(
-        kind == "chess_corner" and not code
-        for kind, code in zip(testfield.kinds, testfield.codes, strict=True)
-    )
     again = again if len(corners) >= max(_FEW_CORNERS, len(again)) else []
-    if len(corners) < _FEWEST or not (again or chess):
+    squares = [
+        row
+        for row, (kind, code) in enumerate(zip(testfield.kinds, testfield.codes, strict=True))
+        if kind == "chess_corner" and (not code or row in again)
+    ]
+    again = [row for row in again if is_marker(testfield.codes[row])]
+    if len(corners) < _FEWEST or not (again or squares):
         return corners
     try:
         known = orient(
@@ -156,7 +159,7 @@ def _by_orientation(
         )  # fmt: skip
     except GeometryError:
         return corners
-    places = [locate_chess_corners(testfield, known)] if chess else []
+    places = [locate_chess_corners(testfield, squares, known)] if squares else []
     if again:
         points = known.camera.project(known.exterior, testfield.points)
         inside = sensor.contains(np.nan_to_num(points, nan=-1e9), 3.0)

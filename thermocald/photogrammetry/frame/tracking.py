@@ -25,7 +25,7 @@ from thermocald.photogrammetry.targets.corner import REACH_PX as CORNER_REACH_PX
 from thermocald.photogrammetry.targets.frame_status import OK, inspect_frame
 from thermocald.photogrammetry.targets.image_file import EncodedImage
 from thermocald.photogrammetry.targets.markers import measure_corners
-from thermocald.photogrammetry.targets.windows import window_reach
+from thermocald.photogrammetry.targets.outline import window_reach
 
 if TYPE_CHECKING:
     from typing import Any
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array, Image
     from thermocald.photogrammetry.field.testfield import TestField
+    from thermocald.photogrammetry.targets.frame_status import NoiseModel
     from thermocald.photogrammetry.targets.markers import MarkerCorners
-    from thermocald.photogrammetry.targets.noise import NoiseModel
     from thermocald.photogrammetry.targets.outline import LocalMap
 
 __all__ = ["RENEWED_AT_PX", "TrackedMeasurement", "Tracker"]

@@ -1,4 +1,10 @@
-"""The network: targets in three dimensions from photographs, with a covariance that is true.
+"""The adjustment of a network of photographs: result, checks, snooping for gross errors.
+
+The test of a point is vᵀ Qvv⁻¹ v, chi² with two degrees of freedom: data snooping that does not
+depend on the image's axes. Its limit holds for all points of the network together.
+
+Source: Baarda, W. (1968): A testing procedure for use in geodetic networks; Förstner, W., Wrobel,
+B. (2016): Photogrammetric Computer Vision, section 4.6.4.
 
 A self-calibrating bundle adjustment without control: interior orientation common to all
 photographs, datum by inner constraints over the targets, scale by measured distances, gross errors
@@ -17,6 +23,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera.camera_model import (
     IOP_NAMES,
     CameraModel,
@@ -25,21 +32,317 @@ from thermocald.photogrammetry.camera.camera_model import (
     Sensor,
 )
 from thermocald.photogrammetry.network import bundle as nb
-from thermocald.photogrammetry.network.checks import refuse_before, refuse_narrow, refuse_weak
-from thermocald.photogrammetry.network.covariance import covariance
-from thermocald.photogrammetry.network.datum import Datum, Distance, bring_to_datum
-from thermocald.photogrammetry.network.result import Network, Rejection, Station
-from thermocald.photogrammetry.network.snooping import MIN_RAYS, Cleaned, snoop
+from thermocald.photogrammetry.network.bundle import Datum, Distance, bring_to_datum, covariance
 from thermocald.photogrammetry.network.start import approximate
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from thermocald.arrays import Array
+    from numpy.typing import NDArray
+
+    from thermocald.arrays import Array, Index
     from thermocald.photogrammetry.field.testfield import Observations
     from thermocald.photogrammetry.network.bundle import Bundle, ImageRays
 
-__all__ = ["Distance", "Network", "Photo", "Rejection", "Station", "adjust_network"]
+
+@dataclass(frozen=True, slots=True)
+class Station:
+    """Where a photograph was taken from; sd of the projection centre, (3,) mm."""
+
+    photo: str
+    exterior: ExteriorOrientation
+    n_targets: int
+    sd_centre: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Rejection:
+    """An image point that was left out: residual in px, and its test value over the limit."""
+
+    photo: str
+    target: str
+    residual: float
+    test: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Network:
+    """The adjusted network.
+
+    names: m targets; points (m, 3) mm with covariance (3m, 3m) mm²; n_rays (m,); angles (m,) rad,
+    the largest angle of intersection of each target; interior with covariance (10, 10), zero for
+    what was held; free: names of what was not; residuals: one (n, 2) px per station; unused:
+    targets and photographs left out, with reasons.
+    """
+
+    names: tuple[str, ...]
+    points: Array
+    covariance: Array
+    n_rays: Index
+    angles: Array
+    camera: CameraModel
+    interior_covariance: Array
+    free: tuple[str, ...]
+    stations: tuple[Station, ...]
+    sigma0: float
+    redundancy: int
+    residuals: tuple[Array, ...]
+    rejected: tuple[Rejection, ...]
+    unused: dict[str, str]
+    datum: str
+    sd_scale: float
+
+    @property
+    def sigmas(self) -> Array:
+        """Standard deviations of the targets (m, 3) mm."""
+        result: Array = np.sqrt(np.diag(self.covariance)).reshape(-1, 3)
+        return result
+
+    @property
+    def extent(self) -> float:
+        """The largest distance between two targets, mm (of their bounding box)."""
+        return float(np.linalg.norm(np.ptp(self.points, axis=0)))
+
+    @property
+    def relative_accuracy(self) -> float:
+        """Mean standard deviation of a coordinate over the extent, without the scale's own."""
+        shape = np.diag(self.covariance).mean() - self._scale_share()
+        return float(np.sqrt(max(shape, 0.0)) / self.extent)
+
+    def _scale_share(self) -> float:
+        centred = self.points - self.points.mean(axis=0)
+        return self.sd_scale**2 * float(np.mean(centred**2))
+
+
+MIN_PHOTOS = 3
+MIN_TARGETS = 8
+MIN_ANGLE = np.radians(20.0)
+MAX_RELATIVE_SD_C = 0.005
+MAX_RELATIVE_SD = 1 / 1000
+MAX_SIGMA0 = 5.0
+MIN_ROLL = np.radians(60.0)
+
+
+def _refuse(reasons: list[str]) -> None:
+    if reasons:
+        raise GeometryError("the network cannot carry a survey: " + "; ".join(reasons))
+
+
+def refuse_before(
+    photos: int, rays: ImageRays, distances: Sequence[Distance], names: Sequence[str]
+) -> None:
+    """Refuse what no adjustment can mend: photographs, targets, or the scale are missing."""
+    reasons = []
+    targets = len(np.unique(rays.target))
+    if photos < MIN_PHOTOS:
+        _refuse(
+            [f"{photos} photographs show targets, {MIN_PHOTOS} are the least and 8 to 12 are good"]
+        )
+    if targets < MIN_TARGETS:
+        reasons.append(f"{targets} targets are seen {MIN_RAYS} times, {MIN_TARGETS} are the least")
+    if not distances:
+        reasons.append("no distance gives the scale: --scale A B MM")
+    seen = {names[t] for t in np.unique(rays.target)}
+    for d in distances:
+        missing = [name for name in (d.a, d.b) if name not in seen]
+        if missing:
+            reasons.append(
+                f"the scale needs target {' and '.join(missing)} in at least {MIN_RAYS} photographs"
+            )
+        if not d.length > 0:
+            reasons.append(f"the distance {d.a}–{d.b} is {d.length:g} mm, it must be positive")
+    _refuse(reasons)
+
+
+def refuse_narrow(angles: Array) -> None:
+    """Refuse rays that hardly intersect, given the largest angle at each target (m,) rad."""
+    angle = float(np.median(angles)) if len(angles) else 0.0
+    if angle < MIN_ANGLE:
+        reason = (
+            f"the rays meet at {np.degrees(angle):.0f}° (median), {np.degrees(MIN_ANGLE):.0f}° are "
+            "the least: take photographs from further to the left, right, above, and below"
+        )
+        _refuse([reason])
+
+
+def refuse_weak(network: Network, weakest: tuple[float, tuple[str, ...]]) -> None:
+    """Refuse a result whose geometry or residuals say that it is not worth its digits."""
+    reasons = []
+    if len(network.stations) < MIN_PHOTOS:
+        reasons.append(
+            f"only {len(network.stations)} photographs could be oriented, {MIN_PHOTOS} are needed"
+        )
+    if network.redundancy < 10:
+        reasons.append(f"{network.redundancy} redundant observations control nothing")
+    c, sd_c = network.camera.interior.c, float(np.sqrt(network.interior_covariance[0, 0]))
+    if "c" in network.free and sd_c > MAX_RELATIVE_SD_C * c:
+        reasons.append(
+            f"the principal distance is uncertain by {100 * sd_c / c:.1f} % (weakest: "
+            f"{', '.join(weakest[1])}): photograph obliquely, turn the camera, bring depth into "
+            "the field, or give a calibrated camera and hold it"
+        )
+    if network.relative_accuracy > MAX_RELATIVE_SD:
+        reasons.append(
+            f"the coordinates' standard deviations are 1:{1 / network.relative_accuracy:.0f} "
+            f"of the field, 1:{1 / MAX_RELATIVE_SD:.0f} is the least"
+        )
+    if network.sigma0 > MAX_SIGMA0:
+        reasons.append(
+            f"residuals are {network.sigma0:.1f} times their stated sigmas: another camera or "
+            "focus among the photographs, a field that moved, or wrong identifications"
+        )
+    _refuse(reasons)
+
+
+def advice(network: Network) -> list[str]:
+    """What would make an accepted network better, as sentences."""
+    notes = []
+    three = [name for name, n in zip(network.names, network.n_rays, strict=True) if n == MIN_RAYS]
+    if three:
+        shown = ", ".join(three[:8]) + (", …" if len(three) > 8 else "")
+        notes.append(f"{len(three)} targets have {MIN_RAYS} rays only, the least: {shown}")
+    if _roll_span(network) < MIN_ROLL:
+        notes.append(
+            "the camera was never turned about its axis: turn it by 90° in some photographs, which "
+            "separates the principal point from the decentering distortion and the orientation"
+        )
+    low = np.degrees(network.angles) < 30
+    if low.any():
+        notes.append(f"{int(low.sum())} targets are intersected under less than 30°")
+    return notes
+
+
+def _roll_span(network: Network) -> float:
+    """The largest difference of roll between two stations, rad, about the mean view."""
+    R = np.array([s.exterior.rotation for s in network.stations])
+    up = R[:, :, 1]
+    axis = -R[:, :, 2].mean(axis=0)
+    axis /= np.linalg.norm(axis)
+    flat = up - (up @ axis)[:, None] * axis
+    flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
+    return float(np.arccos(np.clip((flat @ flat.T).min(), -1.0, 1.0)))
+
+
+MIN_RAYS = 3
+"""Rays that a target needs: of two a wrong one cannot be told, and along one of them not seen."""
+MIN_PHOTO_RAYS = 6
+"""Rays that a photograph needs to be oriented and to say something besides."""
+
+_FAMILY_ERROR = 0.05
+_MEDIAN_CHI2 = 1.386  # of two degrees of freedom
+_COARSE = 10.0  # times the limit: no accident, left out at once
+_CONTROLLED = 1e-3  # cofactor of a residual below which nothing else controls it
+_ROUNDS = 30
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cleaned:
+    """What is left after snooping: the bundle and rays of the photographs and targets in use, with
+    their rows before; of all rays which were rejected, their tests over the limit, and residuals
+    in px.
+    """
+
+    bundle: Bundle
+    rays: ImageRays
+    photos: Index
+    targets: Index
+    rejected: NDArray[np.bool_]
+    tests: Array
+    residuals: Array
+
+
+def snoop(sensor: Sensor, bundle: Bundle, rays: ImageRays, free: Index) -> Cleaned:
+    """Adjust, and leave out gross errors, some per round, until none is left.
+
+    A target or a photograph that too few rays are left of goes with them.
+    """
+    bundle, _ = nb.solve(sensor, bundle, rays, free, robust=True)
+    limit = -2.0 * np.log(_FAMILY_ERROR / len(rays))  # chi² with 2 degrees of freedom
+    v2 = np.sum(nb.residuals(sensor, bundle, rays) ** 2, axis=1)
+    rejected = v2 > _COARSE * limit * max(float(np.median(v2)) / _MEDIAN_CHI2, 1e-12)
+    tests = np.zeros(len(rays))
+    for _round in range(_ROUNDS):
+        _drop_uncontrolled(rejected, rays)
+        part, used, photos, targets = _in_use(bundle, rays, ~rejected)
+        part, _ = nb.solve(sensor, part, used, free)
+        bundle = _written_back(bundle, part, photos, targets)
+        tests = _point_tests(sensor, bundle, rays, rejected, part, used, free) / limit
+        candidates = ~rejected & (tests > 1)
+        if not candidates.any():
+            break
+        # one per target, and only the strong ones: a gross error spoils its neighbours' tests
+        worst = np.zeros(int(rays.target.max()) + 1)
+        np.maximum.at(worst, rays.target[candidates], tests[candidates])
+        rejected |= (
+            candidates & (tests >= worst[rays.target]) & (tests > 0.3 * tests[candidates].max())
+        )
+    plain = nb.ImageRays(
+        rays.photo, rays.target, rays.points, np.broadcast_to(np.eye(2), (len(rays), 2, 2))
+    )
+    sizes = np.linalg.norm(nb.residuals(sensor, bundle, plain), axis=1)
+    return Cleaned(part, used, photos, targets, rejected, tests, sizes)
+
+
+def _drop_uncontrolled(rejected: NDArray[np.bool_], rays: ImageRays) -> None:
+    """Reject all of targets and photographs that too few rays are left of (in place)."""
+    shown = np.bincount(rays.photo)
+    before = -1
+    while rejected.sum() > before:
+        before = int(rejected.sum())
+        left = np.bincount(rays.target[~rejected], minlength=int(rays.target.max()) + 1)
+        rejected |= left[rays.target] < MIN_RAYS
+        left = np.bincount(rays.photo[~rejected], minlength=len(shown))
+        # half of a photograph always fits somewhere: that is no reason to believe it
+        rejected |= (left < np.maximum(MIN_PHOTO_RAYS, shown / 2))[rays.photo]
+    if rejected.all():
+        raise GeometryError(
+            "the photographs contradict each other: no part of them fits together; is it one "
+            "field that did not move, and one camera with one focus?"
+        )
+
+
+def _in_use(
+    bundle: Bundle, rays: ImageRays, good: NDArray[np.bool_]
+) -> tuple[Bundle, ImageRays, Index, Index]:
+    """The part of a network that good rays belong to, renumbered, and its rows before."""
+    photos, photo = np.unique(rays.photo[good], return_inverse=True)
+    targets, target = np.unique(rays.target[good], return_inverse=True)
+    used = nb.ImageRays(photo, target, rays.points[good], rays.whitening[good])
+    part = nb.Bundle(
+        bundle.interior, bundle.rotations[photos], bundle.centres[photos], bundle.points[targets]
+    )
+    return part, used, photos, targets
+
+
+def _written_back(bundle: Bundle, part: Bundle, photos: Index, targets: Index) -> Bundle:
+    rotations, centres, points = (
+        a.copy() for a in (bundle.rotations, bundle.centres, bundle.points)
+    )
+    rotations[photos], centres[photos], points[targets] = part.rotations, part.centres, part.points
+    return nb.Bundle(part.interior, rotations, centres, points)
+
+
+def _point_tests(
+    sensor: Sensor,
+    bundle: Bundle,
+    rays: ImageRays,
+    rejected: NDArray[np.bool_],
+    part: Bundle,
+    used: ImageRays,
+    free: Index,
+) -> Array:
+    """Test values vᵀ Qvv⁻¹ v / sigma0² of all rays, (n,); plain vᵀ v for those left out."""
+    cofactors = covariance(sensor, part, used, free, np.ones(len(used))).residual_cofactors
+    v = nb.residuals(sensor, bundle, rays)
+    tests = np.sum(v * v, axis=1)
+    values, vectors = np.linalg.eigh(cofactors)
+    along = np.einsum("nji,nj->ni", vectors, v[~rejected])
+    controlled = values > _CONTROLLED
+    shares = np.where(controlled, along**2 / np.where(controlled, values, 1), 0)
+    tests[~rejected] = np.sum(shares, axis=1)
+    scale2 = max(float(np.median(tests[~rejected])) / _MEDIAN_CHI2, 1e-12)
+    scaled: Array = tests / scale2
+    return scaled
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,4 +1,16 @@
-"""The free-network bundle adjustment: photographs of one camera, targets, reduced normal equations.
+"""Bundle adjustment: datum, normal equations and covariance of photographs and points.
+
+Position and orientation by inner constraints over all targets (the mean standard deviation is
+smallest, and no target is privileged): they coincide in the mean with the nominal field if there is
+one, else the origin is the centroid and Z the normal of the best plane, towards the cameras. Scale
+by measured distances, with their standard deviations, in a rigorous sequential adjustment.
+
+The reduced matrix is inverted in the gauge of its own null space, the targets follow by back
+substitution, and an S-transformation brings all of it to the datum in which the mean standard
+deviation of the targets is smallest.
+
+Source: Baarda, W. (1973): S-transformations and criterion matrices; Granshaw, S. I. (1980): Bundle
+adjustment methods in engineering photogrammetry, Photogrammetric Record 10(56).
 
 The targets are eliminated block by block (Schur complement), the gauge of seven (position,
 orientation, scale) is left free and its null space added to the reduced matrix, which makes it
@@ -27,25 +39,231 @@ from thermocald.photogrammetry.camera.camera_model import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Index
     from thermocald.photogrammetry.camera.camera_model import Sensor
 
-__all__ = [
-    "Bundle",
-    "ImageRays",
-    "NormalEquations",
-    "linearise",
-    "normal_equations",
-    "null_space",
-    "reduce_targets",
-    "regularise",
-    "residuals",
-    "solve",
-]
+
+@dataclass(frozen=True, slots=True)
+class Distance:
+    """A measured distance between two targets, mm, with its standard deviation."""
+
+    a: str
+    b: str
+    length: float
+    sigma: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Datum:
+    """A bundle in its datum, the targets' covariance (3m, 3m) mm² in it, and how it was brought
+    there: `x_new = scale · turn · x + shift`.
+    """
+
+    bundle: Bundle
+    covariance: Array
+    scale: float
+    turn: Array
+    sd_scale: float
+    statement: str
+
+
+def bring_to_datum(
+    bundle: Bundle,
+    covariance: Array,
+    distances: Sequence[Distance],
+    index: dict[str, int],
+    nominal: Array | None,
+) -> Datum:
+    """Scale and place a free network whose covariance (3m, 3m) has inner constraints.
+
+    index: the row of each target by name; nominal (m, 3) mm, NaN where unknown.
+    """
+    scaled, Q, scale, sd_scale = _scaled(bundle.points, covariance, distances, index)
+    turn, shift, where = _placement(scaled, scale * bundle.centres, nominal, distances[0], index)
+    m = len(scaled)
+    points = scaled @ turn.T + shift
+    blocks = Q.reshape(m, 3, m, 3)
+    turned = np.einsum("ab,mbnc,dc->mand", turn, blocks, turn, optimize=True).reshape(3 * m, 3 * m)
+    placed = Bundle(
+        bundle.interior,
+        turn @ bundle.rotations,
+        scale * bundle.centres @ turn.T + shift,
+        points,
+    )
+    by = ", ".join(f"{d.a}–{d.b} = {d.length:g} ± {d.sigma:g} mm" for d in distances)
+    statement = f"inner constraints over {m} targets, {where}; scale by {by}"
+    return Datum(placed, turned, scale, turn, sd_scale, statement)
+
+
+def _scaled(
+    points: Array, Q: Array, distances: Sequence[Distance], index: dict[str, int]
+) -> tuple[Array, Array, float, float]:
+    """Points and covariance with the scale that the distances give; the scale and its relative sd.
+
+    The estimate is linear in the network's points and the measured distances: ln L = ln l + lambda
+    with the network's own covariance; one distance fixes the scale, further ones also correct the
+    shape, each to its weight.
+    """
+    n, m3 = len(distances), points.size
+    H, r, noise = np.zeros((n, m3)), np.zeros(n), np.zeros(n)
+    for i, d in enumerate(distances):
+        missing = [name for name in (d.a, d.b) if name not in index]
+        if missing:
+            raise GeometryError(
+                f"the distance {d.a}–{d.b} cannot give the scale: target {' and '.join(missing)} "
+                "was not determined; at least three photographs must show both of its ends"
+            )
+        a, b = index[d.a], index[d.b]
+        e = points[b] - points[a]
+        length = float(np.linalg.norm(e))
+        H[i, 3 * b : 3 * b + 3], H[i, 3 * a : 3 * a + 3] = e / length**2, -e / length**2
+        r[i], noise[i] = np.log(d.length / length), (d.sigma / d.length) ** 2
+    # distances without a standard deviation must not make V singular
+    V = H @ Q @ H.T + np.diag(np.maximum(noise, 1e-18))
+    P = np.linalg.inv(V)
+    ones = np.ones(n)
+    weight = float(ones @ P @ ones)
+    a_row = ones @ P / weight
+    lam = float(a_row @ r)
+    M = P - np.outer(P @ ones, a_row)
+    centred = (points - points.mean(axis=0)).ravel()
+    gain = Q @ H.T @ M
+    shape = points + (gain @ r).reshape(-1, 3)
+    scale = float(np.exp(lam))
+    F = gain + np.outer(centred, a_row)
+    T = np.eye(m3) - F @ H
+    Qs = scale**2 * (T @ Q @ T.T + (F * noise) @ F.T)
+    return scale * shape, Qs, scale, float(np.sqrt(1.0 / weight))
+
+
+def _placement(
+    points: Array,
+    centres: Array,
+    nominal: Array | None,
+    first: Distance,
+    index: dict[str, int],
+) -> tuple[Array, Array, str]:
+    """The turn (3, 3) and shift (3,) into the datum, and what it is in words."""
+    if nominal is not None:
+        known = np.isfinite(nominal).all(axis=1)
+        if known.sum() >= 3:
+            turn, shift = _rigid(points[known], nominal[known])
+            return turn, shift, f"in the mean on the nominal coordinates of {known.sum()} targets"
+    centroid = points.mean(axis=0)
+    _, _, Vt = np.linalg.svd(points - centroid)
+    z = Vt[2] * (1.0 if (centres.mean(axis=0) - centroid) @ Vt[2] > 0 else -1.0)
+    along = points[index[first.b]] - points[index[first.a]]
+    along = along - (along @ z) * z
+    # a distance along the normal gives no direction: the field's longest side does
+    if np.linalg.norm(along) < 1e-3 * np.linalg.norm(np.ptp(points, axis=0)):
+        along = Vt[0]
+    x = along / np.linalg.norm(along)
+    turn = np.array([x, np.cross(z, x), z])
+    where = f"origin at their centroid, Z normal to their plane, X along {first.a}–{first.b}"
+    return turn, -turn @ centroid, where
+
+
+def _rigid(points: Array, onto: Array) -> tuple[Array, Array]:
+    """The rotation and shift of least squares (Arun et al. 1987), no reflection."""
+    p, q = points.mean(axis=0), onto.mean(axis=0)
+    U, _, Vt = np.linalg.svd((points - p).T @ (onto - q))
+    turn = Vt.T @ np.diag([1.0, 1.0, np.sign(np.linalg.det(Vt.T @ U.T))]) @ U.T
+    return turn, q - turn @ p
+
 
 _N_IOP = len(IOP_NAMES)
+# Eigenvalues of the scaled matrix below this are rounding errors of its elements.
+_SINGULAR = 1e-13
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Covariance:
+    """Cofactors (sigma0 = 1) of a bundle with inner constraints over the targets.
+
+    interior (10, 10), zero for what is held; centres (k, 3, 3) mm²; points (3m, 3m) mm²;
+    residual_cofactors (n, 2, 2): those of the whitened residuals, the identity less the adjusted
+    points' share; weakest: the smallest eigenvalue of the scaled reduced matrix and the parameters
+    that it belongs to.
+    """
+
+    interior: Array
+    centres: Array
+    points: Array
+    residual_cofactors: Array
+    weakest: tuple[float, tuple[str, ...]]
+
+
+def covariance(
+    sensor: Sensor, bundle: Bundle, rays: ImageRays, free: Index, weights: Array
+) -> Covariance:
+    """The cofactors at the solution; `weights` 0 or 1. GeometryError if it is undetermined."""
+    linearised = linearise(sensor, bundle, rays, weights)
+    normals = normal_equations(bundle, rays, free, linearised)
+    S, _, inverses = reduce_targets(normals, 0.0)
+    f, k, m = len(free), len(bundle.centres), len(bundle.points)
+    null_c, null_p = null_space(bundle.centres, bundle.points, f)
+    scaled, scales, projector = regularise(S, null_c)
+    values, vectors = np.linalg.eigh(scaled)
+    labels = [IOP_NAMES[i] for i in free] + ["a camera's pose"] * (6 * k)
+    share = vectors[:, 0] ** 2
+    strongest = np.argsort(-share)[:3]
+    weakest = (float(values[0]), tuple(dict.fromkeys(labels[i] for i in strongest)))
+    if values[0] < _SINGULAR:
+        raise GeometryError(
+            f"the photographs do not determine {', '.join(weakest[1])}: take them from more "
+            "directions, turn the camera by 90° for some, and bring depth into the field"
+        )
+    Qc = (vectors / values) @ vectors.T - projector
+    Qc = Qc * scales[:, None] * scales
+    W = -np.einsum("mij,umj->umi", inverses, normals.B.reshape(-1, m, 3)).reshape(-1, 3 * m)
+    Qcp = Qc @ W
+    Qp = W.T @ Qcp
+    for t in range(m):
+        Qp[3 * t : 3 * t + 3, 3 * t : 3 * t + 3] += inverses[t]
+    cofactors = np.eye(2) - _adjusted_cofactors(linearised, rays, free, Qc, Qcp, Qp)
+
+    K = np.linalg.solve(null_p.T @ null_p, null_p.T)
+    KQ = K @ Qp
+    inner = Qp - null_p @ KQ - KQ.T @ null_p.T + null_p @ (KQ @ K.T) @ null_p.T
+    KQc = K @ Qcp.T
+    cameras = Qc - null_c @ KQc - KQc.T @ null_c.T + null_c @ (KQ @ K.T) @ null_c.T
+    interior = np.zeros((_N_IOP, _N_IOP))
+    interior[np.ix_(free, free)] = cameras[:f, :f]
+    poses = cameras[f:, f:].reshape(k, 6, k, 6)
+    centres = np.array([poses[i, 3:, i, 3:] for i in range(k)])
+    return Covariance(interior, centres, inner, cofactors, weakest)
+
+
+def _adjusted_cofactors(
+    linearised: tuple[Array, Array, Array, Array],
+    rays: ImageRays,
+    free: Index,
+    Qc: Array,
+    Qcp: Array,
+    Qp: Array,
+) -> Array:
+    """The cofactors (n, 2, 2) of the adjusted, whitened image points; independent of the gauge."""
+    _, by_interior, by_pose, by_point = linearised
+    J = np.concatenate([by_interior[:, :, free], by_pose], axis=2)
+    f = len(free)
+    pose = f + 6 * rays.photo[:, None] + np.arange(6)
+    columns = np.concatenate([np.broadcast_to(np.arange(f), (len(rays), f)), pose], axis=1)
+    rows = 3 * rays.target[:, None] + np.arange(3)
+    cameras = Qc[columns[:, :, None], columns[:, None, :]]
+    mixed = Qcp[columns[:, :, None], rows[:, None, :]]
+    points = Qp[rows[:, :, None], rows[:, None, :]]
+    half = J @ mixed @ np.swapaxes(by_point, 1, 2)
+    total: Array = (
+        J @ cameras @ np.swapaxes(J, 1, 2)
+        + half
+        + np.swapaxes(half, 1, 2)
+        + by_point @ points @ np.swapaxes(by_point, 1, 2)
+    )
+    return total
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -37,6 +37,7 @@ _FLIP = np.diag([1.0, -1.0, -1.0])  # OpenCV's camera looks along +Z with y down
 _FIELDS_OF_VIEW_DEG = (18.0, 25.0, 33.0, 42.0, 52.0, 62.0, 73.0, 85.0, 98.0)
 _TOLERANCE = 0.005  # of the image width: distortion is not known yet
 _MINIMUM = 4
+_CLEAR = 0.5  # of the pairs, that fit
 
 
 def approximate_orientation(
@@ -128,6 +129,14 @@ def _robust_resection(
     exterior = _from_opencv(rvec, tvec)
     predicted = project(sensor, interior.as_array(), exterior.as_array(), X)
     residuals = np.linalg.norm(np.nan_to_num(predicted - uv, nan=1e9), axis=1)
+    if len(rows) <= _CLEAR * len(X):
+        # A board seen obliquely: SQPnP of few pairs fails where that of the plane does not.
+        whole = resection(sensor, interior, X, uv)[0][1]
+        predicted = project(sensor, interior.as_array(), whole.as_array(), X)
+        other = np.linalg.norm(np.nan_to_num(predicted - uv, nan=1e9), axis=1)
+        tolerance = _TOLERANCE * sensor.width
+        if (other < tolerance).sum() > (residuals < tolerance).sum():
+            return whole, other
     return exterior, residuals
 
 

@@ -34,6 +34,7 @@ from thermocald.photogrammetry.series.covariances import (
 from thermocald.photogrammetry.series.design import State
 from thermocald.photogrammetry.series.estimator import (
     ENOUGH_FOR_NOISE,
+    NOISE_SHOWN,
     Estimate,
     SeriesEstimator,
 )
@@ -41,7 +42,6 @@ from thermocald.photogrammetry.series.exterior import choose, loose_bound, obser
 from thermocald.photogrammetry.series.mount import FEWEST_EPOCHS
 from thermocald.photogrammetry.series.normals import ObservationGrid, sums_of_squares
 from thermocald.photogrammetry.series.result import SeriesAdjustment, SeriesSettings
-from thermocald.photogrammetry.series.snooping import pooled_variance
 from thermocald.photogrammetry.series.status import enough_targets, judge
 from thermocald.photogrammetry.series.target_noise import excess_scatter, slow_errors
 
@@ -115,7 +115,8 @@ def adjusted(
         loose = replace(series, s=replace(s, exterior="mount"), bound=bound)
         loose, estimate, use = loose.adjusted(first, use)
         series, why = choose(loose, s.exterior, estimate)
-        first = estimate if series.s.exterior != "series" else first
+        if series.s.exterior != "series" and np.isfinite(estimate.values).all():
+            first = estimate
     else:
         why = "as asked for"
     series, estimate, use = series.adjusted(first, use)
@@ -125,13 +126,17 @@ def adjusted(
 def result(found: Adjusted) -> SeriesAdjustment:
     """Judge the epochs and scale the covariances."""
     series, estimate, use = found.series, found.estimate, found.use
-    system, s = estimate.system, series.s
+    finite = np.isfinite(estimate.values).all(axis=1)
+    system = replace(estimate.system, good=estimate.system.good & finite)
+    estimate, s = replace(estimate, system=system), series.s
     vPv, redundancy = series.sums(estimate)
     positive = redundancy > 0
     unit = vPv / np.where(positive, redundancy, 1.0)
-    pooled = pooled_variance(vPv, redundancy, system.good)
+    pooled = series.variance(estimate)
     stated = sums_of_squares(series.stated, estimate.residuals, system.use)
     sigma0 = np.sqrt(stated / np.where(positive, redundancy, 1.0))
+    if series.shown_share(estimate) < NOISE_SHOWN:
+        unit, sigma0 = np.maximum(unit, pooled), np.maximum(sigma0, np.sqrt(pooled))
     sigma0[~positive] = np.nan
     cofactors = all_cofactors(system)
     relative, level, trend = cofactors.relative, cofactors.level, cofactors.trend

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.field.sheets import FEWEST_ON_A_SHEET
+from thermocald.photogrammetry.field.planes import FEWEST_ON_A_SHEET
 from thermocald.photogrammetry.linalg import inverse_of_determined
 from thermocald.photogrammetry.series.field_motion import (
     FEWEST_EPOCHS,

@@ -26,6 +26,7 @@ from thermocald.photogrammetry.series.normals import (
 from thermocald.photogrammetry.series.snooping import (
     point_tests,
     pooled_variance,
+    pooled_with_stated,
     snoop_series,
     typical_variance,
 )
@@ -43,11 +44,15 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.series.normals import Partials
     from thermocald.photogrammetry.series.result import SeriesSettings
 
-__all__ = ["ENOUGH_FOR_NOISE", "Estimate", "SeriesEstimator"]
+__all__ = ["ENOUGH_FOR_NOISE", "NOISE_SHOWN", "Estimate", "SeriesEstimator"]
 
 ENOUGH_FOR_NOISE = 20
 """Epochs that show the noise of single targets."""
 
+NOISE_SHOWN = 0.5
+"""Share of the redundancy below which residuals show the priors, not the noise: of one epoch."""
+
+_MANY = 10.0  # observations for each common unknown: their priors hardly matter any more
 _ITERATIONS = 15
 _SMALL = 0.1  # standard deviations: a last step that the partials carry to 1e-3
 _SMALLER = 1e-4  # of one block among many: the result must not depend on the blocks
@@ -95,7 +100,7 @@ class SeriesEstimator:
         """Solve, find the gross errors and the targets' own noise; the series with that noise."""
         series, s, offered = self, self.s, use
         estimate = series.solve(start, use, self.unit)
-        found = estimate.converged & estimate.system.good.any()
+        found = (estimate.converged & estimate.system.good) | ~use.any(axis=1)
         if not found.all():
             # Gross errors among few targets: such an epoch must not spoil what all share.
             few = 2 * found.sum() < len(found)
@@ -139,6 +144,7 @@ class SeriesEstimator:
         residuals = self._residuals(values, offsets, planes(2, *use.shape))
         for _ in range(_ITERATIONS):
             step = system.step(residuals, State(values, offsets, pose))
+            sizes = step.sizes
             values = values.copy()
             values[:, own] += step.d_own
             values[:, common] += step.d_common
@@ -154,9 +160,12 @@ class SeriesEstimator:
             if system.good.any():
                 moved[own] += np.median(step.d_own[system.good], axis=0)
             far = self.held is None and np.abs(system.design.at.A @ moved).max(initial=0.0)
+            if not far < self.sensor.width:  # start values are good to a few per cent
+                sizes = np.full(len(use), np.inf)
+                break
             if far > _RELINEARISE_PX:
                 system = self._linearised(values, use, variance)
-        return Estimate(values, offsets, pose, residuals, system, step.sizes < _NEAR)
+        return Estimate(values, offsets, pose, residuals, system, sizes < _NEAR)
 
     def snoop(self, estimate: Estimate, use: Mask, offered: Mask) -> tuple[Estimate, Mask]:
         """Find the gross errors; the estimate without them and what of the offered takes part."""
@@ -193,10 +202,12 @@ class SeriesEstimator:
         typical = None
         for _ in range(_ROUNDS):
             tests = point_tests(estimate.system, estimate.residuals)
-            typical = typical or typical_variance(tests, use)
-            keep = snoop_series(
-                tests, offered, use, self.s.unknowns, self.s.snooping_alpha, typical
-            )
+            if typical is None:
+                typical = typical_variance(tests, use)
+            alpha = self.s.snooping_alpha
+            if self.shown_share(estimate) < NOISE_SHOWN:
+                alpha **= 2  # errors of the field look like gross ones: only those beyond doubt
+            keep = snoop_series(tests, offered, use, self.s.unknowns, alpha, typical)
             keep = rejections.settle(use, keep)
             previous, variance = variance, self.variance(estimate)
             settled = not self.has_offsets or abs(variance / previous - 1) < 0.02
@@ -216,7 +227,8 @@ class SeriesEstimator:
         typical = self.typical
         for _ in range(_ROUNDS):
             tests = point_tests(system, residuals[part])
-            typical = typical or typical_variance(tests, use)
+            if typical is None:  # of all epochs, at the first look
+                typical = typical_variance(tests, use)
             keep = snoop_series(
                 tests, offered[part], use[part], self.s.unknowns, self.s.snooping_alpha, typical
             )
@@ -294,5 +306,18 @@ class SeriesEstimator:
         return vPv, 2 * n - estimate.system.own_count() - share
 
     def variance(self, estimate: Estimate) -> float:
-        """Variance of unit weight of the series, the median over its epochs."""
-        return pooled_variance(*self.sums(estimate), estimate.system.good)
+        """Variance of unit weight of the series: the median over its epochs, and what was stated
+        where they show little of it.
+        """
+        vPv, redundancy = self.sums(estimate)
+        good = estimate.system.good
+        shown = float(redundancy[good].sum()) * self.shown_share(estimate)
+        return pooled_with_stated(pooled_variance(vPv, redundancy, good), shown)
+
+    def shown_share(self, estimate: Estimate) -> float:
+        """Which share of the redundancy shows the noise, however wrong the priors are."""
+        system = estimate.system
+        whole = float(self.sums(estimate)[1][system.good].sum())
+        if whole > _MANY * system.design.width:
+            return 1.0  # an unknown's prior holds at most a quarter of an observation
+        return 1.0 - system.prior_share() / whole if whole > 0 else 0.0

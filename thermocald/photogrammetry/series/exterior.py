@@ -70,14 +70,15 @@ def observed_movement(series: SeriesEstimator, estimate: Estimate) -> Movement:
             extra = pairs.normal_matrices(typical[None], at.A[..., EOP])[0]
             correlated = extra / variance**2
     free = np.array(free_columns(series.s.free), dtype=np.int64)
+    good = system.good & np.isfinite(b).all(axis=1)  # without epochs that diverged
     found, starts = [], []
     for part in series.windows or (slice(0, len(N)),):
-        if system.good[part].sum() < FEWEST_EPOCHS and series.windows:
+        if good[part].sum() < FEWEST_EPOCHS and series.windows:
             continue
         starts.append(part.start)
         found.append(
             estimate_movement(
-                N[part] / variance, b[part] / variance, free, system.good[part],
+                N[part] / variance, b[part] / variance, free, good[part],
                 series.s.drift_period, correlated,
             )
         )  # fmt: skip

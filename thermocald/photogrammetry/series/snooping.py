@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
     Columns = NDArray[np.int64]
 
-__all__ = ["point_tests", "pooled_variance", "snoop_series", "typical_variance"]
+__all__ = [
+    "point_tests", "pooled_variance", "pooled_with_stated", "snoop_series", "typical_variance",
+]  # fmt: skip
 
 
 def point_tests(system: SeriesSystem, residuals: Array) -> Array:
@@ -76,10 +78,16 @@ def pooled_variance(vPv: Array, redundancy: Array, good: Mask) -> float:
     return float(np.median(vPv[good] / redundancy[good])) or 1.0 if good.any() else 1.0
 
 
+def pooled_with_stated(found: float, freedom: float) -> float:
+    """A variance of unit weight found with some degrees of freedom, and 1, which was stated."""
+    known = max(freedom, 0.0)
+    return (known * found + TRUSTED_REDUNDANCY) / (known + TRUSTED_REDUNDANCY)
+
+
 def typical_variance(tests: Array, used: Mask) -> float:
-    """Variance of unit weight that most epochs agree on."""
+    """Variance of unit weight that most epochs agree on; 1 where no residuals show it."""
     variances = _variances(tests, used)
-    return float(np.median(variances[used.any(axis=1)])) if used.any() else 1.0
+    return float(np.median(variances[used.any(axis=1)])) or 1.0 if used.any() else 1.0
 
 
 def snoop_series(

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 __all__ = ["SeriesSystem", "Step", "alike"]
 
 _FARTHEST_PX = 200.0  # that one step may move an image point by
+_KEPT = 4_000_000  # numbers of all couplings together, 32 MB
 _CHUNK = 128  # epochs whose couplings with the offsets are held at a time
 
 
@@ -57,7 +58,7 @@ class SeriesSystem:
     nothing is common; Q (E, p, p): cofactors of an epoch's own parameters, the common ones held;
     good (E,): epochs that carry theirs; Q_common (q, q), or with offsets (q + 2T, q + 2T), empty
     before `solved`; alike: which epochs have the same matrices, as of `same_rows`, or None where
-    that is no longer known.
+    that is no longer known; coupled: what `couplings` gave, where that takes little memory.
     """
 
     design: Design
@@ -68,6 +69,7 @@ class SeriesSystem:
     good: Mask
     Q_common: Array
     alike: tuple[Index, Index] | None
+    coupled: list[tuple[Index, Array]] | None = None
 
     @classmethod
     def formed(cls, design: Design, weights: Array, use: Mask) -> SeriesSystem:
@@ -86,6 +88,8 @@ class SeriesSystem:
 
     def solved(self) -> SeriesSystem:
         """The same with the cofactors of the common unknowns."""
+        if len(self.good) * len(self.design.own) * self.design.width <= _KEPT:
+            self.coupled = list(self.couplings())
         return replace(self, Q_common=inverse_of_determined(self.common_normals()))
 
     def used(self, rows: Index | Mask | slice = slice(None)) -> Array:
@@ -111,6 +115,9 @@ class SeriesSystem:
 
     def couplings(self) -> Iterator[tuple[Index, Array]]:
         """Chunks of good epochs and their blocks (e, p, q + 2T) of own with common unknowns."""
+        if self.coupled is not None:
+            yield from self.coupled
+            return
         rows = np.flatnonzero(self.good)
         if self.design.width == 0 or len(self.design.own) == 0:
             return
@@ -194,6 +201,15 @@ class SeriesSystem:
         """How many of the observations the common unknowns use up."""
         held = np.einsum("ij,ji->", self.Q_common, self.design.prior_matrix())
         return float(self.design.width - held)
+
+    def prior_share(self) -> float:
+        """How much of the redundancy rests on priors of the common unknowns being as stated.
+
+        Along a direction of which the prior tells the share h, that is h - h² of an observation: of
+        one epoch alone a wrong prior and another noise look the same, and many tell them apart.
+        """
+        held = self.Q_common @ self.design.prior_matrix()
+        return float(np.trace(held) - np.einsum("ij,ji->", held, held))
 
 
 def _used(weights: Array, use: Mask) -> Array:

@@ -15,8 +15,8 @@ from thermocald.errors import TestFieldError
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.targets import ring_code
 from thermocald.photogrammetry.targets.chessboard import chess_code
-from thermocald.photogrammetry.targets.dictionary import corner_shift
-from thermocald.photogrammetry.targets.dictionary import dictionary as markers_of
+from thermocald.photogrammetry.targets.markers import corner_shift
+from thermocald.photogrammetry.targets.markers import dictionary as markers_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -61,7 +61,7 @@ def aprilgrid(
     """Kalibr's AprilGrid: size mm of a tag with its black border, spacing as a ratio of it.
 
     Tag `first` is at the lower left; numbers grow to the right, then upwards. The corners of an
-    upright tag are numbered from its bottom right, clockwise (`targets.dictionary`).
+    upright tag are numbered from its bottom right, clockwise (`targets.markers`).
     """
     if not (columns > 0 and rows > 0 and size > 0 and 0 <= spacing <= 1):
         raise TestFieldError(

@@ -21,6 +21,8 @@ from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.photogrammetry.targets.markers import MarkerCorners, measure_corners, to_8_bit
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
@@ -96,7 +98,10 @@ def _find(grey: NDArray[np.uint8], columns: int, rows: int) -> Array | None:
     small = grey
     if scale > 1:
         small = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
-    done, corners = cv2.findChessboardCornersSB(small, (columns, rows), flags=0)
+    size = (columns, rows)
+    done, corners = cv2.findChessboardCornersSB(small, size, flags=0)
+    if not done:  # oblique or soft boards: by the quadrangles
+        done, corners = cv2.findChessboardCorners(small, size)
     if not done:
         return None
     grid = scale * corners.reshape(rows, columns, 2).astype(float) + (scale - 1) / 2
@@ -120,16 +125,11 @@ def _begins_black(grey: NDArray[np.uint8], grid: Array) -> bool:
     return mean(diagonal) < mean(beside)
 
 
-def locate_chess_corners(testfield: TestField, orientation: Orientation) -> MarkerCorners:
-    """Where the corners of ChArUco boards must be, given an orientation, with their two edges."""
-    rows = np.array(
-        [
-            i
-            for i, (kind, code) in enumerate(zip(testfield.kinds, testfield.codes, strict=True))
-            if kind == "chess_corner" and not is_chess(code)
-        ],
-        dtype=np.int64,
-    )
+def locate_chess_corners(
+    testfield: TestField, corners: Sequence[int], orientation: Orientation
+) -> MarkerCorners:
+    """Where corners of squares (rows of the field) must be, given an orientation, and two edges."""
+    rows = np.array(corners, dtype=np.int64)
     first, second, quiet = _edges(testfield, rows)
     points = testfield.points[rows]
     project = orientation.camera.project
@@ -147,11 +147,13 @@ def _edges(testfield: TestField, rows: NDArray[np.int64]) -> tuple[Array, Array,
     from the edges nothing but squares is.
     """
     points = testfield.points[rows]
-    markers = testfield.points[[i for i, k in enumerate(testfield.kinds) if k == "marker_corner"]]
+    kinds = np.array(testfield.kinds)
+    corners = testfield.points[kinds == "chess_corner"]
+    markers = testfield.points[kinds == "marker_corner"]
     first, second = np.zeros_like(points), np.zeros_like(points)
     quiet = np.zeros(len(points))
     for i, point in enumerate(points):
-        offset = points - point
+        offset = corners - point
         distance = np.linalg.norm(offset, axis=1)
         order = np.argsort(distance, kind="stable")[1:9]
         first[i] = offset[order[0]] if len(order) else (1.0, 0, 0)

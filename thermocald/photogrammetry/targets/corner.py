@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.targets.blurred_disc import normal_cdf
+from thermocald.photogrammetry.targets.circle import normal_cdf
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
+from thermocald.arrays import scratch
 from thermocald.photogrammetry.targets.outline import LocalMap, from_ellipses
-from thermocald.photogrammetry.targets.scratch import scratch
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

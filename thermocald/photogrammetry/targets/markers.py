@@ -1,4 +1,14 @@
-"""Square markers of OpenCV's dictionaries: found, identified, and their corners measured.
+"""Square coded markers: dictionaries, the order of their corners, and where they are in a frame.
+
+Programs number the corners of one marker in different orders (`dictionary`). A field with another
+order gives every marker a turn of its own, and a single one even a pose that fits. Among several
+markers the turn shows: what their corners say of the image's directions is not what their places
+say.
+
+Corner 0 of a marker is the top left one of the marker as OpenCV 4 draws it, and the order runs
+clockwise as seen. OpenCV 4 draws AprilTags turned by 180° against the printed originals, later
+versions do not; here the order of OpenCV 4 stays: in an AprilTag that stands upright (as its makers
+and Kalibr print it) corners 0, 1, 2, 3 are bottom right, bottom left, top left, top right.
 
 A test field names marker corners in its `code` column as `DICT_APRILTAG_36h11:17:0`: dictionary,
 marker, corner in the order that `dictionary` defines (clockwise as seen; in an upright AprilTag
@@ -12,7 +22,8 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -20,12 +31,6 @@ import numpy as np
 from thermocald.errors import TestFieldError
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.photogrammetry.targets.corner import fit_corners
-from thermocald.photogrammetry.targets.dictionary import (
-    corner_shift,
-    detector,
-    dictionary,
-    marker_size,
-)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -33,19 +38,96 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array, Image
     from thermocald.photogrammetry.field.testfield import TestField
 
-__all__ = [
-    "DetectedMarkers",
-    "MarkerCorners",
-    "detect_markers",
-    "is_marker",
-    "locate_markers",
-    "marker_rows",
-    "measure_corners",
-    "measure_markers",
-    "parse_marker",
-    "predicted_markers",
-    "to_8_bit",
-]
+
+_FEWEST = 3
+_NEIGHBOURS = 4
+_AGREEMENT = 0.6
+
+
+def corners_turned_deg(found: MarkerCorners, testfield: TestField) -> int:
+    """By how many degrees (0, 90, 180, 270) the field's corners are turned against the image's.
+
+    0 too where fewer than three markers with four corners each are seen: one alone cannot tell.
+    """
+    corners: dict[tuple[str, int], list[tuple[int, Array]]] = {}
+    for row, at in zip(found.rows.tolist(), found.corners, strict=True):
+        name, marker, _ = parse_marker(testfield.codes[row])
+        corners.setdefault((name, marker), []).append((row, at))
+    whole = [pairs for pairs in corners.values() if len(pairs) == 4]
+    if len(whole) < _FEWEST:
+        return 0
+    field = np.array([testfield.points[[row for row, _ in pairs]] for pairs in whole])
+    image = np.array([[at for _, at in pairs] for pairs in whole])
+    centre, seen = field.mean(axis=1), image.mean(axis=1)
+    cosines, sines = [], []
+    for k in range(len(whole)):
+        # the marker's own map of the field's directions into the image
+        linear = np.linalg.lstsq(field[k] - centre[k], image[k] - seen[k], rcond=None)[0]
+        near = np.argsort(np.linalg.norm(centre - centre[k], axis=1), kind="stable")
+        for other in near[1 : _NEIGHBOURS + 1].tolist():
+            told, true = (centre[other] - centre[k]) @ linear, seen[other] - seen[k]
+            size = float(np.linalg.norm(told) * np.linalg.norm(true))
+            if size > 0:
+                cosines.append(float(told @ true) / size)
+                sines.append(float(told[0] * true[1] - told[1] * true[0]) / size)
+    cosine, sine = float(np.median(cosines)), float(np.median(sines))
+    if cosine < -_AGREEMENT:
+        return 180
+    if abs(sine) > _AGREEMENT:
+        return 90 if sine > 0 else 270
+    return 0
+
+
+_TAG_0_UPRIGHT = "110101"  # the first row of tag 0 of the family 36h11, 1 is white
+
+
+@cache
+def dictionary(name: str) -> Any:
+    """OpenCV's dictionary of a name; TestFieldError where it has none."""
+    number = getattr(cv2.aruco, name, None)
+    if not name.startswith("DICT_") or not isinstance(number, int):
+        raise TestFieldError(
+            f"{name!r} is not a dictionary of OpenCV's; DICT_4X4_50, DICT_5X5_1000, or "
+            "DICT_APRILTAG_36h11 are"
+        )
+    return cv2.aruco.getPredefinedDictionary(number)
+
+
+def marker_size(name: str, border: int = 1) -> int:
+    """Cells along the side of a marker with a black border of so many cells."""
+    return int(dictionary(name).markerSize) + 2 * border
+
+
+@cache
+def detector(name: str, border: int = 1) -> Any:
+    """OpenCV's detector of a dictionary's markers; corners are measured by our own fit later."""
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
+    parameters.minMarkerPerimeterRate = 0.01
+    parameters.markerBorderBits = border
+    # A bit is read from a third of its cell: the default of eight px a cell gives blur a chance.
+    return cv2.aruco.ArucoDetector(dictionary(name), parameters)
+
+
+@cache
+def corner_shift(name: str) -> int:
+    """By how many places OpenCV's order of corners precedes ours: 2 where it turns AprilTags."""
+    if not name.startswith("DICT_APRILTAG"):
+        return 0
+    tags = dictionary("DICT_APRILTAG_36h11")
+    drawn = cv2.aruco.generateImageMarker(tags, 0, 8)[1, 1:7] > 127
+    return 2 if "".join(str(int(white)) for white in drawn) == _TAG_0_UPRIGHT else 0
+
+
+@cache
+def marker_cells(name: str, number: int, border: int = 1) -> NDArray[np.bool_]:
+    """The cells of a marker, its border included, True where black; corner 0 is the upper left."""
+    size = marker_size(name, border)
+    image = cv2.aruco.generateImageMarker(dictionary(name), number, size, borderBits=border)
+    cells: NDArray[np.bool_] = np.rot90(np.asarray(image) < 128, k=corner_shift(name)).copy()
+    cells.setflags(write=False)
+    return cells
+
 
 _LARGE_PIXELS = 3_000_000
 _SMALLEST_SIDE_PX = 16.0

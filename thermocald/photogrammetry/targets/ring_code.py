@@ -1,4 +1,4 @@
-"""Ring codes of 12 and 14 bit: circular coded targets as AICON, Metashape, and others print them.
+"""Ring codes around circular targets: words, drawing, and how they are read in a frame.
 
 A target is a disc of radius 1 and a concentric ring between radius 2 and 3 that is cut into N equal
 segments. A segment in the disc's colour is a 1, one in the background's colour a 0. Read clockwise
@@ -12,31 +12,54 @@ that programs print are in increasing order of the code.
 Source: Schneider, C. T. (1991): 3-D Vermessung von Oberflächen und Bauteilen durch Photogrammetrie
 und Bildverarbeitung, IDENT/VISION '91; rule and geometry as the expired patent DE 197 33 466 A1,
 read by M. Petroff, "Photogrammetry targets" (2018), who compared them with Scanreference's targets.
+
+A contour gives a disc to a pixel; its size is taken from the grey values, and so is the perspective
+in which its ring is seen.
+
+A ring is trusted only where the drawing fits after it may shift, turn and grow a little.
+
+About each candidate the grey values are sampled on circles in the ellipse's own frame. A coded
+target has its disc in one grey, a gap about it in the other, background outside of its ring, and
+in the ring transitions that all lie on a raster of 12 or of 14 bits. What is read is then drawn,
+blurred, and compared with the samples. Only a ring that passes all of it and whose code exists is
+a coded target: the codes have little redundancy of their own (`ring_code`), their shape has much.
+
+Searched from the likely to the rare: dark on light in a reduced image first, light on dark at full
+size last, until enough are found for an orientation.
 """
 
 from __future__ import annotations
 
+from collections import Counter
+from dataclasses import dataclass
 from functools import cache
+from math import inf
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
 
 from thermocald.errors import TestFieldError
+from thermocald.photogrammetry.targets.circle import normal_cdf
+from thermocald.photogrammetry.targets.detection import Candidates, find_circles
+from thermocald.photogrammetry.targets.markers import (
+    detect_markers,
+    is_marker,
+    parse_marker,
+    to_8_bit,
+)
+from thermocald.photogrammetry.targets.outline import RING_INNER, RING_OUTER, LocalMap
 
-__all__ = [
-    "BITS",
-    "RING_INNER",
-    "RING_OUTER",
-    "codes",
-    "is_ring",
-    "parse",
-    "segments",
-    "smallest_rotation",
-    "write",
-]
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+    from numpy.typing import NDArray
+
+    from thermocald.arrays import Array, Image, Single
+    from thermocald.photogrammetry.field.testfield import TestField
+
 
 BITS = (12, 14)
-RING_INNER = 2.0
-"""Inner radius of the ring, in radii of the disc."""
-RING_OUTER = 3.0
-"""Outer radius of the ring, in radii of the disc; outside, as much again must be background."""
 
 
 def smallest_rotation(number: int, bits: int) -> int:
@@ -107,3 +130,435 @@ def segments(bits: int, number: int) -> tuple[tuple[float, float], ...]:
             end += 1
         arcs.append((begin / bits, end / bits))
     return tuple(arcs)
+
+
+ANGLES = 84  # a multiple of 12 and of 14
+COARSE_ANGLES = 28
+_PROFILE, _PROFILE_STEP, _PROFILE_REACH = (0.5, 3.55), 0.05, 0.45
+_EDGE_RADII = (0.55, 0.65, 0.75, 0.85, 0.95, 1.05, 1.15, 1.25, 1.35, 1.45)
+_INSIDE = 0.6  # level of a sample, 0 background, 1 ink
+
+
+def sample(
+    image: NDArray[np.uint8], maps: LocalMap, radii: tuple[float, ...], angles: int
+) -> Single:
+    """Grey values (n, radii, angles) on circles about discs, clockwise from the first axis.
+
+    radii: of the circles, in radii of the disc; angles: how many samples a circle has.
+    """
+    turn = 2 * np.pi * np.arange(angles) / angles
+    circle = np.stack([np.cos(turn), np.sin(turn)])
+    grey = np.empty((len(maps), len(radii), angles), dtype=np.float32)
+    chunk = 32_000 // len(radii)  # cv2.remap takes no more rows
+    rho = np.array(radii, dtype=np.float32)[:, None, None]
+    bend = np.stack([circle[0] ** 2, 2 * circle[0] * circle[1], circle[1] ** 2]) / 2
+    bent = bool(np.any(maps.second))
+    for i in range(0, len(maps), chunk):
+        part = slice(i, i + chunk)
+        around = (maps.linear[part] @ circle).astype(np.float32)[:, None] * rho
+        if bent:
+            around += (maps.second[part] @ bend).astype(np.float32)[:, None] * rho**2
+        around += maps.centre[part].astype(np.float32)[:, None, :, None]
+        x, y = (np.ascontiguousarray(around[:, :, k]).reshape(-1, angles) for k in (0, 1))
+        grey[part] = cv2.remap(image, x, y, cv2.INTER_LINEAR).reshape(-1, len(radii), angles)
+    return grey
+
+
+def sized(image: NDArray[np.uint8], maps: LocalMap, gap: Single, contrast: Single) -> LocalMap:
+    """The maps with the size that the discs have at half of their contrast.
+
+    A contour lies where its threshold does, which may be a pixel off.
+    """
+    level = sample(image, maps, _EDGE_RADII, COARSE_ANGLES)
+    level = (level - gap[:, None, None]) / contrast[:, None, None]
+    # The disc reaches as far as ink goes: its level, summed outwards.
+    step = _EDGE_RADII[1] - _EDGE_RADII[0]
+    radius = _EDGE_RADII[0] - step / 2 + np.clip(level, 0, 1).sum(axis=1) * step
+    turn = 2 * np.pi * np.arange(COARSE_ANGLES) / COARSE_ANGLES
+    across = 1 / np.linalg.norm(
+        np.swapaxes(maps.inverse, 1, 2) @ np.stack([np.cos(turn), np.sin(turn)]),
+        axis=1,
+    )
+    excess = np.median((radius - 1) * across, axis=1)
+    axes = np.linalg.norm(maps.linear, axis=1)
+    factor = np.maximum(1 + excess[:, None] / axes, 0.5)
+    return LocalMap(maps.centre, maps.linear * factor[:, None, :], maps.second)
+
+
+def in_perspective(
+    image: NDArray[np.uint8], maps: LocalMap, gap: Single, contrast: Single
+) -> LocalMap:
+    """The maps (n,) of discs with the perspective in which their rings are seen.
+
+    gap, contrast (n,) DN. The edges of disc and ring are looked for along each radius; those of a
+    target seen in perspective w about a centre that is e off lie at R − e·u − uᵀA u R − (w·u) R²
+    instead of at R = 1, 2, 3, with u the direction and A the ellipse's error. What the ring says
+    is of no matter here.
+    """
+    rho = np.arange(_PROFILE[0], _PROFILE[1], _PROFILE_STEP)
+    level = sample(image, maps, tuple(rho.tolist()), ANGLES)
+    level = (level - gap[:, None, None]) / contrast[:, None, None]
+    turn = 2 * np.pi * np.arange(ANGLES) / ANGLES
+    u = np.stack([np.cos(turn), np.sin(turn)])
+    # away from the ends of an arc, whose corners are rounded by blur
+    ring = level[:, np.argmin(np.abs(rho - 2.5))] > _INSIDE
+    ring &= np.roll(ring, 2, axis=1) & np.roll(ring, -2, axis=1)
+    normal, rhs = np.zeros((len(maps), 7, 7)), np.zeros((len(maps), 7))
+    for radius, rising in (
+        (1.0, False),
+        (RING_INNER, True),
+        (RING_OUTER, False),
+    ):
+        window = np.abs(rho - radius) < _PROFILE_REACH
+        part = level[:, window] if rising else 1 - level[:, window]
+        crossing = (part[:, :-1] < 0.5) & (part[:, 1:] >= 0.5)
+        known = crossing.sum(axis=1) == 1
+        if radius > 1:
+            known &= ring
+        first = np.argmax(crossing, axis=1)[:, None]
+        below = np.take_along_axis(part, first, 1)[:, 0]
+        above = np.take_along_axis(part, first + 1, 1)[:, 0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            place = rho[window][first[:, 0]] + _PROFILE_STEP * (0.5 - below) / (above - below)
+        short = np.where(known, radius - place, 0.0)
+        design = np.stack(
+            [
+                u[0], u[1], radius * u[0] ** 2, 2 * radius * u[0] * u[1], radius * u[1] ** 2,
+                radius**2 * u[0], radius**2 * u[1],
+            ]
+        )  # fmt: skip
+        normal += (design * known[:, None]) @ design.T
+        rhs += short @ design.T
+    ex, ey, a, b, d, *w = np.linalg.solve(normal + 1e-3 * np.eye(7), rhs[..., None])[..., 0].T
+    e, shape = np.stack([ex, ey], axis=-1), np.stack([a, b, b, d], axis=-1).reshape(-1, 2, 2)
+    linear = maps.linear @ (np.eye(2) - shape)
+    first, second = linear[:, :, 0], linear[:, :, 1]
+    ws, wt = w[0][:, None], w[1][:, None]
+    bend = np.stack([-2 * ws * first, -ws * second - wt * first, -2 * wt * second], axis=-1)
+    return LocalMap(maps.centre - (maps.linear @ e[..., None])[..., 0], linear, bend)
+
+
+RADII = (1.75, 2.05, 2.25, 2.5, 2.75, 2.95, 3.25)
+_BLURS_PX = (0.8, 1.4)
+_LARGEST_SHIFT = 0.2  # radii, by which perspective and distortion move a ring against its disc
+# RMS of samples against what was read, in levels: at most, and for large targets, whose edges fill
+# less of the ring, less.
+_MISFIT = 0.13
+_MISFIT_LARGE, _MISFIT_EDGE_PX = 0.03, 0.45
+
+
+def allowed_misfit(maps: LocalMap) -> Array:
+    """Largest misfit (n,) in levels with which a ring about each disc is trusted."""
+    allowed: Array = _MISFIT_LARGE + _MISFIT_EDGE_PX / maps.semi_axes[:, 1]
+    return np.minimum(allowed, _MISFIT)
+
+
+def ring_misfit(
+    level: Single,
+    maps: LocalMap,
+    ones: NDArray[np.bool_],
+    which: NDArray[np.int64],
+    within: Array,
+) -> Array:
+    """RMS (n,) of the samples against the ring that was read, drawn with one of two blurs.
+
+    level (n, radii, angles): samples at `RADII`, 0 background, 1 ink; ones (n, bits): what was
+    read; which, within (n, angles): the segment in which each angle lies, and where in it, 0 to 1.
+    """
+    bits = ones.shape[1]
+    mine = np.take_along_axis(ones, which, 1)
+    left = np.take_along_axis(ones, (which - 1) % bits, 1) != mine
+    right = np.take_along_axis(ones, (which + 1) % bits, 1) != mine
+    # Angle to the nearest transition in rad, positive on ink; a bit farther off will do for far.
+    angle = np.minimum(np.where(left, within, within + 1), np.where(right, 1 - within, 2 - within))
+    angle = np.where(mine, angle, -angle) * (2 * np.pi / bits)
+    turn = 2 * np.pi * np.arange(ANGLES) / ANGLES
+    u = np.stack([np.cos(turn), np.sin(turn)])
+    # How many px a radius is: across the circles, and across a radial edge at that radius.
+    across = 1 / np.linalg.norm(np.swapaxes(maps.inverse, 1, 2) @ u, axis=1)
+    along = np.abs(np.linalg.det(maps.linear))[:, None] / np.linalg.norm(maps.linear @ u, axis=1)
+    across, side = across.astype(np.float32), (angle * along).astype(np.float32)
+    rho = np.array(RADII, dtype=np.float32)[:, None]
+    misfit = np.full(len(level), np.inf)
+    for blur in _BLURS_PX:
+        left = np.nonzero(misfit > allowed_misfit(maps))[0]
+        if len(left) == 0:
+            break
+        scale = (across[left] / np.float32(blur))[:, None]
+        drawn = normal_cdf((rho - np.float32(RING_INNER)) * scale)
+        drawn += normal_cdf((np.float32(RING_OUTER) - rho) * scale)
+        drawn -= np.float32(1)
+        drawn *= normal_cdf(rho * (side[left] / np.float32(blur))[:, None])
+        misfit[left] = np.minimum(misfit[left], _rms_after_shift(level[left], drawn))
+    return misfit
+
+
+def _rms_after_shift(level: Single, drawn: Single) -> Array:
+    """RMS (n,) of level minus drawn (n, radii, angles) after the ring may shift, turn, and grow."""
+    n = len(level)
+    turn = (2 * np.pi * np.arange(ANGLES) / ANGLES).astype(np.float32)
+    radii = np.array(RADII, dtype=np.float32)
+    rho, cosine, sine = radii[:, None], np.cos(turn), np.sin(turn)
+    outwards = np.gradient(drawn, radii, axis=1)
+    around = np.roll(drawn, -1, axis=2) - np.roll(drawn, 1, axis=2)
+    around *= np.float32(ANGLES / (4 * np.pi))
+    design = np.stack(
+        [
+            outwards * cosine - around * sine / rho,
+            outwards * sine + around * cosine / rho,
+            around,
+            outwards * rho,
+        ],
+        axis=1,
+    ).reshape(n, 4, -1)
+    residual = (level - drawn).reshape(n, -1)
+    normal = design @ np.swapaxes(design, 1, 2) + 1e-3 * np.eye(4, dtype=np.float32)
+    shift = np.linalg.solve(normal, (design @ residual[..., None]))[..., 0]
+    shift = np.clip(shift, -_LARGEST_SHIFT, _LARGEST_SHIFT)
+    left = residual - (shift[:, None] @ design)[:, 0]
+    rms: Array = np.sqrt(np.mean(left * left, axis=1))
+    return rms
+
+
+_COARSE_RADII = (0.5, 1.5, 2.5, 3.4)
+_MIDDLE = slice(2, 5)
+_OUTSIDE = 0.4  # level of a sample, 0 background, 1 ink
+_LEAST_RELIEF = 0.35  # of the ring, against none about a plain circle
+_SHARE = 0.85  # of the samples on a circle that must agree
+_LEAST_CONTRAST_DN = 10.0
+_SMALLEST_SEMI_AXIS_PX = 2.6  # a gap of less cannot be seen
+_RASTER_PX = 0.5  # by how much a transition may miss the raster, and by how many turns
+_RASTER_TURNS = 0.006
+# A closed ring with something across is read as one arc, a line through a dot as two single bits.
+_MISFIT_OF_FEW = 0.06
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CodedTargets:
+    """Coded targets: bits, numbers (m,), and the row (m,) of each among the candidates."""
+
+    bits: NDArray[np.int64]
+    numbers: NDArray[np.int64]
+    rows: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+
+def read_codes(
+    image: NDArray[np.uint8],
+    candidates: Candidates,
+    known: frozenset[tuple[int, int]] | None = None,
+    wanted: tuple[Collection[tuple[int, int]], float] = ((), inf),
+) -> CodedTargets:
+    """The ring codes about candidates; `known` (bits, number), all others are ignored.
+
+    Both families are always read, since a ring of one may be mistaken for one of the other. A code
+    that is read at two places is dropped: one of the two is wrong. wanted: codes, and how many of
+    them are enough: discs about which no code was found are then not looked at in perspective.
+    """
+    rows, gap, contrast = _disc_and_gap(image, candidates)
+    maps = sized(image, candidates.maps.select(rows), gap, contrast)
+    bits, number = _read(image, maps, gap, contrast)
+    # Seen from near and aslant, a ring is not concentric with its disc: by pixels if it is large.
+    left = np.nonzero(bits == 0)[0]
+    codes, enough = wanted
+    if len(left) and sum(c in codes for c in _pairs(bits, number)) < enough:
+        grey = gap[left], contrast[left]
+        bits[left], number[left] = _read(
+            image, in_perspective(image, maps.select(left), *grey), *grey
+        )
+    good = bits > 0
+    bits, number, rows = bits[good], number[good], rows[good]
+    found = _pairs(bits, number)
+    count = Counter(found)
+    keep = np.array(
+        [i for i, c in enumerate(found) if count[c] == 1 and (known is None or c in known)],
+        dtype=np.int64,
+    )
+    return CodedTargets(bits[keep], number[keep], rows[keep])
+
+
+def _pairs(bits: NDArray[np.int64], number: NDArray[np.int64]) -> list[tuple[int, int]]:
+    return list(zip(bits.tolist(), number.tolist(), strict=True))
+
+
+def _read(
+    image: NDArray[np.uint8], maps: LocalMap, gap: Single, contrast: Single
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Bits (n,), 0 where no code can be trusted, and numbers (n,) of the codes about discs."""
+    level = sample(image, maps, RADII, ANGLES)
+    level = (level - gap[:, None, None]) / contrast[:, None, None]
+    families = np.array(BITS, dtype=np.int64)
+    readings = [_read_family(level, maps, n) for n in families.tolist()]
+    numbers = np.array([r[0] for r in readings]).reshape(len(families), len(maps))
+    misfits = np.array([r[1] for r in readings]).reshape(len(families), len(maps))
+    best, at = np.argmin(misfits, axis=0), np.arange(len(maps))
+    misfit = misfits[best, at]
+    misfits[best, at] = np.inf
+    # A ring that fits both families can be trusted with neither.
+    good = np.isfinite(misfit) & (
+        misfits.min(axis=0, initial=np.inf) > 1.2 * np.where(np.isfinite(misfit), misfit, 0)
+    )
+    return np.where(good, families[best], 0), numbers[best, at]
+
+
+def _disc_and_gap(
+    image: NDArray[np.uint8], candidates: Candidates
+) -> tuple[NDArray[np.int64], Single, Single]:
+    """Candidates with disc, gap, something in the ring, background outside, and all in the image.
+
+    Returns their rows, the grey value of the gap, and the contrast.
+    """
+    height, width = image.shape
+    reach = candidates.maps.half_extent * RING_OUTER
+    low, high = candidates.maps.centre - reach, candidates.maps.centre + reach
+    inside = np.all((low > 0) & (high < (width - 1, height - 1)), axis=1)
+    large = candidates.maps.semi_axes[:, 1] >= _SMALLEST_SEMI_AXIS_PX
+    rows = np.nonzero(inside & large)[0]
+    grey = sample(image, candidates.maps.select(rows), _COARSE_RADII, COARSE_ANGLES)
+    ink, gap = grey[:, 0].mean(axis=1), grey[:, 1].mean(axis=1)
+    contrast = ink - gap
+    enough = contrast * candidates.polarity[rows] >= _LEAST_CONTRAST_DN
+    level = (grey - gap[:, None, None]) / np.where(enough, contrast, 1.0)[:, None, None]
+    passed = (
+        enough
+        & (np.mean(level[:, 0] > _INSIDE, axis=1) >= _SHARE)
+        & (np.mean(level[:, 1] < _OUTSIDE, axis=1) >= _SHARE)
+        & (np.ptp(level[:, 2], axis=1) > _LEAST_RELIEF)
+        & (np.mean(level[:, 3] < _OUTSIDE, axis=1) >= _SHARE)
+    )
+    return rows[passed], gap[passed], contrast[passed]
+
+
+@cache
+def _code_table(bits: int) -> NDArray[np.int64]:
+    """The code of each number of so many bits, -1 where it is none."""
+    table = np.full(1 << bits, -1, dtype=np.int64)
+    words = np.array(codes(bits))
+    for k in range(bits):
+        table[((words << k) | (words >> (bits - k))) & ((1 << bits) - 1)] = words
+    return table
+
+
+def _read_family(level: Single, maps: LocalMap, bits: int) -> tuple[NDArray[np.int64], Array]:
+    """Codes (n,) read with a raster of so many bits, -1 for none, and the misfit (n,) of what was
+    read, infinite where nothing was.
+    """
+    n = len(level)
+    ring = level[:, _MIDDLE].mean(axis=1)
+    after = np.roll(ring, -1, axis=1)
+    crosses = (ring > 0.5) != (after > 0.5)
+    target, at = np.nonzero(crosses)
+    level_at = ring[target, at]
+    place = at + (0.5 - level_at) / (after[target, at] - level_at)
+    phase = 2 * np.pi * place * bits / ANGLES
+    cosine, sine = np.bincount(target, np.cos(phase), n), np.bincount(target, np.sin(phase), n)
+    offset = np.arctan2(sine, cosine) / (2 * np.pi * bits)  # in turns: where the raster begins
+    off = np.zeros(n)
+    np.maximum.at(
+        off, target, np.abs((phase / (2 * np.pi) - offset[target] * bits + 0.5) % 1 - 0.5) / bits
+    )
+    # A pixel is the larger an angle the smaller the target: along its shortest semi-axis.
+    allowed = _RASTER_TURNS + _RASTER_PX / (2 * np.pi * 2.5 * maps.semi_axes[:, 1])
+    on_raster = off < np.minimum(allowed, 0.3 / bits)
+
+    turns = np.arange(ANGLES) / ANGLES
+    position = ((turns - offset[:, None]) % 1.0) * bits
+    which = np.minimum(position.astype(np.int64), bits - 1)
+    within = position - which
+    middle = np.abs(within - 0.5) < 0.3
+    segment = (np.arange(n)[:, None] * bits + which)[middle]
+    ink = np.bincount(segment, ring[middle], n * bits)
+    samples = np.bincount(segment, minlength=n * bits)
+    ones = (ink > 0.5 * samples).reshape(n, bits)
+    codes = _code_table(bits)[ones @ (1 << np.arange(bits - 1, -1, -1))]
+    readable = on_raster & (codes >= 0)
+    misfit = np.full(n, np.inf)
+    rows = np.nonzero(readable)[0]
+    if len(rows):
+        misfit[rows] = ring_misfit(
+            level[rows], maps.select(rows), ones[rows], which[rows], within[rows]
+        )
+        misfit[misfit > allowed_misfit(maps)] = np.inf
+        one_arc = np.sum(ones != np.roll(ones, 1, axis=1), axis=1) == 2
+        misfit[(one_arc | (ones.sum(axis=1) <= 2)) & (misfit > _MISFIT_OF_FEW)] = np.inf
+    return codes, misfit
+
+
+_SEARCHES = ((2, -1), (2, 1), (1, -1), (1, 1))  # scale, polarity
+_ENOUGH_CODES = 0.5
+_LARGE_WIDTH = 1200
+_MARKER_NEIGHBOURHOOD = 2.0  # sides of the marker that names a circle
+
+
+def find_coded(
+    image: Image, testfield: TestField, fewest: int, needed: bool
+) -> tuple[NDArray[np.int64], Array, LocalMap, bool]:
+    """Rows, centres (n, 2), and maps of ring-coded and marker-named circles; whether codes were
+    seen that are not of this field. fewest: targets that carry an orientation; needed: search on
+    until enough are found.
+    """
+    row_of: dict[tuple[int, int], int] = {}
+    named: dict[str, dict[int, int]] = {}
+    for row, code in enumerate(testfield.codes):
+        if testfield.kinds[row] != "circle" or not code:
+            continue
+        if is_ring(code):
+            row_of[parse(code)] = row
+        elif is_marker(code):
+            dictionary, marker, corner = parse_marker(code)
+            if corner is None:
+                named.setdefault(dictionary, {})[marker] = row
+    if not row_of and not named:
+        return _nothing()
+    grey = to_8_bit(image)
+    best: tuple[NDArray[np.int64], Array, LocalMap] | None = None
+    foreign = False
+    enough = max(fewest + 2, _ENOUGH_CODES * (len(row_of) + sum(map(len, named.values()))))
+    searches = _SEARCHES if image.shape[1] > _LARGE_WIDTH else _SEARCHES[2:]
+    for scale, polarity in searches:
+        candidates = find_circles(grey, scale, polarity)
+        codes = read_codes(grey, candidates, wanted=(row_of, enough))
+        keys = list(zip(codes.bits.tolist(), codes.numbers.tolist(), strict=True))
+        ours = [i for i, key in enumerate(keys) if key in row_of]
+        foreign = foreign or len(ours) < len(keys)
+        rows = [row_of[keys[i]] for i in ours]
+        which = [int(codes.rows[i]) for i in ours]
+        for row, place in _circles_by_marker(grey, candidates, named):
+            if place not in which:
+                rows.append(row)
+                which.append(place)
+        if best is None or len(rows) > len(best[0]):
+            maps = candidates.maps.select(np.array(which, dtype=np.int64))
+            best = np.array(rows, dtype=np.int64), maps.centre, maps
+        if len(best[0]) >= enough or (not needed and len(best[0]) >= fewest):
+            break
+    if best is None:
+        return _nothing()
+    return (*best, foreign)
+
+
+def _nothing() -> tuple[NDArray[np.int64], Array, LocalMap, bool]:
+    none = LocalMap(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 2, 3)))
+    return np.zeros(0, dtype=np.int64), np.zeros((0, 2)), none, False
+
+
+def _circles_by_marker(
+    grey: NDArray[np.uint8], candidates: Candidates, named: dict[str, dict[int, int]]
+) -> list[tuple[int, int]]:
+    """(row, candidate) of circles that a marker names: the one circle nearest to its centre."""
+    pairs: list[tuple[int, int]] = []
+    for dictionary, row_of in named.items():
+        found = detect_markers(grey, dictionary, frozenset(row_of))
+        for number, quad in zip(found.numbers.tolist(), found.corners, strict=True):
+            side = np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1).mean()
+            distance = np.linalg.norm(candidates.maps.centre - quad.mean(axis=0), axis=1)
+            outside = np.array(
+                [cv2.pointPolygonTest(quad.astype(np.float32), tuple(c), True) < 0
+                 for c in candidates.maps.centre], dtype=bool,
+            )  # fmt: skip
+            near = np.nonzero(outside & (distance < _MARKER_NEIGHBOURHOOD * side))[0]
+            if len(near):
+                pairs.append((row_of[number], int(near[np.argmin(distance[near])])))
+    return pairs

@@ -5,21 +5,68 @@ from __future__ import annotations
 import csv
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.atomic_file import new_file
-from thermocald.store.database.times import series_times
-from thermocald.store.recording.paths import FileFolder
+from thermocald.atomic_file import make_folder, new_file
+from thermocald.names import FileFolder
+from thermocald.store.database.store import Store
 from thermocald.store.recording.writer import RecordingWriter
+from thermocald.store.series import series_times
 
 if TYPE_CHECKING:
-    from thermocald.epoch import Epoch
-    from thermocald.store.database.row import StoredSeries
-    from thermocald.store.database.store import Store
+    from collections.abc import Callable
 
-__all__ = ["archive_readings", "archive_series"]
+    from thermocald.epoch import Epoch
+    from thermocald.store.series import StoredSeries
+
+
+def archive_store(
+    path: Path,
+    folder: Path,
+    frames: Path | None,
+    series: str | None,
+    finished: bool,
+    skip_existing: bool,
+    say: Callable[[str], None],
+) -> dict[str, Any]:
+    """Write the series of a store as recordings `<camera>-<series>`, and what else was read.
+
+    series: `CAMERA/SERIES` or `SERIES`, None: all; finished: only those after which the camera
+    began another; say: is told of each. Returns `recordings` and `readings`.
+    """
+    written: list[dict[str, Any]] = []
+    readings: dict[str, Path] = {}
+    with Store.open(path) as opened:
+        chosen = opened.all_series() if series is None else [opened.only_series(series)]
+        if finished:
+            newest = {one.camera: one.id for one in opened.all_series()}
+            chosen = [one for one in chosen if newest[one.camera] != one.id]
+        make_folder(folder)
+        every = opened.all_series()
+        for one in chosen:
+            target = folder / _recording_name(one, every)
+            last = opened.last_epoch(one)
+            if last is None or (skip_existing and target.exists()):
+                continue
+            archive_series(opened, one, target, frames)
+            say(f"{target}: epochs to {last}")
+            written.append(
+                {"camera": one.camera, "series": one.name, "path": target, "last_epoch": last}
+            )
+        if series is None and not finished:
+            readings = archive_readings(opened, folder)
+    for target in readings.values():
+        say(f"{target}: readings")
+    return {"recordings": written, "readings": readings}
+
+
+def _recording_name(one: StoredSeries, every: list[StoredSeries]) -> str:
+    """`<camera>-<series>`; `a-b`/`c` and `a`/`b-c` are two, with two hyphens each."""
+    name = f"{one.camera}-{one.name}"
+    alike = sum(f"{other.camera}-{other.name}" == name for other in every)
+    return name if alike == 1 else f"{one.camera}--{one.name}"
 
 
 def archive_series(

@@ -1,4 +1,7 @@
-"""Columns of a series as arrays, fast: chunks of whole columns alongside the rows.
+"""The table `epoch`, listed once: its rows as checked values, its columns over a series as arrays.
+
+Sources of columns are: `number`, times and counts; the parameters and `sd_<parameter>`;
+`temperatures.<channel>` as read; `extra.<name>`; `status` as a code of the table status_code.
 
 SQLite hands out rows at some microseconds each; a million epochs would take seconds. So when
 CHUNK epochs of a series have accumulated, each of their columns is written once more as one blob
@@ -6,44 +9,205 @@ of float64, in the transaction of the last of them; and when MERGED such chunks 
 they become one, since long blobs are read twice as fast. Reading joins the chunks and takes the
 tail, and the epochs that were calibrated after their chunk was written, from the rows. Chunks are
 derived and can be rebuilt.
+
+Checksums are of rows, since SQLite's own integrity check does not see a bit that changed inside a
+value: a CRC-32 over a row's numbers, as little-endian float64 with one NaN for NULL, and then its
+texts, joined by a control character.
 """
 
 from __future__ import annotations
 
+import json
 import logging
-from typing import TYPE_CHECKING
+import math
+import struct
+import zlib
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermocald.errors import StoreError
-from thermocald.store.database.checksum import row_checksum
-from thermocald.store.database.epoch_columns import CHUNKED, late_columns, latest_columns
+from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 
 if TYPE_CHECKING:
     import sqlite3
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from thermocald.arrays import Array
-
-__all__ = [
-    "CHUNK",
-    "MERGED",
-    "build_all_chunks",
-    "build_missing_chunks",
-    "checked_chunks",
-    "forgotten_calibrations",
-    "insert_chunk",
-    "loose_rows",
-    "note_amended",
-    "read_columns",
-    "read_page",
-    "rebuild_chunks",
-]
 
 log = logging.getLogger(__name__)
 
 CHUNK = 1024
 MERGED = 16
+_SEPARATOR = "\x1f"
+_KEYS = ("id", "series_id")
+# columns over a series: what `Store.series_columns` offers, with status, channels and extra ones
+COLUMN_NAMES = (
+    "number",
+    "frame_time",
+    "temperature_time",
+    "clock_trusted",
+    "sigma0",
+    "redundancy",
+    "n_observations",
+    "n_rejected",
+    *PARAMETER_NAMES,
+    *(f"sd_{name}" for name in PARAMETER_NAMES),
+)
+_MAPPINGS = ("temperatures", "extra")
+CHUNKED = (*COLUMN_NAMES, "status", *_MAPPINGS)
+# measured: None where a later calibration uses the observations of the revision before
+_NUMBERS = (*_KEYS, *COLUMN_NAMES, "revision", "measured", "detail_checksum")
+_TEXTS = ("status", *_MAPPINGS, "rejected", "frame", "note", "reason")
+_ALL = (*_NUMBERS, *_TEXTS, "checksum")
+
+
+class DamageError(StoreError):
+    """A row of the store is not as it was written."""
+
+
+def row_checksum(numbers: Sequence[Any], texts: Iterable[str] = (), data: bytes = b"") -> int:
+    """CRC-32 of a row as SQLite gives it back: numbers or None, texts, bytes.
+
+    Raises TypeError or ValueError where a value is of another type, which is damage too.
+    """
+    # 0.0 + -0.0 is 0.0: SQLite does not keep the sign of a zero
+    plain = [math.nan if v is None or v != v else 0.0 + v for v in numbers]
+    found = zlib.crc32(struct.pack(f"<{len(plain)}d", *plain))
+    found = zlib.crc32(_SEPARATOR.join(texts).encode(errors="surrogateescape"), found)
+    return zlib.crc32(data, found)
+
+
+def require_checksum(
+    kept: int,
+    what: str,
+    numbers: Sequence[Any],
+    texts: Iterable[str] = (),
+    data: bytes = b"",
+) -> None:
+    """Raise DamageError naming `what` if a row is not as it was written."""
+    try:
+        good = row_checksum(numbers, texts, data) == kept
+    except (TypeError, ValueError, OverflowError, struct.error):
+        good = False
+    if not good:
+        raise DamageError(
+            f"{what} is damaged: its checksum does not match; `thermocald check` lists all that "
+            "is damaged, a backup has it as it was"
+        )
+
+
+def sql_name(name: str) -> str:
+    """The column of a field: SQL ignores case, and x0 must not be X0."""
+    return f"{name[:-2]}centre_{name[-2:]}" if name[-2:] in ("X0", "Y0", "Z0") else name
+
+
+_SELECTED = ", ".join(f"epoch.{sql_name(name)}" for name in _ALL)
+_INSERT = (
+    f"INSERT INTO epoch ({', '.join(map(sql_name, _ALL))}) VALUES ({', '.join('?' * len(_ALL))})"
+)
+
+
+def insert_row(connection: sqlite3.Connection, row: Mapping[str, Any]) -> None:
+    """Insert one row, all columns but `checksum` given; within the caller's transaction."""
+    numbers = [row[name] for name in _NUMBERS]
+    texts = [row[name] for name in _TEXTS]
+    connection.execute(_INSERT, (*numbers, *texts, row_checksum(numbers, texts)))
+
+
+def rows_of(
+    connection: sqlite3.Connection, series: int, first: int, last: int | None
+) -> Iterator[dict[str, Any]]:
+    """The rows of the epochs numbered `first` to `last`, by number and revision, one by one.
+
+    Raises StoreError for a row whose checksum does not match.
+    """
+    return _checked(
+        connection.execute(
+            f"SELECT {_SELECTED} FROM epoch WHERE series_id = ? AND number >= ? "
+            "AND number <= ifnull(?, number) ORDER BY number, revision",
+            (series, first, last),
+        )
+    )
+
+
+def all_rows(connection: sqlite3.Connection) -> Iterator[dict[str, Any] | DamageError]:
+    """Every row of the table as it lies in the file, or what is wrong with it."""
+    names = dict(connection.execute("SELECT id, camera || '/' || name FROM series"))
+    for row in connection.execute(f"SELECT {_SELECTED} FROM epoch NOT INDEXED ORDER BY id"):
+        try:
+            yield from _checked([row])
+        except DamageError:
+            series, number = row[_NUMBERS.index("series_id")], row[_NUMBERS.index("number")]
+            yield DamageError(f"{names.get(series, f'series {series}')}, epoch {number}")
+
+
+def require_sound(row: Mapping[str, Any]) -> None:
+    """StoreError where a row, by the names of the table's columns, is not as it was written."""
+    numbers = [row[sql_name(name)] for name in _NUMBERS]
+    texts = [row[sql_name(name)] for name in _TEXTS]
+    require_checksum(row["checksum"], f"epoch {row['number']}", numbers, texts)
+
+
+def latest_columns(
+    connection: sqlite3.Connection,
+    series: int,
+    fields: Sequence[str],
+    after: int,
+    until: int | None = None,
+) -> dict[str, Array]:
+    """The epochs numbered above `after`, up to `until`, in their latest revision.
+
+    fields: of `CHUNKED`; `number` is always among the result's. Raises StoreError for damage.
+    """
+    latest = {row["number"]: row for row in rows_of(connection, series, after + 1, until)}
+    return _columns(connection, fields, list(latest.values()))
+
+
+def late_columns(
+    connection: sqlite3.Connection, series: int, fields: Sequence[str]
+) -> dict[str, Array]:
+    """The calibrations that came after their epoch's chunk was written, in their order."""
+    rows = connection.execute(
+        f"SELECT {_SELECTED} FROM late_epoch JOIN epoch ON epoch.id = epoch_id "
+        "WHERE late_epoch.series_id = ? ORDER BY epoch_id",
+        (series,),
+    )
+    return _columns(connection, fields, list(_checked(rows)))
+
+
+def status_codes(connection: sqlite3.Connection) -> dict[int, str]:
+    """The words that the codes in the column `status` stand for."""
+    return dict(connection.execute("SELECT code, status FROM status_code"))
+
+
+def _checked(rows: Iterable[tuple[Any, ...]]) -> Iterator[dict[str, Any]]:
+    count = len(_NUMBERS)
+    number = _NUMBERS.index("number")
+    for row in rows:
+        require_checksum(row[-1], f"epoch {row[number]}", row[:count], row[count:-1])
+        yield dict(zip(_ALL, row, strict=True))
+
+
+def _columns(
+    connection: sqlite3.Connection, fields: Sequence[str], rows: list[dict[str, Any]]
+) -> dict[str, Array]:
+    """Rows → columns; `temperatures` and `extra` become one column per name in them."""
+    columns: dict[str, Array] = {}
+    for field in dict.fromkeys(["number", *fields]):
+        column = [row[field] for row in rows]
+        if field == "status":
+            codes = {status: code for code, status in status_codes(connection).items()}
+            columns[field] = np.array([codes[status] for status in column], dtype=np.float64)
+        elif field in _MAPPINGS:
+            found = [json.loads(text) for text in column]
+            for name in dict.fromkeys(name for mapping in found for name in mapping):
+                columns[f"{field}.{name}"] = np.array(
+                    [mapping.get(name) for mapping in found], dtype=np.float64
+                )
+        else:
+            columns[field] = np.array(column, dtype=np.float64)  # None, SQL's NULL, becomes NaN
+    return columns
 
 
 def read_columns(
@@ -169,19 +333,6 @@ def build_missing_chunks(connection: sqlite3.Connection, series: int) -> None:
         _merge(connection, series)
 
 
-def build_all_chunks(connection: sqlite3.Connection) -> None:
-    """Write all chunks that the rows allow, after a migration; damage leaves a series without."""
-    for (series,) in connection.execute("SELECT id FROM series").fetchall():
-        connection.execute("BEGIN IMMEDIATE")
-        try:
-            build_missing_chunks(connection, series)
-        except StoreError as error:
-            connection.execute("ROLLBACK")
-            log.warning("%s", error)
-        else:
-            connection.execute("COMMIT")
-
-
 def rebuild_chunks(connection: sqlite3.Connection, series: int) -> None:
     """Derive the chunks of a series again from its rows; within the caller's transaction."""
     connection.execute("DELETE FROM column_chunk WHERE series_id = ?", (series,))
@@ -233,10 +384,8 @@ def _checksum(series: int, name: str, first_row: int, last: int, data: bytes) ->
     return row_checksum((series, first_row, last), (name,), data)
 
 
-def _require(
-    kept: int | None, series: int, name: str, first_row: int, last: int, data: bytes
-) -> None:
-    if kept is not None and kept != _checksum(series, name, first_row, last, data):
+def _require(kept: int, series: int, name: str, first_row: int, last: int, data: bytes) -> None:
+    if kept != _checksum(series, name, first_row, last, data):
         raise _ChunkError(f"a chunk of column {name} is damaged")
 
 

@@ -8,66 +8,343 @@ revision, and triggers in the file refuse everything else.
 from __future__ import annotations
 
 import logging
+import threading
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Self
 
+import numpy as np
+
+from thermocald.atomic_file import cannot_write
 from thermocald.errors import StoreError, StoreFullError
+from thermocald.names import file_name, require_channels
 from thermocald.store.database import columns as column_chunks
-from thermocald.store.database.connection import Mode, connect, in_words
-from thermocald.store.database.epoch_columns import COLUMN_NAMES
-from thermocald.store.database.epoch_table import (
-    StoredEpoch,
+from thermocald.store.database.columns import COLUMN_NAMES, status_codes
+from thermocald.store.database.epochs import (
     insert_epoch,
+    select_covariance,
     select_epochs,
+    select_observations,
 )
-from thermocald.store.database.row import (
+from thermocald.store.database.examination import (
+    KEPT,
+    Examination,
+    KeptFrame,
+    examine,
+    frames_after,
+    rows_after,
+)
+from thermocald.store.database.file import Mode, StoreFile, connect, copy_database, in_words
+from thermocald.store.database.rows import (
+    insert_events,
+    insert_readings,
+    insert_series,
+    select_events,
+    select_readings,
+    select_series,
+)
+from thermocald.store.database.wal import read_wal_tail
+from thermocald.store.recording.head import head_document, parse_head
+from thermocald.store.series import (
     NOT_CALIBRATED,
     EpochResult,
     Event,
     LoggedReading,
+    SeriesReader,
+    StoredEpoch,
     StoredSeries,
 )
-from thermocald.store.database.series_table import (
-    insert_events,
-    insert_readings,
-    insert_series,
-)
-from thermocald.store.database.store_reader import StoreReader
-from thermocald.store.recording.paths import file_name
 
 if TYPE_CHECKING:
     import sqlite3
     from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from numpy.typing import NDArray
+
+    from thermocald.arrays import Array
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.field.testfield import Observations, TestField
     from thermocald.store.recording.head import Head
-
-__all__ = ["Store"]
+    from thermocald.store.series import ObservationRows
 
 log = logging.getLogger(__name__)
 
+_EPOCHS_AT_ONCE = 100
+_READINGS_AT_ONCE = 1000
 _DERIVED = ("epoch", "status")
 
 
-class Store(StoreReader):
+class Store(SeriesReader):
     """An open store; use `Store.open` and a `with` block. Threads may share it."""
 
-    def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
-        super().__init__(path, connection)
+    def __init__(self, path: Path, connection: sqlite3.Connection, file: StoreFile | None) -> None:
+        self.path = path
+        self.closed = False
+        self._db = connection
+        self._file = file  # whose lock is given back with the store
+        self._lock = threading.RLock()
         self._unchunked: set[int] = set()  # series whose chunks cannot be built
         self._ends: dict[int, tuple[int, int]] = {}  # series → last number, rows in no chunk
 
     @classmethod
-    def open(cls, path: Path, mode: Mode = "read", *, durable: bool = True) -> Self:
-        """Open a store; for appending it is made if it does not exist.
+    def open(
+        cls, path: Path, mode: Mode = "read", *, durable: bool = True, claimed: bool = False
+    ) -> Self:
+        """Open a store; for appending it is made if it does not exist, and locked for one writer.
 
         durable: what is committed survives a power cut; False: the end of the process only, for
-        what can be computed again. Raises StoreError, StoreVersionError.
+        what can be computed again; claimed: the caller holds the lock, a StoreFile. Raises
+        StoreError, StoreVersionError.
         """
-        return cls(path, connect(path, mode, durable=durable))
+        if mode == "read" or claimed:
+            return cls(path, connect(path, mode, durable=durable), None)
+        file = StoreFile(path)
+        try:
+            if file.names > 1:
+                raise StoreError(
+                    f"{path}: has {file.names} names (hard links), and SQLite keeps what was "
+                    "written last beside one of them; remove the others, or use a symbolic link"
+                )
+            return cls(path, connect(path, mode, durable=durable), file)
+        except BaseException:
+            file.discard_empty()
+            file.release()
+            raise
+
+    def close(self) -> None:
+        """Close the file and give its lock back; may be called twice."""
+        with self._lock, in_words(self.path, "the store cannot be closed"):
+            self.closed = True
+            self._db.close()
+            file, self._file = self._file, None
+            if file is not None:
+                file.release()
+
+    @property
+    def identity(self) -> str:
+        """A UUID that the store was given when it was made: a copy has the same."""
+        ((identity,),) = self._query("SELECT identity FROM store", ())
+        return str(identity)
+
+    def all_series(self) -> list[StoredSeries]:
+        """All series, in the order in which they were begun."""
+        return self._select_series()
+
+    def last_epoch(self, series: StoredSeries) -> int | None:
+        """The number of the last epoch kept, None if there is none: where to resume."""
+        last = self._end(series)[0]
+        return None if last < 0 else last
+
+    def _epochs(
+        self, series: StoredSeries, first: int, last: int | None, details: bool
+    ) -> Iterator[StoredEpoch]:
+        """As they are read; what is missing of a whole series is logged at its end."""
+        missing, before = 0, first or 1
+        for stored in self._pages(series, first, last, details):
+            missing += max(0, stored.epoch.number - before)
+            before = stored.epoch.number + 1
+            yield stored
+        if not first and last is None:
+            missing += max(0, (self.last_epoch(series) or 0) + 1 - before)
+            if missing:
+                log.warning(
+                    "%s: %d epochs of series %s are missing; `thermocald check` says which",
+                    self.path, missing, series.name,
+                )  # fmt: skip
+
+    def _pages(
+        self, series: StoredSeries, first: int, last: int | None, details: bool
+    ) -> Iterator[StoredEpoch]:
+        """The epochs page by page: no statement is open while another thread may close the file.
+
+        SQLite's library ends the process where a connection is closed under a statement.
+        """
+        while True:
+            page: list[StoredEpoch] = []
+            failed: StoreError | None = None
+            try:
+                with self._lock, in_words(self.path, "epochs cannot be read", reading=True):
+                    found = select_epochs(self._db, series.id, first, last, details=details)
+                    page.extend(islice(found, _EPOCHS_AT_ONCE))
+                    del found
+            except StoreError as error:
+                failed = error
+            yield from page
+            if failed is not None:
+                raise failed
+            if len(page) < _EPOCHS_AT_ONCE:
+                return
+            first = page[-1].epoch.number + 1
+
+    def observation_rows(self, series: StoredSeries, first: int, last: int) -> ObservationRows:
+        """The observations of the epochs numbered `first` to `last`, without their quality."""
+        with self._lock, in_words(self.path, "observations cannot be read", reading=True):
+            return select_observations(self._db, series.id, first, last)
+
+    def observations(
+        self, series: StoredSeries, numbers: Iterable[int]
+    ) -> Iterator[Observations | None]:
+        """The observations of some epochs; StoreError for a number that is not there."""
+        for number in numbers:
+            stored = next(self.epochs(series, number, number), None)
+            if stored is None:
+                raise StoreError(f"{self.path}: series {series.name!r} has no epoch {number}")
+            yield stored.epoch.observations
+
+    def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
+        """(E, 16, 16) covariances of some epochs, NaN for those without a result."""
+        result = np.full((len(numbers), 16, 16), np.nan)
+        with self._lock, in_words(self.path, "covariances cannot be read", reading=True):
+            for i, number in enumerate(numbers):
+                covariance = select_covariance(self._db, series.id, int(number))
+                if covariance is not None:
+                    result[i] = covariance
+        return result
+
+    def column_names(self, series: StoredSeries) -> list[str]:
+        """What `series_columns` can give, but extra columns."""
+        return ["epoch", *COLUMN_NAMES[1:], "status", *series.head.channels]
+
+    def stamped_columns(
+        self, series: StoredSeries, names: Sequence[str]
+    ) -> dict[str, NDArray[Any]]:
+        """Columns (E,) over all epochs by name, with times as they were stamped."""
+        source = {name: _source(name, series) for name in names}
+        with self._lock, in_words(self.path, "columns cannot be read", reading=True):
+            columns: dict[str, NDArray[Any]] = dict(
+                column_chunks.read_columns(
+                    self._db, series.id, list(dict.fromkeys(source.values()))
+                )
+            )
+            self._name_statuses(columns)
+        return {name: columns[source[name]] for name in names}
+
+    def column_pages(
+        self, series: StoredSeries, names: Sequence[str], rows: int = 1000
+    ) -> Iterator[dict[str, NDArray[Any]]]:
+        """The same columns, `rows` epochs at a time, in constant memory.
+
+        Every page is read by itself: who takes long over one holds no writer up, and epochs that
+        come meanwhile follow.
+        """
+        source = {name: _source(name, series) for name in names}
+        wanted = list(dict.fromkeys(["number", *source.values()]))
+        after = -1
+        while True:
+            with self._lock, in_words(self.path, "columns cannot be read", reading=True):
+                columns: dict[str, NDArray[Any]] = dict(
+                    column_chunks.read_page(self._db, series.id, wanted, after, rows)
+                )
+                self._name_statuses(columns)
+            if not len(columns["number"]):
+                return
+            after = int(columns["number"][-1])
+            yield {name: columns[source[name]] for name in names}
+
+    def _name_statuses(self, columns: dict[str, NDArray[Any]]) -> None:
+        """Put words in the place of the codes in the column `status`."""
+        if "status" in columns:
+            codes = status_codes(self._db)
+            words = np.array([codes.get(i, "") for i in range(max(codes, default=0) + 1)])
+            columns["status"] = words[columns["status"].astype(np.int64)]
+
+    def readings(
+        self, thermometer: str | None = None, since_utc: float = 0.0
+    ) -> Iterator[LoggedReading]:
+        """Readings apart from epochs, in the order they were kept."""
+        after = 0
+        while True:
+            with self._lock, in_words(self.path, "readings cannot be read", reading=True):
+                after, page = select_readings(
+                    self._db, thermometer, since_utc, after, _READINGS_AT_ONCE
+                )
+            yield from page
+            if not after:
+                return
+
+    def events(self, series: StoredSeries | None = None, since_utc: float = 0.0) -> list[Event]:
+        """What happened, oldest first; of one series, or all."""
+        with self._lock, in_words(self.path, "events cannot be read", reading=True):
+            return select_events(self._db, None if series is None else series.id, since_utc)
+
+    def clock_steps(self, series: StoredSeries) -> list[Event]:
+        """The steps of the clock that the daemon noted, oldest first: of every series the same."""
+        del series
+        return [event for event in self.events() if event.kind == "clock_step"]
+
+    def rows_after(self, table: str, after: int, limit: int) -> list[dict[str, Any]]:
+        """Rows of a growing table as they were kept, see `changes`: for a forwarder."""
+        with self._lock, in_words(self.path, f"{table}s cannot be read", reading=True):
+            return list(rows_after(self._db, table, after, limit))
+
+    def frames_after(self, after: int, limit: int) -> list[KeptFrame]:
+        """Epochs' frames as they were kept, see `changes`: for a forwarder."""
+        with self._lock, in_words(self.path, "frames cannot be listed", reading=True):
+            return list(frames_after(self._db, after, limit))
+
+    def rows_waiting(self, after: Mapping[str, int]) -> int:
+        """How many rows of the growing tables have ids above those given, by table."""
+        return sum(
+            int(self._query(f"SELECT count(*) FROM {table} WHERE id > ?", (after[table],))[0][0])
+            for table in KEPT
+        )
+
+    def check(self) -> None:
+        """Read the whole file; StoreError if anything in it is damaged."""
+        if damaged := self.examine().damaged:
+            more = f" and {len(damaged) - 1} more" if len(damaged) > 1 else ""
+            raise StoreError(f"{self.path}: is damaged: {damaged[0]}{more}")
+
+    def examine(self) -> Examination:
+        """Read the whole file: what is damaged, and which epochs are missing.
+
+        Raises StoreError where it cannot be read as a store at all.
+        """
+        with self._lock, in_words(self.path, "the store cannot be read", reading=True):
+            found = examine(self._db)
+        tail = read_wal_tail(self.path.resolve().with_name(f"{self.path.resolve().name}-wal"))
+        if tail.lost:
+            many = f"{tail.lost} transaction{'s'[: tail.lost != 1]}"
+            many = "all transactions" if tail.lost < 0 else many
+            damaged = (f"the -wal file: {many} in it cannot be read", *found.damaged)
+            found = replace(found, damaged=damaged)
+        found = replace(found, unfinished=tail.unfinished)
+        if not found.damaged:
+            for series in self.all_series():
+                self.series_columns(series, self.column_names(series))
+            self.events()
+        return found
+
+    def copy_to(self, target: Path) -> None:
+        """Copy the store to another file, whole or not at all, while it may be written.
+
+        Raises StoreError; OutputError where that cannot be written.
+        """
+        with in_words(self.path, f"the copy {target} cannot be made"):
+            try:
+                copy_database(self._db, target)
+            except OSError as error:
+                raise cannot_write(target, error) from error
+
+    def _select_series(
+        self, camera: str | None = None, name: str | None = None
+    ) -> list[StoredSeries]:
+        with self._lock, in_words(self.path, "the series cannot be read", reading=True):
+            return select_series(self._db, self.path, camera, name)
+
+    def _end(self, series: StoredSeries) -> tuple[int, int]:
+        """The last epoch number of a series (-1: none) and how many rows are in no chunk."""
+        ((last,),) = self._query(
+            "SELECT ifnull(max(number), -1) FROM epoch WHERE series_id = ?", (series.id,)
+        )
+        with self._lock, in_words(self.path, "the store cannot be read", reading=True):
+            return int(last), column_chunks.loose_rows(self._db, series.id)
+
+    def _query(self, statement: str, values: Sequence[Any]) -> list[tuple[Any, ...]]:
+        with self._lock, in_words(self.path, "the store cannot be read", reading=True):
+            return self._db.execute(statement, values).fetchall()
 
     def create_series(
         self,
@@ -80,8 +357,8 @@ class Store(StoreReader):
         created_utc: float = 0.0,
     ) -> StoredSeries:
         """Begin a series; StoreError if the camera has one of this name already."""
-        if taken := {*COLUMN_NAMES, *_DERIVED} & set(head.channels):
-            raise StoreError(f"a temperature channel cannot be called {min(taken)!r}")
+        require_channels(head.channels, f"{self.path}: series {head.series!r}", StoreError)
+        parse_head(head_document(head), self.path)  # what could not be read again is not written
         file_name(head.camera.name, "camera", StoreError)
         file_name(head.series, "series", StoreError)
         with self._transaction(f"series {head.series!r} was not begun"):
@@ -211,3 +488,12 @@ class Store(StoreReader):
                 if self._db.in_transaction:
                     self._db.execute("ROLLBACK")
                 raise
+
+
+def _source(name: str, series: StoredSeries) -> str:
+    """The name in the chunks of a column by its public name."""
+    if name == "epoch":
+        return "number"
+    if name in COLUMN_NAMES or name == "status":
+        return name
+    return f"temperatures.{name}" if name in series.head.channels else f"extra.{name}"

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = ["WalTail", "read_wal_tail"]
 
 _HEADER = struct.Struct(">8I")  # magic, version, page size, sequence, two salts, two checksums
 _FRAME = struct.Struct(">6I")  # page, size of the database after a commit, two salts, checksums
@@ -31,7 +30,8 @@ _LOOKS, _PAUSE_S = 3, 0.02
 @dataclass(frozen=True, slots=True)
 class WalTail:
     """lost: committed transactions that cannot be read, -1 for all of them; unfinished: the last
-    transaction cannot be read, and nothing says that it was committed.
+    transaction cannot be read, and nothing says that it was committed: its writer was killed, or
+    the file was cut off when it was copied, and more may have followed.
     """
 
     lost: int = 0
@@ -42,7 +42,7 @@ def read_wal_tail(path: Path) -> WalTail:
     """Look at a -wal file, and at the -shm file beside it; it may be written meanwhile."""
     for _ in range(_LOOKS):
         tail = _look(path)
-        if not tail.lost:
+        if tail == WalTail():
             break
         time.sleep(_PAUSE_S)  # half of what is just being written looks like damage
     return tail
@@ -61,24 +61,28 @@ def _look(path: Path) -> WalTail:
     sums = _checksum(order, data[:24], (0, 0))
     if magic & ~1 != _MAGIC or sums != (first, second) or page_size % 512:
         return WalTail(lost=-1)
-    broken = False
+    broken = earlier = False
+    whole = ended = 0  # frames that are there, and up to the last end of a transaction
     commits: list[int] = []  # numbers of the frames that end a transaction, from the broken one on
     step = _FRAME.size + page_size
     for number, at in enumerate(range(_HEADER.size, len(data) - step + 1, step), 1):
         _, commit, *frame_salts, first, second = _FRAME.unpack_from(data, at)
         if frame_salts != salts:
             if not _nearly(frame_salts, salts):
-                break  # of an earlier run
+                earlier = True  # of an earlier run
+                break
             broken = True
         if not broken:
             head, page = data[at : at + 8], data[at + _FRAME.size : at + step]
             sums = _checksum(order, page, _checksum(order, head, sums))
             broken = sums != (first, second)
+        whole, ended = number, number if commit else ended
         if broken and commit:
             commits.append(number)
-    if not broken:
-        return WalTail()
     frames = committed.get(data[16:24], 0)
+    if not broken:
+        cut = ended < whole or (not earlier and (len(data) - _HEADER.size) % step)
+        return WalTail(int(whole < frames), unfinished=bool(cut) and whole >= frames)
     lost = len([n for n in commits if n != commits[-1] or n <= frames])
     return WalTail(lost, unfinished=not lost)
 

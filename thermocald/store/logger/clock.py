@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
 
-__all__ = ["AMBIGUOUS", "DeviceClock", "clock_error", "time_zone"]
-
 AMBIGUOUS = ("refuse", "order", "earlier", "later")
 """What to do with the hour that comes twice: refuse it, go by the order of the rows, take one."""
 
@@ -144,6 +142,30 @@ class DeviceClock:
                 f"{len(back)} times, not once): say --ambiguous earlier or later"
             )
         seconds[twice[back[0] :]] = later[back[0] :]
+
+
+def device_clock(
+    timezone: str | None = None,
+    own: str | None = None,
+    ahead: str = "0",
+    ambiguous: str = "order",
+    option: str = "--timezone",
+) -> DeviceClock:
+    """Return the clock of one device from what is said of it as text.
+
+    timezone: of all devices; own: its own, which counts for times with a zone too; ahead: how far
+    it was ahead, as `clock_error` reads it; option: that says its own. Raises UsageError.
+    """
+    if ambiguous not in AMBIGUOUS:
+        raise UsageError(f"--ambiguous {ambiguous}: must be one of {', '.join(AMBIGUOUS)}")
+    text = own if own is not None else timezone
+    return DeviceClock(
+        zone=None if text is None else time_zone(text),
+        ahead=clock_error(ahead),
+        ambiguous=ambiguous,
+        forced=own is not None,
+        option=option if own is not None else "--timezone",
+    )
 
 
 def _exists(local: datetime) -> bool:

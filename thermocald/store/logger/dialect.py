@@ -1,50 +1,59 @@
 """A table as any program writes it: encoding, separator, decimal mark and header found out.
 
 Lines above the table (a logger's name, its serial number) are passed over; a second line of the
-header with units is joined to the names. What was found is kept, to be shown.
+header with units is joined to the names. The rows are read one by one: a year of them has to fit
+into memory. What was found is kept, to be shown.
 """
 
 from __future__ import annotations
 
 import codecs
 import csv
-import io
 import re
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass
+from itertools import islice
 from typing import TYPE_CHECKING
 
 from thermocald.errors import DataError
-from thermocald.store.logger.moments import parse_moment
+from thermocald.store.logger.moments import is_date_like, parse_moment
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
     from pathlib import Path
 
-__all__ = ["SEPARATORS", "LoggerTable", "read_table"]
-
+OUR_TIMES = ("time", "temperature_time", "frame_time", "timestamp")
+"""Names of a column of seconds in files of ours, which may count from any day."""
 SEPARATORS = {";": "semicolon", "\t": "tab", "|": "bar", ",": "comma"}
-_LARGEST_BYTES = 500_000_000
+_LARGEST_BYTES = 2_000_000_000
+_CHUNK = 1 << 20
 _MOST_COLUMNS = 1000
 _SAMPLE = 400
 _CONSISTENT = 0.8
 _PREAMBLE = 12
-_COMMA_NUMBER = re.compile(r"[+-]?\d+,\d+")
-_POINT_NUMBER = re.compile(r"[+-]?\d+\.\d+")
+_COMMA_NUMBER = re.compile(r"[+-]?\d+,\d+\s*[^\d\s.,:]{0,4}")
+_POINT_NUMBER = re.compile(r"[+-]?\d+\.\d+\s*[^\d\s.,:]{0,4}")
+_READING = re.compile(
+    r"(?:[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?\s*(?:[°º]?\s*[CFK]|℃|℉|deg\s?[CF]|%)?)?"
+    r"|unavailable|unknown|none|null|n/?an?|-+|err(?:or)?",
+    re.IGNORECASE,
+)
 
 
 @dataclass(frozen=True, slots=True)
-class LoggerTable:
-    """Columns of text by name; lines: of each row in the file; what was found out about it."""
+class LoggerFile:
+    """A table in a file: the names of its columns, and what was found out about it.
+
+    first_line: that of the first row; sample: some rows, from its beginning and its end.
+    """
 
     path: Path
-    columns: dict[str, list[str]]
-    lines: list[int]
+    names: tuple[str, ...]
+    first_line: int
     encoding: str
     separator: str
     decimal: str
-
-    def __len__(self) -> int:
-        return len(self.lines)
+    sample: tuple[tuple[str, ...], ...]
 
     @property
     def description(self) -> str:
@@ -55,76 +64,134 @@ class LoggerTable:
             f"{SEPARATORS.get(self.separator, self.separator)}, decimals with {mark}"
         )
 
+    def column(self, name: str) -> list[str]:
+        """Values of a column in the sample."""
+        place = self.names.index(name)
+        return [row[place] for row in self.sample]
 
-def read_table(path: Path, separator: str | None = None, decimal: str | None = None) -> LoggerTable:
-    """Read a logger's table; separator and decimal mark are found out where they are not given.
+    def rows(self) -> Iterator[tuple[int, list[str]]]:
+        """Every row with its line: as many fields as there are names, missing ones empty."""
+        width = len(self.names)
+        for line, row in _rows(self.path, self.encoding, self.separator):
+            if line >= self.first_line:
+                yield line, _fitted(row, width)
+
+
+def open_log(path: Path, separator: str | None = None, decimal: str | None = None) -> LoggerFile:
+    """Find out how a logger's table is written; separator and decimal mark where not given.
 
     Raises DataError where the file cannot be read or holds no table with times.
     """
-    text, encoding = _text(path)
-    lines = text.splitlines()
-    mark = separator or _separator(path, lines)
-    rows: list[list[str]] = []
-    numbers: list[int] = []
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=mark)
+    encoding = _encoding(path)
+    with path.open(encoding=encoding, errors="replace", newline="") as file:
+        begin = list(islice(file, _SAMPLE))
+        end = list(deque(file, _SAMPLE))
+    ours = any(name.strip() in OUR_TIMES for name in begin[0].split(","))
     try:
-        for row in reader:
-            if any(field.strip() for field in row):
-                rows.append([field.strip() for field in row])
-                numbers.append(reader.line_num)
-    except csv.Error as cause:
-        raise DataError(f"{path}, line {reader.line_num}: is not readable: {cause}") from cause
-    width = Counter(len(row) for row in rows[-_SAMPLE:]).most_common(1)[0][0]
+        mark = separator or _separator(path, end if len(end) == _SAMPLE else begin + end)
+    except DataError:
+        if not ours:
+            raise
+        mark = ","
+    start, last = _cut(begin, mark), _cut(end, mark)
+    width = Counter(len(row) for _, row in (start + last)[-_SAMPLE:]).most_common(1)[0][0]
     if width > _MOST_COLUMNS:
         raise DataError(f"{path}: has {width} columns; at most {_MOST_COLUMNS} are read")
-    first = next((i for i, row in enumerate(rows) if len(row) == width and _is_data(row)), None)
-    if first is None or width < 2:
+    first = next((i for i, (_, row) in enumerate(start) if len(row) >= width and _is_data(row)), -1)
+    if first < 0 and ours and len(start) > 1:
+        first = 1
+    if first < 0 or width < 2:
         raise DataError(
             f"{path}: no row holds a time and a number; is it a log of temperatures? Separator and "
             "decimal mark can be given (--separator ';' --decimal ',')"
         )
-    names = _names([row for row in rows[:first] if len(row) == width], width)
-    body = [
-        (n, row) for n, row in zip(numbers[first:], rows[first:], strict=True) if len(row) == width
-    ]
-    columns = {name: [row[i] for _, row in body] for i, name in enumerate(names)}
-    return LoggerTable(
-        path, columns, [n for n, _ in body], encoding, mark, decimal or _decimal(columns, mark)
-    )
+    names = _names([row for _, row in start[:first]], width)
+    rows = tuple(tuple(_fitted(row, len(names))) for _, row in start[first:] + last)
+    found = decimal or _decimal(rows, mark)
+    return LoggerFile(path, names, start[first][0], encoding, mark, found, rows)
 
 
-def _text(path: Path) -> tuple[str, str]:
+def _rows(path: Path, encoding: str, mark: str) -> Iterator[tuple[int, list[str]]]:
+    """Rows that are not empty, with their lines."""
+    with path.open(encoding=encoding, errors="replace", newline="") as file:
+        yield from _parsed(path, file, mark)
+
+
+def _parsed(path: Path, lines: Iterable[str], mark: str) -> Iterator[tuple[int, list[str]]]:
+    reader = csv.reader(lines, delimiter=mark)
+    try:
+        for row in reader:
+            fields = [field.strip() for field in row]
+            if any(fields):
+                yield reader.line_num, fields
+    except csv.Error as cause:
+        raise DataError(f"{path}, line {reader.line_num}: is not readable: {cause}") from cause
+
+
+def _cut(lines: list[str], mark: str) -> list[tuple[int, list[str]]]:
+    try:
+        reader = csv.reader(lines, delimiter=mark)
+        rows = [(reader.line_num, [field.strip() for field in row]) for row in reader]
+    except csv.Error:
+        return []  # said with its line where all rows are read
+    return [(line, row) for line, row in rows if any(row)]
+
+
+def _fitted(row: list[str], width: int) -> list[str]:
+    return row[:width] + [""] * (width - len(row))
+
+
+def _encoding(path: Path) -> str:
+    """The first encoding in which the whole file is text."""
     if not path.is_file():
         raise DataError(f"{path}: is not a file")
     if path.stat().st_size > _LARGEST_BYTES:
         raise DataError(f"{path}: is larger than {_LARGEST_BYTES // 1_000_000} MB; cut it")
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:
+            head = file.read(4096)
+            if not head.strip():
+                raise DataError(f"{path}: is empty")
+            if head.startswith(codecs.BOM_UTF8):
+                return "utf-8-sig"
+            if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+                return "utf-16"
+            if b"\0" in head:
+                raise DataError(f"{path}: is not text")
+            for name in ("utf-8", "gb18030", "cp1252"):
+                file.seek(0)
+                if _is_text(iter(lambda: file.read(_CHUNK), b""), name):
+                    return name
     except OSError as cause:
         raise DataError(f"{path}: cannot be read: {cause.strerror}") from cause
-    if not data.strip():
-        raise DataError(f"{path}: is empty")
-    for bom, name in ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
-                      (codecs.BOM_UTF16_BE, "utf-16")):  # fmt: skip
-        if data.startswith(bom):
-            return data.decode(name, errors="replace"), name
-    if b"\0" in data[:4096]:
-        raise DataError(f"{path}: is not text")
-    for name in ("utf-8", "cp1252", "latin-1"):
-        try:
-            return data.decode(name), name
-        except UnicodeDecodeError:
-            continue
-    raise DataError(f"{path}: is not text in UTF-8, UTF-16 or Latin-1")
+    return "latin-1"
+
+
+def _is_text(chunks: Iterator[bytes], encoding: str) -> bool:
+    decoder = codecs.getincrementaldecoder(encoding)()
+    try:
+        for number, chunk in enumerate(chunks):
+            # GB 18030 writes 温度 in pairs of high bytes; °C and ä of Latin-1 stand alone
+            if encoding == "gb18030" and number == 0:
+                runs = re.findall(rb"[\x80-\xff]+(?=[\0-\x7f])", chunk)
+                if any(len(run) % 2 for run in runs):
+                    return False
+            decoder.decode(chunk)
+        decoder.decode(b"", final=True)
+    except UnicodeDecodeError:
+        return False
+    return True
 
 
 def _separator(path: Path, lines: list[str]) -> str:
     """The first separator that cuts the last lines into rows of one width with a time in each."""
     sample = [line for line in lines[-_SAMPLE:] if line.strip()]
     for mark in SEPARATORS:
-        rows = [[f.strip() for f in row] for row in csv.reader(sample, delimiter=mark) if row]
+        rows = [row for _, row in _cut(sample, mark)]
+        if not rows:
+            continue
         width = Counter(len(row) for row in rows).most_common(1)[0][0]
-        data = sum(len(row) == width and _is_data(row) for row in rows)
+        data = sum(len(row) >= width and _is_data(row) for row in rows)
         if width > 1 and data >= max(1, _CONSISTENT * (len(rows) - _PREAMBLE)):
             return mark
     raise DataError(
@@ -134,42 +201,42 @@ def _separator(path: Path, lines: list[str]) -> str:
 
 
 def _is_data(row: list[str]) -> bool:
-    """Whether a row holds a time and something with digits besides."""
+    """Whether a row holds a time and something that can stand for a reading besides."""
     times = sum(_is_time(field) for field in row)
-    return times > 0 and any(_is_number(field) for field in row)
+    return times > 0 and sum(bool(_READING.fullmatch(field)) for field in row) > 0
 
 
 def _is_time(field: str) -> bool:
     try:
         parse_moment(field)
     except ValueError:
-        # month before day, which is not decided yet
-        return bool(re.fullmatch(r"\d{1,2}[/-]\d{1,2}[/-]\d{2,4}.*", field))
+        return is_date_like(field)  # month before day, which is not decided yet
     return True
 
 
-def _is_number(field: str) -> bool:
-    return bool(re.fullmatch(r"[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?", field)) or field == ""
+def _names(above: list[list[str]], width: int) -> tuple[str, ...]:
+    """Names of the columns, those of a second line (units) joined to them; unique.
 
-
-def _names(header: list[list[str]], width: int) -> list[str]:
-    """Names of the columns, those of a second line (units) joined to them; unique."""
-    if not header:
-        return [f"column {i + 1}" for i in range(width)]
-    names = []
-    for i in range(width):
-        parts = [row[i] for row in header[:2] if row[i]]
+    above: the rows above the data. The first row of the data's width has the names; where none has
+    it, one that is wider (a serial number stands in the first row alone) or one field narrower (the
+    rows end with a separator).
+    """
+    wide = [row for row in above if len(row) > width][-1:]
+    narrow = [row for row in above if len(row) == width - 1 and width > 2][-1:]
+    header = [row for row in above if len(row) == width][:2] or wide or narrow
+    names: list[str] = []
+    for i in range(max(width, *(len(row) for row in header)) if header else width):
+        parts = [row[i] for row in header if i < len(row) and row[i]]
         name = " ".join(dict.fromkeys(parts)) or f"column {i + 1}"
         while name in names:
             name += "'"
         names.append(name)
-    return names
+    return tuple(names)
 
 
-def _decimal(columns: dict[str, list[str]], separator: str) -> str:
-    if separator == ",":
-        quoted = any(_COMMA_NUMBER.fullmatch(v) for c in columns.values() for v in c[:_SAMPLE])
-        return "," if quoted else "."
-    values = [v for column in columns.values() for v in column[:_SAMPLE]]
+def _decimal(rows: tuple[tuple[str, ...], ...], separator: str) -> str:
+    values = [value for row in rows for value in row]
     comma = sum(bool(_COMMA_NUMBER.fullmatch(v)) for v in values)
+    if separator == ",":
+        return "," if any(_COMMA_NUMBER.fullmatch(v) for v in values) else "."
     return "," if comma > sum(bool(_POINT_NUMBER.fullmatch(v)) for v in values) else "."

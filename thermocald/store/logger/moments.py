@@ -6,10 +6,6 @@ import re
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, time, timedelta, timezone
 
-from thermocald.errors import DataError
-
-__all__ = ["DATE_ORDERS", "MomentFormat", "order_of_dates", "parse_moment", "seconds_as_moment"]
-
 DATE_ORDERS = ("ymd", "dmy", "mdy")
 
 _DATE = r"(?P<a>\d{1,4})(?P<mark>[-./:])(?P<b>\d{1,2})(?P=mark)(?P<c>\d{1,4})\.?"
@@ -24,6 +20,21 @@ _FULL = re.compile(rf"(?:{_DATE}|{_COMPACT_DATE})[ T,;_-]+(?:{_TIME}|{_COMPACT_T
 _ONLY_DATE = re.compile(rf"(?:{_DATE}|{_COMPACT_DATE})")
 _ONLY_TIME = re.compile(rf"{_TIME}{_ZONE}")
 _NUMBER = re.compile(r"\d{9,13}(?:[.,]\d+)?")
+_NAMED_DATE = re.compile(
+    r"(?:[^\W\d_]{2,9}\.?,?\s+)?"  # the day of the week
+    r"(?:(?P<m1>[^\W\d_]{3,9})\.?\s+(?P<d1>\d{1,2})(?:st|nd|rd|th)?,?\s+(?P<y1>\d{4})"
+    r"|(?P<d2>\d{1,2})[\s.-]+(?P<m2>[^\W\d_]{3,9})[\s.,-]+(?P<y2>\d{4}|\d{2}))(?P<rest>\D.*|)"
+)
+_MONTHS = {
+    name: number
+    for number, names in enumerate(
+        ("jan", "feb", "mar mär mrz mrt", "apr", "may mai mei", "jun", "jul", "aug", "sep",
+         "oct okt", "nov", "dec dez"), 1)
+    for name in names.split()
+}  # fmt: skip
+"""By the first letters, as English, German and Dutch loggers write them."""
+_WORD = re.compile(r"[A-Za-z]{3}")
+_CHINESE = str.maketrans({"年": "-", "月": "-", "日": " "})
 _ZONES_H = {"Z": 0, "UTC": 0, "GMT": 0, "CET": 1, "MEZ": 1, "CEST": 2, "MESZ": 2}
 _MS_FROM = 1e11  # seconds since 1970 are fewer for 3000 years
 
@@ -41,7 +52,7 @@ def parse_moment(text: str, form: MomentFormat | None = None) -> datetime | date
     Numbers are seconds (or ms) since 1970 UTC. Raises ValueError for what is none of these.
     """
     form = form or MomentFormat()
-    text = text.strip()
+    text = _numbered(text.strip())
     if _NUMBER.fullmatch(text):
         return seconds_as_moment(float(text.replace(",", ".")))
     if found := _FULL.fullmatch(text):
@@ -62,28 +73,33 @@ def seconds_as_moment(seconds: float) -> datetime:
         raise ValueError(f"{seconds} is not a time") from cause
 
 
-def order_of_dates(texts: list[str], where: str) -> str | None:
-    """The order of day and month that all of some dates have; DataError where none tells it.
-
-    None where the form of each date says it: 2026-06-14, 14.06.2026.
-    """
-    parts = [(text, *found) for text in texts if (found := _parts(text))]
-    if not parts:
-        return None
-    orders = {"dmy" if a > 12 else "mdy" for _, a, b in parts if a > 12 or b > 12}
-    if len(orders) == 1:
-        return orders.pop()
-    raise DataError(
-        f"{where}: {parts[0][0]!r} may be day/month or month/day: say --date-order dmy or mdy"
-    )
+def is_date_like(text: str) -> bool:
+    """Whether it is 06/14/2026, with or without a time, whichever number is the month."""
+    return re.match(r"\d{1,2}[/-]\d{1,2}[/-]\d{2,4}(?!\d)", text) is not None
 
 
-def _parts(text: str) -> tuple[int, int] | None:
+def day_and_month(text: str) -> tuple[int, int] | None:
     """First and second number of a date written with / or -, not beginning with the year."""
-    found = _FULL.fullmatch(text.strip()) or _ONLY_DATE.fullmatch(text.strip())
+    text = _numbered(text.strip())
+    found = _FULL.fullmatch(text) or _ONLY_DATE.fullmatch(text)
     if found is None or found["compact"] or len(found["a"]) == 4 or found["mark"] == ".":
         return None
     return int(found["a"]), int(found["b"])
+
+
+def _numbered(text: str) -> str:
+    """A date whose month is a word, or which is Chinese, as 2026-06-14."""
+    if text.isascii() and not _WORD.search(text):
+        return text
+    text = text.translate(_CHINESE)
+    found = _NAMED_DATE.fullmatch(text)
+    if found is None:
+        return text
+    month = _MONTHS.get((found["m1"] or found["m2"])[:3].lower())
+    if month is None:
+        return text
+    day, year = int(found["d1"] or found["d2"]), found["y1"] or found["y2"]
+    return f"{year if len(year) == 4 else 2000 + int(year)}-{month}-{day}{found['rest']}"
 
 
 def _date(found: re.Match[str], form: MomentFormat) -> date:

@@ -20,7 +20,6 @@ from thermocald.store.logger.moments import parse_moment
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = ["SOURCES", "Photograph", "find_photographs", "read_photograph"]
 
 SOURCES = ("exif", "name", "file")
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
@@ -94,6 +93,14 @@ def read_photograph(path: Path, source: str = "exif") -> Photograph:
         path, moment, width, height, _camera(details), focal,
         _pixel_pitch(details, focal, width, height),
     )  # fmt: skip
+
+
+def moment_taken(path: Path) -> datetime | None:
+    """Return when a photograph was taken as its EXIF says it, None where it does not."""
+    try:
+        return read_photograph(path).moment
+    except (DataError, DriverMissing, ImageError):
+        return None
 
 
 def _exif_moment(path: Path, details: dict[int, Any]) -> datetime:

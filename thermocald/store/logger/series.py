@@ -1,20 +1,27 @@
 """Photographs and a log of temperatures put together as the epochs of a recording.
 
-Each photograph gets the reading next to it in time, with the reading's own time; the temperature
-at the photograph's time is interpolated from them when the recording is read.
+Each photograph gets the reading next to it in time, with the reading's own time, and the recording
+keeps every reading: the temperature at a photograph's time is interpolated from all of them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermocald.epoch import Epoch
-from thermocald.errors import DataError
-from thermocald.store.recording.readings import interpolate_readings
+from thermocald.errors import DataError, UsageError
+from thermocald.photogrammetry.camera.camera_model import Sensor
+from thermocald.photogrammetry.camera_files.camera_file import read_camera
+from thermocald.store.logger.temperatures import LogOptions, TemperatureLog, read_log
+from thermocald.store.recording.head import CameraSpec, Channel, Head
+from thermocald.store.recording.reader import EpochColumns, Recording
+from thermocald.store.recording.readings import Readings, interpolate_readings
+from thermocald.store.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,11 +29,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
+    from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.store.logger.clock import DeviceClock
     from thermocald.store.logger.photographs import Photograph
-    from thermocald.store.logger.temperatures import LoggedTemperatures
-
-__all__ = ["PhotographSeries", "put_together"]
 
 _LARGEST_GAP_IN_INTERVALS = 10.0
 
@@ -41,7 +46,7 @@ class PhotographSeries:
 
     photographs: tuple[Photograph, ...]
     times: Array
-    log: LoggedTemperatures
+    log: TemperatureLog
     reading: NDArray[np.int64]
     at_frame: Array
 
@@ -49,6 +54,11 @@ class PhotographSeries:
     def interval(self) -> float:
         """The median time between photographs, s; 1 for a single one."""
         return float(np.median(np.diff(self.times))) if len(self.times) > 1 else 1.0
+
+    @property
+    def readings(self) -> Readings:
+        """Every reading of the log."""
+        return Readings(self.log.times, self.log.channels)
 
     def epochs(self) -> list[Epoch]:
         """The epochs from 1 on, their frames the photographs."""
@@ -93,9 +103,9 @@ def iso(seconds: float) -> str:
 
 
 def put_together(
-    photographs: Sequence[Photograph], camera_clock: DeviceClock, log: LoggedTemperatures
+    photographs: Sequence[Photograph], camera_clock: DeviceClock, log: Path, options: LogOptions
 ) -> PhotographSeries:
-    """Photographs and log on one clock.
+    """Photographs and a logger's file on one clock.
 
     Raises DataError for photographs of different sizes, for times that do not say their zone, and
     where log and photographs do not overlap.
@@ -114,16 +124,17 @@ def put_together(
     order = np.argsort(times, kind="stable")
     times = times[order]
     placed = tuple(named[i] for i in order.tolist())
-    _overlap(times, log.times)
-    reading = _next_to(times, log.times)
-    first = next(iter(log.channels.values()))
-    at_frame = interpolate_readings(times, log.times, first)
+    logged = read_log(log, options, (float(times[0]), float(times[-1])))
+    _overlap(times, logged.times)
+    reading = _next_to(times, logged.times)
+    first = next(iter(logged.channels.values()))
+    at_frame = interpolate_readings(times, logged.times, first)
     if not np.isfinite(at_frame).any():
         raise DataError(
             "no photograph has a temperature: the log has gaps wherever photographs were taken "
             f"({iso(times[0])} to {iso(times[-1])})"
         )
-    return PhotographSeries(placed, times, log, reading, at_frame)
+    return PhotographSeries(placed, times, logged, reading, at_frame)
 
 
 def _size(photograph: Photograph) -> tuple[int, int]:
@@ -148,3 +159,74 @@ def _next_to(frames: Array, log: Array) -> NDArray[np.int64]:
     row = np.where(frames - log[left] <= log[right] - frames, left, right)
     far = np.abs(log[row] - frames) > _LARGEST_GAP_IN_INTERVALS * np.median(np.diff(log))
     return np.where(far, -1, row).astype(np.int64)
+
+
+def camera_of(
+    photograph: Photograph,
+    file: Path | None,
+    pitch: float | None,
+    distance: float | None = None,
+    dry_run: bool = False,
+) -> tuple[CameraSpec, list[str]]:
+    """Return the camera of photographs, and what of it was taken from EXIF.
+
+    file: a camera file, which then says it all; pitch, distance mm: instead of EXIF's; dry_run: a
+    pixel pitch that nobody knows is no error, but noted.
+    """
+    notes: list[str] = []
+    if file is not None:
+        known = read_camera(file, pitch)
+        if (known.sensor.width, known.sensor.height) != (photograph.width, photograph.height):
+            raise UsageError(
+                f"{file}: is of {known.sensor.width} × {known.sensor.height} px, the photographs "
+                f"have {photograph.width} × {photograph.height}"
+            )
+        return CameraSpec(known.name, known.sensor, known.principal_distance, known.interior), notes
+    if distance is None and photograph.focal_length is not None:
+        distance = photograph.focal_length
+        notes.append(f"camera: principal distance {distance:g} mm from EXIF (--principal-distance)")
+    if pitch is None:
+        pitch = photograph.pixel_pitch
+        unknown = (
+            "the size of a pixel is not known and EXIF does not say it: --pixel-pitch 0.00112 "
+            "(mm), or --camera FILE"
+        )
+        if pitch is None and not dry_run:
+            raise UsageError(unknown)
+        said = f"pixel pitch {pitch:.5f} mm from EXIF (--pixel-pitch)" if pitch else unknown
+        notes.append(f"camera: {said}")
+        pitch = pitch or 0.001
+    sensor = Sensor(photograph.width, photograph.height, pitch)
+    return CameraSpec(photograph.camera or "camera", sensor, distance), notes
+
+
+def in_memory(
+    placed: PhotographSeries, camera: CameraSpec, testfield: TestField, series: str
+) -> Recording:
+    """Return photographs and a log as a recording that lies in no folder of its own."""
+    log, row = placed.log, placed.reading
+    channels = {
+        n: np.where(row >= 0, v[np.maximum(row, 0)], np.nan) for n, v in log.channels.items()
+    }
+    columns = EpochColumns(
+        np.arange(1, len(placed.times) + 1),
+        placed.times,
+        np.where(row >= 0, log.times[np.maximum(row, 0)], np.nan),
+        channels,
+        tuple(str(p.path.absolute()) for p in placed.photographs),
+        {},
+        placed.readings,
+    )
+    interval = max(placed.interval, 0.001)
+    thermometers = dict.fromkeys(channels, Channel())
+    head = Head(f"{camera.name}-{series}", series, interval, camera, thermometers)
+    return Recording(Path(), head, testfield, columns, has_observations=False)
+
+
+def write_photographs(folder: Path, recording: Recording, placed: PhotographSeries) -> None:
+    """Write photographs and a log as a recording, in a new folder."""
+    head = replace(recording.head, name=folder.name)
+    with RecordingWriter(folder, head, recording.testfield) as writer:
+        for epoch in placed.epochs():
+            writer.append(epoch)
+        writer.keep_readings(placed.readings)

@@ -1,53 +1,74 @@
-"""A logger's temperatures: which columns are times and temperatures, in which unit.
+"""Temperatures as a logger, a recording or a store has them, for every command that reads a log.
 
-Columns are taken by name, or guessed and shown. Whatever is not certain is refused with the option
-that says it: units, the order of day and month, the time zone.
+Columns are taken by name, or guessed and shown. What is not certain is refused with the option that
+says it (units, the order of day and month, the time zone) unless the file or the times of the
+photographs tell.
 """
 
 from __future__ import annotations
 
 import re
+from array import array
+from collections import Counter
 from dataclasses import dataclass, field, replace
-from datetime import date, datetime, time
+from datetime import UTC, datetime, time
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.errors import DataError
-from thermocald.store.logger.clock import DeviceClock, time_zone
-from thermocald.store.logger.dialect import LoggerTable, read_table
-from thermocald.store.logger.moments import MomentFormat, order_of_dates, parse_moment
+from thermocald.errors import DataError, UsageError
+from thermocald.names import channel_fault
+from thermocald.numbers import column_label
+from thermocald.store.logger.clock import DeviceClock, device_clock, time_zone
+from thermocald.store.logger.dialect import OUR_TIMES, LoggerFile, open_log
+from thermocald.store.logger.moments import (
+    MomentFormat,
+    day_and_month,
+    is_date_like,
+    parse_moment,
+)
+from thermocald.store.logger.units import UNITS, stated_unit, to_celsius
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from thermocald.arrays import Array
 
-__all__ = ["UNITS", "LogOptions", "LoggedTemperatures", "read_log"]
-
-UNITS = ("degC", "K", "degF")
-_TIME_NAME = re.compile(r"time|date|zeit|datum|uhr|stamp|tijd|heure|fecha|hora|utc", re.IGNORECASE)
+_TIME_NAME = re.compile(
+    r"time|date|zeit|datum|uhr|stamp|tijd|heure|fecha|hora|utc|时间|日期|changed", re.IGNORECASE
+)
 _TEMPERATURE_NAME = re.compile(
-    r"temp|°\s*c|deg\s*c|celsius|kelvin|thermo|ds18|pt100|housing|geh[äa]use|\bt\d*\b|\[c\]|\bsensor",
+    r"temp|°\s*[cf]|deg\s*[cf]|celsius|fahrenheit|kelvin|thermo|ds18|pt100|housing|geh[äa]use"
+    r"|\bt\d*\b|[\[(][cf][\])]|\bsensor|温度|[℃℉]",
     re.IGNORECASE,
 )
 _OTHER_NAME = re.compile(
     r"hum|feucht|\brh\b|%|press|druck|hpa|mbar|volt|batt|\bnr\b|index|count|record|lux|light|dew|taupunkt"
+    r"|alarm|limit|threshold|set.?point|serial|trusted|湿度|露点|序号"
     r"|^epoch$|pixel|^(?:c|x0|y0|sigma0)$|^sd_|^#$|^no\.?$",
     re.IGNORECASE,
 )
-_FAHRENHEIT = re.compile(r"°\s*f|deg\s*f|fahrenheit|\[f\]|_f$", re.IGNORECASE)
-_KELVIN = re.compile(r"kelvin|\[k\]|\(k\)|_k$", re.IGNORECASE)
 _HEADER_ZONE = re.compile(r"(?:GMT|UTC)\s*[+-]\s*\d{1,2}(?::?\d{2})?", re.IGNORECASE)
+_NUMBER = re.compile(r"[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?")
+_UNIT_BEHIND = re.compile(r"\s*(?:[°º]\s*[CFK]?|℃|℉|deg\s?[CF]|(?<=[\d\s])[CFK])$")
+_LABEL = "entity_id"
+"""Home Assistant writes all sensors below one another, each row with its name."""
 _NO_READING = {-127.0, -999.0, -9999.0, -99.0, 9999.0}
 _PLAUSIBLE_C = (-90.0, 180.0)
+_KELVIN = (220.0, 450.0)
 _GOOD_SHARE = 0.8
+_MS_FROM = 1e11  # seconds since 1970 are fewer for 3000 years
+_LONGER = 10.0  # times: a log in the wrong order of day and month runs over months
 
 
 @dataclass(frozen=True, slots=True)
 class LogOptions:
     """What is said about a log: names of time and temperature columns (empty: guess), separator and
     decimal mark, order of dates, unit, and the logger's clock.
+
+    wanted: names that are temperatures wherever they occur, such as a model's thermometers; names:
+    what columns are called from now on, by their names in the file.
     """
 
     times: tuple[str, ...] = ()
@@ -57,123 +78,315 @@ class LogOptions:
     date_order: str | None = None
     unit: str | None = None
     clock: DeviceClock = field(default_factory=DeviceClock)
+    wanted: tuple[str, ...] = ()
+    names: Mapping[str, str] = field(default_factory=dict)
+
+
+def log_options(
+    *,
+    timezone: str | None = None,
+    log_timezone: str | None = None,
+    log_clock: str = "0",
+    ambiguous: str = "order",
+    time_column: Sequence[str] | None = None,
+    temperature_column: Sequence[str] | None = None,
+    separator: str | None = None,
+    decimal: str | None = None,
+    date_order: str | None = None,
+    unit: str | None = None,
+    name: Sequence[str] | None = None,
+) -> LogOptions:
+    """Return what is said about a log from text; UsageError for what cannot be meant."""
+    for option, value, allowed in (
+        ("--unit", unit, UNITS),
+        ("--date-order", date_order, ("dmy", "mdy")),
+        ("--decimal", decimal, (",", ".")),
+    ):
+        if value is not None and value not in allowed:
+            raise UsageError(f"{option} {value}: must be one of {', '.join(allowed)}")
+    names = dict(_renamed(text) for text in name or ())
+    mark = {"tab": "\t", "\\t": "\t"}.get(separator or "", separator)
+    clock = device_clock(timezone, log_timezone, log_clock, ambiguous, "--log-timezone")
+    return LogOptions(
+        tuple(time_column or ()), tuple(temperature_column or ()), mark, decimal, date_order, unit,
+        clock, names=names,
+    )  # fmt: skip
+
+
+def _renamed(text: str) -> tuple[str, str]:
+    column, _, label = text.rpartition("=")
+    if not column or not label or (fault := channel_fault(label)):
+        why = fault if column and label else "must be COLUMN=LABEL"
+        raise UsageError(f"--name {text}: {why}")
+    return column, label
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LoggedTemperatures:
-    """times (n,) s UTC, increasing; channels {name: (n,) °C}, NaN where there is none; notes: what
-    was found and guessed, for people.
+class TemperatureLog:
+    """times (n,) s UTC, increasing; channels {name: (n,) °C}, NaN where there is none, the first is
+    the reference; notes: what was found and guessed, for people.
     """
 
     times: Array
     channels: dict[str, Array]
-    notes: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+
+    def with_reference(self, name: str | None) -> TemperatureLog:
+        """The same with another channel as the first, if it has that one."""
+        if name not in self.channels:
+            return self
+        first = {name: self.channels[name]}
+        return replace(self, channels=first | self.channels)
 
 
-def read_log(path: Path, options: LogOptions | None = None) -> LoggedTemperatures:
-    """Read a logger's file; DataError or UsageError says what is not certain and how to say it."""
+def read_log(
+    path: Path, options: LogOptions | None = None, near: tuple[float, float] | None = None
+) -> TemperatureLog:
+    """Read a logger's file; near: s UTC, the span in which it must have been recorded.
+
+    Raises DataError or UsageError for what is not certain, with how to say it.
+    """
     options = options or LogOptions()
-    table = read_table(path, options.separator, options.decimal)
-    notes = [f"log: {len(table)} rows, {table.description}"]
-    time_names = _time_columns(table, options)
-    moments = _moments(table, time_names, options)
-    clock = options.clock
-    header = " ".join(time_names)
-    if said := _HEADER_ZONE.search(header):
-        if clock.forced:
-            notes.append(f"log: the header says {said[0]}; the logger's own zone was given instead")
-        else:  # it is no time without a zone: what is said of such times is not meant for it
-            clock = replace(clock, zone=time_zone(said[0]))
-            notes.append(f"log: the header says the time zone: {said[0]}")
-
-    def where(i: int) -> str:
-        return f"{path}, line {table.lines[i]}"
-
-    times = clock.utc(moments, where)
-    names = _temperature_columns(table, time_names, options)
-    notes.append(
-        f"log: time from {_quoted(time_names)}; temperatures from {_quoted(names)}"
-        + ("" if options.temperatures else " (guessed: --temperature-column says otherwise)")
-    )
+    file = open_log(path, options.separator, options.decimal)
+    time_names = _time_columns(file, options)
+    clock, notes = _clock(options.clock, " ".join(time_names))
+    names = _temperature_columns(file, time_names, options)
+    order, told = _date_order(file, time_names, options, clock, near)
+    table = _Table(file, time_names, names, MomentFormat(order))
+    table.read()
+    times = table.times(clock)
+    if len(times) < 2:
+        raise DataError(f"{path}: holds {len(times)} readings; two at least are needed")
+    _given(table.file, tuple(options.names), "--name")
     channels = {}
     for name in names:
-        values, lost = _values(table, name, options)
-        channels[_channel(name)] = values
-        if lost:
-            notes.append(f"log: {lost} readings of {name!r} are none (-127, -999): left empty")
-    order = np.argsort(times, kind="stable")
-    times = times[order]
-    if np.any(np.diff(times) < 0) or len(times) < 2:
-        raise DataError(f"{path}: holds {len(times)} readings; two at least are needed")
-    keep = np.concatenate([[True], np.diff(times) > 0])
-    if not keep.all():
-        notes.append(f"log: {int((~keep).sum())} rows with the time of the row before: left out")
-    return LoggedTemperatures(
-        times[keep], {n: v[order][keep] for n, v in channels.items()}, tuple(notes)
-    )
+        values, unit_note = _celsius(table, name, options)
+        channel = options.names.get(name) or _channel(name)
+        while channel in channels:  # `T (1)` and `T [1]` are two columns
+            channel += "_"
+        channels[channel] = values
+        notes += unit_note
+    if table.labels:
+        channels = _by_label(table, next(iter(channels.values())), options)
+    notes = [
+        f"log: {len(times)} rows, {file.description}",
+        f"log: time from {_quoted(time_names)}; temperatures from {_quoted(channels)}"
+        + ("" if options.temperatures else " (guessed: --temperature-column says otherwise)"),
+        *told, *notes, *table.left_out(),
+    ]  # fmt: skip
+    times, channels, repeated = _in_order(times, channels)
+    if repeated:
+        notes.append(f"log: {repeated} rows with the time of the row before: left out")
+    return TemperatureLog(times, channels, tuple(notes))
 
 
-def _quoted(names: tuple[str, ...]) -> str:
+def _in_order(times: Array, channels: dict[str, Array]) -> tuple[Array, dict[str, Array], int]:
+    """Rows in the order of time; those of one time become one, and how many were left out."""
+    unique, place = np.unique(times, return_inverse=True)
+    kept, taken = {}, np.zeros(len(times), dtype=bool)
+    for name, values in channels.items():
+        known = np.flatnonzero(np.isfinite(values))
+        _, first = np.unique(place[known], return_index=True)
+        kept[name] = np.full(len(unique), np.nan)
+        kept[name][place[known[first]]] = values[known[first]]
+        taken[known[first]] = True
+    lost = int((~taken & np.any([np.isfinite(v) for v in channels.values()], axis=0)).sum())
+    return unique, kept, lost
+
+
+class _Table:
+    """The rows of a log while they are read: a year of them, as numbers."""
+
+    def __init__(
+        self, file: LoggerFile, times: tuple[str, ...], names: tuple[str, ...], form: MomentFormat
+    ) -> None:
+        self.file, self.names, self._form = file, names, form
+        self._time_names = times
+        self._places = [file.names.index(name) for name in times]
+        self._seconds, self._lines = array("d"), array("q")
+        self._dated: dict[int, datetime] = {}
+        self.values = {name: array("d") for name in names}
+        self.units: dict[str, Counter[str]] = {name: Counter() for name in names}
+        self._untimed: list[tuple[int, str]] = []
+        self._words: dict[str, Counter[str]] = {name: Counter() for name in names}
+        self.labels: list[str] = []
+
+    def read(self) -> None:
+        """Read all rows; those without a time (a footer) and readings that are none are counted."""
+        file = self.file
+        columns = [(name, file.names.index(name)) for name in self.names]
+        label = file.names.index(_LABEL) if _LABEL in file.names else None
+        bare = set(self._time_names) <= set(OUR_TIMES)
+        for line, row in file.rows():
+            text = " ".join(row[place] for place in self._places)
+            seconds = _as_seconds(text) if bare else None
+            moment = None if seconds is not None else self._moment(line, text)
+            if seconds is None and moment is None:
+                self._untimed.append((line, text))
+                continue
+            if moment is not None:
+                self._dated[len(self._seconds)] = moment
+            self._seconds.append(np.nan if seconds is None else seconds)
+            self._lines.append(line)
+            for name, place in columns:
+                self.values[name].append(self._value(line, name, row[place]))
+            if label is not None:
+                self.labels.append(row[label])
+
+    def where(self, row: int) -> str:
+        """A row's place in the file, as errors name it."""
+        return f"{self.file.path}, line {self._lines[row]}"
+
+    def times(self, clock: DeviceClock) -> Array:
+        """Seconds since 1970 UTC of each row."""
+        seconds = np.array(self._seconds)
+        places = list(self._dated)
+        seconds[places] = clock.utc(list(self._dated.values()), lambda k: self.where(places[k]))
+        return seconds
+
+    def left_out(self) -> list[str]:
+        """What was passed over, for people."""
+        said = []
+        if self._untimed:
+            line, text = self._untimed[0]
+            said.append(
+                f"log: {len(self._untimed)} rows hold no time: left out (line {line}: "
+                f"{text[:30]!r})"
+            )
+        for name, words in self._words.items():
+            if words:
+                shown = ", ".join(repr(word) for word, _ in words.most_common(3))
+                count = words.total()
+                said.append(f"log: {count} readings of {name!r} are none ({shown}): left empty")
+        return said
+
+    def _moment(self, line: int, text: str) -> datetime | None:
+        """The time of a row, None where it is no row of readings."""
+        try:
+            moment = parse_moment(text, self._form)
+        except ValueError as cause:
+            if not text[:1].isdigit():
+                return None
+            raise DataError(
+                f"{self.file.path}, line {line}, column {self._time_names[0]!r}: {text[:40]!r} is "
+                f"not a date with a time ({cause})"
+            ) from cause
+        if isinstance(moment, time) or not isinstance(moment, datetime):
+            raise DataError(
+                f"{self.file.path}, line {line}: {text[:40]!r} is a date or a time alone; name "
+                "both columns (--time-column twice)"
+            )
+        return moment
+
+    def _value(self, line: int, name: str, text: str) -> float:
+        """A reading as it stands, NaN for none."""
+        if not text:
+            return np.nan
+        plain = text.replace(",", ".") if self.file.decimal == "," else text
+        if unit := _UNIT_BEHIND.search(plain):
+            plain = plain[: unit.start()]
+            self.units[name][stated_unit(f"({unit[0].strip()[-1:]})") or ""] += 1
+        try:
+            value = float(plain) if "_" not in plain else np.nan
+        except ValueError:
+            value = np.nan
+        if np.isfinite(value) and value not in _NO_READING:
+            return value
+        if re.search(r"\d", text) and value not in _NO_READING:
+            raise DataError(
+                f"{self.file.path}, line {line}, column {name!r}: {text[:40]!r} is not a number"
+            )
+        self._words[name][text[:20]] += 1
+        return np.nan
+
+
+def _as_seconds(text: str) -> float | None:
+    """Seconds since 1970, or milliseconds, of any number; None for a date."""
+    try:
+        seconds = float(text)
+    except ValueError:
+        return None
+    if seconds >= _MS_FROM:
+        seconds /= 1000.0
+    return seconds if seconds < _MS_FROM else None
+
+
+def _clock(clock: DeviceClock, header: str) -> tuple[DeviceClock, list[str]]:
+    """The logger's clock with the zone that the head of its times states."""
+    said = _HEADER_ZONE.search(header)
+    if said is None:
+        return clock, []
+    if clock.forced:
+        return clock, [f"log: the header says {said[0]}; the logger's own zone was given instead"]
+    # it is no time without a zone: what is said of such times is not meant for it
+    zoned = replace(clock, zone=time_zone(said[0]))
+    return zoned, [f"log: the header says the time zone: {said[0]}"]
+
+
+def _by_label(table: _Table, values: Array, options: LogOptions) -> dict[str, Array]:
+    """One channel for each sensor of a file that has them below one another."""
+    labels = np.array(table.labels)
+    every = list(dict.fromkeys(table.labels))
+    names = [n for n in every if n in options.wanted] or [
+        n for n in every if not _OTHER_NAME.search(n) and np.isfinite(values[labels == n]).any()
+    ]
+    return {_channel(name): np.where(labels == name, values, np.nan) for name in names}
+
+
+def _quoted(names: Sequence[str] | dict[str, Array]) -> str:
     return ", ".join(repr(n) for n in names)
 
 
 def _channel(name: str) -> str:
     """A name that a recording can have for a column."""
-    plain = re.sub(r"[^\w .°+-]", "", name).strip() or "temperature"
-    return (
-        f"{plain} of the log"
-        if plain in {"epoch", "frame_time", "temperature_time", "frame"}
-        else plain
-    )
+    plain = re.sub(r"[^\w .°+-]", "", column_label(name)).strip() or "temperature"
+    plain = plain[:48]
+    return f"{plain} of the log" if channel_fault(plain) else plain
 
 
-def _given(table: LoggerTable, names: tuple[str, ...], option: str) -> tuple[str, ...]:
+def _given(file: LoggerFile, names: tuple[str, ...], option: str) -> tuple[str, ...]:
     for name in names:
-        if name not in table.columns:
+        if name not in file.names:
             raise DataError(
-                f"{table.path}: there is no column {name!r} ({option}); there are "
-                f"{', '.join(repr(n) for n in table.columns)}"
+                f"{file.path}: there is no column {name!r} ({option}); there are "
+                f"{_quoted(file.names)}"
             )
     return names
 
 
 def _kind(values: list[str]) -> str:
-    """What most of a column's first values are: moment, date, time, number, text."""
-    kinds: dict[str, int] = {}
-    sample = [v for v in values[:200] if v]
-    for value in sample:
-        try:
-            found = parse_moment(value)
-        except ValueError:
-            kind = "moment?" if re.match(r"\d{1,2}[/-]\d{1,2}[/-]\d{2,4}", value) else "text"
-            if kind == "moment?":
-                kind = "moment" if ":" in value else "date"
-            elif re.fullmatch(r"[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?", value):
-                kind = "number"
-        else:
-            number = re.fullmatch(r"\d+(?:[.,]\d+)?", value)
-            kind = (
-                "seconds" if number and isinstance(found, datetime)
-                else "number" if number
-                else "moment" if isinstance(found, datetime)
-                else "date" if isinstance(found, date)
-                else "time"
-            )  # fmt: skip
-        kinds[kind] = kinds.get(kind, 0) + 1
+    """What most of a column's values are: moment, date, time, number, text."""
+    kinds: Counter[str] = Counter(_kind_of(value) for value in values if re.search(r"\d", value))
     if not kinds:
         return "empty"
-    kind = max(kinds, key=lambda k: kinds[k])
-    return kind if kinds[kind] >= _GOOD_SHARE * len(sample) else "text"
+    kind, count = kinds.most_common(1)[0]
+    return kind if count >= _GOOD_SHARE * kinds.total() else "text"
 
 
-def _time_columns(table: LoggerTable, options: LogOptions) -> tuple[str, ...]:
+def _kind_of(value: str) -> str:
+    number = _NUMBER.fullmatch(_UNIT_BEHIND.sub("", value))
+    try:
+        found = parse_moment(value)
+    except ValueError:
+        if is_date_like(value):
+            return "moment" if ":" in value else "date"
+        return "number" if number else "text"
+    if number:
+        return "seconds" if isinstance(found, datetime) else "number"
+    if isinstance(found, datetime):
+        return "moment"
+    return "time" if isinstance(found, time) else "date"
+
+
+def _time_columns(file: LoggerFile, options: LogOptions) -> tuple[str, ...]:
     if options.times:
-        return _given(table, options.times, "--time-column")
-    kinds = {name: _kind(values) for name, values in table.columns.items()}
+        return _given(file, options.times, "--time-column")
+    kinds = {name: _kind(file.column(name)) for name in file.names}
+    ours = [n for n in OUR_TIMES if kinds.get(n) in ("number", "seconds")]
     moments = [n for n, kind in kinds.items() if kind == "moment"]
     moments += [n for n, kind in kinds.items() if kind == "seconds" and _TIME_NAME.search(n)]
-    if moments:
-        return (moments[0],)
+    if ours or moments:
+        return ((ours or moments)[0],)
     dates = [n for n, kind in kinds.items() if kind == "date"]
     clocks = [n for n, kind in kinds.items() if kind == "time"]
     if dates and clocks:
@@ -182,98 +395,153 @@ def _time_columns(table: LoggerTable, options: LogOptions) -> tuple[str, ...]:
     if len(seconds) == 1:
         return (seconds[0],)
     raise DataError(
-        f"{table.path}: no column holds dates with times; say --time-column NAME (twice for a date "
-        f"and a time). Columns: {', '.join(repr(n) for n in table.columns)}"
+        f"{file.path}: no column holds dates with times; say --time-column NAME (twice for a date "
+        f"and a time). Columns: {_quoted(file.names)}"
     )
 
 
-def _moments(table: LoggerTable, names: tuple[str, ...], options: LogOptions) -> list[datetime]:
-    where = f"{table.path}, column {names[0]!r}"
-    order = options.date_order or order_of_dates(table.columns[names[0]], where)
-    form = MomentFormat(order)
-    columns = [table.columns[name] for name in names]
-    found: list[datetime] = []
-    for i, parts in enumerate(zip(*columns, strict=True)):
-        text = " ".join(parts)
-        try:
-            moment = parse_moment(text, form)
-        except ValueError as cause:
-            raise DataError(
-                f"{table.path}, line {table.lines[i]}, column {names[0]!r}: {text[:40]!r} is not a "
-                f"date with a time ({cause})"
-            ) from cause
-        if isinstance(moment, time) or not isinstance(moment, datetime):
-            raise DataError(
-                f"{table.path}, line {table.lines[i]}: {text[:40]!r} is a date or a time alone; "
-                "name both columns (--time-column twice)"
-            )
-        found.append(moment)
-    return found
+def _date_order(
+    file: LoggerFile,
+    names: tuple[str, ...],
+    options: LogOptions,
+    clock: DeviceClock,
+    near: tuple[float, float] | None,
+) -> tuple[str | None, list[str]]:
+    """The order of day and month, None where each date says it; and how it was found.
+
+    A number above 12 tells it; else the photographs, as only one order puts the log next to them;
+    else the rows, as a log that runs on for days would jump from month to month in the other order.
+    """
+    if options.date_order is not None:
+        return options.date_order, []
+    if not any(day_and_month(text) for text in file.column(names[0])):
+        return None, []
+    places = [file.names.index(name) for name in names]
+    first = last = ""
+    orders: set[str] = set()
+    same = True
+    for _, row in file.rows():
+        found = day_and_month(row[places[0]])
+        if found is None:
+            continue
+        last = " ".join(row[place] for place in places)
+        first = first or last
+        same &= found[0] == found[1]
+        if max(found) > 12:
+            orders.add("dmy" if found[0] > 12 else "mdy")
+    if len(orders) == 1:
+        return orders.pop(), []
+    if same:
+        return "dmy", []
+    if not orders:
+        spans = {order: _span(first, last, order) for order in ("dmy", "mdy")}
+        if near is not None:
+            far = {
+                order: _apart(clock.utc(list(span), lambda _: f"{file.path}"), near)
+                for order, span in spans.items()
+            }
+            if abs(far["dmy"] - far["mdy"]) > 86400.0:
+                order = min(far, key=lambda o: far[o])
+                return order, [
+                    f"log: {first!r} is {_words(order)}: so it lies next to the photographs"
+                ]
+        lengths = {o: abs((b - a).total_seconds()) + 1.0 for o, (a, b) in spans.items()}
+        order = min(lengths, key=lambda o: lengths[o])
+        if max(lengths.values()) > _LONGER * lengths[order]:
+            return order, [f"log: {first!r} is {_words(order)}: so the rows follow one another"]
+    raise DataError(
+        f"{file.path}, column {names[0]!r}: {first!r} may be day/month or month/day: say "
+        "--date-order dmy or mdy"
+    )
+
+
+def _words(order: str) -> str:
+    return "day/month" if order == "dmy" else "month/day"
+
+
+def _span(first: str, last: str, order: str) -> tuple[datetime, datetime]:
+    """First and last moment of a log in an order of day and month."""
+    found = []
+    for text in (first, last):
+        moment = parse_moment(text, MomentFormat(order))
+        found.append(moment if isinstance(moment, datetime) else datetime.now(UTC))
+    return found[0], found[1]
+
+
+def _apart(span: Array, near: tuple[float, float]) -> float:
+    """How many seconds lie between two spans, 0 where they overlap."""
+    return float(max(span.min() - near[1], near[0] - span.max(), 0.0))
 
 
 def _temperature_columns(
-    table: LoggerTable, times: tuple[str, ...], options: LogOptions
+    file: LoggerFile, times: tuple[str, ...], options: LogOptions
 ) -> tuple[str, ...]:
     if options.temperatures:
-        return _given(table, options.temperatures, "--temperature-column")
+        return _given(file, options.temperatures, "--temperature-column")
+    wanted = tuple(name for name in options.wanted if name in file.names)
     numeric = [
         name
-        for name, values in table.columns.items()
-        if name not in times and _kind(values) in ("number", "seconds")
+        for name in file.names
+        if name not in times and _kind(file.column(name)) in ("number", "seconds")
     ]
-    named = [n for n in numeric if _TEMPERATURE_NAME.search(n) and not _OTHER_NAME.search(n)]
-    if named:
-        return tuple(named)
-    others = [n for n in numeric if not _OTHER_NAME.search(n)]
+    named = [
+        n for n in numeric
+        if _TEMPERATURE_NAME.search(n) and not _OTHER_NAME.search(n) and n not in wanted
+    ]  # fmt: skip
+    if wanted or named:
+        return (*wanted, *named)
+    others = [n for n in numeric if not _OTHER_NAME.search(n) and n not in OUR_TIMES]
     if len(others) == 1:
         return (others[0],)
-    shown = "; ".join(f"{n!r}: {table.columns[n][0]}" for n in numeric) or "none with numbers"
+    shown = "; ".join(f"{n!r}: {file.column(n)[0]}" for n in numeric) or "none with numbers"
     raise DataError(
-        f"{table.path}: which column is the temperature? Say --temperature-column NAME. {shown}"
+        f"{file.path}: which column is the temperature? Say --temperature-column NAME. {shown}"
     )
 
 
-def _values(table: LoggerTable, name: str, options: LogOptions) -> tuple[Array, int]:
-    """A column (n,) in °C, and how many readings were none."""
-    values = np.full(len(table), np.nan)
-    lost = 0
-    for i, text in enumerate(table.columns[name]):
-        plain = text.replace(",", ".") if table.decimal == "," else text
-        plain = re.sub(r"\s*(°\s*[CFK]?|deg[CF]|K)$", "", plain)
-        if plain.lower() in ("", "nan", "na", "n/a", "-", "--", "null", "none", "err", "error"):
-            continue
-        if "_" in plain:
-            plain = "?"
-        try:
-            values[i] = float(plain)
-        except ValueError:
+def _celsius(table: _Table, name: str, options: LogOptions) -> tuple[Array, list[str]]:
+    """A column (n,) in °C, and what its unit is taken from."""
+    path = table.file.path
+    values = np.array(table.values[name])
+    known = values[np.isfinite(values)]
+    unit, source = (options.unit, "") if options.unit else _unit(table, name)
+    notes = []
+    if unit is None:
+        if len(known) and known.min() > _KELVIN[0] and known.max() < _KELVIN[1]:
             raise DataError(
-                f"{table.path}, line {table.lines[i]}, column {name!r}: {text[:40]!r} is not a "
-                "number"
-            ) from None
-        if values[i] in _NO_READING:
-            values[i], lost = np.nan, lost + 1
-    unit = options.unit or _unit(table, name, values)
-    values = values - 273.15 if unit == "K" else (values - 32) / 1.8 if unit == "degF" else values
-    wrong = (values < _PLAUSIBLE_C[0]) | (values > _PLAUSIBLE_C[1])
+                f"{path}, column {name!r}: {known[0]:g} looks like kelvin: say --unit K to convert"
+            )
+        unit = "degC"
+    elif unit != "degC" and options.unit is None:
+        notes.append(f"log: {name!r} is converted from {unit}, as {source} says")
+    celsius = to_celsius(values, unit)
+    wrong = (celsius < _PLAUSIBLE_C[0]) | (celsius > _PLAUSIBLE_C[1])
     if wrong.any():
         i = int(np.argmax(wrong))
         raise DataError(
-            f"{table.path}, line {table.lines[i]}, column {name!r}: {table.columns[name][i]} is "
-            f"{values[i]:.4g} °C; temperatures of cameras lie between {_PLAUSIBLE_C[0]:g} and "
-            f"{_PLAUSIBLE_C[1]:g} °C. Another unit (--unit), or another column "
-            "(--temperature-column)?"
+            f"{table.where(i)}, column {name!r}: {values[i]:g} {unit} is {celsius[i]:.4g} °C; "
+            f"temperatures of cameras lie between {_PLAUSIBLE_C[0]:g} and {_PLAUSIBLE_C[1]:g} °C. "
+            "Another unit (--unit), or another column (--temperature-column)?"
         )
-    return values, lost
+    return celsius, notes
 
 
-def _unit(table: LoggerTable, name: str, values: Array) -> str:
-    """degC; DataError where name or values give another unit away."""
-    known = values[np.isfinite(values)]
-    if _FAHRENHEIT.search(name):
-        raise DataError(f"{table.path}, column {name!r}: looks like °F: say --unit degF to convert")
-    if _KELVIN.search(name) or (len(known) and known.min() > 220 and known.max() < 450):
+def _unit(table: _Table, name: str) -> tuple[str | None, str]:
+    """The unit that a column states, and where; DataError where the file contradicts itself."""
+    file = table.file
+    found: dict[str, str] = {}
+    if unit := stated_unit(name):
+        found[unit] = "its head"
+    for unit in table.units[name]:
+        if unit:
+            found.setdefault(unit, "each reading")
+    for column in file.names:
+        if column.lower() in ("unit", "units", "einheit", "unit_of_measurement"):
+            for text in set(file.column(column)):
+                if unit := stated_unit(f"({text})") or stated_unit(text):
+                    found.setdefault(unit, f"the column {column!r}")
+    if len(found) > 1:
         raise DataError(
-            f"{table.path}, column {name!r}: looks like kelvin: say --unit K to convert"
+            f"{file.path}, column {name!r}: is {' and '.join(found)} at once; say which with --unit"
         )
-    return "degC"
+    return next(iter(found.items()), (None, ""))

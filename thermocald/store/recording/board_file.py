@@ -4,12 +4,14 @@ ring-coded targets.
 
 from __future__ import annotations
 
+import csv
 import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.errors import TestFieldError
+from thermocald.errors import TestFieldError, UsageError
+from thermocald.photogrammetry.network.bundle import Distance
 from thermocald.photogrammetry.targets import boards
 from thermocald.yaml_file import read_yaml
 
@@ -17,8 +19,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from thermocald.photogrammetry.field.testfield import TestField
-
-__all__ = ["read_board", "read_rings"]
 
 _MOST_LINES = 20_000
 _LARGEST_BYTES = 5_000_000
@@ -210,3 +210,22 @@ def read_rings(path: Path, bits: int, diameter: float, sigma: float | None = Non
         raise TestFieldError(f"{path}: holds no line `label, X, Y, Z`")
     sigmas = None if sigma is None else np.full((len(points), 3), sigma)
     return boards.numbered_rings(numbers, np.array(points), bits, diameter, sigmas=sigmas)
+
+
+def read_distances(path: Path) -> list[Distance]:
+    """Read measured distances, a CSV with a, b, length, sigma mm; UsageError names the row."""
+    try:
+        with path.open(encoding="utf-8", newline="") as stream:
+            rows = list(csv.DictReader(stream, skipinitialspace=True))
+    except (OSError, UnicodeDecodeError) as cause:
+        raise UsageError(f"{path}: cannot be read: {cause}") from cause
+    found = []
+    for number, row in enumerate(rows, start=2):
+        try:
+            found.append(Distance(row["a"], row["b"], float(row["length"]), float(row["sigma"])))
+        except (KeyError, TypeError, ValueError):
+            raise UsageError(
+                f"{path}, row {number}: a, b, length, sigma (mm) are needed, it has "
+                f"{', '.join(str(v) for v in row.values())}"
+            ) from None
+    return found

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from thermocald.errors import RecordingError
+from thermocald.names import require_channels
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, InteriorOrientation, Sensor
 from thermocald.yaml_file import dump_yaml, read_yaml
 
@@ -15,16 +16,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-__all__ = [
-    "FORMAT",
-    "CameraSpec",
-    "Channel",
-    "Head",
-    "head_document",
-    "head_yaml",
-    "parse_head",
-    "read_head",
-]
 
 FORMAT = "thermocald-recording/1"
 _LONGEST_NAME = 200
@@ -132,7 +123,9 @@ def read_head(folder: Path) -> Head:
         raise RecordingError(f"{folder}: is not a folder; a recording is one with recording.yaml")
     if not path.is_file():
         raise RecordingError(f"{folder}: is not a recording: recording.yaml is missing")
-    return parse_head(read_yaml(path, RecordingError), path)
+    head = parse_head(read_yaml(path, RecordingError), path)
+    require_channels(head.channels, f"{path}, key temperatures", RecordingError)
+    return head
 
 
 def parse_head(document: Mapping[str, Any], path: Path) -> Head:

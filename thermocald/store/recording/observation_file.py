@@ -13,7 +13,7 @@ import numpy as np
 
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.series.normals import ObservationGrid
-from thermocald.store.recording.parquet_table import ParquetTable
+from thermocald.store.recording.parquet_table import ParquetTable, parse_once
 from thermocald.store.recording.table import Chunk, Table
 
 if TYPE_CHECKING:
@@ -24,9 +24,10 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
 
-__all__ = ["ObservationFile", "ObservationTable"]
 
 _GRID_POINTS, _GRID_EPOCHS = 300_000, 4_000  # of a grid: 12 MB
+# Of text or Parquet: above it (a day of 150 targets every 10 s) a recording is read in parts.
+LONG_FROM_BYTES = 100_000_000
 _REQUIRED = ("epoch", "target", "x", "y", "sx", "sy")
 
 
@@ -84,8 +85,13 @@ class ObservationFile:
     """The file of a recording; numbers: the (E,) epoch numbers of epochs.csv, increasing."""
 
     def __init__(self, path: Path, field: TestField, numbers: NDArray[np.int64]) -> None:
-        columnar = path.suffix == ".parquet"
-        self._table = ParquetTable(path, _REQUIRED) if columnar else Table(path, _REQUIRED)
+        self._table: Table | ParquetTable
+        if path.suffix == ".parquet":
+            self._table = ParquetTable(path, _REQUIRED)
+        else:
+            table = Table(path, _REQUIRED)
+            long = path.stat().st_size >= LONG_FROM_BYTES
+            self._table = parse_once(table, _REQUIRED) if long else table
         self._field = field
         self._numbers = numbers
         self._quality = self._numeric_extras()

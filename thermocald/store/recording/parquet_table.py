@@ -3,11 +3,21 @@
 Ten times as fast to read as CSV and a third of its size; the numbers are the same to the bit. It
 needs pyarrow (`pip install 'thermocald[parquet]'`). A chunk answers as one of a CSV table does, so
 that what is checked of one is checked of the other.
+
+A CSV file that is too long for memory is read again and again by a series' passes: its text is
+parsed once, into such a file in the user's cache that is known by the text's place, size, time.
 """
 
 from __future__ import annotations
 
+import hashlib
+import logging
+import os
+import shutil
+import tempfile
+import time
 from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,14 +28,12 @@ from thermocald.store.recording.table import Chunk, Table
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
-    from pathlib import Path
     from typing import NoReturn, Self
 
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
 
-__all__ = ["ColumnChunk", "ParquetTable", "csv_to_parquet", "parquet_to_csv", "write_parquet"]
 
 _ROWS = 1 << 18
 _MOST_COLUMNS = 200
@@ -33,13 +41,22 @@ _MOST_COLUMNS = 200
 _FORMS = {"x": "%.5f", "y": "%.5f"}
 _USUAL_FORM = "%.6g"
 
+log = logging.getLogger(__name__)
+
+_TEXT_BLOCK = 1 << 24  # bytes of text that are parsed at a time
+_KEPT_DAYS = 14.0  # since a copy was last read
+
 
 class ParquetTable:
-    """A Parquet file with the columns of a CSV table; RecordingError where one is missing."""
+    """A Parquet file with the columns of a CSV table; RecordingError where one is missing.
 
-    def __init__(self, path: Path, required: Sequence[str]) -> None:
+    original: the table of which the file is a copy, which then says what is wrong with a row.
+    """
+
+    def __init__(self, path: Path, required: Sequence[str], original: Table | None = None) -> None:
         parquet = _pyarrow().parquet
         self.path = path
+        self._original = original
         try:
             schema = parquet.read_schema(path)
         except (OSError, ValueError) as cause:
@@ -87,6 +104,8 @@ class ParquetTable:
 
     def fail(self, row: int, column: str | None, message: str) -> NoReturn:
         """Raise RecordingError for one row (from 0) and column."""
+        if self._original is not None:
+            self._original.fail(row, column, message)
         where = f"{self.path}, row {row + 1}"
         raise RecordingError(f"{where}{f', column {column}' if column else ''}: {message}")
 
@@ -134,12 +153,91 @@ class ColumnChunk(Chunk):
         return found
 
 
+def parse_once(table: Table, required: Sequence[str]) -> Table | ParquetTable:
+    """Return a table of text as its binary copy in the user's cache, which is made where missing.
+
+    The table itself is returned where pyarrow or room on the disk is missing, and where the text is
+    not the plain numbers that pyarrow's parser expects: the table then says what is wrong with it.
+    """
+    try:
+        _pyarrow()
+        found = table.path.stat()
+        key = f"2 {table.path.resolve()} {found.st_ino} {found.st_size} {found.st_mtime_ns}"
+        folder = _cache()
+        copy = folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.parquet"
+        if copy.exists():
+            os.utime(copy)
+        else:
+            _forget_old(folder)
+            if shutil.disk_usage(folder).free < 2 * found.st_size:
+                return table
+            partial = copy.with_name(f"{copy.stem}-{os.getpid()}.parquet")
+            try:
+                _parse(table, partial)
+                partial.replace(copy)
+            finally:
+                partial.unlink(missing_ok=True)
+        return ParquetTable(copy, required, table)
+    except UsageError:
+        log.info("%s is read from text each time; pyarrow would parse it once", table.path)
+    except (OSError, ValueError, RecordingError) as cause:  # pyarrow's errors are the former two
+        log.debug("%s has no binary copy: %s", table.path, cause)
+    return table
+
+
+def _cache() -> Path:
+    """The folder of copies: the user's own and nobody else's."""
+    with suppress(OSError, RuntimeError):
+        base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+        folder = Path(base) / "thermocald"
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK):
+            return folder
+    folder = Path(tempfile.gettempdir()) / f"thermocald-{os.geteuid()}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    owner = folder.lstat()
+    if folder.is_symlink() or owner.st_uid != os.geteuid() or owner.st_mode & 0o077:
+        raise OSError(f"{folder} is not this user's own")
+    return folder
+
+
+def _forget_old(folder: Path) -> None:
+    for copy in folder.glob("*.parquet"):
+        with suppress(OSError):
+            if copy.stat().st_mtime < time.time() - 86_400 * _KEPT_DAYS:
+                copy.unlink()
+
+
+def _parse(table: Table, target: Path) -> None:
+    """Write a CSV table as Parquet by pyarrow's parser, whose numbers are Python's to the bit."""
+    from pyarrow import csv, float64, int64, string
+
+    first = next(table.chunks(1), None)
+    if first is None:
+        raise ValueError("no rows")
+    kinds = {
+        name: int64() if name == "epoch" else float64() if first.is_number(name) else string()
+        for name in table.columns
+        if name
+    } | {"target": string()}
+    reader = csv.open_csv(
+        table.path,
+        csv.ReadOptions(block_size=_TEXT_BLOCK, column_names=table.columns, skip_rows=1),
+        csv.ParseOptions(newlines_in_values=False),
+        csv.ConvertOptions(
+            column_types=kinds, null_values=[""], include_columns=list(kinds), check_utf8=True
+        ),
+    )
+    with reader, _Writer(target) as writer:
+        for batch in reader:
+            writer.write({name: batch.column(name) for name in kinds})
+
+
 class _Writer:
-    """Columns to a Parquet file, whole or not at all."""
+    """Columns to a Parquet file."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._partial = path.with_name(f".{path.name}.partial")
         self._writer: Any = None
 
     def __enter__(self) -> Self:
@@ -151,19 +249,13 @@ class _Writer:
         if self._writer is None:
             words = [f.name for f in batch.schema if f.type == pyarrow.string()]
             self._writer = pyarrow.parquet.ParquetWriter(
-                self._partial, batch.schema, compression="zstd", use_dictionary=words
+                self._path, batch.schema, compression="zstd", use_dictionary=words
             )
         self._writer.write_table(batch)
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        try:
-            if self._writer is not None:
-                self._writer.close()
-            if kind is None and self._writer is not None:
-                self._partial.replace(self._path)
-        finally:
-            with suppress(OSError):
-                self._partial.unlink(missing_ok=True)
+        if self._writer is not None:
+            self._writer.close()
 
 
 def write_parquet(path: Path, columns: Mapping[str, Any]) -> None:
@@ -173,7 +265,7 @@ def write_parquet(path: Path, columns: Mapping[str, Any]) -> None:
         name: pyarrow.array(values, from_pandas=isinstance(values, np.ndarray))
         for name, values in columns.items()
     }
-    with _Writer(path) as writer:
+    with new_file(path) as partial, _Writer(partial) as writer:
         writer.write(arrays)
 
 
@@ -185,7 +277,7 @@ def csv_to_parquet(source: Path, target: Path, advance: Any = lambda _: None) ->
     pyarrow = _pyarrow()
     table = Table(source, ("epoch", "target", "x", "y", "sx", "sy"))
     numeric: dict[str, bool] = {}
-    with _Writer(target) as writer:
+    with new_file(target) as partial, _Writer(partial) as writer:
         for chunk in table.chunks(_ROWS):
             columns: dict[str, Any] = {}
             for name in filter(None, table.columns):

@@ -12,11 +12,18 @@ import numpy as np
 
 from thermocald.epoch import Epoch
 from thermocald.errors import RecordingError
+from thermocald.names import FileFolder
 from thermocald.store.recording.head import CameraSpec, Channel, Head, read_head
-from thermocald.store.recording.observation_file import ObservationFile, ObservationTable
-from thermocald.store.recording.paths import FileFolder
+from thermocald.store.recording.observation_file import (
+    LONG_FROM_BYTES,
+    ObservationFile,
+    ObservationTable,
+)
 from thermocald.store.recording.readings import (
+    READINGS,
+    Readings,
     interpolate_readings,
+    read_readings,
     temperature_at_frame,
     temperatures_at_frame,
 )
@@ -55,8 +62,6 @@ __all__ = [
     "write_testfield",
 ]
 
-# Above this size (a day of 150 targets every 10 s) `iter_epochs` streams instead of loading.
-_STREAMED_ABOVE_BYTES = 100_000_000
 _KELVIN_FROM = 220.0  # hotter than any camera, and a cold day in kelvin
 _HOTTEST_C = 1000.0  # no camera works there: another unit, or a damaged line
 
@@ -66,7 +71,8 @@ class EpochColumns:
     """`epochs.csv` in columns.
 
     numbers (E,), frame_time (E,), temperature_time (E,) s, temperatures {channel: (E,) °C} with
-    NaN where there is none; frames: E relative paths, "" for none; extra: unknown columns as text.
+    NaN where there is none; frames: E relative paths, "" for none; extra: unknown columns as text;
+    readings: every reading of the log, of a recording that keeps them (`readings.csv`), else None.
     """
 
     numbers: NDArray[np.int64]
@@ -75,14 +81,20 @@ class EpochColumns:
     temperatures: dict[str, Array]
     frames: tuple[str, ...]
     extra: dict[str, tuple[str, ...]]
+    readings: Readings | None = None
 
     def __len__(self) -> int:
         return len(self.numbers)
 
     def at_frame(self, channel: str) -> Array:
         """A channel's temperature at the frames' times, (E,) °C."""
-        readings = self.temperatures[channel]
-        return interpolate_readings(self.frame_time, self.temperature_time, readings)
+        return interpolate_readings(self.frame_time, *self.readings_of(channel))
+
+    def readings_of(self, channel: str) -> tuple[Array, Array]:
+        """Times (R,) s and readings (R,) °C of a channel: the log's, else those next to frames."""
+        if self.readings is not None:
+            return self.readings.times, self.readings.channels[channel]
+        return self.temperature_time, self.temperatures[channel]
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,14 +172,14 @@ class Recording:
     def is_long(self) -> bool:
         """Whether its observations are read in parts, as they are too many for memory."""
         size = self._observation_path.stat().st_size if self.has_observations else 0
-        return size >= _STREAMED_ABOVE_BYTES
+        return size >= LONG_FROM_BYTES
 
     @property
     def _observation_path(self) -> Path:
         parquet = self.path / "observations.parquet"
         return parquet if parquet.exists() else self.path / "observations.csv"
 
-    @property
+    @cached_property
     def _observation_file(self) -> ObservationFile:
         return ObservationFile(self._observation_path, self.testfield, self.columns.numbers)
 
@@ -305,6 +317,7 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
         {name: np.concatenate(readings) for name, readings in temperatures.items()},
         tuple(chain.from_iterable(frames)),
         {name: tuple(chain.from_iterable(values)) for name, values in extra.items()},
+        read_readings(log, channels) if channels and (log := folder / READINGS).exists() else None,
     )
 
 

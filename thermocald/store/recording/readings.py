@@ -2,22 +2,65 @@
 
 from __future__ import annotations
 
+import csv
+import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.store.recording.table import Table
+
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
 
     from numpy.typing import ArrayLike
 
     from thermocald.arrays import Array
     from thermocald.epoch import Epoch
 
-__all__ = ["interpolate_readings", "temperature_at_frame", "temperatures_at_frame"]
-
+READINGS = "readings.csv"
+"""Every reading of a log, in a recording whose frames were taken beside one."""
 _LARGEST_GAP_IN_INTERVALS = 10.0
 _AT_ONCE = 100_000  # frames: a year of them has to fit into memory
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Readings:
+    """Every reading of a log: times (R,) s, increasing; channels {name: (R,) °C}, NaN for none."""
+
+    times: Array
+    channels: Mapping[str, Array]
+
+
+def write_readings(path: Path, readings: Readings) -> None:
+    """Write readings as `readings.csv`: time, one column per channel."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        rows = csv.writer(file, lineterminator="\n")
+        rows.writerow(["time", *readings.channels])
+        columns = [c.tolist() for c in readings.channels.values()]
+        for time, *values in zip(readings.times.tolist(), *columns, strict=True):
+            rows.writerow([f"{time:.6f}", *("" if math.isnan(v) else f"{v:.10g}" for v in values)])
+
+
+def read_readings(path: Path, channels: Sequence[str]) -> Readings:
+    """Read a `readings.csv`; RecordingError names line and column of what is wrong."""
+    table = Table(path, ["time", *channels])
+    parts: dict[str, list[Array]] = {name: [] for name in ("time", *channels)}
+    before = -np.inf
+    for chunk in table.chunks():
+        times = chunk.numbers("time")
+        steps = np.diff(times, prepend=before)
+        chunk.check("time", steps <= 0, "times must increase")
+        before = float(times[-1])
+        parts["time"].append(times)
+        for name in channels:
+            values = chunk.numbers(name, empty_is_nan=True)
+            chunk.check(name, values < -273.15, "is below absolute zero")
+            parts[name].append(values)
+    joined = {name: np.concatenate([np.empty(0), *found]) for name, found in parts.items()}
+    return Readings(joined.pop("time"), joined)
 
 
 def interpolate_readings(

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
 
-__all__ = ["Chunk", "Table"]
 
 _MAX_EXACT_INTEGER = 2**53
 _MOST_COLUMNS = 1000

@@ -16,13 +16,6 @@ from thermocald.store.recording.table import Table
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = [
-    "parse_testfield",
-    "read_testfield",
-    "require_millimetres",
-    "testfield_csv",
-    "write_testfield",
-]
 
 _MOST_TARGETS = 4000
 _LARGEST_MM = 1e9  # a thousand kilometres

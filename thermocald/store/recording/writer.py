@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Self
 
 from thermocald.atomic_file import cannot_write
 from thermocald.errors import RecordingError
+from thermocald.names import require_channels
 from thermocald.store.recording.head import Head, head_yaml
+from thermocald.store.recording.readings import READINGS, Readings, write_readings
 from thermocald.store.recording.testfield_file import testfield_csv
 
 if TYPE_CHECKING:
@@ -23,10 +25,6 @@ if TYPE_CHECKING:
 
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.field.testfield import Observations, TestField
-
-__all__ = ["RecordingWriter", "write_recording"]
-
-_RESERVED = {"epoch", "frame_time", "temperature_time", "frame"}
 
 
 class RecordingWriter:
@@ -49,8 +47,7 @@ class RecordingWriter:
         self._last_reading = -math.inf
 
     def __enter__(self) -> Self:
-        if reserved := _RESERVED & set(self._head.channels):
-            raise RecordingError(f"a temperature column cannot be called {min(reserved)!r}")
+        require_channels(self._head.channels, str(self.path), RecordingError)
         if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
             raise RecordingError(f"{self.path}: exists already; choose another name or remove it")
         try:
@@ -93,6 +90,13 @@ class RecordingWriter:
         self._last = epoch
         if math.isfinite(epoch.temperature_time):
             self._last_reading = epoch.temperature_time
+
+    def keep_readings(self, readings: Readings) -> None:
+        """Keep every reading of a log, not only those next to the frames."""
+        try:
+            write_readings(self._partial / READINGS, readings)
+        except OSError as cause:
+            raise self._failed(cause) from cause
 
     def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
         if kind is not None:

@@ -1,10 +1,20 @@
-"""Connecting to the server's database, and its errors in words."""
+"""A server's store: its address, connections to its database, its tables, its errors in words.
+
+    postgresql://reader@db.example/thermocald?camera=gauge-7&series=M1&sslmode=verify-full
+
+`station`, `camera` and `series` are ours; everything else goes to libpq as it stands.
+"""
 
 from __future__ import annotations
 
-from contextlib import contextmanager
+import re
+import threading
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
+from urllib.parse import parse_qsl, quote, urlencode, urlsplit, urlunsplit
 
+from thermocald.addresses import without_secrets
 from thermocald.errors import (
     DriverMissing,
     ServerError,
@@ -12,20 +22,18 @@ from thermocald.errors import (
     StoreError,
     StoreVersionError,
     ThermocaldError,
+    UsageError,
 )
+from thermocald.store import schema
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
+    from pathlib import Path
 
-    from sqlalchemy import Engine
+    from psycopg import Connection
 
-    from thermocald.store.server.address import ServerAddress
-
-__all__ = ["REVISION", "Connected", "connect", "in_words", "require_revision"]
-
-REVISION = "0003"
-"""The schema that this program writes and reads; `thermocald server init` brings a server to it."""
-
+_SCHEME = re.compile(r"^postgres(ql)?:/+")
+_OURS = ("station", "camera", "series")
 _CONNECT_S = 10
 # A network that died is noticed within a minute, in a query or between two.
 _SESSION = {
@@ -52,46 +60,93 @@ _ADVICE = {
 }
 _PASSES = ("08", "40", "53", "55", "57", "58")
 """Classes of errors that may pass by themselves: the same batch is tried again."""
+_LOCK = 7496051  # of `server init`: two at a time would each make the tables
+_TABLES = ("testfield", "series", "epoch", "event", "reading", "frame")
+_FUNCTIONS = (
+    "thermocald_month(float8)",
+    "thermocald_report(text, uuid, float8, bigint, bigint, text)",
+)
 
 
-def connect(address: ServerAddress) -> Engine:
-    """An engine for the address; nothing is connected yet. DriverMissing without SQLAlchemy."""
-    try:
-        from sqlalchemy import create_engine
-        from sqlalchemy.exc import ArgumentError
-    except ImportError as error:
-        raise DriverMissing(
-            f"a server's store needs SQLAlchemy and psycopg: pip install 'thermocald[server]' "
-            f"({error})"
-        ) from error
-    try:
-        return create_engine(
-            address.url, connect_args=_SESSION, pool_pre_ping=True, pool_size=2, max_overflow=2
-        )
-    except (ArgumentError, ImportError, ValueError) as error:
-        raise StoreError(f"{address}: cannot be used: {error}") from error
+def is_server(source: Path | str) -> bool:
+    """Whether a source on the command line is a server's address and not a file or folder."""
+    return bool(_SCHEME.match(str(source)))
+
+
+@dataclass(frozen=True, slots=True)
+class ServerAddress:
+    """An address as parsed: `url` for libpq, and a selection, None for all."""
+
+    url: str
+    station: str | None = None
+    camera: str | None = None
+    series: str | None = None
+
+    @classmethod
+    def parse(cls, source: Path | str) -> Self:
+        """From text or from a path, in which `//` has become `/`. UsageError where it is wrong."""
+        if not is_server(source):
+            raise UsageError(
+                f"{without_secrets(str(source))}: is not a server's address (postgresql://…)"
+            )
+        text = _SCHEME.sub("postgresql://", str(source))
+        try:
+            parts = urlsplit(text)
+            _ = parts.port
+            query = parse_qsl(parts.query, keep_blank_values=True, strict_parsing=bool(parts.query))
+        except ValueError as error:
+            raise UsageError(
+                f"{without_secrets(str(source))}: is not a valid address: "
+                f"{without_secrets(str(error))}"
+            ) from None
+        selection = {name: value for name, value in query if name in _OURS}
+        rest = urlencode([(n, v) for n, v in query if n not in _OURS], quote_via=quote)
+        url = urlunsplit(("postgresql", parts.netloc, parts.path, rest, ""))
+        return cls(url, **selection)
+
+    @staticmethod
+    def narrowed(source: Path, station: str, camera: str, series: str) -> Path:
+        """The same address, selecting one series, as a path in the place of the given one."""
+        from pathlib import Path
+
+        parts = urlsplit(_SCHEME.sub("postgresql://", str(source)))
+        rest = [(n, v) for n, v in parse_qsl(parts.query) if n not in _OURS]
+        chosen = [("station", station), ("camera", camera), ("series", series)]
+        query = urlencode([*rest, *chosen], quote_via=quote, safe="")
+        return Path(urlunsplit((parts.scheme, parts.netloc, parts.path, query, "")))
+
+    @property
+    def place(self) -> str:
+        """The whole of the address but its password: which server, database and user."""
+        parts = urlsplit(self.url)
+        user, _, host = parts.netloc.rpartition("@")
+        options = sorted((n, v) for n, v in parse_qsl(parts.query) if n != "password")
+        return f"postgresql://{user.split(':')[0]}@{host}{parts.path}?{urlencode(options)}"
+
+    def __str__(self) -> str:
+        """The address for messages: without a password."""
+        parts = urlsplit(self.url)
+        place = parts.netloc.rsplit("@", 1)
+        user = place[0].split(":", 1)[0] + "@" if len(place) == 2 else ""
+        return f"postgresql://{user}{place[-1]}{parts.path}"
 
 
 @contextmanager
 def in_words(address: ServerAddress | str, doing: str) -> Iterator[None]:
-    """Turn SQLAlchemy's and psycopg's errors into ServerGone (may pass) or ServerError."""
+    """Turn psycopg's errors into ServerGone (may pass) or ServerError."""
     import psycopg
-    from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
     try:
         yield
     except ThermocaldError:
         raise
-    except (DBAPIError, psycopg.Error) as error:
-        cause = error.orig if isinstance(error, DBAPIError) else error
-        raise _told(address, doing, cause) from error
-    except SQLAlchemyError as error:
-        raise ServerError(f"{address}: {doing}: {error}") from error
+    except psycopg.Error as error:
+        raise _told(address, doing, error) from error
 
 
 def _told(address: ServerAddress | str, doing: str, cause: Any) -> StoreError:
     state = getattr(cause, "sqlstate", None) or ""
-    text = " ".join(str(cause).split())
+    text = without_secrets(" ".join(str(cause).split()))
     advice = _ADVICE.get(state) or _ADVICE.get(state[:2], "")
     if not state:
         # libpq failed before the server spoke: name resolution, refusal, TLS, a dead connection
@@ -117,21 +172,27 @@ def _told(address: ServerAddress | str, doing: str, cause: Any) -> StoreError:
 class Connected:
     """A server whose tables are of this program's version; use it in a `with` block.
 
-    Raises ServerGone, ServerError, StoreVersionError.
+    any_version: its tables may be older, or not there. Raises ServerGone, ServerError,
+    StoreVersionError, DriverMissing without psycopg.
     """
 
-    def __init__(self, address: ServerAddress) -> None:
+    def __init__(self, address: ServerAddress, *, any_version: bool = False) -> None:
         self.address = address
-        self._engine = connect(address)
+        self._idle: list[Connection[Any]] = []
+        self._pool = threading.Lock()
+        if any_version:
+            return
         try:
-            require_revision(self._engine, address)
+            self._require_version()
         except BaseException:
-            self._engine.dispose()
+            self.close()
             raise
 
     def close(self) -> None:
         """Close all connections; may be called twice."""
-        self._engine.dispose()
+        with self._pool:
+            while self._idle:
+                self._idle.pop().close()
 
     def __enter__(self) -> Self:
         return self
@@ -139,23 +200,98 @@ class Connected:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def _query(self, statement: str, values: Sequence[Any]) -> list[tuple[Any, ...]]:
-        """All rows that psycopg gives for a statement with %s."""
-        with in_words(self.address, "it cannot be read"), self._engine.connect() as connection:
-            cursor = connection.connection.cursor()
-            cursor.execute(statement, values)
-            return list(cursor.fetchall())
+    @contextmanager
+    def _transaction(self, doing: str) -> Iterator[Connection[Any]]:
+        """A connection of one's own, in a transaction that is committed at the end."""
+        with in_words(self.address, doing):
+            connection = self._take()
+            try:
+                with connection.transaction():
+                    yield connection
+            except BaseException:
+                connection.close()
+                raise
+            with self._pool:
+                self._idle.append(connection)
+
+    def _take(self) -> Connection[Any]:
+        """A connection that lives: one that was used before may have died meanwhile."""
+        import psycopg
+
+        while True:
+            with self._pool:
+                connection = self._idle.pop() if self._idle else None
+            if connection is None:
+                return _connect(self.address)
+            with suppress(psycopg.Error):
+                connection.execute("SELECT 1")
+                connection.rollback()
+                return connection
+            connection.close()
+
+    def _query(self, statement: Any, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
+        """All rows of a statement with %s."""
+        with self._transaction("it cannot be read") as connection:
+            return connection.execute(statement, values).fetchall()
+
+    def _require_version(self) -> None:
+        """StoreVersionError where the server's tables are not of this program's version."""
+        ((found,),) = self._query("SELECT version FROM thermocald_version")
+        if found != (known := len(schema.SERVER_STEPS)):
+            remedy = (
+                "run `thermocald server init` there" if found < known else "update thermocald here"
+            )
+            raise StoreVersionError(
+                f"{self.address}: its tables are of version {found}, this program's are {known}; "
+                f"{remedy}"
+            )
 
 
-def require_revision(engine: Engine, address: ServerAddress) -> None:
-    """StoreVersionError where the server's tables are not of this program's version."""
-    from sqlalchemy import text
+def _connect(address: ServerAddress) -> Connection[Any]:
+    try:
+        import psycopg
+    except ImportError as error:
+        raise DriverMissing(
+            f"a server's store needs psycopg: pip install 'thermocald[server]' ({error})"
+        ) from error
+    try:
+        return psycopg.connect(address.url, **_SESSION)  # type: ignore[arg-type]
+    except psycopg.ProgrammingError as error:  # a parameter that libpq does not know
+        raise StoreError(f"{address}: cannot be used: {without_secrets(str(error))}") from error
 
-    with in_words(address, "its version cannot be read"), engine.connect() as connection:
-        found = connection.execute(text("SELECT version_num FROM alembic_version")).scalar()
-    if found != REVISION:
-        older = str(found or "") < REVISION
-        remedy = "run `thermocald server init` there" if older else "update thermocald here"
-        raise StoreVersionError(
-            f"{address}: its tables are of version {found}, this program's are {REVISION}; {remedy}"
-        )
+
+def create_tables(address: ServerAddress) -> None:
+    """Bring an empty or older database to this program's tables, all or nothing."""
+    with (
+        Connected(address, any_version=True) as server,
+        server._transaction("its tables cannot be made") as connection,
+    ):
+        connection.execute("SELECT pg_advisory_xact_lock(%s)", (_LOCK,))
+        connection.execute("CREATE TABLE IF NOT EXISTS thermocald_version (version integer)")
+        found = connection.execute("SELECT version FROM thermocald_version").fetchone()
+        before = found[0] if found else 0
+        version = schema.upgrade(connection.execute, before, schema.SERVER_STEPS)
+        connection.execute("DELETE FROM thermocald_version")
+        connection.execute("INSERT INTO thermocald_version VALUES (%s)", (version,))
+
+
+def grant(address: ServerAddress, role: str, *, writes: bool) -> None:
+    """Let a role that exists read, or (writes) insert and nothing else.
+
+    A role that forwards sees no row of any station: what leaks with a stolen Pi is its own.
+    """
+    if not role or "\0" in role:
+        raise UsageError("a role must have a name")
+    name = '"' + role.replace('"', '""') + '"'
+    statements = [f"GRANT SELECT ON thermocald_version TO {name}"]
+    if writes:
+        statements.append(f"GRANT INSERT ON {', '.join(_TABLES)} TO {name}")
+        statements += [f"GRANT EXECUTE ON FUNCTION {one} TO {name}" for one in _FUNCTIONS]
+    else:
+        statements.append(f"GRANT SELECT ON {', '.join(_TABLES)}, station, summary TO {name}")
+    with (
+        Connected(address, any_version=True) as server,
+        server._transaction(f"role {role!r} was not granted") as connection,
+    ):
+        for statement in statements:
+            connection.execute(statement)

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
     from thermocald.store.recording.head import Head
 
-__all__ = ["CameraRecord", "FleetReader", "RecentEpoch", "Sample", "StationState"]
 
 RECENT = 60
 SPREAD = 120
@@ -59,7 +58,7 @@ class StationState:
     """What a station said of itself.
 
     contact: s UTC, by the server's clock; clock: s, the station's minus the server's; waiting,
-    refused: rows.
+    refused: rows; stores: how many stores reported under its name within an hour.
     """
 
     contact: float
@@ -67,6 +66,7 @@ class StationState:
     waiting: int
     refused: int
     version: str
+    stores: int = 1
 
 
 @dataclass(slots=True)
@@ -102,8 +102,10 @@ class FleetReader(Connected):
     def stations(self) -> dict[str, StationState]:
         """What the stations said of themselves, by name."""
         rows = self._query(
-            "SELECT name, contact, clock - contact, waiting, refused, version FROM station "
-            "WHERE name = coalesce(%s, name)",
+            "SELECT DISTINCT ON (name) name, contact, clock - contact, waiting, refused, version, "
+            "(SELECT count(*) FROM station other WHERE other.name = station.name "
+            "AND other.contact > station.contact - 3600) FROM station "
+            "WHERE name = coalesce(%s, name) ORDER BY name, contact DESC",
             (self.address.station,),
         )
         return {name: StationState(*state) for name, *state in rows}

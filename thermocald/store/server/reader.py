@@ -1,42 +1,48 @@
-"""Reading a server's store with the methods of `store.database.store.Store` that read."""
+"""Reading a server's store with the methods of `store.database.store.Store` that read.
+
+Columns come by binary COPY: every row of the copy is as long as every other, since a missing number
+comes as NaN. NumPy reads blocks of rows as they stand, and neither the server nor this process
+holds the series as rows.
+"""
 
 from __future__ import annotations
 
 import json
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
-from thermocald.store.database.blob import (
+from thermocald.store.database.columns import COLUMN_NAMES, sql_name
+from thermocald.store.database.epochs import (
+    stored_epoch,
     unpack_covariance,
     unpack_observations,
     unpack_rows,
 )
-from thermocald.store.database.epoch_columns import sql_name
-from thermocald.store.database.epoch_table import StoredEpoch, stored_epoch
-from thermocald.store.database.row import Event, LoggedReading, StoredSeries
-from thermocald.store.database.series_reader import StampedReader
 from thermocald.store.recording.head import parse_head
 from thermocald.store.recording.testfield_file import parse_testfield
-from thermocald.store.server.address import ServerAddress
-from thermocald.store.server.columns import read_columns
-from thermocald.store.server.connection import Connected, in_words
+from thermocald.store.series import Event, LoggedReading, SeriesReader, StoredEpoch, StoredSeries
+from thermocald.store.server.connection import Connected, ServerAddress
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from uuid import UUID
 
     from numpy.typing import NDArray
+    from psycopg import Connection
+    from psycopg.sql import Composable, Composed
 
     from thermocald.arrays import Array
-    from thermocald.store.database.blob import ObservationRows
+    from thermocald.store.series import ObservationRows
 
-__all__ = ["ServerStore"]
-
-_BLOCK = 500  # epochs fetched at a time by a server-side cursor
+_HEADER, _TRAILER = 19, 2  # bytes before the first row, and of the message after the last
+_BLOCK = 50_000  # rows that become arrays at a time
+_ORDER = ("number", "frame_time", "revision")
+_EPOCHS = 500  # epochs fetched at a time by a server-side cursor
 _LATEST = (
     "FROM epoch e WHERE series = %s AND NOT EXISTS (SELECT 1 FROM epoch later "
     "WHERE later.series = e.series AND later.number = e.number AND later.revision > e.revision "
@@ -44,7 +50,7 @@ _LATEST = (
 )
 
 
-class ServerStore(Connected, StampedReader):
+class ServerStore(Connected, SeriesReader):
     """An open store on a server, narrowed to what its address selects; use it in a `with` block."""
 
     _remedy = "; select with ?station=…&camera=…&series=… in the address"
@@ -53,6 +59,11 @@ class ServerStore(Connected, StampedReader):
         self.path = Path(str(address))
         self._keys: list[UUID] = []
         super().__init__(address)
+
+    @property
+    def where(self) -> str:
+        """The address without its password."""
+        return str(self.address)
 
     @classmethod
     def open(cls, source: Path | str) -> Self:
@@ -66,7 +77,7 @@ class ServerStore(Connected, StampedReader):
             "SELECT s.key, station, head, csv, start, identity, settings, created_utc "
             "FROM series s JOIN testfield USING (digest) "
             "WHERE station = coalesce(%s, station) AND camera = coalesce(%s, camera) "
-            "AND name = coalesce(%s, name) ORDER BY created_utc, s.key",
+            "AND name = coalesce(%s, name) ORDER BY created_utc, station, camera, name, s.key",
             (wanted.station, wanted.camera, wanted.series),
         )
         return [
@@ -88,12 +99,12 @@ class ServerStore(Connected, StampedReader):
         ((last,),) = self._query("SELECT max(number) FROM epoch WHERE series = %s", (key,))
         return None if last is None else int(last)
 
-    def series_columns(self, series: StoredSeries, names: Sequence[str]) -> dict[str, NDArray[Any]]:
-        """Columns (E,) over all epochs by name, as `Store.series_columns`."""
-        reading = in_words(self.address, "columns cannot be read")
-        with reading, self._engine.connect() as connection:
-            raw: Any = connection.connection.driver_connection
-            return read_columns(raw, self._keys[series.id], series, names)
+    def stamped_columns(
+        self, series: StoredSeries, names: Sequence[str]
+    ) -> dict[str, NDArray[Any]]:
+        """Columns (E,) over all epochs by name, with times as they were stamped."""
+        with self._transaction("columns cannot be read") as connection:
+            return _read_columns(connection, self._keys[series.id], series, names)
 
     def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
         """(E, 16, 16) covariances of some epochs, NaN for those without a result."""
@@ -183,12 +194,13 @@ class ServerStore(Connected, StampedReader):
 
     def _stream(self, statement: str, values: Sequence[Any]) -> Iterator[tuple[Any, ...]]:
         """Rows by a server-side cursor: a year of epochs in constant memory."""
-        with in_words(self.address, "it cannot be read"), self._engine.connect() as connection:
-            raw: Any = connection.connection.driver_connection
-            with raw.cursor(name="thermocald") as cursor:
-                cursor.itersize = _BLOCK
-                cursor.execute(statement, values)
-                yield from cursor
+        with (
+            self._transaction("it cannot be read") as connection,
+            connection.cursor(name="thermocald") as cursor,
+        ):
+            cursor.itersize = _EPOCHS
+            cursor.execute(statement, values)
+            yield from cursor
 
 
 _EPOCH = (
@@ -205,4 +217,91 @@ def _epoch(row: tuple[Any, ...], details: bool) -> StoredEpoch:
         field,
         unpack_covariance(bytes(covariance)) if covariance else None,
         unpack_observations(bytes(seen)) if seen else None,
+    )
+
+
+def _read_columns(
+    connection: Connection[Any], key: UUID, series: StoredSeries, names: Sequence[str]
+) -> dict[str, NDArray[Any]]:
+    """Columns (E,) over all epochs of a series by name, each epoch as it was calibrated last.
+
+    connection: within a transaction; key: of the series at the server. Numbers are float64, NaN
+    where an epoch has none; `status` is text.
+    """
+    from psycopg import sql
+
+    words: list[str] = []
+    if "status" in names:
+        # a station that forwards now must not add a word between the two statements
+        connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ")
+        found = connection.execute("SELECT DISTINCT status FROM epoch WHERE series = %s", (key,))
+        words = sorted(word for (word,) in found)
+    wanted = {name: _expression(name, series, words) for name in names}
+    wanted |= {f" {name}": sql.SQL("{}::float8").format(sql.Identifier(name)) for name in _ORDER}
+    statement = sql.SQL("COPY (SELECT {} FROM epoch WHERE series = {}) TO STDOUT (FORMAT BINARY)")
+    values = sql.SQL(", ").join(wanted.values())
+    copied = _copy(connection, statement.format(values, sql.Literal(key)), len(wanted))
+    columns: dict[str, NDArray[Any]] = dict(zip(wanted, copied, strict=True))
+    rows = _latest(*(columns.pop(f" {name}") for name in _ORDER))
+    if rows is not None:
+        columns = {name: column[rows] for name, column in columns.items()}
+    if "status" in columns:
+        columns["status"] = np.array(words, dtype=np.str_)[columns["status"].astype(np.int64) - 1]
+    return columns
+
+
+def _copy(connection: Connection[Any], statement: Composed, size: int) -> list[Array]:
+    """The columns (E,) of a copy of `size` numbers a row."""
+    fields = [("columns", ">i2")]
+    for i in range(size):
+        fields += [(f"length{i}", ">i4"), (f"value{i}", ">f8")]
+    row = np.dtype(fields)
+    blocks: list[list[Array]] = [[np.empty(0)] for _ in range(size)]
+    with connection.cursor() as cursor, cursor.copy(statement) as copy:
+        for messages in _messages(copy):
+            found = np.frombuffer(messages, row)
+            for i, column in enumerate(blocks):
+                column.append(found[f"value{i}"].astype(np.float64))
+    return [np.concatenate(column) for column in blocks]
+
+
+def _messages(copy: Any) -> Iterator[bytes]:
+    """The rows of a copy, many at a time, without its header and trailer."""
+    start = _HEADER
+    messages = iter(copy)
+    while block := list(islice(messages, _BLOCK)):
+        yield b"".join(m for m in block if len(m) != _TRAILER)[start:]
+        start = 0
+
+
+def _latest(numbers: Array, times: Array, revisions: Array) -> NDArray[np.intp] | None:
+    """The rows of the last revisions, ordered by number and time; None where all are, in order."""
+    steps = np.diff(numbers)
+    if np.all(steps > 0):
+        return None
+    order: NDArray[np.intp] = np.lexsort((times, numbers))
+    if not revisions.any():
+        return order
+    _, first, counts = np.unique(numbers[order], return_index=True, return_counts=True)
+    highest = np.repeat(np.maximum.reduceat(revisions[order], first), counts)
+    latest: NDArray[np.intp] = order[revisions[order] == highest]
+    return latest
+
+
+def _expression(name: str, series: StoredSeries, words: Sequence[str]) -> Composable:
+    """A column as double precision, NaN for NULL; `status` as its place in `words`, from 1."""
+    from psycopg import sql
+
+    if name == "status":
+        listed = sql.SQL(", ").join(map(sql.Literal, words))
+        return sql.SQL("array_position(ARRAY[{}]::text[], status)::float8").format(listed)
+    if name == "epoch":
+        return sql.SQL("number::float8")
+    if name == "clock_trusted":
+        return sql.SQL("clock_trusted::int::float8")
+    if name in COLUMN_NAMES:
+        return sql.SQL("coalesce({}::float8, 'NaN')").format(sql.Identifier(sql_name(name)))
+    column = "temperatures" if name in series.head.channels else "extra"
+    return sql.SQL("coalesce(({}::json->>{})::float8, 'NaN')").format(
+        sql.Identifier(column), sql.Literal(name)
     )

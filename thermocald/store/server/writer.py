@@ -15,16 +15,16 @@ from thermocald import __version__
 from thermocald.errors import StoreVersionError
 from thermocald.store.recording.head import head_document
 from thermocald.store.recording.testfield_file import testfield_csv
-from thermocald.store.server.connection import Connected, in_words
+from thermocald.store.server.connection import Connected
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from thermocald.store.database.changes import KeptFrame
-    from thermocald.store.database.row import StoredSeries
-    from thermocald.store.server.address import ServerAddress
+    from psycopg import Connection
 
-__all__ = ["ServerWriter", "series_key"]
+    from thermocald.store.database.examination import KeptFrame
+    from thermocald.store.series import StoredSeries
+    from thermocald.store.server.connection import ServerAddress
 
 _DAY_S = 86400.0
 _SANE = (946_684_800.0, 4_102_444_800.0)  # s UTC: 2000 to 2100
@@ -33,9 +33,9 @@ _NAMESPACE = UUID("c1b7b0de-6c1e-5f0e-9d0d-7468656d6f63")
 _LOCAL = {"epoch": {"id", "series_id"}, "event": {"series_id"}, "reading": set[str]()}
 
 
-def series_key(station: str, series: StoredSeries) -> UUID:
-    """The key of a series at the server: station, camera, name, and when it was begun."""
-    text = json.dumps([station, series.camera, series.name, series.created_utc])
+def series_key(station: str, store: UUID, series: StoredSeries) -> UUID:
+    """The key of a series at the server: station, store, camera, name, and when it was begun."""
+    text = json.dumps([station, str(store), series.camera, series.name, series.created_utc])
     return uuid5(_NAMESPACE, text)
 
 
@@ -45,32 +45,26 @@ class ServerWriter(Connected):
     Raises ServerGone (try again later), ServerError, StoreVersionError.
     """
 
-    def __init__(self, address: ServerAddress, station: str) -> None:
+    def __init__(self, address: ServerAddress, station: str, store: str) -> None:
         super().__init__(address)
         self.station = station
+        self.store = UUID(store)
         self._sent: set[UUID] = set()
         self._days: set[int] = set()
         try:
             self._tables = self._described()
         except BaseException:
-            self._engine.dispose()
+            self.close()
             raise
 
     def _described(self) -> dict[str, dict[str, str]]:
         """{table: {column: type}} there: one query, as every round of a station needs it."""
-        from sqlalchemy import text
-
-        columns_of = text(
+        found: dict[str, dict[str, str]] = {}
+        for table, column, kind in self._query(
             "SELECT table_name, column_name, udt_name FROM information_schema.columns "
             "WHERE table_schema = 'public' ORDER BY ordinal_position"
-        )
-        with (
-            in_words(self.address, "its tables cannot be read"),
-            self._engine.connect() as connection,
         ):
-            found: dict[str, dict[str, str]] = {}
-            for table, column, kind in connection.execute(columns_of):
-                found.setdefault(table, {})[column] = kind
+            found.setdefault(table, {})[column] = kind
         return found
 
     def write(
@@ -82,7 +76,7 @@ class ServerWriter(Connected):
         """
         if not rows:
             return
-        keys = {id_: series_key(self.station, one) for id_, one in series.items()}
+        keys = {id_: series_key(self.station, self.store, one) for id_, one in series.items()}
         ready = [self._row(table, row, keys) for row in rows]
         needed = {row["series_id"] for row in rows if row.get("series_id") is not None}
         days: set[int] = set()
@@ -90,48 +84,35 @@ class ServerWriter(Connected):
             times = (row["frame_time"] for row in rows)
             # there is no month for what a clock says that was not set
             days = {int(t // _DAY_S) for t in times if _SANE[0] <= t <= _SANE[1]} - self._days
-        with in_words(self.address, f"{len(rows)} {table}s were not sent"):
-            with self._engine.begin() as connection:
-                for id_ in sorted(needed):
-                    if keys[id_] not in self._sent:
-                        self._insert_series(connection, keys[id_], series[id_])
-                self._make_months(connection, days)
-                self._insert(connection, table, ready)
-            # only what was committed counts as done
-            self._sent.update(keys[id_] for id_ in needed)
-            self._days |= days
+        with self._transaction(f"{len(rows)} {table}s were not sent") as connection:
+            for id_ in sorted(needed):
+                if keys[id_] not in self._sent:
+                    self._insert_series(connection, keys[id_], series[id_])
+            for day in sorted(days):  # partitions for their months, of at most 31 days
+                connection.execute("SELECT thermocald_month(%s)", (day * _DAY_S,))
+            self._insert(connection, table, ready)
+        # only what was committed counts as done
+        self._sent.update(keys[id_] for id_ in needed)
+        self._days |= days
 
     def write_frame(self, series: StoredSeries, frame: KeptFrame, data: bytes) -> None:
         """Insert the file of one epoch's frame; the server checks it against its SHA-256."""
         row = {
-            "series": series_key(self.station, series),
+            "series": series_key(self.station, self.store, series),
             "number": frame.number,
             "frame_time": frame.frame_time,
             "name": str(frame.path),
             "digest": hashlib.sha256(data).hexdigest(),
             "data": data,
         }
-        doing = in_words(self.address, f"the frame of epoch {frame.number} was not sent")
-        with doing, self._engine.begin() as connection:
+        with self._transaction(f"the frame of epoch {frame.number} was not sent") as connection:
             self._insert(connection, "frame", [row])
 
     def report(self, waiting: int, refused: int, clock: float) -> None:
         """Say how this station is: rows that wait, rows refused, its own clock (s, UTC)."""
-        from sqlalchemy import text
-
-        values = {
-            "name": self.station,
-            "clock": clock,
-            "waiting": waiting,
-            "refused": refused,
-            "version": __version__,
-        }
-        doing = in_words(self.address, "the station's state was not sent")
-        with doing, self._engine.begin() as connection:
-            connection.execute(
-                text("SELECT thermocald_report(:name, :clock, :waiting, :refused, :version)"),
-                values,
-            )
+        values = (self.station, self.store, clock, waiting, refused, __version__)
+        with self._transaction("the station's state was not sent") as connection:
+            connection.execute("SELECT thermocald_report(%s, %s, %s, %s, %s, %s)", values)
 
     def _row(self, table: str, row: Mapping[str, Any], keys: Mapping[int, UUID]) -> dict[str, Any]:
         columns = self._tables[table]
@@ -154,13 +135,14 @@ class ServerWriter(Connected):
             ready[name] = value.replace("\0", "\ufffd") if isinstance(value, str) else value
         return ready
 
-    def _insert_series(self, connection: Any, key: UUID, series: StoredSeries) -> None:
+    def _insert_series(self, connection: Connection[Any], key: UUID, series: StoredSeries) -> None:
         csv = testfield_csv(series.testfield)
         digest = hashlib.sha256(csv.encode()).hexdigest()
         self._insert(connection, "testfield", [{"digest": digest, "csv": csv}])
         row = {
             "key": key,
             "station": self.station,
+            "store": self.store,
             "camera": series.camera,
             "name": series.name,
             "start": series.start,
@@ -172,21 +154,16 @@ class ServerWriter(Connected):
         }
         self._insert(connection, "series", [row])
 
-    def _make_months(self, connection: Any, days: set[int]) -> None:
-        """Partitions for the months of these days since 1970; a month has at most 31 of them."""
-        from sqlalchemy import text
-
-        for day in sorted(days):
-            connection.execute(text("SELECT thermocald_month(:at)"), {"at": day * _DAY_S})
-
-    def _insert(self, connection: Any, table: str, rows: Sequence[Mapping[str, Any]]) -> None:
+    def _insert(
+        self, connection: Connection[Any], table: str, rows: Sequence[Mapping[str, Any]]
+    ) -> None:
         """One statement for all rows, of which those that are there already are passed over."""
         kinds = self._tables[table]
         names = list(rows[0])
         columns = ", ".join(f'"{name}"' for name in names)
         arrays = ", ".join(f"%b::{kinds[name]}[]" for name in names)
         values = tuple([_as(kinds[name], row[name]) for row in rows] for name in names)
-        connection.exec_driver_sql(
+        connection.execute(
             f'INSERT INTO "{table}" ({columns}) SELECT * FROM unnest({arrays}) '
             # no conflict target: naming one would ask for the right to read
             "ON CONFLICT DO NOTHING",

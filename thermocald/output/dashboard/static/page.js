@@ -2,8 +2,10 @@
 "use strict";
 const $ = (id) => document.getElementById(id);
 const SVG = "http://www.w3.org/2000/svg";
+// As in the reports: colours that everybody can tell apart, bands of 95 %.
+const PALETTE = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00"], BAND = 1.96;
 const COURSE_EVERY_MS = 10000, RESIDUAL_SCALE = 400;
-let status = {}, series = [], shownEpoch = null, courseAt = 0, eventsAt = 0;
+let status = {}, series = [], shownEpoch = null, courseAt = 0, eventsAt = 0, courses = 0, lastUtc = 0;
 
 async function get(path) {
   const answer = await fetch(path, { headers: { accept: "application/json" } });
@@ -36,14 +38,14 @@ function options(select, names) {
 }
 
 function show(document_) {
+  if (document_.pid) lastUtc = document_.utc;
   status = document_;
-  const cameras = status.cameras || {};
-  if (Object.keys(cameras).length) options($("camera"), Object.keys(cameras));
+  fillCameras();
   const old = status.age_s > 10;
-  $("connection").textContent = !status.pid ? "no daemon runs" :
+  $("connection").textContent = !status.pid ? ended() :
     old ? `the daemon has not answered for ${fixed(status.age_s, 0)} s` : "live";
-  if (!status.pid) $("state").textContent = "no daemon runs; what was stored is below";
-  showCamera(cameras[$("camera").value]);
+  if (!status.pid) $("state").textContent = `${ended()}; what was stored is below`;
+  showCamera((status.cameras || {})[chosen()]);
   showDevices();
   showWarnings();
   if (status.pid) {
@@ -54,9 +56,26 @@ function show(document_) {
   if (Date.now() - eventsAt > COURSE_EVERY_MS) refreshEvents();
 }
 
+function ended() {
+  const since = status.stopped || lastUtc;
+  return since ? `acquisition has ended: no daemon runs since ${time(since)} UTC` : "no daemon runs";
+}
+
+// The camera whose figures, frame and curves are shown: what else arrives is thrown away.
+function chosen() { return $("camera").value; }
+
+function fillCameras() {
+  const names = [...Object.keys(status.cameras || {}), ...series.map((s) => s.camera).reverse()];
+  if (names.length) options($("camera"), [...new Set(names)]);
+}
+
 function showCamera(camera) {
   const last = camera && camera.last;
-  if (!last || last.epoch === undefined) return;
+  if (!last || last.epoch === undefined) {
+    rows("figures", []);
+    if (status.pid) { $("state").textContent = "no epoch yet"; $("state").className = ""; }
+    return;
+  }
   const online = last.online || {}, good = last.status === "ok";
   const state = $("state");
   state.className = good ? last.state : "failed";
@@ -69,19 +88,21 @@ function showCamera(camera) {
       sd ? `± ${fixed(sd, 5)}; this epoch alone ${fixed(last[name], 5)} ± ${fixed(last["sd_" + name], 5)}` : ""]);
   }
   figures.push(["sigma0", fixed(last.sigma0, 3), `${last.n_observations} targets, ${last.n_rejected} rejected`]);
+  if (online.orientation) figures.push(["Camera", online.orientation, ""]);
   rows("figures", figures.flatMap(([name, value, more]) => {
     const dd = element("dd", value + " ");
     dd.append(element("small", more));
     return [element("dt", name), dd];
   }));
-  const key = `${$("camera").value}/${last.epoch}`;
-  if (key !== shownEpoch) { shownEpoch = key; showFrame($("camera").value); }
+  const key = `${chosen()}/${last.epoch}`;
+  if (key !== shownEpoch) { shownEpoch = key; showFrame(chosen()); }
 }
 
 async function showFrame(name) {
   let epoch;
   try { epoch = await get(`api/cameras/${encodeURIComponent(name)}/epoch`); } catch { return; }
-  const targets = epoch.targets || {}, found = series.find((s) => s.camera === name);
+  if (name !== chosen()) return;
+  const targets = epoch.targets || {}, found = series.findLast((s) => s.camera === name);
   const overlay = $("overlay");
   if (found) overlay.setAttribute("viewBox", `0 0 ${found.width_px} ${found.height_px}`);
   const width = found ? found.width_px : 1000, parts = [];
@@ -103,10 +124,9 @@ async function showFrame(name) {
   const text = `epoch ${epoch.row.epoch}: ${count} targets, ${bad} rejected (red); residuals ×${RESIDUAL_SCALE}`;
   $("frame-caption").textContent = text;
   overlay.setAttribute("aria-label", text);
-  const picture = await fetch(`api/cameras/${encodeURIComponent(name)}/epoch`.replace("/epoch", "/frame"))
-    .catch(() => null);
+  const picture = await fetch(`api/cameras/${encodeURIComponent(name)}/frame`).catch(() => null);
   const frame = $("frame");
-  if (!picture || !picture.ok) { return; }
+  if (!picture || !picture.ok || name !== chosen()) return;
   const url = URL.createObjectURL(await picture.blob());
   frame.onload = () => URL.revokeObjectURL(url);
   frame.src = url;
@@ -120,7 +140,8 @@ function showDevices() {
     for (const [name, device] of Object.entries(status[kind] || {})) {
       const row = element("tr"), state = element("td");
       const good = ["open", "finished"].includes(device.device);
-      state.append(element("span", device.device, good ? "ready" : "failed"), " " + (device.why || ""));
+      state.append(element("span", device.device, good ? "ready" : "failed"),
+        (device.since ? ` since ${time(device.since)} UTC ` : " ") + (device.why || ""));
       const rhythm = kind === "cameras" ?
         `every ${device.period_s} s, late ${fixed(1000 * device.late_p99_s, 1)} ms (p99), ` +
         `${device.skipped} skipped, ${device.lost} lost, ${device.deferred - device.caught_up} to catch up` : "";
@@ -155,32 +176,39 @@ async function refreshEvents() {
 }
 
 async function refreshCourse() {
+  const course = ++courses;
   courseAt = Date.now();
   try {
     series = await get("api/series");
-    const name = $("camera").value || (series.length ? series[series.length - 1].camera : "");
-    if (!$("camera").value) options($("camera"), [...new Set(series.map((s) => s.camera))]);
-    options($("series"), series.filter((s) => s.camera === name).map((s) => s.series).reverse());
-    if (!$("series").value) return;
-    const query = new URLSearchParams({ camera: name, series: $("series").value, points: "1500" });
+    if (course !== courses) return;
+    fillCameras();
+    options($("series"), series.filter((s) => s.camera === chosen()).map((s) => s.series).reverse());
+    if (!$("series").value) {
+      $("course-note").textContent = "nothing is stored of this camera yet";
+      Plotly.purge("course");
+      return;
+    }
+    const query = new URLSearchParams({ camera: chosen(), series: $("series").value, points: "1500" });
     $("download").href = `api/series.csv?${query}`;
     const span = document.querySelector("input[name=span]:checked").value;
     if (span) query.set("last", span);
-    draw(await get(`api/columns?${query}`));
-  } catch (error) { $("course-note").textContent = "not available yet"; }
+    const columns = await get(`api/columns?${query}`);
+    if (course === courses) draw(columns, `${query.get("camera")}/${query.get("series")}`);
+  } catch (error) { if (course === courses) $("course-note").textContent = "not available yet"; }
 }
 
-function draw(columns) {
+function draw(columns, name) {
   const style = getComputedStyle(document.documentElement);
   const colour = (name) => style.getPropertyValue(name).trim();
   const x = columns.frame_time.map((t) => new Date(t * 1000));
   const traces = [], layout = {
-    margin: { l: 70, r: 15, t: 10, b: 40 }, showlegend: columns.channels.length > 1,
+    margin: { l: 70, r: 15, t: 36, b: 40 }, colorway: PALETTE, showlegend: columns.channels.length > 1,
     paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", uirevision: "same",
-    font: { color: colour("--ink") }, legend: { orientation: "h", y: 1.05 },
+    font: { color: colour("--ink") }, legend: { orientation: "h", y: 1.04, x: 0 },
     xaxis: { gridcolor: colour("--line"), anchor: "y5" }, hovermode: "x",
   };
-  const panels = [[columns.channels, "°C"], [["c"], "c mm"], [["x0"], "x0 mm"], [["y0"], "y0 mm"], [["sigma0"], "σ0"]];
+  const panels = [[columns.channels, "°C"], [["c"], "c in mm"], [["x0"], "x₀ in mm"], [["y0"], "y₀ in mm"],
+    [["sigma0"], "σ₀ (no unit)"]];
   panels.forEach(([names, title], i) => {
     const axis = i ? `y${i + 1}` : "y", top = 1 - i * 0.205;
     layout[i ? `yaxis${i + 1}` : "yaxis"] = { title: { text: title, standoff: 10 }, automargin: true, domain: [top - 0.18, top],
@@ -189,27 +217,38 @@ function draw(columns) {
       const y = columns[name], sd = columns["sd_" + name];
       if (sd && sd.some((v) => v !== null)) {
         traces.push({ x: [...x, ...[...x].reverse()], yaxis: axis, type: "scatter", mode: "none",
-          y: [...y.map((v, k) => v === null ? null : v + sd[k]),
-            ...y.map((v, k) => v === null ? null : v - sd[k]).reverse()],
-          fill: "toself", fillcolor: "rgba(90,140,200,.28)", hoverinfo: "skip", showlegend: false });
+          y: [...y.map((v, k) => v === null ? null : v + BAND * sd[k]),
+            ...y.map((v, k) => v === null ? null : v - BAND * sd[k]).reverse()],
+          fill: "toself", fillcolor: "rgba(0,114,178,.2)", hoverinfo: "skip", showlegend: false });
       }
+      const line = names.length > 1 ? { width: 1.5 } : { width: 1.5, color: PALETTE[0] };
       traces.push({ x, y, yaxis: axis, name, type: "scatter", mode: "lines",
-        showlegend: names.length > 1, line: { width: 1.5 } });
+        showlegend: names.length > 1, line });
     }
   });
   Plotly.react("course", traces, layout, { responsive: true, displaylogo: false });
-  $("course-note").textContent = `${columns.epochs} epochs` +
+  $("course-note").textContent = `${name}: ${columns.epochs} epochs` +
     (columns.per_point > 1 ? `, up to ${columns.per_point} averaged in a point` : "") +
-    "; bands are ± one standard deviation of a single epoch";
+    "; bands hold 95 % of what a single epoch leaves uncertain";
 }
 
 function listen() {
   const stream = new EventSource("api/stream");
   stream.onmessage = (message) => show(JSON.parse(message.data));
-  stream.onerror = () => { $("connection").textContent = "the page's server does not answer; trying again"; };
+  stream.onerror = () => {
+    $("connection").textContent = status.pid ? "the page's server does not answer; trying again" :
+      `${ended()}; this page's server has ended too`;
+  };
 }
 
-$("camera").addEventListener("change", () => { shownEpoch = null; $("frame").hidden = true; show(status); refreshCourse(); });
+$("camera").addEventListener("change", () => {
+  shownEpoch = null;
+  $("frame").hidden = true;
+  $("overlay").replaceChildren();
+  $("frame-caption").textContent = "no frame yet";
+  show(status);
+  refreshCourse();
+});
 $("series").addEventListener("change", refreshCourse);
 $("range").addEventListener("change", refreshCourse);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", refreshCourse);

@@ -1,0 +1,401 @@
+"""Simulated devices that obey the rules of real ones, and fail on demand as hardware fails.
+
+    cameras:
+      - name: mock
+        driver: mock                  # renders a known test field with a known thermal drift
+        testfield: markers            # markers, circles, plain, or the path of a testfield.csv
+        model: camera.thermal.yaml    # default: an RPi camera v2.1, half a pixel per kelvin
+        programme: [[0, 25.0], [700, 50.0], [1500, 27.0]]   # s since the first open, °C
+        seed: 0                       # of the noise, which depends on the time alone
+        exposure_s: 0.02
+        latency_s: 0.3                # from the call to the end of the exposure
+    thermometers:
+      - name: mock
+        driver: mock                  # the same programme, with lag, offset, noise, quantisation
+        programme: [[0, 25.0], [700, 50.0], [1500, 27.0]]
+        channels:                     # default: one channel `temperature` with these values
+          temperature: {lag_s: 0, offset_k: 0, gain: 1, noise_k: 0.02, resolution_k: 0.0625}
+        seed: 0
+        conversion_s: 0.1             # from the call to the value
+    outputs:
+      - {name: kept, driver: mock, keep: 1000}              # the last results, in memory
+
+The programme is linear between its points and constant before and after them; time counts from the
+first `open`: unplugging a device does not cool it. `gain` scales the difference to the first
+temperature, for a second channel that warms more. All three take faults:
+
+    timeout_s: 1
+    faults:
+      - {kind: timeout, at: 3}                      # the 3rd capture or reading does not answer
+      - {kind: unplugged, at_s: 60, for_s: 30}      # s after the first open; open fails meanwhile
+      - {kind: stuck, at: 10, count: 20}            # 20 times the same value
+
+Kinds: `timeout` (no answer within `timeout_s`), `unplugged` (gone, also for `open`), `truncated`
+(half a frame, half a line: what a driver refuses as a bad reading), `wrong_size` (a frame of
+another size, an answer of another length), `stuck` (the same value or image with new times, which
+no driver can detect). A test may also call `inject` while the device is open.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import deque
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import AfterValidator, Field
+
+from thermocald.errors import BadReading, ConfigurationError, DeviceGone, DeviceTimeout
+from thermocald.hal import Camera, Device, DriverOptions, Frame, KnownScene, Output, Thermometer
+from thermocald_drivers import support
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from thermocald.hal import Clock, Reading
+    from thermocald.photogrammetry.field.testfield import TestField
+    from thermocald.physics.model import Prediction, ThermalModel
+    from thermocald.physics.scene import Scene
+
+Kind = Literal["timeout", "unplugged", "truncated", "wrong_size", "stuck"]
+
+
+class Fault(DriverOptions):
+    """One fault: `count` calls from call number `at`, or `for_s` seconds from `at_s`."""
+
+    kind: Kind
+    at: Annotated[int, Field(ge=1)] = 1
+    count: Annotated[int, Field(ge=1)] = 1
+    at_s: Annotated[float, Field(ge=0.0, le=1e9)] | None = None
+    for_s: Annotated[float, Field(ge=0.0, le=1e9)] = 0.0
+
+    def active(self, call: int, elapsed_s: float) -> bool:
+        if self.at_s is not None:
+            return self.at_s <= elapsed_s < self.at_s + self.for_s
+        return self.at <= call < self.at + self.count
+
+
+def _points(points: list[list[float]]) -> list[list[float]]:
+    """[seconds, °C] points; ValueError for times that do not increase."""
+    if any(len(point) != 2 for point in points):
+        raise ConfigurationError("must be a list of [seconds, °C]")
+    if any(b[0] <= a[0] for a, b in itertools.pairwise(points)):
+        raise ConfigurationError("its times must increase")
+    if any(not -273.15 <= celsius <= 2000.0 for _, celsius in points):
+        raise ConfigurationError("a temperature is not within -273.15 … 2000 °C")
+    return points
+
+
+Programme = Annotated[list[list[float]], Field(min_length=1), AfterValidator(_points)]
+DEFAULT_PROGRAMME = [[0.0, 25.0], [700.0, 50.0], [1500.0, 27.0]]
+Seed = Annotated[int, Field(ge=0, le=2**31)]
+
+
+class MockOptions(DriverOptions):
+    """What all mocks have."""
+
+    faults: list[Fault] = []  # noqa: RUF012 - pydantic copies it
+    timeout_s: Annotated[float, Field(ge=0.0, le=3600.0)] = 1.0
+
+
+class CameraOptions(MockOptions):
+    """As above."""
+
+    testfield: support.Text = "markers"
+    model: support.Text | None = None
+    programme: Programme = DEFAULT_PROGRAMME
+    seed: Seed = 0
+    exposure_s: Annotated[float, Field(ge=1e-6, le=10.0)] = 0.02
+    latency_s: Annotated[float, Field(ge=0.0, le=60.0)] = 0.3
+
+
+class Channel(DriverOptions):
+    """How a channel differs from the programme."""
+
+    lag_s: Annotated[float, Field(ge=0.0, le=1e5)] = 0.0
+    offset_k: Annotated[float, Field(ge=-100.0, le=100.0)] = 0.0
+    gain: Annotated[float, Field(ge=-100.0, le=100.0)] = 1.0
+    noise_k: Annotated[float, Field(ge=0.0, le=10.0)] = 0.02
+    resolution_k: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0625
+
+
+class ThermometerOptions(MockOptions):
+    """As above."""
+
+    programme: Programme = DEFAULT_PROGRAMME
+    channels: Annotated[
+        dict[support.Text, Channel],
+        Field(min_length=1, default_factory=lambda: {"temperature": Channel()}),
+    ]
+    seed: Seed = 0
+    conversion_s: Annotated[float, Field(ge=0.0, le=60.0)] = 0.1
+
+
+class OutputOptions(MockOptions):
+    """As above."""
+
+    keep: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
+
+
+class Faults:
+    """The faults of one mock device."""
+
+    def __init__(
+        self, where: str, clock: Clock, plan: Sequence[Fault], timeout_s: float = 1.0
+    ) -> None:
+        self._where = where
+        self._clock = clock
+        self._timeout_s = timeout_s
+        self._faults = list(plan)
+        self._calls = 0
+        self.started: float | None = None
+
+    def inject(self, kind: Kind, count: int = 1) -> None:
+        """Let the next `count` calls fail."""
+        self._faults.append(Fault(kind=kind, at=self._calls + 1, count=count))
+
+    def clear(self) -> None:
+        """Remove all faults: the device is plugged in again."""
+        self._faults.clear()
+
+    def on_open(self) -> None:
+        """Called by `open`: DeviceGone while unplugged; such an attempt counts as a call."""
+        if self.started is None:
+            self.started = self._clock.monotonic()
+        if self._kind(self._calls + 1) == "unplugged":
+            self._calls += 1
+            raise DeviceGone(f"{self._where}: unplugged")
+
+    def on_call(self) -> Kind | None:
+        """Called by every capture or reading.
+
+        Raises DeviceTimeout, after the time has passed, or DeviceGone. Returns a kind that the mock
+        itself must imitate, None without a fault.
+        """
+        self._calls += 1
+        kind = self._kind(self._calls)
+        if kind == "timeout":
+            self._clock.sleep_until(self._clock.monotonic() + self._timeout_s)
+            raise DeviceTimeout(f"{self._where}: no answer within {self._timeout_s:g} s")
+        if kind == "unplugged":
+            raise DeviceGone(f"{self._where}: unplugged")
+        return kind
+
+    def refuse(self, kind: Kind | None, unit: str) -> None:
+        """Raise BadReading for an answer that a driver must refuse."""
+        if kind in ("truncated", "wrong_size"):
+            what = "is cut off" if kind == "truncated" else "has the wrong size"
+            raise BadReading(f"{self._where}: the {unit} {what}")
+
+    def _kind(self, call: int) -> Kind | None:
+        elapsed = 0.0 if self.started is None else self._clock.monotonic() - self.started
+        return next((f.kind for f in self._faults if f.active(call, elapsed)), None)
+
+
+class MockDevice(Device):
+    """What the mocks share: opening and closing with faults, and the time since the first opening.
+
+    name: for messages.
+    """
+
+    name: ClassVar[str]
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.faults = Faults(self.name, self.clock, self.options.faults, self.options.timeout_s)
+        self._open = False
+
+    def open(self) -> None:
+        self.faults.on_open()
+        self._open = True
+
+    def close(self) -> None:
+        self._open = False
+
+    def identity(self) -> Mapping[str, str]:
+        seed = getattr(self.options, "seed", 0)
+        return {"name": self.name, "serial": f"mock-{seed}"}
+
+    def _require_open(self) -> None:
+        if not self._open:
+            raise DeviceGone(f"{self.name}: it is not open")
+
+    def _elapsed(self, monotonic: float) -> float:
+        """Seconds from the first opening to a time of the monotonic clock; 0 before it."""
+        started = self.faults.started
+        return monotonic - (monotonic if started is None else started)
+
+    def _programme(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Times (n,) s and temperatures (n,) °C."""
+        times, values = np.array(self.options.programme, dtype=float).T
+        return times, values
+
+
+class MockCamera(MockDevice, Camera):
+    """Renders what a warming camera would see; equal times give equal frames."""
+
+    name = "mock camera"
+    Options = CameraOptions
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._latency_s = max(self.options.latency_s, self.options.exposure_s)
+        self._sequence = 0
+        self._scene: Scene | None = None
+        self._last: NDArray[np.uint8] | None = None
+
+    def open(self) -> None:
+        super().open()
+        _ = self.scene
+
+    def identity(self) -> Mapping[str, str]:
+        return {**super().identity(), "testfield": self.options.testfield}
+
+    @property
+    def scene(self) -> Scene:
+        """The test field in front of the camera; loaded at first use."""
+        if self._scene is None:
+            from thermocald.physics.model_file import read_model
+            from thermocald.physics.scene import Scene
+            from thermocald.physics.testfields import demonstration_model, load_field
+
+            field, path = load_field(self.options.testfield), self.options.model
+            self._model = demonstration_model(field) if path is None else read_model(Path(path))
+            if self._model.exterior is None:
+                raise ConfigurationError(
+                    f"{path}: has no exterior orientation; the mock camera needs one in front of "
+                    "its test field"
+                )
+            self._scene = Scene(self._model.sensor, field)
+        return self._scene
+
+    def known_scene(self) -> KnownScene:
+        return KnownScene(self.model.sensor, self.field)
+
+    @property
+    def field(self) -> TestField:
+        """The test field that is rendered."""
+        return self.scene.field
+
+    @property
+    def model(self) -> ThermalModel:
+        """The true thermal model."""
+        _ = self.scene
+        return self._model
+
+    def capture(self) -> Frame:
+        self._require_open()
+        kind = self.faults.on_call()
+        self.clock.sleep_until(self.clock.monotonic() + self._latency_s)
+        self.faults.refuse(kind, "frame")
+        exposure = self.options.exposure_s
+        monotonic = self.clock.monotonic() - 0.5 * exposure
+        utc = self.clock.utc() - 0.5 * exposure
+        self._sequence += 1
+        if kind != "stuck" or self._last is None:
+            self._last = self._picture(monotonic)
+        return Frame(self._last, monotonic, utc, exposure=exposure, sequence=self._sequence)
+
+    def truth(self, monotonic: float) -> Prediction:
+        """The true orientation and effects at a time of the monotonic clock."""
+        from thermocald.physics.history import History
+
+        times, values = self._programme()
+        at = np.array([self._elapsed(monotonic)])
+        history = History(at, times, {"temperature": values}, "temperature", 0.0)
+        return self.model.predict(history, self.field)
+
+    def _picture(self, monotonic: float) -> Any:
+        truth = self.truth(monotonic)
+        points = truth.points(self.field.points)[0] if truth.moves_points else None
+        seed = [self.options.seed, round(monotonic * 1e6) & 2**63 - 1]
+        return self.scene.render(
+            truth.iop[0], truth.eop[0], points, seed, float(truth.blur_factor[0])
+        )
+
+
+class MockThermometer(MockDevice, Thermometer):
+    """Reads a programme; equal times give equal readings."""
+
+    name = "mock thermometer"
+    Options = ThermometerOptions
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._times, self._values = self._programme()
+        self._last: dict[str, float] = {}
+
+    def named_channels(self) -> list[str]:
+        return list(self.options.channels)
+
+    def read(self) -> Reading:
+        self._require_open()
+        kind = self.faults.on_call()
+        start, wait = self.clock.monotonic(), self.options.conversion_s
+        self.clock.sleep_until(start + wait)
+        self.faults.refuse(kind, "answer")
+        if kind != "stuck" or not self._last:
+            at = start + 0.5 * wait
+            self._last = {
+                name: self._value(k, channel, at)
+                for k, (name, channel) in enumerate(self.options.channels.items())
+            }
+        return support.middle_reading(self.clock, self._last, start)
+
+    def truth(self, monotonic: float) -> float:
+        """The programme's temperature (°C) at a time of the monotonic clock."""
+        return lagged(self._times, self._values, 0.0, self._elapsed(monotonic))
+
+    def _value(self, number: int, channel: Channel, at: float) -> float:
+        true = lagged(self._times, self._values, channel.lag_s, self._elapsed(at))
+        value = self._values[0] + channel.gain * (true - self._values[0]) + channel.offset_k
+        seed = [self.options.seed, number, round(at * 1e6) & 2**63 - 1]
+        value += channel.noise_k * float(np.random.default_rng(seed).standard_normal())
+        step = channel.resolution_k
+        return float(round(value / step) * step if step > 0 else value)
+
+
+class MockOutput(MockDevice, Output):
+    """Keeps the last results in `results`, oldest first."""
+
+    name = "mock output"
+    Options = OutputOptions
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.timeout_s = self.options.timeout_s
+        self.results: deque[dict[str, Any]] = deque(maxlen=self.options.keep)
+
+    def emit(self, result: Mapping[str, Any]) -> None:
+        self._require_open()
+        self.faults.refuse(self.faults.on_call(), "acknowledgement")
+        self.results.append(dict(result))
+
+
+def lagged(
+    times: NDArray[np.float64], values: NDArray[np.float64], lag_s: float, at: float
+) -> float:
+    """The response of a first-order lag to a piecewise linear temperature, at a time.
+
+    times (n,) s, values (n,) °C; in equilibrium before the first. On a line of slope m the response
+    is value - m·lag plus the decaying rest of the state before (closed form, no step size).
+    """
+    if lag_s == 0.0:
+        return float(np.interp(at, times, values))
+    state, now = float(values[0]), float(times[0])
+    pieces = zip(times, np.append(times[1:], math.inf), values, strict=True)
+    for i, (start, end, value) in enumerate(pieces):
+        if at <= start:
+            break
+        slope = 0.0 if math.isinf(end) else (values[i + 1] - value) / (end - start)
+        until = min(at, end)
+        settled_before, settled = value - slope * lag_s, value + slope * (until - start - lag_s)
+        state = settled + (state - settled_before) * math.exp(-(until - start) / lag_s)
+        now = until
+        if now >= at:
+            break
+    return state

@@ -1,0 +1,295 @@
+"""The running series: against replay of the same epochs, against the truth, and what it costs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thermocald.acquisition.calibrator import Calibrator
+from thermocald.analysis.online import running_series
+from thermocald.analysis.online.running_series import RunningSeries
+from thermocald.analysis.series.adjusted import table_of_series
+from thermocald.analysis.series.epochs import calibrate_epochs
+from thermocald.epoch import Epoch
+from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES, project
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
+from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.photogrammetry.series.result import SeriesSettings
+from thermocald.physics.testfields import corner_field, demonstration_model
+from thermocald.store.recording.head import CameraSpec, Head
+from thermocald.store.recording.reader import read_recording
+
+NOISE = 0.04
+MAIN = PARAMETER_NAMES[:3]
+
+
+class Scene:
+    """A camera that warms up before a corner known to `field_sd` mm, whose mount may move."""
+
+    def __init__(self, seed, *, field_sd=0.05, wrong=None, per_side=4, hidden=5, slow_px=0.0,
+                 tremble_px=0.0, knock=None):  # fmt: skip
+        self.rng = rng = np.random.default_rng([61, seed])
+        self.plain = corner_field("plain", per_side=per_side, pitch_mm=620.0 / per_side)
+        self.model = demonstration_model(self.plain)
+        self.sensor = self.model.sensor
+        error = field_sd if wrong is None else wrong
+        given = self.plain.points + error * rng.normal(size=self.plain.points.shape)
+        self.field = TestField.build(self.plain.names, given, field_sd)
+        self.hidden, self.knock = hidden, knock
+        self.tremble, self.slow = (
+            px * self.sensor.pixel_pitch / 3.04 for px in (tremble_px, slow_px)
+        )
+        self.sway = np.zeros(3)
+
+    def epoch(self, k: int) -> tuple[Epoch, np.ndarray]:
+        """The epoch and its true values (16,)."""
+        rng, warm = self.rng, 1 - np.exp(-k / 25)
+        now = np.concatenate([self.model.interior.as_array(), self.model.exterior.as_array()])
+        now[:3] += np.array([2e-3, -4.5e-3, -3e-3]) * warm
+        self.sway = 0.95 * self.sway + rng.normal(0, self.slow * np.sqrt(1 - 0.95**2), 3)
+        now[10:13] += self.sway + rng.normal(0, self.tremble, 3)
+        if self.knock is not None and k >= self.knock:
+            now[10] += 5e-4
+        points = project(self.sensor, now[:10], now[10:], self.plain.points)
+        points += rng.normal(0, NOISE, points.shape)
+        rows = np.sort(rng.permutation(len(self.plain))[: len(self.plain) - self.hidden])
+        seen = Observations(rows, points[rows], np.full((len(rows), 2), NOISE))
+        time = 1e9 + 10.0 * k
+        return Epoch(k + 1, time, time, {"t": 20.0 + 10 * warm}, None, seen), now
+
+
+def take(scene, epochs, exterior="auto", settings=None, offsets=True):
+    """The running series, its results with their columns, and the epochs by themselves."""
+    settings = settings or AdjustmentSettings()
+    calibrator = Calibrator(scene.sensor, scene.field, settings, nominal_c=3.04)
+    running = RunningSeries(scene.sensor, scene.field, settings, exterior=exterior, offsets=offsets)
+    results, alone, truth = [], [], []
+    for k in range(epochs):
+        epoch, now = scene.epoch(k)
+        alone.append(calibrator.calibrate(epoch))
+        results.append(running.refine(alone[-1], epoch.observations))
+        truth.append(now)
+    return running, results, alone, np.array(truth)
+
+
+def replayed(sensor, field, epochs, exterior="auto", c=3.04):
+    """The table of the same epochs, by `replay`."""
+    head = Head("replay", "M1", 10.0, CameraSpec("camera", sensor, c, None), {})
+    calibrator = Calibrator(sensor, field, nominal_c=c)
+    temperature = {e.number: next(iter(e.temperatures.values()), np.nan) for e in epochs}
+    apart, seen = calibrate_epochs(iter(epochs), calibrator, temperature)
+    settings = SeriesSettings.of(AdjustmentSettings(), exterior)
+    return table_of_series(head, field, apart, seen, settings)
+
+
+def assert_like_replay(columns, table, values=0.05, sds=0.02):
+    assert table.ok[-1]
+    for k, name in enumerate(MAIN):
+        sd = table.sd[-1, k]
+        assert abs(columns[f"series_{name}"] - table.values[-1, k]) < values * sd, name
+        assert columns[f"sd_series_{name}"] == pytest.approx(sd, rel=sds)
+        assert columns[f"level_sd_{name}"] == pytest.approx(table.level_sd[k], rel=sds)
+
+
+SCENES = {
+    "still": {}, "trembling": {"tremble_px": 0.06}, "wandering": {"slow_px": 0.08},
+    "knocked": {"knock": 30}, "badly surveyed": {"field_sd": 0.15, "wrong": 0.4},
+}  # fmt: skip
+
+
+def quick(one):
+    """All scenes, one of them in the quick suite."""
+    return [n if n == one else pytest.param(n, marks=pytest.mark.slow) for n in SCENES]
+
+
+@pytest.mark.parametrize("name", quick("knocked"))
+def test_the_series_is_replay_of_the_epochs_so_far(name):
+    """Values to 0.05 standard deviations, standard deviations to 2 %, whenever all are adjusted."""
+    scene = Scene(3, **SCENES[name])
+    _, results, alone, _ = take(scene, 60)
+    epochs = [c.epoch for c in alone]
+    for n in (1, 2, 5, 12, 19, 20, 25, 33, 40, 60):
+        assert_like_replay(results[n - 1][1], replayed(scene.sensor, scene.field, epochs[:n]))
+
+
+@pytest.mark.parametrize("name", quick("badly surveyed"))
+def test_every_epoch_has_its_own_result_with_a_true_standard_deviation(name):
+    """About the mean of 60 epochs: the level is that of the field's errors, stated apart."""
+    z = []
+    for seed in range(3):
+        _, results, alone, truth = take(Scene(seed, **SCENES[name]), 60)
+        assert all(c.adjustment.ok for c in alone)
+        assert all(r.ok for r, _ in results)
+        error = np.array([r.values[:3] for r, _ in results]) - truth[:, :3]
+        z.append((error - error.mean(axis=0)) / [r.sd[:3] for r, _ in results])
+        share = np.mean([len(r.rejected) / r.n_observations for r, _ in results])
+        assert share < 0.006  # of 43 targets, whose own noise is the scale
+    rms = np.sqrt(np.mean(np.square(z), axis=(0, 1)))
+    assert rms == pytest.approx(np.ones(3), abs=0.15)
+
+
+def test_the_first_epoch_says_what_was_stated_where_it_shows_nothing_else():
+    """A field whose error nobody has seen takes up what one epoch leaves: the noise is not 0."""
+    for field_sd, wrong in ((0.02, 0.0), (2.0, 0.4), (0.05, 0.05), (0.002, 0.002)):
+        _, results, alone, _ = take(Scene(4, field_sd=field_sd, wrong=wrong, hidden=0), 3)
+        for (result, _), by_itself in zip(results, alone, strict=True):
+            assert 0.75 < result.sigma0 < 1.25
+            assert result.sd[1] < 1.3 * by_itself.adjustment.sd[1]
+            assert len(result.rejected) <= 1
+        sds = [r.sd[1] for r, _ in results]
+        assert sds[0] == pytest.approx(sds[1], rel=0.3)
+
+
+def test_what_is_decided_follows_the_data_and_is_said():
+    running, results, _, _ = take(Scene(5), 24)
+    columns = [c for _, c in results]
+    assert "mount_px" not in columns[10]
+    assert columns[-1]["mount_px"] == 0.0
+    assert running.report()["orientation"] == (
+        "the camera stands still: one orientation for 24 epochs"
+    )
+    running, results, _, _ = take(Scene(5), 12)
+    assert "12 of the 20 epochs" in running.report()["orientation"]
+    running, results, _, _ = take(Scene(5, tremble_px=0.2), 24)
+    assert results[-1][1]["mount_px"] > 0.05
+    assert "the mount moves by 0." in running.report()["orientation"]
+
+
+def test_a_camera_that_is_carried_elsewhere_begins_another_series():
+    """Its epochs keep their results."""
+    scene = Scene(6, hidden=0)
+    running, _, _, _ = take(scene, 30)
+    calibrator = Calibrator(scene.sensor, scene.field, nominal_c=3.04)
+    away = scene.model.exterior.as_array().copy()
+    away[[1, 3]] += 0.2, 250.0
+    restarted = []
+    for k in range(30, 60):
+        epoch, now = scene.epoch(k)
+        now[10:] = away
+        points = project(scene.sensor, now[:10], away, scene.plain.points)
+        points += scene.rng.normal(0, NOISE, points.shape)
+        inside = ((points > 0) & (points < (scene.sensor.width, scene.sensor.height))).all(axis=1)
+        rows = np.flatnonzero(inside)
+        seen = Observations(rows, points[rows], np.full((len(rows), 2), NOISE))
+        calibrated = calibrator.calibrate(replace(epoch, observations=seen))
+        result, columns = running.refine(calibrated, seen)
+        assert result.ok
+        assert abs(result.values[0] - now[0]) < 0.02
+        restarted.append("series_restarted" in columns)
+    assert restarted == [False, True] + [False] * 28
+    assert "begun again after epoch" in running.report()["orientation"]
+
+
+def test_a_program_started_again_goes_on_where_it_was():
+    scene = Scene(7)
+    _, results, alone, _ = take(scene, 60)
+    again = RunningSeries(
+        scene.sensor, scene.field, AdjustmentSettings(), exterior="auto", offsets=True
+    )
+    for calibrated, (result, _) in zip(alone[:35], results, strict=False):
+        again.remember(calibrated, calibrated.epoch.observations, result.values)
+    for calibrated, (whole, columns) in zip(alone[35:], results[35:], strict=True):
+        result, after = again.refine(calibrated, calibrated.epoch.observations)
+        assert (np.abs(result.values - whole.values)[:3] < 0.1 * whole.sd[:3]).all()
+        for name in MAIN:
+            apart = after[f"series_{name}"] - columns[f"series_{name}"]
+            assert abs(apart) < 0.1 * np.hypot(columns[f"sd_series_{name}"],
+                                               columns[f"level_sd_{name}"])  # fmt: skip
+
+
+def test_gross_errors_in_most_epochs_are_found():
+    scene = Scene(8, per_side=5, hidden=15)
+    calibrator = Calibrator(scene.sensor, scene.field, nominal_c=3.04)
+    running = RunningSeries(
+        scene.sensor, scene.field, AdjustmentSettings(), exterior="auto", offsets=True
+    )
+    for k in range(30):
+        epoch, _ = scene.epoch(k)
+        points = epoch.observations.points.copy()
+        points[: 3 if k % 3 else 0] += 20.0
+        seen = replace(epoch.observations, points=points)
+        result, _ = running.refine(calibrator.calibrate(replace(epoch, observations=seen)), seen)
+        assert result.ok
+        if k % 3:
+            assert set(seen.targets[:3]) <= set(result.rejected)
+
+
+def test_a_clock_that_is_set_back_breaks_nothing():
+    """By two hours in the middle, and to the very first time at the end."""
+    scene = Scene(11)
+    calibrator = Calibrator(scene.sensor, scene.field, nominal_c=3.04)
+    running = RunningSeries(
+        scene.sensor, scene.field, AdjustmentSettings(), exterior="auto", offsets=True
+    )
+    for k in range(32):
+        epoch, _ = scene.epoch(k)
+        back = 1e9 if k == 31 else epoch.frame_time - 7200.0 * (k >= 24)
+        epoch = replace(epoch, frame_time=back, temperature_time=back)
+        result, columns = running.refine(calibrator.calibrate(epoch), epoch.observations)
+        assert result.ok
+        assert np.isfinite(result.values).all()
+    assert columns["series_epochs"] == 32
+
+
+def test_nothing_shared_leaves_the_epoch_as_it_is():
+    _, results, alone, _ = take(Scene(9), 3, exterior="per_epoch", offsets=False)
+    assert all(r is c.adjustment and not x for (r, x), c in zip(results, alone, strict=True))
+
+
+def test_priors_and_what_is_held_are_kept():
+    settings = AdjustmentSettings(
+        free=("c", "x0", "y0"), priors={"c": (3.1, 1e-6), "Z0": (1000.0, 1e9)}
+    )
+    _, results, _, _ = take(Scene(10), 4, settings=settings)
+    for result, _ in results:
+        assert result.values[0] == pytest.approx(3.1, abs=1e-4)
+        assert (result.values[3:10] == 0).all()
+
+
+def test_an_epoch_of_month_twelve_costs_what_one_of_the_first_days_does(monkeypatch):
+    """What is adjusted together, and how often, once the epochs that are kept are all there."""
+    monkeypatch.setattr(running_series, "_WINDOW", 30)
+    monkeypatch.setattr(running_series, "_FEWEST", 30)
+    together: list[int] = []
+    real = running_series.adjusted
+
+    def counted(sensor, field, grid, *rest):
+        together.append(len(grid))
+        return real(sensor, field, grid, *rest)
+
+    monkeypatch.setattr(running_series, "adjusted", counted)
+    scene = Scene(11)
+    running, _, _, _ = take(scene, 60)
+    assert max(together) == 30
+    early = len(together)
+    running.epochs += 3_000_000
+    running._look_at = [k + 3_000_000 for k in running._look_at]
+    calibrator = Calibrator(scene.sensor, scene.field, nominal_c=3.04)
+    for k in range(60, 120):
+        epoch, _ = scene.epoch(k)
+        running.refine(calibrator.calibrate(epoch), epoch.observations)
+    assert max(together) == 30
+    assert len(together) - early <= 4 * 3
+    assert len(running._kept) == 30
+
+
+@pytest.fixture(scope="module")
+def real(shared):
+    """A real camera that stands still, its field known to some millimetres."""
+    return read_recording(Path(shared) / "data" / "aviary-cam6")
+
+
+@pytest.mark.parametrize("n", [1, 3, 10, 20, 27])
+def test_a_real_camera_is_live_what_replay_finds(real, n):
+    calibrator = Calibrator(real.camera.sensor, real.testfield, nominal_c=12.7)
+    running = RunningSeries(
+        real.camera.sensor, real.testfield, AdjustmentSettings(), exterior="auto", offsets=True
+    )
+    epochs = list(real.epochs)[:n]
+    for epoch in epochs:
+        result, columns = running.refine(calibrator.calibrate(epoch), epoch.observations)
+        assert result.ok
+    assert_like_replay(columns, replayed(real.camera.sensor, real.testfield, epochs, c=12.7))

@@ -1,0 +1,63 @@
+"""A folder as a user has it: two recordings, a store, a model, photographs and a logger's file."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+import thermocald as tc
+from tests.commands import call
+from tests.golden.workshop import photographs
+
+
+@pytest.fixture(scope="session")
+def world(tmp_path_factory):
+    """The folder; tests write beside it."""
+    folder = tmp_path_factory.mktemp("world")
+    for k in (1, 2):
+        tc.simulate("rpi-v2.1-heating", seed=k, series=f"M{k}", out=folder / f"M{k}")
+    assert call("replay", "M1", "--store", "thermocald.db", folder=folder).returncode == 0
+    tc.fit(tc.open(folder / "M1"), tc.open(folder / "M2")).save(folder / "camera.yaml")
+    photographs(folder)
+    (folder / "log.csv").rename(folder / "logger.csv")
+    board = Path(__file__).resolve().parents[3] / "shared" / "data" / "chessboard"
+    if board.is_dir():
+        (folder / "board").mkdir()
+        for name in ("f000", "f060", "f090", "f120", "f150", "f180", "f240", "f330"):
+            (folder / "board" / f"{name}.jpg").symlink_to(board / f"{name}.jpg")
+    done = call("testfield", "import", "--chessboard", "9x6", "--square", 25, "-o", "board.csv",
+                folder=folder)  # fmt: skip
+    assert done.returncode == 0
+    return folder
+
+
+@pytest.fixture
+def inside(world, monkeypatch):
+    """The folder as the working directory."""
+    monkeypatch.chdir(world)
+    return world
+
+
+@pytest.fixture(scope="session")
+def M1(world):
+    return tc.open(world / "M1")
+
+
+@pytest.fixture(scope="session")
+def M2(world):
+    return tc.open(world / "M2")
+
+
+@pytest.fixture(scope="session")
+def epochs(M1):
+    return M1.calibrate()
+
+
+@pytest.fixture(scope="session")
+def camera(world):
+    return tc.load_camera(world / "camera.yaml")
+
+
+os.environ.setdefault("MPLBACKEND", "agg")

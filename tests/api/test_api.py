@@ -1,0 +1,224 @@
+"""The front door as API.md has it, line by line, and every example of its docstrings."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import thermocald as tc
+from tests.commands import call
+from thermocald.errors import DataError, StoreError, UsageError
+
+DOCUMENTED = (
+    "api", "series", "results", "analysis.series.epochs", "analysis.camera.camera",
+    "analysis.thermal.thermal_camera", "analysis.thermal.live_camera",
+)  # fmt: skip
+
+
+def examples():
+    found = []
+    for name in DOCUMENTED:
+        module = importlib.import_module(f"thermocald.{name}")
+        found += [t for t in doctest.DocTestFinder().find(module, globs={"tc": tc}) if t.examples]
+    return found
+
+
+@pytest.mark.parametrize("example", examples(), ids=lambda t: t.name)
+def test_an_example_of_a_docstring(inside, example):
+    if "board" in example.docstring and not (inside / "board").is_dir():
+        pytest.skip("the reference data are absent")
+    said: list[str] = []
+    failed, _ = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example, out=said.append)
+
+    assert failed == 0, "".join(said)
+
+
+def test_every_public_function_has_an_example():
+    names = {t.name.rsplit(".", 1)[-1] for t in examples()}
+    functions = {n for n in tc.__all__ if n[0].islower()} - {"reference_study"}
+
+    assert functions <= names
+
+
+def test_a_series_says_what_it_is(M1):
+    assert repr(M1) == (
+        "<Series rpi-v2.1/M1: 150 epochs, 147 targets, 25.0 to 50.0 °C (reference: temperature)>"
+    )
+    assert len(M1.time) == len(M1) == 150
+    assert M1.time.dtype == np.dtype("datetime64[us]")
+
+
+def test_a_store_and_its_recording_are_the_same_series(inside, M1):
+    kept = tc.open("thermocald.db")
+    (other,) = tc.open_all("thermocald.db")
+
+    assert (kept.camera, kept.name, len(kept)) == (M1.camera, M1.name, len(M1))
+    np.testing.assert_allclose(kept.temperature, M1.temperature)
+    assert repr(other) == repr(kept)
+    a, b = kept.calibrate(exterior="series"), M1.calibrate(exterior="series")
+    np.testing.assert_allclose(a.values, b.values, rtol=1e-6)
+
+
+def test_several_series_have_to_be_told_apart(inside):
+    with pytest.raises(StoreError, match=r"camera/series in this store: rpi-v2\.1/M1"):
+        tc.open("thermocald.db", "M7")
+    with pytest.raises(StoreError, match="does not exist"):
+        tc.open("nowhere")
+
+
+def test_photographs_become_a_series(inside, tmp_path):
+    told = {"log": "logger.csv", "timezone": "Europe/Berlin", "testfield": "M1/testfield.csv",
+            "pixel_pitch": 0.00112}  # fmt: skip
+    here = tc.import_photographs("photos", **told)
+    there = tc.import_photographs("photos", **told, out=tmp_path / "P1")
+
+    assert len(here) == len(there) == 6
+    np.testing.assert_allclose(here.temperature, there.temperature)
+    np.testing.assert_array_equal(here.time, there.time)
+    assert (tmp_path / "P1" / "frames").is_dir()
+
+
+def test_epochs_are_columns_with_covariance(epochs):
+    assert epochs.values.shape == epochs.sd.shape == (150, 16)
+    assert epochs.covariance.shape == (150, 16, 16)
+    np.testing.assert_array_equal(epochs.c, epochs.values[:, 0])
+    np.testing.assert_array_equal(epochs.sd_Z0, epochs.sd[:, 15])
+    variance = np.diagonal(epochs.covariance, axis1=1, axis2=2)
+    there = np.isfinite(epochs.sd)
+    np.testing.assert_allclose(np.sqrt(variance[there]), epochs.sd[there], rtol=1e-12)
+    with pytest.raises(AttributeError, match="no 'focal'"):
+        _ = epochs.focal
+
+
+def test_epochs_as_csv_are_the_export(epochs, world, tmp_path):
+    epochs.to_csv(tmp_path / "ours.csv")
+    call("export", "M1", "-o", tmp_path / "theirs.csv", folder=world)
+
+    assert (tmp_path / "ours.csv").read_text() == (tmp_path / "theirs.csv").read_text()
+
+
+def test_epochs_as_a_data_frame(epochs):
+    frame = epochs.to_pandas()
+
+    assert list(frame.index) == list(range(1, 151))
+    np.testing.assert_array_equal(frame["sd_c"], epochs.sd_c)
+    assert frame.attrs["units"]["omega"] == "rad"
+    assert str(frame["time"].dtype).startswith("datetime64")
+
+
+def test_epochs_as_a_dataset_written_and_read(epochs, tmp_path):
+    xarray = pytest.importorskip("xarray")
+    pytest.importorskip("h5netcdf")
+    data = epochs.to_xarray()
+    data.to_netcdf(tmp_path / "M1.nc", engine="h5netcdf")
+
+    with xarray.open_dataset(tmp_path / "M1.nc", engine="h5netcdf") as read:
+        xarray.testing.assert_allclose(read.drop_vars("status"), data.drop_vars("status"), rtol=0)
+        assert read.attrs == data.attrs
+        assert read.x0.attrs["units"] == "mm"
+        assert list(read.status.values) == list(data.status.values)
+        assert set(read.coords) == {"epoch", "time", "temperature", "parameter", "parameter_2"}
+        assert read.covariance.dims == ("epoch", "parameter", "parameter_2")
+
+
+def test_one_result_prints_documents_draws_and_reports(epochs, M1, M2, camera, tmp_path, world):
+    study = tc.study(M1, M2, sets=200, f_number=2.0)
+    found = tc.discover(M1, verify=[M2])
+    for k, result in enumerate((epochs, study, found, camera, camera.at(35.0))):
+        assert str(result).count("\n") >= 3
+        assert json.loads(json.dumps(result.as_dict(), allow_nan=False))
+        assert result._repr_html_().startswith("<pre>")
+        assert "at 0x" not in repr(result)
+        assert len(repr(result)) < 200
+        result.plot().savefig(tmp_path / f"{k}.png")
+        assert result.report(tmp_path / f"{k}.html").stat().st_size > 1000
+    assert found.verdict == "effects_found"
+    found.save(tmp_path / "found.yaml")
+    assert tc.load_camera(tmp_path / "found.yaml").model.effects
+
+
+def test_a_result_is_what_the_command_says(epochs, world):
+    said = call("replay", "M1", folder=world).stdout
+    document = json.loads(call("replay", "M1", "--json", "-", folder=world).stdout)
+
+    assert said.strip() == str(epochs).strip()
+    assert {k: v for k, v in document.items() if k not in ("recording", "store")} == json.loads(
+        json.dumps(epochs.as_dict())
+    )
+
+
+def test_a_camera_at_a_temperature(camera, tmp_path):
+    import cv2
+
+    now = camera.at(35.0)
+    pose = tc.ExteriorOrientation(0.1, -0.05, 0.02, 10.0, 20.0, 900.0)
+    X = np.array([[0.0, 0.0, 0.0], [100.0, -80.0, 20.0], [-150.0, 60.0, -30.0]])
+    image = now.project(X, pose)
+    np.testing.assert_allclose(image, now.project(X, pose.as_array()))
+
+    K, distortion = now.opencv()
+    inside = (X - [10.0, 20.0, 900.0]) @ pose.rotation * [1, -1, -1]
+    theirs, _ = cv2.projectPoints(inside, np.zeros(3), np.zeros(3), K, distortion)
+    np.testing.assert_allclose(theirs[:, 0], image, atol=1e-6)
+
+    for name in ("ros.yaml", "opencv.yaml", "kalibr.yaml", "cameras.xml", "colmap.txt",
+                 "m.cameramodel", "cam.json", "cam.ior"):  # fmt: skip
+        assert now.write(tmp_path / name)
+        assert (tmp_path / name).stat().st_size > 100
+    with pytest.raises(UsageError, match="say which format"):
+        now.write(tmp_path / "camera.yaml")
+
+
+def test_what_is_wrong_is_said(M1, camera):
+    with pytest.raises(UsageError, match="is the same series as"):
+        tc.study(M1, M1)
+    with pytest.raises(UsageError, match="must be one of per_epoch"):
+        M1.calibrate(exterior="still")
+    with pytest.raises(UsageError, match="fahrenheit"):
+        camera.at(95.0)
+    with pytest.raises(DataError, match="there is no such file or folder"):
+        tc.import_photographs("nothing", log="x.csv", testfield="M1/testfield.csv")
+
+
+def test_the_import_costs_nothing():
+    """Without NumPy, within 30 ms of the processor (median of five)."""
+    program = (
+        "import sys, time; a = time.process_time(); import thermocald; "
+        "print(time.process_time() - a, 'numpy' in sys.modules)"
+    )
+    runs = [
+        subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+        for _ in range(5)
+    ]
+    seconds, numpy = zip(*(r.stdout.split() for r in runs), strict=True)
+
+    assert set(numpy) == {"False"}
+    assert sorted(map(float, seconds))[2] < 0.030
+
+
+def test_a_script_of_a_user_is_typed_and_runs(inside, tmp_path):
+    """From a recording to files of ROS at 10 and 40 °C; types are real ones for mypy."""
+    pytest.importorskip("mypy")
+    script = Path(__file__).with_name("user_script.py")
+    root = Path(__file__).resolve().parents[2]
+    checked = subprocess.run(
+        [sys.executable, "-m", "mypy", "--strict", "--config-file", str(root / "pyproject.toml"),
+         str(script)], capture_output=True, text=True, cwd=root, check=False,
+    )  # fmt: skip
+    assert checked.returncode == 0, checked.stdout
+    ran = subprocess.run(
+        [sys.executable, str(script), "M1", "M2", str(tmp_path)], capture_output=True, text=True,
+        check=False,
+    )  # fmt: skip
+    assert ran.returncode == 0, ran.stderr
+    files = {path.name: path.read_text() for path in tmp_path.glob("*.yaml")}
+    assert set(files) == {"ros-10.yaml", "ros-40.yaml"}
+    assert all("distortion_model: plumb_bob" in text for text in files.values())
+    assert files["ros-10.yaml"] != files["ros-40.yaml"]

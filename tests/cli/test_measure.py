@@ -1,0 +1,165 @@
+"""`thermocald measure`: control points on a cold morning, places on the water in the sun."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import yaml
+
+from tests.commands import call
+from tests.main_paths.crooked import CAMERA, PITCH, SIZE, project
+
+POSE = np.array([np.deg2rad(70.0), 0.02, -0.01, 500.0, -1000.0, 6000.0])
+ORIGIN_M = np.array([192_000.0, 313_000.0, 138.0])  # a national grid
+RATES = {"c": 0.4e-3, "x0": 0.35e-3, "y0": -0.2e-3}
+SD = {"c": 0.5e-3, "x0": 0.6e-3, "y0": 0.6e-3}
+SD_RATE = 4e-6
+NAMES = ("c", "x0", "y0")
+NOISE_PX, NOISE_K, SURVEY_MM = 0.2, 0.05, 8.0
+MORNING, AFTERNOON = 1.7e9, 1.7e9 + 6 * 3600
+PLACES = np.array([[300.0, 9_000.0, 0.0], [-2_000.0, 20_000.0, 0.0], [2_500.0, 14_000.0, 0.0]])
+
+
+def write_model(path) -> None:
+    """A thermal model of the crooked camera about 20 °C, with covariance."""
+    parameters = [f"interior.{n}" for n in NAMES] + [f"rates.{n}" for n in NAMES]
+    variances = [SD[n] ** 2 for n in NAMES] + [SD_RATE**2] * 3
+    known = {**dict.fromkeys(("A1", "A2", "A3", "B1", "B2", "C1", "C2"), 0.0), **CAMERA}
+    units = {"c": "mm", "x0": "mm", "y0": "mm", "A1": "mm-2", "A2": "mm-4", "A3": "mm-6",
+             "B1": "mm-1", "B2": "mm-1", "C1": "1", "C2": "1"}  # fmt: skip
+    path.write_text(
+        yaml.safe_dump(
+            {
+                "format": "thermocald-model/1", "name": "gauge", "version": 1,
+                "camera": {"name": "gauge", "width": SIZE[0], "height": SIZE[1],
+                           "pixel_pitch": PITCH},
+                "reference_temperature": {"value": 20.0, "unit": "degC"},
+                "interior": {
+                    n: {"value": known[n], "unit": units[n], **({"sd": SD[n]} if n in SD else {})}
+                    for n in units
+                },
+                "rates": {n: {"value": RATES[n], "sd": SD_RATE, "unit": "mm/K"} for n in NAMES},
+                "effects": [], "validity": {"temperature": [-5.0, 45.0]},
+                "covariance": {"parameters": parameters,
+                               "matrix": np.diag(variances).tolist()},
+            }
+        )
+    )  # fmt: skip
+
+
+def world(folder, seed: int) -> np.ndarray:
+    """One gauge as it comes out: files beside the model; the level of the water that day, mm."""
+    rng = np.random.default_rng(seed)
+    off = {n: rng.normal(0, SD[n]) for n in NAMES}
+    rate = {n: RATES[n] + rng.normal(0, SD_RATE) for n in NAMES}
+
+    def image(points, temperature):
+        c, x0, y0 = (CAMERA[n] + off[n] + rate[n] * (temperature - 20.0) for n in NAMES)
+        return project(points, POSE, c, x0, y0) + rng.normal(0, NOISE_PX, (len(points), 2))
+
+    warmth = {MORNING: 4.0, AFTERNOON: 36.0}
+    with (folder / "log.csv").open("w", newline="") as out:
+        rows = csv.writer(out)
+        rows.writerow(["time", "temperature"])
+        for k in range(-60, 6 * 360 + 61):
+            share = min(max(k * 10.0 / (6 * 3600), 0.0), 1.0)
+            rows.writerow(
+                [f"{MORNING + 10.0 * k:.0f}", f"{4 + 32 * share + rng.normal(0, NOISE_K):.3f}"]
+            )
+    n = 12
+    y = rng.uniform(8_000, 28_000, n)
+    control = np.column_stack(
+        [np.where(np.arange(n) % 2, 0.3, -0.3) * y, y, rng.uniform(-200, 2_500, n)]
+    )
+    seen = image(control, warmth[MORNING])
+    surveyed = (control + rng.normal(0, SURVEY_MM, control.shape)) / 1000 + ORIGIN_M
+    with (folder / "gcp.csv").open("w", newline="") as out:
+        rows = csv.writer(out)
+        rows.writerow(["target", "X", "Y", "Z", "sX", "sY", "sZ", "x", "y", "sx", "sy"])
+        for i in range(n):
+            rows.writerow([f"g{i}", *(f"{v:.5f}" for v in surveyed[i]), *[SURVEY_MM / 1000] * 3,
+                           *seen[i], NOISE_PX, NOISE_PX])  # fmt: skip
+    lifted = rng.normal(0, 5.0)
+    (folder / "water.yaml").write_text(f"level: {ORIGIN_M[2] + lifted / 1000:.6f}\nsd: 0.005\n")
+    with (folder / "points.csv").open("w", newline="") as out:
+        rows = csv.writer(out)
+        rows.writerow(["time", "name", "x", "y", "sx", "sy"])
+        for k, uv in enumerate(image(PLACES, warmth[AFTERNOON])):
+            rows.writerow([f"{AFTERNOON:.0f}", f"stone {k}", *uv, NOISE_PX, NOISE_PX])
+    return PLACES / 1000 + ORIGIN_M
+
+
+def measured(folder, *more: object, status: int = 0):
+    done = call(
+        "measure", folder / "points.csv", "--model", folder / "model.yaml", "--log",
+        folder / "log.csv", "--control", folder / "gcp.csv", "--seen", f"{MORNING:.0f}", "--plane",
+        folder / "water.yaml", "--length-unit", "m", *more,
+    )  # fmt: skip
+    assert "Traceback" not in done.stderr
+    assert done.returncode == status, done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def draws(tmp_path_factory):
+    """Places of forty gauges: normalised errors, and errors with and without the thermal model."""
+    errors, with_model, without = [], [], []
+    for seed in range(40):
+        folder = tmp_path_factory.mktemp("gauge")
+        write_model(folder / "model.yaml")
+        truth = world(folder, seed)
+        document = json.loads(measured(folder, "--json", "-").stdout)
+        for place, true in zip(document["places"], truth, strict=True):
+            error = [place[a] - t for a, t in zip("XY", true[:2], strict=True)]
+            errors.append([e / place[f"sd_{a}"] for e, a in zip(error, "XY", strict=True)])
+            with_model.append(np.hypot(*error))
+            other = place["without_correction"]
+            without.append(np.hypot(other["X"] - true[0], other["Y"] - true[1]))
+    return np.array(errors), np.array(with_model), np.array(without)
+
+
+def test_standard_deviations_of_places_are_true(draws):
+    errors, _, _ = draws
+    rms = np.sqrt(np.mean(errors**2))
+    assert 0.85 <= rms <= 1.15, f"error/sd of places {rms:.2f}"
+
+
+def test_the_thermal_model_is_worth_it(draws):
+    """32 K move the camera by ten pixels; most of that is taken off."""
+    _, with_model, without = draws
+    assert np.median(without) / np.median(with_model) > 5
+
+
+def test_what_is_printed(tmp_path):
+    write_model(tmp_path / "model.yaml")
+    world(tmp_path, 1)
+    text = measured(tmp_path).stdout
+    assert "3 places; pose from 12 control points" in text
+    assert "stone 1" in text
+    assert "313020" in text
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "words"),
+    [("water.yaml", "depth: 3\n", "one of level, plane, line is needed"),
+     ("water.yaml", "level: deep\n", "level must be a number"),
+     ("water.yaml", "line: {point: [1, 2], direction: [0, 0, 1]}\n", "must be three numbers"),
+     ("gcp.csv", "target,X,Y,Z\na,1,2,3\n", "column sX is missing"),
+     ("points.csv", "time,name,x,y,sx,sy\n1700021600,sky,1640,-900,0.2,0.2\n", "above the horizon"),
+     ("points.csv", "time,name,x,y,sx,sy\n1600000000,old,1640,1700,0.2,0.2\n", "outside the temp")],
+)  # fmt: skip
+def test_what_cannot_be_measured_is_one_line(tmp_path, file, content, words):
+    write_model(tmp_path / "model.yaml")
+    world(tmp_path, 1)
+    (tmp_path / file).write_text(content)
+    done = call(
+        "measure", tmp_path / "points.csv", "--model", tmp_path / "model.yaml", "--log",
+        tmp_path / "log.csv", "--control", tmp_path / "gcp.csv", "--seen", f"{MORNING:.0f}",
+        "--plane", tmp_path / "water.yaml", "--length-unit", "m",
+    )  # fmt: skip
+    assert done.returncode in (1, 2)
+    assert words in " ".join(done.stderr.split())
+    assert "Traceback" not in done.stderr

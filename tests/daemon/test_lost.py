@@ -1,0 +1,155 @@
+"""An epoch that was taken and not kept is lost, and everybody who asks is told."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import threading
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from thermocald_drivers.alert import Watch, condition_of
+
+from tests.commands import call
+from tests.daemon.conftest import make_recording
+from tests.daemon.test_store_file import guard, path  # noqa: F401
+from thermocald.acquisition.pairing import Readings
+from thermocald.acquisition.pipeline import Pipeline
+from thermocald.cli.status import status
+from thermocald.daemon.live_state import LiveState
+from thermocald.errors import DataError, StoreError
+from thermocald.hal import Frame, SystemClock
+from thermocald.output.dashboard.view import View
+from thermocald.output.status_text import status_warnings
+from thermocald.store.database.store import Store
+
+
+def until(condition) -> None:
+    deadline = time.monotonic() + 20.0
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def refuse(path, statement: str) -> None:  # noqa: F811
+    with sqlite3.connect(path) as db:
+        db.execute(f"CREATE TRIGGER refused {statement} BEGIN SELECT RAISE(ABORT, 'no'); END")
+    db.close()
+
+
+REFUSALS = {
+    "its number": None,
+    "the row": "BEFORE INSERT ON epoch WHEN NEW.number = 4",
+    "its observations": "BEFORE INSERT ON detail",
+    "a word": "BEFORE INSERT ON status_code WHEN NEW.status = 'ok'",
+    "its time": "BEFORE INSERT ON epoch WHEN NEW.frame_time > 1e9 + 3.5",
+}
+
+
+@pytest.mark.parametrize("refusal", REFUSALS)
+def test_a_refused_row_is_lost_for_everybody(guard, path, tmp_path, refusal):  # noqa: F811
+    if REFUSALS[refusal] is None:
+        guard.keep(2, time_s=2e9)
+    else:
+        refuse(path, REFUSALS[refusal])
+        guard.keep(4)
+    assert guard.lost == 1
+    document = {"store": guard.status(), "pid": 1, "stalled": []}
+    live = LiveState(tmp_path / "live")
+    live.write_status(document)
+    well, why = View(path, live.folder).healthy()
+    assert not well
+    assert "an epoch was lost" in why
+    others = {"cameras": {}, "thermometers": {}, "outputs": {}, "clock": {"trusted": True},
+              "frames": {"paused": ""}}  # fmt: skip
+    assert any("1 epochs are lost" in text for text in status_warnings(document | others))
+    (event,) = [e for e in guard.stored_events() if e.kind == "epoch_lost"]
+    assert "epoch" in event.text
+    # an hour later the page is well again, the count stays
+    status_file = live.folder / "status.json"
+    later = json.loads(status_file.read_text())
+    later["store"]["lost_s_ago"] = 3601.0
+    status_file.write_text(json.dumps(later))
+    assert View(path, live.folder).healthy() == (True, "")
+
+
+def test_the_exit_status_of_status_says_so(guard, tmp_path, monkeypatch, capsys):  # noqa: F811
+    guard.keep(2, time_s=2e9)
+    document = {
+        "store": guard.status(), "stalled": [], "cameras": {}, "thermometers": {}, "outputs": {},
+        "clock": {"trusted": True}, "frames": {"paused": ""}, "sessions": {}, "age_s": 0.0,
+        "utc": 1.0, "started": 0.0, "pid": 1, "version": "0",
+    }  # fmt: skip
+    monkeypatch.setattr("thermocald.cli.status.read_status", lambda *_: document)
+    with pytest.raises(DataError, match="1 epochs were lost"):
+        status()
+    assert "1 epochs are lost" in capsys.readouterr().out
+
+
+def test_the_exit_status_of_run_says_so(tmp_path):
+    """A whole run at the command line: one epoch of twenty is refused by the file."""
+    recording = make_recording(tmp_path / "small", 20)
+    run = ["run", "--recording", recording, "--fast", "--store", tmp_path / "t.db"]
+    with Store.open(tmp_path / "t.db", "append"):
+        pass
+    refuse(tmp_path / "t.db", "BEFORE INSERT ON epoch WHEN NEW.number = 7")
+    done = call(*run, folder=tmp_path)
+    assert done.returncode == 1
+    assert "1 epochs were lost: epoch 7 of rpi" in done.stderr
+    with Store.open(tmp_path / "t.db") as store:
+        numbers = [s.epoch.number for s in store.epochs(store.find_series())]
+    assert numbers == [n for n in range(1, 21) if n != 7]
+
+
+def test_what_waits_at_the_end_for_a_store_that_is_away_is_lost(guard, path):  # noqa: F811
+    def away():
+        raise StoreError("the disk is away")
+
+    guard._file.watch = away
+    refuse(path, "BEFORE INSERT ON epoch")
+    guard.keep(4)
+    assert (guard.waiting, guard.lost) == (1, 0)
+    guard.close()
+    assert guard.lost == 1
+    assert guard.status()["lost_why"].startswith("epoch 4: ")
+
+
+@pytest.mark.parametrize("how", ["the keeper breaks", "too slow", "the end", "too many wait"])
+def test_an_epoch_that_is_not_handed_over_is_lost(how):
+    gate, told = threading.Event(), []
+
+    def keep(acquired):
+        if how == "the keeper breaks":
+            raise RuntimeError("a mistake of ours")
+        gate.wait(20.0)
+
+    keeper = SimpleNamespace(keep=keep, amend=None, backlog=lambda below: None)
+    pipeline = Pipeline(
+        "cam", None, Readings({}), (), keeper, SystemClock(), depth=1, patience_s=0.0,
+        on_lost=told.append,
+    )  # fmt: skip
+    pipeline.start()
+    count = 2 if how == "the keeper breaks" else 8 if how in ("too slow", "too many wait") else 3
+    for _ in range(count):
+        pipeline.submit(Frame(np.zeros((4, 4), np.uint8), 0.0, 0.0))
+    if how == "the keeper breaks":
+        until(lambda: len(told) == count)
+    elif how == "the end":
+        pipeline.stop(0.2)
+    gate.set()
+    assert pipeline.stop(20.0) or how == "the end"
+    assert pipeline.lost == len(told) > 0
+    assert all(text.startswith("camera cam: ") for text in told)
+
+
+def test_an_alert_says_so_and_takes_it_back():
+    watch = Watch([condition_of({"lost": 1})])
+    rows = [
+        {"epoch": n, "series": "M1", "status": "ok", "frame_time": float(n), "lost": lost}
+        for n, lost in enumerate([0, 0, 1, 1, 4, 4])
+    ]
+    alerts = [(r["epoch"], a.state, a.text) for r in rows for a in watch.changes(r, "cam")]
+    assert [(n, state) for n, state, _ in alerts] == [(2, "out"), (3, "in"), (4, "out"), (5, "in")]
+    assert alerts[2][2] == "cam: 3 epochs were taken and not kept (limit 1)"

@@ -1,0 +1,74 @@
+"""What chips and loggers give, from their data sheets and public drivers: right, or refused.
+
+`chip_outputs.tsv` has a row each: the driver, the chip, what it gives, further options, the
+temperature that it means or `refuse`, and the source. All go through the driver as it is, as the
+first reading after opening: nothing supports a value that the chip gives without having measured.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.drivers.fakes.sysfs import Sysfs
+from tests.drivers.test_device_outputs import phone_reads, serial
+from thermocald.errors import BadReading
+from thermocald.hal import VirtualClock, open_device
+
+with Path(__file__).with_suffix("").with_name("chip_outputs.tsv").open() as file:
+    ROWS = list(csv.DictReader(file, delimiter="\t", quoting=csv.QUOTE_NONE))
+REFUSE = "refuse"
+
+
+def fields(text):
+    return dict(part.split("=") for part in text.split())
+
+
+def kernel(row, folder):
+    sysfs, name = Sysfs(folder), row["chip"]
+    if row["driver"] == "hwmon":
+        sysfs.hwmon(0, name, temp1_input=row["what it gives"])
+    elif row["driver"] == "iio":
+        sysfs.iio(0, name, **{f"in_temp_{k}": v for k, v in fields(row["what it gives"]).items()})
+    else:
+        sysfs.zone(0, name, row["what it gives"])
+    key, driver = ("zone", "thermal_zone") if row["driver"] == "zone" else ("chip", row["driver"])
+    options = {key: name, "sysfs": str(folder), **json.loads(row["options"] or "{}")}
+    with open_device("thermometer", driver, options, VirtualClock()) as device:
+        return device.read().values["temperature"]
+
+
+def reading(row, server, folder):
+    """°C as the driver reads the row; BadReading where it refuses it."""
+    if row["driver"] == "serial":
+        options = {"pattern": r"T=(?P<temperature>\S+)", **json.loads(row["options"] or "{}")}
+        return serial(server, folder, row["what it gives"], options)
+    if row["driver"] == "battery":
+        lines = [f"  {k}: {v}" for k, v in fields(row["what it gives"]).items()]
+        text = "\n".join(["Current Battery Service state:", "  present: true", *lines, ""])
+        return phone_reads(server, {"temperature": "battery"}, battery=text)["temperature"]
+    return kernel(row, folder)
+
+
+@pytest.mark.parametrize(
+    "row", ROWS, ids=lambda row: f"{row['driver']} {row['chip']} {row['what it gives']}"
+)
+def test_a_chip_is_read_rightly_or_refused(row, server, tmp_path):
+    found, message = REFUSE, ""
+    try:
+        found = reading(row, server, tmp_path)
+    except BadReading as error:
+        message = str(error)
+    assert len(message.splitlines()) <= 1
+    expected = row["expected"]
+    # the kernel's offsets and scales are rounded to as much as 3 mK
+    assert found == (REFUSE if expected == REFUSE else pytest.approx(float(expected), abs=5e-3))
+
+
+def test_there_are_two_hundred():
+    """With good readings among them: a driver that refuses everything would pass otherwise."""
+    assert len(ROWS) >= 200
+    assert sum(row["expected"] != REFUSE for row in ROWS) >= 60

@@ -1,0 +1,326 @@
+"""Outputs of devices that nobody wrote down: refused with one line, or right.
+
+Strategies make a chip's conversion, a firmware's way of printing and a user's correction, and what
+the chip gives without having measured. Few examples here, thousands in the slow suite.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from thermocald_drivers import chips
+from thermocald_drivers.android_thermometer import battery
+from thermocald_drivers.kernel import HwmonThermometer, IioThermometer
+from thermocald_drivers.serial_line import UNITS, SerialThermometer
+
+from tests.drivers.fakes.pty_instrument import Instrument
+from tests.drivers.fakes.sysfs import Sysfs
+from thermocald.errors import BadReading, ConfigurationError
+from thermocald.hal import SystemClock, VirtualClock, driver_names, open_device
+
+FEW = {"max_examples": 60, "deadline": None, "derandomize": True,
+       "suppress_health_check": [HealthCheck.function_scoped_fixture]}  # fmt: skip
+MANY = {**FEW, "max_examples": 3000}
+
+
+FEWER, MORE = {**FEW, "max_examples": 12}, {**FEW, "max_examples": 200}  # for each driver
+AMOUNTS = pytest.mark.parametrize(
+    "amount",
+    [pytest.param(FEW, id="few"), pytest.param(MANY, id="many", marks=pytest.mark.slow)],
+)
+
+
+def one_line(error):
+    assert len(str(error).splitlines()) == 1
+    assert "Traceback" not in str(error)
+
+
+# --- a firmware that prints, and a user who corrects -------------------------------------
+
+CORRECTED = st.tuples(
+    st.sampled_from(["C", "F", "K"]),
+    st.sampled_from([0, 1, 2, 3]),  # decimals
+    st.sampled_from([1.0, 0.98, 1.03]),
+    st.floats(-3.0, 3.0).map(lambda value: round(value, 2)),
+    st.sampled_from(["%", ","]),
+)
+
+
+def printed(celsius, unit, decimals, comma):
+    factor, zero = UNITS[unit]
+    text = f"{celsius / factor + zero:.{decimals}f}"
+    return text.replace(".", ",") if comma == "," else text
+
+
+def line_read(text, **options):
+    """°C of a line as the driver converts it, without the tty; None where it is refused."""
+    device = SerialThermometer(clock=VirtualClock(), port="none", pattern=r"(?P<t>\S+)", **options)
+    match = device.pattern.fullmatch(text)
+    try:
+        return device._values(match)["t"]
+    except BadReading as error:
+        one_line(error)
+        return None
+
+
+def no_sensor(celsius, how):
+    unit, decimals, scale, offset, comma = how
+    text = printed(celsius, unit, decimals, comma)
+    assert line_read(text, unit=unit, scale=scale, offset=offset) is None, text
+
+
+def no_sensor_of_a_chip(name, k, how):
+    unit, decimals, scale, offset, comma = how
+    values = [c for c in chips.idle_celsius(name) if abs(c) > 0.05] or [0.0]
+    text = printed(values[k % len(values)], unit, max(decimals, 1), comma)
+    assert line_read(text, unit=unit, scale=scale, offset=offset, chip=name) is None, text
+
+
+def measured(celsius, how):
+    unit, decimals, scale, offset, comma = how
+    factor, zero = UNITS[unit]
+    text = printed(celsius, unit, max(decimals, 1), comma)
+    number = float(text.replace(",", "."))
+    found = line_read(text, unit=unit, scale=scale, offset=offset)
+    if found is not None:
+        assert found == pytest.approx(factor * (number * scale + offset - zero), abs=1e-9)
+
+
+TEXTS = st.text(alphabet="0123456789+-.,eE_nNaAiIfF °xX٢", max_size=12)
+
+
+def any_text(text):
+    if text.strip() and not any(c.isspace() for c in text):
+        found = line_read(text)
+        assert found is None or math.isclose(found, float(text.replace(",", ".")))
+
+
+@AMOUNTS
+def test_what_is_printed_without_a_sensor_is_refused(amount):
+    settings(**amount)(given(st.sampled_from(chips.FIRMWARE_C), CORRECTED)(no_sensor))()
+
+
+@AMOUNTS
+def test_what_a_chip_gives_without_measuring_is_refused(amount):
+    settings(**amount)(
+        given(st.sampled_from(chips.names()), st.integers(0, 10), CORRECTED)(no_sensor_of_a_chip)
+    )()
+
+
+@AMOUNTS
+def test_what_is_measured_is_right_or_refused(amount):
+    settings(**amount)(given(st.floats(-38.0, 83.0), CORRECTED)(measured))()
+
+
+@AMOUNTS
+def test_any_text_is_a_number_or_refused(amount):
+    settings(**amount)(given(TEXTS)(any_text))()
+
+
+# --- words of chips under the kernel ------------------------------------------------------
+
+WORDS = st.sampled_from(sorted(chips.ANY_WORDS))
+FORMATS = st.tuples(st.floats(-20000, 20000), st.floats(0.05, 300.0))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("sys")
+
+
+def kernel_read(driver, cls, folder, name, **files):
+    getattr(Sysfs(folder), driver)(0, name, **files)
+    with cls(clock=VirtualClock(), chip=name, sysfs=str(folder)) as device:
+        try:
+            return device.read().values["temperature"]
+        except BadReading as error:
+            one_line(error)
+            return None
+
+
+@AMOUNTS
+def test_words_without_a_measurement_are_refused_whatever_the_scale(amount, folder):
+    @settings(**amount)
+    @given(WORDS, FORMATS)
+    def check(word, form):
+        offset, scale = form
+        files = {
+            "in_temp_raw": f"{word}",
+            "in_temp_offset": f"{offset}",
+            "in_temp_scale": f"{scale}",
+        }
+        assert kernel_read("iio", IioThermometer, folder, "anychip", **files) is None
+
+    check()
+
+
+@AMOUNTS
+def test_any_content_of_sysfs_is_right_or_refused(amount, folder):
+    content = st.one_of(
+        st.integers(-300_000, 3_000_000).map(str),
+        st.text(alphabet="0123456789-+. eEx_\tNaif٢", max_size=9),
+    )
+
+    @settings(**amount)
+    @given(content, st.sampled_from(["lm75", "it87", "sht3x", "anychip", "k10temp"]))
+    def check(text, name):
+        found = kernel_read("hwmon", HwmonThermometer, folder, name, temp1_input=text)
+        if found is not None:
+            assert found == pytest.approx(float(text) / 1000.0)
+            assert -55.0 <= found <= 125.0
+            assert not chips.is_idle(name, found)
+
+    check()
+
+
+def test_a_recent_reading_supports_what_a_chip_also_gives_unmeasured(folder):
+    sysfs, clock, read = Sysfs(folder), VirtualClock(), []
+    sysfs.hwmon(0, "lm75", temp1_input="2000")
+    with HwmonThermometer(clock=clock, chip="lm75", sysfs=str(folder)) as device:
+        for milli, wait in (("2000", 10), ("0", 10), ("-500", 10), ("-500", 50), ("-1000", 1)):
+            sysfs.hwmon(0, "lm75", temp1_input=milli)
+            clock.advance(wait)
+            try:
+                read.append(device.read().values["temperature"])
+            except BadReading:
+                read.append(None)
+    assert read == [2.0, 0.0, -0.5, None, None]
+
+
+# --- units that switch --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("unit", [None, "thousandths"])
+@pytest.mark.parametrize("after", ["45", "450", "46", "447"])
+def test_a_zone_that_switches_its_unit(unit, after, tmp_path):
+    sysfs, read = Sysfs(tmp_path), []
+    sysfs.zone(0, "skin", "45000")
+    options = {"zone": "skin", "sysfs": str(tmp_path)} | ({"unit": unit} if unit else {})
+    device = open_device("thermometer", "thermal_zone", options, VirtualClock())
+    for number in ("45000", "45200", after, after, "45100"):
+        sysfs.zone(0, "skin", number)
+        device.open()
+        try:
+            read.append(device.read().values["temperature"])
+        except BadReading:
+            read.append(None)
+            device.close()  # as the daemon does after each fault
+    device.close()
+    assert read == [45.0, 45.2, None, None, 45.1]
+
+
+@AMOUNTS
+def test_a_battery_in_any_unit_is_right_or_refused(amount):
+    @settings(**amount)
+    @given(st.floats(-20.0, 60.0), st.sampled_from([1.0, 0.1, 0.001]), st.integers(3300, 4400))
+    def check(celsius, unit, millivolts):
+        number = round(celsius / unit)
+        found = battery(f"present: true\nvoltage: {millivolts}\ntemperature: {number}\n")
+        if found is not None and unit != 0.001:
+            assert found[0] * found[1] == pytest.approx(number * unit)
+
+    check()
+
+
+def test_a_battery_whose_unit_was_certain_is_read_in_a_frost(server):
+    from tests.drivers.fakes.adb_server import FakePhone
+
+    def dump(number):
+        return f"present: true\nvoltage: 3900\ntemperature: {number}\n"
+
+    phone = FakePhone(battery=dump(55))
+    server.listing, server.phones = None, {"X": phone}
+    options = {"serial": "X", "port": server.port, "start_server": False}
+    read = []
+    with open_device("thermometer", "android", options, VirtualClock()) as device:
+        for number in (55, 92, 61, 24, 5, 45):  # unknown; then in tenths
+            phone.battery = dump(number)
+            try:
+                read.append(device.read().values["temperature"])
+            except BadReading:
+                read.append(None)
+    assert read == [None, 9.2, 6.1, 2.4, 0.5, 4.5]
+
+
+# --- half a late line ---------------------------------------------------------------------
+
+LINES = [b"+023.5C\r", b"T=+023.5C\r\n", b"  21.75 C\r\n"]
+
+
+@pytest.mark.parametrize("line", LINES)
+@pytest.mark.parametrize("reopened", [False, True])
+def test_the_rest_of_a_late_line_is_no_answer(line, reopened):
+    """Cut at every other byte: what was late is dropped, and the answer to this command used."""
+    number = r"(?:T=)?\s*(?P<temperature>[-+]?\d*\.\d+) ?C"
+    for cut in range(2, len(line), 2):
+        far = Instrument()
+        options = {"port": far.port, "pattern": number, "command": "?\r", "timeout_s": 0.6}
+        device = open_device("thermometer", "serial", options, SystemClock())
+        device.open()
+        far.send(line[:cut])
+        if reopened:
+            time.sleep(0.02)
+            device.close()
+            device.open()
+        rest = b"" if reopened else line[cut:]  # what was late is lost while it is closed
+        far.answers = {b"?\r": [rest + b"+018.25C\r", b"+018.25C\r", b"+018.25C\r"]}
+        try:
+            assert device.read().values["temperature"] == 18.25 or not line[:cut].strip()
+        finally:
+            device.close()
+            far.close()
+
+
+def test_a_prompt_is_no_late_line():
+    far = Instrument({b"?\r": [b"21.5 C\r\n> ", b"21.6 C\r\n> ", b"21.7 C\r\n> "]})
+    options = {"port": far.port, "pattern": r"(?P<t>[\d.]+) C", "command": "?\r", "timeout_s": 0.5}
+    with open_device("thermometer", "serial", options, SystemClock()) as device:
+        assert [device.read().values["t"] for _ in range(3)] == [21.5, 21.6, 21.7]
+    far.close()
+
+
+# --- options ------------------------------------------------------------------------------
+
+SCALARS = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8)
+KEYED = st.dictionaries(st.text(max_size=5), SCALARS, max_size=2)
+ANYTHING = SCALARS | KEYED | st.lists(SCALARS | KEYED | st.lists(SCALARS, max_size=3), max_size=3)
+
+
+@pytest.mark.parametrize(
+    "amount",
+    [pytest.param(FEWER, id="few"), pytest.param(MORE, id="more", marks=pytest.mark.slow)],
+)
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [(kind, name) for kind in ("camera", "thermometer", "output") for name in driver_names(kind)],
+)
+def test_any_option_is_taken_or_refused_in_one_line(kind, name, amount):
+    from thermocald.hal import load_driver, option_names
+
+    fields = load_driver(kind, name).Options.model_fields
+    required = {key: ANYTHING for key in option_names(kind, name) if fields[key].is_required()}
+    more = {key: ANYTHING for key in fields if key not in required}
+
+    @settings(**amount)
+    @given(st.fixed_dictionaries(required, optional=more))
+    def check(options):
+        try:
+            device = open_device(kind, name, options, VirtualClock())
+        except ConfigurationError as error:
+            message = str(error)
+        else:
+            device.close()
+            return
+        assert message.startswith(f"{kind} driver {name!r}: ")
+        assert "Traceback" not in message
+
+    check()
+
+
+def test_threads_are_not_left_behind():
+    assert not [t for t in threading.enumerate() if t.name == "instrument"]

@@ -1,0 +1,105 @@
+"""Which station and server rows are of: two of one name, one of two places, a copied store."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import psycopg
+import pytest
+
+from tests.fleet.conftest import address, count
+from thermocald.fleet.cursor import Cursor
+from thermocald.fleet.findings import add_findings
+from thermocald.fleet.forward import Forwarder
+from thermocald.fleet.overview import read_overview
+from thermocald.store.database.store import Store
+from thermocald.store.server.connection import ServerAddress, create_tables
+from thermocald.store.server.fleet_reader import FleetReader
+
+
+def filled_store(path, head, field, make_epoch, make_result, epochs=5) -> Path:
+    with Store.open(path, "append", durable=False) as store:
+        series = store.create_series(head, field)
+        for i in range(1, epochs + 1):
+            store.append(series, make_epoch(i), make_result(i))
+    return path
+
+
+@pytest.fixture
+def two(tmp_path, head, field, make_epoch, make_result):
+    made = (head, field, make_epoch, make_result)
+    return [filled_store(tmp_path / f"{name}.db", *made) for name in ("one", "two")]
+
+
+def test_two_stations_of_one_name_are_told_apart_and_reported(server, two):
+    place = address(server)
+    for store in two:
+        assert Forwarder(store, place, "gauge-7").send_waiting().rows == 5
+    assert count(server, "series") == 2
+    assert count(server, "epoch") == 10
+    assert count(server, "station") == 2
+    with FleetReader(place) as fleet:
+        assert fleet.stations()["gauge-7"].stores == 2
+    now, cameras = read_overview(place, Path("x"))
+    add_findings(cameras, [], now)
+    assert "twins" in {finding.kind for camera in cameras for finding in camera.findings}
+
+
+def test_one_station_that_got_a_new_store_is_no_twin(server, two):
+    place = address(server)
+    Forwarder(two[0], place, "gauge-7").send_waiting()
+    with psycopg.connect(server.address(name="thermocald")) as connection:
+        connection.execute("UPDATE station SET contact = contact - 7200")
+    Forwarder(two[1], place, "gauge-7").send_waiting()
+    with FleetReader(place) as fleet:
+        assert fleet.stations()["gauge-7"].stores == 1
+
+
+@pytest.mark.parametrize("part", ["database", "user", "host", "option", "port in another form"])
+def test_another_server_gets_every_row(server, two, part):
+    """As the cursor sees it; for another database, as the rows arrive."""
+    one = "postgresql://owner@127.0.0.1:5432/thermocald?host=/run/a"
+    other = {
+        "database": one.replace("/thermocald", "/elsewhere"),
+        "user": one.replace("owner@", "other@"),
+        "host": one.replace("/run/a", "/run/b"),
+        "option": one + "&options=-csearch_path%3Dx",
+        "port in another form": one.replace(":5432", "") + "&port=5433",
+    }[part]
+    places = [ServerAddress.parse(text).place for text in (one, other)]
+    with Store.open(two[0]) as store:
+        path = two[0].with_name("cursor")
+        cursor = Cursor.read(path, store, places[0], "a")
+        cursor.sent["epoch"] = 5
+        cursor.write(path)
+        assert Cursor.read(path, store, places[0], "a").sent["epoch"] == 5
+        assert Cursor.read(path, store, places[1], "a").sent["epoch"] == 0
+    if part != "database":
+        return
+    with psycopg.connect(server.address(), autocommit=True) as connection:
+        connection.execute("DROP DATABASE IF EXISTS elsewhere WITH (FORCE)")
+        connection.execute("CREATE DATABASE elsewhere")
+    elsewhere = ServerAddress.parse(server.address(name="elsewhere"))
+    create_tables(elsewhere)
+    for place in (address(server), elsewhere):
+        assert Forwarder(two[0], place, "gauge-7").send_waiting().rows == 5
+        assert Forwarder(two[0], place, "gauge-7").send_waiting().rows == 0
+
+
+def test_a_restored_or_another_store_under_the_old_name_is_sent_from_its_start(server, two):
+    place = address(server)
+    kept = two[0].with_name("backup.db")
+    with Store.open(two[0]) as store:
+        store.copy_to(kept)
+        identity = store.identity
+    assert Forwarder(two[0], place, "a").send_waiting().rows == 5
+    two[0].unlink()
+    shutil.copyfile(kept, two[0])
+    with Store.open(two[0]) as store:
+        assert store.identity == identity  # a copy is the same store
+    Forwarder(two[0], place, "a").send_waiting()
+    assert count(server, "epoch") == 5  # nothing twice
+    shutil.copyfile(two[1], two[0])
+    Forwarder(two[0], place, "a").send_waiting()
+    assert count(server, "epoch") == 10

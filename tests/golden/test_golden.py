@@ -1,0 +1,62 @@
+"""What users see stays what it is, or is renewed on purpose (`make golden`)."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.golden.cases import CASES, EXCUSED, Case
+from tests.golden.compare import Bounds, differences
+from tests.golden.corpora import CORPORA, check
+from tests.golden.workshop import DATA, EXPECTED, Workshop, wrong
+from thermocald.cli.commands import COMMANDS
+
+
+@pytest.fixture(scope="module")
+def workshop(tmp_path_factory):
+    return Workshop(tmp_path_factory.mktemp("golden"))
+
+
+@pytest.mark.parametrize("case", CASES, ids=[case.name for case in CASES])
+def test_golden(workshop, case: Case):
+    if case.needs_data and not DATA.is_dir():
+        pytest.skip("the reference data are absent")
+
+    assert wrong(case, workshop.result(case.name)) == []
+
+
+def test_every_command_is_held_or_excused():
+    held = {case.words[0] for case in CASES}
+
+    assert set(COMMANDS) == held | set(EXCUSED)
+    assert not held & set(EXCUSED)
+
+
+def test_nothing_is_stored_that_no_case_makes():
+    stored = {path.stem for path in EXPECTED.iterdir()}
+
+    assert stored <= {c.name for c in CASES} | {f"corpus-{name}" for name in CORPORA}
+    assert sum(path.stat().st_size for path in EXPECTED.iterdir()) < 400_000
+
+
+def test_a_number_that_moved_is_seen():
+    before = {"c": 3.04, "sd_c": 1e-4, "text": "c = 3.0400 mm in 12 epochs", "n": 12}
+    bound = Bounds(1e-9, 1e-6, 1e-3)
+
+    assert list(differences(before, {**before, "c": 3.04 + 1e-11}, bound)) == []
+    assert list(differences(before, {**before, "c": 3.04 + 1e-8}, bound))
+    assert list(differences(before, {**before, "sd_c": 1.0005e-4}, bound)) == []
+    assert list(differences(before, {**before, "sd_c": 1.002e-4}, bound))
+    assert list(differences(before, {**before, "text": "c = 3.0401 mm in 12 epochs"}, bound)) == []
+    assert list(differences(before, {**before, "text": "c = 3.0402 mm in 12 epochs"}, bound))
+    assert list(differences(before, {**before, "text": "c = 3.0400 mm in 13 epochs"}, bound))
+    assert list(differences(before, {**before, "n": 13}, bound))
+    assert list(differences(before, {"c": 3.04}, bound)) == [": without sd_c, text, n"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CORPORA)
+def test_corpus(name):
+    if name.startswith("real") and not DATA.is_dir():
+        pytest.skip("the reference data are absent")
+
+    assert check(name) == []

@@ -1,0 +1,190 @@
+"""The folder in which the commands run, and what they leave there."""
+
+from __future__ import annotations
+
+import csv
+import functools
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+
+from tests.commands import call
+from tests.golden.cases import CASES, Case
+from tests.golden.compare import differences, parsed, shortened
+
+EXPECTED = Path(__file__).parent / "expected"
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+_LINES = 60
+_BY_NAME = {case.name: case for case in CASES}
+_LAG = """format: thermocald-effect/1
+effects:
+  - effect: thermal_lag
+    parameters: {tau: {value: 75.0, sd: 2.0, unit: s}}
+"""
+_PROGRAMME = """format: thermocald-programme/1
+name: warm-up
+epochs: 90
+interval: 20.0
+ambient: 21.0
+sources: {housing: [{from: 0, to: 1800, value: 3.0}]}
+"""
+
+
+class Workshop:
+    """Runs each case once, those before it that it needs first."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.found: dict[str, dict[str, Any]] = {}
+        if DATA.is_dir():
+            (folder / "data").symlink_to(DATA)
+        write_inputs(folder)
+
+    def result(self, name: str) -> dict[str, Any]:
+        """Exit status, lines printed, files written; as they are stored."""
+        if name not in self.found:
+            case = _BY_NAME[name]
+            for earlier in case.after:
+                self.result(earlier)
+            if make := INPUTS.get(name):
+                make(self.folder)
+            self.found[name] = _run(case, self.folder)
+        return self.found[name]
+
+
+def _run(case: Case, folder: Path) -> dict[str, Any]:
+    for name in case.writes:
+        (folder / name).unlink(missing_ok=True)
+    with mock.patch.dict(os.environ, COLUMNS="100"):
+        done = call(*case.words, folder=folder)
+    files = {n: parsed(n, (folder / n).read_text()) for n in case.writes if (folder / n).exists()}
+    out: dict[str, Any] = {"status": done.returncode}
+    if done.returncode:
+        out["error"] = done.stderr.splitlines()[-1]
+    if done.stdout.startswith("{"):
+        out["document"] = json.loads(done.stdout)
+    else:
+        out["printed"] = done.stdout.splitlines()
+    short = shortened(json.loads(json.dumps({**out, "files": files})))
+    if "printed" in out and len(out["printed"]) <= _LINES:
+        short["printed"] = out["printed"]
+    return short
+
+
+def wrong(case: Case, found: dict[str, Any]) -> list[str]:
+    """What is not as it is stored; a line that says so where nothing is."""
+    path = EXPECTED / f"{case.name}.json"
+    if not path.is_file():
+        return [f"{path.name} is missing: python -m tests.golden --update {case.name}"]
+    return list(differences(json.loads(path.read_text()), found, case.tolerance))
+
+
+def store(case: Case, found: dict[str, Any]) -> None:
+    """Keep a result as what is expected from now on; 14 digits of each number."""
+    EXPECTED.mkdir(exist_ok=True)
+    text = json.dumps(_rounded(found), separators=(",", ":"), ensure_ascii=False)
+    # one entry a line, so that a change is a line of a diff
+    text = text.replace(',"', ',\n"').replace(":{", ":\n{")
+    (EXPECTED / f"{case.name}.json").write_text(text + "\n")
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _rounded(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_rounded(v) for v in value]
+    return float(f"{value:.13e}") if isinstance(value, float) else value
+
+
+def write_inputs(folder: Path) -> None:
+    """Small files that commands read."""
+    (folder / "lag.yaml").write_text(_LAG)
+    (folder / "programme.yaml").write_text(_PROGRAMME)
+    camera = {
+        "format": "thermocald-camera/1",
+        "name": "pi",
+        "sensor": {"width": 3280, "height": 2464, "pixel_pitch": 0.00112},
+        "interior": {"c": 3.04, "x0": 0.01, "y0": -0.02, "A1": -2.5e-3, "A2": 1e-4, "B1": 1e-5},
+    }
+    (folder / "pi.json").write_text(json.dumps(camera))
+
+
+def points(folder: Path) -> None:
+    """Points of an image at the times of M1's epochs."""
+    rows = parsed("epochs.csv", (folder / "M1/epochs.csv").read_text())
+    rng = np.random.default_rng(0)
+    text = "time,x,y\n" + "".join(
+        f"{t:.3f},{x:.3f},{y:.3f}\n"
+        for t in rows["frame_time"][::3]
+        for x, y in rng.uniform(100, 2300, (4, 2))
+    )
+    (folder / "points.csv").write_text(text)
+
+
+def photographs(folder: Path) -> None:
+    """Six small photographs with EXIF times, and a German logger's file."""
+    from PIL import Image
+
+    (folder / "photos").mkdir(exist_ok=True)
+    for i in range(6):
+        exif = Image.Exif()
+        exif.get_ifd(0x8769)[0x9003] = f"2026:06:14 12:00:{10 * i:02d}"
+        exif.get_ifd(0x8769)[0x920A] = 3.04
+        image = Image.fromarray(np.full((48, 64), 90, np.uint8))
+        image.save(folder / "photos" / f"{i}.jpg", exif=exif)
+    rows = [f"14.06.2026;12:0{i // 4}:{15 * (i % 4):02d};{21 + 0.25 * i:.2f}" for i in range(8)]
+    text = "Datum;Uhrzeit;Temperatur °C\n" + "\n".join(r.replace(".", ",", 0) for r in rows) + "\n"
+    (folder / "log.csv").write_text(text.replace("21.", "21,").replace("22.", "22,"), "latin-1")
+
+
+def blind(folder: Path, name: str, effects: tuple[str, ...], strength: float, seed: int) -> None:
+    """A blind recording: written by code that shares nothing with the program."""
+    from tests.blind.case import Case as Blind
+    from tests.blind.generator import generate, write
+
+    for series in generate(Blind(effects, strength, seed))[0]:
+        write(series, folder / name / series.name)
+
+
+def real(folder: Path, camera: str, effect: str, seed: int) -> None:
+    """An effect hidden in the corners of a real camera."""
+    from tests.real_corners.generator import RealCase, generate, write
+
+    for series in generate(RealCase(camera, (effect,) if effect else (), seed))[0]:
+        write(series, camera, folder / "real" / series.name)
+
+
+def walls(folder: Path) -> None:
+    """Tags on the walls of a hall; corner 0 of these is the bottom right one."""
+    corner = ("viewer_bottom_right", "viewer_bottom_left", "viewer_top_left", "viewer_top_right")
+    with (DATA / "frc" / "targets.csv").open() as source:
+        rows = list(csv.DictReader(source))
+    lines = ["target,X,Y,Z,diameter,sX,sY,sZ,kind,code"]
+    for row in rows:
+        k, tag = corner.index(row["corner"]), row["tag_id"]
+        place = ",".join(row[f"{axis}_mm"] for axis in "XYZ")
+        lines.append(f"{tag}.{k},{place},,5,5,5,marker_corner,DICT_APRILTAG_36h11:{tag}:{k}")
+    (folder / "walls.csv").write_text("\n".join(lines) + "\n")
+    (folder / "lifecam.yaml").write_text(
+        "name: lifecam\nwidth: 1280\nheight: 720\npixel_pitch: 0.001\n"
+        "interior: {c: 1.1275, x0: -0.0139, y0: 0.0272}\n"
+    )
+
+
+INPUTS: dict[str, Callable[[Path], None]] = {
+    "correct": points,
+    "import": photographs,
+    "data-calibrate": walls,
+    "blind-time-offset": functools.partial(
+        blind, name="time_offset", effects=("time_offset",), strength=0.1, seed=41
+    ),
+    "blind-pair": functools.partial(
+        blind, name="pair", effects=("hysteresis", "decentering_drift"), strength=0.3, seed=50
+    ),
+    "real-lag": functools.partial(real, camera="aviary-cam6", effect="thermal_lag", seed=1),
+}

@@ -1,0 +1,161 @@
+"""Every command that computes, as users call it, on every real recording and a rendered session.
+
+Nothing thermal happens in the 50 s of the real cameras: whoever finds an effect there is wrong. The
+rendered session goes the way of somebody with a folder of photographs and a logger.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.commands import call
+from tests.main_paths import crooked
+
+REAL = ["aviary-cam0", "aviary-cam1", "aviary-cam2", "aviary-cam6"]
+SOME = [c if c == "aviary-cam2" else pytest.param(c, marks=pytest.mark.slow) for c in REAL]
+
+
+def run(*arguments: object, status: int = 0):
+    """A command that ends as it should, without a traceback or a warning of Python's."""
+    done = call(*arguments)
+    assert done.returncode == status, done.stderr
+    assert "Traceback" not in done.stderr
+    assert "Warning:" not in done.stderr
+    return done
+
+
+def with_temperature(recording: Path, out: Path, first: int, last: int) -> Path:
+    """Rows first to last of a recording, 30 s apart, with a temperature that was made up."""
+    shutil.copytree(recording, out)
+    with (out / "epochs.csv").open() as table:
+        heads = list(csv.DictReader(table))[first:last]
+    kept = {r["epoch"] for r in heads}
+    rng = np.random.default_rng([first, last])
+    for k, row in enumerate(heads):
+        row["frame_time"] = row["temperature_time"] = f"{1.7e9 + 30.0 * k:.1f}"
+        row["temperature"] = f"{22 + 12 * np.sin(k / 16) ** 2 + rng.normal(0, 0.03):.3f}"
+    with (out / "observations.csv").open() as table:
+        points = [r for r in csv.DictReader(table) if r["epoch"] in kept]
+    for name, content in (("epochs.csv", heads), ("observations.csv", points)):
+        with (out / name).open("w", newline="") as table:
+            writer = csv.DictWriter(table, content[0])
+            writer.writeheader()
+            writer.writerows(content)
+    return out
+
+
+@pytest.mark.parametrize("camera", SOME)
+def test_without_a_temperature(shared, tmp_path, camera):
+    """What needs a thermometer says so in one line; what does not gives its result."""
+    recording = shared / "data" / camera
+    checked = run("check", recording)
+    assert "101" in checked.stdout
+    replayed = json.loads(run("replay", recording, "--json", "-").stdout)
+    assert replayed["ok"] >= 100
+    run("export", recording, "-o", tmp_path / "rows.csv")
+    with (tmp_path / "rows.csv").open() as table:
+        assert len(list(csv.DictReader(table))) == 101
+    for command in (("fit", recording, "-o", tmp_path / "m.yaml"), ("discover", recording)):
+        refused = run(*command, status=1)
+        last = refused.stderr.strip().splitlines()[-1]
+        assert last.startswith("error: ")
+        assert "temperature" in last
+    assert not (tmp_path / "m.yaml").exists()
+
+
+@pytest.mark.parametrize("camera", SOME)
+def test_where_nothing_thermal_happens(shared, tmp_path, camera):
+    """No drift, no rate, no effect; and a report of it."""
+    m1 = with_temperature(shared / "data" / camera, tmp_path / "M1", 0, 50)
+    m2 = with_temperature(shared / "data" / camera, tmp_path / "M2", 50, 101)
+    page = tmp_path / "study.html"
+    study = json.loads(run("study", m1, m2, "--json", "-", "--report", page).stdout)
+    assert [len(camera["series"]) for camera in study["cameras"]] == [2]
+    assert page.stat().st_size > 10_000
+    found = json.loads(run("discover", m1, "--verify", m2, "--json", "-").stdout)
+    names = {e["effect"] for e in found["effects"]}
+    assert names <= {"target_displacement", "mount_motion"}, found["verdict"]
+    model = tmp_path / "camera.thermal.yaml"
+    fitted = json.loads(run("fit", m1, m2, "-o", model, "--json", "-").stdout)
+    for name, rate in fitted["rates"].items():
+        assert abs(rate["value"]) < 4 * rate["sd"], f"{name} {rate}"
+    predicted = run("predict", "--model", model, "--temperature", 28, "--json", "-")
+    assert json.loads(predicted.stdout)
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory):
+    """A folder of JPEGs with EXIF times, a logger's file, the field; and the truth."""
+    folder = tmp_path_factory.mktemp("photographs")
+    truth = crooked.write_frames(folder / "frames", 24, seed=4)
+    photos = folder / "photos"
+    photos.mkdir()
+    with (folder / "frames" / "epochs.csv").open() as table:
+        heads = list(csv.DictReader(table))
+    with (folder / "logger.csv").open("w", newline="") as out:
+        log = csv.writer(out, delimiter=";")
+        log.writerow(["Datum", "Uhrzeit", "Temperatur [°C]", "Feuchte [%]"])
+        for k in range(-6, 3 * len(heads) + 6):
+            moment = datetime.fromtimestamp(1.7e9 + k * 10 / 3, UTC)
+            log.writerow([moment.strftime("%d.%m.%Y"), moment.strftime("%H:%M:%S"),
+                          f"{24 + 0.05 * k * 10 / 3:.2f}".replace(".", ","), "45,1"])  # fmt: skip
+    for head in heads:
+        moment = datetime.fromtimestamp(float(head["frame_time"]), UTC)
+        with Image.open(folder / "frames" / head["frame"]) as image:
+            exif = image.getexif()
+            exif.get_ifd(0x8769)[0x9003] = moment.strftime("%Y:%m:%d %H:%M:%S")
+            exif.get_ifd(0x8769)[0x920A] = 3.04
+            exif[0x0110] = "bent"
+            image.save(photos / Path(head["frame"]).name, exif=exif, quality=95)
+    return folder, truth
+
+
+def test_photographs_and_a_logger(photographs, tmp_path):
+    """import, replay, study, fit, predict: the drift that was put in comes out, within 4 sd."""
+    folder, truth = photographs
+    m1 = tmp_path / "M1"
+    taken = run(
+        "import", folder / "photos", "--log", folder / "logger.csv", "--timezone", "UTC",
+        "--testfield", folder / "frames" / "testfield.csv", "--pixel-pitch", 0.00224, "--out", m1,
+    )  # fmt: skip
+    assert "24" in taken.stdout
+    replayed = json.loads(run("replay", m1, "--exterior", "series", "--json", "-").stdout)
+    assert replayed["ok"] == 24
+    run("export", m1, "-o", tmp_path / "rows.csv", "--exterior", "series")
+    with (tmp_path / "rows.csv").open() as table:
+        rows = list(csv.DictReader(table))
+    for name in ("c", "x0", "y0"):
+        values, sds = (np.array([float(r[f"{p}{name}"]) for r in rows]) for p in ("", "sd_"))
+        error = values - truth[name]
+        assert abs(error - error.mean()).max() < 5 * np.median(sds), name
+    page = tmp_path / "study.html"
+    run("study", m1, "--report", page)
+    assert "px" in page.read_text(encoding="utf-8")
+    model = tmp_path / "camera.thermal.yaml"
+    done = call("fit", m1, "-o", model)
+    assert "Traceback" not in done.stderr
+    assert done.returncode == 0, done.stderr
+    assert model.exists()
+    run("predict", "--model", model, "--temperature", 30)
+
+
+def test_calibrate_photographs(photographs, tmp_path):
+    """The same photographs as those of one calibration: one camera, c within the drift."""
+    folder, truth = photographs
+    some = sorted((folder / "photos").glob("*.jpg"))[::8]
+    document = json.loads(
+        run(
+            "calibrate", *some, "--testfield", folder / "frames" / "testfield.csv",
+            "--pixel-pitch", 0.00224, "--json", "-", "--report", tmp_path / "page.html",
+        ).stdout
+    )  # fmt: skip
+    assert [p["status"] for p in document["photographs"]] == ["ok"] * 3
+    assert truth["c"].min() - 0.002 < document["interior"]["c"] < truth["c"].max() + 0.002

@@ -1,0 +1,134 @@
+"""The page in a real browser, with several cameras: the one that is chosen rules all of it."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from tests.output.test_pages import keep
+from thermocald.epoch import Epoch
+from thermocald.photogrammetry.camera.camera_model import Sensor
+from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.store.database.store import Store
+from thermocald.store.recording.head import CameraSpec, Channel, Head
+from thermocald.store.series import EpochResult
+
+_OPEN = {"device": "open", "why": "", "since": None, "faults": 0}
+# c of camera k is k mm: what belongs to which camera can be read off
+_SHOWN = """() => ({
+  selected: document.querySelector('#camera').value,
+  figure: Number([...document.querySelectorAll('#figures dt')].find(e => e.textContent === 'c')
+    .nextElementSibling.textContent.split(' ')[0]),
+  curve: document.querySelector('#course').data.find(t => t.name === 'c').y[0],
+  note: document.querySelector('#course-note').textContent.split('/')[0],
+  csv: new URL(document.querySelector('#download').href).searchParams.get('camera'),
+  targets: document.querySelectorAll('#overlay circle').length,
+})"""
+_SETTLED = """name => document.querySelector('#course-note').textContent.startsWith(name + '/')
+  && document.querySelector('#frame-caption').textContent.startsWith('epoch')"""
+
+
+def _name(k: int) -> str:
+    return f"cam-{k:02}"
+
+
+@pytest.fixture
+def page_with(tmp_path):
+    """number of cameras → (address of a page with so many, a call that has the daemon run)."""
+    servers = []
+
+    def serve(cameras: int):
+        path, live = tmp_path / "t.db", tmp_path / "live"
+        live.mkdir()
+        status = {
+            "version": "0", "pid": 1, "utc": 1.6e9, "started": 1.6e9, "stalled": [],
+            "clock": {"trusted": True}, "store": {"state": "ok", "waiting": 0, "path": str(path)},
+            "frames": {"paused": ""}, "cameras": {}, "thermometers": {"housing": _OPEN},
+            "outputs": {"mqtt": {**_OPEN, "device": "out", "why": "no broker", "since": 1.6e9}},
+        }  # fmt: skip
+        with Store.open(path, "append", durable=False) as store:
+            for k in range(1, cameras + 1):
+                camera = CameraSpec(_name(k), Sensor(640, 480, 0.003))
+                head = Head(_name(k), "M1", 10.0, camera, {"temperature": Channel()})
+                series = store.create_series(head, TestField.build(["a"], np.zeros((1, 3))))
+                for n in range(1, 31):
+                    result = EpochResult("ok", "", np.full(16, float(k)), np.eye(16), 1.0, 10, 2,
+                                         ())  # fmt: skip
+                    time = 1.6e9 + 10 * n
+                    store.append(series, Epoch(n, time, time, {"temperature": 20.0 + n}), result)
+                last = {"epoch": 30, "frame_time": 1.6e9 + 300, "temperature": 50.0, "c": float(k),
+                        "sigma0": 1.0, "n_observations": k, "n_rejected": 0, "status": "ok",
+                        "state": "ready"}  # fmt: skip
+                status["cameras"][_name(k)] = {
+                    **_OPEN, "series": "M1", "period_s": 10.0, "late_p99_s": 0.0, "skipped": 0,
+                    "lost": 0, "deferred": 0, "caught_up": 0, "last": last,
+                }  # fmt: skip
+                targets = {"x": [9.0] * k, "y": [9.0] * k, "vx": [0.1] * k, "vy": [0.1] * k,
+                           "rejected": [False] * k}  # fmt: skip
+                (live / f"{_name(k)}.json").write_text(
+                    json.dumps({"row": {"epoch": 30}, "targets": targets})
+                )
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        command = [sys.executable, "-m", "thermocald", "dashboard", "--store", str(path)]
+        command += ["--live", str(live), "--port", str(port)]
+        server = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+        servers.append(server)
+        assert "the page is at" in server.stderr.readline()
+        start = lambda: (live / "status.json").write_text(json.dumps(status))  # noqa: E731
+        return f"http://127.0.0.1:{port}/", start
+
+    yield serve
+    for server in servers:
+        server.kill()
+        server.communicate()
+
+
+@pytest.mark.parametrize("cameras", [2, 12])
+def test_the_chosen_camera_rules_the_whole_page(cameras, page_with, page_of):
+    url, start = page_with(cameras)
+    page = page_of(url)
+    # the curves are there before the daemon says which cameras it has
+    page.wait_for_function("() => (document.querySelector('#course').data || []).length")
+    start()
+    page.wait_for_function("() => document.querySelector('#figures dd') !== null")
+    page.wait_for_function(_SETTLED, arg=page.input_value("#camera"))
+    first = int(page.input_value("#camera")[-2:])
+    assert page.evaluate(_SHOWN) == _all_of(first)
+
+    box = page.locator("#course .modebar").bounding_box()
+    curves = page.locator('#course .nsewdrag[data-subplot="xy"]').bounding_box()
+    assert box["y"] + box["height"] <= curves["y"] + 1  # the toolbar covers no curve
+    right = page.evaluate(
+        "[...document.querySelectorAll('section')].map(e => e.getBoundingClientRect().right)"
+    )
+    assert max(right) - min(r for r in right if r > 800) < 1  # no part of the width is left empty
+    keep(page, f"dashboard-{cameras}-1280")
+
+    # answers of cameras that are no longer wanted come late
+    slow, wanted = (_name(1), _name(cameras)) if first != 1 else (_name(cameras), _name(1))
+    page.evaluate(
+        """slow => { const get = window.fetch; window.fetch = async (path, ...more) => {
+        if (path.includes(slow)) await new Promise(done => setTimeout(done, 600));
+        return get(path, ...more); }; }""",
+        slow,
+    )
+    for name in (slow, wanted, slow, wanted):
+        page.select_option("#camera", name)
+    page.wait_for_function(_SETTLED, arg=wanted)
+    page.wait_for_timeout(1000)
+    assert page.evaluate(_SHOWN) == _all_of(int(wanted[-2:]))
+    assert "out since 2020-09-13 12:26:40 UTC no broker" in page.text_content("#devices")
+
+
+def _all_of(k: int) -> dict:
+    return {
+        "selected": _name(k), "figure": k, "curve": k, "note": _name(k), "csv": _name(k),
+        "targets": k,
+    }  # fmt: skip

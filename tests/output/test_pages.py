@@ -1,0 +1,348 @@
+"""Every report as a page, in a real browser: at 1280 and 390 px wide, and on A4.
+
+With THERMOCALD_PAGES=FOLDER the pages are kept as pictures there.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.blind.bridge import series_input
+from tests.blind.case import Case
+from tests.blind.generator import generate
+from tests.commands import call
+from tests.daemon.conftest import make_recording
+from thermocald.analysis.camera.photographs import calibrate_observations
+from thermocald.analysis.series.drift import with_drifts
+from thermocald.analysis.series.recorded import recorded_table
+from thermocald.analysis.study.study import StudySettings, study
+from thermocald.discovery.result import discover_series
+from thermocald.output.calibration import render_calibration
+from thermocald.output.discovery import report_html
+from thermocald.output.fleet import render_fleet
+from thermocald.output.study.report import render_study
+from thermocald.photogrammetry.camera.camera_model import Sensor, project
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
+from thermocald.photogrammetry.field.testfield import Observations
+from thermocald.physics.testfields import corner_field, demonstration_model
+from thermocald.store.recording.reader import open_recording
+from thermocald.thermal.reduce import reduce_together
+
+LONG = "Temp °C LGR SN 20493821 SEN SN 20493821 of the northern river bank, behind the gauge"
+NAMES = (LONG, "相机外壳温度传感器", "درجة حرارة غلاف الكاميرا")
+_MARKS = re.compile(r"<bound|object at 0x|\bnan\b|\bNone\b|np\.float")
+_TEXT = """() => { const all = document.body.cloneNode(true);
+  all.querySelectorAll('script, style').forEach(e => e.remove()); return all.textContent; }"""
+# Quadrilaterals of texts in one drawing that cross; a hair's breadth is none.
+_OVERLAPS = """() => {
+  const quad = text => {
+    const b = text.getBBox(), m = text.getScreenCTM(), e = 0.12 * b.height;
+    const [left, top, right, bottom] = [b.x + e, b.y + e, b.x + b.width - e, b.y + b.height - e];
+    return [[left, top], [right, top], [right, bottom], [left, bottom]]
+      .map(([x, y]) => new DOMPoint(x, y).matrixTransform(m));
+  };
+  const apart = (p, q) => [p, q].some(shape => shape.some((a, i) => {
+    const b = shape[(i + 1) % 4], n = [b.y - a.y, a.x - b.x];
+    const along = s => s.map(v => v.x * n[0] + v.y * n[1]);
+    const u = along(p), v = along(q);
+    return Math.max(...u) <= Math.min(...v) || Math.max(...v) <= Math.min(...u);
+  }));
+  const found = [];
+  for (const svg of document.querySelectorAll('svg')) {
+    const texts = [...svg.querySelectorAll('text')].filter(t => t.textContent.trim());
+    const quads = texts.map(quad);
+    quads.forEach((q, i) => quads.slice(0, i).forEach((p, j) => {
+      if (!apart(p, q)) found.push([texts[j].textContent, texts[i].textContent,
+        svg.getAttribute('aria-label')]);
+    }));
+  }
+  return found;
+}"""
+# Axes whose ticks are numbers and whose label is missing or has no unit.
+_WITHOUT_UNIT = """() => [...document.querySelectorAll('svg g[id*="matplotlib.axis_"]')]
+.filter(axis => {
+  const numbers = [...axis.querySelectorAll('g[id*="tick_"] text')]
+    .map(t => t.textContent.trim()).filter(Boolean);
+  if (!numbers.length || !numbers.every(t => /^[−\\d][\\d.,·⁰-⁹¹²³⁻]*$/.test(t))) return false;
+  const label = [...axis.children].filter(g => /-text_\\d+$/.test(g.id))
+    .map(g => g.textContent.trim()).join(' ');
+  return !/ in \\S|\\((no unit|number|count|UTC)\\)/.test(label);
+}).map(axis => axis.closest('svg').getAttribute('aria-label') + ': ' + axis.id)"""
+_WITHOUT_CAPTION = """() => [...document.querySelectorAll('figure')].filter(f =>
+  (f.querySelector('figcaption')?.textContent || '').split(/\\s+/).length < 10).length"""
+# A drawing is empty when it holds no stroke or face that is longer than an axis tick.
+_EMPTY = """() => [...document.querySelectorAll('figure .panel svg')].filter(svg => {
+  const marks = [...svg.querySelectorAll('[id*="axes_"] path, [id*="axes_"] use')]
+    .filter(p => (p.closest('[clip-path]') || p.closest('[id*="Quiver"]'))
+      && !p.closest('[id*="matplotlib.axis"]'));
+  return !marks.some(p => p.tagName === 'use' || p.getBBox().width > 2 || p.getBBox().height > 2);
+}).map(svg => svg.getAttribute('aria-label'))"""
+_WIDER = """width => [...document.querySelectorAll('body *')]
+  .filter(e => !e.closest('.scroll, svg, .panel'))
+  .filter(e => e.getBoundingClientRect().right > width + 1)
+  .map(e => e.outerHTML.slice(0, 120))"""
+
+
+def _study(warm_study, **_):
+    return render_study(warm_study, "My camera")
+
+
+def _study_of_names(warm_up, **_):
+    series = []
+    for k, name in enumerate(NAMES, start=1):
+        one = warm_up(seed=k)(name, label=LONG)
+        (thermometer,) = one.thermometers
+        more = tuple(replace(thermometer, name=n) for n in NAMES)
+        series.append(replace(one, thermometers=more))
+    return render_study(study(series, StudySettings(sets=500)), LONG)
+
+
+def _study_of_nothing(empty_study, **_):
+    return render_study(empty_study)
+
+
+def _discovered(effects, title, **more):
+    series, _ = generate(Case(effects, 0.3, **more))
+    return report_html(discover_series(reduce_together([series_input(s) for s in series])), title)
+
+
+def _discovery(**_):
+    series, _truth = generate(Case(("thermal_lag",), 0.3, 1))
+    return report_html(
+        discover_series(reduce_together([series_input(s) for s in series])), NAMES[1]
+    )
+
+
+def _discovery_of_nothing(**_):
+    return _discovered((), "M1", seed=23, with_m2=False)
+
+
+def _discovery_unexplained(**_):
+    return _discovered(("outside",), LONG, seed=24, with_m2=False)
+
+
+def _calibration(**_):
+    """Photographs from five places, with a gross error and a photograph without targets."""
+    field = corner_field("plain", per_side=6, pitch_mm=100.0)
+    model = demonstration_model(field)
+    rng = np.random.default_rng(5)
+    measured = []
+    for turn in (0.0, 0.05, -0.05, 0.1, -0.1):
+        eop = model.exterior.as_array() + np.array([0, 1, 20, 400, 0, 0]) * turn
+        points = project(model.sensor, model.interior.as_array(), eop, field.points)
+        points = points + rng.normal(0, 0.04, points.shape)
+        measured.append(Observations(np.arange(len(field)), points, np.full(points.shape, 0.04)))
+    measured[1].points[3] += 20.0
+    names = [f"{NAMES[k % 3]}-{k}.jpg" for k in range(5)]
+    result = calibrate_observations(
+        names, measured, {}, field, model.sensor, AdjustmentSettings(),
+        model.interior.c,
+    )  # fmt: skip
+    return render_calibration(result, model.sensor, NAMES[2])
+
+
+def _not_calibrated(**_):
+    field = corner_field("plain", per_side=2, pitch_mm=100.0)
+    result = calibrate_observations(
+        ["a.jpg"], [Observations(np.arange(0), np.zeros((0, 2)), np.zeros((0, 2)))], {}, field,
+        Sensor(640, 480, 0.001), AdjustmentSettings(),
+    )  # fmt: skip
+    return render_calibration(result, Sensor(640, 480, 0.001), "camera")
+
+
+def _fleet(**_):
+    rng = np.random.default_rng(7)
+    cameras = []
+    for k in range(12):
+        rates = {
+            name: {"value": rng.normal(1e-4, 2e-5), "sd": 5e-6, "unit": "mm/K"}
+            for name in ("c", "x0", "y0")
+        }
+        cameras.append(
+            {
+                "station": NAMES[k % 3] if k < 3 else f"gauge{k}", "camera": f"cam{k}",
+                "type": "rpi-v2.1", "lag_s": 60.0 * k, "on_the_way_s": 2.0, "waiting": None,
+                "ok": float("nan") if k == 5 else 0.99, "temperature": 20.0 + k,
+                "temperature_range": None if k == 5 else [5.0, 40.0], "rates": rates,
+                "findings": [{"kind": "odd", "text": f"c follows {LONG} unlike the others"}]
+                if k in (2, 7) else [],
+            }
+        )  # fmt: skip
+    of_type = {
+        name: {"value": 1e-4, "sd": 1e-5, "sd_between": 2e-5, "unit": "mm/K"}
+        for name in ("c", "x0", "y0")
+    }
+    names = [f"{c['station']}/{c['camera']}" for c in cameras]
+    summary = {"cameras": 12, "stations": 12, "epochs": 9, "sound": 10, "odd": 2}
+    return render_fleet(
+        {
+            "summary": dict.fromkeys(("late", "sensor", "calibrate", "clock", "refused"), 0)
+            | summary,
+            "cameras": cameras, "servers": ["postgresql://db.example/thermocald"],
+            "types": [{"type": "rpi-v2.1", "cameras": names, "rates": of_type}],
+        }
+    )  # fmt: skip
+
+
+def _epochs(tmp_path_factory, **_):
+    folder = tmp_path_factory.mktemp("epochs")
+    recording = open_recording(make_recording(folder / "small", 60))
+    epochs = with_drifts(recorded_table(recording, AdjustmentSettings(), "auto", None, 1)[0])
+    return epochs.report(folder / "epochs.html").read_text(encoding="utf-8")
+
+
+def _of_command(tmp_path_factory, *arguments):
+    path = tmp_path_factory.mktemp("command") / "page.html"
+    call(*arguments, "--report", path)
+    return path.read_text(encoding="utf-8")
+
+
+def _field_check(tmp_path_factory, **_):
+    return _of_command(tmp_path_factory, "testfield", "check", "--paper", "A4")
+
+
+def _certificate(tmp_path_factory, **_):
+    folder = tmp_path_factory.mktemp("fit")
+    for k, name in enumerate(("M1", "M2")):
+        call("simulate", "--preset", "rpi-v2.1-heating", "--seed", k, "--series", name,
+             "--out", folder / name)  # fmt: skip
+    model = folder / "camera.yaml"
+    return _of_command(tmp_path_factory, "fit", folder / "M1", folder / "M2", "-o", model)
+
+
+REPORTS = {
+    "field-check": _field_check,
+    "certificate": _certificate,
+    "epochs": _epochs,
+    "study": _study,
+    "study-names": _study_of_names,
+    "study-nothing": _study_of_nothing,
+    "discovery": _discovery,
+    "discovery-nothing": _discovery_of_nothing,
+    "discovery-unexplained": _discovery_unexplained,
+    "calibration": _calibration,
+    "calibration-nothing": _not_calibrated,
+    "fleet": _fleet,
+}
+_QUICK = ("field-check", "study", "epochs", "calibration", "fleet", "discovery-nothing")
+
+
+@pytest.fixture(scope="module")
+def page_text(warm_study, warm_up, empty_study, tmp_path_factory):
+    """name → the report as HTML, made once."""
+    made: dict[str, str] = {}
+
+    def text(name: str) -> str:
+        if name not in made:
+            made[name] = REPORTS[name](
+                warm_study=warm_study,
+                warm_up=warm_up,
+                empty_study=empty_study,
+                tmp_path_factory=tmp_path_factory,
+            )
+        return made[name]
+
+    return text
+
+
+@pytest.fixture
+def open_page(page_of, tmp_path):
+    """(HTML, width) → the page from a file, without a network, every section unfolded."""
+
+    def open_(html: str, width: int, **options):
+        file = tmp_path / "report.html"
+        file.write_text(html, encoding="utf-8")
+        page = page_of(file.as_uri(), width, 900, offline=True, **options)
+        page.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
+        return page
+
+    return open_
+
+
+def _faults(page, width: int) -> dict:
+    return {
+        "marks": _MARKS.findall(page.evaluate(_TEXT)),
+        "wider": page.evaluate(_WIDER, width),
+        "overlapping": page.evaluate(_OVERLAPS),
+        "no unit": page.evaluate(_WITHOUT_UNIT),
+        "no caption": page.evaluate(_WITHOUT_CAPTION),
+        "empty": page.evaluate(_EMPTY),
+        "console": page.problems,
+    }
+
+
+NONE = {"marks": [], "wider": [], "overlapping": [], "no unit": [], "no caption": 0, "empty": [],
+        "console": []}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "name", [n if n in _QUICK else pytest.param(n, marks=pytest.mark.slow) for n in REPORTS]
+)
+def test_a_report_as_a_page(name, page_text, open_page):
+    html = page_text(name)
+    assert len(html) < 3e6
+    for width in (1280, 390):
+        page = open_page(html, width)
+        assert _faults(page, width) == NONE
+        keep(page, f"{name}-{width}")
+    page = open_page(html, 794)  # A4 at 96 px per inch
+    page.emulate_media(media="print")
+    assert page.locator("button:visible, nav:visible").count() == 0
+    assert _faults(page, 794) == NONE
+    assert len(page.pdf(format="A4")) > 10_000
+    keep(page, f"{name}-a4")
+
+
+def keep(page, name: str) -> None:
+    """Keep a picture of the whole page where THERMOCALD_PAGES says."""
+    if folder := os.environ.get("THERMOCALD_PAGES"):
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        (Path(folder) / f"{name}.png").write_bytes(page.screenshot(full_page=True))
+
+
+def test_every_fault_of_a_page_would_be_seen(open_page):
+    """The test above can fail: a page with each of the faults."""
+    html = """<body><p>x is <bound method A.b of <a object at 0x7f>, nan or None</p>
+      <div style="width:2000px">wide</div><figure><div class="panel"><svg aria-label="drawing"
+      width="300" height="100"><g id="matplotlib.axis_1"><g id="xtick_1"><text x="9" y="20">1</text>
+      </g></g><text x="90" y="20">one label</text><text x="100" y="22">another</text></svg></div>
+      </figure><script>lost()</script></body>"""
+    html = html.replace("<bound", "&lt;bound").replace("<a object", "&lt;a object")
+    found = _faults(open_page(html, 1280), 1280)
+    assert [key for key, value in found.items() if not value] == []
+
+
+@pytest.mark.slow
+def test_everything_can_be_read_without_its_script(page_text, browser, tmp_path):
+    file = tmp_path / "report.html"
+    file.write_text(page_text("study"), encoding="utf-8")
+    page = browser.new_page(java_script_enabled=False)
+    page.goto(file.as_uri())
+    assert page.locator(".answer .sentence").is_visible()
+    assert page.locator("figure svg").first.is_visible()
+    for part in page.locator("summary").all():
+        if part.locator("xpath=..").get_attribute("open") is None:
+            part.click()
+    assert page.locator("figure .panel").count() > 30
+    assert all(panel.is_visible() for panel in page.locator("figure .panel").all())
+    assert page.locator("button:visible").count() == 0
+    page.close()
+
+
+def test_values_are_read_off_a_drawing_and_tables_copied(page_text, open_page):
+    page = open_page(page_text("study"), 1280)
+    panel = page.locator("figure .panel:has(svg[data-scales])").first
+    box = panel.locator("svg").bounding_box()
+    page.mouse.move(box["x"] + 0.6 * box["width"], box["y"] + 0.5 * box["height"])
+    assert len(panel.locator("output").text_content().split(", ")) == 2
+    width = box["width"]
+    panel.locator("svg").click()
+    assert panel.locator("svg").bounding_box()["width"] > 2 * width
+    page.locator("button.copy").first.click()
+    assert page.problems == []

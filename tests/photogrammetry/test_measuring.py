@@ -1,0 +1,182 @@
+"""Pose from control points with a known camera, and places on planes: standard deviations hold."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.main_paths.crooked import CAMERA, PITCH, SIZE, project, rotation
+from thermocald.errors import GeometryError
+from thermocald.photogrammetry.camera.camera_model import (
+    ExteriorOrientation,
+    InteriorOrientation,
+    Sensor,
+)
+from thermocald.photogrammetry.epoch.measuring import Line, Plane, on_line, on_plane, resect
+from thermocald.photogrammetry.field.testfield import Observations, TestField
+
+SENSOR = Sensor(*SIZE, PITCH)
+INTERIOR = InteriorOrientation(
+    CAMERA["c"], CAMERA["x0"], CAMERA["y0"], A1=CAMERA["A1"], A2=CAMERA["A2"], B1=CAMERA["B1"],
+    B2=CAMERA["B2"],
+)  # fmt: skip
+# A bridge: 6 m above the water, looking along it and down by 20°.
+POSE = np.array([np.deg2rad(70.0), 0.02, -0.01, 500.0, -1000.0, 6000.0])
+WATER = Plane(np.zeros(3), np.array([0.0, 0.0, 1.0]), sd_mm=4.0, sd_tilt=1e-3)
+SIGMA = 0.3
+
+
+def camera_covariance() -> np.ndarray:
+    """Of c, x0, y0 as one thermometer's noise makes it: they move together; and a little each."""
+    together = np.array([0.4e-3, 0.35e-3, -0.2e-3]) * 1.5
+    Q = np.zeros((10, 10))
+    Q[:3, :3] = np.outer(together, together) + np.diag([0.1e-3, 0.2e-3, 0.2e-3]) ** 2
+    return Q
+
+
+def control_points(n: int, rng: np.random.Generator) -> np.ndarray:
+    """On both banks, at several heights."""
+    y = rng.uniform(9_000, 30_000, n)
+    x = np.where(np.arange(n) % 2, 0.3, -0.3) * y + rng.normal(0, 400, n)
+    return np.column_stack([x, y, rng.uniform(-200, 2_500, n)])
+
+
+def drawn(rng: np.random.Generator, points: np.ndarray, Q: np.ndarray, sigma_mm: float):
+    """A camera, the surveyed points and their images as they come out one time."""
+    delta = rng.multivariate_normal(np.zeros(3), Q[:3, :3])
+    c, x0, y0 = INTERIOR.c + delta[0], INTERIOR.x0 + delta[1], INTERIOR.y0 + delta[2]
+    image = project(points, POSE, c, x0, y0) + rng.normal(0, SIGMA, (len(points), 2))
+    surveyed = points + rng.normal(0, sigma_mm, points.shape)
+    n = len(points)
+    field = TestField.build([f"g{i}" for i in range(n)], surveyed, sigma_mm)
+    seen = Observations(np.arange(n), image, np.full((n, 2), SIGMA))
+    return (c, x0, y0), field, seen
+
+
+@pytest.mark.parametrize("n", [6, 12])
+def test_errors_are_what_the_covariance_says(n):
+    """Pose, camera and a place on the water over 300 draws: chi-square and error/sd near 1."""
+    rng = np.random.default_rng(n)
+    points, Q = control_points(n, rng), camera_covariance()
+    places = np.array([[300.0, 9_000.0, 0.0], [-2_000.0, 25_000.0, 0.0]])
+    square, errors = [], []
+    for _ in range(300):
+        (c, x0, y0), field, seen = drawn(rng, points, Q, 10.0)
+        r = resect(SENSOR, INTERIOR, Q, field, seen, snooping_alpha=0.0)
+        assert r.status == "ok", r.reason
+        prior = r.covariance if r.sigma0 <= 1 else r.covariance / r.sigma0**2  # as it was stated
+        d = r.values[10:] - POSE
+        d[:3] = np.arctan2(np.sin(d[:3]), np.cos(d[:3]))
+        square.append(d @ np.linalg.solve(prior[10:, 10:], d))
+        image = project(places, POSE, c, x0, y0) + rng.normal(0, SIGMA, (2, 2))
+        level = rng.normal(0, WATER.sd_mm)
+        lifted = replace(WATER, point=WATER.point + level * WATER.normal, sd_tilt=0.0)
+        X, C = on_plane(SENSOR, r.values, prior, image, SIGMA, lifted)
+        errors.append((X - places)[:, :2].ravel() / np.sqrt(np.diag(C))[[0, 1, 3, 4]])
+    assert np.mean(square) / 6 == pytest.approx(1.0, abs=0.1)
+    assert np.std(np.array(errors), axis=0) == pytest.approx(np.ones(4), abs=0.13)
+
+
+def test_places_on_a_plane_against_a_monte_carlo():
+    """Sd within 3 %, covariance within 6 %: 40,000 draws of an intersection of its own."""
+    rng = np.random.default_rng(2)
+    points, Q = control_points(10, rng), camera_covariance()
+    _, field, seen = drawn(rng, points, Q, 10.0)
+    r = resect(SENSOR, INTERIOR, Q, field, seen, snooping_alpha=0.0)
+    uv = np.array([[1700.0, 1500.0], [900.0, 1900.0]])
+    X, C = on_plane(SENSOR, r.values, r.covariance, uv, SIGMA, WATER)
+    N = 40_000
+    draws = rng.multivariate_normal(r.values, r.covariance, N)
+    found = np.empty((N, 2, 3))
+    level, tilt = rng.normal(0, WATER.sd_mm, N), rng.normal(0, WATER.sd_tilt, (N, 2))
+    normal = np.column_stack([-tilt, np.ones(N)])
+    for k in range(2):
+        seen_at = uv[k] + rng.normal(0, SIGMA, (N, 2))
+        found[:, k] = intersect(seen_at, draws, level, normal)
+    sd = np.sqrt(np.diag(C)).reshape(2, 3)
+    spread = found.std(axis=0)
+    assert np.abs(found.mean(axis=0) - X).max() < 0.05 * sd.max()
+    assert spread[:, :2] == pytest.approx(sd[:, :2], rel=0.03)
+    together = np.cov(found.reshape(N, 6).T)
+    assert np.corrcoef(found[:, 0, 1], found[:, 1, 1])[0, 1] == pytest.approx(
+        C[1, 4] / np.sqrt(C[1, 1] * C[4, 4]), abs=0.03
+    )
+    assert together[0, 0] == pytest.approx(C[0, 0], rel=0.06)
+
+
+def intersect(uv: np.ndarray, draws: np.ndarray, level: np.ndarray, normal: np.ndarray):
+    """Rays of as many cameras with the plane normal·X = level, distortion undone by iteration."""
+    x = (uv[:, 0] - (SIZE[0] - 1) / 2) * PITCH - draws[:, 1]
+    y = -(uv[:, 1] - (SIZE[1] - 1) / 2) * PITCH - draws[:, 2]
+    a, b = x.copy(), y.copy()
+    for _ in range(30):
+        r2 = a**2 + b**2
+        radial = draws[:, 3] * r2 + draws[:, 4] * r2**2 + draws[:, 5] * r2**3
+        dx = a * radial + draws[:, 6] * (r2 + 2 * a**2) + 2 * draws[:, 7] * a * b
+        dy = b * radial + draws[:, 7] * (r2 + 2 * b**2) + 2 * draws[:, 6] * a * b
+        a, b = x - dx, y - dy
+    inside = np.column_stack([a, b, -draws[:, 0]])
+    ray = np.stack([rotation(*d[10:13]) @ v for d, v in zip(draws, inside, strict=True)])
+    centre = draws[:, 13:16]
+    t = (level - np.sum(normal * centre, axis=1)) / np.sum(normal * ray, axis=1)
+    return centre + t[:, None] * ray
+
+
+def test_a_gross_error_is_found():
+    rng = np.random.default_rng(4)
+    points, Q = control_points(14, rng), camera_covariance()
+    _, field, seen = drawn(rng, points, Q, 10.0)
+    seen.points[5] += [9.0, -7.0]
+    r = resect(SENSOR, INTERIOR, Q, field, seen)
+    assert r.status == "ok"
+    assert r.rejected == (5,)
+
+
+@pytest.mark.parametrize(
+    ("rows", "start", "word"),
+    [(slice(0, 3), False, "too_few_targets"), (slice(0, 2), True, "too_few_targets"),
+     (slice(0, 3), True, "ok")],
+)  # fmt: skip
+def test_few_points(rows, start, word):
+    """Three points suffice where an earlier pose tells which of four it is."""
+    rng = np.random.default_rng(5)
+    points, Q = control_points(12, rng)[rows], camera_covariance()
+    _, field, seen = drawn(rng, points, Q, 10.0)
+    near = (
+        ExteriorOrientation.from_array(POSE + np.array([1e-3, 1e-3, 1e-3, 20, 20, 20]))
+        if start
+        else None
+    )
+    assert resect(SENSOR, INTERIOR, Q, field, seen, near).status == word
+
+
+def test_points_in_one_line_determine_no_pose():
+    rng = np.random.default_rng(6)
+    points = np.array([-2_000.0, 9_000.0, 500.0]) + np.linspace(0, 1, 8)[:, None] * [0, 20_000, 0]
+    Q = camera_covariance()
+    _, field, seen = drawn(rng, points, Q, 0.0)
+    r = resect(SENSOR, INTERIOR, Q, field, seen)
+    assert r.status != "ok"
+    assert r.reason
+
+
+def test_a_staff_is_read_along_its_line():
+    """A staff at 12 m: the height is the truth's, its sd smaller than that along the water."""
+    Q = np.zeros((16, 16))
+    values = np.concatenate([INTERIOR.as_array(), POSE])
+    staff = Line(np.array([800.0, 12_000.0, 0.0]), np.array([0.0, 0.0, 1.0]))
+    place = np.array([[800.0, 12_000.0, 730.0]])
+    uv = project(place, POSE, INTERIOR.c, INTERIOR.x0, INTERIOR.y0)
+    X, C = on_line(SENSOR, values, Q, uv, SIGMA, staff)
+    assert pytest.approx(place, abs=1e-4) == X
+    on_water, of_water = on_plane(SENSOR, values, Q, uv, SIGMA, WATER)
+    assert of_water[1, 1] > C[2, 2] > 0
+    assert on_water[0, 2] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_above_the_horizon_there_is_no_water():
+    values = np.concatenate([INTERIOR.as_array(), POSE])
+    with pytest.raises(GeometryError, match="above the horizon"):
+        on_plane(SENSOR, values, np.zeros((16, 16)), [[1640.0, 20.0]], SIGMA, WATER)

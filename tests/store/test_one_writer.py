@@ -1,0 +1,148 @@
+"""One writer of a store, whatever it is called and whoever writes: none of its epochs is lost."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import yaml
+
+from tests.commands import call
+from tests.daemon.conftest import ENVIRONMENT, make_recording
+from thermocald.daemon.store_guard import StoreGuard
+from thermocald.epoch import Epoch
+from thermocald.errors import StoreError
+from thermocald.photogrammetry.camera.camera_model import Sensor
+from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.store.database.store import Store
+from thermocald.store.recording.head import CameraSpec, Channel, Head
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    return make_recording(tmp_path_factory.mktemp("one-writer") / "small", 12)
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "kept.db"
+
+
+@pytest.fixture
+def daemon(path):
+    """A daemon's store with epochs in its -wal file."""
+    guard = StoreGuard(path, durable=False)
+    head = Head("a", "M0", 10.0, CameraSpec("rpi", Sensor(640, 480, 0.001)), {"t": Channel()})
+    series = guard.store.create_series(head, TestField.build(["a"], np.zeros((1, 3))))
+    for number in range(1, 24):
+        guard.store.append(series, Epoch(number, 1e9 + number, 1e9 + number, {"t": 20.0}))
+    yield guard
+    guard.close()
+
+
+def as_called(path, tmp_path, kind):
+    other = tmp_path / "other.db"
+    if kind == "link":
+        other.symlink_to(path)
+    elif kind == "link to link":
+        (tmp_path / "between.db").symlink_to(path)
+        other.symlink_to(tmp_path / "between.db")
+    elif kind == "hard link":
+        os.link(path, other)
+    elif kind == "hard link in another folder":
+        other = tmp_path / "snapshot/kept.db"
+        other.parent.mkdir()
+        os.link(path, other)
+    elif kind == "folder's link":
+        (tmp_path / "folder").symlink_to(tmp_path, target_is_directory=True)
+        other = tmp_path / "folder/kept.db"
+    elif kind == "way round":
+        other = tmp_path / "../" / tmp_path.name / "kept.db"
+    else:
+        other = path
+    return other
+
+
+KINDS = [
+    "same", "link", "link to link", "hard link", "hard link in another folder", "folder's link",
+    "way round",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_replay_does_not_write_beside_a_daemon(daemon, path, tmp_path, recording, kind):
+    other = as_called(path, tmp_path, kind)
+    done = subprocess.run(
+        [sys.executable, "-m", "thermocald", "replay", recording, "--store", other],
+        env=ENVIRONMENT, cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "another thermocald writes it" in done.stderr
+    assert "Traceback" not in done.stderr
+    daemon.close()
+    for name in {path, other} - {tmp_path / "other.db"}:
+        with Store.open(name) as store:
+            store.check()
+            (series,) = store.all_series()
+            assert [s.epoch.number for s in store.epochs(series)] == list(range(1, 24))
+
+
+WRITERS = {
+    "replay": ["replay", "{recording}", "--store", "{store}"],
+    "run": ["run", "--recording", "{recording}", "--store", "{store}", "--fast"],
+    "run of devices": ["run", "--mock", "--store", "{store}", "--epochs", "2"],
+    "retention": ["archive", "--config", "{config}", "--to", "{folder}/a", "--retention"],
+}
+
+
+@pytest.mark.parametrize("writer", WRITERS)
+def test_every_command_that_writes_takes_the_lock(daemon, path, tmp_path, recording, writer):
+    places = {
+        "recording": recording, "store": path, "folder": tmp_path, "config": tmp_path / "c.yaml",
+    }  # fmt: skip
+    document = {"store": {"path": str(path)}, "thermometers": [{"name": "t", "driver": "mock"}]}
+    (tmp_path / "c.yaml").write_text(yaml.safe_dump(document))
+    arguments = [part.format(**places) for part in WRITERS[writer]]
+    done = call(*arguments, folder=tmp_path)
+    assert done.returncode == 1
+    assert "another thermocald writes it" in done.stderr
+
+
+def test_a_command_that_writes_keeps_a_daemon_away(tmp_path):
+    with Store.open(tmp_path / "t.db", "append"), pytest.raises(StoreError, match="another"):
+        StoreGuard(tmp_path / "t.db")
+    StoreGuard(tmp_path / "t.db").close()
+
+
+@pytest.mark.parametrize("command", ["check", "archive", "backup"])
+def test_what_a_hard_link_lacks_is_not_called_sound(daemon, path, tmp_path, command):
+    os.link(path, tmp_path / "other.db")
+    more = {"archive": ["--to", tmp_path / "a"], "backup": [tmp_path / "b.db"]}.get(command, [])
+    done = call(command, tmp_path / "other.db", *more, folder=tmp_path)
+    assert done.returncode == 1
+    assert "under another of its names" in done.stderr
+    assert call(command, path, *more, folder=tmp_path).returncode == 0
+
+
+def test_a_store_of_two_names_is_not_written_where_nobody_waits(daemon, path, tmp_path, recording):
+    daemon.close()
+    os.link(path, tmp_path / "other.db")
+    done = call("replay", recording, "--store", tmp_path / "other.db", folder=tmp_path)
+    assert done.returncode == 1
+    assert "2 names (hard links)" in done.stderr
+    # a daemon must not stay away because of somebody's backup: it says so and goes on
+    guard = StoreGuard(path)
+    assert "2 names" in guard.notice
+    guard.close()
+
+
+def test_a_copy_is_a_store_of_its_own(daemon, path, tmp_path, recording):
+    daemon.store.checkpoint()
+    shutil.copyfile(path, tmp_path / "copy.db")
+    assert call("replay", recording, "--store", tmp_path / "copy.db").returncode == 0
+    with Store.open(tmp_path / "copy.db") as store:
+        assert len(store.all_series()) == 2

@@ -1,0 +1,230 @@
+"""Names of channels that come from the world never become a column of ours, nor shift one."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings, strategies
+
+from tests.commands import call
+from tests.drivers.fakes.sysfs import Sysfs
+from tests.store.test_crafted import change
+from thermocald.acquisition.pairing import Readings, require_columns
+from thermocald.acquisition.pipeline import AcquiredEpoch, Pipeline
+from thermocald.daemon.epoch_keeper import result_row
+from thermocald.epoch import Epoch
+from thermocald.errors import ConfigurationError, RecordingError, StoreError, WrongDevice
+from thermocald.hal import Frame, Reading, VirtualClock, open_device
+from thermocald.names import channel_fault, require_channels
+from thermocald.output.dashboard.view import View
+from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES, Sensor
+from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.physics.presets import preset_simulation
+from thermocald.store.database.store import Store
+from thermocald.store.recording.head import CameraSpec, Channel, Head, read_head
+from thermocald.store.recording.reader import read_recording, write_recording
+
+LIKE_OURS = [
+    "A1", "c", "skew_s", "frame", "sd_c", "status", "epoch", "blur_px", "lost", "online_c",
+    "drift_c_px", "temperature_time", "event",
+]  # fmt: skip
+MARKS = ["Diode, left", "a;b", "bell\x07", " lead", "x=1", 'say "t"', "", "é" * 65, "two\nlines"]
+GOOD = [
+    "temperature",
+    "camera",
+    "Core 0",
+    "Gehäuse (innen)",
+    "probe1",
+    "C",
+    "28-00000a1b2c3d",
+    "µm",
+]
+
+
+@pytest.mark.parametrize("name", [*LIKE_OURS, *MARKS])
+def test_a_name_that_cannot_be_a_channel_is_refused_everywhere(tmp_path, name):
+    assert channel_fault(name)
+    with pytest.raises(WrongDevice, match="cannot be called"):
+        Reading({name: 20.0}, 0.0, 0.0)
+    options = {"sensors": {name: "28-000000000001"}}
+    with pytest.raises(ConfigurationError, match="cannot be called"):
+        open_device("thermometer", "ds18b20", options, VirtualClock())
+    head = Head("a", "M1", 10.0, CameraSpec("cam", Sensor(640, 480, 0.001)), {name: Channel()})
+    field = TestField.build(["a"], np.zeros((1, 3)))
+    with Store.open(tmp_path / "t.db", "append") as store:
+        with pytest.raises(StoreError, match="cannot be called"):
+            store.create_series(head, field)
+        assert not store.all_series()
+    with pytest.raises(RecordingError, match="cannot be called"):
+        write_recording(tmp_path / "M1", head, field, [])
+    assert not (tmp_path / "M1").exists()
+
+
+@pytest.mark.parametrize("name", GOOD)
+def test_natural_names_stay(name):
+    assert not channel_fault(name)
+    assert Reading({name: 20.0}, 0.0, 0.0).values == {name: 20.0}
+
+
+def test_every_column_that_an_epoch_can_have_is_ours(tmp_path):
+    """From where the columns are made, so that a new one is refused as a channel too."""
+    plan = SimpleNamespace(name="cam", series="M1")
+    row = result_row(plan, Epoch(1, 0.0, 0.0, {}), None, {})
+    recording = tmp_path / "M1"
+    simulation = preset_simulation("rpi-v2.1-heating", 1, "M1", None)
+    replace(simulation, programme=replace(simulation.programme, epochs=12)).write(recording)
+    call("replay", recording, "--store", tmp_path / "s.db")
+    call("export", recording, "-o", tmp_path / "x.csv")
+    with Store.open(tmp_path / "s.db") as store:
+        series = store.find_series()
+        page = next(View(tmp_path / "s.db", tmp_path).csv(series.camera, series.name))
+        names = {*store.column_names(series)}
+    exported = (tmp_path / "x.csv").read_text().splitlines()[0]
+    known = {*row, *names, *page.strip().split(","), *exported.split(",")}
+    known -= {"temperature", *read_head(recording).channels}
+    assert set(PARAMETER_NAMES) < known
+    assert not [name for name in known if not channel_fault(name)]
+
+
+@pytest.mark.parametrize("name", ["A1", "c", "skew_s", "frame", "sd_x0", "n_rejected"])
+@pytest.mark.parametrize(
+    "stanza",
+    [
+        lambda n: {"driver": "ds18b20", "sensors": {n: "28-000000000001"}},
+        lambda n: {"driver": "hwmon", "chip": "k10temp", "channels": {n: "temp1"}},
+        lambda n: {"driver": "mock", "channels": {n: {}}},
+        lambda n: {"driver": "serial", "port": "/dev/null", "pattern": f"(?P<{n}>[-+0-9.]+)"},
+    ],
+    ids=["ds18b20", "hwmon", "mock", "serial"],
+)
+def test_check_refuses_the_configuration(tmp_path, name, stanza):
+    document = {"thermometers": [{"name": "board", **stanza(name)}]}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(document))
+    for command in ("check", "check --probe", "run --config"):
+        done = call(*command.split(), tmp_path / "config.yaml", folder=tmp_path)
+        assert done.returncode == 2
+        assert f"cannot be called {name!r}" in done.stderr
+        assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    "thermometers",
+    [
+        {"c": ["temperature"], "air": ["temperature"]},  # a thermometer's own name is the column
+        {"skew": ["s"], "air": ["temperature"]},
+        {"a": ["b_d"], "a_b": ["d"]},
+        {"sd": ["board"], "air": ["temperature"]},
+        {"board": ["inner", "temperature"]},  # `temperature` is what the reference is called
+        {"drift": ["px_per_min"], "x": ["y"]},
+    ],
+)
+def test_columns_of_several_thermometers_are_told_apart(tmp_path, thermometers):
+    with pytest.raises(ConfigurationError):
+        require_columns(thermometers, ConfigurationError)
+    document = {
+        "cameras": [{"name": "cam", "driver": "mock", "thermometers": list(thermometers)}],
+        "thermometers": [
+            {"name": n, "driver": "mock", "options": {"channels": {c: {} for c in channels}}}
+            for n, channels in thermometers.items()
+        ],
+    }
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(document))
+    done = call("check", tmp_path / "config.yaml", folder=tmp_path)
+    assert (done.returncode, "Traceback" in done.stderr) == (2, False)
+    assert "thermometers" in done.stderr
+
+
+@pytest.mark.parametrize("label", ["c", "Diode, left", "x\x07y", "frame", "a;b", "epoch", "A1"])
+def test_a_label_of_the_kernel_that_is_no_name_gives_way_to_the_input(tmp_path, label):
+    sysfs = Sysfs(tmp_path)
+    sysfs.hwmon(
+        0, "k10temp", temp1_input="28000", temp1_label=label, temp2_input="31000",
+        temp2_label="Tctl",
+    )  # fmt: skip
+    options = {"chip": "k10temp", "sysfs": str(sysfs.root)}
+    with open_device("thermometer", "hwmon", options, VirtualClock()) as device:
+        assert device.read().values == {"temp1": 28.0, "Tctl": 31.0}
+
+
+def test_a_recording_with_a_column_of_ours_is_refused_when_it_is_opened(tmp_path):
+    simulation = preset_simulation("rpi-v2.1-heating", 1, "M1", None)
+    replace(simulation, programme=replace(simulation.programme, epochs=6)).write(tmp_path / "M1")
+    path = tmp_path / "M1/recording.yaml"
+    path.write_text(path.read_text().replace("temperature:", "sigma0:", 1))
+    with pytest.raises(RecordingError, match="'sigma0'"):
+        read_recording(tmp_path / "M1")
+    for command in ("check", "replay", "study", "fit --output m.yaml", "discover"):
+        done = call(*command.split(), tmp_path / "M1", folder=tmp_path)
+        assert "'sigma0': it is the name of a column" in done.stderr
+
+
+def test_names_with_marks_are_quoted_in_the_csv_of_the_page(tmp_path):
+    """A store made before such names were refused."""
+    head = Head("a", "M1", 10.0, CameraSpec("cam", Sensor(640, 480, 0.001)), {"left": Channel()})
+    with Store.open(tmp_path / "t.db", "append") as store:
+        series = store.create_series(head, TestField.build(["a"], np.zeros((1, 3))))
+        store.append(series, Epoch(1, 1e9, 1e9, {"left": 20.0}))
+    change(tmp_path / "t.db", "UPDATE series SET head = replace(head, 'left', 'Diode, left')")
+    text = "".join(View(tmp_path / "t.db", tmp_path).csv("cam", "M1"))
+    header, row = csv.reader(io.StringIO(text))
+    assert len(header) == len(row)
+    assert "Diode, left" in header
+
+
+def test_the_reference_keeps_its_place_when_it_is_not_read():
+    clock = VirtualClock()
+    readings = Readings({"housing": 10.0, "air": 10.0})
+    readings.add("air", Reading({"temperature": 12.0}, 0.0, clock.utc()))
+    kept: list[AcquiredEpoch] = []
+    keeper = SimpleNamespace(keep=kept.append, amend=None, backlog=lambda below: None)
+    pipeline = Pipeline(
+        "cam", None, readings, ["housing", "air"], keeper, clock, patience_s=0.0,
+        columns=lambda: ["housing", "air"],
+    )  # fmt: skip
+    pipeline.start()
+    pipeline.submit(Frame(np.zeros((4, 4), np.uint8), 0.0, clock.utc()))
+    assert pipeline.drain(10.0)
+    pipeline.stop(10.0)
+    (epoch,) = [acquired.epoch for acquired in kept]
+    assert list(epoch.temperatures) == ["housing", "air"]
+    assert np.isnan(epoch.temperatures["housing"])
+    assert epoch.temperatures["air"] == 12.0
+    row = result_row(SimpleNamespace(name="cam", series="M1"), epoch, None, {})
+    assert np.isnan(row["temperature"])
+
+
+def test_two_names_are_never_one():
+    with pytest.raises(ConfigurationError, match="two channels"):
+        require_channels(["a", "b", "a"], "here", ConfigurationError)
+
+
+@settings(max_examples=60, deadline=None)
+@given(name=strategies.text(max_size=70))
+def test_any_text_as_a_channel_is_refused_or_right(tmp_path_factory, name):
+    """Refused with one line, or read back as it was: from the store, the page and a recording."""
+    folder = tmp_path_factory.mktemp("any")
+    head = Head("a", "M1", 10.0, CameraSpec("cam", Sensor(640, 480, 0.001)), {name: Channel()})
+    field = TestField.build(["a"], np.zeros((1, 3)))
+    seen = Observations(np.array([0]), np.ones((1, 2)), np.ones((1, 2)))
+    epoch = Epoch(1, 1e9, 1e9, {name: 20.5}, observations=seen)
+    with Store.open(folder / "t.db", "append", durable=False) as store:
+        if channel_fault(name):
+            with pytest.raises(StoreError) as told:
+                store.create_series(head, field)
+            assert "\n" not in str(told.value)
+            return
+        store.append(store.create_series(head, field), epoch)
+    with Store.open(folder / "t.db") as store:
+        series = store.find_series()
+        assert store.series_columns(series, [name])[name].tolist() == [20.5]
+    text = "".join(View(folder / "t.db", folder).csv("cam", "M1"))
+    header, row = csv.reader(io.StringIO(text))
+    assert dict(zip(header, row, strict=True))[name] == "20.5"
+    write_recording(folder / "M1", head, field, [epoch])
+    assert read_recording(folder / "M1").columns.temperatures[name].tolist() == [20.5]

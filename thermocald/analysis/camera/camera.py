@@ -1,0 +1,254 @@
+"""A camera at one time: interior orientation with covariance, and what can be done with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.analysis.camera.image_grid import image_grid
+from thermocald.analysis.camera.undistortion import undistorted_points
+from thermocald.errors import UsageError
+from thermocald.numbers import with_sd
+from thermocald.photogrammetry.camera.camera_model import (
+    IOP_NAMES,
+    CameraModel,
+    ExteriorOrientation,
+    InteriorOrientation,
+    partials,
+    project,
+)
+from thermocald.physics.effect import PARAMETER_UNITS
+from thermocald.result import Result, jsonable, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from numpy.typing import ArrayLike
+
+    from thermocald.arrays import Array
+    from thermocald.photogrammetry.camera.camera_model import Sensor
+    from thermocald.photogrammetry.epoch.adjustment import Adjustment
+    from thermocald.photogrammetry.epoch.measuring import Line, Plane
+    from thermocald.photogrammetry.field.testfield import Observations, TestField
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Camera(Result):
+    """A camera at one time: its interior orientation with covariance.
+
+    sensor: size px and pixel pitch mm; temperature °C, NaN where none is known; values (10,),
+    covariance (10, 10): c, x0, y0 (mm), A1 … C2; extrapolated: by how many kelvin the temperature
+    lies outside what the model was fitted on, 0 inside.
+
+    >>> camera = tc.load_camera("camera.yaml").at(35.0)
+    >>> camera.sd["c"] > 0
+    True
+    """
+
+    sensor: Sensor
+    temperature: float
+    values: Array
+    covariance: Array
+    extrapolated: float = 0.0
+    name: str = "camera"
+
+    @property
+    def interior(self) -> InteriorOrientation:
+        """The interior orientation."""
+        return InteriorOrientation.from_array(self.values)
+
+    @property
+    def model(self) -> CameraModel:
+        """Sensor and interior orientation together."""
+        return CameraModel(self.sensor, self.interior)
+
+    @property
+    def sd(self) -> dict[str, float]:
+        """Standard deviations by name, 0 where a parameter was held."""
+        return dict(zip(IOP_NAMES, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
+    def project(self, points: ArrayLike, pose: ExteriorOrientation | ArrayLike) -> Array:
+        """Project object points (n, 3) mm: image points (n, 2) px, NaN behind the camera.
+
+        pose: omega, phi, kappa (rad), X0, Y0, Z0 (mm), as an ExteriorOrientation or six numbers.
+
+        >>> camera = tc.load_camera("camera.yaml").at(35.0)
+        >>> camera.project([[0.0, 0.0, -1000.0]], [0, 0, 0, 0, 0, 0]).shape
+        (1, 2)
+        """
+        six = pose.as_array() if isinstance(pose, ExteriorOrientation) else pose
+        return project(self.sensor, self.values, np.asarray(six, dtype=float), points)
+
+    def rays(self, image_points: ArrayLike) -> Array:
+        """Return the unit directions (n, 3) in the camera frame of image points (n, 2) px.
+
+        The camera looks along -Z. Raises GeometryError beyond where the distortion folds back.
+
+        >>> tc.load_camera("camera.yaml").at(35.0).rays([[100.0, 100.0]]).shape
+        (1, 3)
+        """
+        return self.model.rays(image_points)
+
+    def undistort(self, image_points: ArrayLike, to: InteriorOrientation | None = None) -> Array:
+        """Return image points (n, 2) px as a camera without distortion would have seen them.
+
+        to: principal distance and point of that camera; by default this one's distance, and the
+        image centre. Raises GeometryError beyond where the distortion folds back.
+
+        >>> tc.load_camera("camera.yaml").at(35.0).undistort([[100.0, 100.0]]).shape
+        (1, 2)
+        """
+        target = to or InteriorOrientation(self.interior.c)
+        return undistorted_points(self.sensor, self.values, image_points, target)
+
+    def as_seen_by(self, image_points: ArrayLike, other: InteriorOrientation) -> Array:
+        """Image points (n, 2) px as this camera would have seen them with another IOP."""
+        r = self.rays(image_points)
+        points = r / -r[..., 2:]
+        return project(self.sensor, other.as_array(), np.zeros(6), points)
+
+    def point_covariance(self, image_points: ArrayLike) -> Array:
+        """Covariance (n, 2, 2) px² of where a fixed direction is seen, from this IOP's."""
+        r = self.rays(image_points)
+        _, J, _ = partials(self.sensor, self.values, np.zeros(6), r / -r[..., 2:])
+        J = J[..., :10]
+        result: Array = np.einsum("ncp,pq,ndq->ncd", J, self.covariance, J)
+        return result
+
+    def object_error(self, distance_mm: float, image_points: ArrayLike | None = None) -> Array:
+        """Return the standard deviation (n,) mm, in place, on a plane at a distance, that the
+        interior orientation's makes.
+
+        image_points (n, 2) px: by default corners, edge middles and centre, row by row.
+
+        >>> tc.load_camera("camera.yaml").at(35.0).object_error(10_000.0).shape
+        (9,)
+        """
+        points = image_grid(self.sensor) if image_points is None else image_points
+        covariance = self.point_covariance(points) * self.sensor.pixel_pitch**2
+        variance = np.trace(covariance, axis1=1, axis2=2)
+        result: Array = np.sqrt(variance) * distance_mm / self.interior.c
+        return result
+
+    def resect(self, control: TestField, seen: Observations) -> Adjustment:
+        """Return the pose that control points give, with this camera as it is known.
+
+        The covariance (16, 16) of the result joins camera and pose; its status says why there is
+        none.
+        """
+        from thermocald.photogrammetry.epoch.measuring import resect
+
+        return resect(self.sensor, self.interior, self.covariance, control, seen)
+
+    def on_plane(
+        self,
+        image_points: ArrayLike,
+        pose: Adjustment,
+        plane: Plane | Line,
+        sigma: ArrayLike = 0.0,
+    ) -> tuple[Array, Array]:
+        """Return where image points (n, 2) px lie on a plane or a line, (n, 3) mm.
+
+        pose: of `resect`; sigma px. Also returns their joint covariance (3n, 3n): of image points,
+        camera, pose and plane. Raises GeometryError for rays that miss it.
+        """
+        from thermocald.photogrammetry.epoch.measuring import place_on
+
+        return place_on(self.sensor, pose.values, pose.covariance, image_points, sigma, plane)
+
+    def object_distance(self, other: Camera, distance_mm: float) -> Array:
+        """Distances (9,) mm on a plane between where this and another state puts the grid."""
+        grid = image_grid(self.sensor)
+        places = []
+        for state in (self, other):
+            r = state.rays(grid)
+            places.append(distance_mm * r[..., :2] / -r[..., 2:])
+        result: Array = np.linalg.norm(places[0] - places[1], axis=1)
+        return result
+
+    def opencv(self) -> tuple[Array, Array]:
+        """Return OpenCV's camera matrix (3, 3) px and distortion (5,): k1, k2, p1, p2, k3.
+
+        Exact but where the model has an affinity C1 or a shear C2: then it is a fit over the image
+        area, whose residual the files of `write` state.
+
+        >>> K, distortion = tc.load_camera("camera.yaml").at(35.0).opencv()
+        >>> K.shape, distortion.shape
+        ((3, 3), (5,))
+        """
+        from thermocald.photogrammetry.camera.conversions import to_family
+        from thermocald.photogrammetry.camera.model_families import BrownOpenCV
+
+        found = to_family(self.model, BrownOpenCV(5), None).values
+        fx, fy, cx, cy = found[:4]
+        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), np.array(found[4:])
+
+    def write(self, path: Path | str, format: str = "") -> str:  # noqa: A002
+        """Write the camera for another program; returns how exact the file is.
+
+        format: opencv, ros, colmap, mrcal, kalibr, metashape, aicon, json; by default what the
+        file's name says: `ros.yaml`, or a suffix that one format has (`.xml`, `.json`, …). Raises
+        UsageError where that is none or several, GeometryError for a model without rays.
+
+        >>> tc.load_camera("camera.yaml").at(35.0).write("ros.yaml")
+        'exact: both models give the same pixels'
+        """
+        from thermocald.photogrammetry import camera_files
+
+        target = Path(path)
+        comment = "" if np.isnan(self.temperature) else f"at {self.temperature:g} degC"
+        covariance = self.covariance if self.covariance.any() else None
+        chosen = format or _format_of(target)
+        return camera_files.write(self.model, target, chosen, covariance, comment, self.name)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the interior orientation with `sd_` of each parameter, as documents have it."""
+        found = {
+            "camera": self.name,
+            "temperature": self.temperature,
+            "extrapolated_K": self.extrapolated,
+            **dict(zip(IOP_NAMES, self.values.tolist(), strict=True)),
+            **{f"sd_{name}": sd for name, sd in self.sd.items()},
+            "covariance": self.covariance,
+        }
+        document: dict[str, Any] = jsonable(found)
+        return document
+
+    def lines(self) -> list[str]:
+        """Return the camera in lines for people."""
+        at = "" if np.isnan(self.temperature) else f" at {self.temperature:g} °C"
+        return [self.name + at] + [
+            f"  {name:>3} = {with_sd(value, self.sd[name], PARAMETER_UNITS[name])}"
+            for name, value in zip(IOP_NAMES, self.values.tolist(), strict=True)
+            if value or self.sd[name]
+        ]
+
+    def plot(self) -> Figure:
+        """Draw what the distortion does to a grid of image points, px."""
+        figure, axes = new_figure(1, panel=(6.0, 4.5))
+        axis = axes[0, 0]
+        width, height = self.sensor.width, self.sensor.height
+        u, v = np.meshgrid(np.linspace(0, width - 1, 25), np.linspace(0, height - 1, 19))
+        points = np.stack([u.ravel(), v.ravel()], axis=1)
+        dx, dy = (points - self.undistort(points)).T
+        drawn = axis.quiver(*points.T, dx, dy, np.hypot(dx, dy), angles="xy", width=0.003)
+        figure.colorbar(drawn, label="distortion, px")
+        axis.set(xlim=(0, width), ylim=(height, 0), aspect="equal", xlabel="x, px", ylabel="y, px")
+        axis.set_title(self.lines()[0])
+        return figure
+
+
+def _format_of(path: Path) -> str:
+    """The format that a file's name says; UsageError where it says none, or several."""
+    from thermocald.photogrammetry import camera_files
+
+    if path.stem in camera_files.FORMATS:
+        return path.stem
+    suffix = path.suffix.lower()
+    fitting = [name for name, known in camera_files.FORMATS.items() if known.suffix == suffix]
+    if len(fitting) != 1:
+        there = ", ".join(fitting or camera_files.FORMATS)
+        raise UsageError(f"{path}: say which format it shall have, format=…: {there}")
+    return fitting[0]

@@ -1,0 +1,447 @@
+"""The series that is being taken: the estimator of `replay`, fed epoch by epoch.
+
+Every epoch has a result of its own, with an exterior orientation of its own. What the epochs so far
+say of the targets is taken off it: where they are off, how well each is measured, which ones
+wander. Next to it stands the epoch's result in its series, as `replay` of the epochs so far finds
+it: one orientation for all of them, or one and the movements of the mount.
+
+The last epochs are kept and adjusted together again: after each of the first 120 where there is
+time, and at last after half as many as are kept. From then on an epoch costs the same and the
+memory stays the same however long the series is. What all epochs have in common (the level) follows
+from which targets are seen and which are rejected, and may be far less sure than a difference of
+two epochs. An epoch's own result is therefore carried to the level of the first one: the correction
+is what the epochs that are kept have changed by since they were reported.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.photogrammetry.camera.camera_model import (
+    ExteriorOrientation,
+    InteriorOrientation,
+    project,
+)
+from thermocald.photogrammetry.parameters import EOP, IOP, PARAMETER_NAMES, PRINCIPAL
+from thermocald.photogrammetry.series.adjustment import adjusted, result
+from thermocald.photogrammetry.series.known import KnownSeries
+from thermocald.photogrammetry.series.mount import FEWEST_EPOCHS, drift_period
+from thermocald.photogrammetry.series.normals import ObservationGrid
+from thermocald.photogrammetry.series.result import SeriesSettings
+
+if TYPE_CHECKING:
+    from thermocald.acquisition.calibrator import CalibratedEpoch
+    from thermocald.arrays import Array, Index, Mask
+    from thermocald.photogrammetry.camera.camera_model import Sensor
+    from thermocald.photogrammetry.epoch.adjustment import Adjustment, AdjustmentSettings
+    from thermocald.photogrammetry.field.testfield import Observations, TestField
+    from thermocald.photogrammetry.series.adjustment import Adjusted
+    from thermocald.photogrammetry.series.field_motion import FieldMovement
+    from thermocald.photogrammetry.series.result import Exterior, SeriesAdjustment
+
+_WINDOW = 200  # epochs that are kept
+_WINDOW_POINTS = 60_000  # image points of them: 2.4 MB
+_FEWEST = 101  # of them before a field of many targets
+_EACH = 120  # epochs, after each of which the series is adjusted again where there is time
+_OFTEN, _SELDOM = 0.1, 0.5  # shares of new epochs after which that is done otherwise
+_SOON = 0.05  # share for the series, whose own level moves with it, where there is time
+_MOST_TARGETS = 400  # seen in a series: the normal matrix of their offsets is a full one
+_TURNED_PX, _STAYS = 30.0, 2  # beyond one linearisation, and for so many epochs in a row
+_DOUBTED = 5  # epochs in a row that carry a result of their own and have none in the series
+
+_ESTIMATED = PARAMETER_NAMES[PRINCIPAL]
+
+
+@dataclass(eq=False)
+class _Kept:
+    """An epoch that is kept: observations on the grid, number, time s, temperature °C, the values
+    (16,) of its adjustment by itself and those reported, None where these are the same.
+    """
+
+    grid: ObservationGrid
+    number: int
+    time: float
+    temperature: float
+    alone: Array
+    reported: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Epoch:
+    """One epoch in a series: status and reason, values (16,), covariance (16, 16) relative to the
+    series, sigma0, redundancy, rejected (T,), residuals (T, 2) px.
+    """
+
+    status: str
+    reason: str
+    values: Array
+    covariance: Array
+    sigma0: float
+    redundancy: int
+    rejected: Mask
+    residuals: Array
+
+
+@dataclass(eq=False)
+class _Together:
+    """The kept epochs adjusted together.
+
+    seen (t,): targets of the field that take part; moved: what of the field did.
+    """
+
+    seen: Index
+    found: Adjusted
+    sample: SeriesAdjustment
+    moved: tuple[FieldMovement, ...]
+
+    @cached_property
+    def known(self) -> KnownSeries:
+        """What they say of further epochs."""
+        return KnownSeries.of(self.found, self.sample)[0]
+
+    @property
+    def image_px(self) -> float:
+        """How far the mount moves in the image."""
+        return self.sample.movement.image_px(self.found.estimate.system.design.at.A)
+
+    def epoch(self, row: int, targets: int) -> _Epoch:
+        """One of the epochs."""
+        s = self.sample
+        return self._epoch(
+            targets, s.status[row], s.reasons[row], s.values[row], s.covariance[row],
+            float(s.sigma0[row]), int(s.redundancy[row]), s.rejected[row], s.residuals[row],
+        )  # fmt: skip
+
+    def further(self, grid: ObservationGrid, epochs: int) -> _Epoch:
+        """An epoch that came later, adjusted with what is known of its series."""
+        block = self.known.adjusted(_still(grid, self.moved).targets(self.seen), epochs)
+        covariance = self.known.covariance(block, self.known.shared.mean)
+        status, reasons = self.known.judged(block, covariance)
+        estimate = block.estimate
+        return self._epoch(
+            grid.points.shape[1], status[0], reasons[0], estimate.values[0], covariance[0],
+            float(block.sigma0[0]), int(block.redundancy[0]),
+            block.grid.observed[0] & ~block.use[0], estimate.residuals[0],
+        )  # fmt: skip
+
+    def _epoch(
+        self, targets: int, status: str, reason: str, values: Array, covariance: Array,
+        sigma0: float, redundancy: int, rejected: Mask, residuals: Array,
+    ) -> _Epoch:  # fmt: skip
+        every, left = np.zeros(targets, dtype=bool), np.full((targets, 2), np.nan)
+        every[self.seen], left[self.seen] = rejected, residuals
+        return _Epoch(status, reason, values, covariance, sigma0, redundancy, every, left)
+
+
+def _still(
+    grid: ObservationGrid, moved: tuple[FieldMovement, ...], epoch: int = -1
+) -> ObservationGrid:
+    """One epoch as if the field had stood still; epoch: its row among those that told of it."""
+    mask = np.zeros(grid.observed.shape, dtype=bool)
+    points = grid.points
+    for m in moved:
+        if m.kind == "wander":
+            mask[:, m.rows] = True
+        else:
+            points = points.copy(order="K")
+            points[:, m.rows] -= m.trajectory[min(epoch, len(m.trajectory) - 1)] * m.image
+    return ObservationGrid(points, grid.weights).reject(mask)
+
+
+def _going_on(times: Array) -> Array:
+    """Return the times (E,) s of epochs in their order, as if the clock had never been set back."""
+    steps = np.diff(times)
+    ahead = steps > 0
+    usual = float(np.median(steps[ahead])) if ahead.any() else 1.0
+    since = np.cumsum(np.where(ahead, steps, usual))
+    return np.concatenate([times[:1], times[0] + since])
+
+
+class RunningSeries:
+    """The epochs of one series as they come, in any order, one thread at a time.
+
+    exterior: as of `SeriesSettings`; offsets: one offset per target, with the test field's sigmas
+    as prior. epochs: how many were taken in since the start or the last reset.
+    """
+
+    def __init__(
+        self,
+        sensor: Sensor,
+        testfield: TestField,
+        settings: AdjustmentSettings,
+        *,
+        exterior: Exterior,
+        offsets: bool,
+    ) -> None:
+        self._sensor = sensor
+        self._field = testfield
+        offsets = offsets and bool((testfield.sigmas > 0).any())
+        series = replace(SeriesSettings.of(settings, exterior), target_offsets=offsets)
+        if not settings.snooping_alpha:
+            series = replace(series, snooping_alpha=0.0)
+        self._asked = series
+        self._own = replace(series, exterior="per_epoch", snooping_alpha=settings.snooping_alpha)
+        size = min(_WINDOW, max(_WINDOW_POINTS // max(len(testfield), 1), _FEWEST))
+        self._kept: deque[_Kept] = deque(maxlen=size)
+        self._restarted = 0
+        self._hurried = False
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all: the epochs to come are another series."""
+        self.epochs = 0
+        self._look_at = [0, 0]
+        self._period, self._offsets = 0.0, False
+        self._kept.clear()
+        self._each: _Together | None = None
+        self._series: _Together | None = None
+        self._level = np.zeros(16)
+        self._shown = np.zeros(len(self._field), dtype=bool)
+        self._doubts = self._away = 0
+
+    @property
+    def any(self) -> bool:
+        """Whether there is something that epochs share, and something of their own beside it."""
+        s = self._asked
+        return len(s.free) > 0 and (s.exterior != "per_epoch" or s.target_offsets)
+
+    def remember(self, calibrated: CalibratedEpoch, seen: Observations, reported: Array) -> None:
+        """Take an epoch in that was reported (16,) before the program was started again."""
+        self._keep(calibrated, seen)
+        self._kept[-1].reported = reported
+
+    def refine(
+        self, calibrated: CalibratedEpoch, seen: Observations, *, hurried: bool = False
+    ) -> tuple[Adjustment, dict[str, float]]:
+        """An epoch's own result given the epochs so far, and its result in the series as columns.
+
+        calibrated: the epoch by itself, which is returned as it is where it has no result; seen:
+        its observations with the sigmas with which they are adjusted; hurried: others wait.
+        """
+        alone = calibrated.adjustment
+        weak = alone.status == "weak_geometry" and alone.interior is not None
+        if not self.any or not (alone.ok or weak):
+            return alone, {}
+        self._hurried = hurried
+        columns: dict[str, float] = {}
+        if self._elsewhere(alone):
+            self._away += 1
+            if self._away < _STAYS:
+                return alone, columns
+            self._restart(calibrated.epoch.number)
+            columns["series_restarted"] = 1.0
+        self._away = 0
+        self._keep(calibrated, seen)
+        own, whole = self._adjusted()
+        columns |= self._columns(whole)
+        if self._doubted(own, whole):
+            columns["series_restarted"] = 1.0
+        values = None if own is None else own.values - self._level
+        if own is None or own.status != "ok" or values is None:
+            if not weak or whole is None or whole.status != "ok" or self._series is None:
+                return alone, columns
+            # too weak by itself, carried by its series: with what the series' level is sure to
+            own, values = whole, whole.values
+            level = np.diag(self._series.sample.level_sd**2)
+            own = replace(whole, covariance=whole.covariance + level)
+        else:
+            self._kept[-1].reported = values
+        return (
+            replace(
+                alone,
+                status="ok",
+                reason="",
+                interior=InteriorOrientation.from_array(values[IOP]),
+                exterior=ExteriorOrientation.from_array(values[EOP]),
+                covariance=own.covariance,
+                sigma0=own.sigma0,
+                redundancy=own.redundancy,
+                residuals=own.residuals[alone.targets],
+                rejected=tuple(np.flatnonzero(own.rejected).tolist()),
+            ),
+            columns,
+        )
+
+    def report(self) -> dict[str, Any]:
+        """For status and page: how the camera's orientation is taken, and on how many epochs."""
+        if self._series is None:
+            return {}
+        return {
+            "orientation": self._sentence(self._series),
+            "exterior": self._series.sample.exterior,
+            "series_epochs": len(self._kept),
+        }
+
+    def _sentence(self, series: _Together) -> str:
+        """How the exterior orientation is estimated, for people."""
+        n, asked = len(self._kept), self._asked.exterior
+        if series.sample.exterior == "mount":
+            said = f"the mount moves by {series.image_px:.3f} px about one orientation ({n} epochs)"
+        elif series.sample.exterior == "series":
+            still = "the camera stands still" if asked == "auto" else "as configured"
+            said = f"{still}: one orientation for {n} epochs"
+        elif asked == "auto":
+            said = (
+                f"each epoch has its own orientation: {n} of the {FEWEST_EPOCHS} epochs that show "
+                "whether the camera stands still"
+            )
+        else:
+            said = "each epoch has its own orientation, as configured"
+        if self._restarted:
+            said += f"; begun again after epoch {self._restarted}"
+        return said
+
+    def _columns(self, whole: _Epoch | None) -> dict[str, float]:
+        """The epoch's result in its series, as columns for the store."""
+        if whole is None or self._series is None or whole.status != "ok":
+            return {}
+        sd, level = np.sqrt(np.diag(whole.covariance)), self._series.sample.level_sd
+        columns = {"series_epochs": float(len(self._kept))}
+        if self._series.sample.exterior != "per_epoch":
+            columns["mount_px"] = self._series.image_px
+        for k, name in enumerate(_ESTIMATED):
+            if sd[k] > 0:
+                columns[f"series_{name}"] = float(whole.values[k])
+                columns[f"sd_series_{name}"] = float(sd[k])
+                columns[f"level_sd_{name}"] = float(level[k])
+        return columns
+
+    def _keep(self, calibrated: CalibratedEpoch, seen: Observations) -> None:
+        epoch = calibrated.epoch
+        self.epochs += 1
+        self._kept.append(
+            _Kept(
+                ObservationGrid.from_observations(self._field, [seen]),
+                epoch.number,
+                epoch.frame_time,
+                next(iter(epoch.temperatures.values()), np.nan),
+                calibrated.adjustment.values,
+            )
+        )
+
+    def _doubted(self, own: _Epoch | None, whole: _Epoch | None) -> bool:
+        """Whether the series has contradicted so many epochs in a row that it starts again."""
+        words = {"too_many_rejected", "global_test"}
+        against = any(e is not None and e.status in words for e in (own, whole))
+        self._doubts = self._doubts + 1 if against else 0
+        if self._doubts < _DOUBTED:
+            return False
+        self._restart(self._kept[-1].number)
+        return True
+
+    def _restart(self, number: int) -> None:
+        self.reset()
+        self._restarted = number
+
+    def _elsewhere(self, alone: Adjustment) -> bool:
+        """Whether the camera sees its targets elsewhere than in the last epoch: it was turned, by
+        far more than a knock that the movements of a mount take up.
+        """
+        if not self._kept:
+            return False
+        points = self._field.points[alone.targets]
+        here, there = (
+            project(self._sensor, values[IOP], values[EOP], points)
+            for values in (alone.values, self._kept[-1].alone)
+        )
+        return bool(np.median(np.abs(here - there)) > _TURNED_PX)
+
+    def _adjusted(self) -> tuple[_Epoch | None, _Epoch | None]:
+        """The last epoch's own result, None where epochs share nothing that changes it, and that
+        in the series.
+        """
+        newest, n, T = self._kept[-1], len(self._kept), len(self._field)
+        more = self._series is None or self._shows_more(newest.grid)
+        rows: list[int | None] = [None, None]
+        if more or self.epochs >= self._look_at[1]:
+            rows[1] = self._look()
+        if self._offsets and (more or self.epochs >= self._look_at[0]):
+            rows[0] = self._look_at_each()
+        return tuple(
+            None if t is None else t.further(newest.grid, n) if row is None else t.epoch(row, T)
+            for t, row in zip((self._each, self._series), rows, strict=True)
+        )  # type: ignore[return-value]
+
+    def _shows_more(self, grid: ObservationGrid) -> bool:
+        """Whether an epoch shows targets that none of those adjusted together did."""
+        return bool((grid.observed[0] & ~self._shown).any())
+
+    def _again(self, share: float) -> int:
+        """The epoch at which all are adjusted together again."""
+        full = len(self._kept) == self._kept.maxlen
+        return self.epochs + max(int((_SELDOM if full else share) * len(self._kept)), 1)
+
+    def _laid_out(self) -> tuple[list[_Kept], ObservationGrid, Array, int]:
+        """The kept epochs in the order of their numbers, their observations, where an adjustment
+        starts (16,), and the row of the newest.
+        """
+        newest, kept = self._kept[-1], sorted(self._kept, key=lambda k: k.number)
+        grid = ObservationGrid(
+            np.concatenate([k.grid.points for k in kept]),
+            np.concatenate([k.grid.weights for k in kept]),
+        )
+        start = np.median([k.alone for k in kept], axis=0)
+        return kept, grid, start, next(i for i, k in enumerate(kept) if k is newest)
+
+    def _look(self) -> int:
+        """Adjust the kept epochs as `replay` does; the row of the newest among them."""
+        kept, grid, start, row = self._laid_out()
+        time = _going_on(np.array([k.time for k in kept]))
+        self._period = drift_period(time, np.array([k.temperature for k in kept]))
+        self._shown = np.asarray(grid.observed.any(axis=0))
+        self._offsets = self._asked.target_offsets and self._shown.sum() <= _MOST_TARGETS
+        s = replace(self._asked, drift_period=self._period, target_offsets=self._offsets)
+        self._series = series = self._together(grid, start, s, ())
+        share = _OFTEN if self._hurried else 0.0 if self.epochs < _EACH else _SOON
+        self._look_at[1] = self._again(share)
+        if len(kept) < FEWEST_EPOCHS:
+            return row
+        from thermocald.analysis.series.still_field import still_field  # 2 MB
+
+        moved, still = still_field(
+            self._sensor, self._field, grid, series.sample.spread(series.seen, len(self._field)),
+            start, np.array([k.number for k in kept]), time,
+        )  # fmt: skip
+        if moved:
+            self._series = self._together(still, start, s, moved)
+        return row
+
+    def _look_at_each(self) -> int:
+        """Adjust the kept epochs with an orientation of their own; the row of the newest."""
+        assert self._series is not None
+        kept, grid, start, row = self._laid_out()
+        moved = self._series.moved
+        still = [
+            _still(ObservationGrid(grid.points[k : k + 1], grid.weights[k : k + 1]), moved, k)
+            for k in range(len(grid))
+        ]
+        grid = ObservationGrid(
+            np.concatenate([g.points for g in still]), np.concatenate([g.weights for g in still])
+        )
+        s = replace(self._own, drift_period=self._period)
+        self._each = each = self._together(grid, start, s, moved)
+        self._level = self._moved_level(kept, each.sample)
+        self._look_at[0] = self._again(_OFTEN)
+        return row
+
+    def _together(
+        self, grid: ObservationGrid, start: Array, s: SeriesSettings,
+        moved: tuple[FieldMovement, ...],
+    ) -> _Together:  # fmt: skip
+        seen = np.flatnonzero(grid.observed.any(axis=0))
+        found = adjusted(self._sensor, self._field.subset(seen), grid.targets(seen), start, s)
+        return _Together(seen, found, result(found), moved)
+
+    def _moved_level(self, kept: list[_Kept], sample: SeriesAdjustment) -> Array:
+        """By how much (16,) the epochs as adjusted now differ from what was reported of them."""
+        change = [
+            now - then.reported
+            for now, then, ok in zip(sample.values, kept, sample.ok, strict=True)
+            if ok and then.reported is not None
+        ]
+        return np.median(change, axis=0) if change else np.zeros(16)

@@ -1,0 +1,537 @@
+"""The epochs of a series, calibrated: one row each, and what belongs to all of them.
+
+Comes from a recording or a store: epochs one by one as they were calibrated or stored, or all
+adjusted together from their observations (`adjusted`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.acquisition.calibrated_blocks import calibrated_epochs
+from thermocald.atomic_file import write_parts
+from thermocald.errors import DataError, DriverMissing
+from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
+from thermocald.photogrammetry.series.spool import released
+from thermocald.photogrammetry.series.words import Words
+from thermocald.physics.effect import PARAMETER_UNITS
+from thermocald.result import Result, jsonable, new_figure
+from thermocald.store.recording.reader import interpolate_readings
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+
+    import pandas as pd
+    import xarray as xr
+    from matplotlib.figure import Figure
+    from numpy.typing import NDArray
+
+    from thermocald.acquisition.calibrator import Calibrator
+    from thermocald.arrays import Array
+    from thermocald.epoch import Epoch
+    from thermocald.photogrammetry.field.testfield import Observations
+    from thermocald.photogrammetry.series.adjustment import SeriesAdjustment
+    from thermocald.photogrammetry.series.field_motion import FieldMovement
+    from thermocald.store.recording.head import Head
+
+CSV_COLUMNS = (
+    "epoch",
+    "frame_time",
+    "temperature",
+    *PARAMETER_NAMES,
+    "sigma0",
+    "n_observations",
+    "n_rejected",
+    "status",
+    *(f"sd_{name}" for name in PARAMETER_NAMES),
+)
+
+_ROWS = 20_000  # of a table that are worked on at a time
+
+
+BY_EPOCH = (
+    "number", "frame_time", "temperature", "values", "sd", "sigma0", "n_observations",
+    "n_rejected", "status", "reasons", "redundancy", "stillness",
+)  # fmt: skip
+
+
+_EXTERIOR_WORDS = {
+    "per_epoch": "per epoch",
+    "series": "of the series",
+    "mount": "of the series with movements of the mount",
+}
+_DRAWN = ("c", "x0", "y0")
+LEVEL = 0.01
+"""A change that chance gives more rarely is a drift."""
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """One parameter over a series, in its own unit.
+
+    mean; scatter: standard deviation over the epochs; sd: stated by the adjustments, RMS; change:
+    of a straight line from the first to the last epoch, with sd_change; p: that chance gives as
+    much, corrected for the number of parameters; drifts: p below 1 %, with and without any single
+    group of targets; rests_on: the group without which there would be no drift, or "";
+    per_kelvin, sd_per_kelvin, p_temperature: slope on the reference temperature, its standard
+    deviation and its p-value, corrected, NaN where that is constant or not known;
+    last_minus_first: between the first and the last epoch.
+    """
+
+    name: str
+    mean: float
+    scatter: float
+    sd: float
+    change: float
+    sd_change: float
+    p: float
+    drifts: bool
+    rests_on: str = ""
+    per_kelvin: float = float("nan")
+    p_temperature: float = float("nan")
+    last_minus_first: float = float("nan")
+    sd_last_minus_first: float = float("nan")
+    sd_per_kelvin: float = float("nan")
+
+    @property
+    def moves(self) -> bool:
+        """Whether the camera moved: in time, or with its temperature."""
+        return self.drifts or self.p_temperature < LEVEL
+
+    @property
+    def in_words(self) -> str:
+        """How much it moves, or `none`."""
+        if self.moves:
+            if self.p_temperature < LEVEL:
+                return f"{self.per_kelvin * 1000:+.3f} ± {self.sd_per_kelvin * 1000:.3f} µm/K"
+            return f"in time (p {self.p:.1g})"
+        return f"none (only target {self.rests_on} moves)" if self.rests_on else "none"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the entry of a document."""
+        return {
+            "name": self.name,
+            "mean": self.mean,
+            "scatter": self.scatter,
+            "stated_sd": self.sd,
+            "scatter_over_sd": self.scatter / self.sd,
+            "change": self.change,
+            "sd_change": self.sd_change,
+            "last_minus_first": self.last_minus_first,
+            "sd_last_minus_first": self.sd_last_minus_first,
+            "p": self.p,
+            "drift": self.moves,
+            "per_kelvin": self.per_kelvin,
+            "sd_per_kelvin": self.sd_per_kelvin,
+            "p_temperature": self.p_temperature,
+            "rests_on": self.rests_on or None,
+        }
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Epochs(Result):
+    """The calibrated epochs of a series; rows are epochs.
+
+    number, frame_time (E,) s UTC; temperature (E,) °C of the reference at the frame's time;
+    values, sd (E, 16): the parameters c, x0, y0 (mm), A1 … C2, omega, phi, kappa (rad), X0, Y0, Z0
+    (mm) and their standard deviations, NaN where there is none; sigma0, n_observations, n_rejected
+    (E,); status, reasons: E words and sentences; exterior: `series`, `mount` or `per_epoch`;
+    level_sd (16,): of what all epochs have in common, NaN where it cannot be separated. Columns are
+    attributes too: `epochs.c`, `epochs.sd_c`.
+
+    drifts: what moved, and whether chance would give as much; left_out: targets found to move by
+    themselves; field_movements: boards and targets that moved, taken off the observations;
+    adjustment: of the series, None for epochs as a store keeps them; groups: {name: rows of the
+    test field} of what belongs together; without: the epochs without some targets (rows), quickly
+    or with all care.
+
+    >>> epochs = tc.open("M1").calibrate()
+    >>> bool((epochs.sd_c[epochs.ok] > 0).all())
+    True
+    """
+
+    number: NDArray[np.int64]
+    frame_time: Array
+    temperature: Array
+    values: Array
+    sd: Array
+    sigma0: Array
+    n_observations: NDArray[np.integer]
+    n_rejected: NDArray[np.integer]
+    status: Sequence[str]
+    reasons: Sequence[str]
+    exterior: str
+    level_sd: Array = field(default_factory=lambda: np.full(16, np.nan))
+    adjustment: SeriesAdjustment | None = None
+    groups: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
+    without: Callable[[NDArray[np.int64], bool], Epochs] | None = None
+    left_out: tuple[str, ...] = ()
+    trend_sd: Array = field(default_factory=lambda: np.zeros(16))
+    redundancy: Array = field(default_factory=lambda: np.zeros(0))
+    stillness: Array = field(default_factory=lambda: np.zeros(0))
+    sampled: NDArray[np.int64] | None = None
+    field_movements: tuple[FieldMovement, ...] = ()
+    drifts: tuple[Course, ...] = ()
+    head: Head | None = None
+
+    def __len__(self) -> int:
+        return len(self.number)
+
+    def __getattr__(self, name: str) -> Array:
+        """One column (E,): `c`, `x0`, … `Z0` and `sd_c`, …"""
+        column = name.removeprefix("sd_")
+        if column not in PARAMETER_NAMES:
+            known = ", ".join(PARAMETER_NAMES)
+            raise AttributeError(f"Epochs has no {name!r}; the parameters are {known}")
+        table = self.sd if name != column else self.values
+        values: Array = table[:, PARAMETER_NAMES.index(column)]
+        return values
+
+    def part(self, rows: slice) -> Epochs:
+        """Some rows, without what belongs to the series as a whole."""
+        return replace(
+            self,
+            **{name: getattr(self, name)[rows] for name in BY_EPOCH},
+            adjustment=None, sampled=None, without=None, drifts=(),
+        )  # fmt: skip
+
+    def parts(self) -> Iterator[Epochs]:
+        """All rows, some thousand at a time; what was used of a long series leaves memory."""
+        for first in range(0, len(self.number), _ROWS):
+            yield self.part(slice(first, first + _ROWS))
+            released(self.values)
+            released(self.sd)
+
+    @property
+    def ok(self) -> NDArray[np.bool_]:
+        """(E,): epochs with a result."""
+        return Words.of(self.status).are("ok")
+
+    @property
+    def time(self) -> NDArray[np.datetime64]:
+        """(E,): the frames' times, UTC, to the microsecond."""
+        return np.round(self.frame_time * 1e6).astype(np.int64).astype("datetime64[us]")
+
+    @cached_property
+    def covariance(self) -> Array:
+        """(E, 16, 16): of each epoch's parameters, NaN where it has no result.
+
+        Its diagonal is sd². Raises DataError for epochs as a store keeps them, and for a series
+        that is too long to keep them all; of such a one `adjustment.covariance` has a sample.
+        """
+        if self.adjustment is None or self.sampled is not None:
+            raise DataError(
+                "the covariance of every epoch is not kept of a series this long; "
+                "adjustment.covariance has those of the epochs `sampled`"
+                if self.sampled is not None
+                else "these epochs are as the store keeps them: open its series and calibrate it"
+            )
+        out: Array = self.adjustment.covariance.copy()
+        common = self.adjustment.settings.common
+        if len(common):
+            out[:, common[:, None], common] += self.adjustment.level_covariance[
+                common[:, None], common
+            ]
+        out[~self.ok] = np.nan
+        return out
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `thermocald replay --json` writes, without the names of files."""
+        ok = self.ok
+        level = dict(zip(PARAMETER_NAMES, self.level_sd.tolist(), strict=True))
+        document: dict[str, Any] = {
+            "format": "thermocald-replay/1",
+            "exterior": self.exterior,
+            "exterior_choice": None if self.adjustment is None else self.adjustment.choice,
+            "epochs": len(self),
+            "ok": int(ok.sum()),
+            "sigma0": float(np.median(self.sigma0[ok])) if ok.any() else None,
+            "noise_ratio": None if self.adjustment is None else self.adjustment.noise_ratio,
+            "rejected": int(self.n_rejected.sum()),
+            "left_out": list(self.left_out),
+            "field_movements": [
+                {**m.as_json(), "sentence": m.sentence} for m in self.field_movements
+            ],
+            "parameters": [{**c.as_dict(), "sd_mean_level": level[c.name]} for c in self.drifts],
+            "without_result": [
+                {"epoch": int(self.number[i]), "status": self.status[i], "reason": self.reasons[i]}
+                for i in np.flatnonzero(~ok).tolist()
+            ],
+        }
+        if self.adjustment is not None and self.exterior == "series":
+            document["stood_still"] = _stood_still(self.stillness)
+        converted: dict[str, Any] = jsonable(document)
+        return converted
+
+    def lines(self) -> list[str]:
+        """Return what `thermocald replay` prints."""
+        document = self.as_dict()
+        stands = _EXTERIOR_WORDS[self.exterior]
+        calibrated = f"{document['ok']} of {document['epochs']} epochs calibrated"
+        rejected = f"{document['rejected']} rejected observations"
+        out = [f"{calibrated}, exterior orientation {stands}, {rejected}"]
+        if document["sigma0"] is not None:
+            out.append(
+                f"sigma0 {document['sigma0']:.2f}: image points scatter that many times as much as "
+                "their stated standard deviations say"
+            )
+        if document["exterior_choice"]:
+            out.append(f"--exterior {self.exterior}: {document['exterior_choice']}")
+        out += [f"{moved.sentence}; this is taken off" for moved in self.field_movements]
+        out += [
+            f"left out: target {name} and what belongs to it moves by itself"
+            for name in self.left_out
+        ]
+        out += _table_of(self.drifts)
+        reasons = [f"{w['status']}: {w['reason']}" for w in document["without_result"]]
+        out += [f"{reasons.count(text)} × {text}" for text in sorted(set(reasons))]
+        still = document.get("stood_still")
+        if still and still["epochs_that_moved"]:
+            moved, bound = still["epochs_that_moved"], f"bound {still['bound']:.0f}"
+            out.append(
+                f"the camera did not stand still in {moved} epochs (chi-square "
+                f"{still['largest_chi2']:.0f}, {bound}): use --exterior per_epoch"
+            )
+        return out
+
+    def plot(self, against: str = "time") -> Figure:
+        """Draw how c, x0 and y0 changed since the first epoch, µm, with a band of one sd.
+
+        against: `time` or `temperature`. Needs matplotlib (extra `report`).
+        """
+        ok = self.ok
+        x = self.temperature[ok] if against == "temperature" else self.time[ok].astype(object)
+        figure, axes = new_figure(len(_DRAWN))
+        for axis, name in zip(axes[:, 0], _DRAWN, strict=True):
+            y, sd = 1e3 * getattr(self, name)[ok], 1e3 * getattr(self, f"sd_{name}")[ok]
+            y = y - y[:1]
+            axis.errorbar(x, y, np.nan_to_num(sd), fmt=".", ms=3, lw=0.6)
+            axis.set_ylabel(f"change of {name} in µm")
+            axis.grid(alpha=0.3)
+        if against != "temperature":
+            from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
+
+            times = AutoDateLocator(maxticks=8)  # type: ignore[no-untyped-call]
+            axes[-1, 0].xaxis.set_major_locator(times)
+            axes[-1, 0].xaxis.set_major_formatter(
+                ConciseDateFormatter(times)  # type: ignore[no-untyped-call]
+            )
+        axes[-1, 0].set_xlabel("temperature in °C" if against == "temperature" else "time (UTC)")
+        if self.head is not None:
+            axes[0, 0].set_title(f"{self.head.camera.name}/{self.head.series}")
+        return figure
+
+    def to_csv(self, path: Path | str) -> Path:
+        """Write what `thermocald export` writes, CONVENTIONS §4; returns the file's path."""
+        write_parts(Path(path), self.csv_lines())
+        return Path(path)
+
+    def csv_lines(self) -> Iterable[str]:
+        """Yield the lines of `to_csv`."""
+        return csv_text(self)
+
+    @property
+    def without_result(self) -> dict[str, int]:
+        """{reason: epochs without a result}, the commonest first."""
+        counts = Words.of(self.reasons).counts()
+        counts.pop("", None)
+        return dict(sorted(counts.items(), key=lambda entry: -entry[1]))
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return a DataFrame: the columns of `to_csv` with `time`, the index is the epoch's number.
+
+        Units stand in `attrs["units"]`. Raises DriverMissing without pandas.
+
+        >>> frame = tc.open("M1").calibrate().to_pandas()
+        >>> units = frame.attrs.get("units")
+        >>> frame.index.name, units.get("c")
+        ('epoch', 'mm')
+        """
+        pandas = _imported("pandas")
+        columns = {"time": self.time, **self._columns()}
+        frame = pandas.DataFrame(columns, index=pandas.Index(self.number, name="epoch"))
+        frame.attrs["units"] = {n: u for n in frame.columns if (u := unit_of(str(n)))}
+        return frame
+
+    def to_xarray(self) -> xr.Dataset:
+        """Return a Dataset on the axes `epoch` and `parameter`, with units as attributes.
+
+        Every column of `to_csv` is a variable of its own, `covariance` (epoch, parameter,
+        parameter_2) comes where `covariance` is known; coordinates are time and temperature. It can
+        be written as netCDF. Raises DriverMissing without xarray.
+
+        >>> data = tc.open("M1").calibrate().to_xarray()
+        >>> data.c.units, tuple(data.covariance.dims)
+        ('mm', ('epoch', 'parameter', 'parameter_2'))
+        """
+        xarray = _imported("xarray")
+        columns = self._columns()
+        coordinates = {
+            "epoch": self.number,
+            "time": ("epoch", self.time.astype("datetime64[ns]")),
+            "temperature": ("epoch", columns.pop("temperature")),
+        }
+        variables: dict[str, Any] = {
+            name: ("epoch", np.array(list(values)) if name == "status" else values)
+            for name, values in columns.items()
+        }
+        if self.adjustment is not None and self.sampled is None:
+            axes = ("epoch", "parameter", "parameter_2")
+            variables["covariance"] = (axes, self.covariance)
+            coordinates["parameter"] = coordinates["parameter_2"] = list(PARAMETER_NAMES)
+        about = {"exterior": self.exterior}
+        if self.head is not None:
+            about |= {"camera": self.head.camera.name, "series": self.head.series}
+        data: xr.Dataset = xarray.Dataset(variables, coordinates, about)
+        for name in data.variables:
+            if unit := unit_of(str(name)):
+                data[name].attrs["units"] = unit
+        return data
+
+    def _columns(self) -> dict[str, Any]:
+        return {
+            "frame_time": self.frame_time,
+            "temperature": self.temperature,
+            **{name: getattr(self, name) for name in PARAMETER_NAMES},
+            "sigma0": self.sigma0,
+            "n_observations": self.n_observations,
+            "n_rejected": self.n_rejected,
+            "status": tuple(self.status),
+            **{f"sd_{name}": getattr(self, f"sd_{name}") for name in PARAMETER_NAMES},
+        }
+
+
+def unit_of(column: str) -> str:
+    """Return the unit of a column of `CSV_COLUMNS`, "" where it has none."""
+    others = {"frame_time": "s", "temperature": "degC"}
+    return others.get(column) or PARAMETER_UNITS.get(column.removeprefix("sd_"), "")
+
+
+def _imported(module: str) -> Any:
+    import importlib
+
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        missing = f"{module} is not installed: pip install 'thermocald[tables]'"
+        raise DriverMissing(missing) from None
+
+
+def _stood_still(stillness: Array) -> dict[str, Any]:
+    """Whether single epochs had another exterior orientation (chi-square, 6 degrees of freedom)."""
+    from scipy.stats import chi2
+
+    values = stillness[np.isfinite(stillness)]
+    limit = float(chi2.ppf(1 - 0.01 / max(len(values), 1), 6))
+    return {
+        "epochs_that_moved": int((values > limit).sum()),
+        "largest_chi2": float(values.max(initial=0.0)),
+        "bound": limit,
+    }
+
+
+def _table_of(drifts: Sequence[Course]) -> list[str]:
+    """A line for each parameter below a line of titles; nothing without parameters."""
+    rows = [
+        (
+            "",
+            "mean mm",
+            "scatter µm",
+            "sd µm",
+            "ratio",
+            "line µm ± sd",
+            "last - first µm ± sd",
+            "drift",
+        )
+    ]
+    rows += [
+        (
+            c.name,
+            f"{c.mean:.5f}",
+            f"{1e3 * c.scatter:.3f}",
+            f"{1e3 * c.sd:.3f}",
+            f"{c.scatter / c.sd:.2f}",
+            f"{1e3 * c.change:+.3f} ± {1e3 * c.sd_change:.3f}",
+            f"{1e3 * c.last_minus_first:+.3f} ± {1e3 * c.sd_last_minus_first:.3f}",
+            c.in_words,
+        )
+        for c in drifts
+    ]
+    if not drifts:
+        return []
+    width = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    placed = [[f"{t:>{w}}" for t, w in zip(row, width, strict=True)] for row in rows]
+    return [" ".join([f"{name:<{width[0]}}", *right]) for (name, *_), (_, *right) in
+            zip(rows, placed, strict=True)]  # fmt: skip
+
+
+def calibrate_epochs(
+    epochs: Iterable[Epoch],
+    calibrator: Calibrator,
+    temperature: Mapping[int, float],
+    advance: Callable[[int], None] | None = None,
+    jobs: int = 1,
+) -> tuple[Epochs, list[Observations | None]]:
+    """Adjust epochs one by one; their table, and the observations for a series adjustment.
+
+    temperature: {epoch number: °C at the frame's time}; jobs: processes.
+    """
+    rows, observations = [], []
+    for done in calibrated_epochs(calibrator, epochs, jobs):
+        a = done.adjustment
+        rows.append((done.epoch.number, done.epoch.frame_time, a))
+        observations.append(done.epoch.observations)
+        if advance is not None:
+            advance(1)
+    table = Epochs(
+        np.array([n for n, _, _ in rows], dtype=np.int64),
+        np.array([t for _, t, _ in rows]),
+        np.array([temperature.get(n, np.nan) for n, _, _ in rows]),
+        np.array([a.values if a.ok else np.full(16, np.nan) for _, _, a in rows]).reshape(-1, 16),
+        np.array([a.sd if a.ok else np.full(16, np.nan) for _, _, a in rows]).reshape(-1, 16),
+        np.array([a.sigma0 if a.ok else np.nan for _, _, a in rows]),
+        np.array([a.n_observations for _, _, a in rows], dtype=np.int64),
+        np.array([len(a.rejected) for _, _, a in rows], dtype=np.int64),
+        tuple(a.status for _, _, a in rows),
+        tuple(a.reason for _, _, a in rows),
+        "per_epoch",
+    )
+    return table, observations
+
+
+def frame_temperatures(
+    number: NDArray[np.int64], frame_time: Array, reading_time: Array, readings: Array
+) -> dict[int, float]:
+    """{epoch number: °C at the frame's time}, from readings at their own times."""
+    values = interpolate_readings(frame_time, reading_time, readings)
+    return dict(zip(number.tolist(), values.tolist(), strict=True))
+
+
+def csv_text(table: Epochs) -> Iterable[str]:
+    """The table as lines of CSV (CONVENTIONS §4): a result's figures with all their digits."""
+    yield ",".join(CSV_COLUMNS) + "\n"
+
+    for part in table.parts():
+        columns = [
+            [str(n) for n in part.number.tolist()],
+            [f"{t:.6f}" for t in part.frame_time.tolist()],
+            _cells(part.temperature),
+            *(_cells(column) for column in part.values.T),
+            _cells(part.sigma0),
+            [str(n) for n in part.n_observations.tolist()],
+            [str(n) for n in part.n_rejected.tolist()],
+            part.status,
+            *(_cells(column) for column in part.sd.T),
+        ]
+        yield from (",".join(row) + "\n" for row in zip(*columns, strict=True))
+
+
+def _cells(column: Array) -> list[str]:
+    """Numbers with all their digits, nothing where there is none."""
+    return [repr(v) if isfinite(v) else "" for v in column.tolist()]

@@ -1,0 +1,238 @@
+"""A thermal model from calibrations at several temperatures, as those have who own a board.
+
+Each calibration gives an interior orientation with its covariance; together they give the interior
+orientation at T₀ and the rates of c, x0, y0 by generalised least squares (Koch, Parameter
+Estimation and Hypothesis Testing in Linear Models, 3.2). What the model does not move (distortion,
+affinity) is one value, and the test of the sum of squares says whether that holds.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from datetime import datetime
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.stats import chi2
+
+from thermocald.analysis.camera.difference import CameraDifference
+from thermocald.errors import ConfigurationError, DataError, UsageError
+from thermocald.photogrammetry import camera_files
+from thermocald.photogrammetry.camera.camera_model import (
+    IOP_NAMES,
+    CameraModel,
+    InteriorOrientation,
+    Sensor,
+)
+from thermocald.physics.model import RATED, ThermalModel
+from thermocald.store.recording.readings import interpolate_readings
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from thermocald.arrays import Array, Index
+    from thermocald.store.logger.clock import DeviceClock
+    from thermocald.store.logger.temperatures import TemperatureLog
+
+FORMAT = "thermocald-calibration/1"
+_LEVEL = 1e-3
+_LEAST_SPAN_K = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """One calibration: camera, covariance (10, 10) of its interior orientation, when its
+    photographs were taken as the camera wrote it, and at which temperature °C, None if unknown.
+    """
+
+    path: Path
+    name: str
+    camera: CameraModel
+    covariance: Array
+    photographs: int
+    moments: tuple[datetime, ...]
+    temperature: float | None
+
+    def span(self, clock: DeviceClock) -> Array:
+        """When the photographs were taken, s UTC; DataError where no file said it."""
+        if not self.moments:
+            raise DataError(
+                f"{self.path}: does not say when its photographs were taken; say their "
+                f"temperature: 21.5={self.path}"
+            )
+        return clock.utc(list(self.moments), lambda _: str(self.path))
+
+
+def is_calibration(path: Path) -> bool:
+    """Whether a file is a JSON document of `calibrate`, or a camera that it wrote."""
+    try:
+        with path.open(encoding="utf-8") as file:
+            return path.suffix == ".json" and '"thermocald-ca' in file.read(200)
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def read_calibration(path: Path, temperature: float | None = None) -> Calibration:
+    """Read what `calibrate` wrote with `--json` or `--camera-out`; ConfigurationError names it."""
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as cause:
+        raise ConfigurationError(f"{path}: cannot be read: {cause}") from cause
+    if document.get("format") != FORMAT:
+        found = camera_files.read(path)
+        if found.covariance is None:
+            raise ConfigurationError(f"{path}: the camera has no covariance: it cannot be weighted")
+        return Calibration(path, found.name, found.model, found.covariance, 0, (), temperature)
+    try:
+        head, interior = document["camera"], document["interior"]
+        names, r = document["correlations"]["names"], np.array(document["correlations"]["matrix"])
+        sd = np.array([interior[f"sd_{name}"] for name in names])
+        rows = [IOP_NAMES.index(name) for name in names]
+        covariance = np.zeros((10, 10))
+        covariance[np.ix_(rows, rows)] = r * np.outer(sd, sd)
+        sensor = Sensor(head["width"], head["height"], head["pixel_pitch"])
+        model = CameraModel(sensor, InteriorOrientation(**{n: interior[n] for n in IOP_NAMES}))
+        good = [p for p in document["photographs"] if p["status"] == "ok"]
+        moments = tuple(datetime.fromisoformat(p["time"]) for p in good if p.get("time"))
+    except (KeyError, TypeError, ValueError) as cause:
+        reason = document.get("reason") or f"{cause} is missing"
+        raise ConfigurationError(f"{path}: holds no calibrated camera: {reason}") from cause
+    return Calibration(
+        path, head["name"], model, covariance, len(good), moments, temperature
+    )  # fmt: skip
+
+
+def with_log(calibration: Calibration, log: TemperatureLog, clock: DeviceClock) -> Calibration:
+    """The calibration at the mean temperature of its photographs; DataError outside the log."""
+    times = calibration.span(clock)
+    readings = interpolate_readings(times, log.times, next(iter(log.channels.values())))
+    if not np.isfinite(readings).all():
+        raise DataError(f"{calibration.path}: the log has no temperature for its photographs")
+    return replace(calibration, temperature=float(readings.mean()))
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationsFit:
+    """A model of several calibrations: sigma0 of their stated covariances; effect_missing: whether
+    the model leaves more than these allow; rms_px of each: its camera against the model.
+    """
+
+    model: ThermalModel
+    calibrations: tuple[Calibration, ...]
+    sigma0: float
+    effect_missing: bool
+    rms_px: tuple[float, ...]
+
+
+def fit_calibrations(
+    calibrations: Sequence[Calibration],
+    T0: float | None = None,
+    temperature_sd: float = 0.1,
+    channel: str = "temperature",
+) -> CalibrationsFit:
+    """Fit interior orientation and rates; temperature_sd K: of each calibration's temperature.
+
+    Raises DataError for too few or too narrow temperatures, UsageError for cameras that differ.
+    """
+    T = np.array([_known(c) for c in calibrations])
+    first = calibrations[0]
+    free = np.flatnonzero(np.diag(first.covariance) > 0)
+    for other in calibrations[1:]:
+        _require_alike(first, other, free)
+    if np.ptp(T) < _LEAST_SPAN_K:
+        raise DataError(
+            f"the calibrations lie between {T.min():.1f} and {T.max():.1f} °C: a thermal model "
+            "needs two temperatures at least, better 20 K apart"
+        )
+    at = round(float(T.mean()), 1) if T0 is None else T0
+    rated = [i for i, k in enumerate(free) if IOP_NAMES[k] in RATED]
+    A = np.vstack([_design(len(free), rated, t - at) for t in T])
+    y = np.concatenate([c.camera.interior.as_array()[free] for c in calibrations])
+    blocks = [c.covariance[np.ix_(free, free)] for c in calibrations]
+    rates = np.zeros(len(free))
+    for _ in range(2):  # what the temperature's sd does is known with the rates
+        moved = temperature_sd**2 * np.outer(rates, rates)
+        weight = np.linalg.inv(block_diag(*(block + moved for block in blocks)))
+        covariance = np.linalg.inv(A.T @ weight @ A)
+        covariance = 0.5 * (covariance + covariance.T)
+        x = covariance @ A.T @ weight @ y
+        rates[rated] = x[len(free) :]
+    left = y - A @ x
+    square, redundancy = float(left @ weight @ left), len(y) - len(x)
+    missing = bool(redundancy and square > chi2.ppf(1 - _LEVEL, redundancy))
+    sigma0 = float(np.sqrt(square / redundancy)) if redundancy else 1.0
+    if missing:
+        covariance *= sigma0**2
+    names = [f"interior.{IOP_NAMES[k]}" for k in free]
+    names += [f"rates.{IOP_NAMES[free[i]]}" for i in rated]
+    sds = dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
+    values = first.camera.interior.as_array().copy()
+    values[free] = x[: len(free)]
+    found = dict(zip(names, x.tolist(), strict=True))
+    model = ThermalModel(
+        first.name,
+        first.camera.sensor,
+        at,
+        InteriorOrientation.from_array(values),
+        {name: found.get(f"rates.{name}", 0.0) for name in RATED},
+        sds=sds,
+        covariance_names=tuple(names),
+        covariance=tuple(tuple(row) for row in covariance.tolist()),
+        validity={channel: (float(T.min()), float(T.max()))},
+        name=first.name,
+    )
+    rms = tuple(_rms(model, c, t) for c, t in zip(calibrations, T.tolist(), strict=True))
+    told: list[dict[str, Any]] = [
+        {"calibration": str(c.path), "temperature": round(t, 3), "photographs": c.photographs,
+         "rms_px": round(r, 5)}
+        for c, t, r in zip(calibrations, T.tolist(), rms, strict=True)
+    ]  # fmt: skip
+    evidence = {"fit": {
+        "effect_missing": missing, "misfit_px": round(max(rms), 5),
+        "significance_sigmas": round(sigma0, 1),
+    }}  # fmt: skip
+    model = replace(model, fitted_on=tuple(told), evidence=evidence)
+    return CalibrationsFit(model, tuple(calibrations), sigma0, missing, rms)
+
+
+def _known(calibration: Calibration) -> float:
+    if calibration.temperature is None:
+        raise UsageError(
+            f"{calibration.path}: at which temperature? Write 21.5={calibration.path}, or give the "
+            "--log of the thermometer"
+        )
+    return calibration.temperature
+
+
+def _require_alike(first: Calibration, other: Calibration, free: Index) -> None:
+    """Raise UsageError for another sensor, or other parameters that were estimated or held."""
+    if other.camera.sensor != first.camera.sensor:
+        raise UsageError(f"{other.path}: is of another sensor than {first.path}")
+    own = np.flatnonzero(np.diag(other.covariance) > 0)
+    held = np.setdiff1d(np.arange(10), free)
+    same = other.camera.interior.as_array()[held] == first.camera.interior.as_array()[held]
+    if not np.array_equal(own, free) or not same.all():
+        raise UsageError(
+            f"{other.path}: other parameters were estimated than in {first.path}; calibrate both "
+            "with the same --free"
+        )
+
+
+def _design(size: int, rated: list[int], dT: float) -> Array:
+    """∂ parameters of one calibration / ∂ (interior at T₀, rates)."""
+    A = np.zeros((size, size + len(rated)))
+    A[:, :size] = np.eye(size)
+    for column, row in enumerate(rated):
+        A[row, size + column] = dT
+    return A
+
+
+def _rms(model: ThermalModel, calibration: Calibration, temperature: float) -> float:
+    """By how much the image of a calibration and of the model differ, px."""
+    values = model.interior.as_array() + (temperature - model.T0) * model.rate_vector
+    camera = CameraModel(model.sensor, InteriorOrientation.from_array(values))
+    difference = CameraDifference(("model", calibration.name), camera, calibration.camera)
+    return difference.rms_px

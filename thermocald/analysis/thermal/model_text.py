@@ -1,0 +1,85 @@
+"""A thermal model in lines for people, with what its fit said."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+from thermocald.numbers import with_sd
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+_UNSEEN = 0.5
+"""From which weight of the type on a parameter is called the type's."""
+_UNKNOWN = {"": (math.nan, math.nan)}
+
+
+def model_lines(document: Mapping[str, Any]) -> list[str]:
+    """Return the lines of a document of `thermocald fit`, the first the camera's name."""
+    lines = [str(document["camera"])]
+    low, high = next(iter((document["validity"] or _UNKNOWN).values()))
+    T0 = f"T0 = {document['reference_temperature']:g} °C"
+    if why := document.get("not_examined"):
+        left = document["left_over_in_noise"]
+        lines.append(f"  not examined whether an effect is missing: {why}")
+        lines.append(
+            f"  fitted from {low:g} to {high:g} °C, {T0}; what is left over is {left:.1f} times "
+            "the noise" + ("" if document["band"] else ": no 95 % band is stated")
+        )
+    elif document.get("effect_missing") and document.get("calibrations"):
+        lines.append(
+            f"  the calibrations differ by {document['sigma0']:.1f} times what their standard "
+            "deviations allow: more than c, x0, y0 moves with temperature, or not in a straight "
+            f"line\n  fitted from {low:g} to {high:g} °C, {T0}; standard deviations are widened by "
+            "that"
+        )
+    elif document.get("effect_missing"):
+        lines.append(
+            f"  an effect is missing: the model leaves {document['misfit_px']:.3f} px in smooth "
+            f"trajectories ({document['significance_sigmas']:.0f} standard deviations); "
+            "run: thermocald discover\n"
+            f"  fitted from {low:g} to {high:g} °C, {T0}; standard deviations are widened by what "
+            "is left, and no 95 % band is stated"
+        )
+    else:
+        lines.append(f"  valid from {low:g} to {high:g} °C, {T0}")
+    if "type" in document:
+        kind = document["type"]
+        lines.append(f"  with what {kind['cameras']} cameras of the type {kind['name']} say of it")
+        if unseen := [name for name, weight in kind["weights"].items() if weight > _UNSEEN]:
+            lines.append(
+                f"  these recordings show little of {', '.join(unseen)}: value and standard "
+                "deviation are the type's; record the way between two temperatures, too"
+            )
+    for name, rate in document["rates"].items():
+        shown = with_sd(1e3 * rate["value"], 1e3 * rate.get("sd", math.nan), "µm/K")
+        lines.append(f"  {name:>4}: {shown}")
+    for effect in document["effects"]:
+        parts = [
+            f"{k} = {with_sd(v['value'], v.get('sd', math.nan), v['unit'])}"
+            for k, v in effect["parameters"].items()
+            if isinstance(v, dict)
+        ]
+        lines.append(f"  {effect['effect']}: {', '.join(parts)}")
+    lines += [
+        f"  {s['name']}: {s['epochs']} epochs{_on_means(s['means'])}, {s['rms_px']:.4f} px "
+        f"left over beside {s['noise_px']:.4f} px of noise, thermometer "
+        f"± {s['thermometer_sd']:.3f} K"
+        for s in document.get("series", ())
+    ]
+    lines += [
+        f"  {c['calibration']}: {c['photographs']} photographs at {c['temperature']:.1f} °C, "
+        f"the model's image is {c['rms_px']:.4f} px away"
+        for c in document.get("calibrations", ())
+    ]
+    lines += [
+        f"  {h['name']} left out: predicted to {h['rms_px']:.4f} px (noise alone "
+        f"{h['floor_px']:.4f}), {h['object_mm']:.2f} mm at 10 m"
+        for h in document.get("prediction_test", ())
+    ]
+    return [part for line in lines for part in line.split("\n")]
+
+
+def _on_means(count: int | None) -> str:
+    return "" if count is None else f" on {count} means"

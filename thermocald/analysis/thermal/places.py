@@ -1,0 +1,265 @@
+"""Places in metres from image points of a camera that warms and cools: what a gauge is there for.
+
+Control points that were seen once give the pose. At every other time the camera is that of its
+thermal model, corrected by what the control points have said of it; the mount is taken to stand
+still. Each place has the covariance of its image point, of camera and pose together, of the
+thermometer and of the plane, and stands beside the place that the same camera would have given
+without the thermal model, as it was when the control points were seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.analysis.thermal.correction import require_inside
+from thermocald.errors import ConfigurationError, DataError
+from thermocald.photogrammetry.camera.camera_model import InteriorOrientation
+from thermocald.photogrammetry.epoch.measuring import Line, Plane, place_on, resect
+from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.photogrammetry.parameters import EOP
+from thermocald.result import Result, new_figure
+from thermocald.store.recording.table import Table
+from thermocald.yaml_file import read_yaml
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from matplotlib.figure import Figure
+
+    from thermocald.analysis.thermal.thermal_camera import ThermalCamera
+    from thermocald.arrays import Array
+    from thermocald.photogrammetry.epoch.adjustment import Adjustment
+    from thermocald.store.logger.temperatures import TemperatureLog
+
+UNITS = {"mm": 1.0, "m": 1000.0}
+"""Lengths that control points and planes may be given in, in mm."""
+
+_ROUND_MM = 1e6  # national grids: coordinates count from a round number near the points
+
+
+@dataclass(frozen=True, eq=False)
+class ControlPoints:
+    """Surveyed points and where they were seen.
+
+    field: coordinates in mm from `origin` (3,) mm; seen: image points px; unit: of the file.
+    """
+
+    field: TestField
+    seen: Observations
+    origin: Array
+    unit: str
+
+    @classmethod
+    def read(cls, path: Path, unit: str) -> ControlPoints:
+        """Read a CSV with target, X, Y, Z, sX, sY, sZ (mm or m) and x, y, sx, sy (px).
+
+        Raises DataError naming file, line and column.
+        """
+        table = Table(
+            path, ("target", "X", "Y", "Z", "sX", "sY", "sZ", "x", "y", "sx", "sy"), DataError
+        )
+        names: list[str] = []
+        columns: dict[str, list[Array]] = {n: [] for n in table.columns if n and n != "target"}
+        wanted = ("X", "Y", "Z", "sX", "sY", "sZ", "x", "y", "sx", "sy")
+        for chunk in table.chunks():
+            names += [word.strip() for word in chunk.text("target")]
+            for name in wanted:
+                values = chunk.numbers(name)
+                if name[0] == "s":
+                    chunk.check(name, values <= 0, "a standard deviation must be above 0")
+                columns[name].append(values)
+        if not names:
+            raise DataError(f"{path}: holds no control points")
+        if len(set(names)) < len(names):
+            twice = next(n for n in names if names.count(n) > 1)
+            raise DataError(f"{path}: target {twice!r} is duplicated")
+        whole = {name: np.concatenate(columns[name]) for name in wanted}
+        scale = UNITS[unit]
+        points = scale * np.stack([whole[n] for n in "XYZ"], axis=1)
+        origin = np.round(points.mean(axis=0) / _ROUND_MM) * _ROUND_MM
+        sigmas = scale * np.stack([whole[n] for n in ("sX", "sY", "sZ")], axis=1)
+        field = TestField.build(names, points - origin, sigmas)
+        image = np.stack([whole["x"], whole["y"]], axis=1)
+        seen = Observations(
+            np.arange(len(names)), image, np.stack([whole["sx"], whole["sy"]], axis=1)
+        )
+        return cls(field, seen, origin, unit)
+
+
+def read_surface(path: Path, control: ControlPoints) -> Plane | Line:
+    """Read where the points lie: `level` (and `sd`) of a water, a `plane`, or a `line`.
+
+    In the unit and the coordinates of the control points. Raises ConfigurationError.
+    """
+    document = read_yaml(path)
+    kinds = [k for k in ("level", "plane", "line") if k in document]
+    if len(kinds) != 1 or set(document) - {*kinds, "sd", "sd_tilt_deg"}:
+        raise ConfigurationError(
+            f"{path}: one of level, plane, line is needed, and sd, sd_tilt_deg may follow; found: "
+            f"{', '.join(document)}"
+        )
+    scale = UNITS[control.unit]
+    sd = scale * _number(path, document, "sd")
+    tilt = np.radians(_number(path, document, "sd_tilt_deg"))
+    if "level" in document:
+        height = scale * _number(path, document, "level") - control.origin[2]
+        middle = control.field.points[:, :2].mean(axis=0)
+        return Plane(np.array([*middle, height]), np.array([0.0, 0.0, 1.0]), sd, tilt)
+    kind, way = ("plane", "normal") if "plane" in document else ("line", "direction")
+    parts = document[kind]
+    if not isinstance(parts, dict) or set(parts) != {"point", way}:
+        raise ConfigurationError(f"{path}, {kind}: holds point: [X, Y, Z] and {way}: [a, b, c]")
+    point = scale * _vector(path, parts, "point") - control.origin
+    along = _vector(path, parts, way)
+    size = float(np.linalg.norm(along))
+    if not size > 0:
+        raise ConfigurationError(f"{path}, {kind}: {way} must not be zero")
+    if kind == "line":
+        return Line(point, along / size, sd)
+    return Plane(point, along / size, sd, tilt)
+
+
+def _number(path: Path, document: dict[str, Any], key: str) -> float:
+    value = document.get(key, 0.0)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+        raise ConfigurationError(f"{path}: {key} must be a number, not {value!r}")
+    if key != "level" and value < 0:
+        raise ConfigurationError(f"{path}: {key} must not be below 0")
+    return float(value)
+
+
+def _vector(path: Path, document: dict[str, Any], key: str) -> Array:
+    value = document[key]
+    try:
+        vector = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        vector = np.empty(0)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise ConfigurationError(f"{path}: {key} must be three numbers, not {value!r}")
+    return vector
+
+
+@dataclass(frozen=True, eq=False)
+class Places(Result):
+    """Where image points lie.
+
+    names (n); points (n, 3) in the unit and the coordinates of the control points, with their joint
+    covariance (3n, 3n); without (n, 3): as the camera of the control points' time would have it;
+    pose: the resection; temperatures (n,) °C, NaN where none is known.
+    """
+
+    names: list[str]
+    points: Array
+    covariance: Array
+    without: Array
+    unit: str
+    pose: Adjustment
+    rejected: tuple[str, ...]
+    temperatures: Array
+
+    @cached_property
+    def sd(self) -> Array:
+        """Standard deviations (n, 3)."""
+        return np.sqrt(np.diag(self.covariance)).reshape(-1, 3)
+
+    @property
+    def shift_mm(self) -> Array:
+        """How far the thermal correction moves each place, (n,) mm."""
+        shift: Array = np.linalg.norm(self.points - self.without, axis=1) * UNITS[self.unit]
+        return shift
+
+    def as_dict(self) -> dict[str, Any]:
+        places = [
+            {
+                "name": name, "temperature": T,
+                **dict(zip("XYZ", p, strict=True)),
+                **{f"sd_{axis}": v for axis, v in zip("XYZ", sd, strict=True)},
+                "without_correction": dict(zip("XYZ", w, strict=True)), "correction_mm": shift,
+            }
+            for name, T, p, sd, w, shift in zip(
+                self.names, self.temperatures.tolist(), self.points.tolist(), self.sd.tolist(),
+                self.without.tolist(), self.shift_mm.tolist(), strict=True,
+            )
+        ]  # fmt: skip
+        return {
+            "format": "thermocald-places/1", "unit": self.unit, "places": places,
+            "covariance": self.covariance.tolist(),
+            "pose": {
+                "sigma0": self.pose.sigma0, "redundancy": self.pose.redundancy,
+                "control_points": self.pose.n_observations, "rejected": list(self.rejected),
+                "sd_angles_deg": np.degrees(self.pose.sd[EOP][:3]).tolist(),
+                "sd_centre_mm": self.pose.sd[EOP][3:].tolist(),
+            },
+        }  # fmt: skip
+
+    def lines(self) -> list[str]:
+        digits = 1 if self.unit == "mm" else 4
+        pose = (
+            f"{len(self.names)} places; pose from {self.pose.n_observations} control points, "
+            f"sigma0 {self.pose.sigma0:.2f}"
+        )
+        if self.rejected:
+            pose += f", {', '.join(self.rejected)} contradict the others and are left out"
+        wide = max(map(len, self.names), default=4)
+        lines = [pose, f"{'':{wide}}  X ± sd, Y ± sd, Z ± sd in {self.unit}; thermal correction mm"]
+        for name, p, sd, shift in zip(self.names, self.points, self.sd, self.shift_mm, strict=True):
+            at = ", ".join(f"{v:.{digits}f} ± {s:.{digits}f}" for v, s in zip(p, sd, strict=True))
+            lines.append(f"{name:{wide}}  {at}; {shift:.1f}")
+        return lines
+
+    def plot(self) -> Figure:
+        figure, axes = new_figure(1, panel=(6.0, 4.0))
+        ax = axes[0, 0]
+        ax.errorbar(self.points[:, 0], self.points[:, 1], 2 * self.sd[:, 1], 2 * self.sd[:, 0], "o")
+        ax.plot(self.without[:, 0], self.without[:, 1], "x", label="without thermal correction")
+        ax.set(xlabel=f"X / {self.unit}", ylabel=f"Y / {self.unit}", aspect="equal")
+        ax.legend()
+        return figure
+
+
+def measure_places(
+    camera: ThermalCamera,
+    log: TemperatureLog,
+    control: ControlPoints,
+    when: float,
+    surface: Plane | Line,
+    names: list[str],
+    times: Array,
+    observed: Array,
+    thermometer_sd: float = 0.0,
+    extrapolate: bool = False,
+) -> Places:
+    """Measure where image points lie on a plane or a line, each at its own time.
+
+    when: s UTC, the control points' time; times (n,) s UTC and observed (n, 4): x, y and their
+    standard deviations, px; thermometer_sd K, of a reading of the log. Raises DataError where there
+    is no pose or no temperature, GeometryError for rays that miss.
+    """
+    if not len(observed):
+        raise DataError("there is no image point to be measured")
+    require_inside(log, np.append(times, when))
+    readings = dict(log.channels)
+    then = camera.along(log.times, readings, [when], extrapolate, temperature_sd=thermometer_sd)
+    seen_at = float(then.temperatures[0])
+    now = camera.along(log.times, readings, times, extrapolate, seen_at, thermometer_sd)
+    sensor = camera.model.sensor
+    interior = InteriorOrientation.from_array(then.values[0])
+    pose = resect(sensor, interior, then.covariance[0], control.field, control.seen)
+    if not pose.ok:
+        raise DataError(f"the control points give no pose ({pose.status}): {pose.reason}")
+    image, sigmas = observed[:, :2], observed[:, 2:]
+    without, _ = place_on(sensor, pose.values, pose.covariance, image, sigmas, surface)
+    states = pose.values + np.pad(now.values - then.values, ((0, 0), (0, 6)))
+    points, covariance = place_on(
+        sensor, states, pose.covariance, image, sigmas, surface, now.covariance
+    )
+    scale = UNITS[control.unit]
+    return Places(
+        names, (points + control.origin) / scale, covariance / scale**2,
+        (without + control.origin) / scale, control.unit, pose,
+        tuple(control.field.names[r] for r in pose.rejected), now.temperatures,
+    )  # fmt: skip

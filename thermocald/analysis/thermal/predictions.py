@@ -1,0 +1,140 @@
+"""What a thermal camera is asked for, as a document and as lines for people."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.analysis.thermal.prediction_test import predicted_error
+from thermocald.analysis.thermal.warm_up import warm_up
+from thermocald.numbers import plain
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
+from thermocald.physics.device import (
+    CameraDevice,
+    default_heat,
+    read_camera_device,
+    read_programme,
+)
+from thermocald.physics.simulation import Simulation
+from thermocald.physics.testfields import demonstration_field
+from thermocald.store.sources import require_source
+from thermocald.thermal.reduce import reduce_series
+from thermocald.thermal.source import load_series
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from thermocald.analysis.camera.camera import Camera
+    from thermocald.analysis.thermal.thermal_camera import ThermalCamera
+    from thermocald.store.logger.temperatures import TemperatureLog
+
+Told = tuple[dict[str, Any], list[str]]
+
+
+def describe_camera(thermal: ThermalCamera, camera: Camera, distance: float) -> Told:
+    """Say what a camera is, and what its uncertainty and drift mean on a plane at `distance` m."""
+    error = camera.object_error(distance * 1000.0)
+    reference = thermal.at(thermal.model.T0, extrapolate=True)
+    moved = camera.object_distance(reference, distance * 1000.0)
+    document = {
+        "format": "thermocald-prediction/1",
+        **camera.as_dict(),
+        "distance_m": distance,
+        "object_error_mm": float(np.sqrt(np.mean(error**2))),
+        "drift_from_reference_mm": float(moved.max()),
+    }
+    in_space = (
+        f"  on a plane at {distance:g} m: ± {plain(document['object_error_mm'], 'mm', 2)} "
+        f"from this orientation's uncertainty; the drift since {thermal.model.T0:g} °C is up to "
+        f"{plain(document['drift_from_reference_mm'], 'mm', 3)}"
+    )
+    return document, [*camera.lines(), in_space]
+
+
+def predict_along(thermal: ThermalCamera, log: TemperatureLog, extrapolate: bool) -> Told:
+    """Predict the camera along a log, a row a reading."""
+    along = thermal.along(
+        log.times, dict(log.channels), extrapolate=extrapolate,
+        temperature_sd=thermal.thermometer_sd or 0.0,
+    )  # fmt: skip
+    sds = along.sd
+    header = ["time", "temperature", *IOP_NAMES, *(f"sd_{n}" for n in IOP_NAMES), "extrapolated_K"]
+    rows = [
+        [time, temperature, *values, *sd, outside]
+        for time, temperature, values, sd, outside in zip(
+            along.times, along.temperatures, along.values, sds, along.extrapolated, strict=True
+        )
+    ]
+    document = {
+        "format": "thermocald-prediction/1",
+        "camera": thermal.model.camera,
+        "columns": header,
+        "rows": rows,
+    }
+    lines = [",".join(header)]
+    lines += [",".join(f"{v:.10g}" for v in row) for row in rows]
+    return document, lines
+
+
+def check_prediction(thermal: ThermalCamera, path: Path, advance: Callable[[int], None]) -> Told:
+    """Hold each series of a recording or a store against what the model predicts of it."""
+    found, lines = [], []
+    inputs = load_series(require_source(path), advance)
+    series = [reduce_series(s, affinity=False, strict=False) for s in inputs]
+    for s in series:
+        sensor = s.source.sensor
+        sd = thermal.thermometer_sd or s.thermometers[s.history.reference].noise
+        scaled = thermal.for_images(sensor.width, sensor.height, s.source.camera)
+        error = predicted_error(scaled.model, s, sd)
+        found.append(asdict(error))
+        bands = f"{error.coverage:.1%} inside their 95 % bands"
+        if thermal.model.misses_an_effect:
+            bands = "no 95 % band is stated, as the model misses an effect"
+        lines.append(
+            f"{s.source.name}: predicted to {error.rms_px:.4f} px (noise alone "
+            f"{error.floor_px:.4f}), {bands}, {error.object_mm:.2f} mm at 10 m"
+        )
+    document = {
+        "format": "thermocald-prediction-test/1",
+        "camera": thermal.model.camera,
+        "series": found,
+    }
+    return document, lines
+
+
+def advise_warm_up(
+    thermal: ThermalCamera, programme: Path, camera: Path | None, distance: float, wanted: float
+) -> Told:
+    """Say how long the camera needs within a programme until it is steady to `wanted` mm at
+    `distance` m; camera: its file, which says how it warms.
+    """
+    if camera is not None:
+        device = read_camera_device(camera)
+    else:
+        network, thermometers = default_heat()
+        device = CameraDevice(thermal.model.camera, thermal.model.sensor, network, thermometers)
+    history = Simulation(
+        thermal.model, device, demonstration_field("plain"), read_programme(programme)
+    ).true_history
+    along = thermal.along(
+        history.reading_times, dict(history.readings), history.times, extrapolate=True
+    )
+    advice = warm_up(along, distance * 1000.0, wanted)
+    document = {
+        "format": "thermocald-warm-up/1",
+        "camera": thermal.model.camera,
+        "distance_m": distance,
+        "wanted_mm": wanted,
+        "steady_from_s": advice.steady_from,
+        "error_at_begin_mm": float(advice.error.max()),
+        "temperature_at_end": float(along.temperatures[-1]),
+    }
+    if advice.steady_from is None:
+        said = "does not come to rest within this programme: let it run longer"
+    else:
+        said = f"is steady to {wanted:g} mm at {distance:g} m after {advice.steady_from:.0f} s"
+    worst = f"(up to {document['error_at_begin_mm']:.1f} mm before)"
+    return document, [f"{thermal.model.camera} {said} {worst}"]

@@ -1,0 +1,420 @@
+"""The front door: what `import thermocald` offers; each function is what a command does.
+
+Times are seconds since 1970-01-01 UTC or datetime64, temperatures °C, lengths mm, image points px.
+Wrong input raises the errors of `thermocald.errors`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.analysis.thermal.thermal_camera import ThermalCamera, load_camera
+from thermocald.errors import UsageError
+from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
+from thermocald.series import RecordedSeries, Series, open_every_series, open_series, source_of
+
+if TYPE_CHECKING:
+    from thermocald.photogrammetry.field.testfield import TestField
+    from thermocald.physics.model import ModelEffect, ThermalModel
+    from thermocald.results import Calibration, Discovery, Study
+
+Progress = Callable[[int], None] | None
+Effects = Mapping[str, Mapping[str, Any]] | Iterable[str]
+
+
+def open(source: Path | str, series: str | None = None) -> Series:  # noqa: A001
+    """Open a series: a recording's folder, a store, or `postgresql://…`.
+
+    series: which of a store, `CAMERA/SERIES` or `SERIES`; not needed where there is one. Frames
+    and observations are read when they are needed. Raises StoreError where nothing is there, or
+    several series fit; RecordingError names file, line and column.
+
+    >>> tc.open("M1")
+    <Series rpi-v2.1/M1: 150 epochs, 147 targets, 25.0 to 50.0 °C (reference: temperature)>
+    """
+    return open_series(source_of(source), series)
+
+
+def open_all(source: Path | str) -> list[Series]:
+    """Open every series of a store, a server or a recording's folder (then one).
+
+    Raises StoreError where nothing is there, DataError for a store without series.
+
+    >>> len(tc.open_all("thermocald.db"))
+    1
+    """
+    return open_every_series(source_of(source))
+
+
+def import_photographs(
+    photographs: Path | str | Sequence[Path | str],
+    *,
+    log: Path | str,
+    testfield: TestField | Path | str,
+    timezone: str | None = None,
+    pixel_pitch: float | None = None,
+    camera: Path | str | None = None,
+    series: str = "M1",
+    times: str = "exif",
+    out: Path | str | None = None,
+) -> Series:
+    """Make a series of photographs with EXIF times and a logger's file, in any dialect of CSV.
+
+    timezone: of times without one (`Europe/Berlin`, `+02:00`), else they are refused; pixel_pitch
+    mm, or camera: a camera file, where EXIF does not say it; times: of the photographs, `exif`,
+    `name` (of the file) or `file` (date); out: a new folder to write the recording to; without it
+    the photographs are read where they are. Raises DataError where times or columns cannot be
+    understood, UsageError where a choice is needed.
+
+    >>> photos = tc.import_photographs("photos", log="logger.csv", timezone="Europe/Berlin",
+    ...                                testfield="M1/testfield.csv", pixel_pitch=0.00112)
+    >>> len(photos)
+    6
+    """
+    from thermocald.store.logger.clock import device_clock
+    from thermocald.store.logger.photographs import SOURCES, find_photographs, read_photograph
+    from thermocald.store.logger.series import (
+        camera_of,
+        in_memory,
+        put_together,
+        write_photographs,
+    )
+    from thermocald.store.logger.temperatures import log_options
+
+    if times not in SOURCES:
+        raise UsageError(f"times {times!r}: must be one of {', '.join(SOURCES)}")
+    pictures = [read_photograph(path, times) for path in find_photographs(_paths(photographs))]
+    clock = device_clock(timezone, None, "0", "refuse", "timezone")
+    placed = put_together(pictures, clock, source_of(log), log_options(timezone=timezone))
+    known = None if camera is None else source_of(camera)
+    spec, _ = camera_of(pictures[0], known, pixel_pitch)
+    recording = in_memory(placed, spec, read_testfield(testfield), series)
+    if out is None:
+        return RecordedSeries(recording)
+    write_photographs(source_of(out), recording, placed)
+    return open(out)
+
+
+def read_testfield(source: TestField | Path | str) -> TestField:
+    """Read a testfield.csv: names, coordinates and standard deviations, mm.
+
+    Raises TestFieldError naming line and column.
+
+    >>> field = tc.read_testfield("M1/testfield.csv")
+    >>> len(field), field.points.shape
+    (147, (147, 3))
+    """
+    from thermocald.photogrammetry.field.testfield import TestField
+    from thermocald.store.recording.testfield_file import read_testfield as read
+
+    return source if isinstance(source, TestField) else read(source_of(source))
+
+
+def calibrate(
+    images: Path | str | Sequence[Path | str],
+    testfield: TestField | Path | str,
+    *,
+    camera: Path | str | None = None,
+    pixel_pitch: float | None = None,
+    free: Iterable[str] = DEFAULT_FREE,
+    progress: Progress = None,
+) -> Calibration:
+    """Calibrate a camera from photographs of a test field, which share one interior orientation.
+
+    images: files, or folders of them; camera: a camera file of any format, as initial values, held
+    where the photographs do not carry a calibration; pixel_pitch mm: without it and a camera a
+    pixel counts as 1 µm; free: the interior orientation to estimate; progress: receives how many
+    photographs are measured. Raises UsageError where there is no photograph; what became of each
+    says the result. Source: bundle adjustment with data snooping, Luhmann et al. 2019, chapter 4.4.
+
+    >>> one = tc.calibrate("board", "board.csv", pixel_pitch=0.003)
+    >>> one.status, len(one.poses)
+    ('ok', 8)
+    """
+    from thermocald.analysis.camera.photographs import (
+        calibrate_photographs,
+        images_of,
+        unknown_camera,
+    )
+    from thermocald.photogrammetry.camera_files.camera_file import read_camera
+    from thermocald.results import Calibration
+
+    paths = images_of(_paths(images))
+    if camera is not None:
+        file = read_camera(source_of(camera), pixel_pitch)
+    else:
+        file = unknown_camera(paths, pixel_pitch)
+    found = calibrate_photographs(
+        paths,
+        read_testfield(testfield),
+        file.sensor,
+        AdjustmentSettings(free=tuple(free)),
+        file.principal_distance,
+        file.interior,
+        progress,
+    )
+    return Calibration(found, file, camera is None and pixel_pitch is None)
+
+
+def study(
+    *series: Series,
+    labels: Sequence[str | None] = (),
+    window: int = 31,
+    alpha: float = 0.05,
+    sets: int = 50_000,
+    seed: int = 0,
+    distance_mm: float = 10_000.0,
+    grid: int = 3,
+    focus_mm: float = 1000.0,
+    f_number: float = 2.0,
+    confusion_mm: float | None = None,
+    thermometer_sd: float | None = None,
+    exterior: str = "auto",
+    free: Iterable[str] = DEFAULT_FREE,
+    jobs: int = 1,
+    progress: Progress = None,
+) -> Study:
+    """Study how a camera changes with its temperature, whether that is significant, what it does.
+
+    labels: of the series, those with one label are one camera; by default the camera's name.
+    window, alpha: epochs and level of the F-test; sets, seed: of the Monte-Carlo, on a plane at
+    distance_mm with grid × grid points; focus_mm, f_number, confusion_mm: of the depth of field;
+    thermometer_sd K, by default estimated; exterior, free: as `Series.calibrate`; progress:
+    receives how many sets were drawn. Raises UsageError where one series is given twice, DataError
+    where none can be studied. Source: Elias et al. 2020, Sensors 20, 643, section 4.
+
+    >>> found = tc.study(tc.open("M1"), tc.open("M2"), sets=200)
+    >>> found.cameras[0].label
+    'rpi-v2.1'
+    """
+    from thermocald.analysis.study.input import refuse_copies
+    from thermocald.analysis.study.study import StudySettings
+    from thermocald.analysis.study.study import study as run
+    from thermocald.results import Study, as_result
+
+    if not series:
+        raise UsageError("give at least one series to study")
+    if window % 2 == 0:
+        raise UsageError(f"window is {window}; it must be odd, so that it has a centre")
+    _refuse_twice(series)
+    settings = StudySettings(
+        window=window, alpha=alpha, sets=sets, seed=seed, distance_mm=distance_mm, grid=grid,
+        focus_mm=focus_mm, f_number=f_number, confusion_mm=confusion_mm,
+        thermometer_sd=thermometer_sd, jobs=jobs,
+    )  # fmt: skip
+    named = [*labels, *[None] * (len(series) - len(labels))]
+    measured = [
+        one.measured(label, thermometer_sd, exterior, tuple(free), jobs)
+        for label, one in zip(named, series, strict=True)
+    ]
+    refuse_copies(measured)
+    return as_result(Study, run(measured, settings, progress))
+
+
+def reference_study(*, progress: Progress = None, **settings: Any) -> Study:
+    """Study the presets, each figure of the reference study beside ours.
+
+    settings: those of `study`, from window to jobs; progress: receives how many series are done.
+    Source: Elias et al. 2020, Sensors 20, 643, section 4.
+    """
+    from thermocald.analysis.study.reference import compare, reference_studies
+    from thermocald.analysis.study.study import StudySettings
+    from thermocald.results import Study
+
+    chosen = StudySettings(**settings)
+    cameras = tuple(reference_studies(chosen, advance=progress or (lambda _: None)))
+    return Study(chosen, cameras, tuple(c for camera in cameras for c in compare(camera)))
+
+
+def fit(
+    *series: Series,
+    effects: Effects = (),
+    model: ThermalCamera | ThermalModel | Path | str | None = None,
+    T0: float | None = None,
+    kind: str | Path | ThermalModel | None = None,
+    jobs: int = 1,
+    progress: Progress = None,
+) -> ThermalCamera:
+    """Fit a thermal model to all series of a camera, in one adjustment over all image points.
+
+    effects: names, as in `--effect`, or {name: {parameter: start value}}; model: whose effects and
+    T0 are fitted again, such as discovery's; T0 °C, by default the mean; kind: of several cameras
+    the name of their type, of one its type's model, which helps where it was measured at few
+    temperatures; progress: receives how many frames were measured. Raises DataError for series of
+    different cameras or of one temperature, UsageError for an effect that a series cannot show.
+
+    >>> camera = tc.fit(tc.open("M1"), tc.open("M2"))
+    >>> camera.model.camera
+    'rpi-v2.1'
+    """
+    from thermocald.analysis.thermal.camera_fit import fit_camera, fit_camera_of_type, fit_type
+    from thermocald.analysis.thermal.type_model import require_type
+    from thermocald.physics.model import ThermalModel
+    from thermocald.physics.model_file import read_model
+    from thermocald.thermal.effect_options import check_names
+    from thermocald.thermal.reduce import reduce_series
+
+    if not series:
+        raise UsageError("give at least one series to fit a model to")
+    if isinstance(kind, Path) or (isinstance(kind, str) and Path(kind).suffix in (".yaml", ".yml")):
+        kind = read_model(source_of(kind))
+    if isinstance(kind, ThermalModel):
+        require_type(kind)
+        if effects or model is not None or T0 is not None:
+            raise UsageError(f"type {kind.camera}: effects and T0 are the type's; give no others")
+    listed, T0 = _structure(effects, model, T0)
+    reduced = [
+        reduce_series(one.observed(progress, jobs), affinity=False, strict=False) for one in series
+    ]
+    check_names(listed, reduced)
+    if isinstance(kind, ThermalModel):
+        return fit_camera_of_type(reduced, kind)
+    if kind is not None:
+        return fit_type(reduced, listed, T0, kind)
+    return fit_camera(reduced, listed, T0)
+
+
+def discover(
+    series: Series,
+    *,
+    verify: Sequence[Series] = (),
+    model: ThermalCamera | ThermalModel | Path | str | None = None,
+    jobs: int = 1,
+    say: Callable[[str], None] | None = None,
+) -> Discovery:
+    """Find where simulation and measurement disagree, name the missing effect, prove it.
+
+    verify: further series of this camera, made at another time, to prove it on; model: the model
+    so far, by default the base model, linear in temperature; jobs: processes; say: receives a line
+    at each step. Raises DataError for series of different cameras or thermometers and for copies,
+    UsageError where the series to explain is among those to prove it on.
+
+    >>> found = tc.discover(tc.open("M1"), verify=[tc.open("M2")])
+    >>> found.verdict
+    'effects_found'
+    """
+    from thermocald.discovery.entries import terms_of
+    from thermocald.discovery.evidence import require_other_series
+    from thermocald.discovery.result import discover_series
+    from thermocald.results import Discovery, as_result
+    from thermocald.thermal.reduce import reduce_together
+
+    tell = say or (lambda _: None)
+    every = (series, *verify)
+    _refuse_twice(every)
+    old = _model_of(model)
+    inputs = []
+    for one in every:
+        tell(f"reading {one.source}")
+        inputs.append(one.observed(None, jobs, say=say))
+    require_other_series(inputs)
+    tell("reducing the epochs to normal equations")
+    evidence = reduce_together(inputs, None if old is None else old.T0)
+    found = discover_series(evidence, say, () if old is None else terms_of(old), jobs)
+    name = series.source.rsplit("/", 1)[-1]
+    return as_result(Discovery, found, name=name, before=old)
+
+
+def simulate(
+    preset: str,
+    *,
+    effects: Effects = (),
+    own_effects: bool = True,
+    lamp: Sequence[tuple[float, float]] | None = None,
+    seed: int = 0,
+    series: str = "M1",
+    testfield: TestField | Path | str | None = None,
+    epochs: int | None = None,
+    frames: bool = False,
+    out: Path | str | None = None,
+    progress: Progress = None,
+) -> Series:
+    """Simulate a camera that warms up, as one series.
+
+    preset: a camera of the reference study (`rpi-v2.1-heating`, `nexus5-cold`, …); effects: to add,
+    {name: {parameter: value}}; own_effects: keep those of the preset; lamp: [(from s, W)], what
+    heats the housing instead of the preset's heat; testfield: by default a corner of 147 circles;
+    epochs: by default the preset's 150; frames: render frames instead of image points; out: the
+    folder of the recording, by default one that goes when the program ends. The series knows its
+    `truth`. Raises ConfigurationError for an unknown preset or effect.
+
+    >>> simulated = tc.simulate("rpi-v2.1-heating", effects={"thermal_lag": {"tau": 75}}, seed=1)
+    >>> len(simulated)
+    150
+    """
+    import atexit
+    import shutil
+    import tempfile
+
+    from thermocald.physics.heat import Course
+    from thermocald.physics.presets import preset_simulation
+
+    field = None if testfield is None else read_testfield(testfield)
+    simulation = preset_simulation(preset, seed, series, field)
+    model = simulation.model
+    if not own_effects:
+        model = replace(model, effects=())
+    for effect in _effects(effects):
+        model = model.with_effect(effect)
+    programme = simulation.programme
+    if epochs is not None:
+        programme = replace(programme, epochs=epochs)
+    if lamp is not None:
+        times, watts = (list(column) for column in zip(*lamp, strict=True))
+        steps = Course.steps([*times, times[-1] + 1e9], watts)
+        programme = replace(programme, sources={"housing": steps})
+    simulation = replace(simulation, model=model, programme=programme)
+    if out is None:
+        folder = Path(tempfile.mkdtemp(prefix="thermocald-"))
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        out = folder / series
+    simulation.write(source_of(out), with_frames=frames, advance=progress or (lambda _: None))
+    made = open(out)
+    made.truth = np.array(simulation.truth.iop)
+    return made
+
+
+def _paths(given: Path | str | Sequence[Path | str]) -> list[Path]:
+    return [source_of(p) for p in ((given,) if isinstance(given, str | Path) else given)]
+
+
+def _refuse_twice(series: Sequence[Series]) -> None:
+    """UsageError where one series is given twice: it would count as two that agree."""
+    for i, one in enumerate(series):
+        for other in series[:i]:
+            if one is other or one.place == other.place:
+                raise UsageError(
+                    f"{one.source} is the same series as {other.source}; give each series once (a "
+                    "copy would count as a second measurement that agrees perfectly)"
+                )
+
+
+def _model_of(model: ThermalCamera | ThermalModel | Path | str | None) -> ThermalModel | None:
+    if isinstance(model, str | Path):
+        return load_camera(model).model
+    return model.model if isinstance(model, ThermalCamera) else model
+
+
+def _structure(
+    effects: Effects, model: ThermalCamera | ThermalModel | Path | str | None, T0: float | None
+) -> tuple[list[ModelEffect], float | None]:
+    start = _model_of(model)
+    listed = [] if start is None else list(start.effects)
+    for effect in _effects(effects):
+        if any(e.name == effect.name for e in listed):
+            raise UsageError(f"effect {effect.name} is given twice")
+        listed.append(effect)
+    return listed, start.T0 if start is not None and T0 is None else T0
+
+
+def _effects(given: Effects) -> list[ModelEffect]:
+    from thermocald.thermal.effect_options import effect_with, parse_effect
+
+    if isinstance(given, Mapping):
+        return [effect_with(name, values) for name, values in given.items()]
+    return [parse_effect(text) for text in ((given,) if isinstance(given, str) else given)]

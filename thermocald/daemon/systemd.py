@@ -1,0 +1,117 @@
+"""systemd's side of the daemon: the journal with fields, and sd_notify(3).
+
+Fields are THERMOCALD_DEVICE, THERMOCALD_EVENT, CODE_FILE …
+Try: journalctl THERMOCALD_EVENT=device_out
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import socket
+import struct
+import sys
+import time
+
+from thermocald.addresses import CleanFormatter
+
+_SOCKET = "/run/systemd/journal/socket"
+_PRIORITIES = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
+_FIELDS = {"device": "THERMOCALD_DEVICE", "event": "THERMOCALD_EVENT"}
+
+
+class JournalHandler(logging.Handler):
+    """Sends records to the journal's native socket (systemd.journal-fields(7))."""
+
+    def __init__(self, path: str = _SOCKET) -> None:
+        super().__init__()
+        self._path = path
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        priority = next((p for level, p in _PRIORITIES if record.levelno >= level), 7)
+        fields = {
+            "MESSAGE": self.format(record),
+            "PRIORITY": str(priority),
+            "SYSLOG_IDENTIFIER": "thermocald",
+            "THERMOCALD_LOGGER": record.name,
+            "THERMOCALD_THREAD": record.threadName or "",
+            "CODE_FILE": record.pathname,
+            "CODE_LINE": str(record.lineno),
+        }
+        for attribute, name in _FIELDS.items():
+            if (value := getattr(record, attribute, None)) is not None:
+                fields[name] = str(value)
+        message = b"".join(_encoded(name, value) for name, value in fields.items())
+        try:
+            self._socket.sendto(message, self._path)
+        except OSError:
+            # no journal, or a message too long for a datagram: stderr is read by systemd too
+            print(self.format(record), file=sys.stderr)  # noqa: T201
+
+    def close(self) -> None:
+        self._socket.close()
+        super().close()
+
+
+def _encoded(name: str, value: str) -> bytes:
+    data = value.encode()
+    if b"\n" not in data:
+        return name.encode() + b"=" + data + b"\n"
+    return name.encode() + b"\n" + struct.pack("<Q", len(data)) + data + b"\n"
+
+
+def set_up_logging(level: str) -> None:
+    """Log to the journal under systemd, to standard error otherwise."""
+    root = logging.getLogger()
+    root.setLevel(level.upper())
+    for old in list(root.handlers):
+        root.removeHandler(old)
+        old.close()
+    handler: logging.Handler
+    if os.environ.get("JOURNAL_STREAM") and os.path.exists(_SOCKET):
+        handler = JournalHandler()
+        handler.setFormatter(CleanFormatter("%(message)s"))
+    else:
+        handler = logging.StreamHandler(sys.stderr)
+        handler.setFormatter(CleanFormatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    root.addHandler(handler)
+
+
+def notify(message: str) -> bool:
+    """Send `KEY=value` lines to the service manager; False if there is none that listens."""
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    if not address.startswith(("/", "@")):
+        return False
+    if address.startswith("@"):  # an abstract socket
+        address = "\0" + address[1:]
+    with (
+        contextlib.suppress(OSError),
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as channel,
+    ):
+        channel.settimeout(1.0)
+        channel.sendto(message.encode(), address)
+        return True
+    return False
+
+
+def notify_ready(status: str) -> None:
+    """Started, or reloaded."""
+    notify(f"READY=1\nSTATUS={status}")
+
+
+def notify_reloading() -> None:
+    """A reload begins; `notify_ready` ends it."""
+    notify(f"RELOADING=1\nMONOTONIC_USEC={time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000}")
+
+
+def watchdog_interval_s() -> float | None:
+    """How often the watchdog is to be fed, half of what systemd allows; None if there is none."""
+    pid = os.environ.get("WATCHDOG_PID", "")
+    if pid and pid != str(os.getpid()):
+        return None
+    try:
+        return int(os.environ["WATCHDOG_USEC"]) / 2e6
+    except (KeyError, ValueError):
+        return None

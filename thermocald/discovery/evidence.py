@@ -1,0 +1,337 @@
+"""What a recording shows before any search: targets that jumped, boards that moved, wanderers.
+
+They are looked for in what a free camera per epoch leaves, so that nothing the camera itself does
+can be mistaken for them, and taken out before the trajectories of parameters are examined.
+
+Source: a step at an unknown time as Page (1955), Biometrika 42, 523-527.
+
+Series of one camera: M1 to discover on, others to prove it on; recordings or in stores.
+
+Boards that moved and targets that wander: found, reported, and none of the camera's.
+
+A board that was knocked or creeps is put back where it was; a target that wanders is left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.discovery import criteria
+from thermocald.errors import DataError, UsageError
+from thermocald.photogrammetry.field.planes import field_sheets
+from thermocald.photogrammetry.series.board_motion import board_movements, refined
+from thermocald.photogrammetry.series.field_motion import (
+    FieldMovement,
+    FieldSeries,
+    wandering_targets,
+)
+from thermocald.photogrammetry.series.normals import ObservationGrid
+from thermocald.store.recording.reader import open_recording
+from thermocald.store.server.connection import is_server
+from thermocald.store.sources import require_source, source_name
+from thermocald.thermal.reduce import with_points, without_targets
+from thermocald.thermal.scan import cosines
+from thermocald.thermal.source import load_series, series_input
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from thermocald.arrays import Array
+    from thermocald.thermal.series import ReducedSeries, SeriesInput
+
+
+def load_together(
+    first: Path, others: Sequence[Path], say: Callable[[str], None], jobs: int = 1
+) -> list[SeriesInput]:
+    """Read M1 and the recordings to prove it on; refuses those of another camera or thermometer.
+
+    jobs: processes that measure frames.
+    """
+    places = [_place(p) for p in (first, *others)]
+    for k, path in enumerate(others, start=1):
+        if places[k] == places[0]:
+            raise UsageError(
+                f"{path} is the recording to explain itself; --verify needs another recording of "
+                "the same camera, made at another time"
+            )
+        if places[k] in places[1:k]:
+            raise UsageError(f"{path} is given to --verify twice; one time is enough")
+    out = []
+    for path in (first, *others):
+        say(f"reading {source_name(path)}")
+        out.append(_read(path, say, jobs))
+    require_other_series(out)
+    return out
+
+
+def _read(path: Path, say: Callable[[str], None], jobs: int) -> SeriesInput:
+    """Read one series: a recording's, or the only one of a store or of what an address selects."""
+    if path.is_dir():
+        return series_input(open_recording(path), say, jobs=jobs)
+    found = load_series(require_source(path))
+    if len(found) > 1:
+        there = ", ".join(f"{s.camera}/{s.series}" for s in found)
+        remedy = (
+            "select one with ?station=…&camera=…&series=… in the address"
+            if is_server(path)
+            else "make recordings of them with `thermocald archive`"
+        )
+        raise DataError(f"{source_name(path)}: holds several series ({there}); {remedy}")
+    return found[0]
+
+
+def _place(source: Path) -> str:
+    return str(source) if is_server(source) else str(source.resolve())
+
+
+def require_other_series(series: Sequence[SeriesInput]) -> None:
+    """Refuse series to prove it on that are of another camera or thermometer, or copies."""
+    for other in series[1:]:
+        _same_camera(series[0], other)
+    for k, other in enumerate(series):
+        for before in series[:k]:
+            if np.array_equal(before.grid.points, other.grid.points, equal_nan=True):
+                raise DataError(
+                    f"{other.name} holds the same observations as {before.name}; "
+                    "--verify needs measurements of their own (simulated ones another --seed)"
+                )
+
+
+def _same_camera(a: SeriesInput, b: SeriesInput) -> None:
+    if a.camera != b.camera or a.sensor != b.sensor:
+        raise DataError(
+            f"{b.name} is of another camera ({b.camera}, {b.sensor.width}×{b.sensor.height} px) "
+            f"than {a.name} ({a.camera}, {a.sensor.width}×{a.sensor.height} px); constants of one "
+            "camera cannot be verified on another"
+        )
+    reference = next(iter(a.readings), None)
+    if reference is not None and reference != next(iter(b.readings), None):
+        raise DataError(
+            f"{b.name}: the reference temperature is {next(iter(b.readings), 'missing')!r}, in "
+            f"{a.name} it is {reference!r}; both series need the same thermometer"
+        )
+
+
+_PASSES = 2
+
+
+def replace_moved_boards(evidence: ReducedSeries) -> tuple[list[FieldMovement], ReducedSeries]:
+    """Find the boards that moved, and put them back to where they were."""
+    found = board_movements(_field_series(evidence))
+    if not found:
+        return [], evidence
+    still = _put_boards_back(evidence, found)
+    for _ in range(_PASSES):
+        found = [refined(_field_series(still), m) for m in found]
+        still = _put_boards_back(evidence, found)
+    return found, still
+
+
+def _put_boards_back(evidence: ReducedSeries, found: list[FieldMovement]) -> ReducedSeries:
+    """Reduce the series with boards back in their places."""
+    grid = evidence.source.grid
+    points = np.array(grid.points)
+    for m in found:
+        points[:, m.rows] -= m.trajectory[:, None, None] * m.image
+    return with_points(evidence, ObservationGrid(points, grid.weights))
+
+
+def drop_wandering_targets(evidence: ReducedSeries) -> tuple[list[FieldMovement], ReducedSeries]:
+    """Find the targets that wander, and reduce the series without them."""
+    found = wandering_targets(_field_series(evidence))
+    if not found:
+        return [], evidence
+    rows = np.concatenate([m.rows for m in found])
+    return found, without_targets(evidence, np.union1d(evidence.excluded, rows))
+
+
+def _field_series(e: ReducedSeries) -> FieldSeries:
+    field = e.source.field
+    boards = field_sheets(field)
+    return FieldSeries(
+        e.times, e.residuals, e.weights, e.columns, e.at.B, field.points, boards, field.names,
+        e.numbers,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Displaced:
+    """Targets that moved together: rows of the field, time s ± s from the series' start,
+    displacement (k, 3) mm as far as an image shows it (across the ray), sd (k, 3), step (k, 2) px.
+    """
+
+    rows: NDArray[np.int64]
+    time: float
+    sd_time: float
+    vectors: Array
+    sd_vectors: Array
+    steps: Array
+    gain: float
+
+
+def _find_steps(evidence: ReducedSeries) -> tuple[Array, NDArray[np.int64], Array]:
+    """Find the best step of each target: gain (T,), first epoch after it, share of movement."""
+    w = np.sqrt(evidence.weights[..., :2])
+    r = evidence.residuals * w
+    # noise may grow with heat: each epoch in units of its own spread
+    own = np.array([np.nanmedian(np.abs(x)) if np.isfinite(x).any() else 1.0 for x in r])
+    r = np.nan_to_num(r / np.maximum(1.4826 * own, 0.3)[:, None, None])
+    there = np.isfinite(evidence.residuals[..., 0]).astype(float)
+    count = np.cumsum(there, axis=0)
+    total = count[-1]
+    before = count[:-1]
+    after = total - before
+    sums = np.cumsum(r, axis=0)
+    s0, s1 = sums[:-1], sums[-1] - sums[:-1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        difference = s1 / after[..., None] - s0 / before[..., None]
+        gain = np.sum(difference**2, axis=2) * before * after / total
+    gain = np.where((before >= 4) & (after >= 4), np.nan_to_num(gain), 0.0)
+    best = np.argmax(gain, axis=0)
+    columns = np.arange(gain.shape[1])
+    top = gain[best, columns]
+    # how much of all slow movement is this one step?
+    slow = cosines(evidence.times, 14)
+    slow = slow / np.linalg.norm(slow, axis=1, keepdims=True)
+    step = (np.arange(len(r))[:, None] > best[None]).astype(float)
+    mean = np.sum(r * there[..., None], axis=0) / np.maximum(total, 1)[:, None]
+    high = s1[best, columns] / np.maximum(after[best, columns], 1)[:, None] - mean
+    low = s0[best, columns] / np.maximum(before[best, columns], 1)[:, None] - mean
+    model = np.where(step[..., None] > 0, high, low) * there[..., None]
+    left = np.einsum("je,etk->jtk", slow, r - model)
+    rest = np.maximum(np.sum(left**2, axis=(0, 2)) - 2 * len(slow), 0.0)
+    return top, best + 1, top / np.maximum(top + rest, 1e-9)
+
+
+def _lasts(residuals: Array, first: int) -> bool:
+    """Test whether a step in residuals (E, 2) is in most epochs; a gross error moves a mean,
+    too.
+    """
+    before, after = residuals[:first], residuals[first:]
+    mean = np.nanmean(after, axis=0) - np.nanmean(before, axis=0)
+    middle = np.nanmedian(after, axis=0) - np.nanmedian(before, axis=0)
+    return bool(np.sum(mean * middle) > 0.5 * np.sum(mean**2))
+
+
+def find_displaced_targets(evidence: ReducedSeries) -> tuple[list[Displaced], ReducedSeries]:
+    """Find targets that jumped, and reduce the series without them.
+
+    A marker jumps as a whole: where a few of its corners jump, it was badly seen, and is left out.
+    """
+    found: dict[int, tuple[int, float]] = {}
+    limit = criteria.STEP_CHI2 * evidence.correlation
+    cleaned = evidence
+    for _ in range(8):
+        gain, first, share = _find_steps(cleaned)
+        w = cleaned.weights[..., 0]
+        sigma = float(1.0 / np.sqrt(np.mean(w[w > 0])))
+        there = np.isfinite(cleaned.residuals[..., 0]).sum(axis=0)
+        size = 2.0 * sigma * np.sqrt(gain / np.maximum(there, 1))
+        # real targets wander: what many of them do is not a displacement
+        common = 8.0 * float(np.percentile(gain[there > 0], 85)) if (there > 0).any() else 0.0
+        top = float(gain.max(initial=0.0))
+        # one moved target drags the camera and with it all others: the largest go first
+        chosen = np.flatnonzero(
+            (gain > max(limit, common, 0.3 * top))
+            & (share > criteria.STEP_SHARE)
+            & (size > criteria.STEP_PX)
+        )
+        chosen = np.array([t for t in chosen if _lasts(cleaned.residuals[:, t], first[t])], int)
+        if not len(chosen):
+            break
+        for row in chosen:
+            found[int(row)] = (int(first[row]), float(gain[row]))
+        if len(found) > 0.2 * evidence.source.grid.observed.any(axis=0).sum():
+            return [], evidence  # so many do not jump by themselves: it is the camera
+        cleaned = without_targets(evidence, _add_markers(evidence, found))
+    if not found:
+        return [], evidence
+    whole = _keep_whole_markers(evidence, found)
+    return _group_steps(cleaned, whole) if whole else [], cleaned
+
+
+def _add_markers(evidence: ReducedSeries, found: Iterable[int]) -> NDArray[np.int64]:
+    groups = evidence.source.field.groups
+    return np.flatnonzero(np.isin(groups, groups[sorted(found)]))
+
+
+def _keep_whole_markers(
+    evidence: ReducedSeries, found: dict[int, tuple[int, float]]
+) -> dict[int, tuple[int, float]]:
+    """Drop the jumps that other corners of their marker did not make with them."""
+    groups = evidence.source.field.groups
+    seen = evidence.source.grid.observed.any(axis=0)
+    out = {}
+    for row, (first, gain) in found.items():
+        corners = np.flatnonzero((groups == groups[row]) & seen)
+        together = [r for r in corners.tolist() if r in found and abs(found[r][0] - first) <= 1]
+        if 4 * len(together) >= 3 * len(corners):
+            out[row] = (first, gain)
+    return out
+
+
+def _group_steps(cleaned: ReducedSeries, found: dict[int, tuple[int, float]]) -> list[Displaced]:
+    """Measure the steps against the camera that the other targets give; one group per time."""
+    rows = np.array(sorted(found))
+    A = cleaned.columns[rows]
+    misclosure = cleaned.source.grid.points[:, rows] - cleaned.at.predicted[rows]
+    v = misclosure - np.einsum("ek,tik->eti", cleaned.values, A)
+    w = cleaned.weights[..., 0]
+    sigma = float(1.0 / np.sqrt(np.mean(w[w > 0])))
+    v = np.where(np.abs(v - np.nanmedian(v, axis=0)).max(axis=2, keepdims=True) < 1e6, v, np.nan)
+    firsts = np.array([_find_best_step(v[:, k]) for k in range(len(rows))])
+    groups: list[list[int]] = []
+    for k in np.argsort(firsts):
+        if groups and firsts[k] - firsts[groups[-1][-1]] <= 1:
+            groups[-1].append(int(k))
+        else:
+            groups.append([int(k)])
+    out = []
+    for group in groups:
+        first = int(np.median(firsts[group]))
+        steps, vectors, sds = [], [], []
+        for k in group:
+            b, a = v[:first, k], v[first:, k]
+            b, a = b[np.isfinite(b[:, 0])], a[np.isfinite(a[:, 0])]
+            step = np.median(a, axis=0) - np.median(b, axis=0)
+            variance = (np.pi / 2) * sigma**2 * (1 / max(len(a), 1) + 1 / max(len(b), 1))
+            B = cleaned.at.B[rows[k]]
+            inverse = np.linalg.pinv(B)
+            steps.append(step)
+            vectors.append(inverse @ step)
+            sds.append(np.sqrt(np.diag(inverse @ inverse.T) * variance))
+        t = cleaned.times
+        out.append(
+            Displaced(
+                rows[group],
+                float(0.5 * (t[first - 1] + t[first])),
+                float((t[first] - t[first - 1]) / np.sqrt(12.0)),
+                np.array(vectors),
+                np.array(sds),
+                np.array(steps),
+                sum(found[int(rows[k])][1] for k in group),
+            )
+        )
+    return out
+
+
+def _find_best_step(v: Array) -> int:
+    """Find the first epoch after the step of one target (E, 2); gross errors are clipped."""
+    there = np.isfinite(v[:, 0])
+    x = np.where(there[:, None], v, 0.0)
+    spread = np.nanmedian(np.abs(np.diff(v[there], axis=0))) * 6 + 1e-9
+    low, high = np.nanpercentile(v[there], [3, 97], axis=0)
+    x = np.clip(x, low - spread, high + spread) * there[:, None]
+    n0 = np.cumsum(there)[:-1].astype(float)
+    n1 = there.sum() - n0
+    s = np.cumsum(x, axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        d = (s[-1] - s[:-1]) / n1[:, None] - s[:-1] / n0[:, None]
+        gain = np.nan_to_num(np.sum(d**2, axis=1) * n0 * n1)
+    return int(np.argmax(gain)) + 1

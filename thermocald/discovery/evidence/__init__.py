@@ -1,1 +1,0 @@
-"""What a recording shows before any search: targets that moved, noise that grows."""

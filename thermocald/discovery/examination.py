@@ -1,0 +1,410 @@
+"""The examination: from evidence to the effects that explain it, or to none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.discovery import criteria
+from thermocald.discovery.evidence import (
+    Displaced,
+    drop_wandering_targets,
+    find_displaced_targets,
+    replace_moved_boards,
+)
+from thermocald.discovery.mounted import is_convincing, search_beside_mount, treat_slips_as_knocks
+from thermocald.discovery.search import Search, Solution
+from thermocald.discovery.validation import (
+    SurrogateTest,
+    compare_with_surrogates,
+    is_confirmed,
+    measure_block_gains,
+)
+from thermocald.thermal.fit import HypothesisFitter
+from thermocald.thermal.movement import (
+    WAVES,
+    add_jumps_to_noise,
+    add_tremble,
+    detect_tremble,
+    find_combinations,
+    weight_leaps_down,
+)
+from thermocald.thermal.noise import (
+    NoiseGrowth,
+    calibrate_thermometers,
+    noise_growth,
+    weight_slow_noise,
+)
+from thermocald.thermal.reduce import reweight
+from thermocald.thermal.scan import examine_all, remove_curvature
+from thermocald.thermal.series import in_blocks
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from thermocald.arrays import Array
+    from thermocald.photogrammetry.series.field_motion import FieldMovement
+    from thermocald.thermal.hypothesis import Term
+    from thermocald.thermal.movement import Mount
+    from thermocald.thermal.scan import Adequacy
+    from thermocald.thermal.series import ReducedSeries
+
+_EFFECTS = 3
+_COMBINATIONS = 8  # of a level that are fitted in full
+# effects of which one says how far the image moves
+_GUIDES = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Examination:
+    """What the search found.
+
+    fitter: the series as examined, displaced targets out and noise weighted; base, best: solutions;
+    ranking: singles by score; rivals: solutions that cannot be excluded; adequacy: of best, per
+    series; cross_validation: gains (blocks,) of its effects on blocks of time left out; surrogates:
+    each of its effects against surrogates; mount: its movement, where it moves; knocks: of the
+    mount, terms of the base; field_movements: boards and targets that moved, per series.
+    """
+
+    fitter: HypothesisFitter
+    base: Solution
+    best: Solution
+    ranking: tuple[Solution, ...]
+    rivals: tuple[Solution, ...]
+    base_adequacy: tuple[Adequacy, ...]
+    adequacy: tuple[Adequacy, ...]
+    adequate: bool
+    cross_validation: tuple[Array, ...] = ()
+    displaced: tuple[tuple[Displaced, ...], ...] = ()
+    noise_growth: NoiseGrowth | None = None
+    surrogates: tuple[SurrogateTest, ...] = ()
+    mount: Mount | None = None
+    knocks: tuple[Term, ...] = ()
+    original: tuple[ReducedSeries, ...] = ()
+    field_movements: tuple[tuple[FieldMovement, ...], ...] = ()
+
+
+def examine_series(
+    series: Sequence[ReducedSeries],
+    progress: Callable[[str], None] | None = None,
+    given: Sequence[tuple[str, dict[str, Any]]] = (),
+    jobs: int = 1,
+) -> Examination:
+    """Examine one series, or M1 with M2, which share their physical constants.
+
+    given: effects that the model has already, with their values; they are fitted again and stay;
+    jobs: candidates that surrogates try at a time.
+    """
+    say = progress or (lambda _: None)
+    say("targets that moved")
+    displaced, cleaned, field = [], [], []
+    for e in series:
+        boards, still = replace_moved_boards(e)
+        groups, without = find_displaced_targets(still)
+        wandering, without = drop_wandering_targets(without)
+        field.append((*boards, *wandering))
+        displaced.append(tuple(groups))
+        cleaned.append(without)
+    say("measuring noise")
+    growth = noise_growth(cleaned)
+    if growth is not None:
+        cleaned = [reweight(e, n) for e, n in zip(cleaned, growth.noise, strict=True)]
+    calibrated = calibrate_thermometers(cleaned)
+    ready = [in_blocks(weight_slow_noise(e)) for e in calibrated]
+    found = None
+    wanders = max(e.correlation for e in calibrated) > criteria.MEMORY
+    if wanders:
+        found = _examine_beside_mount(calibrated, say, given, jobs)
+    if found is None:
+        shaking = calibrated if not wanders and any(map(detect_tremble, calibrated)) else []
+        found = _examine_standing(ready, shaking, say, given, jobs)
+    return replace(
+        found, displaced=tuple(displaced), noise_growth=growth, original=tuple(series),
+        field_movements=tuple(field),
+    )  # fmt: skip
+
+
+def _examine_standing(
+    ready: list[ReducedSeries],
+    shaking: list[ReducedSeries],
+    say: Callable[[str], None],
+    given: Sequence[tuple[str, dict[str, Any]]],
+    jobs: int,
+) -> Examination:
+    """Search where the mount stands still, and again with what the effects found make known.
+
+    shaking: the series where all targets jump together. What a thermometer's errors take up of that
+    depends on the effect; unless an effect explains it, each is fitted with the tremble it leaves.
+    """
+    say("base model")
+    fitter = HypothesisFitter(ready)
+    search = Search(fitter, say)
+    base = search.base(given)
+    # one effect moves the image by most of what it moves at all
+    guide = min([base, *search.expand(base, _GUIDES)], key=lambda s: s.score).fit
+    bent = remove_curvature(fitter, guide)
+    if bent:
+        search = Search(HypothesisFitter(bent), say)
+        base = search.base(given)
+    found = _search_standing(search, base, say, jobs)
+    if not found.adequate:
+        again = remove_curvature(found.fitter, found.best.fit)
+        if again is not None and _is_explained(again, found):
+            say("curvature of the projection: once more")
+            search = Search(HypothesisFitter(again), say)
+            found = _search_standing(search, search.base(given), say, jobs)
+    noisy = add_jumps_to_noise(found.fitter, found.best.fit)
+    if shaking and (noisy is not None or not found.adequate):
+        alongside = _examine_beside_mount(shaking, say, given, jobs)
+        if alongside is not None:
+            return alongside
+    if noisy is not None and (found.adequate or _is_explained(noisy, found)):
+        say("noise that targets share: once more")
+        search = Search(HypothesisFitter(noisy), say)
+        found = _search_standing(search, search.base(given), say, jobs)
+    return found
+
+
+def _is_explained(series: list[ReducedSeries], found: Examination) -> bool:
+    """Test whether the effects found leave nothing over in other states of the series."""
+    fitter = HypothesisFitter(series)
+    refined = fitter.refine(fitter.fit(found.best.terms, found.best.fit.coefficients))
+    now = examine_all(fitter, refined)
+    return adequate(now, found.base_adequacy)
+
+
+def _search_standing(
+    search: Search, base: Solution, say: Callable[[str], None], jobs: int
+) -> Examination:
+    """Search where the mount stands still: combinations grow while the score improves."""
+    fitter = search.fitter
+    kept = len(base.terms)
+    base_adequacy = examine_all(fitter, base.fit)
+    best, ranking, seen = base, list[Solution](), list[Solution]()
+    frontier = [base]
+    complete = False
+    for level in range(1, _EFFECTS + 1):
+        say(f"effect {level}: alongside {' or '.join(', '.join(s.names) for s in frontier)}"
+            if level > 1 else "effect 1: alongside the base")  # fmt: skip
+        if level == 1:
+            grown = search.expand(base)
+            ranking = grown
+        else:
+            # once nothing is left over, other effects have to promise more than the best explains
+            below = best.score if complete else np.inf
+            more = search.expand_all(frontier, 4, _COMBINATIONS, below)
+            grown = [search.shrink(s, kept) for s in more]
+        seen += grown
+        if complete:
+            equal = [s for s in frontier if s.score < best.score + criteria.BAND]
+            grown = [s for s in grown if _is_worth_it(fitter, base, best, equal, s)]
+        if not grown:
+            break
+        champion = min(grown, key=lambda s: s.score)
+        if champion.score >= best.score:
+            break
+        best = search.with_events_moved(champion)
+        seen.append(best)
+        complete = adequate(examine_all(fitter, best.fit), base_adequacy)
+        # what is adequate may still lack something too fast for the absolute test, and one effect
+        # with many coefficients may stand for two others that have not been tried together yet
+        frontier = _choose_frontier(grown) if complete or level == 1 else [best]
+    # larger combinations that were not accepted are no rivals
+    seen = [s for s in seen if len(s.terms) <= len(best.terms)]
+    if len(best.terms) > kept:
+        best, seen = _compare_ties(search, best, seen)
+        # The likelihood holds every trajectory of the temperature for equally probable. A lag
+        # smooths the thermometer's noise, a delay does not; so a smooth image, which all
+        # temperatures give, would speak for a lag whatever the cause: the fit alone decides.
+        other = search.with_other_delay(best)
+        if other is not None:
+            seen = [*seen, other]
+            best = other if other.fit.chi2 < best.fit.chi2 - 0.5 * criteria.DRIVES_BAND else best
+    blocks: list[Array] = []
+    tests: tuple[SurrogateTest, ...] = ()
+    if adequate(examine_all(fitter, best.fit), base_adequacy):
+        best, blocks, tests = _keep_named(search, base, best, jobs)
+    adequacy = examine_all(fitter, best.fit)
+    complete = adequate(adequacy, base_adequacy)
+    if len(best.terms) > kept and len(fitter.series) < 2:
+        # where single targets wander much, one series alone carries no name
+        complete = complete and fitter.series[0].correlation <= criteria.WANDERING
+    return Examination(
+        fitter, base, best, tuple(ranking), _list_rivals(best, seen), base_adequacy, adequacy,
+        complete, tuple(blocks), surrogates=tests,
+    )  # fmt: skip
+
+
+def _list_rivals(best: Solution, seen: Sequence[Solution]) -> tuple[Solution, ...]:
+    """List the solutions that cannot be excluded in favour of the best, best first."""
+    out: list[Solution] = []
+    for s in sorted(seen, key=lambda s: s.score):
+        mine = [t for t in best.terms if t.effect not in s.names]
+        theirs = [t for t in s.terms if t.effect not in best.names]
+        # one way of following the temperature in place of another is judged by the fit alone
+        swapped = len(mine) == len(theirs) == 1 and mine[0].is_drive and theirs[0].is_drive
+        close = (
+            s.fit.chi2 < best.fit.chi2 + criteria.DRIVES_BAND
+            if swapped
+            else s.score < best.score + criteria.BAND
+        )
+        different = sorted(s.names) != sorted(best.names)
+        if different and close and s.names not in [r.names for r in out]:
+            out.append(s)
+    return tuple(out)
+
+
+def _compare_ties(
+    search: Search, best: Solution, seen: list[Solution]
+) -> tuple[Solution, list[Solution]]:
+    """Compare near ties again, each under the thermometer noise that suits it best."""
+    close = {s.terms: s for s in seen if s.score < best.score + 60.0}
+    if len({s.names for s in close.values()}) < 2:
+        return best, seen
+    fitter = search.fitter
+    again: list[Solution] = []
+    for s in sorted(close.values(), key=lambda s: s.score)[:6]:
+        _, objective = fitter.thermometer_scale(s.fit)
+        again.append(replace(s, fit=replace(s.fit, logdet=objective - s.fit.chi2)))
+    again.sort(key=lambda s: s.score)
+    others = [s for s in seen if s.terms not in close]
+    return again[0], [*again, *others]
+
+
+def _is_worth_it(
+    fitter: HypothesisFitter,
+    base: Solution,
+    best: Solution,
+    equal: Sequence[Solution],
+    champion: Solution,
+) -> bool:
+    """Decide whether effects take the place of `best`, which explains all, or of one `equal` to it.
+
+    One effect more has to be worth more than the finer points of the others; others in their
+    place have to exclude them, and to fit better: a smoother temperature alone is no reason.
+    """
+    fewer = [s for s in equal if set(s.names) <= set(champion.names)]
+    if not fewer:
+        more = _measure_px(fitter, best, champion) >= criteria.CURVATURE_PX
+        return (
+            more
+            and champion.score < best.score - criteria.BAND
+            and champion.fit.chi2 < best.fit.chi2
+        )
+    least = max(criteria.FURTHER_PX, criteria.FURTHER_SHARE * _measure_px(fitter, base, best))
+    return all(_measure_px(fitter, s, champion) >= least for s in fewer)
+
+
+def _measure_px(fitter: HypothesisFitter, without: Solution, with_it: Solution) -> float:
+    """Return the RMS px that one more effect explains."""
+    gain = max(without.score - with_it.score, 0.0)
+    coordinates = 2.0 * sum(float(e.n.sum()) for e in fitter.series)
+    weights = np.concatenate([e.weights[..., 0].ravel() for e in fitter.series])
+    return float(np.sqrt(gain / coordinates / np.mean(weights[weights > 0])))
+
+
+def _choose_frontier(grown: list[Solution], width: int = 4) -> list[Solution]:
+    """Choose the best solutions of a level, one per set of names."""
+    out: list[Solution] = []
+    for s in sorted(grown, key=lambda s: s.score):
+        if all(sorted(s.names) != sorted(o.names) for o in out):
+            out.append(s)
+    return out[:width]
+
+
+def adequate(now: Sequence[Adequacy], base: Sequence[Adequacy]) -> bool:
+    """Test whether a solution leaves nothing, or next to nothing of what the base left."""
+    return all(
+        a.adequate or a.misfit_px < criteria.LEFT_SHARE * b.misfit_px
+        for a, b in zip(now, base, strict=True)
+    )
+
+
+def _examine_beside_mount(
+    calibrated: list[ReducedSeries],
+    say: Callable[[str], None],
+    given: Sequence[tuple[str, dict[str, Any]]],
+    jobs: int,
+) -> Examination | None:
+    """Search alongside a mount that moves; None where the movement is not one of a mount.
+
+    A smooth influence that was not recorded is not a wander of a mount.
+    """
+    fitter = HypothesisFitter([in_blocks(replace(e, correlation=1.0)) for e in calibrated])
+    fitter = HypothesisFitter(
+        weight_leaps_down(fitter, fitter.fit(()), find_combinations(fitter.series))
+    )
+    shaken = add_tremble(fitter, fitter.fit(()), WAVES)
+    found = search_beside_mount(HypothesisFitter(shaken), say, given)
+    if found.mount.smoothness(found.fitter, found.best.fit) > criteria.SMOOTH:
+        return None
+    search = Search(found.fitter, say, found.like)
+    best, blocks, tests = _keep_named(search, found.base, found.best, jobs)
+    if any(t.kind.is_event and t not in best.terms for t in found.best.terms):
+        found = treat_slips_as_knocks(
+            found, len(given)
+        )  # steps that cannot be named are still there
+        best, blocks, tests = _keep_named(search, found.base, found.best, jobs)
+    base = found.base
+    if not is_convincing(found.fitter, base, best):
+        best, blocks, tests = base, [], ()
+    adequacy = examine_all(found.fitter, best.fit)
+    rivals: list[Solution] = []
+    for s in sorted(found.seen, key=lambda s: s.score):
+        names = [t.effect for t in s.terms if t not in found.knocks]
+        own = [t.effect for t in best.terms if t not in found.knocks]
+        # between two readings the temperature is unknown: a delay and its rate look alike
+        differ = [t for t in (*s.terms, *best.terms) if (t in s.terms) != (t in best.terms)]
+        band = criteria.DRIVES_BAND if any(t.kind.delay for t in differ) else criteria.BAND
+        close = s.score < best.score + band and len(names) <= len(own)
+        if close and sorted(names) != sorted(own) and s.names not in [r.names for r in rivals]:
+            rivals.append(s)
+    return Examination(
+        found.fitter, base, best, found.ranking, tuple(rivals), examine_all(found.fitter, base.fit),
+        adequacy, True, tuple(blocks), surrogates=tests, mount=found.mount, knocks=found.knocks,
+    )  # fmt: skip
+
+
+def _keep_named(
+    search: Search, base: Solution, best: Solution, jobs: int
+) -> tuple[Solution, list[Array], tuple[SurrogateTest, ...]]:
+    """Drop the effects that blocks left out or surrogates speak against."""
+    kept = len(base.terms)
+    best, blocks = _keep_confirmed(search, base, best)
+    while len(best.terms) > kept:
+        tests = []
+        for i in range(kept, len(best.terms)):
+            without = _drop_effect(search, base, best, i)
+            gain = without.score - best.score
+            tests.append(compare_with_surrogates(search, best.fit, without, gain, jobs=jobs))
+        worst = max(range(len(tests)), key=lambda i: tests[i].p)
+        if tests[worst].passed:
+            return best, blocks, tuple(tests)
+        search.progress(f"{best.names[kept + worst]} is not more than noise may give")
+        best, blocks = _keep_confirmed(search, base, _drop_effect(search, base, best, kept + worst))
+    return best, blocks, ()
+
+
+def _drop_effect(search: Search, base: Solution, best: Solution, number: int) -> Solution:
+    """Leave one effect out of a solution, and fit the others again."""
+    terms = [t for i, t in enumerate(best.terms) if i != number]
+    penalties = [p for i, p in enumerate(best.penalties) if i != number]
+    return search.refine(terms, penalties) if len(terms) > len(base.terms) else base
+
+
+def _keep_confirmed(search: Search, base: Solution, best: Solution) -> tuple[Solution, list[Array]]:
+    """Drop the effects that do not predict blocks left out; also return what the others gain
+    on each block.
+    """
+    kept = len(base.terms)
+    while len(best.terms) > kept:
+        blocks = measure_block_gains(search.fitter, best.fit, kept)
+        bad = [i for i, g in enumerate(blocks) if not is_confirmed(g)]
+        if not bad:
+            return best, blocks
+        worst = kept + min(bad, key=lambda i: float(blocks[i].sum()))
+        search.progress(f"{best.names[worst]} does not predict the blocks left out")
+        best = _drop_effect(search, base, best, worst)
+    return best, []

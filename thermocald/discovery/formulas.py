@@ -1,0 +1,534 @@
+"""The search for a formula: a library on a grid, the best made exact, then one operator further.
+
+Scored as the catalogue's effects are (`search`): the gain in χ² less
+
+    coefficients · ln n + constants · ln n + 2 ln(trials) + margin,
+
+n the number of epochs, trials how many formulas were tried. Everything runs on condensed evidence.
+
+The library: formulas that are tried first, on a grid of constants, and those one step further.
+
+    recorded quantity → memory (lag, play, …) → shape (power, threshold, …) → memory (integral, …)
+
+Grids follow what was recorded: thresholds lie within the range, time constants within the duration.
+
+Condensed evidence: what a trajectory of a few parameters would explain, by two products.
+
+The likelihood of the base model is a quadratic form in any further trajectory of the camera's
+parameters; on rows of neighbouring epochs, with levels and the base's own rates eliminated, its
+matrix is a few hundred square. Its root whitens trajectory and data once, and thousands of
+candidates cost milliseconds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.physics.formula import TIME, Evaluator, Node
+from thermocald.physics.history import History
+from thermocald.physics.operators import OPERATORS
+from thermocald.thermal.scan import normals_beside
+from thermocald.thermal.series import unit_directions
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from thermocald.arrays import Array
+    from thermocald.physics.operators import Constant
+    from thermocald.thermal.fit import HypothesisFitter
+    from thermocald.thermal.hypothesis import Fit
+    from thermocald.thermal.likelihood import Weighting
+    from thermocald.thermal.series import ReducedSeries
+
+_ROWS = 90  # of one series
+
+_KNOTS = 400
+
+_NULL = 1e-9  # of the largest eigenvalue: levels, the base's own rates
+
+
+@dataclass(frozen=True, eq=False)
+class Condensed:
+    """Series on few rows, whitened.
+
+    histories: one per series, asked for the rows' times; edges: where each series begins among the
+    rows; root (k, rows, r): whitens trajectories of each parameter; data (r,), whitened; amplitude
+    (k, rows): the trajectories that the data have themselves, px-scaled; epochs: how many the
+    series hold.
+    """
+
+    histories: tuple[History, ...]
+    edges: tuple[int, ...]
+    root: Array
+    data: Array
+    amplitude: Array
+    epochs: int
+
+    def gains(self, trajectories: Array) -> Array:
+        """Return χ² (G,) that trajectories (rows, G) explain, each in all parameters together."""
+        Z = self.regressors(trajectories)
+        out: Array = np.sum((Z @ self.data) ** 2, axis=1)
+        return out
+
+    def gains_of(self, regressors: Array, data: Array) -> Array:
+        """Return the same (G, S) for other data (r, S), from `regressors` (G, k, r)."""
+        G, k, r = regressors.shape
+        out: Array = ((regressors.reshape(G * k, r) @ data) ** 2).reshape(G, k, -1).sum(axis=1)
+        return out
+
+    def whitened(self, trajectories: Array) -> Array:
+        """Whiten trajectories (rows, G) in each parameter: (G, k, r)."""
+        s = trajectories - trajectories.mean(axis=0)
+        return np.stack([s.T @ part for part in self.root], axis=1)
+
+    def regressors(self, trajectories: Array) -> Array:
+        """Return orthonormal whitened regressors (G, k, r) of trajectories (rows, G)."""
+        s = trajectories - trajectories.mean(axis=0)
+        Z = self.whitened(s / np.maximum(np.abs(s).max(axis=0), 1e-300))
+        Z /= np.maximum(np.linalg.norm(Z, axis=2, keepdims=True), 1e-9)
+        own = Z @ np.swapaxes(Z, 1, 2) + 1e-7 * np.eye(Z.shape[1])
+        out: Array = np.linalg.inv(np.linalg.cholesky(own)) @ Z
+        return out
+
+    def beside(self, trajectory: Array) -> Condensed:
+        """Put a trajectory (rows,) into the model."""
+        Q = self.regressors(trajectory[:, None])[0].T
+        root = self.root - (self.root @ Q) @ Q.T
+        return replace(self, root=root, data=self.data - Q @ (Q.T @ self.data))
+
+    @property
+    def power(self) -> float:
+        """χ² of everything that the base model leaves in these parameters."""
+        return float(self.data @ self.data)
+
+    def surrogates(self, count: int, rng: np.random.Generator) -> Array:
+        """Draw whitened data (r, count) whose trajectories are moved in time against the recording.
+
+        Each series by itself: shifted in a circle, half of them reversed, half turned in sign. So
+        they are as smooth as the misfit, and their cause was not recorded.
+        """
+        out = np.zeros((len(self.data), count))
+        for i in range(count):
+            moved = np.empty_like(self.amplitude)
+            for begin, end in zip(self.edges[:-1], self.edges[1:], strict=True):
+                n = end - begin
+                part = np.roll(self.amplitude[:, begin:end], rng.integers(n // 8, n - n // 8), 1)
+                part = part[:, ::-1] if rng.random() < 0.5 else part
+                moved[:, begin:end] = part if rng.random() < 0.5 else -part
+            out[:, i] = np.einsum("ker,ke->r", self.root, moved)
+        return out
+
+
+def condensed(
+    fitter: HypothesisFitter,
+    fit: Fit,
+    parameters: Sequence[str],
+    weightings: Sequence[Weighting] | None = None,
+) -> Condensed:
+    """Condense the evidence of all series about some parameters, beside a fitted hypothesis.
+
+    weightings: covariances of another hypothesis, whose reading errors are nearer to the truth.
+    """
+    k, directions = len(parameters), unit_directions(parameters)
+    pools = [_pool(e) for e in fitter.series]
+    counts = [p.shape[1] for p in pools]
+    edges = np.concatenate([[0], np.cumsum(counts)])
+    rows = int(edges[-1])
+    place = np.arange(k * rows).reshape(k, rows)
+    further = [
+        (np.tile(pool, k), np.repeat(directions, m, axis=1), place[:, begin : begin + m].ravel())
+        for pool, m, begin in zip(pools, counts, edges, strict=False)
+    ]
+    Q, y = normals_beside(fit, further, k * rows, weightings)
+    size, U = np.linalg.eigh(0.5 * (Q + Q.T))
+    kept = size > _NULL * size[-1]
+    size, U = size[kept], U[:, kept]
+    held = 0.1 * float(np.median(size))
+    amplitude = U @ (U.T @ y / (size + held))
+    return Condensed(
+        tuple(_history(e, p) for e, p in zip(fitter.series, pools, strict=True)),
+        tuple(int(i) for i in edges),
+        (U * np.sqrt(size)).reshape(k, rows, -1),
+        U.T @ y / np.sqrt(size),
+        amplitude.reshape(k, rows),
+        sum(int((e.n > 0).sum()) for e in fitter.series),
+    )
+
+
+def _pool(e: ReducedSeries) -> Array:
+    """Return which of the rows each epoch belongs to, (E, m)."""
+    E = len(e.times)
+    size = int(np.ceil(E / _ROWS))
+    group = np.arange(E) // size
+    out: Array = (group[:, None] == np.arange(group[-1] + 1)).astype(float)
+    return out
+
+
+def _history(e: ReducedSeries, pool: Array) -> History:
+    """Return the history at the rows' mean times, on some hundred knots."""
+    h = e.history
+    knots = h.polygon().times
+    knots = knots[:: int(np.ceil(len(knots) / _KNOTS))]
+    readings = {name: h.polygon(name).at(knots) for name in h.readings}
+    times = (e.times @ pool) / pool.sum(axis=0)
+    return History(times, knots, readings, h.reference, h.T0, h.columns)
+
+
+_MEMORIES = ("lag", "play", "peak", "maximum", "minimum")
+
+
+class Library:
+    """The formulas over what all of some histories hold."""
+
+    def __init__(self, histories: Sequence[History]) -> None:
+        self.evaluators = tuple(Evaluator(h) for h in histories)
+        first = histories[0]
+        self.reference = Node("", name=first.reference)
+        others = [Node("", name=n) for n in first.readings if n != first.reference]
+        others += [Node("column", name=n) for n in first.columns]
+        self.leaves = [n for n in (self.reference, *others) if self._varies(n)]
+        duration = max(float(h.times[-1]) for h in histories)
+        step = float(np.median(np.diff(first.times)))
+        self.duration = duration
+        self.taus = np.geomspace(max(step, duration / 120), duration / 2, 7)
+
+    def _varies(self, leaf: Node) -> bool:
+        for e in self.evaluators:
+            known = e.history.columns if leaf.operator else e.history.readings
+            if leaf.name not in known or np.ptp(e.values(leaf)) <= 0:
+                return False
+        return True
+
+    def values(self, node: Node) -> Array:
+        """Return the trajectory (rows,) of a bound formula over all histories, one after the
+        other.
+        """
+        return np.concatenate([e.values(node) for e in self.evaluators])
+
+    def stack(self, nodes: Sequence[Node]) -> Array:
+        """Return the trajectories (rows, G)."""
+        return np.stack([self.values(n) for n in nodes], axis=1)
+
+    def span(self, node: Node) -> tuple[float, float]:
+        """Return the range of a formula's values."""
+        v = self.values(node)
+        return float(v.min()), float(v.max())
+
+    # -- first tries -----------------------------------------------------------------------------
+
+    def first(self) -> list[Node]:
+        """List everything that is tried before anything is known."""
+        out: list[Node] = []
+        for leaf in self.leaves:
+            for inner in self.remembered(leaf):
+                out += [inner, *self.shapes(inner)]
+            out += self.waves(leaf)
+            for rated in self.rates(leaf):
+                out += [rated, *self.shapes(rated, about_zero=True)]
+            changed = _apply("change", leaf)
+            out += [_apply(n, changed) for n in ("square", "cube", "magnitude", "signed_square")]
+            out.append(_apply("product", changed, Node(TIME)))
+            for shape in (*self.offsets(leaf), *self.shapes(leaf)):
+                out += self.remembered(shape, few=True)
+                out.append(_apply("integral", shape))
+        out += self.products()
+        return _keep_distinct(out)
+
+    def remembered(self, node: Node, few: bool = False) -> list[Node]:
+        """Send a quantity through each operator with memory."""
+        low, high = self.span(node)
+        out = [] if few else [node]
+        taus = self.taus[::2] if few else self.taus
+        out += [_apply("lag", node, tau) for tau in taus]
+        out += [_apply("maximum", node)]
+        if few:
+            return out
+        out += [_apply("lag", _apply("lag", node, tau), tau) for tau in taus[:-1]]
+        out += [_apply("play", node, r) for r in (high - low) * np.geomspace(0.04, 0.35, 5)]
+        out += [_apply("minimum", node)]
+        out += [_apply("peak", node, tau) for tau in taus[1:]]
+        return out
+
+    def rates(self, node: Node) -> list[Node]:
+        """List the rates of a quantity, at once and smoothed."""
+        smooth = [_apply("rate", _apply("lag", node, tau)) for tau in self.taus[1:5]]
+        return [_apply("rate", node), *smooth]
+
+    def offsets(self, node: Node, few: bool = False) -> list[Node]:
+        """Count a quantity from somewhere else."""
+        low, high = self.span(node)
+        width = high - low
+        far = low + width * np.array([-3.0, -1.0, -0.2, 0.5, 1.2, 2.0, 4.0])
+        places = far if few else np.linspace(low - 0.5 * width, high + 0.5 * width, 9)
+        return [_apply("offset", node, a) for a in places]
+
+    def shapes(self, node: Node, about_zero: bool = False) -> list[Node]:
+        """Send a quantity through each pointwise operator."""
+        low, high = self.span(node)
+        width = max(high - low, 1e-12)
+        inside = np.linspace(low, high, 11)[1:-1]
+        out = [_apply("above", node, k) for k in inside]
+        out += [
+            _apply("saturation", node, k, w * width)
+            for k in inside[::2]
+            for w in (0.01, 0.08, 0.25)
+        ]
+        if about_zero:
+            names = ("square", "signed_square", "magnitude", "cube")
+            return out + [_apply(name, node) for name in names]
+        middle = _apply("offset", node, 0.5 * (low + high))
+        out += [_apply("square", middle), _apply("cube", middle), _apply("magnitude", middle)]
+        out += [
+            _apply("power", _apply("above", node, k), p)
+            for k in (low - 0.02 * width, *inside[1:6:2])
+            for p in (0.5, 2.0, 3.0)
+        ]
+        out += [_apply("exponential", node, w * width) for w in (0.12, 0.4)]
+        return out
+
+    def waves(self, node: Node) -> list[Node]:
+        """Let a quantity come back to the same again and again, as interference does."""
+        low, high = self.span(node)
+        periods = (high - low) * np.array([0.2, 0.3, 0.45, 0.7])
+        return [_apply("wave", node, P, phi) for P in periods for phi in np.arange(4) * np.pi / 4]
+
+    def products(self) -> list[Node]:
+        """List products of two quantities."""
+        time, out = Node(TIME), [_apply("square", Node(TIME)), _apply("power", Node(TIME), 0.5)]
+        for i, leaf in enumerate(self.leaves):
+            for offset in self.offsets(leaf, few=True):
+                out.append(_apply("product", offset, time))
+                others = [n for n in self.leaves if n != leaf]
+                out += [_apply("product", offset, n) for n in others]
+                out += [_apply("product", offset, _apply("rate", n)) for n in self.leaves]
+            out += [
+                _apply("product", _apply("rate", leaf), _apply("rate", n))
+                for n in self.leaves[i + 1 :]
+            ]
+        return out
+
+    # -- one step further --------------------------------------------------------------------------
+
+    def further(self, node: Node) -> list[Node]:
+        """Add one operator to a formula: around it, at its quantities, or as a factor."""
+        out = [*self.remembered(node)[1:], _apply("rate", node), _apply("integral", node)]
+        out += self.shapes(node)
+        out += [_apply("product", o, node) for leaf in self.leaves
+                for o in self.offsets(leaf, few=True)]  # fmt: skip
+        out.append(_apply("product", node, Node(TIME)))
+        for leaf in {n for n in node.walk() if n.is_leaf and n.operator != TIME}:
+            out += [_replace_leaf(node, leaf, inner) for inner in self.remembered(leaf)[1:]]
+            out += [_replace_leaf(node, leaf, other) for other in self.leaves if other != leaf]
+        deepest = max(node.depth, 4)
+        return [n for n in _keep_distinct(out) if n.depth <= deepest]
+
+
+def _apply(operator: str, *parts: Node | float) -> Node:
+    count = OPERATORS[operator].inputs
+    inputs = tuple(p for p in parts[:count] if isinstance(p, Node))
+    return Node(operator, inputs, tuple(float(p) for p in parts[count:] if not isinstance(p, Node)))
+
+
+def _replace_leaf(node: Node, leaf: Node, by: Node) -> Node:
+    if node == leaf:
+        return by
+    return replace(node, inputs=tuple(_replace_leaf(n, leaf, by) for n in node.inputs))
+
+
+def _keep_distinct(nodes: Sequence[Node]) -> list[Node]:
+    """Keep each once; a thermometer itself is the catalogue's."""
+    return [n for n in dict.fromkeys(nodes) if n.inputs or n.operator]
+
+
+_WIDTH = 16  # structures whose constants are made exact
+_KEPT = 800  # formulas of a library that are tried again under other covariances
+_FURTHER = 3  # of them that are taken one operator further
+_STEPS = 2  # how many operators further
+_ITERATIONS = 6
+_SIMPLER = 0.25  # log of what is left: one operator more has to leave a quarter less
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A formula with its constants, the χ² it explains, and what the search for it costs."""
+
+    node: Node
+    gain: float
+    penalty: float
+
+    @property
+    def net(self) -> float:
+        return self.gain - self.penalty
+
+
+class FormulaSearch:
+    """One search over what some series recorded."""
+
+    def __init__(
+        self, evidence: Condensed, margin: float, before: FormulaSearch | None = None
+    ) -> None:
+        """before: a search over the same series with other covariances; its worst are left out."""
+        self.margin = margin
+        self.evidence = evidence
+        if before is None:
+            self.library = Library(evidence.histories)
+            self.nodes = self.library.first()
+            self.tried = len(self.nodes)
+            self.nodes, self.stack = self._finite(self.nodes)
+        else:
+            self.library, self.tried = before.library, before.tried
+            kept = np.sort(np.argsort(-before.gains)[:_KEPT])
+            self.nodes, self.stack = [before.nodes[i] for i in kept], before.stack[:, kept]
+        self.regressors = evidence.regressors(self.stack)
+        self.gains: Array = np.sum((self.regressors @ evidence.data) ** 2, axis=1)
+
+    def _finite(self, nodes: Sequence[Node]) -> tuple[list[Node], Array]:
+        """Keep the formulas that have values everywhere and change; also their trajectories (rows,
+        G).
+        """
+        with np.errstate(all="ignore"):
+            stack = self.library.stack(nodes)
+            good = np.isfinite(stack).all(axis=0) & (np.ptp(stack, axis=0) > 0)
+        return [n for n, ok in zip(nodes, good, strict=True) if ok], stack[:, good]
+
+    def best(self, further: bool = True) -> list[Found]:
+        """Rank formulas, best first, each structure once; further: with operators added, too."""
+        found = self._exact(self.nodes, self.gains, _WIDTH)
+        for _ in range(_STEPS if further else 0):
+            if self._left(found[0].gain) < 0.5 * len(self.evidence.data):
+                break
+            more: list[Node] = []
+            for one in found[:_FURTHER]:
+                more += self.library.further(one.node)
+            before = found[0]
+            found = sorted([*found, *self._tried(more)], key=self._rank, reverse=True)
+            if self._rank(found[0]) <= self._rank(before):
+                break
+        return found
+
+    def _tried(self, nodes: Sequence[Node]) -> list[Found]:
+        """Try formulas one operator further; the most promising become exact."""
+        self.tried += len(nodes)
+        kept, stack = self._finite(nodes)
+        return self._exact(kept, self.evidence.gains(stack), _WIDTH // 2)
+
+    def _rank(self, found: Found) -> float:
+        """Rank by what is left; a further operator has to leave a quarter less."""
+        return self._ranked(found.node, found.gain)
+
+    def _ranked(self, node: Node, gain: float) -> float:
+        return -float(np.log(self._left(gain))) - _SIMPLER * _count_operators(node)
+
+    def _exact(self, nodes: Sequence[Node], gains: Array, width: int) -> list[Found]:
+        """Fit the constants of the best structures."""
+        order = np.argsort([-self._ranked(n, float(g)) for n, g in zip(nodes, gains, strict=True)])
+        seen: dict[Node, Node] = {}
+        for i in order:
+            structure = nodes[i].named()[0]
+            if structure not in seen:
+                seen[structure] = nodes[i]
+            if len(seen) == width:
+                break
+        out = [self._refined(node) for node in seen.values()]
+        return sorted(out, key=self._rank, reverse=True)
+
+    def _refined(self, node: Node) -> Found:
+        """Find the constants that explain most: Gauss-Newton, the coefficients eliminated."""
+        structure, values = node.named()
+        constants = list(structure.free())
+        x = np.array([values[name] for name, _, _ in constants])
+        steps = np.array([self._step(owner.bound(values), c, v)
+                          for (_, c, owner), v in zip(constants, x, strict=True)])  # fmt: skip
+        library = Library(self.evidence.histories)
+        low, high = np.array([self._limits(owner.bound(values), c) for _, c, owner in constants]
+                             or np.zeros((0, 2))).T  # fmt: skip
+
+        def at(x: Array) -> Node:
+            names = (name for name, _, _ in constants)
+            return structure.bound(dict(zip(names, x.tolist(), strict=True)))
+
+        def moved(x: Array, step: Array) -> Array:
+            positive = np.array([c.positive for _, c, _ in constants], dtype=bool)
+            factor = np.exp(np.clip(step / np.where(x == 0, 1.0, x), -1.0, 1.0))
+            return np.clip(np.where(positive, x * factor, x + step), low, high)
+
+        trajectory = library.values(at(x))
+        gain = float(self.evidence.gains(trajectory[:, None])[0])
+        for _ in range(_ITERATIONS if len(x) else 0):
+            sides = [library.values(at(moved(x, d))) for d in np.diag(steps)]
+            shift = self._newton(trajectory, np.stack(sides, axis=1) - trajectory[:, None])
+            improved = False
+            for damping in (1.0, 0.4, 0.1):
+                trial = moved(x, damping * shift * steps)
+                candidate = library.values(at(trial))
+                if not np.isfinite(candidate).all() or np.ptp(candidate) <= 0:
+                    continue
+                new = float(self.evidence.gains(candidate[:, None])[0])
+                if new > gain:
+                    improved = new > gain + 1e-4 * self._left(gain)
+                    x, trajectory, gain = trial, candidate, new
+                    break
+            if not improved:
+                steps = 0.25 * steps
+        return Found(at(x), gain, self._penalty(len(x)))
+
+    def _newton(self, trajectory: Array, slopes: Array) -> Array:
+        """Return the step of the constants (n,), in the units of `slopes` (rows, n)."""
+        Z = self.evidence.whitened(trajectory[:, None])[0].T
+        slopes = np.nan_to_num(slopes)
+        weights = np.linalg.lstsq(Z, self.evidence.data, rcond=1e-10)[0]
+        D = np.einsum("k,gkr->rg", weights, self.evidence.whitened(slopes))
+        X = np.hstack([Z, D])
+        size = np.maximum(np.linalg.norm(X, axis=0), 1e-300)
+        out: Array = (np.linalg.lstsq(X / size, self.evidence.data, rcond=1e-6)[0] / size)[
+            Z.shape[1] :
+        ]
+        return out
+
+    def _step(self, owner: Node, constant: Constant, value: float) -> float:
+        """Return a step of a constant that changes the formula somewhat."""
+        if constant.positive or constant.role == "phase":
+            return 0.05 * max(abs(value), 1.0 if constant.role == "phase" else 0.0)
+        low, high = self.library.span(owner.inputs[0])
+        return 0.03 * (high - low)
+
+    def _limits(self, owner: Node, constant: Constant) -> tuple[float, float]:
+        """Return where a constant may be: a threshold near the range of what it is applied to."""
+        low, high = self.library.span(owner.inputs[0])
+        width = high - low
+        if constant.role == "time_constant":
+            return 0.25 * self.library.taus[0], 3.0 * self.library.duration
+        if constant.role == "threshold":
+            reach = 3.0 * width if owner.operator == "offset" else 0.1 * width
+            return low - reach, high + reach
+        if constant.role == "exponent":
+            return 0.1, 6.0
+        return (1e-3 * width, 10.0 * width) if constant.positive else (-np.inf, np.inf)
+
+    def _left(self, gain: float) -> float:
+        """Return the χ² that is left beyond the noise, never quite none."""
+        r = len(self.evidence.data)
+        return max(self.evidence.power - gain - r, 0.0) + 0.1 * r
+
+    def _penalty(self, constants: int) -> float:
+        n = np.log(self.evidence.epochs)
+        return float(
+            (len(self.evidence.root) + constants) * n + 2 * np.log(max(self.tried, 1)) + self.margin
+        )
+
+    def surrogates(self, count: int, rng: np.random.Generator) -> tuple[float, Array]:
+        """Return the share of the misfit that the library explains at best, of data and
+        surrogates.
+        """
+        data = self.evidence.surrogates(count, rng)
+        power = np.maximum(np.sum(data**2, axis=0), 1e-300)
+        gains = self.evidence.gains_of(self.regressors, np.column_stack([data, self.evidence.data]))
+        top = gains.max(axis=0)
+        return float(top[-1] / self.evidence.power), top[:-1] / power
+
+
+def _count_operators(node: Node) -> int:
+    return sum(not n.is_leaf for n in node.walk())

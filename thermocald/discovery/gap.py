@@ -1,0 +1,160 @@
+"""The gap between simulation and measurement, as CONVENTIONS §4 prints it.
+
+rms_px: image points measured minus simulated. chi2_reduced: the same over its noise, image noise
+and what the thermometers' noise does to the prediction; 1 is the floor. object_mm_at_10m: rms_px
+on a plane at 10 m.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.photogrammetry.linalg import scaled_solve
+from thermocald.thermal.scan import examine
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from thermocald.arrays import Array
+    from thermocald.discovery.evidence import Displaced
+    from thermocald.thermal.fit import HypothesisFitter
+    from thermocald.thermal.hypothesis import Fit, Term
+    from thermocald.thermal.series import ReducedSeries
+
+
+_DISTANCE_MM = 10_000.0
+
+
+@dataclass(frozen=True)
+class Gap:
+    """One G of CONVENTIONS §4."""
+
+    rms_px: float
+    chi2_reduced: float
+    object_mm_at_10m: float
+    floor: float = 1.0  # of chi2_reduced: what the measurement leaves about its own cameras
+
+    def as_json(self) -> dict[str, float]:
+        """Return the gap as the document has it."""
+        return {
+            "rms_px": self.rms_px,
+            "chi2_reduced": self.chi2_reduced,
+            "object_mm_at_10m": self.object_mm_at_10m,
+        }
+
+
+def fit_first(fitter: HypothesisFitter, terms: Sequence[Term]) -> Fit:
+    """Fit a hypothesis to the first series alone and carry its constants to the others."""
+    fit = fitter.refine(fitter.fit(terms, only=[0]), only=[0])
+    return carry_over(fit)
+
+
+def carry_over(fit: Fit) -> Fit:
+    """Keep constants as the first series gave them; estimate again what a series has of its own.
+
+    Of an oscillation that is the phase, of a slip its time and height.
+    """
+    x = fit.coefficients.copy()
+    for block in fit.blocks:
+        if block.series in (None, 0):
+            continue
+        assert block.series is not None
+        _, _, index = fit.designs[block.series]
+        reduced = fit.reduced[block.series]
+        inside = (index >= block.start) & (index < block.stop)
+        A = reduced.A[np.ix_(inside, inside)]
+        right = reduced.c[inside] - reduced.A[np.ix_(inside, ~inside)] @ x[index[~inside]]
+        own = index[inside]
+        if block.term >= 0 and fit.terms[block.term].kind.is_periodic:
+            model = next(b for b in fit.blocks if b.term == block.term and b.series == 0)
+            pair = x[model.start : model.stop].reshape(2, -1)
+            _, s, v = np.linalg.svd(pair, full_matrices=False)
+            amplitude = s[0] * v[0]
+            angles = np.linspace(0, 2 * np.pi, 720, endpoint=False)
+            trial = np.stack(
+                [np.outer(np.cos(angles), amplitude), np.outer(np.sin(angles), amplitude)], axis=1
+            ).reshape(len(angles), -1)
+            cost = np.einsum("ai,ij,aj->a", trial, A, trial) - 2 * trial @ right
+            x[own] = trial[int(np.argmin(cost))]
+        else:
+            x[own] = scaled_solve(A, right, 1e-9)
+    return replace(fit, coefficients=x)
+
+
+def image_chi2(evidence: ReducedSeries, fit: Fit, series: int) -> float:
+    """Sum squared parameter misfits in the metric of the image points, levels estimated again."""
+    return float(evidence.squares(evidence.values - fit.parameters(series)).sum())
+
+
+def measure_gap(
+    fitter: HypothesisFitter,
+    fit: Fit,
+    series: int,
+    displaced: Sequence[Displaced] = (),
+    displacement_known: bool = True,
+    noise: Array | None = None,
+    noise_known: bool = True,
+    explained: float = 0.0,
+) -> Gap:
+    """Measure the gap of one series at a fit.
+
+    displaced: targets taken out, and whether the model knows of their steps; noise: the epochs'
+    noise factor the evidence is weighted by, and whether the model knows it; explained: χ² that
+    a bridge takes up alongside the model.
+    """
+    e = fitter.series[series]
+    residuals = np.nan_to_num(e.residuals)
+    within = float(np.sum(e.weights[..., :2] * residuals**2))
+    coordinates = 2.0 * float(e.n.sum())
+    targets = float((e.n.sum() > 0) * np.sum(e.weights[..., 0].any(axis=0)))
+    # what a camera does within one block of a long series is not part of the comparison
+    unused = e.blocks.within_free if e.blocks is not None else 0.0
+    free = max(coordinates - 2.0 * targets - e.rank - unused, 1.0)
+    # `with_correlated_noise` has put correlated noise into the weights; the floor is that of single
+    # epochs
+    k = e.correlation
+    total = within + k * max(fit.chi2_of(series) - explained, 0.0)
+    image = within + k * max(image_chi2(e, fit, series) - explained, 0.0)
+    moved, count = _measure_moved(e, displaced, displacement_known)
+    total, image, free = total + moved, image + moved, free + count
+    chi2 = total / free
+    if noise is not None:
+        power = float(np.mean(noise**2))
+        if not noise_known:
+            chi2 *= power / float(np.min(noise) ** 2)
+    rms = e.sigma_px * float(np.sqrt(image / free))
+    floor = 1.0
+    if e.movement is not None:
+        # the camera's own noise, on this recording: what no smooth trajectory takes up
+        floor = chi2 - k * examine(fitter, fit, series).excess / free
+    mm = rms * e.source.sensor.pixel_pitch / float(e.at.iop[0]) * _DISTANCE_MM
+    return Gap(rms, chi2, mm, floor)
+
+
+def _measure_moved(
+    evidence: ReducedSeries, displaced: Sequence[Displaced], known: bool
+) -> tuple[float, float]:
+    """Return χ² of the displaced targets about the camera of the others, and its degrees of
+    freedom.
+    """
+    total = count = 0.0
+    w = evidence.weights[..., 0]
+    weight = float(np.mean(w[w > 0]))
+    for group in displaced:
+        A = evidence.columns[group.rows]
+        misclosure = evidence.source.grid.points[:, group.rows] - evidence.at.predicted[group.rows]
+        v = misclosure - np.einsum("ek,tik->eti", evidence.values, A)
+        after = evidence.times >= group.time
+        if known:
+            v = np.where(after[:, None, None], v - group.steps, v)
+        middle = np.nanmedian(v, axis=0)
+        v = v - middle
+        spread = 1.4826 * np.nanmedian(np.abs(v), axis=0)
+        inside = np.abs(v) < np.maximum(8.0 * spread, 1e-9)
+        inside &= (evidence.n > 0)[:, None, None]
+        total += weight * float(np.sum(np.where(inside, v, 0.0) ** 2))
+        count += float(np.sum(inside))
+    return total, count

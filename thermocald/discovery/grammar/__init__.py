@@ -1,1 +1,0 @@
-"""Beyond the catalogue: formulas over what was recorded, searched as its effects are."""

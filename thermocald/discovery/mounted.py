@@ -1,0 +1,248 @@
+"""The search where the camera moves on its mount: each hypothesis alongside the movement it leaves.
+
+What no effect explains is a wander of the mount with a size of its own for each hypothesis, so that
+a cause is held against what a moving mount would do by chance. Knocks of the mount, steps that a
+turn and a shift of the camera explain as well as a slip inside of it, are no effects: they are
+found, kept alongside the base model, and reported with time and size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from thermocald.discovery import criteria
+from thermocald.discovery.search import Search, Solution
+from thermocald.photogrammetry.camera.camera_model import EOP_NAMES
+from thermocald.thermal.movement import (
+    Mount,
+    estimate_mount_motion,
+    find_combinations,
+    guess_mount_motion,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from thermocald.thermal.fit import HypothesisFitter
+    from thermocald.thermal.hypothesis import Fit, Term
+
+_WIDTH = 4  # solutions of a level whose movement is estimated
+_LEVELS = 5
+_EFFECTS = 3
+_KNOCKS = 3
+_PROMISE = 0.3  # of which a scan has to promise, in the noise before
+_CORNERS = (0.0, 3.0)
+_REST = 0.05
+# further estimates of the movement without an effect, and the share by which one has to come nearer
+# to the score with an effect
+_TURNS = 5
+_SETTLED = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """A solution and the movement of the mount with it, in a fitter that has it."""
+
+    solution: Solution
+    fitter: HypothesisFitter
+    mount: Mount
+
+    @property
+    def score(self) -> float:
+        return self.solution.score
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        return self.solution.terms
+
+
+@dataclass(frozen=True, eq=False)
+class Mounted:
+    """What the search found: base (knocks in it) and best in one fitter; knocks of the mount.
+
+    ranking: single effects by score; seen: every solution that was looked at, with its movement;
+    like: the search, for its trajectories.
+    """
+
+    fitter: HypothesisFitter
+    mount: Mount
+    base: Solution
+    best: Solution
+    knocks: tuple[Term, ...]
+    ranking: tuple[Solution, ...]
+    seen: tuple[Solution, ...]
+    like: Search
+
+
+def search_beside_mount(
+    fitter: HypothesisFitter,
+    say: Callable[[str], None],
+    given: Sequence[tuple[str, dict[str, Any]]] = (),
+) -> Mounted:
+    """Add effects and knocks, one by one, while the penalised likelihood improves."""
+    first = Search(fitter)
+    start = first.base(given)
+    W = find_combinations(fitter.series)
+    guess = guess_mount_motion(fitter, start.fit, W)
+    say("movement of the mount")
+    trials = [_fit_beside(fitter, start, Mount(W, guess, corner), 4) for corner in _CORNERS]
+    plain = best = min(trials, key=lambda t: t.score)
+    ranking, seen = list[Solution](), list[Solution]()
+    for level in range(_LEVELS):
+        say(f"alongside the mount: {', '.join(best.solution.names) or 'the base'}")
+        search = Search(best.fitter, like=first)
+        grown: list[Beside] = []
+        # a scan is right to some percent, and a further effect has to be worth much
+        further = any(not t.kind.is_event for t in best.terms[len(start.terms) :])
+        least = _PROMISE * _least_further(plain, best) if further else 0.0
+        for solution in _add_delays(search, search.expand(best.solution, 6, least)[:_WIDTH]):
+            trial = _profile(best, solution)
+            knock = _try_knock(best, trial)
+            grown.append(knock or trial)
+        if not grown:
+            break
+        if level == 0:
+            ranking = sorted((g.solution for g in grown), key=lambda s: s.score)
+            # a movement estimated to its end takes up drifts too: a scan would find nothing in it
+            plain = best = _settle(plain, ranking[0].score)
+        seen += [g.solution for g in grown]
+        allowed = [g for g in grown if _allowed(g, best, plain, len(start.terms))]
+        if not allowed:
+            break
+        best = min(allowed, key=lambda g: g.score)
+    return _conclude(best, len(start.terms), ranking, seen, first, False)
+
+
+def _add_delays(search: Search, solutions: list[Solution]) -> list[Solution]:
+    """Add, for the first delay of the temperature, the other kind of delay too: a scan
+    without the movement of the mount may leave it out.
+    """
+    for solution in solutions:
+        other = search.with_other_delay(solution)
+        if other is not None:
+            names = [s.names for s in solutions]
+            return solutions if other.names in names else [*solutions, other]
+    return solutions
+
+
+def _fit_beside(fitter: HypothesisFitter, solution: Solution, mount: Mount, turns: int) -> Beside:
+    own, fit, mount = estimate_mount_motion(
+        fitter, solution.terms, mount, solution.fit.coefficients, turns
+    )
+    return Beside(Solution(fit, solution.penalties), own, mount)
+
+
+def _settle(found: Beside, best: float) -> Beside:
+    """Estimate the movement again from what it leaves over, while it may come below another score:
+    a direction that the first estimate has at zero stays there.
+    """
+    for _ in range(_TURNS):
+        if found.score < best:
+            break
+        more = _profile(found, found.solution)
+        if more.score > found.score:
+            break
+        change, found = found.score - more.score, more
+        if change < _SETTLED * (found.score - best):
+            break
+    return found
+
+
+def _profile(best: Beside, solution: Solution) -> Beside:
+    """Fit a solution with the movement that it leaves; its non-linear parameters refined in it."""
+    guess = guess_mount_motion(best.fitter, solution.fit, best.mount.combinations)
+    # a share of the movement before: what starts at zero stays there
+    mount = replace(best.mount, covariance=guess + _REST * best.mount.covariance)
+    found = _fit_beside(best.fitter, solution, mount, 5)
+    fit = found.fitter.refine(found.solution.fit, max_iterations=3)
+    return replace(found, solution=Solution(fit, solution.penalties))
+
+
+def _is_knock(term: Term) -> bool:
+    return term.kind.is_event and term.parameters == EOP_NAMES
+
+
+def _try_knock(best: Beside, trial: Beside) -> Beside | None:
+    """Explain the same event as a knock of the mount, where that does as well; else None."""
+    term = trial.terms[-1]
+    if not term.kind.is_event:
+        return None
+    terms = (*trial.terms[:-1], replace(term, parameters=EOP_NAMES))
+    more = len(EOP_NAMES) / max(len(term.parameters), 1)
+    penalties = (*trial.solution.penalties[:-1], trial.solution.penalties[-1] * more)
+    fit = best.fitter.fit(terms)
+    knock = _profile(best, Solution(fit, penalties))
+    if knock.solution.fit.objective < trial.solution.fit.objective + criteria.SLIP_NOT_KNOCK:
+        return knock
+    return None
+
+
+def _allowed(grown: Beside, best: Beside, plain: Beside, given: int) -> bool:
+    """Decide whether a solution improves enough on the one before."""
+    gain = best.score - grown.score
+    own = [t for t in grown.terms[given:] if not t.kind.is_event]
+    knocks = len(grown.terms) - given - len(own)
+    if len(own) > _EFFECTS or knocks > _KNOCKS or gain <= 0:
+        return False
+    if grown.terms[-1].kind.is_event or len(own) == 1:
+        return True
+    return gain > _least_further(plain, best)
+
+
+def _least_further(plain: Beside, best: Beside) -> float:
+    """Return what an effect after the first has to gain."""
+    return max(criteria.MOUNT_FURTHER, criteria.MOUNT_SHARE * (plain.score - best.score))
+
+
+def treat_slips_as_knocks(found: Mounted, given: int) -> Mounted:
+    """Take steps inside the camera for nuisances as knocks are."""
+    best = Beside(found.best, found.fitter, found.mount)
+    return _conclude(best, given, found.ranking, found.seen, found.like, True)
+
+
+def _conclude(
+    best: Beside,
+    given: int,
+    ranking: Sequence[Solution],
+    seen: Sequence[Solution],
+    like: Search,
+    all_steps: bool,
+) -> Mounted:
+    """Put base and best in the fitter of the best, knocks with the base; all_steps: slips too."""
+    terms, penalties = best.terms, best.solution.penalties
+    first = list(zip(terms[:given], penalties[:given], strict=True))
+    rest = list(zip(terms[given:], penalties[given:], strict=True))
+    knocks = [x for x in rest if _is_knock(x[0]) or (all_steps and x[0].kind.is_event)]
+    effects = [x for x in rest if x not in knocks]
+
+    def solution(parts: list[tuple[Term, float]]) -> Solution:
+        fit: Fit = best.fitter.refine(best.fitter.fit([t for t, _ in parts]), max_iterations=3)
+        return Solution(fit, tuple(p for _, p in parts))
+
+    base = solution(first + knocks)
+    whole = solution(first + knocks + effects) if effects else base
+    own = tuple(t for t, _ in knocks)
+    return Mounted(best.fitter, best.mount, base, whole, own, tuple(ranking), tuple(seen), like)
+
+
+def is_convincing(fitter: HypothesisFitter, base: Solution, best: Solution) -> bool:
+    """Test whether the effects of `best` are worth their penalties, and hold in both series.
+
+    Constants from all series but one are held against that one, and from two each against the
+    other; events are new each time.
+    """
+    if base.score <= best.score:
+        return False
+    every = range(len(fitter.series))
+    if len(every) < 2 or all(t.is_separate for t in best.terms[len(base.terms) :]):
+        return True
+    own, there = [], []
+    for left in every:
+        rest = [s for s in every if s != left]
+        without = fitter.fit(base.terms, only=rest)
+        whole = fitter.refine(fitter.fit(best.terms, only=rest), only=rest)
+        own.append(sum(without.chi2_of(s) - whole.chi2_of(s) for s in rest) / len(rest))
+        there.append(without.chi2_of(left) - whole.chi2_of(left))
+    least = criteria.MOUNT_WORSE * max(own)
+    return min(there) > -least and sum(there) > least

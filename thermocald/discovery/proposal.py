@@ -1,0 +1,277 @@
+"""A proposal: a formula that takes the place of a name, where the data allow one.
+
+Searched on both series together under the likelihood of the catalogue, it has to pass what a
+name has to pass, and more: surrogates whose cause was not recorded reach its share of the misfit
+in less than one of a hundred, and constants from either series alone close the gap of the other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.discovery import criteria
+from thermocald.discovery.formulas import FormulaSearch, condensed
+from thermocald.discovery.gap import image_chi2
+from thermocald.discovery.search import Solution
+from thermocald.discovery.validation import SurrogateTest
+from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
+from thermocald.photogrammetry.linalg import explained
+from thermocald.physics.formula import parse
+from thermocald.thermal import criteria as noise_criteria
+from thermocald.thermal.fit import HypothesisFitter
+from thermocald.thermal.hypothesis import BASE, Term
+from thermocald.thermal.scan import examine_all, normals_beside, relinearise
+from thermocald.thermal.series import unit_directions
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from thermocald.arrays import Array
+    from thermocald.discovery.examination import Examination
+    from thermocald.discovery.formulas import Found
+    from thermocald.thermal.hypothesis import Fit
+    from thermocald.thermal.series import ReducedSeries
+
+
+_FITTED = 8  # formulas of a pass that are fitted in full
+_REFINED = 2  # of them with exact constants
+_TURNS = 3
+_SEED = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """What was found.
+
+    fitter: the series it was found on; base, best: solutions in it; closed: share of the misfit of
+    M2 that constants of M1 explain, and of M1 by constants of M2; surrogates: shares of
+    surrogates; rivals: other formulas, as simple, and by how much they score worse.
+    """
+
+    fitter: HypothesisFitter
+    base: Solution
+    best: Solution
+    closed: tuple[float, float]
+    surrogates: SurrogateTest
+    rivals: tuple[tuple[Term, float], ...]
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """The formulas, without what the base model has already."""
+        return self.best.terms[len(self.base.terms) :]
+
+
+def propose(
+    x: Examination, parameters: Sequence[str], progress: Callable[[str], None] | None = None
+) -> Proposal | None:
+    """Find a formula for what an examination leaves without a name; None where the data allow none.
+
+    parameters: columns in which the image moves. One series alone allows none.
+    """
+    # what moves the image little may still be seen well
+    moving = [p for p in PARAMETER_NAMES if p in {*parameters, *BASE}]
+    if len(x.fitter.series) < 2:
+        return None
+    (progress or (lambda _: None))("beyond the catalogue")
+    fitter, base = _straighten(x)
+    search = FormulaSearch(condensed(fitter, base.fit, moving), criteria.MARGIN)
+    test = SurrogateTest(
+        *search.surrogates(criteria.FORMULA_SURROGATES, np.random.default_rng(_SEED))
+    )
+    if not test.passed:
+        return None
+    tried: dict[str, Solution] = {}
+    best = base
+    for turn in range(_TURNS):
+        before = best
+        if turn:
+            here = condensed(fitter, base.fit, moving, best.fit.weightings)
+            search = FormulaSearch(here, criteria.MARGIN, search)
+        _try(fitter, base, moving, search.best(further=turn > 0), tried)
+        best = min([base, *tried.values()], key=lambda s: s.score)
+        if best.score > before.score - criteria.MARGIN or all(
+            a.adequate for a in examine_all(fitter, best.fit)
+        ):
+            break
+    if best is base:
+        return None
+    best = _choose_parameters(fitter, base, _simplify(fitter, base, best))
+    closed = _cross_check(fitter, base, best)
+    if closed is None:
+        return None
+    by_m1, by_m2 = closed  # NaN: M2 does not determine them
+    if not (
+        by_m1 > criteria.CLOSED_ALONE
+        if np.isnan(by_m2)
+        else by_m1 > criteria.CLOSED and by_m2 > criteria.CLOSED_BACK
+    ):
+        return None
+    size = _count_operators(best.terms[-1])
+    rivals = sorted(
+        ((s.terms[-1], float(s.score - best.score)) for s in tried.values()
+         if s.terms[-1].effect != best.terms[-1].effect and _count_operators(s.terms[-1]) <= size),
+        key=lambda r: r[1],
+    )  # fmt: skip
+    return Proposal(fitter, base, best, closed, test, tuple(rivals))
+
+
+def _straighten(x: Examination) -> tuple[HypothesisFitter, Solution]:
+    """Take the curvature of the projection along everything that moves off the series, and fit the
+    base model in them.
+    """
+    series: list[ReducedSeries] = []
+    for s, (e, a) in enumerate(zip(x.fitter.series, x.base_adequacy, strict=True)):
+        bridge = a.trajectories.T @ a.amplitudes
+        series.append(relinearise(x.fitter, x.base.fit, s, bridge) or e)
+    fitter = HypothesisFitter(series)
+    return fitter, replace(x.base, fit=fitter.fit(x.base.terms, x.base.fit.coefficients))
+
+
+def _try(
+    fitter: HypothesisFitter,
+    base: Solution,
+    parameters: Sequence[str],
+    formulas: Sequence[Found],
+    tried: dict[str, Solution],
+) -> None:
+    """Fit formulas in the full likelihood, those that are best then exactly."""
+    here: dict[str, Solution] = {}
+    for found in formulas[:_FITTED]:
+        structure, values = found.node.named()
+        term = Term(structure.text(), tuple(parameters), tuple(values.items()))
+        penalty = found.penalty + criteria.MARGIN * _count_operators(term)
+        fit = _fit(fitter, (*base.terms, term))
+        if fit is not None:
+            here[term.effect] = Solution(fit, (*base.penalties, penalty))
+    for text, solution in sorted(here.items(), key=lambda h: h[1].score)[:_REFINED]:
+        better = _fit(fitter, solution.terms, refined=True)
+        here[text] = solution if better is None else replace(solution, fit=better)
+    for text, solution in here.items():
+        if text not in tried or solution.score < tried[text].score:
+            tried[text] = solution
+
+
+def _count_operators(term: Term) -> int:
+    return sum(not n.is_leaf for n in parse(term.effect).walk())
+
+
+def _fit(
+    fitter: HypothesisFitter,
+    terms: Sequence[Term],
+    only: Sequence[int] | None = None,
+    refined: bool = False,
+) -> Fit | None:
+    """Fit in the full likelihood; None where a formula is too steep for the readings' noise."""
+    try:
+        fit = fitter.fit(terms, only=only)
+        fit = fitter.refine(fit, 4, only) if refined else fit
+    except np.linalg.LinAlgError:
+        return None
+    return fit if np.isfinite(fit.objective) else None
+
+
+def _leaves_nothing(fitter: HypothesisFitter, fit: Fit) -> bool:
+    """Test whether no smooth trajectory is significant any more, however small."""
+    return all(a.significance < noise_criteria.SIGNIFICANT for a in examine_all(fitter, fit))
+
+
+def _simplify(fitter: HypothesisFitter, base: Solution, best: Solution) -> Solution:
+    """Leave out operators that it does as well without, one after the other."""
+    nothing_left = _leaves_nothing(fitter, best.fit)
+    while True:
+        term = best.terms[-1]
+        node = parse(term.effect).bound(dict(term.nonlinear))
+        found = []
+        for simpler in node.simpler():
+            structure, values = simpler.named()
+            if not structure.inputs:
+                continue
+            own = Term(structure.text(), term.parameters, tuple(values.items()))
+            fit = _fit(fitter, (*base.terms, own), refined=True)
+            if fit is not None:
+                solution = Solution(fit, (*base.penalties, best.penalties[-1] - criteria.MARGIN))
+                if solution.score < best.score or (nothing_left and _leaves_nothing(fitter, fit)):
+                    found.append(solution)
+        if not found:
+            return best
+        best = min(found, key=lambda s: s.score)
+
+
+def _choose_parameters(fitter: HypothesisFitter, base: Solution, best: Solution) -> Solution:
+    """Choose the parameters in which the formula is needed, one after the other."""
+    term = best.terms[-1]
+    A, c = _sum_all_parameters(fitter, base, best, term)
+    n = float(np.log(sum(int((e.n > 0).sum()) for e in fitter.series)))
+    chosen = [PARAMETER_NAMES.index(p) for p in term.parameters]
+
+    def gain(some: Sequence[int]) -> float:
+        at = list(some)
+        return float(explained(A[np.ix_(at, at)], c[at], 1e-9)) - n * len(at)
+
+    while len(chosen) > 1:
+        fewer = max(([j for j in chosen if j != i] for i in chosen), key=gain)
+        if gain(fewer) < gain(chosen):
+            break
+        chosen = fewer
+    least = max(criteria.MARGIN, criteria.PARAMETER_SHARE * gain(chosen))
+    while True:
+        more = [[*chosen, j] for j in range(len(c)) if j not in chosen and A[j, j] > 1e-6]
+        wider = max(more, key=gain, default=chosen)
+        if gain(wider) < gain(chosen) + least:
+            break
+        chosen = wider
+    names = tuple(PARAMETER_NAMES[i] for i in sorted(chosen))
+    if names == term.parameters:
+        return best
+    terms = (*best.terms[:-1], replace(term, parameters=names))
+    fit = _fit(fitter, terms, refined=True)
+    if fit is None:
+        return best
+    change = n * (len(names) - len(term.parameters))
+    return Solution(fit, (*best.penalties[:-1], best.penalties[-1] + change))
+
+
+def _sum_all_parameters(
+    fitter: HypothesisFitter, base: Solution, best: Solution, term: Term
+) -> tuple[Array, Array]:
+    """Return normal equations A (16, 16), c (16,) of a trajectory in each parameter of the camera,
+    beside the base model.
+    """
+    count = len(PARAMETER_NAMES)
+    every = [fitter.trajectories(term, s, operators=False)[0] for s in range(len(fitter.series))]
+    further = [
+        (np.tile(t - t.mean(), count), unit_directions(PARAMETER_NAMES), np.arange(count))
+        for t in every
+    ]
+    return normals_beside(base.fit, further, count, best.fit.weightings)
+
+
+def _cross_check(
+    fitter: HypothesisFitter, base: Solution, best: Solution
+) -> tuple[float, float] | None:
+    """Return the share of the misfit of M2 that constants of M1 alone explain, and the other way,
+    NaN where M2 alone does not determine them; None where M1 does not.
+    """
+    shares = []
+    for here, there in ((0, 1), (1, 0)):
+        without = fitter.fit(base.terms, only=[here])
+        whole = _fit(fitter, best.terms, [here], refined=True)
+        if whole is None:
+            if here == 0:
+                return None
+            shares.append(float("nan"))
+            continue
+        left, before = (_misfit_px(fitter, f, there) for f in (whole, without))
+        shares.append(1.0 - (left / max(before, 1e-9)) ** 2)
+    return shares[0], shares[1]
+
+
+def _misfit_px(fitter: HypothesisFitter, fit: Fit, series: int) -> float:
+    """Return the RMS px that constants leave in a series, beyond the noise of its free cameras."""
+    e = fitter.series[series]
+    chi2 = image_chi2(e, fit, series) - e.rank * float((e.n > 0).sum() - 1)
+    coordinates = 2.0 * float(e.n.sum())
+    return e.sigma_px * float(np.sqrt(max(chi2, 0.0) * e.correlation / coordinates))

@@ -1,1 +1,0 @@
-"""The search: candidates, their combinations, and what excludes them."""

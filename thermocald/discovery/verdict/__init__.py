@@ -1,1 +1,0 @@
-"""The verdict: names, numbers with standard deviations, gaps, the new model."""

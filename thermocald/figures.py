@@ -1,0 +1,412 @@
+"""The figures of all reports: described once, drawn with matplotlib as SVG, as PNG for papers.
+
+A figure is a list of panels. Long curves are thinned to the minimum and maximum of each stretch,
+so that no outlier disappears and no file grows with the length of a series. Text stays text: it
+can be searched, copied and edited.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import warnings
+from contextlib import contextmanager
+from dataclasses import dataclass
+from html import escape
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from thermocald.atomic_file import new_file
+from thermocald.numbers import coefficient, shortened, superscript
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from thermocald.arrays import Array
+
+# Colour-blind safe (Okabe & Ito 2008), dark enough for thin lines on white paper.
+PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
+PALE, GREY = "#9fb4c1", "#555555"
+BAND = 1.96  # standard deviations: 95 % on every page
+_MOST_POINTS = 800
+_PANEL_INCHES = (3.4, 2.5)
+_LEGEND_LETTERS = 52  # in a line above a panel
+_FEW_ARROWS = 25
+_DECADES = 3.0  # that an axis must span to be logarithmic
+_STYLE: dict[str, Any] = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "thermocald",  # the same study gives the same file
+    "font.family": "sans-serif",
+    "font.size": 9,
+    "path.simplify": False,  # curves are thinned already; it would drop zero-length strokes
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlesize": 10,
+    "axes.titleweight": "bold",
+    "axes.formatter.useoffset": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e4e4e4",
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+    "legend.fontsize": 7,
+    "figure.max_open_warning": 0,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """x, y (n,); kind: line, points, or band between `lower` and `upper` (n,) about a line."""
+
+    name: str
+    x: Array
+    y: Array
+    kind: Literal["line", "points", "band"] = "line"
+    colour: str = PALETTE[0]
+    lower: Array | None = None
+    upper: Array | None = None
+    dashed: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Arrows:
+    """Vectors (n, 2) px at image points (n, 2) px, y down, of a frame of so many px.
+
+    longest: length of a vector, px, that is drawn a tenth of the frame's width long (a fifth where
+    there is room), by default that of the longest one.
+    """
+
+    points: Array
+    vectors: Array
+    frame: tuple[int, int]
+    colour: str = PALETTE[1]
+    longest: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """One diagram; horizontal: (y, label) of dashed lines; equal: same scale on both axes."""
+
+    title: str
+    x_label: str
+    y_label: str
+    curves: tuple[Curve, ...]
+    log_y: bool = False
+    equal: bool = False
+    horizontal: tuple[tuple[float, str], ...] = ()
+    arrows: Arrows | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Figure:
+    """Panels under one name, which is a file name too; columns: in a drawing for a paper."""
+
+    name: str
+    title: str
+    caption: str
+    panels: tuple[Panel, ...]
+    columns: int = 3
+
+
+def thin(x: Array, *ys: Array, most: int = _MOST_POINTS) -> tuple[Array, ...]:
+    """Columns (n,) at about `most` rows or fewer, which hold the extremes of the first of `ys`."""
+    n = len(x)
+    if n <= most:
+        return (x, *ys)
+    edges = np.linspace(0, n, most // 2 + 1).astype(int)[:-1]
+    y = ys[0]
+    filled_low = np.where(np.isfinite(y), y, np.inf)
+    filled_high = np.where(np.isfinite(y), y, -np.inf)
+    rows = np.unique(
+        np.concatenate(
+            [
+                _position(filled_low, np.minimum.reduceat(filled_low, edges), edges),
+                _position(filled_high, np.maximum.reduceat(filled_high, edges), edges),
+            ]
+        )
+    )
+    return tuple(column[rows] for column in (x, *ys))
+
+
+def _position(values: Array, extremes: Array, edges: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The first row of each stretch that holds its extreme."""
+    lengths = np.diff(np.append(edges, len(values)))
+    hit = np.flatnonzero(values == np.repeat(extremes, lengths))
+    stretch = np.searchsorted(edges, hit, side="right") - 1
+    _, first = np.unique(stretch, return_index=True)
+    return np.asarray(hit[first])
+
+
+@contextmanager
+def drawing_style() -> Iterator[None]:
+    """The style that all drawings share, while they are made."""
+    import matplotlib as mpl
+
+    settings: Any = _STYLE
+    with mpl.rc_context(settings), warnings.catch_warnings():
+        # the browser has the letters that this font lacks
+        warnings.filterwarnings("ignore", message="Glyph .* missing from")
+        warnings.filterwarnings("ignore", message="Matplotlib currently does not support")
+        yield
+
+
+def new_drawing(
+    width: float, height: float, layout: Literal["constrained"] | None = "constrained"
+) -> Any:
+    """An empty drawing of so many inches."""
+    # Without pyplot: no global state, no window, nothing to close.
+    from matplotlib.figure import Figure as Canvas
+
+    return Canvas(figsize=(width, height), layout=layout)
+
+
+def inline_svg(drawing: Any, prefix: str, label: str) -> str:
+    """A drawing as an <svg> element; `prefix` keeps its ids apart from those of others."""
+    buffer = io.StringIO()
+    with drawing_style():
+        drawing.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = re.sub(r'font-family: [^;"]*', "font-family: sans-serif", text)
+    text = re.sub(r">\s+<", "><", text)
+    text = re.sub(r'\bid="', f'id="{prefix}-', text)
+    text = re.sub(r"url\(#", f"url(#{prefix}-", text)
+    text = re.sub(r'href="#', f'href="#{prefix}-', text)
+    text = re.sub(r"<[^>]*>", lambda tag: _shorter(tag[0]), text)
+    # The page decides the width; the height follows from the viewBox.
+    head, rest = text.split(">", 1)
+    head = re.sub(r'\s(width|height)="[^"]*"', "", head)
+    return f'{head} role="img" aria-label="{escape(label)}"{_scales(drawing)}>{rest}'
+
+
+def _scales(drawing: Any) -> str:
+    """What the page's script needs to read values off: corners of the one axis, in pt and data."""
+    if len(drawing.axes) != 1 or drawing.axes[0].get_yscale() != "linear":
+        return ""
+    axis = drawing.axes[0]
+    if not (axis.xaxis.label.get_text() and axis.yaxis.label.get_text()):
+        return ""
+    width, height = 72 * drawing.get_size_inches()
+    box = axis.get_position()
+    corners = (box.x0 * width, box.x1 * width, (1 - box.y0) * height, (1 - box.y1) * height)
+    numbers = [f"{v:.6g}" for v in (*corners, *axis.get_xlim(), *axis.get_ylim())]
+    return f' data-scales="{" ".join(numbers)}"'
+
+
+def _shorter(tag: str) -> str:
+    """A tag with its numbers to 0.01 pt, on one line."""
+    return re.sub(r"(\.\d\d)\d+", r"\1", re.sub(r"\s+", " ", tag))
+
+
+def save(drawing: Any, folder: Path, name: str) -> list[Path]:
+    """A drawing as <name>.svg and <name>.png (200 dpi)."""
+    paths = [folder / f"{name}.svg", folder / f"{name}.png"]
+    with drawing_style():
+        with new_file(paths[0]) as partial:
+            about = {"Date": None, "Creator": "thermocald"}
+            drawing.savefig(partial, format="svg", metadata=about)
+        with new_file(paths[1]) as partial:
+            drawing.savefig(partial, format="png", dpi=200)
+    return paths
+
+
+def draw_panel(panel: Panel, *, legend: bool = True) -> Any:
+    """One panel as a drawing of its own."""
+    with drawing_style():
+        # Fixed margins fit the short labels; fitting them exactly triples the time of a report.
+        drawing = new_drawing(*_PANEL_INCHES, None)
+        axis = drawing.subplots()
+        rows = _fill(axis, panel, legend=legend)
+        drawing.subplots_adjust(right=0.95, bottom=0.19, top=0.89 - 0.055 * rows)
+        # how many ticks there are, and with how many digits, depends on the height
+        longest = max((len(text) for text in _tick_labels(axis)), default=0)
+        drawing.subplots_adjust(left=min(0.36, 0.155 + 0.0185 * longest))
+        return drawing
+
+
+def draw_figure(figure: Figure) -> Any:
+    """All panels of a figure in one drawing, for a paper."""
+    with drawing_style():
+        columns = min(figure.columns, len(figure.panels))
+        rows = -(-len(figure.panels) // columns)
+        drawing = new_drawing(_PANEL_INCHES[0] * columns, _PANEL_INCHES[1] * rows)
+        axes = np.atleast_1d(drawing.subplots(rows, columns)).ravel()
+        for i, axis in enumerate(axes):
+            if i < len(figure.panels):
+                _fill(axis, figure.panels[i], legend=i == 0)
+            else:
+                axis.set_axis_off()
+        return drawing
+
+
+def _tick_labels(axis: Any) -> list[str]:
+    """The labels of the y axis that will be drawn, without drawing it."""
+    low, high = axis.get_ylim()
+    ticks = [tick for tick in axis.get_yticks() if low <= tick <= high]
+    labels: list[str] = axis.yaxis.get_major_formatter().format_ticks(ticks)
+    return labels
+
+
+def _fill(axis: Any, panel: Panel, *, legend: bool) -> int:
+    """Draw a panel; returns the rows of its legend, which is above it, clear of the data."""
+    for curve in panel.curves:
+        _draw_curve(axis, curve)
+    if panel.arrows is not None:
+        draw_arrows(axis, panel.arrows)
+    for y, label in panel.horizontal:
+        axis.axhline(y, color=GREY, linestyle="--", linewidth=0.9)
+        if label:
+            axis.annotate(
+                label, (0.99, y), xycoords=("axes fraction", "data"), ha="right", va="bottom",
+                fontsize=7, color=GREY,
+            )  # fmt: skip
+    if panel.log_y:
+        use_logarithm(axis)
+    if panel.equal:
+        axis.set_aspect("equal", adjustable="datalim")
+    label_axes(axis, panel.x_label, panel.y_label)
+    names = {c.name for c in panel.curves if c.name}
+    rows = legend_above(axis) if legend and len(names) > 1 else 0
+    most = 40 if panel.arrows is None else 18  # beside the scale arrow
+    axis.set_title(shortened(panel.title, most), loc="left", pad=6 + 10 * rows)
+    return rows
+
+
+def label_axes(axis: Any, x: str = "", y: str = "") -> None:
+    """Name both axes and write their ticks without an offset or a power that stands apart."""
+    if x:
+        axis.set_xlabel(shortened(x, 48))
+        _plain_ticks(axis.xaxis, axis.get_xlim())
+    if y:
+        axis.set_ylabel(shortened(y, 36))
+        if axis.get_yscale() == "linear":
+            _plain_ticks(axis.yaxis, axis.get_ylim())
+
+
+def _plain_ticks(axis: Any, limits: tuple[float, float]) -> None:
+    largest = max(map(abs, limits))
+    if largest >= 1e5 or largest < 1e-3:
+        axis.set_major_formatter(lambda value, _: tick_text(value))
+
+
+def tick_text(value: float) -> str:
+    """`20`, `0.001`, `2·10⁵`: a tick in full, with a power of ten only where it needs one."""
+    if value == 0 or 1e-3 <= abs(value) < 1e5:
+        return f"{value:.7g}".replace("-", "−")
+    mantissa, _, exponent = f"{value:.4e}".partition("e")
+    shown = f"{float(mantissa):g}"
+    power = f"10{superscript(int(exponent))}"
+    return (power if shown == "1" else f"{shown}·{power}").replace("-", "−")
+
+
+def use_logarithm(axis: Any) -> None:
+    """A logarithmic y axis with the ticks in full; linear where nothing spans three decades."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    low, high = axis.get_ylim()
+    low = min((v for v in _positive(axis)), default=low)
+    if low <= 0 or np.log10(high / low) < _DECADES:
+        return
+    axis.set_yscale("log")
+    axis.yaxis.set_major_locator(LogLocator(numticks=6))
+    axis.yaxis.set_major_formatter(lambda value, _: tick_text(value))
+    axis.yaxis.set_minor_formatter(NullFormatter())
+
+
+def _positive(axis: Any) -> Iterator[float]:
+    for line in axis.get_lines():
+        values = np.asarray(line.get_ydata(), dtype=float)
+        if (values := values[np.isfinite(values)]).size:
+            yield float(values.min())
+
+
+def legend_above(axis: Any) -> int:
+    """Put the legend above the axes, clear of the data; returns its rows."""
+    handles, names = axis.get_legend_handles_labels()
+    first = {shortened(name, 18): handle for name, handle in zip(names, handles, strict=True)}
+    columns = max(1, min(len(first), _LEGEND_LETTERS // (max(map(len, first)) + 4)))
+    axis.legend(
+        first.values(), first.keys(), loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns,
+        handlelength=1.2, columnspacing=1.0, labelspacing=0.2, borderaxespad=0.1, borderpad=0.2,
+    )  # fmt: skip
+    return int(-(-len(first) // columns))
+
+
+def _draw_curve(axis: Any, curve: Curve) -> None:
+    label = curve.name or None
+    if curve.kind == "points":
+        # Zero-length strokes with round caps: a tenth of the size of as many markers.
+        x = np.column_stack([curve.x, curve.x, np.full(len(curve.x), np.nan)]).ravel()
+        y = np.column_stack([curve.y, curve.y, np.full(len(curve.y), np.nan)]).ravel()
+        axis.plot(x, y, color=curve.colour, linewidth=2.2, solid_capstyle="round", label=label)
+        return
+    style = "--" if curve.dashed else "-"
+    axis.plot(curve.x, curve.y, style, color=curve.colour, linewidth=1.1, label=label)
+    if curve.kind == "band" and curve.lower is not None and curve.upper is not None:
+        axis.fill_between(
+            curve.x, curve.lower, curve.upper, color=curve.colour, alpha=0.2, linewidth=0
+        )
+
+
+def draw_arrows(axis: Any, arrows: Arrows) -> None:
+    """Vectors on the frame, y down, with a scale arrow below it."""
+    width, height = arrows.frame
+    lengths = np.linalg.norm(arrows.vectors, axis=1)
+    shown = arrows.longest or max(float(np.nanmax(lengths, initial=0.0)), 1e-9)
+    share = 0.2 if len(arrows.points) <= _FEW_ARROWS else 0.1
+    scale = shown / (share * width)
+    axis.plot([0, width, width, 0, 0], [0, 0, height, height, 0], color=PALE, linewidth=0.8)
+    quiver = axis.quiver(
+        *arrows.points.T, *arrows.vectors.T, angles="xy", scale_units="xy", scale=scale,
+        color=arrows.colour, width=0.006, headwidth=4, minlength=0,
+    )  # fmt: skip
+    reference = _round_below(shown)
+    axis.quiverkey(
+        quiver, 0.9, 1.05, reference, f"{tick_text(reference)} px", labelpos="W",
+        coordinates="axes", color="black", fontproperties={"size": 8},
+    )  # fmt: skip
+    axis.set_xlim(-0.6 * share * width, (1 + 0.6 * share) * width)
+    axis.set_ylim((1 + 0.6 * share) * height, -0.6 * share * height)
+    axis.set_aspect("equal")
+    axis.grid(visible=False)
+
+
+def _round_below(value: float) -> float:
+    """The next lower 1, 2, 5 times a power of ten."""
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(max(m for m in (1.0, 2.0, 5.0) if m * power <= value * 1.0000001) * power)
+
+
+def draw_matrix(matrix: Array, names: Sequence[str], title: str) -> Any:
+    """A matrix of correlation coefficients (n, n) in colours with its numbers; NaN stays grey."""
+    with drawing_style():
+        n = len(names)
+        short = [shortened(name, 18) for name in names]
+        size = 1.4 + 0.42 * n
+        drawing = new_drawing(size, size)
+        axis = drawing.subplots()
+        axis.set_facecolor("#dddddd")
+        # Not an image: cells of an SVG stay sharp and can be edited.
+        axis.pcolormesh(
+            np.ma.masked_invalid(matrix), cmap="RdBu_r", vmin=-1, vmax=1, edgecolors="white"
+        )
+        for (row, column), r in np.ndenumerate(matrix):
+            if np.isfinite(r):
+                shade = "white" if abs(r) > 0.6 else "black"
+                axis.text(
+                    column + 0.5, row + 0.5, coefficient(r), ha="center", va="center", fontsize=7,
+                    color=shade,
+                )  # fmt: skip
+        axis.set_xticks(np.arange(n) + 0.5, short, rotation=60, ha="right")
+        axis.set_yticks(np.arange(n) + 0.5, short)
+        axis.invert_yaxis()
+        axis.set_aspect("equal")
+        axis.grid(visible=False)
+        axis.tick_params(length=0)
+        axis.set_title(shortened(title, 40), loc="left")
+        return drawing

@@ -1,0 +1,130 @@
+"""Names and paths that come from the world: checked where they enter the program.
+
+Channels come from devices, users and files, and become columns beside ours. One that is called like
+a column of ours would take its place in some table, and a mark that separates columns would shift
+them; so both are refused.
+A recording or a store may have been made by anybody. What it names must stay within its own folder:
+no absolute path, no `..`, no link that leads out; a name of a camera or series that becomes part of
+a file's name holds no separator and no control character.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from thermocald.errors import ThermocaldError
+
+_PARAMETERS = (
+    "c", "x0", "y0", "A1", "A2", "A3", "B1", "B2", "C1", "C2", "omega", "phi", "kappa", "X0", "Y0",
+    "Z0",
+)  # fmt: skip
+OUR_COLUMNS = frozenset(
+    (
+        *_PARAMETERS,
+        "epoch", "number", "frame", "frame_time", "temperature_time", "time", "clock_trusted",
+        "status", "reason", "sigma0", "redundancy", "n_observations", "n_rejected", "revision",
+        "device", "series", "state", "stored", "lost", "online",
+        "pixel_pitch", "skew_s", "event", "innovation_chi2", "innovation_bound",
+        "drift_px_per_min", *(f"drift_{name}_px" for name in ("c", "x0", "y0")),
+        "blur_px", "blur_trend_x", "blur_trend_y", "blur_curvature", "contrast", "grey", "noise",
+        "saturation", "epochs", "per_point", "channels", "target",
+    )
+)  # fmt: skip
+"""What tables, outputs and pages of ours call their columns."""
+_OUR_PREFIXES = ("sd_", "online_")
+_SEPARATORS = ",;=\"'\\"
+_LONGEST = 64
+
+
+def channel_fault(name: object) -> str:
+    """Say why a channel cannot have a name; empty where it can."""
+    if not isinstance(name, str) or not name or name != name.strip() or len(name) > _LONGEST:
+        return f"must be text of 1 to {_LONGEST} characters, without spaces around it"
+    if not name.isprintable():
+        return "holds a control character"
+    if marks := [mark for mark in _SEPARATORS if mark in name]:
+        return f"holds {marks[0]!r}, which separates columns"
+    if name in OUR_COLUMNS or name.startswith(_OUR_PREFIXES):
+        return "is the name of a column of this program"
+    return ""
+
+
+def require_channels(names: Iterable[object], where: str, error: type[Exception]) -> None:
+    """Raise `error`, its message beginning with `where`, for names that channels cannot have."""
+    known: set[object] = set()
+    for name in names:
+        fault = channel_fault(name)
+        if not fault and name in known:
+            fault = "is the name of two channels"
+        if fault:
+            shown = repr(name)[:80]
+            raise error(f"{where}: a temperature channel cannot be called {shown}: it {fault}")
+        known.add(name)
+
+
+_LONGEST_PATH = 4096
+_LONGEST_NAME = 120
+
+
+def relative_path(text: str, what: str, error: type[ThermocaldError]) -> Path:
+    """A path that stays within the folder it is relative to; `what` begins the error's message."""
+    path = PurePosixPath(text)
+    if path.is_absolute() or ".." in path.parts or "\0" in text or len(text) > _LONGEST_PATH:
+        raise error(
+            f"{what}: {text[:80]!r} leads out of its folder; it must be relative, without `..`"
+        )
+    return Path(path)
+
+
+def file_name(text: str, what: str, error: type[ThermocaldError]) -> str:
+    """A name of a camera, series or thermometer that may become part of a file's name."""
+    if (
+        not text.strip()
+        or text.startswith(".")
+        or "/" in text
+        or not text.isprintable()
+        or len(text) > _LONGEST_NAME
+    ):
+        raise error(
+            f"{what}: {text[:80]!r} cannot be part of a file's name: it must be 1 to "
+            f"{_LONGEST_NAME} printable characters without `/`, and not begin with a point"
+        )
+    return text
+
+
+class FileFolder:
+    """A folder whose files are looked up by relative paths that must not lead out of it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._root = os.path.realpath(folder)
+        self._inside: dict[str, bool] = {}  # sub-folders looked at: a year has few of them
+
+    def find(self, relative: str | Path) -> Path | None:
+        """The path of a regular file in the folder; None where it is absent or leads out."""
+        text = os.fspath(relative)
+        if os.path.isabs(text) or ".." in PurePosixPath(text).parts or "\0" in text:
+            return None
+        path = os.path.join(self.folder, text)
+        try:
+            mode = os.lstat(path).st_mode
+        except OSError:
+            return None
+        if stat.S_ISLNK(mode):
+            return Path(path) if os.path.isfile(path) and self._is_inside(path) else None
+        if not stat.S_ISREG(mode):
+            return None
+        parent = os.path.dirname(path)
+        if parent not in self._inside:
+            self._inside[parent] = self._is_inside(parent)
+        return Path(path) if self._inside[parent] else None
+
+    def _is_inside(self, path: str) -> bool:
+        real = os.path.realpath(path)
+        return real == self._root or real.startswith(self._root.rstrip("/") + "/")

@@ -1,0 +1,149 @@
+"""Numbers as people write them: with their standard deviation, its two digits, and a unit."""
+
+from __future__ import annotations
+
+import math
+import re
+
+UNITS = {
+    "c": "mm",
+    "x0": "mm",
+    "y0": "mm",
+    "A1": "mm⁻²",
+    "A2": "mm⁻⁴",
+    "A3": "mm⁻⁶",
+    "B1": "mm⁻¹",
+    "B2": "mm⁻¹",
+    "C1": "",
+    "C2": "",
+    "sigma0": "",
+}
+_SYMBOLS = {"sigma0": "σ₀", "x0": "x₀", "y0": "y₀"}
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_MINUS = "−"
+
+
+def parameter_label(name: str) -> str:
+    """How a parameter or a thermometer is called in figures and tables."""
+    return _SYMBOLS.get(name) or column_label(name).replace("_", " ")
+
+
+def column_label(name: str) -> str:
+    """Of a logger's column the label that its owner gave (LBL), else the quantity.
+
+    Serial numbers are no name: `Temp, °C (LGR S/N: 204, SEN S/N: 204, LBL: housing)` is `housing`.
+    """
+    if label := re.search(r"(?<![^\W_])LBL(?![^\W_])[\W_]*(.*\w)", name):
+        return label[1]
+    serial = re.search(
+        r"[\s,(_]*(?:(?:°\s?|deg)[CFK][\W_]+)?(?<![^\W_])(?:LGR|SEN)(?![^\W_]).*\d", name
+    )
+    return (name[: serial.start()] if serial else "") or name
+
+
+def shortened(text: str, most: int) -> str:
+    """A text of at most so many letters: its middle gives way, since units stand at the end."""
+    if len(text) <= most:
+        return text
+    tail = (most - 1) // 2
+    return f"{text[: most - 1 - tail].rstrip()}…{text[-tail:].lstrip()}"
+
+
+def superscript(exponent: int) -> str:
+    """An exponent as raised digits."""
+    return str(exponent).translate(_SUPERSCRIPT)
+
+
+def with_sd(value: float, sd: float, unit: str = "") -> str:
+    """`6.959 ± 0.028 mm`, with a power of ten outside 0.001 to 10000; an en dash for nothing."""
+    if not math.isfinite(value):
+        return "–"
+    if not math.isfinite(sd) or sd <= 0:
+        return plain(value, unit)
+    largest = max(abs(value), sd)
+    exponent = math.floor(math.log10(largest))
+    scale = 0 if -3 <= exponent < 4 else exponent
+    v, s = value / 10**scale, sd / 10**scale
+    decimals = max(0, 1 - math.floor(math.log10(s)))
+    body = f"{v:.{decimals}f} ± {s:.{decimals}f}".replace("-", _MINUS)
+    if scale:
+        body = f"({body})·10{superscript(scale)}"
+    return f"{body} {unit}".rstrip()
+
+
+def signed(value: float, sd: float, unit: str = "") -> str:
+    """The same with its sign: `+0.350 ± 0.002 px/K`."""
+    text = with_sd(value, sd, unit)
+    return f"+{text}" if value > 0 and not text.startswith("(") else text
+
+
+def rounded(value: float, sd: float, unit: str = "") -> str:
+    """A number to the second digit of its standard deviation, which is not shown."""
+    if not math.isfinite(value) or not math.isfinite(sd) or sd <= 0:
+        return plain(value, unit, 6)
+    if max(abs(value), sd) < 1e-3:
+        exponent = math.floor(math.log10(max(abs(value), sd)))
+        decimals = max(0, 1 + exponent - math.floor(math.log10(sd)))
+        body = f"{value / 10**exponent:.{decimals}f}·10{superscript(exponent)}"
+        return f"{body} {unit}".rstrip().replace("-", _MINUS)
+    decimals = max(0, 1 - math.floor(math.log10(sd)))
+    return f"{value:.{decimals}f} {unit}".rstrip().replace("-", _MINUS)
+
+
+def plain(value: float, unit: str = "", digits: int = 4) -> str:
+    """A number to some significant digits, with a power of ten where it needs one."""
+    if not math.isfinite(value):
+        return "∞" if math.isinf(value) else "–"
+    if value == 0:
+        return f"0 {unit}".rstrip()
+    exponent = math.floor(math.log10(abs(value)))
+    if -3 <= exponent < 5:
+        body = f"{value:.{max(0, digits - 1 - exponent)}f}"
+    else:
+        body = f"{value / 10**exponent:.{digits - 1}f}·10{superscript(exponent)}"
+    return f"{body} {unit}".rstrip().replace("-", _MINUS)
+
+
+def duration(seconds: float) -> str:
+    """`25 minutes`, `1 minute`, `3.5 hours`, `12 days`: as long as a person would say it."""
+    for unit, length in (("day", 86_400.0), ("hour", 3600.0), ("minute", 60.0)):
+        if seconds >= 2 * length or (unit == "minute" and seconds >= 59.5):
+            count = seconds / length
+            shown = f"{count:.0f}" if count >= 10 or unit == "minute" else f"{count:.1f}"
+            return f"{shown} {unit}{'' if shown == '1' else 's'}"
+    shown = f"{seconds:.0f}"
+    return f"{shown} second{'' if shown == '1' else 's'}"
+
+
+def percent(share: float, decimals: int = 0) -> str:
+    """A share as per cent; never 100 or 0 for what is not all or none."""
+    if not math.isfinite(share):
+        return "–"
+    shown = f"{100 * share:.{decimals}f}"
+    smallest = 10**-decimals
+    if share < 1 and float(shown) == 100:
+        return f"> {100 - smallest:.{decimals}f} %"
+    if share > 0 and float(shown) == 0:
+        return f"< {smallest:.{decimals}f} %"
+    return f"{shown} %"
+
+
+def p_text(p: float) -> str:
+    """A p-value: `≤ 0.001`, or two digits."""
+    if not math.isfinite(p):
+        return "–"
+    return "≤ 0.001" if p <= 0.001 else f"{p:.2g}"
+
+
+def coefficient(r: float) -> str:
+    """A correlation: two digits, three close to ±1, and 1 only for what is 1."""
+    if not math.isfinite(r):
+        return "–"
+    if abs(r) == 1:
+        shown = f"{r:.0f}"
+    elif abs(r) >= 0.995:
+        # Cut off, not rounded.
+        shown = f"{math.copysign(math.floor(abs(r) * 1000) / 1000, r):.3f}"
+    else:
+        shown = f"{r:.2f}".replace("-0.00", "0.00")
+    return shown.replace("-", _MINUS)

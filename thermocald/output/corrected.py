@@ -1,0 +1,236 @@
+"""Points and images as a camera without thermal drift had seen them, from file to file."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.analysis.thermal.correction import correct_points, image_corrections
+from thermocald.analysis.thermal.timed_rows import STANDARD_INPUT, RowBlock, row_blocks
+from thermocald.atomic_file import make_folder, new_file
+from thermocald.errors import DataError, ImageError, ThermocaldError, UsageError
+from thermocald.output.image_metadata import with_metadata
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from thermocald.analysis.thermal.correction import ImageCorrection
+    from thermocald.analysis.thermal.thermal_camera import ThermalCamera
+    from thermocald.store.logger.clock import DeviceClock
+    from thermocald.store.logger.temperatures import TemperatureLog
+
+_ADDED = ("dx", "dy", "sd_x", "sd_y", "temperature", "extrapolated_K")
+_SAID = 20  # rows that are named
+
+
+@dataclass
+class Correction:
+    """What is corrected with which model and log, and what came of it.
+
+    to: °C to correct to, None for the model's T₀; temperature_sd K, of a reading of the log; say:
+    is told of each row that cannot be corrected.
+    """
+
+    thermal: ThermalCamera
+    log: TemperatureLog
+    clock: DeviceClock
+    to: float | None
+    temperature_sd: float
+    extrapolate: bool = False
+    say: Callable[[str], None] = print
+    points: int = 0
+    extrapolated_rows: int = 0
+    images: list[dict[str, Any]] = field(default_factory=list)
+    refused: list[dict[str, Any]] = field(default_factory=list)
+    _moved: float = 0.0
+    _left_over: float = 0.0
+
+    def as_dict(self) -> dict[str, Any]:
+        """The result as `--json` has it."""
+        head = {
+            "format": "thermocald-correction/1",
+            "corrected_to": self.corrected_to,
+            "temperature_sd": self.temperature_sd,
+        }
+        if self.images:
+            return {**head, "images": self.images, "refused": self.refused}
+        return {
+            **head,
+            "points": self.points,
+            "rms_correction_px": self._rms(self._moved),
+            "rms_left_over_px": self._rms(self._left_over),
+            "extrapolated_rows": self.extrapolated_rows,
+            "refused": self.refused,
+        }
+
+    def __str__(self) -> str:
+        if self.images:
+            worst = max(d["rms_left_over_px"] for d in self.images)
+            most = max(d["largest_correction_px"] for d in self.images)
+            return (
+                f"{len(self.images)} images corrected by up to {most:.3f} px; left over ± "
+                f"{worst:.3f} px at most (RMS)"
+            )
+        return (
+            f"{self.points} points corrected by {self._rms(self._moved):.3f} px (RMS); left over ± "
+            f"{self._rms(self._left_over):.3f} px"
+        )
+
+    @property
+    def corrected_to(self) -> float:
+        """°C."""
+        return self.thermal.model.T0 if self.to is None else self.to
+
+    def lines(self, path: Path) -> Iterator[str]:
+        """Yield the corrected CSV of points, a block of rows at a time.
+
+        `-` is standard input: rows are corrected as they come in. Rows that cannot be corrected are
+        kept in `refused`. Raises DataError where none can.
+        """
+        for block in row_blocks(path, ("x", "y"), self.clock):
+            yield self._corrected(self._possible(block, path), path)
+        self._require_any(path, self.points)
+
+    def write_images(self, path: Path, out: Path, advance: Callable[[int], None]) -> None:
+        """Correct the images that a CSV of time and image names, into a folder.
+
+        EXIF is kept. Images that cannot be corrected are kept in `refused`. Raises DataError where
+        none can, UsageError where one would be overwritten.
+        """
+        make_folder(out)
+        for block in row_blocks(path, (), self.clock):
+            possible = self._possible(block, path)
+            if not possible.lines:
+                continue
+            corrections = image_corrections(
+                self.thermal, self.log, possible.times, self.to, self.temperature_sd,
+                self.extrapolate,
+            )  # fmt: skip
+            for line, row, c in zip(possible.lines, possible.rows, corrections, strict=True):
+                source, written = path.parent / row["image"], out / row["image"].rsplit("/", 1)[-1]
+                try:
+                    _write_corrected(source, written, c)
+                except ImageError as cause:
+                    self._refuse(path, line, str(cause))
+                else:
+                    self.images.append(_told(source, written, c))
+                advance(1)
+        self._require_any(path, len(self.images))
+
+    def require_all(self, path: Path) -> None:
+        """Raise DataError where a row was refused."""
+        if self.refused:
+            count = len(self.refused) + self.points + len(self.images)
+            lines = ", ".join(str(r["line"]) for r in self.refused[:_SAID])
+            raise DataError(
+                f"{path}: {len(self.refused)} of {count} rows were not corrected: lines {lines}"
+                + (", …" if len(self.refused) > _SAID else "")
+            )
+
+    def _possible(self, block: RowBlock, path: Path) -> RowBlock:
+        """The rows that lie in the image and in the time of the log; the others are said."""
+        log = self.log.times
+        step = float(np.median(np.diff(log))) if len(log) > 1 else 0.0
+        within = (block.times >= log[0] - step) & (block.times <= log[-1] + step)
+        possible = block.kept(
+            within,
+            f"was measured outside the temperature log ({log[0]:.0f} to {log[-1]:.0f} s)",
+        )
+        if possible.values.shape[1]:
+            sensor = self.thermal.model.sensor
+            possible = possible.kept(
+                sensor.contains(possible.values),
+                f"lies outside the model's {sensor.width}×{sensor.height} px; of another camera, "
+                "or binned (--size)?",
+            )
+        for line, reason in possible.refused:
+            self._refuse(path, line, reason)
+        return possible
+
+    def _corrected(self, block: RowBlock, path: Path) -> str:
+        if not len(block.times):
+            return ""
+        try:
+            found = correct_points(
+                self.thermal, self.log, block.times, block.values, self.to, self.temperature_sd,
+                self.extrapolate,
+            )  # fmt: skip
+        except ThermocaldError as cause:
+            if path != STANDARD_INPUT:
+                raise
+            # of what comes in one row must not stop the others
+            if len(block.times) == 1:
+                self._refuse(path, block.lines[0], str(cause))
+                return ""
+            ones = [
+                block.kept(np.arange(len(block.times)) == i, "") for i in range(len(block.times))
+            ]
+            return "".join(self._corrected(one, path) for one in ones)
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        if not self.points:
+            writer.writerow([*block.header, *_ADDED])
+        moved = found.points - block.values
+        for i, row in enumerate(block.rows):
+            row = {**row, "x": f"{found.points[i, 0]:.5f}", "y": f"{found.points[i, 1]:.5f}"}
+            tail = [*moved[i], *found.sds[i], found.temperature[i], found.extrapolated[i]]
+            writer.writerow([*(row[n] for n in block.header), *(f"{v:.6g}" for v in tail)])
+        self.points += len(block.rows)
+        self._moved += float(np.sum(moved**2))
+        self._left_over += float(np.sum(found.sds**2))
+        self.extrapolated_rows += int((found.extrapolated > 0).sum())
+        return text.getvalue()
+
+    def _refuse(self, path: Path, line: int, reason: str) -> None:
+        self.refused.append({"line": line, "reason": reason})
+        if len(self.refused) <= _SAID:
+            self.say(f"{path}, line {line}: not corrected: {reason}")
+
+    def _require_any(self, path: Path, count: int) -> None:
+        if not count:
+            first = self.refused[0]
+            raise DataError(
+                f"{path}: no row was corrected; line {first['line']}: {first['reason']}"
+            )
+
+    def _rms(self, squares: float) -> float:
+        return float((squares / (2 * self.points)) ** 0.5)
+
+
+def _write_corrected(source: Path, written: Path, c: ImageCorrection) -> None:
+    import cv2
+
+    image = cv2.imread(str(source), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise ImageError(f"{source}: is not a readable image")
+    if written.exists() and written.samefile(source):
+        raise UsageError(f"{written}: would be overwritten; give another --out")
+    height, width = c.map_x.shape
+    if image.shape[:2] != (height, width):
+        raise ImageError(
+            f"{source}: has {image.shape[1]}×{image.shape[0]} px, the model's camera "
+            f"{width}×{height}; say --size where it is binned"
+        )
+    corrected = cv2.remap(image, c.map_x, c.map_y, cv2.INTER_CUBIC)
+    encoded, data = cv2.imencode(written.suffix, corrected)
+    if not encoded:
+        raise ImageError(f"{written}: its format cannot be written")
+    with new_file(written) as partial:
+        partial.write_bytes(with_metadata(data.tobytes(), source.read_bytes()))
+
+
+def _told(source: Path, written: Path, c: ImageCorrection) -> dict[str, Any]:
+    return {
+        "image": str(source),
+        "corrected": str(written),
+        "temperature": c.temperature,
+        "rms_correction_px": c.rms_px,
+        "largest_correction_px": c.largest_px,
+        "rms_left_over_px": c.left_over_px,
+        "extrapolated_K": c.extrapolated,
+    }

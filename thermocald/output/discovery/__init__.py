@@ -1,1 +1,0 @@
-"""A discovery for people: figures and the report."""

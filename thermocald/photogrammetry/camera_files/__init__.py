@@ -1,0 +1,125 @@
+"""Camera files of other programs: one module per format, one entry to write and one to read.
+
+    write(model, path, "mrcal")         → the statement of how exact the file is
+    read(path) → ImportedCamera         format recognised by its content
+
+Conventions and what is exact: docs/reference/camera_files.md and `photogrammetry.conversions`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.atomic_file import write_text
+from thermocald.errors import ConfigurationError, DataError, UsageError
+from thermocald.photogrammetry.camera_files import (
+    aicon,
+    colmap,
+    kalibr,
+    metashape,
+    mrcal,
+    native,
+    opencv,
+    ros,
+)
+from thermocald.photogrammetry.camera_files.camera_record import Format, ImportedCamera, Record
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from thermocald.arrays import Array
+    from thermocald.photogrammetry.camera.camera_model import CameraModel
+
+__all__ = ["FORMATS", "Format", "ImportedCamera", "file_name", "read", "recognised", "write"]
+
+FORMATS: dict[str, Format] = {
+    module.FORMAT.name: module.FORMAT
+    for module in (opencv, ros, colmap, mrcal, kalibr, metashape, aicon, native)
+}
+_LARGEST_FILE = 10_000_000
+
+
+def file_name(stem: str, format_name: str) -> str:
+    """A file's name with the suffix that the format usually has."""
+    return stem + _format(format_name).suffix
+
+
+def _format(name: str) -> Format:
+    if name not in FORMATS:
+        raise UsageError(f"camera file format {name!r}: there are {', '.join(FORMATS)}")
+    return FORMATS[name]
+
+
+def write(
+    model: CameraModel,
+    path: Path,
+    format: str,  # noqa: A002
+    covariance: Array | None = None,
+    comment: str = "",
+    name: str = "camera",
+) -> str:
+    """Write a camera; returns the statement of how exact it is, which also stands in the file.
+
+    covariance: (10, 10) in the order of `IOP_NAMES`, goes into the formats that have room for it.
+    An existing file is replaced as a whole or not at all. Raises UsageError for an unknown format,
+    GeometryError if the model has no rays for part of its image.
+    """
+    if covariance is not None and np.shape(covariance) != (10, 10):
+        raise UsageError(f"a covariance of shape {np.shape(covariance)}, not (10, 10)")
+    record = Record(model, name, covariance, comment)
+    text, statement = _format(format).encode(record)
+    write_text(path, text)
+    return statement
+
+
+def recognised(path: Path) -> str | None:
+    """The format that a file's content tells, None where it is of none, or cannot be read."""
+    try:
+        return _recognised(_text(path), path).name
+    except ConfigurationError:
+        return None
+
+
+def read(
+    path: Path,
+    format: str | None = None,  # noqa: A002
+    pixel_pitch: float | None = None,
+) -> ImportedCamera:
+    """Read a camera file; without a format it is told by the content.
+
+    pixel_pitch: mm, for files that do not say it. Raises ConfigurationError that names the file.
+    """
+    text = _text(path)
+    chosen = _format(format) if format is not None else _recognised(text, path)
+    try:
+        found = chosen.decode(text)
+        if not isinstance(found, ImportedCamera):
+            return found.imported(chosen.name, text, pixel_pitch)
+        own = found.model.sensor.pixel_pitch
+        if pixel_pitch is not None and not np.isclose(pixel_pitch, own, rtol=1e-9):
+            raise ConfigurationError(
+                f"pixel pitch {pixel_pitch:g} mm was given, the file says {own:g} mm"
+            )
+        return found
+    except (ConfigurationError, DataError) as cause:
+        raise ConfigurationError(f"{path} ({chosen.about}): {cause}") from cause
+
+
+def _text(path: Path) -> str:
+    try:
+        if path.stat().st_size > _LARGEST_FILE:
+            raise ConfigurationError(f"{path}: too large for a camera file")
+        return path.read_text(encoding="utf-8")
+    except OSError as cause:
+        raise ConfigurationError(f"{path}: cannot be read: {cause.strerror}") from cause
+    except UnicodeDecodeError:
+        raise ConfigurationError(f"{path}: no text, and so no camera file") from None
+
+
+def _recognised(text: str, path: Path) -> Format:
+    for candidate in FORMATS.values():
+        if candidate.recognises(text):
+            return candidate
+    raise ConfigurationError(f"{path}: no camera file of any of {', '.join(FORMATS)}")

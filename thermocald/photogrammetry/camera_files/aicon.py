@@ -1,0 +1,196 @@
+"""An AICON .ior: photogrammetric terms in mm, radial ones balanced by R0.
+
+Written is the record that TU Dresden's FlowVeloTool (github.com/AnetteEltner/FlowVeloTool,
+photogrammetry_functions.py) reads as an AICON .ior, the one public reader there is: one line of
+numbers between single blanks,
+
+    camera type Ck Xh Yh A1 A2 R0 A3 B1 B2 C1 C2 width height columns rows
+
+with Ck < 0 and mm; the first two are skipped by it. With R0 ≠ 0 it has, ideal points (x̂, ŷ) of
+principal distance -Ck, x' = Xh + (1 + C1)(x̂ + Δx) + C2 (ŷ + Δy), y' = Yh + ŷ + Δy: exact without
+affinity and shear. (With R0 = 0 it takes the terms as numbers without unit: never written here,
+and refused.) Comments follow the record, where its reader does not look.
+
+Read are both this record and `name value [sd]` per line, as calibration sheets are typed over;
+there the terms are those of the measured point (Luhmann et al. 2014, section 3.3.2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.errors import ConfigurationError
+from thermocald.photogrammetry.camera.conversions import to_family
+from thermocald.photogrammetry.camera.model_families import MeasuredPoint
+from thermocald.photogrammetry.camera_files.camera_record import (
+    ForeignCamera,
+    Format,
+    Record,
+    header,
+)
+from thermocald.photogrammetry.camera_files.file_text import number
+
+if TYPE_CHECKING:
+    from thermocald.arrays import Array
+    from thermocald.photogrammetry.camera.camera_model import (
+        CameraModel,
+        InteriorOrientation,
+        Sensor,
+    )
+    from thermocald.photogrammetry.camera.conversions import Family
+
+__all__ = ["FORMAT"]
+
+# In the order of our ten: c x0 y0 A1 A2 A3 B1 B2 C1 C2.
+_NAMES = ("Ck", "Xh", "Yh", "A1", "A2", "A3", "B1", "B2", "C1", "C2")
+_LINES = ("Ck", "Xh", "Yh", "A1", "A2", "R0", "A3", "B1", "B2", "C1", "C2")
+_SIZES = ("sensor_width_mm", "sensor_height_mm", "pixels_x", "pixels_y")
+_FIELDS = ("camera", "type", *_LINES, *_SIZES)
+
+
+@dataclass(frozen=True, slots=True)
+class _Balanced:
+    """The record's model: terms at the ideal point, affinity applied after the distortion."""
+
+    r0: float
+
+    @property
+    def name(self) -> str:
+        """For messages."""
+        return f"AICON model, R0 {self.r0:g} mm"
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """As ours."""
+        return ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2", "C1", "C2")
+
+    def project(self, sensor: Sensor, values: Array, directions: Array) -> Array:
+        """Directions → image points."""
+        c, x0, y0, *_, C1, C2 = values
+        x, y = c * directions[:, 0], -c * directions[:, 1]
+        plain = np.concatenate([values[:8], [0.0, 0.0]])
+        dx, dy = MeasuredPoint(self.r0).correction(plain, x, y)
+        x, y = x + dx, y + dy
+        image = np.column_stack([x0 + (1 + C1) * x + C2 * y, -(y0 + y)])
+        return image / sensor.pixel_pitch + sensor.centre
+
+    def from_brown(self, model: CameraModel) -> Array:
+        """Exact without affinity and shear."""
+        values: Array = MeasuredPoint(self.r0, at_ideal_point=True).from_brown(model)
+        values[8:] = model.interior.C1, model.interior.C2
+        return values
+
+    def to_brown(self, sensor: Sensor, values: Array) -> InteriorOrientation:
+        """The inverse."""
+        plain = np.concatenate([values[:8], [0.0, 0.0]])
+        found = MeasuredPoint(self.r0, at_ideal_point=True).to_brown(sensor, plain)
+        return found.with_values(C1=float(values[8]), C2=float(values[9]))
+
+
+def _encode(record: Record) -> tuple[str, str]:
+    sensor = record.model.sensor
+    half_diagonal = 0.5 * float(np.hypot(sensor.width, sensor.height)) * sensor.pixel_pitch
+    # the radial correction vanishes at two thirds of the way to the corner, as is usual
+    r0 = float(f"{2 / 3 * half_diagonal:.4g}")
+    result = to_family(record.model, _Balanced(r0), record.covariance)
+    values = dict(zip(_NAMES, result.values.tolist(), strict=True))
+    values |= {"Ck": -values["Ck"], "R0": r0}
+    extent = sensor.width * sensor.pixel_pitch, sensor.height * sensor.pixel_pitch
+    numbers = [*(values[n] for n in _LINES), *extent, sensor.width, sensor.height]
+    lines = [" ".join(["1", "1", *map(repr, numbers)]) + " "]
+    lines += [f"# fields: {' '.join(_FIELDS)}", f"# name: {' '.join(record.name.split())}"]
+    if result.covariance is not None:
+        sds = np.sqrt(np.diag(result.covariance)).tolist()
+        lines += [f"# sd {n} {sd!r}" for n, sd in zip(_NAMES, sds, strict=True)]
+    return "\n".join(lines) + "\n" + header(record, result.statement), result.statement
+
+
+def _decode(text: str) -> ForeignCamera:
+    fields = _record(text)
+    if fields is None:
+        return _typed(text)
+    found = dict(zip(_FIELDS, fields, strict=True))
+    spread, name = {}, "camera"
+    for line in text.splitlines():
+        words = line.split()
+        if words[:2] == ["#", "name:"]:
+            name = " ".join(words[2:]) or name
+        if words[:2] == ["#", "sd"] and len(words) == 4:
+            spread[words[2]] = number(words[3], f"standard deviation of {words[2]}")
+    r0 = number(found["R0"], "R0")
+    if r0 == 0 and any(number(found[n], n) for n in _NAMES[3:8]):
+        raise ConfigurationError(
+            "R0 is 0: programs differ in the unit of such terms; type the numbers over, one name "
+            "and value per line"
+        )
+    return _foreign(found, spread, _Balanced(r0), name)
+
+
+def _record(text: str) -> list[str] | None:
+    """The fields of a record, or None where the text is none."""
+    words = [w for line in text.splitlines() for w in line.split("#")[0].split()]
+    if len(words) != len(_FIELDS):
+        return None
+    try:
+        values = [float(w) for w in words]
+    except ValueError:
+        return None
+    return words if values[2] < 0 else None
+
+
+def _typed(text: str) -> ForeignCamera:
+    """One `name value [sd]` per line."""
+    found: dict[str, str] = {}
+    spread: dict[str, float] = {}
+    name = "camera"
+    for i, line in enumerate(text.splitlines(), start=1):
+        words = line.split("#")[0].split()
+        if not words:
+            continue
+        key, rest = words[0], words[1:]
+        if key == "camera":
+            name = " ".join(rest)
+        elif key not in (*_LINES, *_SIZES):
+            raise ConfigurationError(f"line {i}: {key!r} is none of {', '.join(_LINES + _SIZES)}")
+        elif key in found:
+            raise ConfigurationError(f"line {i}: {key} is duplicated")
+        elif not rest:
+            raise ConfigurationError(f"line {i}: {key} has no value")
+        else:
+            found[key] = rest[0]
+            if len(rest) > 1:
+                spread[key] = number(rest[1], f"line {i}: standard deviation of {key}")
+    missing = [key for key in ("Ck", *_SIZES) if key not in found]
+    if missing:
+        raise ConfigurationError(f"{', '.join(missing)} missing")
+    r0 = number(found.get("R0", 0.0), "R0")
+    return _foreign(found, spread, MeasuredPoint(r0), name)
+
+
+def _foreign(
+    found: dict[str, str], spread: dict[str, float], family: Family, name: str
+) -> ForeignCamera:
+    values = np.array([number(found.get(key, 0.0), key) for key in _NAMES])
+    values[0] = abs(values[0])
+    sizes = [number(found[key], key) for key in _SIZES]
+    r0 = number(found.get("R0", 0.0), "R0")
+    if not 0 <= r0 < 1000:
+        raise ConfigurationError(f"R0 is {r0:g} mm; it is a radius in the image")
+    if not 1 <= sizes[2] < 1e6:
+        raise ConfigurationError(f"{sizes[2]:g} columns of pixels are impossible")
+    covariance = None
+    if spread:
+        covariance = np.diag([spread.get(key, 0.0) ** 2 for key in _NAMES])
+    size = int(sizes[2]), int(sizes[3])
+    return ForeignCamera(size, family, values, name, covariance, sizes[0] / sizes[2])
+
+
+def _recognises(text: str) -> bool:
+    typed = any(line.split()[:1] == ["Ck"] for line in text.splitlines())
+    return typed or _record(text) is not None
+
+
+FORMAT = Format("aicon", ".ior", "AICON interior orientation", _encode, _decode, _recognises)

@@ -1,1 +1,0 @@
-"""The survey of a test field, from photographs to coordinates."""

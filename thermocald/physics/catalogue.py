@@ -1,0 +1,123 @@
+"""The catalogue of effects, and the chain of those that replace the temperature.
+
+The registry is the entry point `thermocald.effects`, for the built-in effects (in `pyproject.toml`)
+and for those of other distributions alike; an entry's name is the effect's. A formula (`formula`)
+is an effect too, whose name is its text.
+
+Effects of kind `drive` (a lag, a delay, a play) act one after the other, each on what the one
+before makes of the temperature at the times of the readings. Simulation, fit and discovery use
+this one chain, forward and as the matrix that carries the readings' errors through it.
+"""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+from functools import cache
+from importlib.metadata import entry_points
+from typing import TYPE_CHECKING, Any
+
+from thermocald.errors import ConfigurationError
+from thermocald.physics.effect import Effect
+from thermocald.physics.formula import formula_effect, is_formula
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from scipy.sparse import csr_array
+
+    from thermocald.arrays import Array
+    from thermocald.physics.history import History
+
+    Drives = Sequence[tuple[str, Mapping[str, Any]]]
+
+_GROUP = "thermocald.effects"
+
+
+@cache
+def names() -> tuple[str, ...]:
+    """Return the names of the catalogue's effects, sorted.
+
+    ConfigurationError where there is none: the installation is older than the program.
+    """
+    found = tuple(sorted({point.name for point in entry_points(group=_GROUP)}))
+    if not found:
+        raise ConfigurationError(
+            "no effect is installed: thermocald's entry points are older than the program; "
+            "install it again (python -m pip install -e .)"
+        )
+    return found
+
+
+@cache
+def get(name: str) -> Effect:
+    """Return an effect by its name, or by the formula that it is.
+
+    ConfigurationError where there is none, or where it is not one.
+    """
+    if is_formula(name):
+        return formula_effect(name)
+    if name not in names():
+        near = get_close_matches(name, names(), 1)
+        hint = f"did you mean {near[0]!r}?" if near else f"known are: {', '.join(names())}"
+        raise ConfigurationError(f"unknown effect {name!r}; {hint}")
+    (point,) = entry_points(group=_GROUP, name=name)
+    try:
+        loaded = point.load()
+    except (ImportError, AttributeError) as error:
+        raise ConfigurationError(f"effect {name!r} cannot be imported: {error}") from error
+    if not (isinstance(loaded, type) and issubclass(loaded, Effect) and loaded.name == name):
+        raise ConfigurationError(
+            f"the entry point {name!r} of {_GROUP} is {point.value}, which is not an Effect with "
+            "this name"
+        )
+    return loaded()
+
+
+def find(wanted: Callable[[Effect], bool]) -> Effect:
+    """Return the first effect with some property; ConfigurationError where none has it."""
+    for name in names():
+        if wanted(get(name)):
+            return get(name)
+    raise ConfigurationError("no installed effect has the property that was asked for")
+
+
+def seen_in(place: str) -> Effect:
+    """Return the effect seen in the measuring noise ("noise") or in single targets ("targets")."""
+    return find(lambda effect: effect.seen_in == place)
+
+
+def driven_history(history: History, drives: Drives) -> History:
+    """Send the readings of a history's reference through drives [(effect, values)]."""
+    for name, values in drives:
+        at_readings = history.at(history.reading_times)
+        history = history.with_reference(get(name).drive(at_readings, **values))
+    return history
+
+
+def drive(history: History, drives: Drives) -> Array:
+    """Return the temperature (E,) °C behind the linear terms at the history's times."""
+    if not drives:
+        return history.temperature()
+    name, values = drives[-1]
+    return get(name).drive(driven_history(history, drives[:-1]), **values)
+
+
+def drive_matrix(history: History, drives: Drives, at_readings: bool = False) -> csr_array | None:
+    """Return ∂ drive / ∂ readings, (E, R), sparse.
+
+    at_readings: of the driven readings (R, R) instead, None (the identity) where there is no
+    drive.
+    """
+    chain: csr_array | None = None
+    for name, values in drives if at_readings else drives[:-1]:
+        here = history.at(history.reading_times)
+        own = get(name).sensitivity(here, **values)
+        chain = own if chain is None else own @ chain
+        history = history.with_reference(get(name).drive(here, **values))
+    if at_readings:
+        return chain
+    if not drives:
+        return history.temperature_matrix()
+    name, values = drives[-1]
+    last = get(name).sensitivity(history, **values)
+    return last if chain is None else last @ chain

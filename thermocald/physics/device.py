@@ -1,0 +1,279 @@
+"""A camera as a device to simulate: sensor, set-up, heat, thermometers, how well it measures.
+
+The camera file:
+
+    format: thermocald-camera/1
+    name: rpi-v2.1
+    width: 3280
+    height: 2464
+    pixel_pitch: 0.00112                         # mm
+    exterior: {omega: …, …, Z0: 1000.0}          # rad, mm; default: before the field's middle
+    distance: 1300.0                             # mm, for that default
+    measuring: {sigma: 0.04, missed: 0.02, gross: 0.002, gross_size: 3.0}   # px, shares, px
+    look: {paper: 200, ink: 30, blur: 0.8, noise: 2.0, vignetting: 0.15}    # DN, px, share
+    heat:
+      bodies: {lens: {capacity: 0.6}, board: {capacity: 15.0}}              # J/K
+      links:                                     # W/K; what is not a body is a boundary
+      - {between: [lens, board], conductance: 0.01}
+      - {between: [board, ambient], conductance: 0.05}
+    thermometers:                                # the first is the reference
+      temperature: {body: lens, noise: 0.04, resolution: 0.0625}            # K
+
+Programmes: what is done to a camera, and when it looks.
+
+    format: thermocald-programme/1
+    name: lamp cycles
+    series: M1
+    epochs: 150
+    interval: 10.0                               # s
+    jitter: 0.0                                  # s, of the frames' cadence (sigma)
+    reading: {offset: 0.0, spread: 1.0}          # s: thermometers are read ± spread about the frame
+    begin: 1600000000.0                          # s UTC
+    initial: 22.0                                # °C, all bodies; default: ambient at the start
+    ambient: 22.0                                # °C: a number, pieces, or a log (see `course`)
+    sources:                                     # W into bodies of the camera file
+      housing: [{from: 0, to: 60, value: 0}, {from: 60, to: 900, value: 6.0},
+                {from: 900, to: 1500, value: 0}]
+
+Other boundaries than `ambient` stand under `boundaries: {chamber: …}`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.photogrammetry.camera.camera_model import EOP_NAMES, ExteriorOrientation, Sensor
+from thermocald.physics.effect import PARAMETER_UNITS
+from thermocald.physics.heat import (
+    Course,
+    HeatNetwork,
+    Link,
+    SimulatedThermometer,
+    read_course,
+    read_network,
+    read_thermometer,
+)
+from thermocald.physics.model_file import QuantityReader, read_sensor
+from thermocald.physics.scene import Look
+from thermocald.yaml_file import read_yaml
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from thermocald.arrays import Array
+
+PROGRAMME_FORMAT = "thermocald-programme/1"
+
+
+@dataclass(frozen=True)
+class Programme:
+    """Epochs and what happens during them.
+
+    epochs, interval s, jitter s, reading_offset, reading_spread s, begin s UTC; initial °C or None
+    (as the ambient at the start); boundaries {name: Course °C}, sources {body: Course W}.
+    """
+
+    name: str
+    epochs: int
+    interval: float
+    boundaries: Mapping[str, Course]
+    sources: Mapping[str, Course] = field(default_factory=dict)
+    series: str = "M1"
+    jitter: float = 0.0
+    reading_offset: float = 0.0
+    reading_spread: float = 1.0
+    begin: float = 1_600_000_000.0
+    initial: float | Mapping[str, float] | None = None
+
+    @property
+    def duration(self) -> float:
+        """From the first frame to the last, nominally, s."""
+        return (self.epochs - 1) * self.interval
+
+    def frame_times(self, rng: np.random.Generator) -> Array:
+        """Draw when frames are taken, (E,) s from the start, the first at 0, ascending."""
+        nominal = np.arange(self.epochs) * self.interval
+        limit = 0.4 * self.interval
+        shift = np.clip(self.jitter * rng.standard_normal(self.epochs), -limit, limit)
+        shift[0] = 0.0
+        return nominal + shift
+
+    def reading_times(self, frames: Array, rng: np.random.Generator) -> Array:
+        """Draw when thermometers are read, (E,) s from the start, ascending."""
+        spread = self.reading_spread * rng.uniform(-1.0, 1.0, len(frames))
+        result: Array = np.maximum.accumulate(frames + self.reading_offset + spread)
+        return result
+
+
+def read_programme(path: Path) -> Programme:
+    """Read a programme file; ConfigurationError names file and key, and where there is a gap."""
+    document = read_yaml(path)
+    top = QuantityReader(path, document)
+    found = top.text("format")
+    if found != PROGRAMME_FORMAT:
+        raise top.fail("format", f"is {found[:60]!r}; this program reads {PROGRAMME_FORMAT!r}")
+    top.only(
+        ("format", "name", "series", "epochs", "interval", "jitter", "reading", "begin", "initial",
+         "ambient", "boundaries", "sources")
+    )  # fmt: skip
+    epochs = top.whole("epochs", "1")
+    interval = top.number("interval", "s", above=0.0)
+    duration = (epochs - 1) * interval
+    boundaries = {"ambient": read_course(top, "ambient", "degC", duration, path.parent)}
+    boundaries |= _read_courses(top, "boundaries", "degC", duration, path.parent)
+    offset, spread = 0.0, 1.0
+    if document.get("reading") is not None:
+        reading = top.inner("reading")
+        reading.only(("offset", "spread"))
+        offset = reading.number("offset", "s", 0.0)
+        spread = reading.number("spread", "s", 1.0, low=0.0)
+    return Programme(
+        top.text("name", path.stem),
+        epochs,
+        interval,
+        boundaries,
+        _read_courses(top, "sources", "W", duration, path.parent),
+        top.text("series", "M1"),
+        top.number("jitter", "s", 0.0, low=0.0),
+        offset,
+        spread,
+        top.number("begin", "s", 1_600_000_000.0),
+        top.number("initial", "degC") if document.get("initial") is not None else None,
+    )
+
+
+def _read_courses(
+    top: QuantityReader, key: str, unit: str, duration: float, folder: Path
+) -> dict[str, Course]:
+    if top.mapping.get(key) is None:
+        return {}
+    group = top.inner(key)
+    return {str(name): read_course(group, name, unit, duration, folder) for name in group.mapping}
+
+
+CAMERA_FORMAT = "thermocald-camera/1"
+
+
+@dataclass(frozen=True, slots=True)
+class Measuring:
+    """How image points are measured: sigma px of a coordinate; share of targets missed; share
+    grossly wrong, and by how much (sigma, px) those are.
+    """
+
+    sigma: float = 0.04
+    missed: float = 0.02
+    gross: float = 0.002
+    gross_size: float = 3.0
+
+
+@dataclass(frozen=True)
+class CameraDevice:
+    """A camera in its set-up, as the camera file describes it."""
+
+    name: str
+    sensor: Sensor
+    network: HeatNetwork
+    thermometers: Mapping[str, SimulatedThermometer]
+    exterior: ExteriorOrientation | None = None
+    distance: float = 1300.0
+    measuring: Measuring = field(default_factory=Measuring)
+    look: Look = field(default_factory=Look)
+
+    @property
+    def reference(self) -> str:
+        """The reference thermometer's name."""
+        return next(iter(self.thermometers))
+
+
+def default_heat() -> tuple[HeatNetwork, dict[str, SimulatedThermometer]]:
+    """Return a camera module on a board in a housing before a test field, and two thermometers.
+
+    Capacities and conductances are of the order of a Raspberry Pi in a plastic case: the module
+    warms with a time constant of a few minutes.
+    """
+    network = HeatNetwork(
+        {"sensor": 1.0, "lens": 1.5, "board": 40.0, "housing": 60.0, "test_field": 2000.0},
+        (
+            Link("sensor", "lens", 0.05),
+            Link("sensor", "board", 0.05),
+            Link("lens", "housing", 0.02),
+            Link("board", "housing", 0.25),
+            Link("housing", "ambient", 0.4),
+            Link("test_field", "ambient", 5.0),
+        ),
+    )
+    thermometers = {
+        "temperature": SimulatedThermometer("lens"),
+        "board_temperature": SimulatedThermometer("board"),
+    }
+    return network, thermometers
+
+
+def read_camera_device(path: Path) -> CameraDevice:
+    """Read a camera file; ConfigurationError names file and key."""
+    document = read_yaml(path)
+    top = QuantityReader(path, document)
+    found = top.text("format")
+    if found != CAMERA_FORMAT:
+        raise top.fail("format", f"is {found[:60]!r}; this program reads {CAMERA_FORMAT!r}")
+    top.only(
+        ("format", "name", "width", "height", "pixel_pitch", "exterior", "distance", "measuring",
+         "look", "heat", "thermometers")
+    )  # fmt: skip
+    network, thermometers = default_heat()
+    if document.get("heat") is not None:
+        network = read_network(top.inner("heat"))
+    if document.get("thermometers") is not None:
+        group = top.inner("thermometers")
+        thermometers = {str(n): read_thermometer(group.inner(n)) for n in group.mapping}
+    for name, thermometer in thermometers.items():
+        if thermometer.body not in (*network.bodies, *network.boundaries):
+            raise top.fail(
+                f"thermometers.{name}.body",
+                f"is {thermometer.body!r}; bodies are {', '.join(network.bodies)}",
+            )
+    if not thermometers:
+        raise top.fail("thermometers", "is empty: one thermometer is needed")
+    return CameraDevice(
+        top.text("name", "camera"),
+        read_sensor(top),
+        network,
+        thermometers,
+        _read_exterior(top) if document.get("exterior") is not None else None,
+        top.number("distance", "mm", 1300.0, above=0.0),
+        _read_measuring(top) if document.get("measuring") is not None else Measuring(),
+        _read_look(top) if document.get("look") is not None else Look(),
+    )
+
+
+def _read_exterior(top: QuantityReader) -> ExteriorOrientation:
+    reader = top.inner("exterior")
+    reader.only(EOP_NAMES)
+    return ExteriorOrientation(*(reader.number(n, PARAMETER_UNITS[n]) for n in EOP_NAMES))
+
+
+def _read_measuring(top: QuantityReader) -> Measuring:
+    reader, usual = top.inner("measuring"), Measuring()
+    reader.only(("sigma", "missed", "gross", "gross_size"))
+    return Measuring(
+        reader.number("sigma", "px", usual.sigma, above=0.0),
+        reader.share("missed", usual.missed),
+        reader.share("gross", usual.gross),
+        reader.number("gross_size", "px", usual.gross_size, low=0.0),
+    )
+
+
+def _read_look(top: QuantityReader) -> Look:
+    reader, usual = top.inner("look"), Look()
+    reader.only(("paper", "ink", "blur", "noise", "vignetting"))
+    return Look(
+        reader.number("paper", "DN", usual.paper_dn, low=0.0, high=255.0),
+        reader.number("ink", "DN", usual.ink_dn, low=0.0, high=255.0),
+        reader.number("blur", "px", usual.blur_px, low=0.0, high=30.0),
+        reader.number("noise", "DN", usual.noise_dn, low=0.0, high=60.0),
+        reader.number("vignetting", "1", usual.vignetting, low=0.0, high=1.0),
+    )

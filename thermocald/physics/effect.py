@@ -1,0 +1,471 @@
+"""What an effect is: a physical cause with a name, a signature and parameters.
+
+One class is used three times: forward in the simulation (`influence`), as columns in a fit
+(`drive`, `signal`, with `sensitivity` to carry the thermometer's error through them), and as words
+in a report (`sentence`, `experiment_against`). Everything in which effects differ is stated here
+as a property or a method: no other module asks for an effect by its name.
+
+Three kinds:
+
+* `drive` replaces the temperature that drives the linear terms of the base model;
+* `signal` adds coefficient × signal(t) to some of the camera's parameters;
+* `image` acts beyond the camera's parameters: object points, measuring noise, blur.
+
+Non-linear parameters are those a fit has to search (a time constant, a threshold); coefficients
+are linear: for a `signal` they bear the names of the parameters they act on.
+"""
+
+from __future__ import annotations
+
+from abc import ABC
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+import numpy as np
+
+from thermocald.errors import ConfigurationError, DataError
+from thermocald.photogrammetry.camera.camera_model import EOP_NAMES, IOP_NAMES, PARAMETER_NAMES
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+    from scipy.sparse import csr_array
+
+    from thermocald.arrays import Array
+    from thermocald.photogrammetry.field.testfield import TestField
+    from thermocald.physics.following import Follower
+    from thermocald.physics.history import History
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Displacement:
+    """Some targets have moved: rows (k,) of the test field, vector (3,) mm, active (E,) when."""
+
+    rows: NDArray[np.int64]
+    vector: Array
+    active: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Influence:
+    """What an effect changes at E times.
+
+    iop (E, 10), eop (E, 6): added, in the order of IOP_NAMES and EOP_NAMES; scale (E, 3): factors
+    of the object coordinates; displacements: of single targets; noise_factor, blur_factor (E,).
+    """
+
+    iop: Array
+    eop: Array
+    scale: Array
+    noise_factor: Array
+    blur_factor: Array
+    displacements: tuple[Displacement, ...] = field(default=())
+
+    @classmethod
+    def none(cls, epochs: int) -> Self:
+        """Return an influence that changes nothing."""
+        one = np.ones(epochs)
+        return cls(np.zeros((epochs, 10)), np.zeros((epochs, 6)), np.ones((epochs, 3)), one, one)
+
+    @classmethod
+    def of_parameters(cls, changes: Mapping[str, Array], epochs: int) -> Self:
+        """Add changes (E,) of IOP and EOP by their names."""
+        result = cls.none(epochs)
+        for name, change in changes.items():
+            if name in IOP_NAMES:
+                result.iop[:, IOP_NAMES.index(name)] += change
+            else:
+                result.eop[:, EOP_NAMES.index(name)] += change
+        return result
+
+    def __add__(self, other: Influence) -> Influence:
+        """Add another influence."""
+        return Influence(
+            self.iop + other.iop,
+            self.eop + other.eop,
+            self.scale * other.scale,
+            self.noise_factor * other.noise_factor,
+            self.blur_factor * other.blur_factor,
+            self.displacements + other.displacements,
+        )
+
+
+Role = Literal["", "period", "phase", "event", "delay", "time_constant", "threshold", "width"]
+
+# Units of IOP and EOP as the files write them (CONVENTIONS §2).
+PARAMETER_UNITS: dict[str, str] = {
+    "c": "mm", "x0": "mm", "y0": "mm", "A1": "mm-2", "A2": "mm-4", "A3": "mm-6",
+    "B1": "mm-1", "B2": "mm-1", "C1": "1", "C2": "1",
+    "omega": "rad", "phi": "rad", "kappa": "rad", "X0": "mm", "Y0": "mm", "Z0": "mm",
+}  # fmt: skip
+
+# Experiments that separate two effects; each effect states how it responds to some of them.
+EXPERIMENTS: dict[str, str] = {
+    "hold": "hold the lamp at 45 °C for 20 minutes",
+    "cycle": "heat and cool twice between the same two temperatures",
+    "rate": "heat over the same range once slowly and once fast",
+    "hotter": "heat 10 K further than before",
+    "idle": "leave the lamp off and let the device run for an hour",
+    "restart": "switch the device off for an hour and record again",
+    "shade": "shade the test field and heat the camera alone",
+    "turn": "turn the camera by 180° about its optical axis and heat it again",
+    "disconnect": "disconnect fan, heater and charger",
+    "load": "load the processor without heating from outside",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """A non-linear parameter of an effect.
+
+    unit; low, high: range to search; default: start value; log: searched by its logarithm; text: a
+    name (a channel, targets) rather than a number; role: what it means to a search, which chooses
+    the grid of trial values by it.
+    """
+
+    unit: str
+    low: float
+    high: float
+    default: float
+    log: bool = False
+    text: bool = False
+    role: Role = ""
+
+    def difference_step(self, value: float) -> float:
+        """Return a step for difference quotients: small for its effect, large for rounding."""
+        if self.log:
+            return 1e-3 * max(abs(value), 1e-6)
+        return {"threshold": 0.02, "delay": 0.05}.get(self.role, 1e-3)
+
+    def bounded(self, old: float, new: float, slack: float = 1.0) -> float:
+        """Limit a step of an iteration to the range, and to a factor of 2 if `log`.
+
+        slack: factor on the lower bound: data may ask for less than a simulation makes sense of.
+        """
+        if self.log:
+            near = np.clip(new, old / 2.0, old * 2.0)
+            return float(np.clip(near, slack * self.low, self.high))
+        return float(np.clip(new, self.low, self.high))
+
+
+def say_estimate(estimate: Mapping[str, Any]) -> str:
+    """Write an estimate as people do: 84.1 ± 1.9 s, two digits of the standard deviation."""
+    value, sd, unit = estimate.get("value"), estimate.get("sd"), estimate.get("unit", "")
+    unit = "" if unit == "1" else f" {unit}"
+    if isinstance(value, str) or value is None:
+        return f"{value}{unit}"
+    if not sd or not np.isfinite(sd):
+        return f"{value:.4g}{unit}"
+    digits = 1 - int(np.floor(np.log10(sd)))
+    if -2 <= digits <= 5:
+        d = max(digits, 0)
+        return f"{round(value, digits):.{d}f} ± {round(sd, digits):.{d}f}{unit}"
+    exponent = int(np.floor(np.log10(max(abs(value), sd))))
+    d = max(digits + exponent, 0)
+    return f"({value / 10.0**exponent:.{d}f} ± {sd / 10.0**exponent:.{d}f})e{exponent}{unit}"
+
+
+def coefficient_units(per: str, parameters: tuple[str, ...] = PARAMETER_NAMES) -> dict[str, str]:
+    """Return units of coefficients that act on parameters: mm/K, rad/K, …; `per`: "K", "s", "1"."""
+    if per == "1":
+        return {name: PARAMETER_UNITS[name] for name in parameters}
+    return {name: f"{PARAMETER_UNITS[name]}/{per}" for name in parameters}
+
+
+Kind = Literal["drive", "signal", "image"]
+SeenIn = Literal["trajectory", "noise", "targets"]
+
+
+@dataclass(frozen=True, slots=True)
+class Steady:
+    """An effect's signal at a temperature T at which the camera has long been.
+
+    powers: factors of (T - T₀)⁰, (T - T₀)¹, (T - T₀)²; knee: °C above which T - knee is added,
+    and the name of the parameter that it is; nothing of all this by default.
+    """
+
+    powers: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    knee: float | None = None
+    knee_name: str = ""
+
+
+class Effect(ABC):
+    """One physical cause. Subclasses are stateless; their docstrings state the formula.
+
+    name: as in the catalogue; noun: for sentences; nonlinear: searched parameters; linear:
+    {coefficient: unit}; usual: the coefficients that act unless told otherwise; fresh: non-linear
+    parameters that belong to one series and do not carry over to another; optional: non-linear
+    parameters that a model may leave out; behaviour: answers to EXPERIMENTS.
+
+    For a search: seen_in: the trajectories of the camera's parameters, the measuring noise, or
+    single targets; parameter_sets: the sets of coefficients that it may act on, by default the
+    usual ones; moves_mount: it may act on the orientation of the camera instead;
+    irreversible: it stays after cooling; follows_rate: its signal is the temperature's rate;
+    columns:
+    {coefficient: column of the reduced series} where names differ; steady_signal: see `steady`;
+    of_now: it follows from the first, the highest, the lowest and the last three readings, so that
+    a live camera need not keep the others.
+    """
+
+    name: ClassVar[str]
+    noun: ClassVar[str]
+    kind: ClassVar[Kind]
+    nonlinear: ClassVar[Mapping[str, Parameter]] = {}
+    linear: ClassVar[Mapping[str, str]] = {}
+    usual: ClassVar[tuple[str, ...]] = ()
+    fresh: ClassVar[tuple[str, ...]] = ()
+    optional: ClassVar[tuple[str, ...]] = ()
+    behaviour: ClassVar[Mapping[str, str]] = {}
+    seen_in: ClassVar[SeenIn] = "trajectory"
+    parameter_sets: ClassVar[tuple[tuple[str, ...], ...]] = ()
+    moves_mount: ClassVar[bool] = False
+    irreversible: ClassVar[bool] = False
+    follows_rate: ClassVar[bool] = False
+    columns: ClassVar[Mapping[str, str]] = {}
+    steady_signal: ClassVar[Steady | None] = None
+    of_now: ClassVar[bool] = False
+
+    def follower(self, values: Mapping[str, Any]) -> Follower | None:  # noqa: ARG002
+        """The drive with its state, for readings one by one; None where it needs them all."""
+        return None
+
+    @property
+    def is_drive(self) -> bool:
+        """Whether it replaces the temperature behind the linear terms."""
+        return self.kind == "drive"
+
+    @property
+    def is_event(self) -> bool:
+        """Whether it happens at one time of a series or not at all; its size is the series' own."""
+        return any(self.nonlinear[name].role == "event" for name in self.fresh)
+
+    @property
+    def is_periodic(self) -> bool:
+        """Whether it cycles: two signals, whose weights are amplitude and phase of the series."""
+        return any(self.nonlinear[name].role == "phase" for name in self.fresh)
+
+    @property
+    def delay(self) -> str:
+        """The parameter that to first order delays the temperature, s; "" where there is none."""
+        if not self.is_drive:
+            return ""
+        roles = ("delay", "time_constant")
+        return next((n for n, p in self.nonlinear.items() if p.role in roles), "")
+
+    def column(self, coefficient: str) -> str:
+        """Return the column of a reduced series that a coefficient acts on."""
+        return self.columns.get(coefficient, coefficient)
+
+    def drive(self, history: History, **nonlinear: Any) -> Array:
+        """Return the temperature (E,) °C that drives the linear terms in place of T."""
+        raise NotImplementedError(f"{self.name} is not a drive")
+
+    def signal(self, history: History, **nonlinear: Any) -> Array:
+        """Return the time series (E, k) that the coefficients multiply; k is 1 but for
+        oscillations.
+        """
+        raise NotImplementedError(f"{self.name} has no signal")
+
+    def channel(self, history: History, **nonlinear: Any) -> str:  # noqa: ARG002
+        """Return the temperature column that it reads."""
+        return history.reference
+
+    def sensitivity(self, history: History, **nonlinear: Any) -> csr_array:
+        """Return ∂ (drive or first signal) / ∂ readings of `channel`, (E, R), sparse.
+
+        Where a subclass knows no formula: by differences, one reading at a time.
+        """
+        from scipy.sparse import csr_array
+
+        name = self.channel(history, **nonlinear)
+        readings = np.asarray(history.readings[name], dtype=float)
+        step = 1e-4
+        columns = np.zeros((len(history.times), len(readings)))
+        for i in np.flatnonzero(np.isfinite(readings)):
+            sides = []
+            for sign in (1.0, -1.0):
+                moved = readings.copy()
+                moved[i] += sign * step
+                other = replace(history, readings={**history.readings, name: moved})
+                sides.append(self._course(other, **nonlinear))
+            columns[:, i] = (sides[0] - sides[1]) / (2 * step)
+        return csr_array(columns)
+
+    def further_sensitivities(
+        self,
+        history: History,  # noqa: ARG002
+        **nonlinear: Any,  # noqa: ARG002
+    ) -> dict[str, csr_array]:
+        """Return the same for every further column that it reads, {channel: (E, R)}."""
+        return {}
+
+    def propagate(self, history: History, errors: Array, **nonlinear: Any) -> Array:
+        """Carry errors (R, m) K of the readings to drive or first signal (E, m), first order."""
+        result: Array = self.sensitivity(history, **nonlinear) @ np.nan_to_num(errors)
+        return result
+
+    def unresolved(
+        self,
+        history: History,
+        rate_jump: Array | None = None,  # noqa: ARG002
+        **nonlinear: Any,  # noqa: ARG002
+    ) -> Array:
+        """Return the sd (E,) of drive or first signal that the times of the readings leave.
+
+        What happens between two readings, or after the last, no reading tells; their noise is not
+        meant. rate_jump (E,) K/s: how uncertain the rate of the temperature is at the frames,
+        because it jumps next to them. Most effects need the temperature alone, which straight lines
+        between readings tell.
+        """
+        return np.zeros(len(history.times))
+
+    def turns(self, history: History, **nonlinear: Any) -> NDArray[np.bool_]:  # noqa: ARG002
+        """Find epochs (E,) in which the drive depends on which reading was an extreme.
+
+        What `sensitivity` says is uncertain there.
+        """
+        return np.zeros(len(history.times), dtype=bool)
+
+    def steady(
+        self,
+        values: Mapping[str, Any],  # noqa: ARG002
+        T0: float,  # noqa: ARG002
+        channels: Mapping[str, float] | None,  # noqa: ARG002
+    ) -> Steady:
+        """Return the signal of a camera that has long been at one temperature, and never hotter.
+
+        T0: the model's reference temperature °C; channels: °C of other thermometers. A drive has
+        settled. DataError where the effect does not say: such a model needs a temperature log.
+        """
+        if self.steady_signal is None and self.kind == "signal":
+            raise DataError(
+                f"effect {self.name} does not say what it is at a steady temperature; "
+                "give a temperature log instead"
+            )
+        return self.steady_signal or Steady()
+
+    def _course(self, history: History, **nonlinear: Any) -> Array:
+        if self.kind == "drive":
+            return self.drive(history, **nonlinear)
+        return self.signal(history, **nonlinear)[:, 0]
+
+    def weights(self, values: Mapping[str, Any], name: str) -> Array:
+        """Return the weight (k,) of each signal in one coefficient; oscillations split by their
+        phase.
+        """
+        return np.array([float(values[name])])
+
+    def split(self, values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, float]]:
+        """Split parameter values into (non-linear ones, coefficients)."""
+        searched = {k: values[k] for k in self.nonlinear if k in values}
+        return searched, {k: float(values[k]) for k in self.linear if k in values}
+
+    def influence(
+        self,
+        history: History,
+        values: Mapping[str, Any],
+        field: TestField | None = None,  # noqa: ARG002
+    ) -> Influence:
+        """Return what it changes at the history's times; a drive changes nothing by itself."""
+        epochs = len(history.times)
+        if self.kind == "image":
+            return replace(Influence.none(epochs), **self.image_changes(history, values))
+        searched, coefficients = self.split(values)
+        if self.kind != "signal" or not any(coefficients.values()):
+            return Influence.none(epochs)
+        course = self.signal(history, **searched)
+        changes = {name: course @ self.weights(values, name) for name in coefficients}
+        return Influence.of_parameters(changes, epochs)
+
+    def image_changes(
+        self,
+        history: History,  # noqa: ARG002
+        values: Mapping[str, Any],  # noqa: ARG002
+    ) -> dict[str, Any]:
+        """Return what an `image` effect without need of a test field changes of an `Influence`."""
+        return {}
+
+    def units(self) -> dict[str, str]:
+        """Return the unit of every parameter by its name."""
+        return {**{k: p.unit for k, p in self.nonlinear.items()}, **self.linear}
+
+    def check(self, values: Mapping[str, Any], where: str = "") -> None:
+        """Raise ConfigurationError where a parameter is missing, unknown or no number in range."""
+        place = f"{where}effect {self.name}"
+        known = self.units()
+        for name in values:
+            if name not in known:
+                raise ConfigurationError(
+                    f"{place} has no parameter {name!r}; it has: {', '.join(known)}"
+                )
+        for name, parameter in self.nonlinear.items():
+            if name not in values:
+                if name in self.optional:
+                    continue
+                raise ConfigurationError(
+                    f"{place}: parameter {name!r} ({parameter.unit}) is missing"
+                )
+            value = values[name]
+            if parameter.text:
+                continue
+            if not isinstance(value, (int, float)) or not np.isfinite(value):
+                raise ConfigurationError(f"{place}: {name} = {value!r} is not a finite number")
+            if (parameter.log or self.kind == "drive") and parameter.low >= 0 and value < 0:
+                raise ConfigurationError(f"{place}: {name} = {value} {parameter.unit} is negative")
+        if self.linear and not any(name in values for name in self.linear):
+            raise ConfigurationError(
+                f"{place}: it needs at least one of the coefficients {', '.join(self.linear)}"
+            )
+        for name in self.linear:
+            if name in values and not (
+                isinstance(values[name], (int, float)) and np.isfinite(values[name])
+            ):
+                raise ConfigurationError(
+                    f"{place}: {name} = {values[name]!r} is not a finite number"
+                )
+
+    def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
+        """Write one sentence for a report; estimates: {parameter: {value, sd, unit}}."""
+        numbers = ", ".join(f"{name} = {say_estimate(e)}" for name, e in estimates.items())
+        return f"{self.noun}{': ' if numbers else ''}{numbers}"
+
+    def experiment_against(self, other: Effect) -> str:
+        """Say what to do to tell this effect from another, and what one would see."""
+        for key, action in EXPERIMENTS.items():
+            mine, theirs = self.behaviour.get(key), other.behaviour.get(key)
+            if mine and theirs and mine != theirs:
+                return f"{action}: {self.noun} {mine}, {other.noun} {theirs}"
+        for key, action in EXPERIMENTS.items():
+            mine, theirs = self.behaviour.get(key), other.behaviour.get(key)
+            if mine or theirs:
+                mover, said = (self, mine) if mine else (other, theirs)
+                return f"{action}: {mover.noun} {said}"
+        return f"record longer and under another programme than now ({self.noun}, {other.noun})"
+
+
+class OfTime(Effect):
+    """An effect that knows the time alone: the thermometer's error does not reach it."""
+
+    of_now = True
+
+    steady_signal = Steady()
+
+    def sensitivity(self, history: History, **_: Any) -> csr_array:
+        from scipy.sparse import csr_array
+
+        return csr_array((len(history.times), len(history.reading_times)))
+
+
+class Proportional(Effect):
+    """An effect whose signal is T - T₀, at once."""
+
+    of_now = True
+
+    steady_signal = Steady((0.0, 1.0, 0.0))
+
+    def signal(self, history: History, **_: Any) -> Array:
+        return (history.temperature() - history.T0)[:, None]
+
+    def sensitivity(self, history: History, **_: Any) -> csr_array:
+        return history.temperature_matrix()

@@ -1,0 +1,251 @@
+"""Effects of how heat reaches the camera, and of when it is measured."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from thermocald.errors import DataError
+from thermocald.physics.effect import (
+    Effect,
+    OfTime,
+    Parameter,
+    Steady,
+    coefficient_units,
+    say_estimate,
+)
+from thermocald.physics.following import DelayFollower, LagFollower
+from thermocald.physics.operators import interpolation_matrix, lag, lag_matrix, slope_matrix
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from scipy.sparse import csr_array
+
+    from thermocald.arrays import Array
+    from thermocald.physics.following import Follower
+    from thermocald.physics.history import History
+
+
+class ThermalLag(Effect):
+    """The linear terms follow L instead of T, with τ dL/dt = T - L and L = T at the start.
+
+    The lumped-capacity body: τ = heat capacity × thermal resistance to where T is measured.
+    Source: Incropera, DeWitt (2007): Fundamentals of Heat and Mass Transfer, 6th ed., section 5.1.
+    """
+
+    name = "thermal_lag"
+    noun = "a thermal lag"
+    kind = "drive"
+    nonlinear: ClassVar[Mapping[str, Parameter]] = {
+        "tau": Parameter("s", 2.0, 3000.0, 60.0, log=True, role="time_constant")
+    }
+    behaviour: ClassVar[Mapping[str, str]] = {
+        "hold": "settles",
+        "rate": "opens the loop more when fast, and rounds its tips",
+        "cycle": "returns to the same line each time",
+        "idle": "does nothing",
+    }
+
+    def follower(self, values: Mapping[str, Any]) -> Follower | None:
+        return LagFollower(float(values["tau"]))
+
+    def drive(self, history: History, tau: float = 60.0, **_: Any) -> Array:
+        p = history.polygon()
+        return lag(p.times, p.values, tau, history.times)
+
+    def sensitivity(self, history: History, tau: float = 60.0, **_: Any) -> csr_array:
+        p = history.polygon()
+        return lag_matrix(p.times, tau, history.times) @ p.matrix
+
+    def propagate(self, history: History, errors: Array, tau: float = 60.0, **_: Any) -> Array:
+        p = history.polygon()
+        # the operator is linear: no matrix needed, whatever the length
+        return lag(p.times, p.matrix @ errors, tau, history.times)
+
+    def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
+        return f"the camera follows the thermometer with a lag of {say_estimate(estimates['tau'])}"
+
+
+class TimeOffset(Effect):
+    """The linear terms follow T(t - d): a pure delay d; d < 0 where T is stamped late.
+
+    Before the first frame the temperature has always been the one of the first frame.
+    """
+
+    name = "time_offset"
+    noun = "a time offset"
+    kind = "drive"
+    nonlinear: ClassVar[Mapping[str, Parameter]] = {
+        "d": Parameter("s", -300.0, 300.0, 10.0, role="delay")
+    }
+    behaviour: ClassVar[Mapping[str, str]] = {
+        "hold": "stops at once after the delay",
+        "rate": "shifts the whole curve by the same time, its tips stay sharp",
+        "cycle": "returns to the same line each time",
+        "idle": "does nothing",
+    }
+
+    def follower(self, values: Mapping[str, Any]) -> Follower | None:
+        return DelayFollower(float(values["d"]))
+
+    def drive(self, history: History, d: float = 0.0, **_: Any) -> Array:
+        return history.polygon().at(history.times - d)
+
+    def unresolved(
+        self,
+        history: History,
+        rate_jump: Array | None = None,  # noqa: ARG002
+        d: float = 0.0,
+        **_: Any,
+    ) -> Array:
+        """Return what is not known after the last reading, where the thermometer is ahead.
+
+        As much as the temperature usually changes over the time that is missing.
+        """
+        p = history.polygon()
+        missing = np.maximum(history.times - d - p.times[-1], 0.0)
+        open_ = np.zeros(len(missing))
+        for e in np.flatnonzero(missing):
+            begun = p.times[p.times + missing[e] <= p.times[-1]]
+            if len(begun):
+                open_[e] = np.sqrt(np.mean((p.at(begun + missing[e]) - p.at(begun)) ** 2))
+        return open_
+
+    def sensitivity(self, history: History, d: float = 0.0, **_: Any) -> csr_array:
+        p = history.polygon()
+        return interpolation_matrix(p.times, history.times - d) @ p.matrix
+
+    def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
+        late = say_estimate(estimates["d"])
+        return f"the camera follows the thermometer after a pure delay of {late}"
+
+
+_NOISE_JUMPS = 3.0  # standard deviations that a jump of the rate must be beyond noise
+
+
+class ThermalGradient(Effect):
+    """Adds a dT/dt: the difference across a plate that heat flows through, so its bow.
+
+    In a body that warms steadily the difference between its faces is proportional to the rate:
+    Carslaw, Jaeger (1959): Conduction of Heat in Solids.
+    """
+
+    name = "thermal_gradient"
+    noun = "a thermal gradient"
+    kind = "signal"
+    linear: ClassVar[Mapping[str, str]] = coefficient_units("(K/s)")
+    usual = ("c", "x0", "y0")
+    moves_mount = True
+    follows_rate = True
+    steady_signal = Steady()
+    of_now = True
+    behaviour: ClassVar[Mapping[str, str]] = {
+        "hold": "vanishes as soon as the temperature stands",
+        "rate": "grows in proportion to the rate",
+        "cycle": "changes its sign between up and down",
+        "idle": "does nothing",
+    }
+
+    def signal(self, history: History, **_: Any) -> Array:
+        p = history.polygon()
+        rate: Array = slope_matrix(p.times, history.times) @ p.values
+        return rate[:, None]
+
+    def unresolved(
+        self,
+        history: History,
+        rate_jump: Array | None = None,
+        **_: Any,
+    ) -> Array:
+        """Return by how much the rate jumps where a lamp is switched between two readings."""
+        if rate_jump is not None:
+            return rate_jump
+        p = history.polygon()
+        if len(p.times) < 5:
+            return np.zeros(len(history.times))
+        jumps = np.abs(np.diff(np.diff(p.values) / np.diff(p.times)))
+        noise = 1.4826 * float(np.median(jumps))
+        excess = np.sqrt(np.maximum(jumps**2 - (_NOISE_JUMPS * noise) ** 2, 0.0))
+        at_knots = np.concatenate([excess[:1], excess, excess[-1:]]) / 2.0
+        return np.interp(history.times, p.times, at_knots)
+
+    def sensitivity(self, history: History, **_: Any) -> csr_array:
+        p = history.polygon()
+        return slope_matrix(p.times, history.times) @ p.matrix
+
+
+class SelfHeating(OfTime):
+    """Adds a (1 - exp(-t/τ)), t from the start of the series.
+
+    The step response of one body with capacity C and conductance G to its own power: τ = C/G.
+    Source: Incropera, DeWitt (2007): Fundamentals of Heat and Mass Transfer, 6th ed., section 5.3.
+    """
+
+    name = "self_heating"
+    noun = "self-heating"
+    kind = "signal"
+    nonlinear: ClassVar[Mapping[str, Parameter]] = {
+        "tau": Parameter("s", 10.0, 10000.0, 300.0, log=True, role="time_constant")
+    }
+    linear: ClassVar[Mapping[str, str]] = coefficient_units("1")
+    usual = ("c", "x0", "y0")
+    steady_signal = Steady((1.0, 0.0, 0.0))
+    behaviour: ClassVar[Mapping[str, str]] = {
+        "idle": "rises and settles although the thermometer stands",
+        "restart": "comes again after each power-on",
+        "hold": "goes on with its own time constant",
+        "cycle": "does not repeat with the cycles",
+    }
+
+    def signal(self, history: History, tau: float = 300.0, **_: Any) -> Array:
+        return -np.expm1(-history.times / tau)[:, None]
+
+    def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
+        return (
+            "the device warms itself, unseen by the thermometer, with a time constant of "
+            f"{say_estimate(estimates['tau'])}"
+        )
+
+
+class SecondHeatSource(Effect):
+    """Adds a (T_channel - T₀), linear in another temperature column of the recording."""
+
+    name = "second_heat_source"
+    noun = "a second heat source"
+    kind = "signal"
+    nonlinear: ClassVar[Mapping[str, Parameter]] = {
+        "channel": Parameter("name", 0.0, 0.0, 0.0, text=True)
+    }
+    linear: ClassVar[Mapping[str, str]] = coefficient_units("K")
+    usual = ("c", "x0", "y0")
+    of_now = True
+    behaviour: ClassVar[Mapping[str, str]] = {
+        "load": "follows the other thermometer",
+        "idle": "follows the other thermometer",
+        "hold": "follows the other thermometer",
+    }
+
+    def channel(self, history: History, channel: str = "", **_: Any) -> str:
+        return channel or next(c for c in history.readings if c != history.reference)
+
+    def signal(self, history: History, channel: str = "", **_: Any) -> Array:
+        return (history.temperature(self.channel(history, channel)) - history.T0)[:, None]
+
+    def sensitivity(self, history: History, channel: str = "", **_: Any) -> csr_array:
+        return history.temperature_matrix(self.channel(history, channel))
+
+    def steady(
+        self, values: Mapping[str, Any], T0: float, channels: Mapping[str, float] | None
+    ) -> Steady:
+        channel = str(values["channel"])
+        if channels is None or channel not in channels:
+            raise DataError(
+                f"the model also depends on {channel!r}: give its temperature, channels="
+                f"{{{channel!r}: …}}"
+            )
+        return Steady((float(channels[channel]) - T0, 0.0, 0.0))
+
+    def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
+        return f"{estimates['channel']['value']} heats the camera too"

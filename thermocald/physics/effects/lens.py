@@ -1,0 +1,120 @@
+"""Effects of the lens and the sensor: expansion, distortion, focus."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from thermocald.physics.effect import Effect, Proportional, Steady, coefficient_units, say_estimate
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from scipy.sparse import csr_array
+
+    from thermocald.arrays import Array
+    from thermocald.physics.history import History
+
+
+class NonlinearExpansion(Effect):
+    """Adds a (T - T₀)² to c, x0, y0.
+
+    Source: the second coefficient of length and of refractive index against temperature, e.g.
+    Schott TIE-19: Temperature Coefficient of the Refractive Index.
+    """
+
+    name = "nonlinear_expansion"
+    noun = "a quadratic expansion"
+    kind = "signal"
+    linear: ClassVar[Mapping[str, str]] = coefficient_units("K2")
+    usual = ("c", "x0", "y0")
+    steady_signal = Steady((0.0, 0.0, 1.0))
+    of_now = True
+    behaviour: ClassVar[Mapping[str, str]] = {
+        "hold": "does not move while the temperature stands",
+        "cycle": "runs along the same curve up and down",
+        "hotter": "keeps bending at every temperature",
+        "rate": "shows the same curve at any rate",
+        "idle": "does nothing",
+    }
+
+    def signal(self, history: History, **_: Any) -> Array:
+        return ((history.temperature() - history.T0) ** 2)[:, None]
+
+    def sensitivity(self, history: History, **_: Any) -> csr_array:
+        slope = 2.0 * (history.temperature() - history.T0)
+        return history.temperature_matrix().multiply(slope[:, None]).tocsr()
+
+
+class RadialDistortionDrift(Proportional):
+    """Adds a (T - T₀) to A1 (A2, A3)."""
+
+    name = "radial_distortion_drift"
+    noun = "a drift of the radial distortion"
+    kind = "signal"
+    linear: ClassVar[Mapping[str, str]] = coefficient_units("K", ("A1", "A2", "A3"))
+    usual = ("A1",)
+    parameter_sets = (("A1",), ("A1", "A2"), ("A1", "A2", "A3"))
+    behaviour: ClassVar[Mapping[str, str]] = {
+        "turn": "stays radial about the principal point",
+        "hold": "does not move while the temperature stands",
+        "cycle": "runs along the same line up and down",
+    }
+
+
+class DecenteringDrift(Proportional):
+    """Adds a (T - T₀) to B1, B2."""
+
+    name = "decentering_drift"
+    noun = "a drift of the decentering distortion"
+    kind = "signal"
+    linear: ClassVar[Mapping[str, str]] = coefficient_units("K", ("B1", "B2"))
+    usual = ("B1", "B2")
+    behaviour: ClassVar[Mapping[str, str]] = {
+        "turn": "turns with the camera",
+        "hold": "does not move while the temperature stands",
+        "cycle": "runs along the same line up and down",
+    }
+
+
+class AffinityDrift(Proportional):
+    """Adds a (T - T₀) to C1, C2: scale difference of the axes and their shear."""
+
+    name = "affinity_drift"
+    noun = "a drift of the affinity"
+    kind = "signal"
+    linear: ClassVar[Mapping[str, str]] = coefficient_units("K", ("C1", "C2"))
+    usual = ("C1", "C2")
+    behaviour: ClassVar[Mapping[str, str]] = {
+        "turn": "turns with the camera, along the sensor axes",
+        "hold": "does not move while the temperature stands",
+        "cycle": "runs along the same line up and down",
+    }
+
+
+class Defocus(Proportional):
+    """Measuring noise and blur are multiplied by max(1 + k (T - T₀), 0.1); positions stay unbiased.
+
+    Noise and blur share the factor: the precision of an edge falls between the root of its blur
+    (Cramér-Rao) and in proportion to it (an operator of fixed width), and an instrument of fixed
+    windows lies at the latter.
+    """
+
+    name = "defocus"
+    noun = "defocus"
+    kind = "image"
+    linear: ClassVar[Mapping[str, str]] = {"factor": "1/K"}
+    usual = ("factor",)
+    seen_in = "noise"
+    behaviour: ClassVar[Mapping[str, str]] = {
+        "hold": "leaves positions alone; noise stays as large as it is",
+        "cycle": "makes noise come and go with the temperature",
+    }
+
+    def image_changes(self, history: History, values: Mapping[str, Any]) -> dict[str, Any]:
+        factor = np.maximum(1.0 + values["factor"] * self.signal(history)[:, 0], 0.1)
+        return {"noise_factor": factor, "blur_factor": factor}
+
+    def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
+        return f"heat defocuses: the measuring noise grows by {say_estimate(estimates['factor'])}"

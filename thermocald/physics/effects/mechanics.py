@@ -1,0 +1,275 @@
+"""Effects of mechanical parts: friction, what gives way, what creeps or slips, and the mount."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from thermocald.photogrammetry.camera.camera_model import EOP_NAMES
+from thermocald.physics.effect import (
+    Effect,
+    OfTime,
+    Parameter,
+    Proportional,
+    Steady,
+    coefficient_units,
+    say_estimate,
+)
+from thermocald.physics.following import PlayFollower
+from thermocald.physics.operators import (
+    lag,
+    lag_matrix,
+    play,
+    play_matrix,
+    play_turns,
+    running_maximum,
+    running_maximum_matrix,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+    from scipy.sparse import csr_array
+
+    from thermocald.arrays import Array
+    from thermocald.physics.following import Follower
+    from thermocald.physics.history import History
+
+
+class Hysteresis(Effect):
+    """The linear terms follow P = min(max(P, T - r), T + r): a play of half-width r on T.
+
+    P rests until T is r away from it, then follows; the loop closes. P = T at the start.
+    Source: Krasnosel'skii, Pokrovskii (1989): Systems with Hysteresis.
+    """
+
+    name = "hysteresis"
+    noun = "hysteresis"
+    kind = "drive"
+    nonlinear: ClassVar[Mapping[str, Parameter]] = {
+        "half_width": Parameter("K", 0.05, 20.0, 1.0, log=True, role="width")
+    }
+    behaviour: ClassVar[Mapping[str, str]] = {
+        "hold": "does not settle: it stays where it is",
+        "cycle": "closes its loop each time, with flat pieces at the turns",
+        "rate": "shows the same loop at any rate",
+        "idle": "does nothing",
+    }
+
+    def follower(self, values: Mapping[str, Any]) -> Follower | None:
+        return PlayFollower(float(values["half_width"]))
+
+    def drive(self, history: History, half_width: float = 1.0, **_: Any) -> Array:
+        p = history.polygon()
+        return play(p.times, p.values, half_width, history.times)
+
+    def sensitivity(self, history: History, half_width: float = 1.0, **_: Any) -> csr_array:
+        p = history.polygon()
+        return play_matrix(p.times, p.values, half_width, history.times) @ p.matrix
+
+    def turns(self, history: History, half_width: float = 1.0, **_: Any) -> NDArray[np.bool_]:
+        p = history.polygon()
+        return play_turns(p.times, p.values, half_width, history.times)
+
+    def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
+        return (
+            "the way up is not the way down: the camera follows with a play of "
+            f"± {say_estimate(estimates['half_width'])}"
+        )
+
+
+class Softening(Effect):
+    """Adds a max(T - T_k, 0): a second slope above the knee T_k.
+
+    Source: expansion of a polymer is two straight lines that meet at the glass transition (ISO
+    11359-2: Thermomechanical analysis).
+    """
+
+    name = "softening"
+    noun = "softening"
+    kind = "signal"
+    nonlinear: ClassVar[Mapping[str, Parameter]] = {
+        "T_k": Parameter("degC", -40.0, 150.0, 40.0, role="threshold")
+    }
+    linear: ClassVar[Mapping[str, str]] = coefficient_units("K")
+    usual = ("c", "x0", "y0")
+    of_now = True
+    behaviour: ClassVar[Mapping[str, str]] = {
+        "hold": "does not move while the temperature stands",
+        "cycle": "runs along the same bent line up and down",
+        "hotter": "goes on along a straight line above its knee",
+        "rate": "shows the same curve at any rate",
+        "idle": "does nothing",
+    }
+
+    def signal(self, history: History, T_k: float = 40.0, **_: Any) -> Array:
+        return np.maximum(history.temperature() - T_k, 0.0)[:, None]
+
+    def sensitivity(self, history: History, T_k: float = 40.0, **_: Any) -> csr_array:
+        above = (history.temperature() > T_k).astype(float)
+        return history.temperature_matrix().multiply(above[:, None]).tocsr()
+
+    def steady(
+        self,
+        values: Mapping[str, Any],
+        T0: float,  # noqa: ARG002
+        channels: Mapping[str, float] | None,  # noqa: ARG002
+    ) -> Steady:
+        return Steady(knee=float(values["T_k"]), knee_name="T_k")
+
+    def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
+        return f"something gives way above {say_estimate(estimates['T_k'])}"
+
+
+class PermanentSet(Effect):
+    """Adds a (max over the past of T - T₀); the past begins with the series.
+
+    Source: the reference study found it in the RPi camera v2.1 (Elias et al. 2020, Sensors 20, 643,
+    section 4.2: image points do not return to their starting position).
+    """
+
+    name = "permanent_set"
+    noun = "a permanent set"
+    kind = "signal"
+    linear: ClassVar[Mapping[str, str]] = coefficient_units("K")
+    usual = ("c", "x0", "y0")
+    irreversible = True
+    steady_signal = Steady((0.0, 1.0, 0.0))
+    of_now = True
+    behaviour: ClassVar[Mapping[str, str]] = {
+        "hold": "stays where it is",
+        "cycle": "appears the first time only: the second loop does not widen it",
+        "hotter": "grows again as soon as it is hotter than ever before",
+        "rate": "is the same at any rate",
+        "idle": "does nothing",
+    }
+
+    def signal(self, history: History, **_: Any) -> Array:
+        p = history.polygon()
+        return (running_maximum(p.times, p.values, history.times) - history.T0)[:, None]
+
+    def sensitivity(self, history: History, **_: Any) -> csr_array:
+        p = history.polygon()
+        return running_maximum_matrix(p.times, p.values, history.times) @ p.matrix
+
+
+class Creep(OfTime):
+    """Adds a t, t in s from the start of the series: steady-state (secondary) creep.
+
+    Source: Findley, Lai, Onaran (1976): Creep and Relaxation of Nonlinear Viscoelastic Materials.
+
+    """
+
+    name = "creep"
+    noun = "creep"
+    kind = "signal"
+    linear: ClassVar[Mapping[str, str]] = coefficient_units("s")
+    usual = ("c", "x0", "y0")
+    moves_mount = True
+    behaviour: ClassVar[Mapping[str, str]] = {
+        "idle": "goes on at the same rate and never settles",
+        "restart": "goes on from where it was, whether powered or not",
+        "hold": "goes on at the same rate",
+        "cycle": "does not repeat with the cycles",
+    }
+
+    def signal(self, history: History, **_: Any) -> Array:
+        return history.times[:, None].copy()
+
+
+class Slip(OfTime):
+    """Adds a from one time on: a step at `time` (s from the start of the series).
+
+    Each series has its own slip: the time does not carry over, nor does the height.
+    """
+
+    name = "slip"
+    noun = "a slip"
+    kind = "signal"
+    nonlinear: ClassVar[Mapping[str, Parameter]] = {
+        "time": Parameter("s", 0.0, 1e9, 600.0, role="event")
+    }
+    linear: ClassVar[Mapping[str, str]] = coefficient_units("1")
+    usual = ("c", "x0", "y0")
+    fresh = ("time",)
+    moves_mount = True
+    behaviour: ClassVar[Mapping[str, str]] = {
+        "hold": "does not come again",
+        "cycle": "does not come again at the same temperature",
+        "idle": "does nothing",
+    }
+
+    def signal(self, history: History, time: float = 600.0, **_: Any) -> Array:
+        return (history.times >= time).astype(float)[:, None]
+
+    def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
+        return f"a part slipped at {say_estimate(estimates['time'])} after the start"
+
+
+class HousingTilt(Proportional):
+    """Adds a (T - T₀) to omega, phi, kappa; the projection centre stays."""
+
+    name = "housing_tilt"
+    noun = "a tilt of the housing"
+    kind = "signal"
+    linear: ClassVar[Mapping[str, str]] = coefficient_units("K", ("omega", "phi", "kappa"))
+    usual = ("omega", "phi", "kappa")
+    behaviour: ClassVar[Mapping[str, str]] = {
+        "turn": "keeps its direction in space",
+        "hold": "does not move while the temperature stands",
+        "cycle": "runs along the same line up and down",
+    }
+
+
+class MountMotion(Effect):
+    """Adds a (L - T₀) to the orientation and the projection centre; τ dL/dt = T - L, L = T at the
+    start. Without tau, or where it is 0, L is T.
+
+    A bracket of length l and expansion α shifts the camera by l α per K; where one of its sides is
+    warmer by ΔT, it turns it by l α ΔT over its thickness.
+    Source: Timoshenko (1925), J. Optical Society of America 11, 233-255 (bending by heat).
+    """
+
+    name = "mount_motion"
+    noun = "a motion of the mount"
+    kind = "signal"
+    nonlinear: ClassVar[Mapping[str, Parameter]] = {
+        "tau": Parameter("s", 2.0, 3000.0, 300.0, log=True, role="time_constant")
+    }
+    optional = ("tau",)
+    linear: ClassVar[Mapping[str, str]] = coefficient_units("K", EOP_NAMES)
+    usual = EOP_NAMES
+    parameter_sets = (EOP_NAMES, EOP_NAMES[:3])
+    steady_signal = Steady((0.0, 1.0, 0.0))
+    behaviour: ClassVar[Mapping[str, str]] = {
+        "turn": "keeps its direction in space",
+        "hold": "settles",
+        "rate": "opens a loop when fast",
+        "shade": "moves what is seen of every field by as much",
+    }
+
+    def signal(self, history: History, tau: float = 0.0, **_: Any) -> Array:
+        if tau <= 0:
+            return (history.temperature() - history.T0)[:, None]
+        p = history.polygon()
+        return (lag(p.times, p.values, tau, history.times) - history.T0)[:, None]
+
+    def sensitivity(self, history: History, tau: float = 0.0, **_: Any) -> csr_array:
+        if tau <= 0:
+            return history.temperature_matrix()
+        p = history.polygon()
+        return lag_matrix(p.times, tau, history.times) @ p.matrix
+
+    def propagate(self, history: History, errors: Array, tau: float = 0.0, **_: Any) -> Array:
+        if tau <= 0:
+            return super().propagate(history, errors)
+        p = history.polygon()
+        return lag(p.times, p.matrix @ errors, tau, history.times)
+
+    def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
+        moved = ", ".join(f"{k} = {say_estimate(e)}" for k, e in estimates.items() if k != "tau")
+        tau = estimates.get("tau")
+        late = "at once" if not tau or not tau["value"] else f"with a lag of {say_estimate(tau)}"
+        return f"the mount moves the camera with the temperature, {late}: {moved}"

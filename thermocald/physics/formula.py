@@ -1,0 +1,455 @@
+"""Formulas as effects: `integral(above(temperature, k))` where the catalogue has no name.
+
+A leaf is a temperature channel (`temperature`), `time`, s since the first frame, or another
+recorded column (`column("humidity")`). Constants are numbers or names; the names are the effect's
+parameters. The text is read as Python's grammar has it and never executed: anything but calls
+of known operators, names, numbers and quoted names is refused.
+
+Operators with memory work on the polygon of the reference's readings, which other channels are
+interpolated to; pointwise ones at the times that are asked for. A formula's name is its text, so it
+stands in model files and commands as any other effect does:
+
+    effects:
+    - effect: integral(above(temperature, k))
+      parameters: {k: {value: 30.2, unit: degC}, c: {value: 1.1e-06, unit: mm/(K s)}}
+"""
+
+from __future__ import annotations
+
+import ast
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from thermocald.errors import ConfigurationError, DataError
+from thermocald.physics.effect import Effect, Parameter, coefficient_units, say_estimate
+from thermocald.physics.operators import OPERATORS, Constant, Operator, interpolation_matrix
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from scipy.sparse import csr_array
+
+    from thermocald.arrays import Array
+    from thermocald.physics.history import History
+
+TIME = "time"
+_COLUMN = "column"
+_LONGEST = 300  # characters of a formula
+_DEEPEST = 8
+_OFFSET_C = "degC"
+_EVER_MEASURED_C = (-90.0, 180.0)  # what thermometers of cameras may read
+_RIDGE = (
+    "; about that temperature nothing was measured: of its constants and the size only a "
+    "combination is known, none by itself"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """An operator with its inputs and constants, or a leaf.
+
+    operator: a key of OPERATORS, or "" for a temperature channel, "time", "column"; name: of the
+    channel or column; constants: names, or numbers where they are bound.
+    """
+
+    operator: str
+    inputs: tuple[Node, ...] = ()
+    constants: tuple[str | float, ...] = ()
+    name: str = ""
+
+    @property
+    def kind(self) -> Operator:
+        """The operator; KeyError at a leaf."""
+        return OPERATORS[self.operator]
+
+    @property
+    def is_leaf(self) -> bool:
+        """Whether it is a recorded quantity itself."""
+        return not self.inputs
+
+    @property
+    def depth(self) -> int:
+        """How many operators stand above each other."""
+        return 0 if self.is_leaf else 1 + max(n.depth for n in self.inputs)
+
+    def walk(self) -> Iterator[Node]:
+        """Yield the node and all below it."""
+        yield self
+        for node in self.inputs:
+            yield from node.walk()
+
+    def channels(self) -> tuple[str, ...]:
+        """List the temperature channels that it reads, in order."""
+        return tuple(dict.fromkeys(n.name for n in self.walk() if n.is_leaf and not n.operator))
+
+    def columns(self) -> tuple[str, ...]:
+        """List the other recorded columns that it reads, in order."""
+        return tuple(dict.fromkeys(n.name for n in self.walk() if n.operator == _COLUMN))
+
+    def free(self) -> Iterator[tuple[str, Constant, Node]]:
+        """Yield the constants that are names: (name, what it is, the node that it belongs to)."""
+        for node in self.walk():
+            if node.is_leaf:
+                continue
+            for value, constant in zip(node.constants, node.kind.constants, strict=True):
+                if isinstance(value, str):
+                    yield value, constant, node
+
+    def bound(self, values: Mapping[str, float]) -> Node:
+        """Replace all names by numbers; KeyError where one is missing."""
+        if self.is_leaf:
+            return self
+        return replace(
+            self,
+            inputs=tuple(n.bound(values) for n in self.inputs),
+            constants=tuple(float(values[c]) if isinstance(c, str) else c for c in self.constants),
+        )
+
+    def simpler(self) -> Iterator[Node]:
+        """Yield every formula with one operator less: a node replaced by one of its inputs."""
+        yield from self.inputs
+        for i, node in enumerate(self.inputs):
+            for other in node.simpler():
+                yield replace(self, inputs=(*self.inputs[:i], other, *self.inputs[i + 1 :]))
+
+    def named(self) -> tuple[Node, dict[str, float]]:
+        """Replace all numbers by names, and return the numbers by those names."""
+        values: dict[str, float] = {}
+
+        def rename(node: Node) -> Node:
+            if node.is_leaf:
+                return node
+            inputs = tuple(rename(n) for n in node.inputs)
+            names: list[str | float] = []
+            for value, constant in zip(node.constants, node.kind.constants, strict=True):
+                name, k = constant.name, 2
+                while name in values:
+                    name, k = f"{constant.name}_{k}", k + 1
+                values[name] = float(value)
+                names.append(name)
+            return replace(node, inputs=inputs, constants=tuple(names))
+
+        return rename(self), values
+
+    def text(self) -> str:
+        """Write the formula as files hold it; `parse` reads it."""
+        if self.operator == TIME:
+            return TIME
+        if self.operator == _COLUMN:
+            return f'column("{self.name}")'
+        if self.is_leaf:
+            return self.name if self.name.isidentifier() else f'"{self.name}"'
+        parts = [n.text() for n in self.inputs]
+        parts += [c if isinstance(c, str) else repr(float(c)) for c in self.constants]
+        return f"{self.operator}({', '.join(parts)})"
+
+    # -- units ---------------------------------------------------------------------------------
+
+    @property
+    def is_celsius(self) -> bool:
+        """Whether its values are temperatures, not differences or powers of them."""
+        if self.is_leaf:
+            return not self.operator
+        return self.kind.keeps and self.inputs[0].is_celsius
+
+    def unit(self) -> dict[str, int]:
+        """Return the exponents of K, s and columns' own units in its values."""
+        if self.operator == TIME:
+            return {"s": 1}
+        if self.operator == _COLUMN:
+            return {self.name: 1}
+        if self.is_leaf:
+            return {"K": 1}
+        total: dict[str, int] = {}
+        for node in self.inputs:
+            for name, power in node.unit().items():
+                total[name] = total.get(name, 0) + power * self.kind.powers
+        if self.kind.seconds:
+            total["s"] = total.get("s", 0) + self.kind.seconds
+        return {name: power for name, power in total.items() if power}
+
+    def unit_of(self, constant: Constant) -> str:
+        """Return the unit of one of its own constants."""
+        if constant.role == "time_constant":
+            return "s"
+        if not constant.same_unit:
+            return "rad" if constant.role == "phase" else "1"
+        if constant.role == "threshold" and self.inputs[0].is_celsius:
+            return _OFFSET_C
+        return unit_text(self.inputs[0].unit())
+
+    # -- words ---------------------------------------------------------------------------------
+
+    def words(self, spoken: Mapping[str, str], reference: str = "temperature") -> str:
+        """Write the formula as mathematics; spoken: {name of a constant: value in words}."""
+        if self.operator == TIME:
+            return "t"
+        if self.is_leaf:
+            return "T" if self.name == reference and not self.operator else self.name
+        inner = [n.words(spoken, reference) for n in self.inputs]
+        own = [spoken.get(str(c), f"{c:.4g}" if not isinstance(c, str) else c)
+               for c in self.constants]  # fmt: skip
+        return self.kind.words.format(*inner, *own)
+
+
+def unit_text(powers: Mapping[str, int]) -> str:
+    """Write a unit as files do: K s, K2/s, 1."""
+    up = [f"{n}{p if p > 1 else ''}" for n, p in powers.items() if p > 0]
+    down = [f"{n}{-p if p < -1 else ''}" for n, p in powers.items() if p < 0]
+    if not up and not down:
+        return "1"
+    return "/".join([" ".join(up) or "1", *down])
+
+
+def parse(text: str) -> Node:
+    """Read the tree of a formula. ConfigurationError says what cannot be read."""
+    if len(text) > _LONGEST:
+        raise ConfigurationError(f"a formula has at most {_LONGEST} characters: {text[:40]} …")
+    try:
+        tree = ast.parse(text, mode="eval").body
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        raise ConfigurationError(f"formula {text!r} cannot be read") from error
+    node = _parse_node(tree, text, 0)
+    names = [name for name, _, _ in node.free()]
+    if len(set(names)) < len(names):
+        raise ConfigurationError(f"formula {text!r}: each constant needs a name of its own")
+    return node
+
+
+def _parse_node(tree: ast.expr, text: str, depth: int) -> Node:
+    if depth > _DEEPEST:
+        raise ConfigurationError(f"formula {text!r}: more than {_DEEPEST} operators in each other")
+    if isinstance(tree, ast.Name):
+        return Node(TIME) if tree.id == TIME else Node("", name=tree.id)
+    if isinstance(tree, ast.Constant) and isinstance(tree.value, str):
+        return Node("", name=tree.value)
+    if not (isinstance(tree, ast.Call) and isinstance(tree.func, ast.Name)) or tree.keywords:
+        raise ConfigurationError(
+            f"formula {text!r}: {ast.unparse(tree)!r} is not a recorded quantity; write a "
+            f'channel, time, column("…"), or one of {", ".join(OPERATORS)}'
+        )
+    name, arguments = tree.func.id, tree.args
+    if name == _COLUMN:
+        one = arguments[0] if len(arguments) == 1 else None
+        if not (isinstance(one, ast.Constant) and isinstance(one.value, str)):
+            raise ConfigurationError(f'formula {text!r}: write column("name")')
+        return Node(_COLUMN, name=one.value)
+    if name not in OPERATORS:
+        raise ConfigurationError(
+            f"formula {text!r}: there is no operator {name!r}; there are {', '.join(OPERATORS)}"
+        )
+    kind = OPERATORS[name]
+    wanted = kind.inputs + len(kind.constants)
+    if len(arguments) != wanted:
+        raise ConfigurationError(
+            f"formula {text!r}: {name} takes {wanted} arguments, not {len(arguments)}"
+        )
+    inputs = tuple(_parse_node(a, text, depth + 1) for a in arguments[: kind.inputs])
+    constants = tuple(_parse_constant(a, text) for a in arguments[kind.inputs :])
+    return Node(name, inputs, constants)
+
+
+def _parse_constant(tree: ast.expr, text: str) -> str | float:
+    if isinstance(tree, ast.Name):
+        return tree.id
+    sign = 1.0
+    if isinstance(tree, ast.UnaryOp) and isinstance(tree.op, ast.USub):
+        tree, sign = tree.operand, -1.0
+    number = tree.value if isinstance(tree, ast.Constant) else None
+    if isinstance(number, bool) or not isinstance(number, int | float):
+        raise ConfigurationError(
+            f"formula {text!r}: {ast.unparse(tree)!r} is neither a number nor a name"
+        )
+    return sign * float(number)
+
+
+class Evaluator:
+    """One history; what has been computed is kept, as formulas share their parts."""
+
+    def __init__(self, history: History) -> None:
+        self.history = history
+        self.knots = history.polygon().times
+        self._kept: dict[tuple[Node, bool], Array] = {}
+
+    def values(self, node: Node, at_knots: bool = False) -> Array:
+        """Return the values (E,) of a bound formula at the frames, or (K,) at the knots."""
+        key = (node, at_knots)
+        if key not in self._kept:
+            self._kept[key] = self._computed(node, at_knots)
+        return self._kept[key]
+
+    def _computed(self, node: Node, at_knots: bool) -> Array:
+        at = self.knots if at_knots else self.history.times
+        if node.is_leaf:
+            return self._leaf(node, at)
+        kind = node.kind
+        if kind.trajectory is not None:
+            inner = self.values(node.inputs[0], at_knots=True)
+            return kind.trajectory(self.knots, inner, *node.constants, at)
+        assert kind.value is not None
+        return kind.value(*(self.values(n, at_knots) for n in node.inputs), *node.constants)
+
+    def _leaf(self, node: Node, at: Array) -> Array:
+        if node.operator == TIME:
+            return np.maximum(at, 0.0)
+        if node.operator:
+            if node.name not in self.history.columns:
+                raise DataError(
+                    f"there is no recorded column {node.name!r}, which the formula reads; there "
+                    f"are: {', '.join(self.history.columns) or 'none'}"
+                )
+            return self.history.column(node.name, at)
+        return self.history.polygon(node.name).at(at)
+
+    def sensitivity(self, node: Node, channel: str, at_knots: bool = False) -> csr_array:
+        """Return ∂ values / ∂ readings of a channel, (E, R) or (K, R), sparse."""
+        from scipy.sparse import csr_array, diags_array
+
+        at = self.knots if at_knots else self.history.times
+        if node.is_leaf:
+            if node.operator or node.name != channel:
+                return csr_array((len(at), len(self.history.reading_times)))
+            p = self.history.polygon(channel)
+            return interpolation_matrix(p.times, at) @ p.matrix
+        kind = node.kind
+        if kind.matrix is not None:
+            inner = self.values(node.inputs[0], at_knots=True)
+            carried = self.sensitivity(node.inputs[0], channel, at_knots=True)
+            if not carried.nnz:
+                return csr_array((len(at), carried.shape[1]))
+            return csr_array(kind.matrix(self.knots, inner, *node.constants, at) @ carried)
+        assert kind.slopes is not None
+        slopes = kind.slopes(*(self.values(n, at_knots) for n in node.inputs), *node.constants)
+        total = csr_array((len(at), len(self.history.reading_times)))
+        for slope, inner_node in zip(slopes, node.inputs, strict=True):
+            total = total + diags_array(slope) @ self.sensitivity(inner_node, channel, at_knots)
+        return csr_array(total)
+
+    def rate_jumps(self, node: Node, jump: Array) -> Array:
+        """Return by how much (E,) values change where rates at the frames are off by `jump` K/s."""
+        if not any(n.operator == "rate" and n.inputs[0].is_leaf for n in node.walk()):
+            return np.zeros(len(self.history.times))
+        return np.abs(self._shifted(node, jump) - self.values(node))
+
+    def _shifted(self, node: Node, jump: Array) -> Array:
+        if node.operator == "rate" and node.inputs[0].is_leaf:
+            return self.values(node) + jump
+        if node.is_leaf or node.kind.remembers:
+            return self.values(node)
+        assert node.kind.value is not None
+        return node.kind.value(*(self._shifted(n, jump) for n in node.inputs), *node.constants)
+
+
+@dataclass(frozen=True, slots=True)
+class _FormulaConstant(Parameter):
+    """A constant of a formula; its size is whatever the formula's input has."""
+
+    positive: bool = False
+
+    def difference_step(self, value: float) -> float:
+        if self.positive:
+            return 1e-3 * max(abs(value), 1e-6)
+        return 0.02 if self.unit == "degC" else 1e-3 * max(abs(value), 1e-6)
+
+
+class _OfFormula(Effect):
+    """Adds a × formula. The formula is data: a tree of known operators over recorded quantities."""
+
+    kind = "signal"
+    usual = ("c", "x0", "y0")
+    node: ClassVar[Node]
+
+    def _bound(self, history: History, values: Mapping[str, Any]) -> tuple[Evaluator, Node]:
+        return Evaluator(history), self.node.bound(values)
+
+    def channel(self, history: History, **_: Any) -> str:
+        channels = self.node.channels()
+        return history.reference if history.reference in channels or not channels else channels[0]
+
+    def signal(self, history: History, **nonlinear: Any) -> Array:
+        evaluator, node = self._bound(history, nonlinear)
+        return evaluator.values(node)[:, None]
+
+    def sensitivity(self, history: History, **nonlinear: Any) -> csr_array:
+        evaluator, node = self._bound(history, nonlinear)
+        return evaluator.sensitivity(node, self.channel(history))
+
+    def further_sensitivities(self, history: History, **nonlinear: Any) -> dict[str, csr_array]:
+        evaluator, node = self._bound(history, nonlinear)
+        first = self.channel(history)
+        others = [name for name in self.node.channels() if name != first]
+        found = {name: evaluator.sensitivity(node, name) for name in others}
+        return {name: matrix for name, matrix in found.items() if matrix.nnz}
+
+    def unresolved(
+        self, history: History, rate_jump: Array | None = None, **nonlinear: Any
+    ) -> Array:
+        if rate_jump is None:
+            return np.zeros(len(history.times))
+        evaluator, node = self._bound(history, nonlinear)
+        return evaluator.rate_jumps(node, rate_jump)
+
+    def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
+        said = {
+            name: _say_constant(e, self.nonlinear[name]).replace("degC", "°C")
+            for name, e in estimates.items()
+            if name in self.nonlinear
+        }
+        moved = [n[2:] for n in estimates if n.startswith("a_")]
+        verb = "follow" if len(moved) > 1 else "follows"
+        text = f"{', '.join(moved) or 'the camera'} {verb} {self.node.words(said)}"
+        unseen = [n for n, e in estimates.items() if n in said and _never_seen(e)]
+        return text + (_RIDGE if unseen else "")
+
+
+def _never_seen(estimate: Mapping[str, Any]) -> bool:
+    """Whether a temperature was never measured at a camera: a curve's tail alone was seen, which
+    tells a combination of its constants and its size, none of them by itself.
+    """
+    low, high = _EVER_MEASURED_C
+    return estimate.get("unit") == _OFFSET_C and not low <= estimate["value"] <= high
+
+
+def _say_constant(estimate: Mapping[str, Any], parameter: Parameter) -> str:
+    """Write an estimate; a positive constant that is not determined as about so much."""
+    value, sd = estimate["value"], estimate["sd"]
+    if _never_seen(estimate):
+        return f"about {value:.2g} {parameter.unit}"
+    if parameter.log and sd is not None and not sd <= abs(value):
+        return f"about {value:.3g} {parameter.unit}"
+    return say_estimate(estimate)
+
+
+def formula_effect(text: str) -> Effect:
+    """Make an effect of a formula. ConfigurationError where its text cannot be read."""
+    tree = parse(text)
+    per = unit_text(tree.unit())
+
+    class OfFormula(_OfFormula):
+        name = text
+        noun = f"an influence that follows {tree.words({})}"
+        node = tree
+        nonlinear: ClassVar[Mapping[str, Parameter]] = {
+            constant_name: _make_parameter(owner.unit_of(constant), constant)
+            for constant_name, constant, owner in tree.free()
+        }
+        linear: ClassVar[Mapping[str, str]] = coefficient_units(
+            per if per.isalnum() else f"({per})"
+        )
+
+    return OfFormula()
+
+
+def is_formula(name: str) -> bool:
+    """Return whether an effect's name is a formula's text: it calls an operator."""
+    return "(" in name
+
+
+def _make_parameter(unit: str, constant: Constant) -> Parameter:
+    low, high = (1e-9, 1e9) if constant.positive else (-1e9, 1e9)
+    start = {"degC": 30.0, "s": 60.0}.get(unit, 1.0)
+    return _FormulaConstant(
+        unit, low, high, start, log=constant.positive, positive=constant.positive
+    )

@@ -1,0 +1,423 @@
+"""Heat: bodies with capacities, conductances between them, and sources.
+
+    C_i dT_i/dt = Σ_j G_ij (T_j - T_i) + P_i(t)
+
+Each body has one temperature (lumped capacity). Boundaries, such as the air or a thermal chamber,
+have a temperature that is given. Sources and boundaries are straight in pieces; for such a drive
+the solution is known in closed form in the modes of the network, and no step width is involved:
+temperatures are exact to rounding on any time axis.
+
+Source: Incropera, DeWitt (2007): Fundamentals of Heat and Mass Transfer, 6th ed., chapter 5;
+modes of a symmetric system as in any text on linear vibrations.
+
+Courses in time: what a lamp, a processor or the air does, as straight pieces that may jump.
+
+In a file a course is a number (always the same), a list of pieces without gaps,
+
+    - {from: 0, to: 60, value: 0.0}
+    - {from: 60, to: 900, begin: 0.0, end: 5.0}        # a ramp
+
+or a log that is played in:
+
+    {log: weather.csv, time: seconds, value: temperature, largest_gap: 900}
+
+Thermometers as instruments: what one says is not the temperature of what it is fixed to.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from thermocald.errors import ConfigurationError
+from thermocald.physics.operators import lag
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from numpy.typing import ArrayLike
+
+    from thermocald.arrays import Array
+    from thermocald.physics.model_file import QuantityReader
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """Straight pieces that follow each other without gaps.
+
+    times (p+1,): s ascending, where pieces meet; begin, end (p,): values at the ends of each.
+    Before the first and after the last piece the value is held.
+    """
+
+    times: Array
+    begin: Array
+    end: Array
+
+    @classmethod
+    def constant(cls, value: float) -> Self:
+        """Make a course that is always the same."""
+        return cls(np.array([0.0, 0.0]), np.array([value]), np.array([value]))
+
+    @classmethod
+    def polygon(cls, times: ArrayLike, values: ArrayLike) -> Self:
+        """Join points by straight lines; of two points at one time it jumps."""
+        t, v = np.asarray(times, dtype=float), np.asarray(values, dtype=float)
+        if len(t) == 1:
+            return cls.constant(float(v[0]))
+        keep = np.append(np.diff(t) > 0, True)[:-1]
+        return cls(np.append(t[:-1][keep], t[-1]), v[:-1][keep], v[1:][keep])
+
+    @classmethod
+    def steps(cls, times: ArrayLike, values: ArrayLike) -> Self:
+        """Hold value i from times[i] to times[i+1]; one time more than values."""
+        v = np.asarray(values, dtype=float)
+        return cls(np.asarray(times, dtype=float), v, v.copy())
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Where it begins and ends, s."""
+        return float(self.times[0]), float(self.times[-1])
+
+    def after(self, t: ArrayLike) -> Array:
+        """Return the value right after each time (a jump there has happened)."""
+        return self._at(np.asarray(t, dtype=float), "right")
+
+    def before(self, t: ArrayLike) -> Array:
+        """Return the value right before each time (a jump there has not happened)."""
+        return self._at(np.asarray(t, dtype=float), "left")
+
+    def _at(self, t: Array, side: Any) -> Array:
+        piece = np.clip(np.searchsorted(self.times, t, side=side) - 1, 0, len(self.begin) - 1)
+        length = self.times[piece + 1] - self.times[piece]
+        share = np.clip((t - self.times[piece]) / np.where(length > 0, length, 1.0), 0.0, 1.0)
+        result: Array = self.begin[piece] + share * (self.end[piece] - self.begin[piece])
+        return result
+
+
+def read_course(
+    reader: QuantityReader, key: str, unit: str, duration: float, folder: Path
+) -> Course:
+    """Read the course at a key of a programme file; it must cover 0 to `duration` s without a
+    gap.
+    """
+    raw = reader.mapping.get(key)
+    if isinstance(raw, list):
+        course = _read_pieces(reader, key, unit)
+    elif isinstance(raw, dict) and "log" in raw:
+        course = _read_log(reader.inner(key), unit, folder)
+    else:
+        return Course.constant(reader.number(key, unit))
+    begin, end = course.span
+    if begin > 0 or end < duration:
+        raise reader.fail(
+            key, f"covers {begin:g} to {end:g} s; the programme lasts from 0 to {duration:g} s"
+        )
+    return course
+
+
+def _read_pieces(reader: QuantityReader, key: str, unit: str) -> Course:
+    times: list[float] = []
+    begin: list[float] = []
+    end: list[float] = []
+    for piece in reader.items(key):
+        piece.only(("from", "to", "value", "begin", "end"))
+        start, stop = piece.number("from", "s"), piece.number("to", "s")
+        if stop <= start:
+            raise piece.fail("to", f"is {stop:g} s, not after {start:g} s")
+        if times and start != times[-1]:
+            what = "a gap" if start > times[-1] else "an overlap"
+            raise piece.fail(
+                "from", f"is {start:g} s, but the piece before ends at {times[-1]:g} s: {what}"
+            )
+        if not times:
+            times.append(start)
+        times.append(stop)
+        if "value" in piece.mapping:
+            value = piece.number("value", unit)
+            begin.append(value)
+            end.append(value)
+        else:
+            begin.append(piece.number("begin", unit))
+            end.append(piece.number("end", unit))
+    if not times:
+        raise reader.fail(key, "is an empty list")
+    return Course(np.array(times), np.array(begin), np.array(end))
+
+
+def _read_log(reader: QuantityReader, unit: str, folder: Path) -> Course:
+    """Read a CSV file with a header, one time a row; time 0 is its first row."""
+    import csv
+
+    reader.only(("log", "time", "value", "largest_gap"))
+    path = folder / reader.text("log")
+    columns = reader.text("time", "time"), reader.text("value", "temperature")
+    largest = reader.number("largest_gap", "s", 900.0, above=0.0)
+    rows: list[tuple[float, float]] = []
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            table = csv.DictReader(file)
+            for name in columns:
+                if name not in (table.fieldnames or ()):
+                    raise ConfigurationError(f"{path}: there is no column {name!r}")
+            for line in table:
+                try:
+                    rows.append((float(line[columns[0]]), float(line[columns[1]])))
+                except (TypeError, ValueError) as cause:
+                    raise ConfigurationError(
+                        f"{path}, line {table.line_num}: {columns[0]} or {columns[1]} is not "
+                        "a number"
+                    ) from cause
+    except (OSError, UnicodeDecodeError) as cause:
+        raise ConfigurationError(f"{path}: cannot be read: {cause}") from cause
+    if len(rows) < 2:
+        raise ConfigurationError(f"{path}: a log needs two rows at least")
+    times, values = np.array(rows).T
+    if not np.isfinite(times).all() or not np.isfinite(values).all():
+        raise ConfigurationError(f"{path}: holds a value that is not finite (a gap in {unit})")
+    steps = np.diff(times)
+    if steps.min() <= 0:
+        raise ConfigurationError(f"{path}, line {int(steps.argmin()) + 3}: time runs backwards")
+    if steps.max() > largest:
+        raise ConfigurationError(
+            f"{path}, line {int(steps.argmax()) + 3}: a gap of {steps.max():g} s; the largest that "
+            f"is bridged is {largest:g} s (largest_gap)"
+        )
+    return Course.polygon(times - times[0], values)
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedThermometer:
+    """A thermometer on a body.
+
+    body: whose temperature it follows; lag s: its own time constant; offset K; noise K (sigma);
+    resolution K: readings are multiples of it, 0 for none; missing: share of readings that fail;
+    stuck: (from, to) s while it repeats its last value.
+    """
+
+    body: str
+    lag: float = 0.0
+    offset: float = 0.0
+    noise: float = 0.04
+    resolution: float = 0.0625
+    missing: float = 0.0
+    stuck: tuple[float, float] | None = None
+
+    def read(
+        self, times: Array, temperatures: Array, instants: Array, rng: np.random.Generator
+    ) -> Array:
+        """Draw readings (R,) °C at instants (R,) s, NaN where missing.
+
+        times (g,) s, temperatures (g,) °C: of the body, joined by straight lines.
+        """
+        # drawn in full whatever the settings, so that one setting does not change another's noise
+        noise = rng.standard_normal(len(instants))
+        missed = rng.random(len(instants))
+        if self.lag > 0:
+            true = lag(times, temperatures, self.lag, instants)
+        else:
+            true = np.interp(instants, times, temperatures)
+        said = true + self.offset + self.noise * noise
+        if self.resolution > 0:
+            said = np.rint(said / self.resolution) * self.resolution
+        if self.stuck is not None:
+            held = np.flatnonzero((instants >= self.stuck[0]) & (instants < self.stuck[1]))
+            if len(held):
+                said[held] = said[max(held[0] - 1, 0)]
+        said[missed < self.missing] = np.nan
+        return said
+
+
+def read_thermometer(reader: QuantityReader) -> SimulatedThermometer:
+    """Read a thermometer of a camera file; units s and K."""
+    reader.only(("body", "lag", "offset", "noise", "resolution", "missing", "stuck"))
+    stuck = None
+    if reader.mapping.get("stuck") is not None:
+        inner = reader.inner("stuck")
+        inner.only(("from", "to"))
+        stuck = (inner.number("from", "s"), inner.number("to", "s"))
+    return SimulatedThermometer(
+        reader.text("body"),
+        reader.number("lag", "s", 0.0, low=0.0),
+        reader.number("offset", "K", 0.0),
+        reader.number("noise", "K", 0.04, low=0.0),
+        reader.number("resolution", "K", 0.0625, low=0.0),
+        reader.share("missing", 0.0),
+        stuck,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """A conductance W/K between two bodies, or a body and a boundary."""
+
+    first: str
+    second: str
+    conductance: float
+
+
+@dataclass(frozen=True)
+class HeatNetwork:
+    """Bodies {name: capacity J/K} and the links between them; other names in links are boundaries.
+
+    Raises ConfigurationError for a capacity or conductance that is not above 0.
+    """
+
+    capacities: Mapping[str, float]
+    links: tuple[Link, ...]
+
+    def __post_init__(self) -> None:
+        if not self.capacities:
+            raise ConfigurationError("a heat network needs at least one body")
+        for name, capacity in self.capacities.items():
+            if not (np.isfinite(capacity) and capacity > 0):
+                raise ConfigurationError(
+                    f"body {name!r} has a capacity of {capacity:g} J/K; it must be above 0"
+                )
+        for link in self.links:
+            if not (np.isfinite(link.conductance) and link.conductance > 0):
+                raise ConfigurationError(
+                    f"the link {link.first}–{link.second} conducts {link.conductance:g} W/K; it "
+                    "must be above 0"
+                )
+            if link.first not in self.capacities and link.second not in self.capacities:
+                raise ConfigurationError(f"neither {link.first!r} nor {link.second!r} is a body")
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """Names of the bodies."""
+        return tuple(self.capacities)
+
+    @property
+    def boundaries(self) -> tuple[str, ...]:
+        """Names of what has a given temperature."""
+        names = dict.fromkeys(n for link in self.links for n in (link.first, link.second))
+        return tuple(n for n in names if n not in self.capacities)
+
+    def _matrices(self) -> tuple[Array, Array, Array]:
+        """Return capacities (n,), conductances (n, n) and those to the boundaries (n, m)."""
+        row = {name: i for i, name in enumerate(self.bodies)}
+        column = {name: i for i, name in enumerate(self.boundaries)}
+        K, B = np.zeros((len(row), len(row))), np.zeros((len(row), len(column)))
+        for link in self.links:
+            for here, there in ((link.first, link.second), (link.second, link.first)):
+                if here in row:
+                    K[row[here], row[here]] += link.conductance
+                    if there in row:
+                        K[row[here], row[there]] -= link.conductance
+                    else:
+                        B[row[here], column[there]] += link.conductance
+        return np.array([self.capacities[n] for n in self.bodies]), K, B
+
+    def solve(
+        self,
+        times: ArrayLike,
+        initial: Mapping[str, float] | float,
+        powers: Mapping[str, Course],
+        temperatures: Mapping[str, Course],
+    ) -> dict[str, Array]:
+        """Return temperatures °C of all bodies and boundaries at times (E,) s, ascending, from 0
+        on.
+
+        initial: °C at time 0, per body or for all; powers: W into bodies; temperatures: °C of the
+        boundaries.
+        """
+        t = np.asarray(times, dtype=float)
+        capacity, K, B = self._matrices()
+        for name in self.boundaries:
+            if name not in temperatures:
+                raise ConfigurationError(f"the temperature of {name!r} is not given")
+        for name in powers:
+            if name not in self.capacities:
+                raise ConfigurationError(
+                    f"a source heats {name!r}, which is not a body; bodies are "
+                    f"{', '.join(self.bodies)}"
+                )
+        start = np.array(
+            [initial if isinstance(initial, int | float) else initial[n] for n in self.bodies],
+            dtype=float,
+        )
+        inner = [c.times for c in (*powers.values(), *temperatures.values())]
+        last = float(t.max(initial=0.0))
+        grid = np.unique(np.concatenate([[0.0], t, *inner]))
+        grid = grid[(grid >= 0.0) & (grid <= last)]
+        begin, end = (self._drive(grid, B, powers, temperatures, side) for side in (True, False))
+        root = np.sqrt(capacity)
+        rate, modes = np.linalg.eigh(K / np.outer(root, root))
+        into = (modes / root[:, None]).T
+        z = np.stack(
+            [
+                _solve_mode(grid, max(float(rate[k]), 0.0), into[k] @ begin, into[k] @ end,
+                      float(modes[:, k] @ (root * start)))
+                for k in range(len(rate))
+            ]
+        )  # fmt: skip
+        solved = (modes / root[:, None]) @ z
+        place = np.searchsorted(grid, t)
+        result = {name: solved[i, place] for i, name in enumerate(self.bodies)}
+        for name in self.boundaries:
+            result[name] = temperatures[name].after(t)
+        return result
+
+    def _drive(
+        self,
+        grid: Array,
+        B: Array,
+        powers: Mapping[str, Course],
+        temperatures: Mapping[str, Course],
+        after: bool,
+    ) -> Array:
+        """Return the heat flow (n, g) W into each body, right after or right before the
+        instants.
+        """
+        q = np.zeros((len(self.bodies), len(grid)))
+        for j, name in enumerate(self.boundaries):
+            course = temperatures[name]
+            q += B[:, j : j + 1] * (course.after(grid) if after else course.before(grid))
+        for name, course in powers.items():
+            q[self.bodies.index(name)] += course.after(grid) if after else course.before(grid)
+        return q
+
+
+def _solve_mode(grid: Array, rate: float, begin: Array, end: Array, start: float) -> Array:
+    """Solve Z' = -rate z + f with f straight from begin[k] to end[k+1] over each step; (g,)."""
+    from scipy.linalg.lapack import dtbtrs
+
+    h = np.diff(grid)
+    x = rate * h
+    small = x < 1e-4
+    safe = np.where(small, 1.0, x)
+    # φ1 = (1 - e^-x)/x and φ2 = (x - 1 + e^-x)/x², by their series where they would cancel
+    phi1 = np.where(small, 1.0 - x / 2 + x * x / 6, -np.expm1(-safe) / safe)
+    phi2 = np.where(small, 0.5 - x / 6 + x * x / 24, (safe + np.expm1(-safe)) / safe**2)
+    z = np.empty((len(grid), 1))
+    z[0] = start
+    z[1:, 0] = h * (phi1 * begin[:-1] + phi2 * (end[1:] - begin[:-1]))
+    band = np.ones((2, len(grid)), order="F")
+    band[1, :-1] = -np.exp(-x)
+    solution, _ = dtbtrs(band, z, uplo="L", diag="U")
+    result: Array = solution[:, 0]
+    return result
+
+
+def read_network(reader: QuantityReader) -> HeatNetwork:
+    """From a camera file: `bodies: {lens: {capacity: 0.6}}`, `links: [{between: [lens, housing],
+    conductance: 0.02}]`; J/K and W/K.
+    """
+    reader.only(("bodies", "links"))
+    bodies = reader.inner("bodies")
+    capacities = {}
+    for name in bodies.mapping:
+        body = bodies.inner(name)
+        body.only(("capacity",))
+        capacities[str(name)] = body.number("capacity", "J/K", above=0.0)
+    links = []
+    for link in reader.items("links"):
+        link.only(("between", "conductance"))
+        ends = link.mapping.get("between")
+        if not isinstance(ends, list) or len(ends) != 2:
+            raise link.fail("between", "must be [one, other]")
+        links.append(Link(str(ends[0]), str(ends[1]), link.number("conductance", "W/K", above=0.0)))
+    return HeatNetwork(capacities, tuple(links))

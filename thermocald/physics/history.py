@@ -1,0 +1,170 @@
+"""The temperature history of a series: what an effect is given.
+
+Readings are joined by straight lines; between the first and the last frame the temperature is
+therefore known at every time, also where a reading is missing or was taken a second away from the
+frame. The operators on such a polygon are in `operators`.
+
+Time 0 is the first frame of the series, and the past begins there: before it the temperature has
+always been the one of time 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+
+from thermocald.errors import DataError
+from thermocald.physics.operators import interpolation_matrix
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import ArrayLike
+    from scipy.sparse import csr_array
+
+    from thermocald.arrays import Array
+    from thermocald.epoch import Epoch
+
+
+@dataclass(frozen=True, eq=False)
+class Polygon:
+    """A temperature as a polygon: times (K,) s ascending, values (K,) °C, and where they come from.
+
+    matrix (K, R): values = matrix @ readings (with missing readings as 0).
+    """
+
+    times: Array
+    values: Array
+    matrix: csr_array
+
+    def at(self, times: ArrayLike) -> Array:
+        """Return the temperature (...,) °C at some times; held beyond the ends."""
+        result: Array = np.interp(np.asarray(times, dtype=float), self.times, self.values)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """What was recorded of the temperature, and the times for which it is asked.
+
+    times (E,): s since the series' start, ascending: the frames; reading_times (R,): s on the same
+    axis; readings: {channel: (R,)} °C, NaN where missing; reference: the channel that is T;
+    T0: the model's reference temperature °C, one value for all series of a camera; columns: {name:
+    (times (N,) s, values (N,))} of what else was recorded, such as a humidity.
+    """
+
+    times: Array
+    reading_times: Array
+    readings: Mapping[str, Array]
+    reference: str
+    T0: float
+    columns: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.reference not in self.readings:
+            raise DataError(
+                f"there is no temperature column {self.reference!r}; there are: "
+                f"{', '.join(self.readings) or 'none'}"
+            )
+
+    @classmethod
+    def from_epochs(cls, epochs: Sequence[Epoch], reference: str, T0: float) -> Self:
+        """Take the readings of a recording's epochs; time 0 is the first frame's time."""
+        frames = np.array([e.frame_time for e in epochs], dtype=float)
+        stamped = [e for e in epochs if np.isfinite(e.temperature_time)]
+        channels = dict.fromkeys(name for e in stamped for name in e.temperatures)
+        begin = float(frames[0]) if len(frames) else 0.0
+        return cls(
+            frames - begin,
+            np.array([e.temperature_time for e in stamped], dtype=float) - begin,
+            {
+                name: np.array([e.temperatures.get(name, np.nan) for e in stamped], dtype=float)
+                for name in channels
+            },
+            reference,
+            T0,
+        )
+
+    def at(self, times: ArrayLike) -> Self:
+        """Ask for other times."""
+        return replace(self, times=np.asarray(times, dtype=float))
+
+    def with_reference(self, readings: ArrayLike) -> Self:
+        """Replace the readings (R,) °C of the reference channel."""
+        changed = {**self.readings, self.reference: np.asarray(readings, dtype=float)}
+        return replace(self, readings=changed)
+
+    @cached_property
+    def _polygons(self) -> dict[str, Polygon]:
+        return {}
+
+    def polygon(self, channel: str | None = None) -> Polygon:
+        """Return a channel (default: the reference) as a polygon that covers all frames.
+
+        Raises DataError where the channel is unknown or was never read.
+        """
+        name = channel or self.reference
+        if name not in self._polygons:
+            if name not in self.readings:
+                raise DataError(
+                    f"there is no temperature column {name!r}; there are: "
+                    f"{', '.join(self.readings)}"
+                )
+            self._polygons[name] = _lay_polygon(self.reading_times, self.readings[name], self.times)
+        return self._polygons[name]
+
+    def temperature(self, channel: str | None = None) -> Array:
+        """Return the temperature (E,) °C of a channel at the frames' times."""
+        return self.polygon(channel).at(self.times)
+
+    def column(self, name: str, at: ArrayLike) -> Array:
+        """Return another recorded column at some times (...,), held beyond its ends."""
+        times, values = self.columns[name]
+        result: Array = np.interp(np.asarray(at, dtype=float), times, values)
+        return result
+
+    def temperature_matrix(self, channel: str | None = None) -> csr_array:
+        """Return ∂ temperature / ∂ readings (E, R)."""
+        p = self.polygon(channel)
+        return interpolation_matrix(p.times, self.times) @ p.matrix
+
+
+def _lay_polygon(times: Array, readings: Array, frames: Array) -> Polygon:
+    """Put knots at the valid readings; carry the ends on along the outer edges, one edge far."""
+    from scipy.sparse import csr_array
+
+    rows = np.flatnonzero(np.isfinite(readings) & np.isfinite(times))
+    if not len(rows):
+        raise DataError("the temperature was never read: every reading of the column is empty")
+    rows = rows[np.argsort(times[rows], kind="stable")]
+    # of several readings with one time stamp the last one counts
+    rows = rows[np.append(np.diff(times[rows]) > 0, True)]
+    t, n = times[rows], len(rows)
+    column, weight, knot = [rows], [np.ones(n)], [np.arange(n)]
+    knots = [t]
+    begin, end = frames.min(initial=t[0]), frames.max(initial=t[-1])
+    for first, second, edge in ((0, 1, begin), (-1, -2, end)):
+        if (edge < t[0]) if first == 0 else (edge > t[-1]):
+            share = 0.0
+            if n > 1:
+                step = t[first] - t[second]
+                share = float(np.clip((edge - t[first]) / step, 0.0, 1.0))
+            index = sum(len(k) for k in knots)
+            column.append(rows[[first, second]] if n > 1 else rows[[0, 0]])
+            weight.append(np.array([1.0 + share, -share]))
+            knot.append(np.array([index, index]))
+            knots.append(np.array([edge]))
+    all_times = np.concatenate(knots)
+    order = np.argsort(all_times, kind="stable")
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    matrix = csr_array(
+        (np.concatenate(weight), (rank[np.concatenate(knot)], np.concatenate(column))),
+        shape=(len(order), len(times)),
+    )
+    return Polygon(
+        all_times[order], matrix @ np.where(np.isfinite(readings), readings, 0.0), matrix
+    )

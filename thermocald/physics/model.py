@@ -1,0 +1,192 @@
+"""The thermal model of one camera: interior orientation as a function of the temperature history.
+
+The base model is linear: the interior orientation at the reference temperature T₀ plus rates times
+(T - T₀), T at the frame's time. Effects of the catalogue are added to it; those of kind `drive`
+replace the T of the linear terms, one after the other in the order of the list.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.errors import ConfigurationError
+from thermocald.photogrammetry.camera.camera_model import (
+    EOP_NAMES,
+    IOP_NAMES,
+    ExteriorOrientation,
+    InteriorOrientation,
+    Sensor,
+)
+from thermocald.physics import catalogue
+from thermocald.physics.catalogue import drive
+from thermocald.physics.effect import Displacement, Influence
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from thermocald.arrays import Array
+    from thermocald.photogrammetry.field.testfield import TestField
+    from thermocald.physics.history import History
+
+_LEFT_OVER = 1.5  # times the noise: what an untested model may leave and state a band
+
+RATED = ("c", "x0", "y0")
+"""The parameters that are linear in temperature in every model."""
+
+
+@dataclass(frozen=True)
+class ModelEffect:
+    """An effect in a model: its name, parameter values, and their standard deviations.
+
+    values: {parameter: number, or text for a channel, or names of targets}; sds: where known.
+    """
+
+    name: str
+    values: Mapping[str, Any]
+    sds: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        catalogue.get(self.name).check(self.values)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """What a model says of E times.
+
+    iop (E, 10), eop (E, 6) (zeros where the model has no exterior orientation), drive (E,) °C: the
+    temperature behind the linear terms; scale (E, 3), displacements: of the object points;
+    noise_factor, blur_factor (E,): of the image measurement.
+    """
+
+    iop: Array
+    eop: Array
+    drive: Array
+    scale: Array
+    displacements: tuple[Displacement, ...]
+    noise_factor: Array
+    blur_factor: Array
+
+    @property
+    def moves_points(self) -> bool:
+        """Whether object points are anywhere else than in the test field's file."""
+        return bool(self.displacements) or bool(np.any(self.scale != 1.0))
+
+    def points(self, points: Array, epochs: slice = slice(None)) -> Array:
+        """Move object points (n, 3) mm to where they are at some of the epochs, (e, n, 3)."""
+        scale = self.scale[epochs]
+        moved = points[None, :, :] * scale[:, None, :]
+        for d in self.displacements:
+            shift = d.active[epochs].astype(float)[:, None, None] * d.vector
+            moved[:, d.rows, :] += shift
+        return moved
+
+
+@dataclass(frozen=True)
+class ThermalModel:
+    """One camera's thermal model; immutable, written to and read from YAML by `model_file`.
+
+    camera: its name; interior: at T0 °C; rates: {parameter of RATED: mm/K}; sds: standard
+    deviations of `interior.c`, `rates.c`, … (those of effects stand with them); covariance_names,
+    covariance: the full matrix where the model was fitted (`interior.c`, `thermal_lag.tau`, …), or
+    () and None;
+    image_sigma: px, of one coordinate of an image point; exterior: of the set-up, or None;
+    validity: {channel: (low, high)} °C that it was fitted on; fitted_on: what it was fitted on,
+    free mappings; evidence: free text and numbers, e.g. of a discovery.
+    """
+
+    camera: str
+    sensor: Sensor
+    T0: float
+    interior: InteriorOrientation
+    rates: Mapping[str, float] = field(default_factory=dict)
+    effects: tuple[ModelEffect, ...] = ()
+    exterior: ExteriorOrientation | None = None
+    image_sigma: float = 0.04
+    sds: Mapping[str, float] = field(default_factory=dict)
+    covariance_names: tuple[str, ...] = ()
+    covariance: tuple[tuple[float, ...], ...] | None = None
+    validity: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    fitted_on: Sequence[Mapping[str, Any]] = ()
+    evidence: Mapping[str, Any] = field(default_factory=dict)
+    name: str = ""
+    version: int = 1
+
+    def __post_init__(self) -> None:
+        for name in self.rates:
+            if name not in RATED:
+                raise ConfigurationError(
+                    f"the base model has no rate of {name!r}, only of {', '.join(RATED)}; "
+                    "other parameters drift by effects"
+                )
+        if not self.interior.c > 0:
+            raise ConfigurationError(f"the principal distance is {self.interior.c} mm, not above 0")
+
+    @cached_property
+    def rate_vector(self) -> Array:
+        """The rates (10,) per K in the order of IOP_NAMES."""
+        return np.array([self.rates.get(name, 0.0) for name in IOP_NAMES])
+
+    @property
+    def drives(self) -> list[tuple[str, Mapping[str, Any]]]:
+        """The effects that replace T, in their order, with their values."""
+        return [(e.name, e.values) for e in self.effects if catalogue.get(e.name).is_drive]
+
+    def drive(self, history: History) -> Array:
+        """Return the temperature (E,) °C behind the linear terms: T through all drives of the
+        model.
+        """
+        return drive(history, self.drives)
+
+    def predict(self, history: History, test_field: TestField | None = None) -> Prediction:
+        """Return everything the model says of the history's times.
+
+        Raises DataError where a temperature column is missing, ConfigurationError where the test
+        field lacks a target that an effect names.
+        """
+        epochs = len(history.times)
+        history = replace(history, T0=self.T0)
+        total = Influence.none(epochs)
+        for effect in self.effects:
+            total = total + catalogue.get(effect.name).influence(history, effect.values, test_field)
+        drive = self.drive(history)
+        iop = self.interior.as_array() + (drive - self.T0)[:, None] * self.rate_vector + total.iop
+        eop = total.eop + (self.exterior.as_array() if self.exterior else 0.0)
+        return Prediction(
+            iop, eop, drive, total.scale, total.displacements, total.noise_factor, total.blur_factor
+        )
+
+    def with_effect(self, effect: ModelEffect, **changes: Any) -> ThermalModel:
+        """Return the next version of the model, with one effect more."""
+        return replace(self, effects=(*self.effects, effect), version=self.version + 1, **changes)
+
+    def without(self, *names: str) -> ThermalModel:
+        """Return the next version of the model, without some of its effects."""
+        kept = tuple(e for e in self.effects if e.name not in names)
+        return replace(self, effects=kept, version=self.version + 1)
+
+    @property
+    def misses_an_effect(self) -> bool:
+        """Whether its fit found that an effect is missing, or could not be tested and left more
+        than noise; then its numbers hold no band.
+        """
+        found = self.evidence.get("fit") or {}
+        if found.get("effect_missing", False) is None:
+            return bool(found.get("left_over_in_noise", 1.0) > _LEFT_OVER)
+        return bool(found.get("effect_missing", False))
+
+    def parameter_names(self) -> tuple[str, ...]:
+        """List the names of all numbers, as `sds` and `covariance_names` use them."""
+        numbers = [f"interior.{n}" for n in IOP_NAMES] + [f"rates.{n}" for n in RATED]
+        if self.exterior is not None:
+            numbers += [f"exterior.{n}" for n in EOP_NAMES]
+        for effect in self.effects:
+            numbers += [
+                f"{effect.name}.{n}"
+                for n, value in effect.values.items()
+                if isinstance(value, int | float)
+            ]
+        return tuple(numbers)

@@ -1,0 +1,413 @@
+"""The YAML file of a thermal model: readable by hand, every number with its unit.
+
+format: thermocald-model/1
+name: my camera
+version: 2                                   # goes up with every change
+camera: {name: rpi-v2.1, width: 3280, height: 2464, pixel_pitch: 0.00112}     # px, px, mm
+reference_temperature: {value: 25.0, unit: degC}                              # T₀
+interior:                                    # at T₀
+c: {value: 3.04, sd: 0.0002, unit: mm}
+rates:                                       # the base model
+x0: {value: -0.0004, sd: 2.0e-06, unit: mm/K}
+effects:                                     # names and parameters of the catalogue
+- effect: thermal_lag
+parameters: {tau: {value: 84.0, sd: 1.9, unit: s}}
+exterior: {X0: {value: 600.0, unit: mm}, …}  # optional: the set-up
+image_sigma: {value: 0.04, unit: px}
+validity: {temperature: [21.0, 52.0]}        # °C it was fitted on
+fitted_on: […]
+covariance: {parameters: [interior.c, …], matrix: [[…], …]}                   # optional
+
+Numbers with units in files written by hand: `3.04`, or `{value: 3.04, sd: 0.01, unit: mm}`.
+
+A bare number has the unit the documentation states; a unit that is written out must be that one.
+
+Effects in files: entries of a model file, and files of their own, such as a proposal.
+
+format: thermocald-effect/1
+statement: x0 follows ∫ (T − 30.2 °C)₊ dt    # for people
+effects:                                     # as in a model file
+- effect: integral(above(temperature, k))    # a name of the catalogue, or a formula
+  parameters: {k: {value: 30.2, sd: 0.1, unit: degC}, x0: {value: 1.1e-06, unit: mm/(K s)}}
+
+A formula is plain text that is read and never executed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.atomic_file import write_text
+from thermocald.errors import ConfigurationError
+from thermocald.photogrammetry.camera.camera_model import (
+    EOP_NAMES,
+    IOP_NAMES,
+    ExteriorOrientation,
+    InteriorOrientation,
+    Sensor,
+)
+from thermocald.physics import catalogue
+from thermocald.physics.effect import PARAMETER_UNITS
+from thermocald.physics.model import RATED, ModelEffect, ThermalModel
+from thermocald.yaml_file import dump_yaml, read_yaml
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from pathlib import Path
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """A value and its standard deviation (None where none is known), in the unit asked for."""
+
+    value: float
+    sd: float | None = None
+
+
+def write_quantity(value: float, unit: str, sd: float | None = None) -> dict[str, Any]:
+    """Return the mapping that a file holds for a number."""
+    document: dict[str, Any] = {"value": float(value)}
+    if sd is not None and math.isfinite(sd):
+        document["sd"] = float(sd)
+    return {**document, "unit": unit}
+
+
+class QuantityReader:
+    """One mapping of a file; errors name the file and the dotted key."""
+
+    def __init__(self, path: Path | str, mapping: Any, prefix: str = "") -> None:
+        self._path = path
+        self._prefix = prefix
+        if not isinstance(mapping, dict):
+            what = "is missing" if mapping is None else "must hold `key: value` pairs"
+            raise ConfigurationError(f"{path}, {prefix.rstrip('.') or 'the file'}: {what}")
+        self.mapping: Mapping[str, Any] = mapping
+
+    def fail(self, key: str, message: str) -> ConfigurationError:
+        """Make an error at a key; the caller raises it."""
+        return ConfigurationError(f"{self._path}, key {self._prefix}{key}: {message}")
+
+    def only(self, known: Iterable[str]) -> None:
+        """Refuse keys that nobody reads."""
+        names = list(known)
+        for key in self.mapping:
+            if key not in names:
+                near = get_close_matches(str(key), names, 1)
+                hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(names)}"
+                raise self.fail(str(key), f"is unknown; {hint}")
+
+    def text(self, key: str, default: str | None = None) -> str:
+        """Read text; a number counts as its digits."""
+        value = self.mapping.get(key, default)
+        if value is None:
+            raise self.fail(key, "is missing")
+        if isinstance(value, bool) or not isinstance(value, str | int | float):
+            raise self.fail(key, "must be text")
+        return str(value)
+
+    def number(
+        self, key: str, unit: str, default: float | None = None,
+        low: float = -math.inf, above: float = -math.inf, high: float = math.inf,
+    ) -> float:  # fmt: skip
+        """Read the value of a quantity: at least `low`, more than `above`, at most `high`."""
+        value = self.quantity(key, unit, default).value
+        if value < low:
+            raise self.fail(key, f"is {value:g} {unit}; it must be at least {low:g}")
+        if value <= above:
+            raise self.fail(key, f"is {value:g} {unit}; it must be above {above:g}")
+        if value > high:
+            raise self.fail(key, f"is {value:g}; it is at most {high:g}")
+        return value
+
+    def share(self, key: str, default: float) -> float:
+        """Read a share, at least 0 and below 1."""
+        value = self.number(key, "1", default, low=0.0)
+        if value >= 1:
+            raise self.fail(key, f"is {value:g}; it is a share below 1")
+        return value
+
+    def quantity(self, key: str, unit: str, default: float | None = None) -> Quantity:
+        """Read a number in `unit`; an error if it is missing, no number, or of another unit."""
+        raw = self.mapping.get(key, default)
+        if raw is None:
+            raise self.fail(key, f"is missing; it is a number in {unit}")
+        sd: float | None = None
+        if isinstance(raw, dict):
+            inner = QuantityReader(self._path, raw, f"{self._prefix}{key}.")
+            inner.only(("value", "sd", "unit"))
+            found = inner.text("unit", unit)
+            if found != unit:
+                raise inner.fail("unit", f"is {found!r}; it must be {unit!r}: convert the value")
+            if "value" not in raw:
+                raise inner.fail("value", "is missing")
+            if raw.get("sd") is not None:
+                sd = inner._float("sd", raw["sd"])
+                if sd < 0:
+                    raise inner.fail("sd", f"is {sd:g}; a standard deviation is not negative")
+            raw = raw["value"]
+        return Quantity(self._float(key, raw), sd)
+
+    def _float(self, key: str, raw: Any) -> float:
+        try:
+            # PyYAML reads 1e-3 as text, since YAML 1.1 wants a point
+            value = float(raw) if isinstance(raw, str | int | float) else math.nan
+        except (ValueError, OverflowError):
+            value = math.nan
+        if isinstance(raw, bool) or not math.isfinite(value):
+            raise self.fail(key, f"{str(raw)[:40]!r} is not a finite number")
+        return value
+
+    def whole(self, key: str, unit: str, low: int = 1) -> int:
+        """Read a whole number."""
+        value = self.number(key, unit, low=low)
+        if value != int(value):
+            raise self.fail(key, f"is {value:g}; it must be a whole number")
+        return int(value)
+
+    def inner(self, key: str) -> QuantityReader:
+        """Enter the mapping at a key."""
+        if self.mapping.get(key) is None:
+            raise self.fail(key, "is missing")
+        return QuantityReader(self._path, self.mapping[key], f"{self._prefix}{key}.")
+
+    def items(self, key: str) -> Iterator[QuantityReader]:
+        """Yield the mappings of a list at a key; none where the key is absent."""
+        values = self.mapping.get(key) or []
+        if not isinstance(values, list):
+            raise self.fail(key, "must be a list (lines that begin with `-`)")
+        for number, value in enumerate(values, start=1):
+            yield QuantityReader(self._path, value, f"{self._prefix}{key}[{number}].")
+
+
+EFFECT_FORMAT = "thermocald-effect/1"
+
+
+def read_effects(path: Path) -> list[ModelEffect]:
+    """Read the effects of an effect file; ConfigurationError names file and key."""
+    top = QuantityReader(path, read_yaml(path))
+    found = top.text("format")
+    if found != EFFECT_FORMAT:
+        raise top.fail("format", f"is {found[:60]!r}; an effect file is {EFFECT_FORMAT!r}")
+    top.only(("format", "statement", "effects", "evidence"))
+    out = [effect_of(entry) for entry in top.items("effects")]
+    if not out:
+        raise top.fail("effects", "holds no effect")
+    return out
+
+
+def write_effects(
+    path: Path, found: Sequence[ModelEffect], statement: str, evidence: Mapping[str, Any]
+) -> None:
+    """Write an effect file, as a whole or not at all."""
+    document = {
+        "format": EFFECT_FORMAT,
+        "statement": statement,
+        "effects": [effect_document(e) for e in found],
+        "evidence": dict(evidence),
+    }
+    write_text(path, dump_yaml(document))
+
+
+def effect_of(reader: QuantityReader) -> ModelEffect:
+    """Read one entry of a list of effects; ConfigurationError names file and key."""
+    reader.only(("effect", "parameters", "evidence"))
+    name = reader.text("effect")
+    try:
+        effect = catalogue.get(name)
+    except ConfigurationError as error:
+        raise reader.fail("effect", str(error)) from error
+    parameters = reader.inner("parameters")
+    units = effect.units()
+    parameters.only(units)
+    values: dict[str, Any] = {}
+    own: dict[str, float] = {}
+    for key, raw in parameters.mapping.items():
+        if key in effect.nonlinear and effect.nonlinear[key].text:
+            plain = raw.get("value") if isinstance(raw, dict) else raw
+            values[key] = tuple(plain) if isinstance(plain, list) else str(plain)
+            continue
+        quantity = parameters.quantity(key, units[key])
+        values[key] = quantity.value
+        if quantity.sd is not None:
+            own[key] = quantity.sd
+    try:
+        effect.check(values)
+    except ConfigurationError as error:
+        raise reader.fail("parameters", str(error)) from error
+    return ModelEffect(name, values, own)
+
+
+def effect_document(effect: ModelEffect) -> dict[str, Any]:
+    """Return the mapping that a file holds for an effect."""
+    units = catalogue.get(effect.name).units()
+    parameters: dict[str, Any] = {}
+    for key, value in effect.values.items():
+        if isinstance(value, str | tuple | list):
+            parameters[key] = list(value) if not isinstance(value, str) else value
+        else:
+            parameters[key] = write_quantity(value, units[key], effect.sds.get(key))
+    return {"effect": effect.name, "parameters": parameters}
+
+
+MODEL_FORMAT = "thermocald-model/1"
+_KEYS = (
+    "format", "name", "version", "camera", "reference_temperature", "interior", "rates", "effects",
+    "exterior", "image_sigma", "validity", "fitted_on", "evidence", "covariance",
+)  # fmt: skip
+
+
+def read_model(path: Path) -> ThermalModel:
+    """Read a model file; ConfigurationError names file and key."""
+    return parse_model(read_yaml(path), path)
+
+
+def write_model(path: Path, model: ThermalModel) -> None:
+    """Write a model file, as a whole or not at all."""
+    write_text(path, dump_yaml(model_document(model)))
+
+
+def parse_model(document: Mapping[str, Any], path: Path | str = "model") -> ThermalModel:
+    """Read the model in a file's mapping; `path` is for the messages."""
+    top = QuantityReader(path, document)
+    found = top.text("format")
+    if found != MODEL_FORMAT:
+        raise top.fail("format", f"is {found[:60]!r}; this program reads {MODEL_FORMAT!r}")
+    top.only(_KEYS)
+    camera = top.inner("camera")
+    sds: dict[str, float] = {}
+
+    def group(key: str, names: tuple[str, ...], per: str = "") -> dict[str, float]:
+        if document.get(key) is None:
+            return {}
+        reader = top.inner(key)
+        reader.only(names)
+        values = {}
+        for name in reader.mapping:
+            quantity = reader.quantity(name, PARAMETER_UNITS[name] + per)
+            values[name] = quantity.value
+            if quantity.sd is not None:
+                sds[f"{key}.{name}"] = quantity.sd
+        return values
+
+    interior = group("interior", IOP_NAMES)
+    if not interior.get("c", 0.0) > 0:
+        raise top.fail("interior.c", "is missing or not above 0 mm")
+    exterior = group("exterior", EOP_NAMES)
+    rates = group("rates", RATED, "/K")
+    names, matrix = _read_covariance(top, document)
+    return ThermalModel(
+        camera=camera.text("name", "camera"),
+        sensor=read_sensor(camera),
+        T0=top.number("reference_temperature", "degC", low=-273.15),
+        interior=InteriorOrientation.from_mapping({"c": 0.0, **interior}),
+        rates=rates,
+        effects=tuple(effect_of(reader) for reader in top.items("effects")),
+        exterior=_read_exterior(top, exterior),
+        image_sigma=top.number("image_sigma", "px", 0.04, above=0.0),
+        sds=sds,
+        covariance_names=names,
+        covariance=matrix,
+        validity=_read_validity(top, document),
+        fitted_on=tuple(document.get("fitted_on") or ()),
+        evidence=dict(document.get("evidence") or {}),
+        name=top.text("name", ""),
+        version=top.whole("version", "1") if "version" in document else 1,
+    )
+
+
+def read_sensor(camera: QuantityReader) -> Sensor:
+    """Read width and height in px and the pixel pitch in mm."""
+    pitch = camera.number("pixel_pitch", "mm", above=0.0)
+    if pitch > 0.1:
+        raise camera.fail("pixel_pitch", f"is {pitch:g} mm; pixels are a few thousandths of a mm")
+    return Sensor(camera.whole("width", "px"), camera.whole("height", "px"), pitch)
+
+
+def _read_exterior(top: QuantityReader, values: dict[str, float]) -> ExteriorOrientation | None:
+    if not values:
+        return None
+    missing = [name for name in EOP_NAMES if name not in values]
+    if missing:
+        raise top.fail(f"exterior.{missing[0]}", "is missing")
+    return ExteriorOrientation.from_mapping(values)
+
+
+def _read_covariance(
+    top: QuantityReader, document: Mapping[str, Any]
+) -> tuple[tuple[str, ...], tuple[tuple[float, ...], ...] | None]:
+    if document.get("covariance") is None:
+        return (), None
+    reader = top.inner("covariance")
+    names = tuple(str(n) for n in reader.mapping.get("parameters") or ())
+    try:
+        matrix = np.array(reader.mapping.get("matrix"), dtype=float)
+    except (TypeError, ValueError) as cause:
+        raise reader.fail("matrix", "must hold rows of numbers") from cause
+    if matrix.shape != (len(names), len(names)) or not np.isfinite(matrix).all():
+        raise reader.fail("matrix", f"must be {len(names)} × {len(names)} finite numbers")
+    if not np.allclose(matrix, matrix.T, rtol=1e-6, atol=0.0):
+        raise reader.fail("matrix", "is not symmetric")
+    return names, tuple(tuple(float(v) for v in row) for row in matrix)
+
+
+def _read_validity(
+    top: QuantityReader, document: Mapping[str, Any]
+) -> dict[str, tuple[float, float]]:
+    ranges: dict[str, tuple[float, float]] = {}
+    if document.get("validity") is None:
+        return ranges
+    reader = top.inner("validity")
+    for channel, pair in reader.mapping.items():
+        if not isinstance(pair, list) or len(pair) != 2:
+            raise reader.fail(str(channel), "must be [lowest, highest] degC")
+        low, high = (reader._float(str(channel), v) for v in pair)
+        if low > high:
+            raise reader.fail(str(channel), f"begins at {low:g} and ends at {high:g} degC")
+        ranges[str(channel)] = (low, high)
+    return ranges
+
+
+def model_document(model: ThermalModel) -> dict[str, Any]:
+    """Return the mapping that a model file holds."""
+
+    def numbers(key: str, values: Mapping[str, float], per: str = "") -> dict[str, Any]:
+        return {
+            n: write_quantity(v, PARAMETER_UNITS[n] + per, model.sds.get(f"{key}.{n}"))
+            for n, v in values.items()
+        }
+
+    document: dict[str, Any] = {
+        "format": MODEL_FORMAT,
+        "name": model.name or model.camera,
+        "version": model.version,
+        "camera": {
+            "name": model.camera,
+            "width": model.sensor.width,
+            "height": model.sensor.height,
+            "pixel_pitch": model.sensor.pixel_pitch,
+        },
+        "reference_temperature": write_quantity(model.T0, "degC"),
+        "interior": numbers("interior", asdict(model.interior)),
+        "rates": numbers("rates", {n: model.rates[n] for n in RATED if n in model.rates}, "/K"),
+        "effects": [effect_document(effect) for effect in model.effects],
+    }
+    if model.exterior is not None:
+        document["exterior"] = numbers("exterior", asdict(model.exterior))
+    document["image_sigma"] = write_quantity(model.image_sigma, "px")
+    if model.validity:
+        document["validity"] = {k: [float(a), float(b)] for k, (a, b) in model.validity.items()}
+    if model.fitted_on:
+        document["fitted_on"] = [dict(f) for f in model.fitted_on]
+    if model.evidence:
+        document["evidence"] = dict(model.evidence)
+    if model.covariance is not None:
+        document["covariance"] = {
+            "parameters": list(model.covariance_names),
+            "matrix": [list(row) for row in model.covariance],
+        }
+    return document

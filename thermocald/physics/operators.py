@@ -1,0 +1,510 @@
+"""Operators on a temperature polygon, and the table of those that formulas are made of.
+
+Every operator is exact for a polygon, works on whole vectors, and comes with the matrix of its
+derivatives by the values at the knots, so that a thermometer's error can be carried through it.
+Knots are (K,) s ascending, values (K,) °C, `at` (E,) s; beyond the ends the values are held.
+
+The operators of formulas are of two kinds. Pointwise operators take values at one time; those with
+memory take a polygon of values and give it back at any times:
+
+    offset(x, a)          x - a
+    above(x, k)           max(x - k, 0)
+    power(x, p)           max(x, 0)^p, x in its own unit
+    square(x), cube(x)    x², x³
+    signed_square(x)      x |x|
+    magnitude(x)          |x|
+    saturation(x, k, w)   tanh((x - k) / w); a switch where w is small
+    exponential(x, w)     exp(x / w)
+    wave(x, P, phi)       sin(2π x / P + phi)
+    product(x, y)         x y
+    rate(x)               dx/dt, per s
+    integral(x)           ∫ x dt from the first frame, s
+    lag(x, tau)           first-order lag
+    play(x, r)            backlash of half-width r
+    change(x)             x less what it was at the first frame
+    maximum(x), minimum(x)   the highest, the lowest value so far
+    peak(x, tau)          the highest value so far, which fades towards x with a time constant
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+    from scipy.sparse import csr_array
+
+    from thermocald.arrays import Array
+
+# Weights of a lag below this share of the reading's own are left out of its matrix.
+_LAG_CUT = 14.0
+
+
+def _edges(knots: Array, at: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    """Find left knot, right knot, and share of the right one, at times (E,); held beyond the
+    ends.
+    """
+    last = len(knots) - 1
+    left = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, max(last - 1, 0))
+    right = np.minimum(left + 1, last)
+    step = knots[right] - knots[left]
+    share = np.clip((at - knots[left]) / np.where(step > 0, step, 1.0), 0.0, 1.0)
+    return left, right, share
+
+
+def interpolation_matrix(knots: Array, at: Array) -> csr_array:
+    """Return the matrix (E, K) that interpolates knots (K,) linearly at times (E,)."""
+    from scipy.sparse import csr_array
+
+    left, right, share = _edges(knots, at)
+    rows = np.arange(len(at))
+    return csr_array(
+        (
+            np.concatenate([1.0 - share, share]),
+            (np.concatenate([rows, rows]), np.concatenate([left, right])),
+        ),
+        shape=(len(at), len(knots)),
+    )
+
+
+def _lag_weights(knots: Array, tau: float) -> tuple[Array, Array, Array]:
+    """Return decay a, weight of the old and of the new value over each edge, (K-1,) each.
+
+    L₊ = a L + (g - a) T + (1 - g) T₊ with a = exp(-h/τ), g = (1 - a) τ/h: the exact response of
+    τ L' = T - L to a straight line.
+    """
+    x = np.diff(knots) / tau
+    a = np.exp(-x)
+    g = -np.expm1(-x) / x
+    return a, g - a, 1.0 - g
+
+
+def lag(knots: Array, values: Array, tau: float, at: Array) -> Array:
+    """Send a polygon through a first-order lag `tau` L' = T - L, L = T at the first knot.
+
+    knots (K,) s, values (K,) or (K, m), at (E,) s; returns (E,) or (E, m).
+    """
+    from scipy.linalg.lapack import dtbtrs
+
+    v = np.asarray(values, dtype=float)
+    columns = v.reshape(len(v), -1)
+    state = columns
+    if len(knots) > 1:
+        a, old, new = _lag_weights(knots, tau)
+        driven = np.empty_like(columns)
+        driven[0] = columns[0]
+        driven[1:] = old[:, None] * columns[:-1] + new[:, None] * columns[1:]
+        band = np.ones((2, len(knots)), order="F")
+        band[1, :-1] = -a
+        state, _ = dtbtrs(band, driven, uplo="L", diag="U")
+    left, right, share = _edges(knots, at)
+    elapsed = share * (knots[right] - knots[left]) / tau
+    edge = (knots[right] - knots[left]) / tau
+    slope = (columns[right] - columns[left]) / np.where(edge > 0, edge, 1.0)[:, None]
+    decayed = np.exp(-elapsed)[:, None]
+    result = (
+        columns[left] * (1.0 - decayed)
+        + state[left] * decayed
+        + slope * (elapsed[:, None] - 1.0 + decayed)
+    )
+    shaped: Array = result.reshape(len(at), *v.shape[1:])
+    return shaped
+
+
+def lag_matrix(knots: Array, tau: float, at: Array) -> csr_array:
+    """Return the matrix (E, K) of `lag`; weights older than 14 tau are left out (below 1e-6)."""
+    from scipy.sparse import csr_array
+
+    n = len(knots)
+    if n == 1:
+        return interpolation_matrix(knots, at)
+    _, old, new = _lag_weights(knots, tau)
+    left, right, share = _edges(knots, at)
+    # state k = Σ_j<k D_kj+1 (old_j T_j + new_j T_j+1) + D_k0 T_0, with D_kj = exp(-(t_k - t_j)/τ)
+    first = np.maximum(np.searchsorted(knots, knots[left] - _LAG_CUT * tau) - 1, 0)
+    counts = left - first + 1
+    rows = np.repeat(np.arange(len(at)), counts)
+    offset = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    columns = np.repeat(first, counts) + offset
+    gone = np.exp(-(knots[left][rows] - knots[columns]) / tau)
+    weight = np.where(columns == 0, 1.0, np.append(0.0, new)[columns]) * gone
+    inner = columns < left[rows]
+    following = np.minimum(columns + 1, n - 1)
+    weight[inner] += old[columns[inner]] * np.exp(
+        -(knots[left][rows] - knots[following])[inner] / tau
+    )
+    elapsed = share * (knots[right] - knots[left]) / tau
+    edge = (knots[right] - knots[left]) / tau
+    decayed = np.exp(-elapsed)
+    rise = (elapsed - 1.0 + decayed) / np.where(edge > 0, edge, 1.0)
+    frames = np.arange(len(at))
+    return csr_array(
+        (
+            np.concatenate([weight * decayed[rows], 1.0 - decayed - rise, rise]),
+            (
+                np.concatenate([rows, frames, frames]),
+                np.concatenate([columns, left, right]),
+            ),
+        ),
+        shape=(len(at), n),
+    )
+
+
+def play(knots: Array, values: Array, half_width: float, at: Array) -> Array:
+    """Send a polygon through a play: the output rests until the input is `half_width` away.
+
+    P = min(max(P, T - r), T + r), P = T at the first knot. knots, values (K,), at (E,); (E,).
+    Source: Krasnosel'skii, Pokrovskii (1989): Systems with Hysteresis.
+    """
+    states = _play_states(values, half_width)
+    left, right, share = _edges(knots, at)
+    now = values[left] * (1.0 - share) + values[right] * share
+    result: Array = np.minimum(np.maximum(states[left], now - half_width), now + half_width)
+    return result
+
+
+def _play_states(values: Array, half_width: float) -> Array:
+    """Compute the states at the knots by a prefix scan: clipping after clipping is clipping."""
+    low, high = values - half_width, values + half_width
+    low[0] = high[0] = values[0]
+    step = 1
+    while step < len(values):
+        lo, hi = low[step:].copy(), high[step:].copy()
+        low[step:] = np.minimum(np.maximum(low[:-step], lo), hi)
+        high[step:] = np.minimum(np.maximum(high[:-step], lo), hi)
+        step *= 2
+    return low
+
+
+def play_matrix(knots: Array, values: Array, half_width: float, at: Array) -> csr_array:
+    """Return ∂ play / ∂ values (E, K): each output depends on the reading that moved it last."""
+    moving, source, _ = _play_moves(knots, values, half_width, at)
+    return _switched(knots, at, moving, source)
+
+
+def _play_moves(
+    knots: Array, values: Array, half_width: float, at: Array
+) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.bool_]]:
+    """Whether the play moves since the knot before each time (E,), the knot that moved it last
+    until then (E,), and whether the time is that very knot (E,).
+    """
+    states = _play_states(values, half_width)
+    moved = np.append(True, states[1:] != states[:-1])
+    source = np.maximum.accumulate(np.where(moved, np.arange(len(values)), 0))
+    left, right, share = _edges(knots, at)
+    now = values[left] * (1.0 - share) + values[right] * share
+    moving = (states[left] < now - half_width) | (states[left] > now + half_width)
+    return moving, source[left], (share == 0) & moved[left]
+
+
+def play_turns(knots: Array, values: Array, half_width: float, at: Array) -> NDArray[np.bool_]:
+    """Find where the play rests after a turn and is near either end of that rest, (E,).
+
+    Which reading was the highest, and when the play is used up, is not sure there.
+    """
+    moving, source, just_moved = _play_moves(knots, values, half_width, at)
+    resting = ~moving & ~just_moved & (source > 0)  # at the start it has not turned
+    near = np.zeros(len(at), dtype=bool)
+    begins = np.flatnonzero(np.diff(resting.astype(int), prepend=0) > 0)
+    ends = np.flatnonzero(np.diff(resting.astype(int), append=0) < 0)
+    for begin, end in zip(begins, ends, strict=True):
+        near[begin : begin + 2] = True
+        near[max(end - 1, begin) : end + 2] = True
+    return near
+
+
+def running_maximum(knots: Array, values: Array, at: Array) -> Array:
+    """Return the highest value from the first knot to each time, (E,)."""
+    left, right, share = _edges(knots, at)
+    now = values[left] * (1.0 - share) + values[right] * share
+    result: Array = np.maximum(np.maximum.accumulate(values)[left], now)
+    return result
+
+
+def running_maximum_matrix(knots: Array, values: Array, at: Array) -> csr_array:
+    """Return ∂ running_maximum / ∂ values (E, K): by the highest reading so far."""
+    highest = np.maximum.accumulate(values)
+    risen = np.append(True, values[1:] > highest[:-1])
+    source = np.maximum.accumulate(np.where(risen, np.arange(len(values)), 0))
+    left, right, share = _edges(knots, at)
+    now = values[left] * (1.0 - share) + values[right] * share
+    return _switched(knots, at, now > highest[left], source[left])
+
+
+def _switched(
+    knots: Array, at: Array, current: NDArray[np.bool_], source: NDArray[np.int64]
+) -> csr_array:
+    """Return rows that follow the input now where `current`, and a former knot elsewhere."""
+    from scipy.sparse import csr_array
+
+    left, right, share = _edges(knots, at)
+    rows = np.arange(len(at))
+    return csr_array(
+        (
+            np.concatenate([np.where(current, 1.0 - share, 1.0), np.where(current, share, 0.0)]),
+            (
+                np.concatenate([rows, rows]),
+                np.concatenate([np.where(current, left, source), right]),
+            ),
+        ),
+        shape=(len(at), len(knots)),
+    )
+
+
+def slope_matrix(knots: Array, at: Array) -> csr_array:
+    """Return the matrix (E, K) of the rate dT/dt at times (E,).
+
+    At the knots the slope of the parabola through three neighbours (second order, also for uneven
+    steps; one-sided at the ends), linear in between.
+    """
+    from scipy.sparse import csr_array
+
+    n = len(knots)
+    if n == 1:
+        return csr_array((len(at), 1))
+    if n == 2:
+        h = knots[1] - knots[0]
+        return csr_array(np.tile([-1.0 / h, 1.0 / h], (len(at), 1)))
+    h = np.diff(knots)
+    h0, h1 = h[:-1], h[1:]
+    inner = np.arange(1, n - 1)
+    a, b = h[0], h[1]
+    y, z = h[-1], h[-2]
+    weights = [
+        -h1 / (h0 * (h0 + h1)),
+        (h1 - h0) / (h0 * h1),
+        h0 / (h1 * (h0 + h1)),
+        np.array([-(2 * a + b) / (a * (a + b)), (a + b) / (a * b), -a / (b * (a + b))]),
+        np.array([y / (z * (y + z)), -(y + z) / (y * z), (2 * y + z) / (y * (y + z))]),
+    ]
+    rows = [inner, inner, inner, np.zeros(3, dtype=int), np.full(3, n - 1)]
+    columns = [inner - 1, inner, inner + 1, np.arange(3), np.arange(n - 3, n)]
+    slopes = csr_array(
+        (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))), shape=(n, n)
+    )
+    return interpolation_matrix(knots, at) @ slopes
+
+
+Role = Literal["threshold", "width", "time_constant", "exponent", "phase", "scale"]
+# knots beyond which the error of a single reading in an integral is left out: it is below 1/√1500
+# of the sum's, and its matrix is full
+_LONG = 1500
+
+
+@dataclass(frozen=True, slots=True)
+class Constant:
+    """A constant of an operator: its usual name, what it means, and whether it is above 0.
+
+    same_unit: it has the unit of what the operator is applied to.
+    """
+
+    name: str
+    role: Role
+    positive: bool
+    same_unit: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Operator:
+    """One operator.
+
+    inputs: how many; constants: in order; powers: exponent of the input's unit in the result's (0:
+    a pure number), seconds: exponent of s that is multiplied; keeps: the result is a value of
+    the input's own kind (°C stays °C). value, slopes: of pointwise ones, (inputs…, constants…) →
+    values, partial derivatives by each input. trajectory, matrix: of those with memory, (knots,
+    values, constants, times) → values at the times, ∂ by the values at the knots.
+    """
+
+    inputs: int
+    constants: tuple[Constant, ...]
+    words: str
+    powers: int = 1
+    seconds: int = 0
+    keeps: bool = False
+    value: Callable[..., Array] | None = None
+    slopes: Callable[..., tuple[Array, ...]] | None = None
+    trajectory: Callable[..., Array] | None = None
+    matrix: Callable[..., csr_array] | None = None
+
+    @property
+    def remembers(self) -> bool:
+        """Whether it depends on the past."""
+        return self.trajectory is not None
+
+
+def _integral(knots: Array, values: Array, at: Array) -> Array:
+    steps = 0.5 * np.diff(knots) * (values[1:] + values[:-1])
+    total = np.append(0.0, np.cumsum(steps))
+    last = len(knots) - 1
+    left = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, max(last - 1, 0))
+    elapsed = np.clip(at - knots[left], 0.0, None)
+    now = np.interp(at, knots, values)
+    whole: Array = total[left] + 0.5 * elapsed * (values[left] + now)
+    return whole - float(np.interp(0.0, knots, total))
+
+
+def _integral_matrix(knots: Array, values: Array, at: Array) -> csr_array:  # noqa: ARG001
+    from scipy.sparse import csr_array
+
+    n = len(knots)
+    if n > _LONG or n < 2:
+        return csr_array((len(at), n))
+    h = np.diff(knots)
+    whole = np.zeros((n, n))
+    inside = np.tri(n, n - 1, -1) * h / 2.0
+    whole[:, :-1] += inside
+    whole[:, 1:] += inside
+    left = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, n - 2)
+    share = np.clip((at - knots[left]) / h[left], 0.0, 1.0)
+    weights = whole[left]
+    rows = np.arange(len(at))
+    weights[rows, left] += h[left] * share * (1.0 - share / 2.0)
+    weights[rows, left + 1] += h[left] * share**2 / 2.0
+    return csr_array(weights - _from_start(whole, knots))
+
+
+def _from_start(whole: Array, knots: Array) -> Array:
+    """Return the row of `whole` at time 0, where an integral begins."""
+    at = np.clip(np.searchsorted(knots, 0.0, side="right") - 1, 0, len(knots) - 2)
+    share = float(np.clip(-knots[at] / (knots[at + 1] - knots[at]), 0.0, 1.0))
+    out: Array = whole[at] * (1.0 - share) + whole[at + 1] * share
+    return out
+
+
+def _change(knots: Array, values: Array, at: Array) -> Array:
+    return np.asarray(np.interp(at, knots, values) - np.interp(0.0, knots, values))
+
+
+def _change_matrix(knots: Array, values: Array, at: Array) -> csr_array:  # noqa: ARG001
+    from scipy.sparse import csr_array
+
+    start = interpolation_matrix(knots, np.zeros(1))
+    return csr_array(interpolation_matrix(knots, at) - start[np.zeros(len(at), dtype=int)])
+
+
+def _peak(knots: Array, values: Array, tau: float, at: Array) -> Array:
+    """Source: the diode and leaky capacitor of a peak detector (Horowitz, Hill (2015): The Art of
+    Electronics, 3rd ed., section 4.5.1).
+    """
+    left = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 1)
+    decay = np.exp(-np.diff(knots) / tau)
+    states = [float(values[0])]
+    for v, d in zip(values[1:].tolist(), decay.tolist(), strict=True):
+        states.append(max(v, v + (states[-1] - v) * d))
+    now = np.interp(at, knots, values)
+    gone = np.exp(-np.clip(at - knots[left], 0.0, None) / tau)
+    return np.asarray(np.maximum(now, now + (np.array(states)[left] - now) * gone))
+
+
+def _peak_matrix(knots: Array, values: Array, tau: float, at: Array) -> csr_array:
+    """Return ∂ peak / ∂ values: of the input where it leads, of a lag since the peak elsewhere."""
+    from scipy.sparse import csr_array
+
+    n = len(knots)
+    decay = np.append(0.0, np.exp(-np.diff(knots) / tau))
+    held = _peak(knots, values, tau, knots) > values
+    rows, columns, weights = [], [], []
+    first = 0
+    for i in range(n):
+        if not held[i]:
+            first = i
+        gone = np.append(np.cumprod(decay[i:first:-1])[::-1], 1.0)
+        share = gone * np.append(1.0, 1.0 - decay[first + 1 : i + 1])
+        kept = share > 1e-6
+        columns.append(np.arange(first, i + 1)[kept])
+        rows.append(np.full(int(kept.sum()), i))
+        weights.append(share[kept])
+    at_knots = csr_array(
+        (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))), shape=(n, n)
+    )
+    return interpolation_matrix(knots, at) @ at_knots
+
+
+_A = Constant("a", "threshold", False)
+_K = Constant("k", "threshold", False)
+_W = Constant("w", "scale", True)
+_TAU = Constant("tau", "time_constant", True, same_unit=False)
+
+
+def _ones(x: Array, *_: float) -> tuple[Array]:
+    return (np.ones_like(x),)
+
+
+OPERATORS: dict[str, Operator] = {
+    "offset": Operator(
+        1, (_A,), "({0} − {1})", value=lambda x, a: np.asarray(x - a), slopes=_ones
+    ),
+    "above": Operator(
+        1, (_K,), "({0} − {1})₊", value=lambda x, k: np.maximum(x - k, 0.0),
+        slopes=lambda x, k: ((x > k).astype(float),),
+    ),
+    "power": Operator(
+        1, (Constant("p", "exponent", True, same_unit=False),), "[{0}]^({1})", 0,
+        value=lambda x, p: np.asarray(np.maximum(x, 0.0) ** p),
+        # a root is vertical at its foot: held where the reading's error ends
+        slopes=lambda x, p: (p * np.maximum(x, 1e-2) ** (p - 1.0) * (x > 0),),
+    ),
+    "square": Operator(
+        1, (), "[{0}]²", 2, value=lambda x: np.asarray(x**2), slopes=lambda x: (2.0 * x,)
+    ),
+    "cube": Operator(
+        1, (), "[{0}]³", 3, value=lambda x: np.asarray(x**3), slopes=lambda x: (3.0 * x**2,)
+    ),
+    "signed_square": Operator(
+        1, (), "sign({0}) · ({0})²", 2, value=lambda x: x * np.abs(x),
+        slopes=lambda x: (2.0 * np.abs(x),),
+    ),
+    "magnitude": Operator(1, (), "|{0}|", value=np.abs, slopes=lambda x: (np.sign(x),)),
+    "saturation": Operator(
+        1, (_K, _W), "tanh(({0} − {1}) / {2})", 0,
+        value=lambda x, k, w: np.tanh((x - k) / w),
+        slopes=lambda x, k, w: (
+            1.0 / (w * np.cosh(np.clip((x - k) / w, -300.0, 300.0)) ** 2),
+        ),
+    ),
+    "exponential": Operator(
+        1, (_W,), "exp({0} / {1})", 0,
+        value=lambda x, w: np.exp(np.clip(x / w, -300.0, 300.0)),
+        slopes=lambda x, w: (np.exp(np.clip(x / w, -300.0, 300.0)) / w,),
+    ),
+    "wave": Operator(
+        1, (Constant("P", "scale", True), Constant("phi", "phase", False, same_unit=False)),
+        "sin(2π · {0} / {1} + {2})", 0,
+        value=lambda x, P, phi: np.sin(2 * np.pi * x / P + phi),
+        slopes=lambda x, P, phi: (2 * np.pi / P * np.cos(2 * np.pi * x / P + phi),),
+    ),
+    "product": Operator(
+        2, (), "{0} · {1}", value=lambda x, y: np.asarray(x * y), slopes=lambda x, y: (y, x)
+    ),
+    "rate": Operator(
+        1, (), "d{0}/dt", seconds=-1, matrix=lambda knots, _, at: slope_matrix(knots, at),
+        trajectory=lambda knots, x, at: np.asarray(slope_matrix(knots, at) @ x),
+    ),
+    "integral": Operator(1, (), "∫ {0} dt", seconds=1, trajectory=_integral,
+                         matrix=_integral_matrix),
+    "change": Operator(1, (), "({0} − {0} at the start)", trajectory=_change,
+                       matrix=_change_matrix),
+    "lag": Operator(1, (_TAU,), "({0}, lagged by {1})", keeps=True, trajectory=lag,
+                    matrix=lambda knots, _, tau, at: lag_matrix(knots, tau, at)),
+    "play": Operator(
+        1, (Constant("r", "width", True),), "({0}, through a play of half-width {1})", keeps=True,
+        trajectory=play, matrix=play_matrix,
+    ),
+    "maximum": Operator(1, (), "(highest {0} so far)", keeps=True, trajectory=running_maximum,
+                        matrix=running_maximum_matrix),
+    "minimum": Operator(
+        1, (), "(lowest {0} so far)", keeps=True,
+        trajectory=lambda knots, x, at: -running_maximum(knots, -x, at),
+        matrix=lambda knots, x, at: running_maximum_matrix(knots, -x, at),
+    ),
+    "peak": Operator(
+        1, (_TAU,), "(highest {0} so far, fading within {1})", keeps=True, trajectory=_peak,
+        matrix=_peak_matrix,
+    ),
+}  # fmt: skip
+"""Every operator by its name."""

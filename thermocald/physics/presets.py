@@ -1,0 +1,319 @@
+"""Presets: the cameras of the reference study, with the drift that it reports.
+
+Elias, Eltner, Liebold, Maas (2020): Assessing the Influence of Temperature Changes on the Geometric
+Stability of Smartphone- and Raspberry Pi Cameras, Sensors 20, 643, sections 4.1 and 4.2. What the
+text states is put in: size and direction of the drift of principal point and principal distance
+between the first and the last of 150 epochs (the RPi: at the highest temperature), σ0 growing to
+3.5 times, the RPi's way back that is not complete. The rates per kelvin follow from that and from
+the course of the temperature. What it does not state is of usual size: temperatures, distortion
+(its drift is small, as the text says), image noise, and the proportion of x to y in the drift.
+
+Sensor and lens data:
+
+* RPi camera v2.1: Raspberry Pi documentation, camera, hardware specification: IMX219,
+  3280 × 2464 px of 1.12 µm, focal length 3.04 mm, f/2.0.
+* LG Google Nexus 5: sensor Sony IMX179 (1/3.2 inch, 3264 × 2448 px of 1.4 µm), f/2.4; focal length
+  3.97 mm as the phone writes it into EXIF.
+* Samsung Galaxy S8: sensor Sony IMX333 or Samsung S5K2L2 (1/2.55 inch, 4032 × 3024 px of 1.4 µm),
+  f/1.7; focal length 4.2 mm as the phone writes it into EXIF.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.errors import ConfigurationError, UsageError
+from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
+from thermocald.physics import catalogue
+from thermocald.physics.device import (
+    CameraDevice,
+    Measuring,
+    Programme,
+    default_heat,
+    read_camera_device,
+    read_programme,
+)
+from thermocald.physics.heat import Course, HeatNetwork, Link, SimulatedThermometer
+from thermocald.physics.model import ModelEffect, ThermalModel
+from thermocald.physics.model_file import read_effects, read_model
+from thermocald.physics.simulation import Simulation
+from thermocald.physics.testfields import corner_field, corner_view, load_field
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+    from pathlib import Path
+
+    from thermocald.photogrammetry.field.testfield import TestField
+
+_EPOCHS = 150
+_INTERVAL_S = 10.0
+_HEATED_S = 750.0  # the RPi's lamp is on for the first half
+
+
+@dataclass(frozen=True)
+class Preset:
+    """One camera in one state, as the reference reports it.
+
+    interior at T0; drift_px, drift_c_mm: of principal point and principal distance over the whole
+    warming; direction_deg: of the principal point's way, in the image (x right, y up); begin_degc,
+    end_degc: temperature at power-on and in equilibrium; noise_ratio: σ0 at the highest temperature
+    over σ0 at the start; set_share: share of the principal point's way that does not come back;
+    lamp: heated from outside, then left to cool; distortion_drift: A1, B1, B2 over the warming.
+    """
+
+    name: str
+    about: str
+    camera: str
+    sensor: Sensor
+    interior: InteriorOrientation
+    f_number: float
+    distance_mm: float
+    drift_px: float
+    direction_deg: float
+    drift_c_mm: float
+    begin_degc: float
+    end_degc: float
+    noise_ratio: float = 1.0
+    set_share: float = 0.0
+    lamp: bool = False
+    distortion_drift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+_NEXUS = Sensor(3264, 2448, 0.0014)
+_NEXUS_INTERIOR = InteriorOrientation(
+    c=3.97, x0=0.021, y0=-0.034, A1=0.0051, A2=-4.0e-4, B1=1.2e-4, B2=-0.9e-4
+)
+_S8 = Sensor(4032, 3024, 0.0014)
+_S8_INTERIOR = InteriorOrientation(
+    c=4.2, x0=-0.017, y0=0.042, A1=0.0062, A2=-3.6e-4, B1=-0.7e-4, B2=1.1e-4
+)
+_RPI = Sensor(3280, 2464, 0.00112)
+_RPI_INTERIOR = InteriorOrientation(
+    c=3.04, x0=0.012, y0=-0.018, A1=-0.0040, A2=5.0e-4, B1=1.0e-4, B2=-2.0e-4
+)
+
+PRESETS: Mapping[str, Preset] = {
+    p.name: p
+    for p in (
+        Preset(
+            "nexus5-cold", "LG Google Nexus 5, switched on cold, warms itself",
+            "nexus5", _NEXUS, _NEXUS_INTERIOR, 2.4, 900.0,
+            drift_px=16.0, direction_deg=-28.0, drift_c_mm=0.007, begin_degc=23.0, end_degc=40.0,
+            distortion_drift=(2e-5, -2e-5, 1e-5),
+        ),
+        Preset(
+            "nexus5-warm", "LG Google Nexus 5, warm already",
+            "nexus5", _NEXUS, _NEXUS_INTERIOR, 2.4, 900.0,
+            drift_px=8.0, direction_deg=-28.0, drift_c_mm=0.003, begin_degc=32.0, end_degc=40.0,
+            distortion_drift=(1e-5, -1e-5, 0.5e-5),
+        ),
+        Preset(
+            "galaxy-s8-cold", "Samsung Galaxy S8, switched on cold, warms itself",
+            "galaxy-s8", _S8, _S8_INTERIOR, 1.7, 900.0,
+            drift_px=40.0, direction_deg=152.0, drift_c_mm=0.007, begin_degc=23.0, end_degc=45.0,
+            noise_ratio=1.8, distortion_drift=(3e-5, 0.0, 0.0),
+        ),
+        Preset(
+            "galaxy-s8-warm", "Samsung Galaxy S8, warm already",
+            "galaxy-s8", _S8, _S8_INTERIOR, 1.7, 900.0,
+            drift_px=11.0, direction_deg=152.0, drift_c_mm=0.003, begin_degc=37.0, end_degc=43.0,
+            noise_ratio=1.2, distortion_drift=(1e-5, 0.0, 0.0),
+        ),
+        Preset(
+            "rpi-v2.1-heating", "Raspberry Pi camera v2.1, heated by a lamp, then left to cool",
+            "rpi-v2.1", _RPI, _RPI_INTERIOR, 2.0, 900.0,
+            drift_px=10.5, direction_deg=-150.0, drift_c_mm=0.005, begin_degc=25.0, end_degc=52.0,
+            noise_ratio=3.5, set_share=0.06, lamp=True, distortion_drift=(2e-5, -2e-5, -2e-5),
+        ),
+    )
+}  # fmt: skip
+"""The presets by name."""
+
+
+def preset_names() -> tuple[str, ...]:
+    """List the names of the presets."""
+    return tuple(PRESETS)
+
+
+def _device(preset: Preset) -> CameraDevice:
+    """Return a module close to a body that gives its heat to the air: 63 % of the way in 300 s."""
+    loss = 0.2375
+    network = HeatNetwork(
+        {"board": 15.0, "housing": 52.0, "lens": 0.8, "sensor": 0.4},
+        (
+            Link("board", "housing", 6.0),
+            Link("lens", "housing", 0.4),
+            Link("sensor", "lens", 0.2),
+            Link("housing", "ambient", loss),
+        ),
+    )
+    thermometers = {
+        "temperature": SimulatedThermometer("lens"),
+        "board_temperature": SimulatedThermometer("board"),
+    }
+    return CameraDevice(
+        preset.camera, preset.sensor, network, thermometers, distance=preset.distance_mm,
+        measuring=Measuring(),
+    )  # fmt: skip
+
+
+def _programme(preset: Preset, device: CameraDevice, series: str) -> Programme:
+    (loss,) = (k.conductance for k in device.network.links if k.second == "ambient")
+    duration = (_EPOCHS - 1) * _INTERVAL_S
+    ambient = preset.begin_degc if preset.lamp else 23.0
+    power = loss * (preset.end_degc - ambient)
+    if preset.lamp:
+        sources = {"housing": Course.steps([0.0, _HEATED_S, duration + 60.0], [power, 0.0])}
+    else:
+        sources = {"board": Course.constant(power)}
+    return Programme(
+        preset.name,
+        _EPOCHS,
+        _INTERVAL_S,
+        {"ambient": Course.constant(ambient)},
+        sources,
+        series,
+        initial=preset.begin_degc,
+    )
+
+
+def preset_simulation(
+    name: str, seed: int = 0, series: str = "M1", field: TestField | None = None
+) -> Simulation:
+    """Return a preset ready to run, by default before a corner field of 147 circles.
+
+    Raises ConfigurationError for a name that is not among the presets.
+    """
+    if name not in PRESETS:
+        raise ConfigurationError(f"unknown preset {name!r}; known are: {', '.join(PRESETS)}")
+    preset = PRESETS[name]
+    device = _device(preset)
+    programme = _programme(preset, device, series)
+    test_field = field if field is not None else corner_field("circles", 7, 90.0)
+    bare = ThermalModel(
+        preset.camera,
+        preset.sensor,
+        preset.begin_degc,
+        preset.interior,
+        exterior=corner_view(test_field, preset.distance_mm),
+        image_sigma=device.measuring.sigma,
+        name=preset.name,
+    )
+    # without jitter the temperature at the frames hangs neither on the seed nor on the drift
+    course = Simulation(bare, device, test_field, programme).true_history.temperature()
+    warming = float(np.max(np.abs(course - course[0])))
+    angle = np.deg2rad(preset.direction_deg)
+    way = preset.drift_px * preset.sensor.pixel_pitch * np.array([np.cos(angle), np.sin(angle)])
+    x0, y0 = (float(v) for v in way * (1.0 - preset.set_share) / warming)
+    model = replace(
+        bare,
+        rates={"c": preset.drift_c_mm / warming, "x0": x0, "y0": y0},
+        effects=tuple(_effects(preset, way, warming)),
+    )
+    return Simulation(model, device, test_field, programme, seed)
+
+
+def _effects(preset: Preset, way: Any, warming: float) -> list[ModelEffect]:
+    found = []
+    if preset.set_share:
+        x0, y0 = (float(v) for v in way * preset.set_share / warming)
+        stays = catalogue.find(lambda e: e.irreversible)
+        found.append(ModelEffect(stays.name, {"x0": x0, "y0": y0}))
+    a1, b1, b2 = preset.distortion_drift
+    if a1:
+        radial = catalogue.find(lambda e: e.usual == ("A1",))
+        found.append(ModelEffect(radial.name, {"A1": a1 / warming}))
+    if b1 or b2:
+        decentering = catalogue.find(lambda e: e.usual == ("B1", "B2"))
+        found.append(ModelEffect(decentering.name, {"B1": b1 / warming, "B2": b2 / warming}))
+    if preset.noise_ratio != 1.0:
+        noise = catalogue.seen_in("noise")
+        rise = (preset.noise_ratio - 1.0) / warming
+        found.append(ModelEffect(noise.name, dict.fromkeys(noise.linear, rise)))
+    return found
+
+
+def given_simulation(
+    preset: str | None = None,
+    model: Path | None = None,
+    camera: Path | None = None,
+    testfield: str | None = None,
+    programme: Path | None = None,
+    seed: int = 0,
+    series: str = "M1",
+    effects: Iterable[Path] = (),
+) -> Simulation:
+    """Return the simulation that a preset and files describe, effects of effect files added.
+
+    Raises UsageError where neither preset nor model and programme are given.
+    """
+    simulation = _described(preset, model, camera, testfield, programme, seed, series)
+    for path in effects:
+        found = simulation.model
+        for one in read_effects(path):
+            found = found.with_effect(one)
+        simulation = replace(simulation, model=found)
+    return simulation
+
+
+def _described(
+    preset: str | None,
+    model: Path | None,
+    camera: Path | None,
+    testfield: str | None,
+    programme: Path | None,
+    seed: int,
+    series: str,
+) -> Simulation:
+
+    field: TestField | None = load_field(testfield) if testfield is not None else None
+    if preset is not None:
+        simulation = preset_simulation(preset, seed, series, field)
+        if camera is not None:
+            simulation = replace(simulation, device=read_camera_device(camera))
+        if programme is not None:
+            simulation = replace(simulation, programme=read_programme(programme))
+        if model is not None:
+            simulation = replace(simulation, model=read_model(model))
+        return simulation
+    if model is None or programme is None:
+        raise UsageError(
+            f"give --preset ({', '.join(preset_names())}), or --model and --programme "
+            "(--camera and --testfield as well, where the usual ones do not fit)"
+        )
+    thermal = read_model(model)
+    if camera is not None:
+        device = read_camera_device(camera)
+    else:
+        network, thermometers = default_heat()
+        device = CameraDevice(thermal.camera, thermal.sensor, network, thermometers)
+    if field is None:
+        field = load_field("circles")
+    return Simulation(thermal, device, field, read_programme(programme), seed)
+
+
+def simulation_catalogue() -> dict[str, list[dict[str, Any]]]:
+    """Return presets and effects, as `simulate --list --json` writes them."""
+    return {
+        "presets": [{"preset": one.name, "about": one.about} for one in PRESETS.values()],
+        "effects": [
+            {"effect": name, "kind": effect.kind, "parameters": effect.units()}
+            for name in catalogue.names()
+            if (effect := catalogue.get(name))
+        ],
+    }
+
+
+def catalogue_lines() -> list[str]:
+    """Return presets and effects as lines for people."""
+    lines = ["presets", *(f"  {p.name:<18} {p.about}" for p in PRESETS.values())]
+    lines.append("effects (for model files)")
+    for name in catalogue.names():
+        effect = catalogue.get(name)
+        searched = ", ".join(f"{k} [{p.unit}]" for k, p in effect.nonlinear.items())
+        linear = ", ".join(f"{k} [{effect.linear[k]}]" for k in effect.usual)
+        lines.append(f"  {name:<24} {'; '.join(t for t in (searched, linear) if t)}")
+    return lines

@@ -1,0 +1,302 @@
+"""Rendered frames: what a camera sees of a test field, in grey values.
+
+The outline of every target is projected with its distortion, filled by exact area coverage, blurred
+by a Gaussian on the pixel grid, darkened towards the corners, given noise, and rounded to 8 bit.
+
+A frame is the same on every machine, bit for bit: positions, coverage and blur are made of IEEE
+operations alone (`portable`), the noise comes from PCG64's raw bits through integer tables, and the
+rest is fixed-point with 6 fractional bits, always odd, so that nothing is ever half-way.
+
+Source: blur, vignetting and noise as in Luhmann, T. et al. (2014): Close-Range Photogrammetry and
+3D Imaging, 2nd ed., chapter 3; vignetting is the first term of the cos⁴ law.
+
+Exact area coverage: which share of each pixel lies inside polygons.
+
+Every edge is cut at the pixels' borders; a piece inside one pixel adds the area to its right to
+the pixel, and its height to all pixels to the right of it, which one running sum along the rows
+turns into coverage. Nothing is sampled. Many polygons are done at once, in windows of their own.
+
+Source: the signed-area accumulation of scan converters, e.g. FreeType's smooth rasteriser.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from thermocald.physics.shapes import Outlines, gaussian_kernel, outlines, project, surface_normals
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from thermocald.arrays import Array
+    from thermocald.photogrammetry.camera.camera_model import Sensor
+    from thermocald.photogrammetry.field.testfield import TestField
+
+    Integers = NDArray[np.int64]
+
+_WIDTH_STEP = 16
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Windows:
+    """Windows of one width, stacked below each other.
+
+    members (k,): which shapes; left, top, height (k,) px: where they lie in the image;
+    row (k,): the first row of each in the stack; width px; rows: height of the stack.
+    """
+
+    members: Integers
+    left: Integers
+    top: Integers
+    height: Integers
+    row: Integers
+    width: int
+    rows: int
+
+
+def windows_around(low: Array, high: Array, margin: int) -> list[Windows]:
+    """Lay windows around shapes with bounds low, high (n, 2) px, with a margin px; by width."""
+    first = np.floor(low + 0.5).astype(np.int64) - margin
+    last = np.floor(high + 0.5).astype(np.int64) + margin + 1
+    width = -(-(last[:, 0] - first[:, 0] + 1) // _WIDTH_STEP) * _WIDTH_STEP
+    result = []
+    for w in np.unique(width):
+        members = np.flatnonzero(width == w)
+        height = last[members, 1] - first[members, 1] + 1
+        row = np.cumsum(height) - height
+        left, top = first[members].T
+        result.append(Windows(members, left, top, height, row, int(w), int(height.sum())))
+    return result
+
+
+def _cut_edges(a: Array, b: Array, axis: int) -> tuple[Array, Array, Integers, Integers]:
+    """Cut edges a → b (n, 2) at whole numbers of one axis: pieces a, b, cell, edge of each."""
+    fa = np.floor(a[:, axis]).astype(np.int64)
+    fb = np.floor(b[:, axis]).astype(np.int64)
+    pieces = np.abs(fb - fa) + 1
+    edge = np.repeat(np.arange(len(a)), pieces)
+    j = np.arange(len(edge)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    rising = (fb >= fa)[edge]
+    cell = np.where(rising, fa[edge] + j, fa[edge] - j)
+    begin, end = a[edge], b[edge]
+    other = 1 - axis
+    delta = end[:, axis] - begin[:, axis]
+    slope = (end[:, other] - begin[:, other]) / np.where(delta != 0.0, delta, 1.0)
+    inner_begin, inner_end = j > 0, j < pieces[edge] - 1
+    line_begin = np.where(rising, cell, cell + 1)
+    line_end = np.where(rising, cell + 1, cell)
+    start = begin[:, other] + (line_begin - begin[:, axis]) * slope
+    stop = begin[:, other] + (line_end - begin[:, axis]) * slope
+    new_a, new_b = np.empty_like(begin), np.empty_like(begin)
+    new_a[:, axis] = np.where(inner_begin, line_begin, begin[:, axis])
+    new_a[:, other] = np.where(inner_begin, start, begin[:, other])
+    new_b[:, axis] = np.where(inner_end, line_end, end[:, axis])
+    new_b[:, other] = np.where(inner_end, stop, end[:, other])
+    return new_a, new_b, cell, edge
+
+
+def coverage(
+    a: Array, b: Array, sign: Array, shape: Integers, windows: Windows
+) -> NDArray[np.float32]:
+    """Return the signed coverage (rows, width) of the windows.
+
+    a, b (e, 2) px: the polygons' edges; sign (e,): +1 for polygons that run clockwise in the image
+    (y down) and are to be added; shape (e,): the member (place in `windows`) each belongs to.
+    """
+    # a pixel's cell is [i, i+1) after the shift by half a pixel
+    origin = np.stack([windows.left, windows.top - windows.row], axis=1)[shape] - 0.5
+    a1, b1, cy, edge1 = _cut_edges(a - origin, b - origin, 1)
+    a2, b2, cx, edge2 = _cut_edges(a1, b1, 0)
+    dy = (b2[:, 1] - a2[:, 1]) * sign[edge1[edge2]]
+    right = 0.5 * (a2[:, 0] + b2[:, 0]) - cx
+    # the row is the first cut's: the second one's rounding cannot move it
+    cell = cy[edge2] * windows.width + cx
+    size = windows.rows * windows.width
+    area = (
+        np.bincount(cell, dy * (1.0 - right), size)
+        + np.bincount(cell + 1, dy * right, size + 1)[:size]
+    )
+    # each row sums to 0: a running sum over all rows is a running sum over each
+    return -np.cumsum(area).reshape(windows.rows, windows.width).astype(np.float32)
+
+
+def blur(stack: NDArray[np.float32], kernel: Array) -> NDArray[np.float32]:
+    """Convolve along both axes with a symmetric kernel (2n+1,); the margins must hold zeros."""
+    n = len(kernel) // 2
+    for axis in (0, 1):
+        k = kernel.astype(np.float32)
+        moved = np.moveaxis(stack, axis, 0)
+        out = np.multiply(moved, k[n])
+        part = np.empty_like(moved)
+        for d in range(1, n + 1):
+            inner = part[d:-d]
+            np.add(moved[2 * d :], moved[: -2 * d], out=inner)
+            np.multiply(inner, k[n + d], out=inner)
+            np.add(out[d:-d], inner, out=out[d:-d])
+        stack = np.moveaxis(out, 0, axis)
+    return stack
+
+
+_FRACTION = 64  # fixed-point steps per DN
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """Grey values and optics: paper and ink DN, blur (Gaussian sigma) px, noise sigma DN, and the
+    share of light that the image corners lose.
+    """
+
+    paper_dn: float = 200.0
+    ink_dn: float = 30.0
+    blur_px: float = 0.8
+    noise_dn: float = 2.0
+    vignetting: float = 0.15
+
+
+@lru_cache(maxsize=2)
+def _compute_gain(sensor: Sensor, vignetting: float) -> NDArray[np.float32]:
+    """Return the share of light (H, W) that arrives: 1 - v (r / r_corner)²."""
+    cx, cy = (sensor.width - 1) / 2, (sensor.height - 1) / 2
+    x2 = (np.arange(sensor.width) - cx) ** 2
+    y2 = (np.arange(sensor.height) - cy) ** 2
+    share = vignetting / (cx * cx + cy * cy)
+    return (1.0 - share * (y2[:, None] + x2[None, :])).astype(np.float32)
+
+
+@lru_cache(maxsize=2)
+def _draw_paper(sensor: Sensor, paper_dn: float, vignetting: float) -> NDArray[np.int16]:
+    """Return the empty scene in fixed point, even numbers."""
+    half = np.float32(paper_dn * _FRACTION / 2)
+    fixed: NDArray[np.int16] = np.rint(_compute_gain(sensor, vignetting) * half).astype(np.int16)
+    return fixed + fixed
+
+
+@lru_cache(maxsize=8)
+def _make_noise_tables(sigma_dn: float) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
+    """Make two tables (256,) whose sum over two random bytes is normal with this sigma, and odd."""
+    from scipy.special import ndtri
+
+    quantiles = ndtri((np.arange(256) + 0.5) / 256)
+    quantiles *= sigma_dn * _FRACTION / np.sqrt(2.0) / float(np.std(quantiles))
+    even = 2 * np.rint(quantiles / 2).astype(np.int16)
+    # symmetric about 0 in steps of 2: half a step above, half below
+    odd = 2 * np.floor(quantiles / 2).astype(np.int16) + 1
+    return even, odd
+
+
+class Scene:
+    """A test field to be photographed; keeps what does not change between frames."""
+
+    def __init__(self, sensor: Sensor, field: TestField, look: Look | None = None) -> None:
+        self.sensor = sensor
+        self.field = field
+        self.look = look or Look()
+        self._normals = surface_normals(field)
+        self._facing = np.zeros(len(field), dtype=bool)
+        self._outlines: Outlines | None = None
+
+    def _shapes(self, centre: Array) -> Outlines:
+        """Return the outlines seen from a point (3,) mm: its side decides how ring codes run."""
+        facing = np.sum(self._normals * (centre - self.field.points), axis=1) > 0
+        if self._outlines is None or not np.array_equal(facing, self._facing):
+            self._facing = facing
+            normals = np.where(facing[:, None], self._normals, -self._normals)
+            self._outlines = outlines(self.field, normals)
+        return self._outlines
+
+    def render(
+        self,
+        iop: Array,
+        eop: Array,
+        points: Array | None = None,
+        seed: int | Sequence[int] = 0,
+        blur_factor: float = 1.0,
+    ) -> NDArray[np.uint8]:
+        """Render a frame (H, W) 8 bit.
+
+        iop (10,), eop (6,); points (n, 3) mm: where the targets are now (default: the field's);
+        seed: of the noise; blur_factor: how much the blur has grown.
+        """
+        # what comes from outside may differ in its last bits; what is rounded away is below 1e-5 px
+        iop, eop = np.round(iop, 10), np.concatenate([np.round(eop[:3], 10), np.round(eop[3:], 6)])
+        where = self.field.points if points is None else np.round(points, 6)
+        look = self.look
+        canvas = _draw_paper(self.sensor, look.paper_dn, look.vignetting).copy()
+        self._draw(canvas, iop, eop, where, blur_factor)
+        if look.noise_dn > 0:
+            even, odd = _make_noise_tables(look.noise_dn)
+            size = canvas.size
+            raw = np.random.PCG64(seed).random_raw(-(-2 * size // 8)).astype("<u8", copy=False)
+            random_bytes = raw.view(np.uint8)[: 2 * size].reshape(2, *canvas.shape)
+            first, second = cv2.LUT(random_bytes[0], even), cv2.LUT(random_bytes[1], odd)
+            cv2.add(first, second, dst=first)
+            noisy = cv2.addWeighted(canvas, 1 / _FRACTION, first, 1 / _FRACTION, 0, dtype=cv2.CV_8U)
+        else:
+            canvas += 1
+            noisy = cv2.addWeighted(canvas, 1 / _FRACTION, canvas, 0.0, 0, dtype=cv2.CV_8U)
+        return np.asarray(noisy, dtype=np.uint8)
+
+    def _draw(
+        self, canvas: NDArray[np.int16], iop: Array, eop: Array, points: Array, blur_factor: float
+    ) -> None:
+        shapes = self._shapes(eop[3:6])
+        if not len(shapes.centre):
+            return
+        image = project(self.sensor, iop, eop, shapes.vertices(points))
+        count = len(shapes.centre)
+        begins = np.flatnonzero(np.diff(shapes.shape, prepend=-1))
+        low = np.minimum.reduceat(image, begins)
+        high = np.maximum.reduceat(image, begins)
+        towards = eop[3:6] - points[shapes.centre]
+        seen = np.sum(towards * shapes.normal, axis=1) > 0
+        with np.errstate(invalid="ignore"):
+            edge = np.array([self.sensor.width, self.sensor.height])
+            seen &= np.all((high > -0.5) & (low < edge - 0.5), axis=1)
+            # a shape far larger than the image would need a window to match: it is behind or beside
+            seen &= np.all(high - low < edge, axis=1)
+        if not seen.any():
+            return
+        rank = np.cumsum(seen) - 1
+        edges = seen[shapes.shape]
+        a, b = image[edges], image[shapes.following[edges]]
+        member = rank[shapes.shape[edges]]
+        sign = shapes.sign[edges]
+        kernel = gaussian_kernel(self.look.blur_px * blur_factor)
+        margin = len(kernel) // 2
+        depth = np.float32((self.look.paper_dn - self.look.ink_dn) * _FRACTION / 2)
+        gain = _compute_gain(self.sensor, self.look.vignetting)
+        place = np.empty(count, dtype=np.int64)
+        for windows in windows_around(low[seen], high[seen], margin):
+            place[:] = -1
+            place[windows.members] = np.arange(len(windows.members))
+            mine = place[member] >= 0
+            stack = coverage(a[mine], b[mine], sign[mine], place[member[mine]], windows)
+            stack = blur(stack, kernel)
+            for k in range(len(windows.members)):
+                self._paste(canvas, gain, stack, depth, windows, k)
+
+    def _paste(
+        self,
+        canvas: NDArray[np.int16],
+        gain: NDArray[np.float32],
+        stack: NDArray[np.float32],
+        depth: np.float32,
+        windows: Windows,
+        k: int,
+    ) -> None:
+        """Take the ink of one window off the canvas."""
+        row, left, top = windows.row[k], windows.left[k], windows.top[k]
+        y0, y1 = max(0, top), min(self.sensor.height, top + windows.height[k])
+        x0, x1 = max(0, left), min(self.sensor.width, left + windows.width)
+        if y0 >= y1 or x0 >= x1:
+            return
+        ink = stack[row + y0 - top : row + y1 - top, x0 - left : x1 - left]
+        taken = np.rint(ink * gain[y0:y1, x0:x1] * depth).astype(np.int16)
+        canvas[y0:y1, x0:x1] -= taken + taken

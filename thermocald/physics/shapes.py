@@ -1,0 +1,317 @@
+"""What targets look like: the outlines of discs, coded rings and markers, in object space.
+
+Outlines are polygons in the target's plane that move with the target. The plane of a circle is not
+in the test field's file: it is the plane through the target that holds most of the others.
+
+Arithmetic whose last bit is the same on every machine.
+
+Libraries of mathematical functions, fused multiply-add and vectorised sums differ in their last
+bits between machines, and a pixel value on the verge of rounding would flip. IEEE 754 fixes
+addition, multiplication, division and square root alone; NumPy's element-wise operations on arrays
+round each of them separately. What a rendered frame depends on is made of these.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.photogrammetry.camera.camera_model import distort, image_to_px
+from thermocald.photogrammetry.targets import outline, ring_code
+from thermocald.photogrammetry.targets.markers import is_marker, marker_cells, parse_marker
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    from thermocald.arrays import Array
+    from thermocald.photogrammetry.camera.camera_model import Sensor
+    from thermocald.photogrammetry.field.testfield import TestField
+
+    Integers = NDArray[np.int64]
+
+# π/2 in two parts: multiples of the first are exact for the angles that occur
+_HALF_PI_HIGH = 1.5707963267341256
+_HALF_PI_LOW = 6.077100506506192e-11
+
+
+def sin_cos(angles: ArrayLike) -> tuple[Array, Array]:
+    """Return sine and cosine (...,) of angles in rad, to 1e-15, by their series on ±π/4."""
+    a = np.asarray(angles, dtype=float)
+    quarter = np.rint(a / 1.5707963267948966)
+    x = (a - quarter * _HALF_PI_HIGH) - quarter * _HALF_PI_LOW
+    x2 = x * x
+    s, c = np.zeros_like(x), np.zeros_like(x)
+    for n in range(9, 0, -1):
+        s = (1.0 + s) * (x2 / (-(2.0 * n) * (2.0 * n + 1.0)))
+        c = (1.0 + c) * (x2 / (-(2.0 * n) * (2.0 * n - 1.0)))
+    s, c = x * (1.0 + s), 1.0 + c
+    turn = quarter.astype(np.int64) % 4
+    swapped = turn % 2 == 1
+    sine, cosine = np.where(swapped, c, s), np.where(swapped, s, c)
+    return np.where(turn >= 2, -sine, sine), np.where((turn == 1) | (turn == 2), -cosine, cosine)
+
+
+def rotation(angles: ArrayLike) -> Array:
+    """Return R (3, 3) of omega, phi, kappa (CONVENTIONS §1), camera to object."""
+    sine, cosine = sin_cos(angles)
+    so, sp, sk = (float(v) for v in sine)
+    co, cp, ck = (float(v) for v in cosine)
+    return np.array(
+        [
+            [cp * ck, -cp * sk, sp],
+            [co * sk + so * sp * ck, co * ck - so * sp * sk, -so * cp],
+            [so * sk - co * sp * ck, so * ck + co * sp * sk, co * cp],
+        ]
+    )
+
+
+def project(sensor: Sensor, iop: Array, eop: Array, points: Array) -> Array:
+    """Project object points (n, 3) mm to image points (n, 2) px as `camera_model.project` does.
+
+    Without matrix products. NaN for points not in front of the camera.
+    """
+    r = rotation(eop[:3])
+    dx, dy, dz = (points[:, k] - eop[3 + k] for k in range(3))
+    xc, yc, zc = (dx * r[0, k] + dy * r[1, k] + dz * r[2, k] for k in range(3))
+    scale = iop[0] / np.where(zc < 0, -zc, np.nan)
+    return image_to_px(sensor, np.stack(distort(iop, scale * xc, scale * yc), axis=1))
+
+
+def gaussian_kernel(sigma: float) -> Array:
+    """Return a normalised Gaussian (2n+1,) on the pixel grid, n = ⌈4 σ⌉; just [1] where σ is 0."""
+    if sigma <= 0:
+        return np.ones(1)
+    n = int(np.ceil(4.0 * sigma))
+    # exp(-k²/2σ²) from the one number exp(-1/2σ²), itself from its series after halving 10 times
+    x = -0.5 / (sigma * sigma) / 1024.0
+    e = 1.0
+    for k in range(14, 0, -1):
+        e = 1.0 + e * x / k
+    for _ in range(10):
+        e = e * e
+    half = [1.0]
+    power, odd = 1.0, e
+    for _ in range(n):
+        power = power * odd
+        odd = odd * e * e
+        half.append(power)
+    total = half[0]
+    for value in half[1:]:
+        total = total + 2.0 * value
+    return np.array([*half[:0:-1], *half]) / total
+
+
+_CIRCLE_EDGES = 96
+_EDGES_PER_MODULE = 3  # a straight edge is bent by the distortion
+_NEIGHBOURS = 12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outlines:
+    """Polygons of all targets, as vertices that hang on the targets.
+
+    A vertex is Σ weights × points[rows] + offset. rows (v, 4), weights (v, 4), offset (v, 3) mm;
+    following (v,): the next vertex of the same polygon; sign (v,): +1 ink, -1 paper again;
+    shape (v,): which target (or marker) it belongs to; counts: number of shapes;
+    centre (s,), normal (s, 3): row of a target and plane of each shape.
+    """
+
+    rows: Integers
+    weights: Array
+    offset: Array
+    following: Integers
+    sign: Array
+    shape: Integers
+    centre: Integers
+    normal: Array
+
+    def vertices(self, points: Array) -> Array:
+        """Return the vertices (v, 3) mm, with the targets at points (n, 3)."""
+        p = self.offset.copy()
+        for k in range(4):
+            p += self.weights[:, k : k + 1] * points[self.rows[:, k]]
+        return p
+
+
+def surface_normals(field: TestField) -> Array:
+    """Find unit normals (n, 3) of the planes the targets lie in; the sign is arbitrary.
+
+    Candidates are the planes through a target and two of its neighbours; the one that holds most
+    targets wins, of several the one whose targets are nearest.
+    """
+    p = field.points
+    n = len(p)
+    if n < 3:
+        return np.tile([0.0, 0.0, 1.0], (n, 1))
+    spread = float(np.linalg.norm(np.ptp(p, axis=0)))
+    tolerance = 0.002 * spread + 3.0 * float(np.nanmax(field.sigmas, initial=0.0))
+    normals = np.zeros((n, 3))
+    for i in range(n):
+        distance = np.linalg.norm(p - p[i], axis=1)
+        near = np.argsort(distance, kind="stable")[1 : _NEIGHBOURS + 1]
+        first, second = np.triu_indices(len(near), 1)
+        u, v = p[near[first]] - p[i], p[near[second]] - p[i]
+        cross = np.cross(u, v)
+        size = np.linalg.norm(cross, axis=1)
+        good = size > 0.2 * np.linalg.norm(u, axis=1) * np.linalg.norm(v, axis=1)
+        if not good.any():
+            normals[i] = (0.0, 0.0, 1.0)
+            continue
+        candidates = cross[good] / size[good, None]
+        inside = np.abs((p - p[i]) @ candidates.T) < tolerance
+        score = inside.sum(axis=0) - 1e-3 * (inside * (distance / spread)[:, None]).mean(axis=0)
+        best = candidates[int(np.argmax(score))]
+        members = p[inside[:, int(np.argmax(score))]]
+        # the plane of all its targets: grid planes come out exact to the coordinates' last digits
+        _, _, axes = np.linalg.svd(members - members.mean(axis=0))
+        refined = axes[2] * np.sign(axes[2] @ best)
+        # rounding keeps the last bits of the decomposition, which differ between machines, out
+        normals[i] = np.round(refined, 9)
+    return normals
+
+
+def _find_basis(normal: Array) -> tuple[Array, Array]:
+    """Return `right` and `down` in the plane, for a viewer whom the normal points at."""
+    helper = np.array([0.0, 0.0, 1.0]) if abs(normal[2]) < 0.7 else np.array([0.0, 1.0, 0.0])
+    right = np.array(
+        [
+            helper[1] * normal[2] - helper[2] * normal[1],
+            helper[2] * normal[0] - helper[0] * normal[2],
+            helper[0] * normal[1] - helper[1] * normal[0],
+        ]
+    )
+    right = right / np.sqrt(right[0] * right[0] + right[1] * right[1] + right[2] * right[2])
+    up = np.array(
+        [
+            normal[1] * right[2] - normal[2] * right[1],
+            normal[2] * right[0] - normal[0] * right[2],
+            normal[0] * right[1] - normal[1] * right[0],
+        ]
+    )
+    return right, -up
+
+
+def _lay_arc(turns: Array) -> Array:
+    sine, cosine = sin_cos(2.0 * np.pi * turns)
+    return np.stack([cosine, sine], axis=1)
+
+
+def _disc_polygons(diameter: float, code: str) -> list[Array]:
+    """Return the outlines (k, 2) mm of a plain or ring-coded disc in (right, down)."""
+    angle = 2.0 * np.pi / _CIRCLE_EDGES
+    # the polygon has the area of the circle
+    radius = 0.5 * diameter * float(np.round(np.sqrt(angle / np.sin(angle)), 12))
+    disc = radius * _lay_arc(np.arange(_CIRCLE_EDGES) / _CIRCLE_EDGES)
+    polygons = [disc]
+    if ring_code.is_ring(code):
+        for begin, end in ring_code.segments(*ring_code.parse(code)):
+            turns = np.linspace(begin, end, max(3, round((end - begin) * _CIRCLE_EDGES) + 1))
+            arc = _lay_arc(turns)
+            polygons.append(
+                radius * np.concatenate([outline.RING_OUTER * arc, outline.RING_INNER * arc[::-1]])
+            )
+    return polygons
+
+
+@lru_cache(maxsize=1024)
+def _marker_polygons(dictionary: str, marker: int) -> tuple[tuple[float, Array], ...]:
+    """Return (sign, outline (k, 2) in sides, from corner 0 to 1 and to 3) of a marker."""
+    pattern = ~marker_cells(dictionary, marker)
+    modules = len(pattern)
+    result = [(1.0, _lay_box(0, 0, modules, modules) / modules)]
+    for y in range(modules):
+        x = 0
+        while x < modules:
+            if pattern[y, x]:
+                end = x
+                while end < modules and pattern[y, end]:
+                    end += 1
+                result.append((-1.0, _lay_box(x, y, end, y + 1) / modules))
+                x = end
+            else:
+                x += 1
+    return tuple(result)
+
+
+def _lay_box(x0: int, y0: int, x1: int, y1: int) -> Array:
+    sides = []
+    corners = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
+    for (ax, ay), (bx, by) in zip(corners, corners[1:] + corners[:1], strict=True):
+        steps = (abs(bx - ax) + abs(by - ay)) * _EDGES_PER_MODULE
+        t = np.arange(steps) / steps
+        sides.append(np.stack([ax + (bx - ax) * t, ay + (by - ay) * t], axis=1))
+    return np.concatenate(sides)
+
+
+def outlines(field: TestField, normals: Array) -> Outlines:
+    """Return the outlines of all targets that can be drawn; normals (n, 3) point at the viewer.
+
+    Circles without a diameter, and markers of which the field lacks a corner, are left out.
+    """
+    rows, weights, offset, sign, counts, shape = [], [], [], [], [], []
+    centre: list[int] = []
+    normal: list[Array] = []
+    markers: dict[tuple[str, int], dict[int, int]] = {}
+    for i in range(len(field)):
+        if field.kinds[i] == "marker_corner":
+            if is_marker(field.codes[i]):
+                dictionary, marker, corner = parse_marker(field.codes[i])
+                if corner is not None:
+                    markers.setdefault((dictionary, marker), {})[corner] = i
+            continue
+        if not field.diameters[i] > 0:
+            continue
+        right, down = _find_basis(normals[i])
+        for polygon in _disc_polygons(float(field.diameters[i]), field.codes[i]):
+            k = len(polygon)
+            rows.append(np.full((k, 4), i))
+            weights.append(np.tile([1.0, 0.0, 0.0, 0.0], (k, 1)))
+            offset.append(polygon[:, :1] * right + polygon[:, 1:] * down)
+            sign.append(np.ones(k))
+            counts.append(k)
+            shape.append(np.full(k, len(centre)))
+        centre.append(i)
+        normal.append(normals[i])
+    for (dictionary, marker), corners in markers.items():
+        if len(corners) < 4:
+            continue
+        order = [corners[k] for k in range(4)]
+        for s, polygon in _marker_polygons(dictionary, marker):
+            u, v = polygon[:, 0], polygon[:, 1]
+            k = len(polygon)
+            rows.append(np.tile(order, (k, 1)))
+            weights.append(np.stack([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v], axis=1))
+            offset.append(np.zeros((k, 3)))
+            sign.append(np.full(k, s))
+            counts.append(k)
+            shape.append(np.full(k, len(centre)))
+        centre.append(order[0])
+        side, other = (
+            field.points[order[1]] - field.points[order[0]],
+            (field.points[order[3]] - field.points[order[0]]),
+        )
+        # corners run clockwise for the viewer: right × down points away from him
+        normal.append(-np.cross(side, other))
+    if not centre:
+        nothing = np.zeros(0, dtype=np.int64)
+        return Outlines(
+            np.zeros((0, 4), np.int64), np.zeros((0, 4)), np.zeros((0, 3)),
+            nothing, np.zeros(0), nothing, nothing, np.zeros((0, 3)),
+        )  # fmt: skip
+    sizes = np.array(counts)
+    first = np.cumsum(sizes) - sizes
+    following = np.arange(sizes.sum()) + 1
+    following[first + sizes - 1] = first
+    return Outlines(
+        np.concatenate(rows).astype(np.int64),
+        np.concatenate(weights),
+        np.concatenate(offset),
+        following.astype(np.int64),
+        np.concatenate(sign),
+        np.concatenate(shape).astype(np.int64),
+        np.array(centre, dtype=np.int64),
+        np.array(normal),
+    )

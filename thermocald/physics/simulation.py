@@ -1,0 +1,276 @@
+"""From a model and a programme to a recording: temperatures, image points, and frames if wanted.
+
+What is simulated in order: the heat network's temperatures on the true time axis; from the true
+temperature at the reference thermometer's place, through the model, orientation and object points
+at each frame's time; the image points with their noise, targets that are missed, and gross
+errors; the thermometers' readings at their own times. The image noise that is written alongside
+each point is the nominal one: where heat defocuses, the points scatter more than they say.
+
+Each kind of chance has its own stream of random numbers, so that changing one (more missing
+readings) leaves the others (the image noise) as they were.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.epoch import Epoch
+from thermocald.errors import ConfigurationError, GeometryError
+from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation, project
+from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.physics.history import History
+from thermocald.physics.testfields import corner_view
+from thermocald.store.recording.reader import CameraSpec, Channel, Head, RecordingWriter
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from thermocald.arrays import Array
+    from thermocald.physics.device import CameraDevice, Programme
+    from thermocald.physics.model import Prediction, ThermalModel
+
+_CHUNK = 64  # epochs at a time
+_MARGIN_PX = 5.0  # a target nearer to the image's edge is not measured
+_FINEST_STEPS = 10  # knots of the true temperature per interval
+_LONG = 20_000  # epochs from which one knot per interval has to do
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """One series of one camera, simulated; everything random depends on `seed`."""
+
+    model: ThermalModel
+    device: CameraDevice
+    field: TestField
+    programme: Programme
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.model.sensor != self.device.sensor:
+            a, b = self.model.sensor, self.device.sensor
+            raise ConfigurationError(
+                f"the model is of {self.model.camera} ({a.width}×{a.height} px, {a.pixel_pitch:g} "
+                f"mm), the camera file of {self.device.name} ({b.width}×{b.height} px, "
+                f"{b.pixel_pitch:g} mm); a model belongs to one camera"
+            )
+
+    def _rng(self, stream: int) -> np.random.Generator:
+        return np.random.Generator(np.random.PCG64([self.seed, stream]))
+
+    @cached_property
+    def frame_times(self) -> Array:
+        """The frames' times (E,), s from the start."""
+        return self.programme.frame_times(self._rng(0))
+
+    @cached_property
+    def reading_times(self) -> Array:
+        """The readings' times (E,), s from the start."""
+        return self.programme.reading_times(self.frame_times, self._rng(1))
+
+    @cached_property
+    def exterior(self) -> ExteriorOrientation:
+        """Where the camera stands: by the model, else by the camera file, else before the field."""
+        return (
+            self.model.exterior
+            or self.device.exterior
+            or corner_view(self.field, self.device.distance)
+        )
+
+    @cached_property
+    def true_history(self) -> History:
+        """The true temperatures at the thermometers' places; `times` are the frames'."""
+        frames, p = self.frame_times, self.programme
+        steps = _FINEST_STEPS if p.epochs <= _LONG else 1
+        last = max(float(frames[-1]), float(self.reading_times[-1]))
+        regular = np.arange(0.0, last + p.interval / steps, p.interval / steps)
+        grid = np.unique(np.concatenate([frames, regular]))
+        initial = p.initial
+        if initial is None:
+            initial = float(p.boundaries["ambient"].after(0.0))
+        bodies = self.device.network.solve(grid, initial, p.sources, p.boundaries)
+        channels = {name: bodies[t.body] for name, t in self.device.thermometers.items()}
+        return History(frames, grid, channels, self.device.reference, self.model.T0)
+
+    @cached_property
+    def truth(self) -> Prediction:
+        """What the model says at the frames' times."""
+        from dataclasses import replace
+
+        model = replace(self.model, exterior=self.exterior)
+        return model.predict(self.true_history, self.field)
+
+    @cached_property
+    def readings(self) -> dict[str, Array]:
+        """What the thermometers said, {channel: (E,) °C}, NaN where one failed."""
+        true = self.true_history
+        return {
+            name: thermometer.read(
+                true.reading_times, true.readings[name], self.reading_times, self._rng(10 + i)
+            )
+            for i, (name, thermometer) in enumerate(self.device.thermometers.items())
+        }
+
+    @property
+    def head(self) -> Head:
+        """The recording's head; the model it was made with stands in it."""
+        sensor = self.model.sensor
+        return Head(
+            f"{self.device.name}-{self.programme.series}",
+            self.programme.series,
+            self.programme.interval,
+            CameraSpec(self.device.name, sensor, float(round(self.model.interior.c, 2))),
+            {
+                name: Channel("degC", t.resolution or None)
+                for name, t in self.device.thermometers.items()
+            },
+            {"simulated": {"model": self.model.name, "version": self.model.version,
+                           "programme": self.programme.name, "seed": self.seed}},
+        )  # fmt: skip
+
+    def image_points(self, epochs: slice) -> Array:
+        """Return the true image points (e, n, 2) px of all targets; NaN behind the camera."""
+        t = self.truth
+        still = self.field.points
+        points = t.points(still, epochs) if t.moves_points else still
+        return project(self.model.sensor, t.iop[epochs], t.eop[epochs], points)
+
+    def observations(self) -> Iterator[Observations]:
+        """Yield the measured image points of each epoch; memory does not grow with their number.
+
+        Raises GeometryError where the camera sees fewer than 3 targets at the start.
+        """
+        measuring, rng = self.device.measuring, self._rng(2)
+        n = len(self.field)
+        stated = np.full((n, 2), measuring.sigma)
+        for begin in range(0, self.programme.epochs, _CHUNK):
+            epochs = slice(begin, min(begin + _CHUNK, self.programme.epochs))
+            true = self.image_points(epochs)
+            count = len(true)
+            noise = rng.standard_normal((count, n, 2))
+            missed = rng.random((count, n)) < measuring.missed
+            gross = rng.random((count, n)) < measuring.gross
+            wrong = rng.standard_normal((count, n, 2)) * measuring.gross_size
+            factor = measuring.sigma * self.truth.noise_factor[epochs]
+            with np.errstate(invalid="ignore"):
+                seen = self.model.sensor.contains(true, _MARGIN_PX) & ~missed
+            measured = true + factor[:, None, None] * noise + gross[..., None] * wrong
+            if begin == 0 and int(seen[0].sum()) < 3:
+                raise GeometryError(
+                    f"the camera sees {int(seen[0].sum())} of {n} targets; let it look at the "
+                    "field (exterior or distance in the camera file)"
+                )
+            for k in range(count):
+                rows = np.flatnonzero(seen[k])
+                yield Observations(rows, measured[k, rows], stated[rows])
+
+    def epochs(self) -> Iterator[Epoch]:
+        """Yield the epochs of the recording with their observations."""
+        begin = self.programme.begin
+        readings = list(self.readings.items())
+        for i, observations in enumerate(self.observations()):
+            yield Epoch(
+                number=i + 1,
+                frame_time=float(begin + self.frame_times[i]),
+                temperature_time=float(begin + self.reading_times[i]),
+                temperatures={name: float(values[i]) for name, values in readings},
+                observations=observations,
+            )
+
+    def frames(self) -> Iterator[NDArray[np.uint8]]:
+        """Render the frames (H, W), one after the other."""
+        from thermocald.physics.scene import Scene
+
+        scene = Scene(self.model.sensor, self.field, self.device.look)
+        t = self.truth
+        for i in range(self.programme.epochs):
+            points = t.points(self.field.points, slice(i, i + 1))[0] if t.moves_points else None
+            yield scene.render(
+                t.iop[i], t.eop[i], points, self.seed * 1_000_003 + i, float(t.blur_factor[i])
+            )
+
+    def write(
+        self,
+        path: Path,
+        with_frames: bool = False,
+        advance: Callable[[int], None] = lambda _: None,
+    ) -> None:
+        """Write the recording: observations, or with frames those alone (they are to be measured).
+
+        advance: called with the number of epochs done. Raises RecordingError if `path` exists.
+        """
+        frames = self.frames() if with_frames else None
+        with RecordingWriter(path, self.head, self.field) as writer:
+            for epoch in self._frame_epochs() if with_frames else self.epochs():
+                image = next(frames) if frames is not None else None
+                writer.append(epoch, None if image is None else _jpeg(image))
+                advance(1)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the document that `simulate` writes with `--json`."""
+        truth, model = self.truth, self.model
+        temperature = self.true_history.temperature()
+        moved = truth.iop - truth.iop[0]
+        pitch = model.sensor.pixel_pitch
+        return {
+            "format": "thermocald-simulation/1",
+            "series": self.programme.series,
+            "seed": self.seed,
+            "epochs": self.programme.epochs,
+            "targets": len(self.field),
+            "model": {
+                "name": model.name or model.camera,
+                "version": model.version,
+                "effects": [effect.name for effect in model.effects],
+            },
+            "temperature": {
+                "first": float(temperature[0]),
+                "last": float(temperature[-1]),
+                "highest": float(temperature.max()),
+            },
+            "drift": {
+                "principal_point_px": float(np.hypot(moved[:, 1], moved[:, 2]).max() / pitch),
+                "principal_point_last_px": float(np.hypot(moved[-1, 1], moved[-1, 2]) / pitch),
+                "c_mm": float(moved[np.argmax(np.abs(moved[:, 0])), 0]),
+            },
+            "noise_factor": {"first": float(truth.noise_factor[0]),
+                             "highest": float(truth.noise_factor.max())},
+        }  # fmt: skip
+
+    def lines(self) -> list[str]:
+        """Return the line that `simulate` prints."""
+        found = self.as_dict()
+        drift, degrees = found["drift"], found["temperature"]
+        return [
+            (
+                f"{found['epochs']} epochs, {found['targets']} targets, {degrees['first']:.1f} to "
+                f"{degrees['highest']:.1f} °C, principal point moved by up to "
+                f"{drift['principal_point_px']:.1f} px, principal distance by "
+                f"{drift['c_mm'] * 1000:.1f} µm"
+            )
+        ]
+
+    def _frame_epochs(self) -> Iterator[Epoch]:
+        begin = self.programme.begin
+        for i in range(self.programme.epochs):
+            yield Epoch(
+                i + 1,
+                float(begin + self.frame_times[i]),
+                float(begin + self.reading_times[i]),
+                {name: float(values[i]) for name, values in self.readings.items()},
+            )
+
+
+def _jpeg(image: NDArray[np.uint8]) -> bytes:
+    import simplejpeg
+
+    data: bytes = simplejpeg.encode_jpeg(
+        np.ascontiguousarray(image[:, :, None]), quality=95, colorspace="GRAY"
+    )
+    return data

@@ -1,1 +1,0 @@
-"""A series reduced to small normal equations, and the hypotheses that are fitted to it."""

@@ -1,1 +1,0 @@
-"""The simulation: bodies that warm, effects on the camera, observations and rendered frames."""

@@ -1,1 +1,0 @@
-"""Formulas: a recorded quantity through operators, as text that is read and never executed."""

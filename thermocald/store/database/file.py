@@ -1,0 +1,423 @@
+"""The SQLite file of a store: locked for one writer, opened, copied, its errors in words.
+
+The lock is on the file itself, whatever name it was opened by.
+SQLite keeps what was committed last in the file `<store>-wal` until it is moved into the store. To
+read it, the helper file `-shm` must be there, or be made; a file opened with `immutable=1`
+is read without it, and lacks those epochs.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import logging
+import os
+import shutil
+import sqlite3
+import tempfile
+import uuid
+from contextlib import closing, contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from thermocald.atomic_file import cannot_write, output_place
+from thermocald.errors import StoreError, StoreFullError, StoreVersionError, ThermocaldError
+from thermocald.store import schema
+from thermocald.store.database.columns import DamageError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+log = logging.getLogger(__name__)
+
+Mode = Literal["read", "append"]
+
+_APPLICATION_ID = 0x74686572  # "ther": distinguishes our files from other SQLite files
+# 4 KiB pages would hold one row of 2.1 to 4 kB each and stand half empty.
+_PAGE_SIZE = 8192
+_BUSY_S = 10.0
+# A quota or a limit on the size of files shows as an error of writing or growing a file.
+_NO_ROOM = ("SQLITE_FULL", "SQLITE_IOERR_WRITE", "SQLITE_IOERR_TRUNCATE", "SQLITE_IOERR_SHMSIZE")
+# A small card must not be full of what waits to be moved; a replay need not sync so often.
+_WAL_LIMIT_BYTES = {True: 1_000_000, False: 4_000_000}  # durable or not
+_MMAP_BYTES = 2**31 - 1
+_ATTEMPTS = 3
+# SQLite's own locks of a file end when any descriptor of it is closed by this process: so a file
+# that is claimed already is not opened a second time.
+_CLAIMED: set[tuple[int, int]] = set()
+
+
+class StoreFile:
+    """A claimed file; the kernel gives the lock back however the process ends.
+
+    Makes an empty file where there is none. Raises StoreError where it cannot be written, or where
+    another process has it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._wal: tuple[int, int] | None = None
+        self._shm: tuple[int, int] | None = None
+        found = _identity(path)
+        if found in _CLAIMED:
+            raise _taken(path)
+        try:
+            self._handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except OSError as error:
+            raise StoreError(str(cannot_write(path, error))) from error
+        try:
+            fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            os.close(self._handle)
+            raise _taken(path) from error
+        status = os.fstat(self._handle)
+        self.names = status.st_nlink
+        self.identity = (status.st_dev, status.st_ino)
+        _CLAIMED.add(self.identity)
+
+    def release(self) -> None:
+        """Give the lock back; after the database was closed."""
+        _CLAIMED.discard(self.identity)
+        os.close(self._handle)
+
+    def discard_empty(self) -> None:
+        """Remove a file that was only made to be locked."""
+        if os.fstat(self._handle).st_size == 0 and _identity(self.path) == self.identity:
+            self.path.unlink(missing_ok=True)
+
+    @property
+    def deleted(self) -> bool:
+        """Whether no name leads to the file any more."""
+        return os.fstat(self._handle).st_nlink == 0
+
+    @property
+    def there(self) -> bool:
+        """Whether the path still leads to this file."""
+        return _identity(self.path) == self.identity
+
+    def remember_helpers(self) -> None:
+        """Note which -wal and -shm files the open database uses, as soon as they are there."""
+        if self._wal is None:
+            self._wal = _identity(self.wal_path)
+        if self._shm is None:
+            self._shm = _identity(self.shm_path)
+
+    @property
+    def helpers_there(self) -> bool:
+        """Whether the -wal and the -shm file are still those that were noted."""
+        shm_there = self._shm is None or _identity(self.shm_path) == self._shm
+        return self.wal_there and shm_there
+
+    @property
+    def wal_there(self) -> bool:
+        """Whether the -wal file is still the one that was noted."""
+        return self._wal is None or _identity(self.wal_path) == self._wal
+
+    @property
+    def wal_path(self) -> Path:
+        """Of the -wal file: next to the file that a link leads to."""
+        resolved = self.path.resolve()
+        return resolved.with_name(f"{resolved.name}-wal")
+
+    @property
+    def shm_path(self) -> Path:
+        """Of the -shm file, the index of the -wal file."""
+        return self.wal_path.with_name(f"{self.wal_path.name.removesuffix('-wal')}-shm")
+
+
+def written_elsewhere(path: Path) -> bool:
+    """Whether a file with several names is being written under another of them.
+
+    Then what was committed last is in a -wal file that cannot be found from this name. Nothing is
+    opened here: SQLite's locks of this process would end with it.
+    """
+    found = path.stat()
+    wal = path.resolve().with_name(f"{path.resolve().name}-wal")
+    if found.st_nlink < 2 or wal.exists():
+        return False
+    try:
+        locks = Path("/proc/locks").read_text(encoding="ascii")
+    except OSError:
+        return False
+    return any(
+        "FLOCK" in line and line.split()[-3].rsplit(":", 1)[-1] == str(found.st_ino)
+        for line in locks.splitlines()
+    )
+
+
+def _taken(path: Path) -> StoreError:
+    return StoreError(
+        f"{path}: another thermocald writes it; end that one first, or choose another store"
+    )
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino
+
+
+@contextmanager
+def in_words(path: Path, doing: str, *, reading: bool = False) -> Iterator[None]:
+    """Turn SQLite's errors into a StoreError that says what to do.
+
+    reading: what was read may be no text or number of ours, which tells of damage as well.
+    """
+    try:
+        yield
+    except DamageError as error:
+        if str(error).startswith(str(path)):
+            raise
+        raise DamageError(f"{path}: {error}") from error
+    except ThermocaldError:
+        raise
+    except sqlite3.Error as cause:
+        full = _name(cause).startswith(_NO_ROOM)
+        kind = StoreFullError if full else StoreError
+        raise kind(f"{path}: {doing}: {_advice(cause)}") from cause
+    except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as cause:
+        if not reading:
+            raise
+        raise StoreError(f"{path}: {doing}: the store is damaged ({cause})") from cause
+
+
+def _name(cause: sqlite3.Error) -> str:
+    """SQLite's name of the error, such as SQLITE_IOERR_WRITE; empty where Python raised it."""
+    return getattr(cause, "sqlite_errorname", "") or ""
+
+
+def _advice(cause: sqlite3.Error) -> str:
+    name = _name(cause)
+    if name.startswith("SQLITE_FULL"):
+        return "the disk is full; free some space, nothing that was stored before is lost"
+    if name.startswith("SQLITE_IOERR"):
+        return f"the disk failed or is full ({cause}); what was stored before is not touched"
+    if name.startswith(("SQLITE_READONLY", "SQLITE_PERM")):
+        return "the file or its folder is read-only; make it writable or choose another store"
+    if name.startswith("SQLITE_CANTOPEN"):
+        return "it cannot be opened; does its folder exist, and may this user write there?"
+    if name.startswith("SQLITE_BUSY"):
+        return f"another process kept it locked for more than {_BUSY_S:g} s"
+    if name.startswith(("SQLITE_NOTADB", "SQLITE_CORRUPT")):
+        return f"it is not a store, or it is damaged ({cause})"
+    return str(cause)
+
+
+def connect(path: Path, mode: Mode, *, durable: bool) -> sqlite3.Connection:
+    """Open or, for appending, make the file; older versions are brought up to date.
+
+    Raises StoreError, StoreVersionError for a file of a newer program.
+    """
+    if mode == "read" and not path.is_file():
+        raise StoreError(f"{path}: there is no such store")
+    if mode == "read" and written_elsewhere(path):
+        raise StoreError(
+            f"{path}: is being written under another of its names (hard links), and lacks what "
+            "was written last; read it under that name"
+        )
+    with in_words(path, "the store cannot be opened", reading=True):
+        connection = _open(path, mode)
+    try:
+        with in_words(path, "the store cannot be opened", reading=True):
+            version = _version(connection, path)
+            if version == 0 and mode == "read":
+                raise StoreError(f"{path}: is empty, nothing was stored yet")
+            if version < len(schema.FILE_STEPS) and mode == "read":
+                connection.close()
+                connection = open_copy(path, _upgrade)  # who reads changes nothing
+            elif version < len(schema.FILE_STEPS):
+                if version:
+                    _backup_version(connection, path, version)
+                else:
+                    connection.execute(f"PRAGMA page_size = {_PAGE_SIZE}")
+                connection.execute("PRAGMA journal_mode = WAL")
+                _upgrade(connection)
+            if mode == "append":
+                connection.execute("PRAGMA journal_mode = WAL")  # a restored backup has it not
+                # with FULL, what is committed survives a power cut; with NORMAL, a killed process
+                connection.execute(f"PRAGMA synchronous = {'FULL' if durable else 'NORMAL'}")
+                limit = _WAL_LIMIT_BYTES[durable]
+                connection.execute(f"PRAGMA journal_size_limit = {limit}")
+                connection.execute(f"PRAGMA wal_autocheckpoint = {limit // _PAGE_SIZE}")
+            else:
+                connection.execute(f"PRAGMA mmap_size = {_MMAP_BYTES}")
+            connection.execute("PRAGMA foreign_keys = ON")
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def _open(path: Path, mode: Mode) -> sqlite3.Connection:
+    if mode == "append":
+        return _connect(path, "rwc")
+    connection = _connect(path, "ro")
+    try:
+        connection.execute("SELECT 1 FROM sqlite_master").fetchone()
+    except sqlite3.OperationalError as cause:
+        connection.close()
+        # where its folder cannot be written, WAL's helper files cannot be made
+        if not _name(cause).startswith(("SQLITE_CANTOPEN", "SQLITE_READONLY")):
+            raise
+        return open_copy(path)
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def _connect(path: Path, mode: str) -> sqlite3.Connection:
+    connection = sqlite3.connect(
+        f"{path.absolute().as_uri()}?mode={mode}",
+        uri=True,
+        timeout=_BUSY_S,
+        isolation_level=None,  # transactions are begun and ended by hand
+        check_same_thread=False,
+    )
+    # a damaged text must show as a wrong checksum of its row, not as an error of the whole query
+    connection.text_factory = _text
+    return connection
+
+
+def _text(data: bytes) -> str:
+    return data.decode(errors="surrogateescape")
+
+
+def _version(connection: sqlite3.Connection, path: Path) -> int:
+    (version,) = connection.execute("PRAGMA user_version").fetchone()
+    (application,) = connection.execute("PRAGMA application_id").fetchone()
+    (tables,) = connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
+    if application != _APPLICATION_ID and (tables or application or version):
+        raise StoreError(f"{path}: is an SQLite file, but no thermocald store")
+    known = len(schema.FILE_STEPS)
+    if version > known:
+        copy = _copy_of_version(path, known)
+        older = f", or go on with {copy}, the copy made before" if copy.exists() else ""
+        raise StoreVersionError(
+            f"{path}: is a store of version {version}, this program knows up to {known}; "
+            f"update thermocald{older}"
+        )
+    return int(version)
+
+
+def _upgrade(connection: sqlite3.Connection) -> None:
+    """Bring a store of any version to this program's, all or nothing."""
+    connection.execute("BEGIN IMMEDIATE")
+    try:
+        # another process may have been faster
+        (before,) = connection.execute("PRAGMA user_version").fetchone()
+        version = schema.upgrade(connection.execute, before, schema.FILE_STEPS)
+        if not before:
+            connection.execute("INSERT INTO store VALUES (1, ?)", (str(uuid.uuid4()),))
+        connection.execute(f"PRAGMA application_id = {_APPLICATION_ID}")
+        connection.execute(f"PRAGMA user_version = {version}")
+    except BaseException:
+        connection.execute("ROLLBACK")
+        raise
+    connection.execute("COMMIT")
+
+
+def _copy_of_version(path: Path, version: int) -> Path:
+    return path.with_name(f"{path.name}.version-{version}")
+
+
+def _backup_version(connection: sqlite3.Connection, path: Path, version: int) -> None:
+    """Copy an older file before it is changed: `<name>.version-<version>`, made once."""
+    copy = _copy_of_version(path, version)
+    if copy.exists():
+        return
+    try:
+        copy_database(connection, copy)
+    except (OSError, sqlite3.Error) as error:
+        raise StoreError(
+            f"{path}: is of version {version}; a backup of it must be made before it is brought "
+            f"up to date, and {copy} cannot be written ({error}); nothing was changed"
+        ) from error
+    known = len(schema.FILE_STEPS)
+    log.info("%s: brought from version %d to %d; backup: %s", path, version, known, copy)
+
+
+def copy_database(source: sqlite3.Connection, target: Path) -> None:
+    """Copy what a connection sees to a file that appears whole or not at all (online backup).
+
+    A writer is not held up. Raises OSError or sqlite3.Error.
+    """
+    target, straight = output_place(target)
+    if straight:
+        raise OSError(errno.EINVAL, "is not a regular file")
+    partial = target.with_name(f".{target.name}.partial")
+    try:
+        partial.unlink(missing_ok=True)
+        partial.touch()  # SQLite would not say why it cannot
+        with closing(sqlite3.connect(partial)) as copy:
+            source.backup(copy)
+            copy.execute("PRAGMA journal_mode = DELETE")
+        descriptor = os.open(partial, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+        os.replace(partial, target)
+    except BaseException:
+        for name in (partial, partial.with_name(f"{partial.name}-journal")):
+            with suppress(OSError):
+                name.unlink(missing_ok=True)
+        raise
+
+
+def open_copy(
+    path: Path, change: Callable[[sqlite3.Connection], None] | None = None
+) -> sqlite3.Connection:
+    """Open a store whose folder cannot be written, with all that its -wal file holds.
+
+    Without a -wal file it is read where it is. Else file and -wal are copied to the folder for
+    temporary files, joined there and opened; the copy is gone with the connection. change: made to
+    the copy first, which then is needed in any case. Raises StoreError, sqlite3.Error.
+    """
+    wal = Path(f"{path.resolve()}-wal")  # SQLite follows links too
+    if change is None and not (wal.exists() and wal.stat().st_size):
+        return _connect(path, "ro&immutable=1")
+    try:
+        folder = Path(tempfile.mkdtemp(prefix="thermocald-"))
+    except OSError as error:
+        raise StoreError(f"{path}: no private copy can be made: {error}") from error
+    try:
+        copy = folder / "copy.db"
+        _copy_files(path, wal, copy)
+        with closing(_connect(copy, "rw")) as connection:
+            connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+            if change is not None:
+                change(connection)
+            connection.execute("PRAGMA journal_mode = DELETE")
+        opened = _connect(copy, "ro&immutable=1")
+        opened.execute("SELECT 1 FROM sqlite_master").fetchone()  # opens the file before it goes
+        return opened
+    except OSError as error:
+        raise StoreError(f"{path}: no private copy can be made: {error}") from error
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _copy_files(path: Path, wal: Path, copy: Path) -> None:
+    """Copy file and -wal as they are at one time: a writer elsewhere may be at work."""
+    for _ in range(_ATTEMPTS):
+        before = _state(path), _state(wal)
+        shutil.copyfile(path, copy)
+        if before[1] is not None:
+            shutil.copyfile(wal, f"{copy}-wal")
+        if (_state(path), _state(wal)) == before:
+            return
+    raise StoreError(
+        f"{path}: is being written by another process, and its -shm file may not be read by you; "
+        "join that user's group, or use sudo"
+    )
+
+
+def _state(path: Path) -> tuple[int, int, int] | None:
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_ino, found.st_size, found.st_mtime_ns

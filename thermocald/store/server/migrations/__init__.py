@@ -1,1 +1,0 @@
-"""The server's tables, version by version, as Alembic runs them."""

@@ -1,1 +1,0 @@
-"""One module a version; a version is never changed once it was released."""

@@ -1,0 +1,417 @@
+"""The fit of hypotheses to series: generalised least squares and Gauss-Newton.
+
+Linear coefficients come from generalised least squares under the likelihood of `likelihood`,
+non-linear ones by Gauss-Newton on the same normal equations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.photogrammetry.linalg import scaled_inverse, scaled_solve
+from thermocald.physics import catalogue
+from thermocald.physics.catalogue import drive, drive_matrix, driven_history
+from thermocald.thermal.hypothesis import BASE, Block, Fit, Term, sum_normals
+from thermocald.thermal.likelihood import ReadingErrorTerm, add_error_term, prepare
+from thermocald.thermal.series import COLUMNS, unit_directions
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+    from scipy.sparse import csr_array
+
+    from thermocald.arrays import Array
+    from thermocald.thermal.likelihood import NormalEquations, Weighting
+    from thermocald.thermal.series import ReducedSeries
+
+# relative standard deviation with which the readings themselves tell their noise
+_NOISE_KNOWN = 0.05
+
+_RIDGE = 1e-12  # of a unit diagonal: holds coefficients that no series determines
+
+_PERIODS = 1.6  # least number of periods in a series; a scan begins at 1.8
+
+
+class HypothesisFitter:
+    """The series under examination, and everything that is computed once for all hypotheses."""
+
+    def __init__(self, series: Sequence[ReducedSeries]) -> None:
+        self.series = tuple(series)
+        self.thermometer_factor = 1.0
+        self.held: frozenset[str] = frozenset()  # non-linear parameters, such as `effect.tau`
+        self.priors: dict[str, tuple[float, float]] = {}  # of these: value known beforehand, sd
+        self._trajectories: dict[Any, tuple[Array, Array | None, str]] = {}
+        self._drives: dict[Any, tuple[Array, Array]] = {}
+        self._further: dict[Any, list[tuple[Array, str]]] = {}
+        self._slope_jumps: dict[int, Array] = {}
+
+    def share_trajectories(self, other: HypothesisFitter) -> None:
+        """Use the trajectories that a fitter of the same histories has computed."""
+        self._trajectories, self._drives = other._trajectories, other._drives
+        self._further = other._further
+        self._slope_jumps = other._slope_jumps
+
+    # -- trajectories ---------------------------------------------------------------------------
+
+    def drive(self, terms: Sequence[Term], series: int) -> tuple[Array, Array]:
+        """Return the trajectory (E,) that drives the linear terms, and its operator (E, states)."""
+        drives = _drives(terms, series)
+        key = (series, tuple((name, tuple(values.items())) for name, values in drives))
+        if key not in self._drives:
+            reduced = self.series[series]
+            history = reduced.history
+            operator = drive_matrix(history, drives)
+            assert operator is not None
+            if len(self._drives) > 60:
+                self._drives.clear()
+            self._drives[key] = (
+                reduced.averaged(drive(history, drives)),
+                reduced.states(history.reference, operator),
+            )
+        return self._drives[key]
+
+    def drive_trajectory(self, terms: Sequence[Term], series: int) -> Array:
+        """Return the trajectory (E,) alone: for scanning, where no operator is needed."""
+        reduced = self.series[series]
+        return reduced.averaged(drive(reduced.history, _drives(terms, series)))
+
+    def trajectories(
+        self, term: Term, series: int, terms: Sequence[Term] = (), operators: bool = True
+    ) -> tuple[Array, Array | None, str]:
+        """Return trajectories (E, m) of a signal, operator (E, states) of the first or None,
+        channel.
+        """
+        effect = catalogue.get(term.effect)
+        values = term.values(series)
+        evidence = self.series[series]
+        if values is None:
+            return np.zeros((len(evidence.times), 1)), None, evidence.history.reference
+        drives = tuple((t.effect, t.nonlinear) for t in terms if t.is_drive)
+        through = term.through_drive and bool(drives)
+        key = (
+            series, term.effect, tuple(sorted(values.items())), drives if through else None,
+            operators,
+        )  # fmt: skip
+        if key not in self._trajectories:
+            history = evidence.history
+            before: csr_array | None = None
+            if through:
+                chain = _drives(terms, series)
+                before = drive_matrix(history, chain, at_readings=True)
+                history = driven_history(history, chain)
+            trajectory = evidence.averaged(effect.signal(history, **values))
+            operator = None
+            channel = effect.channel(history, **values)
+            if operators and trajectory.shape[1] == 1:
+                sparse = effect.sensitivity(history, **values)
+                if sparse.nnz:
+                    whole = sparse if before is None else sparse @ before
+                    operator = evidence.states(channel, whole)
+            if len(self._trajectories) > 600:
+                self._trajectories.clear()
+            self._trajectories[key] = (trajectory, operator, channel)
+        return self._trajectories[key]
+
+    def further_operators(self, term: Term, series: int) -> list[tuple[Array, str]]:
+        """Return operators (E, states) and channels of the further columns that a signal reads."""
+        values = term.values(series)
+        if values is None:
+            return []
+        key = (series, term.effect, tuple(sorted(values.items())))
+        if key not in self._further:
+            evidence = self.series[series]
+            found = term.kind.further_sensitivities(evidence.history, **values)
+            if len(self._further) > 60:
+                self._further.clear()
+            self._further[key] = [(evidence.states(c, m), c) for c, m in found.items()]
+        return self._further[key]
+
+    # -- fitting ---------------------------------------------------------------------------
+
+    def _layout(self, terms: Sequence[Term]) -> tuple[list[Block], int]:
+        blocks = [Block(-1, None, 0, 1, BASE)]
+        start = len(BASE)
+        for i, term in enumerate(terms):
+            if term.is_drive:
+                continue
+            m = 2 if term.kind.is_periodic else 1
+            for s in range(len(self.series)) if term.is_separate else (None,):
+                if s is not None and term.values(s) is None:
+                    continue
+                blocks.append(Block(i, s, start, m, term.parameters))
+                start = blocks[-1].stop
+        return blocks, start
+
+    def design(
+        self, terms: Sequence[Term], blocks: Sequence[Block], series: int, centred: bool = True
+    ) -> tuple[Array, Array, NDArray[np.int64]]:
+        """Return trajectories (E, K), directions (P, K) and places in the unknowns (K,) of one
+        series.
+
+        centred: without their means, for conditioning, where the levels are eliminated anyway;
+        otherwise as the model has them, 0 at T0.
+        """
+        columns: list[Array] = []
+        names: list[str] = []
+        index: list[int] = []
+        for block in blocks:
+            if block.series not in (None, series):
+                continue
+            if block.term < 0:
+                trajectory = self.drive(terms, series)[0][:, None] - self.series[series].T0
+            else:
+                trajectory = self.trajectories(terms[block.term], series, terms, operators=False)[0]
+            if centred:
+                trajectory = trajectory - trajectory.mean(axis=0)
+            for m in range(block.trajectories):
+                columns += [trajectory[:, m]] * len(block.parameters)
+                names += block.parameters
+            index += range(block.start, block.stop)
+        return np.stack(columns, axis=1), unit_directions(names), np.array(index)
+
+    def weighting(
+        self, terms: Sequence[Term], blocks: Sequence[Block], x: Array, series: int
+    ) -> Weighting:
+        """Fix the covariance of a series at some coefficients."""
+        carried: list[ReadingErrorTerm] = []
+        for block in blocks:
+            if block.series not in (None, series) or block.trajectories > 1:
+                continue
+            d = np.zeros(len(COLUMNS))
+            d[[COLUMNS.index(p) for p in block.parameters]] = x[block.start : block.stop]
+            if block.term < 0:
+                operator: Array | None = self.drive(terms, series)[1]
+                channel = self.series[series].history.reference
+            else:
+                _, operator, channel = self.trajectories(terms[block.term], series, terms)
+                for further, name in self.further_operators(terms[block.term], series):
+                    carried = add_error_term(carried, ReadingErrorTerm(d, further, name))
+            if operator is not None and d.any():
+                unresolved = self._unresolved(terms, block, series)
+                carried = add_error_term(
+                    carried, ReadingErrorTerm(d, operator, channel, unresolved)
+                )
+        return prepare(self.series[series], carried, self.thermometer_factor)
+
+    def _unresolved(self, terms: Sequence[Term], block: Block, series: int) -> Array | None:
+        """Return the sd of a trajectory at single epochs (E,) beyond the readings' errors; or None.
+
+        The rate next to a switched lamp; where a play turns, which reading was the extreme.
+        """
+        evidence = self.series[series]
+        history = evidence.history
+        instrument = evidence.thermometers[history.reference]
+        if block.term >= 0:
+            term = terms[block.term]
+            values = term.values(series) or {}
+            # averaged times stand for the frames of long series
+            here = history.at(evidence.times)
+            left = term.kind.unresolved(here, self._slope_jump(series), **values)
+            return left if left.any() else None
+        drives = _drives(terms, series)
+        if not drives:
+            return None
+        before = driven_history(history, drives[:-1])
+        name, values = drives[-1]
+        turns = catalogue.get(name).turns(before, **values)
+        if not turns.any():
+            return None
+        step = float(np.median(np.diff(history.reading_times[instrument.real])))
+        bend = 0.5 * step * self._slope_jump(series)
+        shares = evidence.averaged(turns.astype(float))
+        out: Array = shares * np.sqrt(instrument.noise**2 + bend**2)
+        return out
+
+    def _slope_jump(self, series: int) -> Array:
+        """Return how uncertain the rate (E,) of the reference is where it jumps."""
+        if series not in self._slope_jumps:
+            evidence = self.series[series]
+            instrument = evidence.thermometers[evidence.history.reference]
+            self._slope_jumps[series] = instrument.slope_jump(evidence.times)
+        return self._slope_jumps[series]
+
+    def fit(
+        self,
+        terms: Sequence[Term],
+        start: Array | None = None,
+        max_iterations: int = 3,
+        only: Sequence[int] | None = None,
+    ) -> Fit:
+        """Fit the linear coefficients of a hypothesis; the covariance follows them, `turns` times.
+
+        only: the series that decide (default all); the others are evaluated.
+        """
+        terms = tuple(terms)
+        blocks, K = self._layout(terms)
+        which = range(len(self.series))
+        designs = [self.design(terms, blocks, s) for s in which]
+        x = np.zeros(K) if start is None or len(start) != K else start
+        weightings: list[Weighting] = []
+        reduced: list[NormalEquations] = []
+        A = np.zeros((K, K))
+        for turn in range(max_iterations + (0 if x.any() else 1)):
+            weightings = [self.weighting(terms, blocks, x, s) for s in which]
+            reduced = [w.reduce(d[0], d[1]) for w, d in zip(weightings, designs, strict=True)]
+            A, c = sum_normals(designs, reduced, K, only)
+            new = scaled_solve(A, c, _RIDGE)
+            done = turn > 0 and np.max(np.abs(new - x)) <= 1e-3 * np.max(np.abs(new))
+            x = new
+            if done:
+                break
+        fitted = Fit(
+            terms, tuple(blocks), x, scaled_inverse(A, _RIDGE), 0.0, 0.0, tuple(weightings),
+            tuple(designs), tuple(reduced),
+        )  # fmt: skip
+        chosen = which if only is None else only
+        return replace(
+            fitted,
+            chi2=sum(fitted.chi2_of(s) for s in chosen),
+            logdet=sum(reduced[s].logdet for s in chosen),
+        )
+
+    def thermometer_scale(self, fit: Fit) -> tuple[float, float]:
+        """Find the factor of the readings' noise that makes a hypothesis most likely, and the
+        objective
+        there. Hypotheses that smooth the readings more than others are separated by nothing else
+        but an error of the noise.
+        """
+        from scipy.optimize import minimize_scalar
+
+        kept = self.thermometer_factor
+
+        def objective(log_factor: float) -> float:
+            self.thermometer_factor = kept * float(np.exp(log_factor))
+            here = self.fit(fit.terms, fit.coefficients, 1).objective
+            return here + (log_factor / _NOISE_KNOWN) ** 2
+
+        try:
+            found = minimize_scalar(
+                objective, bounds=(-0.5, 0.5), method="bounded", options={"xatol": 0.02}
+            )
+        finally:
+            self.thermometer_factor = kept
+        return kept * float(np.exp(found.x)), float(found.fun)
+
+    # -- non-linear parameters ------------------------------------------------------------
+
+    def searched(self, terms: Sequence[Term]) -> list[tuple[int, str]]:
+        """List the shared numeric non-linear parameters of a hypothesis."""
+        return [
+            (i, name)
+            for i, term in enumerate(terms)
+            for name, value in term.nonlinear
+            if isinstance(value, float) and f"{term.effect}.{name}" not in self.held
+        ]
+
+    def derivatives(
+        self,
+        fit: Fit,
+        searched: Sequence[tuple[int, str]],
+        series: int,
+        centred: bool = True,
+    ) -> tuple[Array, Array, Array]:
+        """Return ∂(prediction)/∂(non-linear): trajectories (E, D), directions (P, D), map (D,
+        L).
+        """
+        trajectories: list[Array] = []
+        directions: list[Array] = []
+        owner: list[int] = []
+        for position, (i, name) in enumerate(searched):
+            value = dict(fit.terms[i].nonlinear)[name]
+            step = fit.terms[i].kind.nonlinear[name].difference_step(value)
+            sides = []
+            for sign in (1.0, -1.0):
+                terms = list(fit.terms)
+                terms[i] = terms[i].with_value(name, value + sign * step)
+                sides.append(self.design(terms, fit.blocks, series, centred)[0])
+            slope = (sides[0] - sides[1]) / (2 * step)
+            _, V, index = fit.designs[series]
+            for k in np.flatnonzero(np.abs(slope).max(axis=0) > 0):
+                trajectories.append(slope[:, k])
+                directions.append(V[:, k] * fit.coefficients[index[k]])
+                owner.append(position)
+        if not trajectories:
+            E, P = fit.designs[series][0].shape[0], len(COLUMNS)
+            return np.zeros((E, 0)), np.zeros((P, 0)), np.zeros((0, len(searched)))
+        mapping = np.zeros((len(owner), len(searched)))
+        mapping[np.arange(len(owner)), owner] = 1.0
+        return np.stack(trajectories, axis=1), np.stack(directions, axis=1), mapping
+
+    def normal_equations(
+        self, fit: Fit, only: Sequence[int] | None = None
+    ) -> tuple[Array, Array, list[tuple[int, str]]]:
+        """Return A (K + L, K + L), gradient (K + L,) with non-linear parameters as unknowns."""
+        searched = self.searched(fit.terms)
+        K, L = len(fit.coefficients), len(searched)
+        A, g = np.zeros((K + L, K + L)), np.zeros(K + L)
+        for s in range(len(self.series)) if only is None else only:
+            C, V, index = fit.designs[s]
+            dC, dV, mapping = self.derivatives(fit, searched, s)
+            joint = fit.weightings[s].reduce(np.hstack([C, dC]), np.hstack([V, dV]))
+            T = np.zeros((C.shape[1] + dC.shape[1], K + L))
+            T[np.arange(C.shape[1]), index] = 1.0
+            T[C.shape[1] :, K:] = mapping
+            at = np.zeros(T.shape[0])
+            at[: C.shape[1]] = fit.coefficients[index]
+            A += T.T @ joint.A @ T
+            g += T.T @ (joint.c - joint.A @ at)
+        for row, (left, information) in enumerate(self.prior_terms(fit), K):
+            A[row, row] += information
+            g[row] += information * left
+        return A, g, searched
+
+    def prior_terms(self, fit: Fit) -> list[tuple[float, float]]:
+        """Return prior minus value of each searched parameter, and its information (0: none)."""
+        found = []
+        for i, name in self.searched(fit.terms):
+            term = fit.terms[i]
+            value, sd = self.priors.get(f"{term.effect}.{name}", (0.0, np.inf))
+            found.append((value - float(dict(term.nonlinear)[name]), 1.0 / sd**2))
+        return found
+
+    def _with_prior(self, fit: Fit) -> float:
+        return fit.objective + sum(w * left**2 for left, w in self.prior_terms(fit) if w)
+
+    def refine(self, fit: Fit, max_iterations: int = 6, only: Sequence[int] | None = None) -> Fit:
+        """Improve the non-linear parameters by Gauss-Newton; never makes the objective worse."""
+        searched = self.searched(fit.terms)
+        if searched:
+            for _ in range(max_iterations):
+                A, g, _ = self.normal_equations(fit, only)
+                step = scaled_solve(A, g, _RIDGE)[len(fit.coefficients) :]
+                improved = False
+                tried: list[Term] = []
+                for damping in (1.0, 0.3, 0.1):
+                    terms = list(fit.terms)
+                    for (i, name), d in zip(searched, damping * step, strict=True):
+                        old = dict(terms[i].nonlinear)[name]
+                        parameter = terms[i].kind.nonlinear[name]
+                        value = parameter.bounded(old, old + float(d), slack=0.1)
+                        if parameter.role == "period":
+                            value = min(value, max(old, self._longest_period()))
+                        terms[i] = terms[i].with_value(name, value)
+                    if terms == tried:  # every parameter at its bound again
+                        continue
+                    tried = terms
+                    trial = self.fit(terms, fit.coefficients, 2, only)
+                    gain = self._with_prior(fit) - self._with_prior(trial)
+                    if gain > 0:
+                        fit, improved = trial, True
+                        break
+                if not improved or gain < 0.05:
+                    break
+        A, _, searched = self.normal_equations(fit, only)
+        return replace(fit, covariance=scaled_inverse(A, _RIDGE), searched=tuple(searched))
+
+    def _longest_period(self) -> float:
+        """Return the longest period: what is seen less often in each series is a wander."""
+        return max(float(e.times[-1]) for e in self.series) / _PERIODS
+
+
+def _drives(terms: Sequence[Term], series: int) -> list[tuple[str, dict[str, Any]]]:
+    """List the drives among some terms, as `catalogue.drive` takes them."""
+    return [(t.effect, t.values(series) or {}) for t in terms if t.is_drive]

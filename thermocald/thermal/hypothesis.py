@@ -1,0 +1,266 @@
+"""A hypothesis: the base model with some effects added; and the candidates to be added next.
+
+Physical constants are shared by the series; levels belong to each series, and so do the times
+and phases that an effect calls fresh.
+
+The grid of trial values of a non-linear parameter: one for fit and discovery.
+
+The grid replaces a lucky start: each parameter is scanned over everything that the recordings
+could show, as finely as they can resolve it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.physics import catalogue
+from thermocald.thermal.series import COLUMNS, unit_directions
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from thermocald.arrays import Array
+    from thermocald.physics.effect import Effect, Parameter
+    from thermocald.thermal.likelihood import NormalEquations, Weighting
+    from thermocald.thermal.series import ReducedSeries
+
+BASE = ("c", "x0", "y0")
+
+
+@dataclass(frozen=True)
+class Term:
+    """One effect of a hypothesis.
+
+    parameters: the columns it acts on; nonlinear: shared values; fresh: per series, None where
+    the effect does not occur; through_drive: a trajectory of T that follows the drive instead of T.
+    """
+
+    effect: str
+    parameters: tuple[str, ...] = BASE
+    nonlinear: tuple[tuple[str, Any], ...] = ()
+    fresh: tuple[tuple[tuple[str, Any], ...] | None, ...] = ()
+    through_drive: bool = False
+
+    @property
+    def kind(self) -> Effect:
+        """The effect itself."""
+        return catalogue.get(self.effect)
+
+    @property
+    def is_drive(self) -> bool:
+        """Whether it replaces the temperature behind the linear terms."""
+        return self.kind.is_drive
+
+    @property
+    def is_separate(self) -> bool:
+        """Whether each series has coefficients of its own: a height, or amplitude and phase."""
+        return self.kind.is_event or self.kind.is_periodic
+
+    def values(self, series: int) -> dict[str, Any] | None:
+        """Return the non-linear values in one series; None where the effect does not occur
+        there.
+        """
+        if not self.fresh:
+            return dict(self.nonlinear)
+        own = self.fresh[series]
+        return None if own is None else {**dict(self.nonlinear), **dict(own)}
+
+    def with_value(self, name: str, value: float) -> Term:
+        """Change one shared non-linear value."""
+        return replace(
+            self, nonlinear=tuple((k, value if k == name else v) for k, v in self.nonlinear)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Where the coefficients of one term stand: columns of trajectories and of the unknowns."""
+
+    term: int  # -1: the base's rates
+    series: int | None  # None: shared
+    start: int
+    trajectories: int
+    parameters: tuple[str, ...]
+
+    @property
+    def stop(self) -> int:
+        return self.start + self.trajectories * len(self.parameters)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A fitted hypothesis.
+
+    coefficients (K,) px-scaled; covariance (K + L, K + L) of coefficients and the L shared
+    non-linear parameters `searched` [(term, name)]; chi2, logdet: sums over series; parts: normal
+    equations per series; objective: -2 log L but for a constant.
+    """
+
+    terms: tuple[Term, ...]
+    blocks: tuple[Block, ...]
+    coefficients: Array
+    covariance: Array
+    chi2: float
+    logdet: float
+    weightings: tuple[Weighting, ...]
+    designs: tuple[tuple[Array, Array, NDArray[np.int64]], ...]
+    reduced: tuple[NormalEquations, ...]
+    searched: tuple[tuple[int, str], ...] = field(default=())
+
+    @property
+    def objective(self) -> float:
+        return self.chi2 + self.logdet
+
+    def direction(self, block: Block) -> Array:
+        """Return the coefficients of one block as (trajectories, P) in px-scaled columns."""
+        out = np.zeros((block.trajectories, len(COLUMNS)))
+        part = self.coefficients[block.start : block.stop].reshape(block.trajectories, -1)
+        out[:, [COLUMNS.index(p) for p in block.parameters]] = part
+        return out
+
+    def parameters(self, series: int) -> Array:
+        """Return the movement (E, P) of the parameters that the hypothesis makes, px-scaled."""
+        C, V, index = self.designs[series]
+        moved: Array = (C * self.coefficients[index]) @ V.T
+        return moved
+
+    def normals(self, series: Iterable[int] | None = None) -> tuple[Array, Array]:
+        """Sum the normal equations A (K, K), c (K,) of all coefficients over some series."""
+        return sum_normals(self.designs, self.reduced, len(self.coefficients), series)
+
+    def forget(self) -> None:
+        """Let go of what was whitened for scans: of a long series, much."""
+        for weighting in self.weightings:
+            weighting.kept.clear()
+
+    def chi2_of(self, series: int, coefficients: Array | None = None) -> float:
+        """Return χ² of one series at some coefficients (default: the fitted)."""
+        x = self.coefficients if coefficients is None else coefficients
+        _, _, index = self.designs[series]
+        r, part = self.reduced[series], x[index]
+        return float(r.yy - 2 * part @ r.c + part @ r.A @ part)
+
+
+def sum_normals(
+    designs: Sequence[tuple[Array, Array, NDArray[np.int64]]],
+    reduced: Sequence[NormalEquations],
+    size: int,
+    series: Iterable[int] | None = None,
+) -> tuple[Array, Array]:
+    """Sum the series' normal equations, each at the places of its unknowns: A (K, K), c (K,)."""
+    A, c = np.zeros((size, size)), np.zeros(size)
+    for s in range(len(designs)) if series is None else series:
+        index = designs[s][2]
+        A[np.ix_(index, index)] += reduced[s].A
+        c[index] += reduced[s].c
+    return A, c
+
+
+def make_known_term(name: str, values: Mapping[str, Any], series: int) -> Term:
+    """Make a term of an effect whose values are known; series: how many there are.
+
+    An event is the first series'; what a cycle has of its own is not searched.
+    """
+    effect = catalogue.get(name)
+    parameters = tuple(effect.column(p) for p in effect.linear if p in values)
+    shared = tuple(
+        (k, v if isinstance(v, str) else float(v))
+        for k, v in values.items()
+        if k in effect.nonlinear and k not in effect.fresh
+    )
+    fresh: tuple[tuple[tuple[str, Any], ...] | None, ...] = ()
+    if effect.is_event:
+        own = tuple((k, float(values[k])) for k in effect.fresh if k in values)
+        fresh = (own, *(None,) * (series - 1))
+    return Term(name, parameters or BASE, shared, fresh)
+
+
+def trial_values(parameter: Parameter, series: Sequence[ReducedSeries]) -> Array:
+    """Choose values to scan by the parameter's role; the first series decides."""
+    first = series[0]
+    duration = float(first.times[-1])
+    step = float(np.median(np.diff(first.times)))
+    T = first.history.temperature()
+    low, high = float(T.min()), float(T.max())
+    match parameter.role:
+        case "period":
+            # at least two periods, and two frames in each; four frequencies to one resolution
+            frequencies = np.arange(1.8 / duration, 1.0 / (2.1 * step), 1.0 / (3.0 * duration))
+            return np.asarray(1.0 / frequencies[:4000])
+        case "threshold":
+            return np.linspace(low + 0.03 * (high - low), high - 0.03 * (high - low), 32)
+        case "width":
+            return np.geomspace(max(0.2 * parameter.low, 0.01), max(0.45 * (high - low), 0.2), 36)
+        case "time_constant":
+            return np.geomspace(max(0.2 * parameter.low, 0.05 * step), 2.0 * duration, 44)
+        case "event":
+            return first.times[1:]
+        case "delay":
+            reach = min(parameter.high, 0.25 * duration)
+            coarse = np.arange(max(parameter.low, -reach), reach, min(0.5 * step, reach / 20)) + 0.1
+            fine = np.linspace(-step, step, 21) + 0.001 * step  # small delays are the usual ones
+            return np.unique(np.concatenate([coarse, fine]))
+    if parameter.log:
+        return np.geomspace(parameter.low, parameter.high, 40)
+    return np.linspace(parameter.low, parameter.high, 40)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """One effect acting on one set of parameters.
+
+    parameters: columns of the reduced series; name: of the searched non-linear parameter, "" where
+    there is none; grid: its trial values; fixed: non-linear values that are given.
+    """
+
+    effect: str
+    parameters: tuple[str, ...]
+    name: str
+    grid: Array
+    fixed: tuple[tuple[str, Any], ...] = ()
+
+    @property
+    def kind(self) -> Effect:
+        """The effect itself."""
+        return catalogue.get(self.effect)
+
+    @property
+    def directions(self) -> Array:
+        """Its parameters as unit vectors (P, k)."""
+        return unit_directions(self.parameters)
+
+    def term(self, value: float | None, series: int) -> Term:
+        """Return the term at one value of the grid; `series`: how many series there are."""
+        if self.kind.is_event:
+            return Term(self.effect, self.parameters, self.fixed, ((),) * series)
+        own = () if value is None else ((self.name, float(value)),)
+        return Term(self.effect, self.parameters, self.fixed + own)
+
+
+def make_candidate(
+    effect: Effect,
+    parameters: tuple[str, ...],
+    series: Sequence[ReducedSeries],
+    fixed: tuple[tuple[str, Any], ...] = (),
+    *,
+    plain: bool = False,
+) -> Candidate:
+    """Offer an effect on some of its coefficients; of what belongs to a series, events alone are
+    searched.
+
+    fixed: non-linear values that are given; plain: without the parameters that a model may leave
+    out.
+    """
+    given = dict(fixed)
+    columns = tuple(effect.column(p) for p in parameters)
+    for key, parameter in effect.nonlinear.items():
+        own = key in effect.fresh and parameter.role != "event"
+        left_out = plain and key in effect.optional
+        if not (parameter.text or own or left_out or key in given):
+            return Candidate(effect.name, columns, key, trial_values(parameter, series), fixed)
+    return Candidate(effect.name, columns, "", np.zeros(0), fixed)

@@ -1,0 +1,396 @@
+"""The camera's movement on its mount, as variance components alongside a hypothesis.
+
+A camera on a tripod wanders. The amplitudes of cosines in the well-determined combinations of the
+camera's parameters are random, with a covariance Sigma / (corner² + k²) at the k-th half-wave: a
+random walk where the corner is zero, else one that is bounded. Sigma is found by restricted maximum
+likelihood (EM), both series together, with each hypothesis by itself: what a hypothesis explains
+is not a movement.
+
+Source: Patterson, Thompson (1971), Biometrika 58, 545-554 (restricted maximum likelihood);
+Dempster, Laird, Rubin (1977), J. Royal Statistical Society B 39, 1-38 (EM).
+
+What moves from epoch to epoch is found in differences, which slow effects do not touch, and becomes
+a movement of each epoch by itself, or noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import comb
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.photogrammetry.linalg import (
+    best_level,
+    orthonormal_combinations,
+    scaled_inverse,
+)
+from thermocald.thermal import criteria
+from thermocald.thermal.fit import HypothesisFitter
+from thermocald.thermal.random_effects import Movement, waves
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from thermocald.arrays import Array
+    from thermocald.thermal.hypothesis import Fit, Term
+    from thermocald.thermal.series import ReducedSeries
+
+WAVES = 24
+_LEAST = 0.2  # variance of a half-wave, in units of the image noise, that is worth a state
+_TINY = 1e-6
+_FLOOR = 3.0
+_LITTLE = 1e-3  # of what is known of the best known direction
+_FAST = 8  # order of differences that leaves little but what jumps
+
+
+@dataclass(frozen=True, eq=False)
+class Mount:
+    """A movement estimated: covariance (m, m) of the combinations W (P, m), corner in half-waves.
+
+    The combinations have unit variance where the image noise is all.
+    """
+
+    combinations: Array
+    covariance: Array
+    corner: float
+
+    def modes(self) -> tuple[Array, Array]:
+        """Return variances and directions (P, ·) of the independent movements that matter."""
+        size, U = np.linalg.eigh(self.covariance)
+        kept = size > _LEAST
+        kept[-1] = True  # one at least, so that likelihoods remain comparable
+        return np.maximum(size[kept], _TINY), self.combinations @ U[:, kept]
+
+    def on(self, series: Sequence[ReducedSeries]) -> list[ReducedSeries]:
+        """Add the movement to the noise of the series."""
+        size, directions = self.modes()
+        out = []
+        for e in series:
+            K = min(WAVES, len(e.times) // 2)
+            k = np.arange(1, K + 1)
+            sd = np.sqrt(size[:, None] / (self.corner**2 + k**2))
+            out.append(replace(e, movement=Movement(directions, waves(e.times, K), sd)))
+        return out
+
+    def smoothness(self, fitter: HypothesisFitter, fit: Fit) -> float:
+        """Compare the slowest half-waves' power with that of the fast, in this movement's own
+        units.
+
+        About 1 for a random walk; an influence without rough parts has much more.
+        """
+        slow, fast = 0.0, 0.0
+        for e, (mean, root) in zip(fitter.series, _estimate_amplitudes(fit), strict=True):
+            assert e.movement is not None
+            K = e.movement.sd.shape[1]
+            mode, wave = e.movement.states
+            power = np.zeros(K)
+            own = mode == mode.max()  # the strongest
+            k = wave[own]
+            power[k] = (mean[own] ** 2 + np.sum(root[:, own] ** 2, axis=0)) * e.movement.sd[
+                -1, k
+            ] ** 2
+            power *= np.arange(1, K + 1) ** 2
+            slow += float(np.mean(power[: K // 4]))
+            fast += float(np.mean(power[K // 2 :]))
+        return slow / max(fast, 1e-12)
+
+    def size_px(self, e: ReducedSeries) -> float:
+        """Return the RMS over image points and time, px, that the movement is expected to have."""
+        size, _ = self.modes()
+        K = min(WAVES, len(e.times) // 2)
+        falling = 1.0 / (self.corner**2 + np.arange(1, K + 1) ** 2)
+        power = float(np.sum(size)) * float(np.sum(falling))
+        coordinates = 2.0 * float(e.n.mean()) * len(e.times)
+        return float(e.sigma_px * np.sqrt(power / max(coordinates, 1.0)))
+
+
+def find_combinations(series: Sequence[ReducedSeries]) -> Array:
+    """Find the determined combinations (P, m) of parameters, orthonormal under the mean normals."""
+    W, good = orthonormal_combinations(np.mean([e.N.mean(axis=0) for e in series], axis=0))
+    return W[:, good]
+
+
+def guess_mount_motion(fitter: HypothesisFitter, fit: Fit, W: Array) -> Array:
+    """Guess the covariance (m, m) from the power of the misfit's half-waves beyond the noise."""
+    total = np.zeros((W.shape[1], W.shape[1]))
+    count = 0
+    for s, e in enumerate(fitter.series):
+        w = fit.weightings[s]
+        rest = w.left(fit.parameters(s))
+        z = (rest - w.N @ best_level(w.N, rest)) @ W
+        A = waves(e.times, min(WAVES, len(e.times) // 2)).T @ z
+        k = np.arange(1, len(A) + 1)
+        total += np.einsum("k,ki,kj->ij", k**2, A, A) - float(np.sum(k**2)) * np.eye(len(total))
+        count += len(A)
+    size, U = np.linalg.eigh(total / count)
+    # what starts at zero stays there: a slow drift hides in the moments among rough half-waves
+    out: Array = (U * np.maximum(size, _FLOOR)) @ U.T
+    return out
+
+
+def weight_leaps_down(fitter: HypothesisFitter, fit: Fit, W: Array) -> list[ReducedSeries]:
+    """Give less weight to epochs that leap out of their neighbours and come back.
+
+    Somebody leans on the mount, or a board is seen badly: one epoch, of which a fit by squares
+    would make much.
+    """
+    out = []
+    for s, e in enumerate(fitter.series):
+        w = fit.weightings[s]
+        normal = np.einsum("pi,epq,qj->eij", W, w.N, W) + 0.1 * np.eye(W.shape[1])
+        y = np.linalg.solve(normal, (w.left(fit.parameters(s)) @ W)[..., None])[..., 0]
+        padded = np.pad(y, ((2, 2), (0, 0)), mode="edge")
+        calm = np.median(np.stack([padded[k : k + len(y)] for k in range(5)]), axis=0)
+        leap = np.einsum("ei,eij,ej->e", y - calm, normal, y - calm)
+        limit = criteria.LEAP * float(np.median(leap[e.n > 0]))
+        factor = np.where(leap > limit, limit / np.maximum(leap, 1e-9), 1.0)
+        if np.any(factor != 1.0):
+            e = replace(e.weighted(factor), weights=e.weights * factor[:, None, None])
+        out.append(e)
+    return out
+
+
+def estimate_mount_motion(
+    fitter: HypothesisFitter,
+    terms: Sequence[Term],
+    mount: Mount,
+    start: Array | None = None,
+    max_iterations: int = 8,
+) -> tuple[HypothesisFitter, Fit, Mount]:
+    """Estimate the movement alongside a hypothesis: a fitter that has it, the fit in it, the
+    estimate.
+
+    fitter: of the series, with or without a movement; mount: where the iteration starts.
+    """
+    for turn in range(max_iterations + 1):
+        own = HypothesisFitter(mount.on(fitter.series))
+        own.thermometer_factor = fitter.thermometer_factor
+        own.share_trajectories(fitter)
+        fit = own.fit(terms, start, 1 if turn else 2)
+        start = fit.coefficients
+        if turn < max_iterations:
+            mount = _improve_mount(own, fit, mount)
+    return own, fit, mount
+
+
+def _improve_mount(fitter: HypothesisFitter, fit: Fit, mount: Mount) -> Mount:
+    """Take one step: the covariance whose moments the amplitudes have, given the data."""
+    size, directions = mount.modes()
+    power = np.zeros((len(size), len(size)))
+    known = np.zeros((len(size), len(size)))
+    for e, (mean, root) in zip(fitter.series, _estimate_amplitudes(fit), strict=True):
+        assert e.movement is not None
+        a, k = e.movement.moments(mean, root)
+        power += a
+        known += k
+    # of each amplitude the data determine 1 - its variance: so many count (MacKay)
+    value, V = np.linalg.eigh(known)
+    root = (V / np.sqrt(np.maximum(value, _LITTLE * value[-1]))) @ V.T
+    change = root @ power @ root
+    # directions = W U: the covariance in W's coordinates again
+    U = np.linalg.lstsq(mount.combinations, directions * np.sqrt(size), rcond=None)[0]
+    new = U @ change @ U.T
+    return replace(mount, covariance=0.5 * (new + new.T))
+
+
+def _estimate_amplitudes(fit: Fit) -> list[tuple[Array, Array]]:
+    """Estimate the movement's amplitudes (F,) of each series given the data, and a root (·, F) of
+    their covariance: the product of its transpose with itself.
+
+    Levels and coefficients are unknown too: their uncertainty is in the covariance.
+    """
+    from scipy.linalg import solve_triangular
+
+    known = scaled_inverse(fit.normals()[0], 1e-10)
+    out = []
+    for w, (C, V, index) in zip(fit.weightings, fit.designs, strict=True):
+        assert w.factor is not None
+        x = fit.coefficients[index]
+        U = w.carried(C, V)
+        K = np.einsum("epq,qi,ei->pi", w.N, V, C, optimize=True) - w.level.T @ U
+        F = w.level_factor
+        B = solve_triangular(F, K, lower=True)
+        right = solve_triangular(F, w.level_b - K @ x, lower=True)
+        level = solve_triangular(F.T, right, lower=False)
+        data = w.data - U @ x - w.level @ level
+        Q = solve_triangular(F, w.level.T, lower=True).T
+        inverse = solve_triangular(w.factor, np.eye(len(w.factor), w.moving), lower=True)
+        by_level = Q.T @ inverse
+        size, turn = np.linalg.eigh(known[np.ix_(index, index)])
+        by_x = (turn * np.sqrt(np.maximum(size, 0.0))).T @ (U - Q @ B).T @ inverse
+        out.append((inverse.T @ data, np.concatenate([inverse, by_level, by_x])))
+    return out
+
+
+# -- what moves from epoch to epoch ----------------------------------------------------------------
+
+
+def measure_jumps(fitter: HypothesisFitter, fit: Fit, series: int) -> tuple[Array, Array]:
+    """Measure the variance of jumps over its expectation (P,), in combinations W (P, P).
+
+    The columns of W are orthonormal under the mean normal matrix; the thermometer's noise, which
+    jumps too, is in the expectation. What trembles as a whole has a direction of its own: where one
+    is clear, the combinations are turned to it.
+    """
+    e = fitter.series[series]
+    W, good = orthonormal_combinations(e.N.mean(axis=0))
+    z = (_subtract_fit(fitter, fit, series) @ W)[e.n > 0]
+    d = np.diff(z, 2, axis=0)
+    spread = np.median(np.abs(d), axis=0) * 1.4826
+    observed = np.array(
+        [np.mean(x[np.abs(x) <= 4 * s] ** 2) for x, s in zip(d.T, spread, strict=True)]
+    )
+    white = 6.0 / e.correlation
+    second = np.diff(np.eye(len(e.times)), 2, axis=0)
+    carried = np.zeros((W.shape[1], W.shape[1]))
+    for operator, channel, direction in _list_reading_errors(fitter, fit, series):
+        jump = (second @ operator) * e.state_sd(channel)
+        share = W.T @ e.N.mean(axis=0) @ direction
+        carried += np.mean(np.sum(jump**2, axis=1)) * np.outer(share, share)
+    usual = np.all(np.abs(d) <= 4 * spread + 1e-12, axis=1)
+    turned = _find_directions(d[usual][:, good], white, carried[np.ix_(good, good)], 2)
+    if turned is not None:
+        factors, U = turned
+        return np.concatenate([np.ones(int((~good).sum())), factors]), np.column_stack(
+            [W[:, ~good], W[:, good] @ U]
+        )
+    return np.where(good, observed / (white + np.diag(carried)), 1.0), W
+
+
+def _subtract_fit(fitter: HypothesisFitter, fit: Fit, series: int) -> Array:
+    """Return what a fit and one level leave of the right-hand sides (E, P) of a series."""
+    e = fitter.series[series]
+    rest = e.b - np.einsum("epq,eq->ep", e.N, fit.parameters(series))
+    out: Array = rest - e.N @ best_level(e.N, rest)
+    return out
+
+
+def detect_tremble(evidence: ReducedSeries) -> bool:
+    """Test whether all targets jump together from epoch to epoch.
+
+    From differences of so high an order that nothing is left of what follows a temperature: no
+    effect is assumed, and no thermometer's errors come in.
+    """
+    M = evidence.N.mean(axis=0)
+    W, good = orthonormal_combinations(M)
+    W = W[:, good]
+    d = np.diff((evidence.values @ M @ W)[evidence.n > 0], _FAST, axis=0)
+    if len(d) < criteria.FEWEST:
+        return False
+    spread = np.median(np.abs(d), axis=0) * 1.4826
+    usual = np.all(np.abs(d) <= 4 * spread + 1e-12, axis=1)
+    white = comb(2 * _FAST, _FAST) / evidence.correlation
+    return _find_directions(d[usual], white, np.zeros((len(W.T), len(W.T))), _FAST) is not None
+
+
+def _find_directions(
+    d: Array, white: float, carried: Array, order: int
+) -> tuple[Array, Array] | None:
+    """Find factors (m,) along orthonormal directions (m, m) in which differences d (n, m) of an
+    order are clearly larger than expected; None where there are none.
+
+    white: the mean square that image noise gives, carried (m, m): that of thermometers.
+    """
+    n, m = d.shape
+    if n < criteria.FEWEST:
+        return None
+    # differences repeat each other: of n second ones 18/35 are independent
+    shared = np.array([comb(2 * order, k) for k in range(2 * order + 1)], dtype=float)
+    independent = n * shared[order] ** 2 / np.sum(shared**2)
+    edge = (1.0 + np.sqrt(m / independent)) ** 2
+    covariance = d.T @ d / n
+    _, U = np.linalg.eigh(covariance - carried)
+    own = np.einsum("ji,jk,ki->i", U, covariance, U)
+    expected = white + np.einsum("ji,jk,ki->i", U, carried, U)
+    clear = own > criteria.UNUSUAL * edge * expected
+    if not clear.any():
+        return None
+    # what thermometers carry is an upper bound: trajectories are smoothed
+    return np.where(clear, own / white, 1.0), U
+
+
+def weight_jumps_down(evidence: ReducedSeries, factors: Array, W: Array) -> ReducedSeries | None:
+    """Add unusual jumps to the noise of a series; None where there are none."""
+    factors = np.where(factors > criteria.UNUSUAL, factors, 1.0)
+    if np.all(factors == 1.0):
+        return None
+    inverse = np.linalg.inv(W)
+    T = inverse.T @ np.diag(1.0 / np.sqrt(factors)) @ W.T
+    N = T @ evidence.N @ T.T
+    hidden = evidence.hidden.turned(T, evidence.values) if evidence.hidden else None
+    turned = replace(evidence, N=0.5 * (N + N.swapaxes(1, 2)), hidden=hidden)
+    return turned.with_values(evidence.values)
+
+
+def add_tremble(fitter: HypothesisFitter, fit: Fit, slower: int) -> list[ReducedSeries]:
+    """Add what moves from epoch to epoch as a movement of each epoch by itself.
+
+    slower: how many of the slowest half-waves are accounted for otherwise.
+    """
+    out = []
+    for s, e in enumerate(fitter.series):
+        M, W = _measure_fast_power(fitter, fit, s, slower)
+        edge = (1.0 + np.sqrt(len(M) / max(len(e.times) - slower, 1))) ** 2
+        factors, U = np.linalg.eigh(M)
+        clear = factors > criteria.BEYOND * edge  # what so few half-waves cannot show by chance
+        D = W @ (U[:, clear] * np.sqrt(factors[clear] - 1.0))
+        rest = np.diag(M - (U[:, clear] * (factors[clear] - 1.0)) @ U[:, clear].T)
+        more = rest > criteria.UNUSUAL
+        D = np.column_stack([D, W[:, more] * np.sqrt(rest[more] - 1.0)])
+        out.append(replace(e, tremble=D) if D.shape[1] else e)
+    return out
+
+
+def _measure_fast_power(
+    fitter: HypothesisFitter, fit: Fit, series: int, slower: int
+) -> tuple[Array, Array]:
+    """Measure the mean power (m, m) of fast half-waves that a fit leaves in the determined
+    combinations W (P, m) of the parameters: the unit matrix where the image noise is all. What the
+    thermometers' noise makes is taken off.
+    """
+    e = fitter.series[series]
+    W, good = orthonormal_combinations(e.N.mean(axis=0))
+    W = W[:, good]
+    fast = waves(e.times, len(e.times) - 1)[:, slower:].T
+    z = fast @ (_subtract_fit(fitter, fit, series) @ W)
+    power: Array = z.T @ z / len(fast)
+    for operator, channel, direction in _list_reading_errors(fitter, fit, series):
+        carried = fast @ operator
+        noise = np.mean(np.sum((carried * e.state_sd(channel)) ** 2, axis=1))
+        # the fit has smoothed readings: what smoothing took off them is not in the rest
+        taken = np.mean((carried @ e.state_deviation(channel)) ** 2)
+        left = max(np.sqrt(noise) - np.sqrt(taken), 0.0) ** 2
+        along = W.T @ e.N.mean(axis=0) @ direction
+        power -= left * np.outer(along, along)
+    return power, W
+
+
+def _list_reading_errors(
+    fitter: HypothesisFitter, fit: Fit, series: int
+) -> Iterator[tuple[Array, str, Array]]:
+    """Yield how the readings' errors reach the parameters: operator, channel, direction (P,)."""
+    for block in fit.blocks:
+        if block.trajectories > 1 or block.series not in (None, series):
+            continue
+        operator: Array | None
+        if block.term < 0:
+            operator = fitter.drive(fit.terms, series)[1]
+            channel = fitter.series[series].history.reference
+        else:
+            _, operator, channel = fitter.trajectories(fit.terms[block.term], series, fit.terms)
+        if operator is not None:
+            yield operator, channel, fit.direction(block)[0]
+
+
+def add_jumps_to_noise(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries] | None:
+    """Add what still jumps from epoch to epoch to the noise; None where nothing does."""
+    if any(len(e.times) < criteria.FEWEST for e in fitter.series):
+        return None
+    out = [
+        weight_jumps_down(e, *measure_jumps(fitter, fit, s)) for s, e in enumerate(fitter.series)
+    ]
+    if all(e is None for e in out):
+        return None
+    return [e or old for e, old in zip(out, fitter.series, strict=True)]

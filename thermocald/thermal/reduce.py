@@ -1,0 +1,509 @@
+"""The reduction of a series: linearisation, gross errors, offsets of targets, normal equations.
+
+What is constant over the series says nothing about heat: one offset per target (errors of the
+field's coordinates) is taken out here, together with the cameras, so that a target that is hidden
+now and then is not mistaken for a drift.
+
+What a recording must hold to carry a discovery; the refusals say what is missing.
+
+Gross errors of a series, found in time: a target that leaps out of its own neighbours.
+
+All is done in parts of the series, so that a long one needs no more memory than its points.
+
+Where a series is linearised: one camera for its mean image, and what the partials leave.
+
+The normal equations of a series hold partial derivatives at one point. An error of that point is
+one of the rates: the point is as sharp as the mean image is. The image does not follow the
+principal distance in straight lines: over the range of a year that is a hundred-thousandth.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.errors import DataError
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, project
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, adjust
+from thermocald.photogrammetry.epoch.cold_start import cold_start
+from thermocald.photogrammetry.epoch.geometry import GeometryBounds
+from thermocald.photogrammetry.field.planes import plane_fit
+from thermocald.photogrammetry.field.testfield import Observations
+from thermocald.photogrammetry.linalg import MAD_TO_SD
+from thermocald.photogrammetry.series.normals import (
+    linearise,
+    normal_matrices,
+    right_hand_sides,
+    sums_of_squares,
+)
+from thermocald.physics.history import History
+from thermocald.thermal import criteria
+from thermocald.thermal.random_effects import group_hidden_targets
+from thermocald.thermal.series import ReducedSeries, SeriesInput, solve
+from thermocald.thermal.thermometer import Thermometer, thermometers
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from thermocald.arrays import Array, Mask
+    from thermocald.photogrammetry.series.normals import ObservationGrid, Partials
+
+
+def no_temperature(source: SeriesInput, reference: str) -> str:
+    """Write the sentence for a reference temperature that was hardly ever read."""
+    return (
+        f"{source.name}: the recording has no temperature: the column {reference!r} holds fewer "
+        f"than {criteria.MIN_EPOCHS} readings. Discovery compares the camera with a thermometer; "
+        "record one"
+    )
+
+
+def require(source: SeriesInput) -> None:
+    """Raise DataError where temperature, epochs, duration or field do not carry a discovery."""
+    if not source.readings:
+        raise DataError(
+            f"{source.name}: the recording has no temperature column. Discovery compares the "
+            "camera with a thermometer; record one"
+        )
+    reference = next(iter(source.readings))
+    if np.isfinite(source.readings[reference]).sum() < criteria.MIN_EPOCHS and (
+        len(source.frame_times) >= criteria.MIN_EPOCHS
+    ):
+        raise DataError(no_temperature(source, reference))
+    seen = source.grid.observed.sum(axis=1)
+    good = int(np.sum(seen >= criteria.MIN_TARGETS))
+    if good < criteria.MIN_EPOCHS:
+        raise DataError(
+            f"{source.name}: {good} of {len(seen)} epochs have {criteria.MIN_TARGETS} targets or "
+            f"more; discovery needs {criteria.MIN_EPOCHS} such epochs, better 100"
+        )
+    duration = float(source.frame_times[-1] - source.frame_times[0])
+    if duration < criteria.MIN_DURATION:
+        raise DataError(
+            f"{source.name}: the recording lasts {duration:.0f} s; heat needs minutes to reach a "
+            "camera, and what moves faster is not a thermal effect. Record at least "
+            f"{criteria.MIN_DURATION:.0f} s, better half an hour"
+        )
+    rows = source.grid.observed.any(axis=0)
+    if plane_fit(source.field.points[rows])[2]:
+        raise DataError(
+            f"{source.name}: the {int(rows.sum())} targets seen lie in one plane; principal point "
+            "and tilt cannot be separated on it. Use a field with depth, such as a corner"
+        )
+
+
+def require_for_fit(source: SeriesInput) -> None:
+    """Raise DataError where temperature or epochs do not carry the fit of a thermal model."""
+    if not source.readings:
+        raise DataError(f"{source.name}: has no temperature column; a thermal model needs one")
+    enough = source.grid.observed.sum(axis=1) >= criteria.ENOUGH_TARGETS
+    if enough.sum() < criteria.LEAST_EPOCHS:
+        raise DataError(
+            f"{source.name}: fewer than {criteria.LEAST_EPOCHS} epochs show "
+            f"{criteria.ENOUGH_TARGETS} targets or more"
+        )
+
+
+def require_change(source: SeriesInput, reference: str, channel: Thermometer) -> None:
+    """Raise DataError where the reference temperature does not change."""
+    trajectory = channel.trajectory[np.isfinite(channel.trajectory)]
+    change = float(np.ptp(trajectory))
+    if change < max(criteria.LEAST_CHANGE_K, criteria.LEAST_CHANGE * channel.noise):
+        raise DataError(
+            f"{source.name}: the temperature {reference!r} is constant within "
+            f"{change:.2f} K; what follows it cannot be told from what does not. "
+            "Record a series in which it changes by 5 K or more"
+        )
+
+
+_HALF = 2  # neighbours on either side
+_PART = 2048  # epochs at a time
+
+
+def _parts(epochs: int) -> Iterator[slice]:
+    return (slice(k, min(k + _PART, epochs)) for k in range(0, epochs, _PART))
+
+
+def _take_running_median(
+    values: Array, part: slice, mask: Mask | None = None, *, itself: bool = True
+) -> Array:
+    """Return the median over time of up to five neighbours (e, T, 2) in a part, NaN ignored.
+
+    mask (E, T): points that do not count; itself: whether an epoch is among its neighbours.
+    """
+    first, last = max(part.start - _HALF, 0), min(part.stop + _HALF, len(values))
+    near = values[first:last]
+    if mask is not None:
+        near = np.where(mask[first:last, :, None], np.nan, near)
+    before, after = part.start - first, last - part.stop
+    padded = np.pad(near, ((_HALF - before, _HALF - after), (0, 0), (0, 0)),
+                    constant_values=np.nan)  # fmt: skip
+    width, n = 2 * _HALF + 1, part.stop - part.start
+    stack = np.stack([padded[k : k + n] for k in range(width) if itself or k != _HALF])
+    width = len(stack)
+    stack.sort(axis=0)  # NaN go to the end
+    count = np.isfinite(stack).sum(axis=0)
+    low = np.maximum(count - 1, 0) // 2
+    high = np.minimum(count // 2, width - 1)
+    pick = np.take_along_axis
+    middle: Array = 0.5 * (pick(stack, low[None], 0)[0] + pick(stack, high[None], 0)[0])
+    return middle
+
+
+def _take_medians(values: Array) -> Array:
+    """Return the median of each row (e, n), NaN ignored; NaN where there is nothing else."""
+    ordered = np.sort(values, axis=1)  # NaN go to the end
+    count = np.isfinite(ordered).sum(axis=1)
+    rows = np.arange(len(ordered))
+    low, high = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, ordered.shape[1] - 1)
+    return np.asarray(0.5 * (ordered[rows, low] + ordered[rows, high]))
+
+
+def find_spikes(misclosure: Array, seen: Mask) -> Mask:
+    """Find points (E, T) that leap out of their own neighbours in time while the others do not.
+
+    Found before any adjustment, where a gross error of many pixels would hide itself and others.
+    """
+    size, own = np.zeros(seen.shape), np.zeros(len(seen))
+    for part in _parts(len(seen)):
+        # Without the epoch itself: where all move one way it would be its own median, and what
+        # is usual would be nothing.
+        d = misclosure[part] - _take_running_median(misclosure, part, itself=False)
+        for k in range(2):
+            d[..., k] -= _take_medians(d[..., k])[:, None]  # the whole image may move
+        own[part] = MAD_TO_SD * _take_medians(np.abs(d).reshape(len(d), -1))
+        size[part] = np.max(np.abs(np.nan_to_num(d)), axis=2)
+    finite = own[np.isfinite(own)]
+    level = float(np.median(finite)) if len(finite) else 0.0
+    limit = criteria.SPIKE * np.fmax(np.nan_to_num(own), level)
+    return np.asarray(seen & (size > limit[:, None]))
+
+
+def find_outliers(v: Array, weights: Array, seen: Mask, bad: Mask) -> Mask:
+    """Find points (E, T) whose residuals v (E, T, 2) px are gross against their neighbours in time.
+
+    bad: those that were so far, which do not count. Noise may grow with heat: each epoch is
+    assessed by its own spread, or the series' where that is larger.
+    """
+    size, own = np.zeros(seen.shape), np.zeros(len(seen))
+    good = seen & ~bad
+    normal = []
+    for part in _parts(len(seen)):
+        root = np.sqrt(weights[part, :, :2])
+        kept = np.where(good[part, :, None], np.abs(np.nan_to_num(v[part])) * root, np.nan)
+        own[part] = MAD_TO_SD * _take_medians(kept.reshape(len(kept), -1))
+        normal.append(kept[np.isfinite(kept)])
+        local = np.abs(np.nan_to_num(v[part] - _take_running_median(v, part, bad)))
+        size[part] = np.max(local * root, axis=2)
+    level = MAD_TO_SD * float(np.median(np.concatenate(normal)))
+    limit = criteria.GROSS * np.fmax(np.nan_to_num(own), level)
+    return np.asarray(seen & (size > limit[:, None]))
+
+
+_MEAN_IMAGE_PX, _SHARPEST_PX = 0.1, 1e-4  # standard deviation of the mean image's points
+_ANY_GEOMETRY = GeometryBounds(0, 2.0, 1e9, 1e9, 0.0, 0.0)
+
+
+def _free_all(source: SeriesInput, affinity: bool) -> AdjustmentSettings:
+    """Free all parameters: where C1 or C2 is held, the principal point makes up for it, and the
+    partials are those of another camera. Weak ones stay near zero.
+    """
+    c = source.principal_distance or source.sensor.width * source.sensor.pixel_pitch
+    spreads = (0.3 / c**2, 0.3 / c**4, 0.3 / c**6, 0.02 / c, 0.02 / c, 0.02, 0.02)
+    free = IOP_NAMES if affinity else IOP_NAMES[:-2]
+    priors = {n: (0.0, sd) for n, sd in zip(IOP_NAMES[3:], spreads, strict=True) if n in free}
+    return AdjustmentSettings(free, priors, max_rejected=0.9, bounds=_ANY_GEOMETRY)
+
+
+def linearise_series(source: SeriesInput, affinity: bool) -> Partials:
+    """Linearise at one camera for the mean image of the series."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        mean = np.nanmedian(source.grid.points, axis=0)
+    # targets seen in half of the epochs that show any carry the orientation
+    looked = int(source.grid.observed.any(axis=1).sum())
+    often = source.grid.observed.sum(axis=0) >= 0.5 * max(looked, 1)
+    rows = np.flatnonzero(np.isfinite(mean[:, 0]) & often)
+    seen = Observations(rows, mean[rows], np.full((len(rows), 2), _MEAN_IMAGE_PX))
+    settings = _free_all(source, affinity)
+    found = cold_start(
+        source.sensor, source.field, seen, settings, source.principal_distance,
+        None if affinity else source.interior,
+    )  # fmt: skip
+    if found.interior is None or found.exterior is None:
+        raise DataError(
+            f"{source.name}: the camera cannot be oriented on its mean image: {found.reason}"
+        )
+    # as sharp as it is, else the weak priors pull at the camera: 1e-4 of a year's rates
+    rejected = np.isin(seen.targets, found.rejected)
+    left = float(np.sqrt(np.mean(np.square(found.residuals[~rejected]))))
+    sigmas = np.full((len(rows), 2), np.clip(left, _SHARPEST_PX, _MEAN_IMAGE_PX))
+    better = adjust(
+        source.sensor, source.field, replace(seen, sigmas=sigmas), found.interior, found.exterior,
+        replace(settings, snooping_alpha=0.0), rejected,
+    )  # fmt: skip
+    if better.interior is not None and better.exterior is not None:
+        found = better
+    return linearise(source.sensor, source.field, found.values[:10], found.values[10:])
+
+
+def curvature(source: SeriesInput, at: Partials, weights: Array, misclosure: Array) -> Array:
+    """Return what the partials leave of the image's movement with the principal distance (E, T, 2)
+    px.
+
+    A tenth of a per mille of the movement, which the rates of a year would hold. The principal
+    distance is that of the image's scale and shift; the principal point moves the image in straight
+    lines, and what a mount does is small against either.
+    """
+    A = at.A[:, :, :3]
+    N = normal_matrices(weights, A)
+    change = solve(N, right_hand_sides(weights, misclosure, A))[:, 0]
+    low, high = at.iop.copy(), at.iop.copy()
+    step = 1e-3 * float(at.iop[0])
+    low[0], high[0] = at.iop[0] - step, at.iop[0] + step
+    ends = project(source.sensor, np.stack([low, high]), at.eop, source.field.points)
+    second = np.nan_to_num((ends.sum(axis=0) - 2.0 * at.predicted) / step**2)
+    # a gross error that is not known yet is not the camera's
+    change = np.where(np.abs(change) < 0.02 * at.iop[0], change, 0.0)
+    out: Array = 0.5 * np.square(change)[:, None, None] * second
+    return out
+
+
+def reduce_series(
+    source: SeriesInput,
+    T0: float | None = None,
+    scale: Array | None = None,
+    *,
+    affinity: bool = True,
+    strict: bool = True,
+) -> ReducedSeries:
+    """Check a series and reduce it.
+
+    T0 °C: the reference temperature, by default the mean of the series; scale (19,): px per unit of
+    the columns, of another series of the camera; affinity: whether C1 and C2 are free where the
+    projection is linearised; strict: whether the series must carry a discovery, else only a fit.
+
+    Raises DataError where the data cannot carry it: it says what is missing.
+    """
+    least = criteria.MIN_EPOCHS if strict else criteria.LEAST_EPOCHS
+    if strict:
+        require(source)
+    else:
+        require_for_fit(source)
+    times = source.frame_times - source.frame_times[0]
+    reading_times = source.reading_times - source.frame_times[0]
+    usable = np.isfinite(reading_times)
+    reading_times = reading_times[usable]
+    present = {
+        name: np.asarray(r, dtype=float)[usable]
+        for name, r in source.readings.items()
+        if np.isfinite(np.asarray(r, dtype=float)[usable]).sum() >= least
+    }
+    reference = next(iter(source.readings))
+    if reference not in present:
+        raise DataError(no_temperature(source, reference))
+    noises = None
+    if source.noises is not None:
+        noises = {name: source.noises[name][usable] for name in present}
+    knots, instruments = thermometers(reading_times, present, source.resolutions, noises)
+    trajectory = instruments[reference].trajectory
+    trajectory = trajectory[np.isfinite(trajectory)]
+    history = History(
+        times,
+        knots,
+        {name: c.trajectory for name, c in instruments.items()},
+        reference,
+        float(np.mean(trajectory)) if T0 is None else T0,
+        source.polygons(),
+    )
+    if strict:
+        require_change(source, reference, instruments[reference])
+    return _reduce(source, times, history, instruments, linearise_series(source, affinity), scale)
+
+
+def reduce_together(inputs: Sequence[SeriesInput], T0: float | None = None) -> list[ReducedSeries]:
+    """Reduce series in common units; T0 is the mean of the first unless a model has one."""
+    first = reduce_series(inputs[0], T0)
+    out = [first, *(reduce_series(i, first.T0, first.scale) for i in inputs[1:])]
+    for e in out[1:]:
+        low = float(np.min(e.at.iop[0] / first.at.iop[0]))
+        if not 0.9 < low < 1.1:
+            raise DataError(
+                f"{e.source.name}: the principal distance is {e.at.iop[0]:.3f} mm, in "
+                f"{first.source.name} {first.at.iop[0]:.3f} mm: another camera, or refocused"
+            )
+    return out
+
+
+def _reduce(
+    source: SeriesInput,
+    times: Array,
+    history: History,
+    instruments: Mapping[str, Thermometer],
+    at: Partials,
+    scale: Array | None,
+) -> ReducedSeries:
+    X = source.field.points
+    A = np.concatenate([at.A, at.B * X[:, None, :]], axis=-1)
+    used = source.grid.observed.any(axis=0)
+    if scale is None:
+        scale = np.sqrt(np.mean(np.sum(A[used] ** 2, axis=1), axis=0))
+    A = A / scale
+    misclosure = source.grid.points - at.predicted
+    weights = source.grid.weights
+    seen = source.grid.observed
+    bad = find_spikes(misclosure, seen)
+    misclosure -= curvature(source, at, source.grid.reject(bad).weights, misclosure)
+    offsets = np.zeros((len(X), 2))
+    for turn in range(5):
+        w = source.grid.reject(bad).weights
+        N = normal_matrices(w, A)
+        offsets, b, values, v = _improve_offsets(w, N, A, misclosure, offsets)
+        if turn >= 1:
+            bad = find_outliers(v, weights, seen, bad)
+    w = source.grid.reject(bad).weights
+    N = normal_matrices(w, A)
+    offsets, b, values, v = _improve_offsets(w, N, A, misclosure, offsets)
+    lPl = sums_of_squares(w, misclosure - offsets)
+    yy = np.einsum("ek,ek->e", values, b)
+    count = (seen & ~bad).sum(axis=1)
+    free = np.maximum(2 * count - len(scale), 1)
+    # one offset per target is estimated too
+    loss = 1.0 - 2 * int(used.sum()) / max(2 * int(count.sum()), 1)
+    sigma0 = np.sqrt(np.maximum(lPl - yy, 0) / free / loss)
+    enough = count >= criteria.MIN_TARGETS
+    variance = float(np.median(sigma0[enough]) ** 2)
+    v = np.where((seen & ~bad)[..., None], v, np.nan)
+    weak = ~enough
+    N[weak], b[weak], yy[weak], count[weak] = 0.0, 0.0, 0.0, 0
+    return ReducedSeries(
+        source=source,
+        times=times,
+        history=history,
+        thermometers=instruments,
+        at=at,
+        scale=scale,
+        columns=A,
+        N=N / variance,
+        b=b / variance,
+        yy=yy / variance,
+        values=values,
+        residuals=v,
+        weights=w / variance,
+        offsets=offsets,
+        n=count,
+        sigma0=sigma0 / np.sqrt(variance),
+        variance=variance,
+        correlation=_measure_slowness(v),
+        gross=int(bad.sum()),
+        hidden=group_hidden_targets(w / variance, misclosure - offsets, A),
+    )
+
+
+def _improve_offsets(
+    w: Array, N: Array, A: Array, misclosure: Array, offsets: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Improve the offsets (T, 2) px by one step; then right-hand sides (E, k), values (E, k)
+    and the residuals (E, T, 2) px that go with them.
+    """
+
+    def cameras(offsets: Array) -> tuple[Array, Array, Array]:
+        left = misclosure - offsets
+        b = right_hand_sides(w, left, A)
+        values = solve(N, b)
+        return b, values, left - (values @ A.reshape(-1, A.shape[-1]).T).reshape(left.shape)
+
+    _, _, v = cameras(offsets)
+    offsets = offsets + _solve_offsets(w[..., :2], np.nan_to_num(v), N, A)
+    return (offsets, *cameras(offsets))
+
+
+def _solve_offsets(weights: Array, v: Array, N: Array, A: Array, max_iterations: int = 60) -> Array:
+    """Solve for one offset per target (T, 2) that residuals v (E, T, 2) of free cameras ask for.
+
+    Targets hidden for long pull at the cameras of the other epochs: offsets and cameras are solved
+    together, by conjugate gradients on the offsets alone.
+    """
+    k = A.shape[-1]
+    flat = A.reshape(-1, k)
+    total = weights.sum(axis=0)
+    inverse = 1.0 / np.where(total > 0, total, np.inf)
+
+    def normal(p: Array) -> Array:
+        camera = solve(N, (weights * p).reshape(len(N), -1) @ flat)
+        return np.asarray(np.sum(weights * (p - (camera @ flat.T).reshape(v.shape)), axis=0))
+
+    out = np.zeros(total.shape)
+    r = np.sum(weights * v, axis=0)
+    z = inverse * r
+    p, rz = z, float(np.sum(r * z))
+    for _ in range(max_iterations):
+        if np.max(np.abs(z)) < 1e-5:
+            break
+        q = normal(p)
+        pq = float(np.sum(p * q))
+        if pq <= 0:
+            break
+        out = out + rz / pq * p
+        r = r - rz / pq * q
+        z = inverse * r
+        p, rz = z + float(np.sum(r * z)) / rz * p, float(np.sum(r * z))
+    return out
+
+
+def _measure_slowness(v: Array, lags: int = 20) -> float:
+    """Measure by how much slow variances exceed white noise: 1 + 2 Σ autocorrelations.
+
+    From the residuals of all targets together; the mean of each target has been taken out.
+    """
+    E = len(v)
+    lags = min(lags, E // 4)
+    x = v - np.nan_to_num(np.nanmean(v)) if np.isfinite(v).any() else v
+    filled = np.nan_to_num(x)
+    there = np.isfinite(x).astype(float)
+    power = float(np.sum(filled**2) / max(there.sum(), 1.0))
+    total = 1.0
+    for k in range(1, lags + 1):
+        pairs = float(np.sum(there[k:] * there[:-k]))
+        if pairs > 0 and power > 0:
+            r = float(np.sum(filled[k:] * filled[:-k])) / pairs / power
+            total += 2.0 * (r + 1.0 / E)
+    return max(total, 1.0) if total > 1.08 else 1.0
+
+
+def reweight(evidence: ReducedSeries, noise: Array) -> ReducedSeries:
+    """Weight a series for a measuring noise of each epoch of `noise` (E,) times the usual."""
+    free = np.maximum(2.0 * evidence.n - evidence.N.shape[1], 0.0)
+    level = np.sum(free * (evidence.sigma0 / noise) ** 2) / max(float(free.sum()), 1.0)
+    noise = noise * np.sqrt(level)
+    factor = 1.0 / noise**2
+    return replace(
+        evidence.weighted(factor),
+        weights=evidence.weights * factor[:, None, None],
+        sigma0=evidence.sigma0 / noise,
+    )
+
+
+def without_targets(evidence: ReducedSeries, rows: NDArray[np.int64]) -> ReducedSeries:
+    """Reduce the series as if some targets of the field had never been observed."""
+    mask = np.zeros(evidence.source.grid.observed.shape, dtype=bool)
+    mask[:, rows] = True
+    reduced = with_points(evidence, evidence.source.grid.reject(mask))
+    return replace(reduced, source=evidence.source, excluded=np.union1d(evidence.excluded, rows))
+
+
+def with_points(evidence: ReducedSeries, grid: ObservationGrid) -> ReducedSeries:
+    """Reduce the series with other image points, at the same linearisation."""
+    return _reduce(
+        replace(evidence.source, grid=grid),
+        evidence.times,
+        evidence.history,
+        evidence.thermometers,
+        evidence.at,
+        evidence.scale,
+    )

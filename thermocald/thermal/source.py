@@ -1,0 +1,455 @@
+"""From a recording to the arrays that a reduction reads.
+
+A long series condensed while it is read: means of epochs, short where something is fast.
+
+Heat is slow. Over a year the camera's trajectories are carried by means over an hour or so; what is
+faster is looked for in the image itself: its shift and scale, epoch by epoch, less what follows the
+temperature in a straight line. The few windows (a day each, say) in which most is left, or in which
+the temperature itself changes fastest, keep short means. A mean of image points that a camera moves
+alike has the sum of their weights: for the normal equations of a camera that stands still within a
+row nothing is lost.
+
+Does not hold: what is faster than a row outside these windows is averaged over.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.acquisition.calibrated_blocks import calibrated_epochs
+from thermocald.acquisition.calibrator import Calibrator
+from thermocald.errors import DataError
+from thermocald.photogrammetry.linalg import MAD_TO_SD
+from thermocald.photogrammetry.series.blocks import recut
+from thermocald.photogrammetry.series.normals import ObservationGrid
+from thermocald.store.sources import open_source, source_name
+from thermocald.store.stored_blocks import StoredBlocks
+from thermocald.thermal import criteria
+from thermocald.thermal.series import SeriesInput
+from thermocald.thermal.thermometer import estimate_reading_noise
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from thermocald.arrays import Array, Index
+    from thermocald.epoch import Epoch
+    from thermocald.photogrammetry.field.testfield import TestField
+    from thermocald.photogrammetry.series.blocks import ObservationBlocks
+    from thermocald.store.recording.head import Head
+    from thermocald.store.recording.reader import Recording
+    from thermocald.store.recording.readings import Readings
+    from thermocald.store.series import SeriesReader, StoredSeries
+
+_POINTS = 1_300_000  # image points of all rows: 300 MB while they are reduced
+_FEWEST, _MOST = 2_000, 10_000  # rows
+_COARSE = 0.8  # of the rows are long means
+_SHORTEST, _LONGEST = 4, 24  # long means of a window
+_FINER = 12  # short means in a long one
+_NEIGHBOURS = 5  # epochs that tell a gross error
+_AT_ONCE = 4_000  # epochs
+_MEMORY_S = 3600.0  # before the first frame: what a lag may remember
+_READINGS_A_FRAME = 10
+
+
+def limit_rows(targets: int) -> int:
+    """Return how many epochs of so many targets are reduced one by one."""
+    return min(max(_POINTS // max(targets, 1), _FEWEST), _MOST)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Rows of a condensed series: their first epochs (R,), of how many each is, and the grid."""
+
+    first: Index
+    count: Index
+    grid: ObservationGrid
+
+    def without(self, windows: Sequence[slice]) -> _Rows:
+        """Leave out the rows inside some windows of epochs."""
+        keep = np.ones(len(self.first), dtype=bool)
+        for window in windows:
+            keep &= (self.first < window.start) | (self.first >= window.stop)
+        grid = ObservationGrid(self.grid.points[keep], self.grid.weights[keep])
+        return _Rows(self.first[keep], self.count[keep], grid)
+
+    def beside(self, others: Sequence[_Rows]) -> _Rows:
+        """Merge these rows with others in the order of time."""
+        parts = [self, *others]
+        first = np.concatenate([p.first for p in parts])
+        order = np.argsort(first, kind="stable")
+        return _Rows(
+            first[order],
+            np.concatenate([p.count for p in parts])[order],
+            ObservationGrid(
+                np.concatenate([p.grid.points for p in parts])[order],
+                np.concatenate([p.grid.weights for p in parts])[order],
+            ),
+        )
+
+
+def condensed(
+    series: SeriesInput, source: ObservationBlocks, most: int | None = None
+) -> SeriesInput:
+    """Condense a series of all epochs to at most `most` rows.
+
+    series: all epochs, its grid not looked at; source: their observations. Memory is that of the
+    rows and a block.
+    """
+    E, T = len(source), len(series.field)
+    most = most or limit_rows(T)
+    size = int(np.ceil(E / (_COARSE * most)))
+    fine = max(size // _FINER, 1)
+    size = fine * int(np.ceil(size / fine))
+    rows, trajectory = _average_epochs(source.blocks(), 0, E, T, size, fine)
+    if size > 1:
+        spare = (1.0 - _COARSE) * most * fine  # epochs that may stand on short means
+        length = size * int(np.clip(0.5 * spare / size, _SHORTEST, _LONGEST))
+        count = max(int(spare / length), 1)
+        chosen = _choose_fast_windows(
+            trajectory, _average_neighbours(_fill_temperature(series), fine), length // fine, count
+        )
+        windows = [slice(k * length, min((k + 1) * length, E)) for k in chosen]
+        rows = rows.without(windows).beside(
+            [
+                _average_epochs(source.blocks([w]), w.start, w.stop - w.start, T, fine)[0]
+                for w in windows
+            ]
+        )
+    seen = rows.grid.observed.any(axis=1) | (rows.count > 0)
+    keep = np.flatnonzero(seen)
+    return _put_on_rows(series, rows.first[keep], rows.count[keep],
+                    ObservationGrid(rows.grid.points[keep], rows.grid.weights[keep]))  # fmt: skip
+
+
+def _put_on_rows(
+    series: SeriesInput, first: Index, count: Index, grid: ObservationGrid
+) -> SeriesInput:
+    """Average times and readings over rows, their noise as it is of means."""
+
+    def mean(values: Array) -> Array:
+        there = np.isfinite(values)
+        n = np.add.reduceat(there.astype(float), first)
+        total = np.add.reduceat(np.where(there, values, 0.0), first)
+        return np.asarray(np.where(n > 0, total / np.maximum(n, 1.0), np.nan))
+
+    noises = {}
+    for name, readings in series.readings.items():
+        values = np.asarray(readings, dtype=float)
+        resolution = series.resolutions.get(name)
+        one = estimate_reading_noise(series.reading_times, values, resolution)
+        n = np.add.reduceat(np.isfinite(values).astype(float), first)
+        # errors of the step of a display do not average out
+        floor = (resolution or 0.0) / np.sqrt(12.0) / 3.0
+        noises[name] = np.maximum(one / np.sqrt(np.maximum(n, 1.0)), floor)
+    return replace(
+        series,
+        frame_times=mean(series.frame_times),
+        reading_times=mean(series.reading_times),
+        readings={n: mean(np.asarray(r, dtype=float)) for n, r in series.readings.items()},
+        grid=grid,
+        numbers=series.numbers[first],
+        columns={n: mean(c) for n, c in (series.columns or {}).items()},
+        counts=count,
+        noises=noises,
+    )
+
+
+def _fill_temperature(series: SeriesInput) -> Array:
+    """Return the reference temperature (E,) of the epochs, gaps closed by straight lines."""
+    if not series.readings:
+        return np.zeros(len(series.frame_times))
+    values = np.asarray(next(iter(series.readings.values())), dtype=float)
+    there = np.isfinite(values)
+    if not there.any():
+        return np.zeros(len(values))
+    out: Array = np.interp(np.arange(len(values)), np.flatnonzero(there), values[there])
+    return out
+
+
+def _average_neighbours(values: Array, size: int) -> Array:
+    """Average (⌈E / size⌉, …) neighbours."""
+    starts = np.arange(0, len(values), size)
+    count = np.diff(np.append(starts, len(values)))
+    total = np.add.reduceat(values, starts, axis=0)
+    return np.asarray(total / count.reshape(-1, *(1,) * (values.ndim - 1)))
+
+
+def _average_epochs(
+    blocks: Iterable[tuple[int, ObservationGrid]], start: int, epochs: int, targets: int,
+    size: int, fine: int = 0,
+) -> tuple[_Rows, Array]:  # fmt: skip
+    """Average over `size` epochs each, from epoch `start` on; gross errors are left out."""
+    R = -(-epochs // size)
+    normal, right = np.zeros((R, targets, 3)), np.zeros((R, targets, 2))
+    short = fine or size
+    sums = np.zeros((-(-epochs // short), 4))
+    middle: Array | None = None
+    for first, grid in recut(blocks, size * max(_AT_ONCE // size, 1)):
+        w = grid.weights
+        if middle is None:
+            with np.errstate(invalid="ignore"):
+                middle = _locate_targets(grid)
+        p = np.nan_to_num(grid.points - middle)
+        w = np.where(_find_gross(p, w[..., 0] > 0, short)[..., None], 0.0, w)
+        at = np.arange(len(grid)) + first - start
+        runs = np.flatnonzero(np.diff(at // size, prepend=-1))
+        rows = at[runs] // size
+        normal[rows] += np.add.reduceat(w, runs, axis=0)
+        weighted = np.stack(
+            [w[..., 0] * p[..., 0] + w[..., 2] * p[..., 1],
+             w[..., 2] * p[..., 0] + w[..., 1] * p[..., 1]], axis=-1,
+        )  # fmt: skip
+        right[rows] += np.add.reduceat(weighted, runs, axis=0)
+        if fine:
+            runs = np.flatnonzero(np.diff(at // fine, prepend=-1))
+            sums[at[runs] // fine] += np.add.reduceat(_shift_and_scale(p, w, middle), runs, axis=0)
+    if middle is None:
+        middle = np.full((targets, 2), np.nan)
+    determinant = normal[..., 0] * normal[..., 1] - normal[..., 2] ** 2
+    there = determinant > 0
+    d = np.where(there, determinant, 1.0)
+    points = np.stack(
+        [(normal[..., 1] * right[..., 0] - normal[..., 2] * right[..., 1]) / d,
+         (normal[..., 0] * right[..., 1] - normal[..., 2] * right[..., 0]) / d], axis=-1,
+    )  # fmt: skip
+    points = np.where(there[..., None], points + middle, np.nan)
+    begin = start + np.arange(R) * size
+    count = np.minimum(begin + size, start + epochs) - begin
+    rows_ = _Rows(begin, count, ObservationGrid(points, np.where(there[..., None], normal, 0.0)))
+    return rows_, sums[:, :3] / np.maximum(sums[:, 3:], 1e-300)
+
+
+def _locate_targets(grid: ObservationGrid) -> Array:
+    """Return where each target (T, 2) is; the image's middle for those that were not seen."""
+    there = grid.observed[..., None]
+    n = there.sum(axis=0)
+    total = np.where(there, grid.points, 0.0).sum(axis=0)
+    middle = total / np.maximum(n, 1)
+    seen = n[:, 0] > 0
+    middle[~seen] = middle[seen].mean(axis=0) if seen.any() else 0.0
+    return np.asarray(middle)
+
+
+def _find_gross(p: Array, seen: NDArray[np.bool_], short: int) -> NDArray[np.bool_]:
+    """Find points (E, T) far from the median of their short mean."""
+    out = np.zeros(seen.shape, dtype=bool)
+    short = max(short, _NEIGHBOURS)
+    n = len(p) // short * short
+    if not n:
+        return out
+    if n < len(p):  # the last ones, beside their neighbours
+        out[-short:] = _find_gross(p[-short:], seen[-short:], short)
+    values = np.where(seen[..., None], p, np.nan)[:n]
+    runs = values.reshape(-1, short, *p.shape[1:])
+    ordered = np.sort(runs, axis=1)  # NaN go to the end
+    count = np.isfinite(ordered).sum(axis=1)
+    pick = np.maximum(count - 1, 0) // 2
+    median = np.take_along_axis(ordered, pick[:, None], axis=1)
+    off = (runs - median).reshape(n, *p.shape[1:])
+    # the whole image may move within a short mean
+    ordered = np.sort(off, axis=1)
+    pick = np.maximum(np.isfinite(ordered).sum(axis=1) - 1, 0) // 2
+    off = np.abs(off - np.take_along_axis(ordered, pick[:, None], axis=1))
+    known = np.isfinite(off)
+    scale = MAD_TO_SD * float(np.median(off[known])) if known.any() else 0.0
+    out[:n] |= (np.where(known, off, 0.0) > criteria.GROSS_OF_MEAN * max(scale, 1e-6)).any(axis=-1)
+    return out
+
+
+def _shift_and_scale(p: Array, w: Array, middle: Array) -> Array:
+    """Sum of each epoch (E, 4), weighted: shift in x, y, stretch px, and weights."""
+    centre = middle.mean(axis=0)
+    arm = middle - centre
+    arm = arm / max(float(np.sqrt((arm**2).sum(axis=1).mean())), 1e-9)
+    u = w[..., 0]
+    x, y = u * p[..., 0], u * p[..., 1]
+    return np.stack([x.sum(1), y.sum(1), x @ arm[:, 0] + y @ arm[:, 1], u.sum(1)], axis=1)
+
+
+def _choose_fast_windows(
+    trajectory: Array, temperature: Array, length: int, count: int
+) -> list[int]:
+    """Choose the windows of `length` short means that hold most of what is fast, in order of time.
+
+    trajectory (F, 3) px, temperature (F,) °C, of short means. Half of them for what does not follow
+    the temperature, half for what the temperature does.
+    """
+    n = min(len(trajectory), len(temperature))
+    T = temperature[:n] - temperature[:n].mean()
+    z = trajectory[:n] - trajectory[:n].mean(axis=0)
+    if (T @ T) > 0:
+        z = z - np.outer(T, T @ z / (T @ T))
+    windows = -(-n // length)
+    odd, warm = np.zeros(windows), np.zeros(windows)
+    for k in range(windows):
+        part = slice(k * length, min((k + 1) * length, n))
+        odd[k] = _roughness(z[part])
+        warm[k] = _roughness(temperature[part, None])
+    first = np.argsort(-odd, kind="stable")[: -(-count // 2)].tolist()
+    rest = [int(k) for k in np.argsort(-warm, kind="stable") if k not in first]
+    return sorted({int(k) for k in first} | set(rest[: count - len(first)]))
+
+
+def _roughness(values: Array) -> float:
+    """Sum of squares about a straight line, less that of neighbours' differences: their noise."""
+    if len(values) < 8:
+        return 0.0
+    t = np.linspace(-1.0, 1.0, len(values))
+    z = values - values.mean(axis=0)
+    z = z - np.outer(t, t @ z / (t @ t))
+    noise = 0.5 * np.sum(np.diff(values, axis=0) ** 2) * len(values) / (len(values) - 1)
+    return float(np.sum(z**2) - noise)
+
+
+def measure_epochs(
+    recording: Recording, advance: Callable[[int], None] | None = None, jobs: int = 1
+) -> list[Epoch]:
+    """List a recording's epochs with observations; frames are measured where they are not.
+
+    jobs: processes that measure, with the same bits for any number.
+    """
+    if recording.has_observations:
+        return list(recording.epochs)
+    calibrator = Calibrator.of_recording(recording)
+    epochs = []
+    for done in calibrated_epochs(calibrator, recording.iter_epochs(), jobs):
+        epochs.append(done.epoch)
+        if advance is not None:
+            advance(1)
+    return epochs
+
+
+def epochs_input(head: Head, field: TestField, epochs: Sequence[Epoch], name: str) -> SeriesInput:
+    """Put some epochs into arrays; name: of their recording or store, for messages."""
+    readings = {
+        channel: np.array([e.temperatures.get(channel, np.nan) for e in epochs], dtype=float)
+        for channel in head.channels
+    }
+    whole = _start_input(
+        head, field, name,
+        np.array([e.number for e in epochs], dtype=np.int64),
+        np.array([e.frame_time for e in epochs], dtype=float),
+        np.array([e.temperature_time for e in epochs], dtype=float),
+        readings,
+    )  # fmt: skip
+    grid = ObservationGrid.from_observations(field, [e.observations for e in epochs])
+    return replace(whole, grid=grid)
+
+
+def series_input(
+    recording: Recording,
+    say: Callable[[str], None] | None = None,
+    advance: Callable[[int], None] | None = None,
+    jobs: int = 1,
+) -> SeriesInput:
+    """Read the arrays of a recording; its frames are measured where they have not been, on `jobs`
+    processes.
+
+    A long one with observations is condensed while it is read.
+    """
+    if recording.has_observations and len(recording) > limit_rows(len(recording.testfield)):
+        whole = replace(_read_epochs(recording), columns=_read_columns(recording))
+        return condensed(whole, recording)
+    if not recording.has_observations and say is not None:
+        say(f"measuring the {len(recording.columns)} frames of {recording.path}")
+    epochs = measure_epochs(recording, advance, jobs)
+    source = epochs_input(recording.head, recording.testfield, epochs, f"{recording.path}")
+    log = recording.columns.readings
+    if log is not None:
+        source = replace(source, **_cut_log(source, log))
+    return replace(source, columns=_read_columns(recording))
+
+
+def _cut_log(source: SeriesInput, log: Readings) -> dict[str, Any]:
+    """Return the readings of a log that matter to a series: from one hour before it, some a
+    frame.
+    """
+    begin, end = float(source.frame_times[0]), float(source.frame_times[-1])
+    step = float(np.median(np.diff(log.times))) if len(log.times) > 1 else 0.0
+    rows = np.flatnonzero((log.times >= begin - _MEMORY_S) & (log.times <= end + step))
+    rows = rows[:: max(1, len(rows) // (_READINGS_A_FRAME * len(source.frame_times)))]
+    channels = {name: values[rows] for name, values in log.channels.items()}
+    return {"reading_times": log.times[rows], "readings": channels}
+
+
+def _read_columns(recording: Recording) -> dict[str, NDArray[np.float64]]:
+    """Read the further columns of epochs.csv that hold numbers, such as a humidity."""
+    out = {}
+    for name, texts in recording.columns.extra.items():
+        try:
+            values = np.array([float(t) if t.strip() else np.nan for t in texts])
+        except ValueError:
+            continue  # text: a note
+        out[name] = np.where(np.isfinite(values), values, np.nan)
+    return out
+
+
+def _read_epochs(recording: Recording) -> SeriesInput:
+    """Read a recording's epochs without their image points."""
+    columns = recording.columns
+    return _start_input(
+        recording.head, recording.testfield, f"{recording.path}", columns.numbers,
+        columns.frame_time, columns.temperature_time, columns.temperatures,
+    )  # fmt: skip
+
+
+def stored_input(store: SeriesReader, series: StoredSeries, name: str) -> SeriesInput:
+    """Read the arrays of a series in a store; a long one is condensed while it is read."""
+    numbers = store.series_columns(series, ["epoch"])["epoch"].astype(np.int64)
+    if len(numbers) <= limit_rows(len(series.testfield)):
+        epochs = [e.epoch for e in store.epochs(series)]
+        return epochs_input(series.head, series.testfield, epochs, name)
+    names = ["frame_time", "temperature_time", *series.head.channels]
+    columns = store.series_columns(series, names)
+    whole = _start_input(
+        series.head, series.testfield, name, numbers, columns["frame_time"],
+        columns["temperature_time"], {n: columns[n] for n in series.head.channels},
+    )  # fmt: skip
+    return condensed(whole, StoredBlocks(store, series, numbers))
+
+
+def _start_input(
+    head: Head, field: TestField, name: str, numbers: NDArray[np.int64], frame_times: Array,
+    reading_times: Array, readings: Mapping[str, Array],
+) -> SeriesInput:  # fmt: skip
+    camera = head.camera
+    nothing = np.empty((0, len(field), 3))
+    return SeriesInput(
+        name=name,
+        camera=camera.name,
+        sensor=camera.sensor,
+        field=field,
+        principal_distance=camera.principal_distance,
+        frame_times=frame_times,
+        reading_times=reading_times,
+        readings=readings,
+        resolutions={channel: c.resolution for channel, c in head.channels.items()},
+        grid=ObservationGrid(nothing[..., :2], nothing),
+        numbers=numbers,
+        series=head.series,
+        interior=camera.interior,
+    )
+
+
+def load_series(
+    path: Path, advance: Callable[[int], None] | None = None, jobs: int = 1
+) -> list[SeriesInput]:
+    """Read the series of a recording (a folder) or of a store (a file).
+
+    advance: receives how many frames were measured; jobs: processes that measure.
+    """
+    if path.is_dir():
+        from thermocald.store.recording.reader import open_recording
+
+        return [series_input(open_recording(path), advance=advance, jobs=jobs)]
+    with open_source(path) as store:
+        found = [stored_input(store, s, f"{store.path}: {s.name}") for s in store.all_series()]
+    if not found:
+        raise DataError(f"{source_name(path)}: the store holds no series")
+    return found

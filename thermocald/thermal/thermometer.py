@@ -1,0 +1,321 @@
+"""The thermometer as an instrument: its noise, and the smooth trajectory behind its readings.
+
+The smooth trajectory is only where non-linear operators are linearised; the readings themselves
+stay the data and their error is carried through each operator (`likelihood`). So a kink that the
+smoothing rounds off is not mistaken for an effect.
+
+Source: Eilers (2003), A perfect smoother, Analytical Chemistry 75, 3631-3636; generalised
+cross-validation as Golub, Heath, Wahba (1979), Technometrics 21, 215-223.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.photogrammetry.series.blocks import spread_windows
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+    from scipy.sparse import csr_array
+
+    from thermocald.arrays import Array
+
+_SMOOTHING = np.logspace(-1, 5, 19)
+_MOST_FOR_NOISE = 200_000  # readings, in a dozen runs
+_OFTEN_SHARP = 0.2  # share of the intervals above which bends are no kinks by themselves
+_KINK = 1.5  # times the usual bend that a kink then has
+
+
+@dataclass(frozen=True, eq=False)
+class Thermometer:
+    """A temperature column as an instrument, on knots: its readings and latent times between.
+
+    times (K,) s; trajectory (K,) °C: smoothed, filled in, the point of linearisation; NaN at knots
+    of other columns; deviation (K,) K: reading minus trajectory; sd (K,) K of the independent
+    errors; mixing (K, K), sparse: errors of the knots = mixing @ independent errors: a latent time
+    carries the errors of the readings next to it and its own; real (K,): where a knot is a time of
+    reading; noise: K of one reading.
+    """
+
+    times: Array
+    trajectory: Array
+    deviation: Array
+    sd: Array
+    mixing: csr_array
+    real: NDArray[np.bool_]
+    noise: float
+
+    def slope_jump(self, times: Array) -> Array:
+        """Return how uncertain the rate (E,) K/s is at some times because it jumps next to them."""
+        t, y = self.times[self.real], (self.trajectory + self.deviation)[self.real]
+        bend, limit = _measure_bends(t, y, self.noise)
+        width = np.diff(t)
+        size = np.sqrt(np.maximum(bend**2 - (limit / 3.0) ** 2, 0.0)) / width
+        middle = 0.5 * (t[:-1] + t[1:])
+        near = np.abs(times[:, None] - middle[None]) < 1.1 * np.median(width)
+        out: Array = 0.5 * np.max(np.where(near, size[None], 0.0), axis=1)
+        return out
+
+
+def estimate_reading_noise(times: Array, readings: Array, resolution: float | None) -> float:
+    """Estimate the standard deviation in K of one reading, quantisation included.
+
+    From third divided differences, as thermometers are not read at even intervals, cut at 2.2 sigma
+    again and again, so that a switched lamp, which spoils four of them, does not count as noise. A
+    thermometer that repeats one step for long has the error of the step. Of very many readings runs
+    from the first to the last are taken.
+    """
+    if len(readings) > _MOST_FOR_NOISE:
+        runs = spread_windows(len(readings), _MOST_FOR_NOISE)
+        times = np.concatenate([times[run] for run in runs])
+        readings = np.concatenate([readings[run] for run in runs])
+    there = np.isfinite(readings) & np.isfinite(times)
+    t, values = times[there], readings[there]
+    floor = (resolution or 0.0) / np.sqrt(12.0)
+    if len(values) < 8:
+        return max(float(floor), 1e-6)
+    d = _third_differences(t, values)
+    kept = np.ones(len(d), dtype=bool)
+    scale = 0.0
+    for _ in range(20):
+        scale = float(np.sqrt(np.mean(d[kept] ** 2)))
+        scale /= 0.9156  # what a normal distribution cut at 2.2 sigma has left
+        now = np.abs(d) <= max(2.2 * scale, 1e-12)
+        if np.array_equal(now, kept):
+            break
+        kept = now
+    return float(max(scale, floor, 1e-6))
+
+
+def _third_differences(t: Array, y: Array) -> Array:
+    """Return third divided differences of four neighbours, with the variance of one reading."""
+    n = len(t) - 3
+    at = [t[k : k + n] for k in range(4)]
+    total, square = np.zeros(n), np.zeros(n)
+    for i in range(4):
+        product = np.ones(n)
+        for j in range(4):
+            if i != j:
+                apart = at[i] - at[j]
+                product *= np.where(apart == 0.0, 1e-3, apart)
+        total += y[i : i + n] / product
+        square += product**-2.0
+    out: Array = total / np.sqrt(square)
+    return out
+
+
+def find_latent_times(times: Array, readings: Array, resolution: float | None) -> Array:
+    """Find instants between two readings at which the temperature may leave the straight line.
+
+    Where a lamp was switched the trajectory bends within one interval, by up to a quarter of the
+    bend; a maximum that lies between two readings is seen by no reading.
+    """
+    valid = np.isfinite(readings)
+    t, y = times[valid], readings[valid]
+    bend, limit = _measure_bends(t, y, estimate_reading_noise(t, y, resolution))
+    size = np.abs(bend)
+    sharp = size > limit
+    if not len(sharp):
+        return np.zeros(0)
+    if sharp.mean() > _OFTEN_SHARP:  # it bends everywhere: a kink is where it bends most
+        padded = np.pad(size, 2)
+        sharp &= size >= np.max([padded[k : k + len(size)] for k in range(5)], axis=0)
+        sharp &= size > _KINK * np.median(size[size > limit])
+    return 0.5 * (t[:-1] + t[1:])[sharp]
+
+
+def _measure_bends(t: Array, y: Array, noise: float) -> tuple[Array, float]:
+    """Return the change of slope around each interval times its length (K - 1,) K, and three
+    sigma.
+    """
+    if len(t) < 4:
+        return np.zeros(max(len(t) - 1, 0)), np.inf
+    h = np.diff(t)
+    slope = np.diff(y) / h
+    bend = np.zeros(len(h))
+    bend[1:-1] = (slope[2:] - slope[:-2]) * h[1:-1]
+    bend[0], bend[-1] = (slope[1] - slope[0]) * h[0], (slope[-1] - slope[-2]) * h[-1]
+    return bend, 3.0 * 2.0 * noise
+
+
+def smooth_channel(
+    times: Array,
+    readings: Array,
+    latent: NDArray[np.bool_],
+    resolution: float | None,
+    noises: Array | None = None,
+) -> Thermometer:
+    """Smooth one column on knots: its times, those of others (NaN), and its latent ones.
+
+    times (K,) s ascending, readings (K,) °C with NaN where missing; latent (K,): True where a knot
+    is a latent time of this column, or of another; noises (K,) K: where readings are means of many.
+    """
+    noise = (
+        estimate_reading_noise(times, readings, resolution) if noises is None else _usual(noises)
+    )
+    valid = np.isfinite(readings)
+    own = ~latent
+    t, y = times[own], readings[own]
+    filled = np.interp(t, t[np.isfinite(y)], y[np.isfinite(y)])
+    smooth = filled
+    if valid.sum() >= 8 and float(np.ptp(readings[valid])) > 3 * noise:
+        smooth = _smooth(filled, np.isfinite(y).astype(float), noise)
+    trajectory = np.full(len(times), np.nan)
+    trajectory[own] = smooth
+    sd = np.full(len(times), noise) if noises is None else noises.copy()
+    if not np.isfinite(y).all():
+        # what may happen between two readings: a share of the step across the gap
+        missing = np.flatnonzero(own)[~np.isfinite(y)]
+        sd[missing] = (2.0 * noise + np.abs(np.gradient(smooth)))[~np.isfinite(y)]
+    from scipy.sparse import csr_array, lil_array
+
+    mixing = lil_array((len(times), len(times)))
+    mixing.setdiag(np.ones(len(times)))
+    rows = np.flatnonzero(latent)
+    if len(rows):
+        bend, limit = _measure_bends(t, filled, noise)
+        index = np.searchsorted(t, times[rows]) - 1
+        index = np.clip(index, 0, len(t) - 2)
+        knot = np.flatnonzero(own)
+        for row, i in zip(rows, index, strict=True):
+            share = (times[row] - t[i]) / (t[i + 1] - t[i])
+            mixing[row, knot[i]], mixing[row, knot[i + 1]] = 1 - share, share
+            size = abs(bend[i]) if abs(bend[i]) > limit else 0.0
+            # a kink at a random place bulges by 1/8 of the bend in the middle, ± 0.07; its
+            # neighbours bend too and do not bulge
+            top = size > 0 and size >= np.max(np.abs(bend[max(i - 1, 0) : i + 2]))
+            trajectory[row] = (1 - share) * smooth[i] + share * smooth[i + 1]
+            trajectory[row] -= bend[i] / 8 * top
+            sd[row] = 0.12 * size + 0.25 * noise
+    deviation = np.nan_to_num(readings - trajectory)
+    return Thermometer(times, trajectory, deviation, sd, csr_array(mixing), own, noise)
+
+
+def extend(channel: Thermometer) -> Thermometer:
+    """Add knots before its begin and after its end, as uncertain as they are.
+
+    Before the start the temperature is taken as it was at the start (EFFECTS: the past begins
+    with the series), after the end it goes on along its slope; both within half of what the slope
+    makes of the time elapsed. A delay asks for such times, and so does the state at the start.
+    """
+    t = channel.times
+    k = np.flatnonzero(np.isfinite(channel.trajectory))
+    step = float(np.median(np.diff(t[k])))
+    before = -step * np.array([12.0, 6.0, 3.0, 0.5]) + t[0]
+    after = step * np.array([0.5, 1.5, 3.0, 6.0, 12.0]) + t[-1]
+    first = np.polyfit(t[k[:4]], channel.trajectory[k[:4]], 1)[0]
+    last = np.polyfit(t[k[-4:]], channel.trajectory[k[-4:]], 1)[0]
+    held = np.full(len(before), channel.trajectory[k[0]])
+    carried = channel.trajectory[k[-1]] + last * (after - t[-1]) * 0.7
+    K, n, m = len(t), len(before), len(after)
+    from scipy.sparse import block_diag, csr_array
+
+    edge = np.concatenate([np.arange(n), np.arange(n + K, n + K + m)])
+    at = np.concatenate([np.full(n, n + k[0]), np.full(m, n + k[-1])])
+    ends = csr_array((np.ones(n + m), (edge, at)), shape=(n + K + m, n + K + m))
+    ones = [csr_array(np.eye(size)) for size in (n, m)]
+    mixing = csr_array(block_diag([ones[0], channel.mixing, ones[1]]) + ends)
+    rate = float(np.sqrt(np.mean(np.gradient(channel.trajectory[k], t[k]) ** 2)))
+    return Thermometer(
+        np.concatenate([before, t, after]),
+        np.concatenate([held, channel.trajectory, carried]),
+        np.concatenate([np.zeros(n), channel.deviation, np.zeros(m)]),
+        np.concatenate(
+            [
+                0.5 * abs(first) * (t[0] - before) + 0.1 * channel.noise,
+                channel.sd,
+                0.5 * (abs(last) + rate) * (after - t[-1]) + 0.1 * channel.noise,
+            ]
+        ),
+        mixing,
+        np.concatenate([np.zeros(n, dtype=bool), channel.real, np.zeros(m, dtype=bool)]),
+        channel.noise,
+    )
+
+
+def _smooth(values: Array, weights: Array, noise: float) -> Array:
+    """Penalise second differences, but for kinks; the penalty by generalised cross-validation."""
+    from scipy.linalg import solveh_banded
+
+    n = len(values)
+    second = np.convolve(values, [1.0, -2.0, 1.0], mode="valid")
+    kink = np.abs(second) > 4.0 * np.sqrt(6.0) * noise
+    loose = np.where(kink, 1e-4, 1.0)
+    band = np.zeros((3, n))  # upper form of DᵀWD
+    for offset, coefficient in enumerate((1.0, -2.0, 1.0)):
+        band[2, offset : offset + n - 2] += loose * coefficient**2
+    band[1, 1 : n - 1] += -2.0 * loose
+    band[1, 2:] += -2.0 * loose
+    band[0, 2:] += loose
+    eigenvalues = (2.0 - 2.0 * np.cos(np.pi * np.arange(n) / n)) ** 2
+    best, chosen = np.inf, values
+    for penalty in _SMOOTHING:
+        system = penalty * band
+        system[2] += weights
+        z = solveh_banded(system, weights * values)
+        free = n - float(np.sum(1.0 / (1.0 + penalty * eigenvalues)))
+        score = float(np.sum(weights * (values - z) ** 2)) / free**2
+        if score < best:
+            best, chosen = score, z
+    return np.asarray(chosen, dtype=float)
+
+
+def _usual(noises: Array) -> float:
+    return float(np.median(noises))
+
+
+def thermometers(
+    times: Array,
+    readings: Mapping[str, Array],
+    resolutions: Mapping[str, float | None],
+    noises: Mapping[str, Array] | None = None,
+) -> tuple[Array, dict[str, Thermometer]]:
+    """Put all columns on common knots: the readings' times and the latent ones of each column.
+
+    noises {column: (R,)} K: of readings that are means of many; between those nothing is latent.
+    """
+    latent = {
+        name: find_latent_times(times, r, resolutions.get(name)) if noises is None else np.zeros(0)
+        for name, r in readings.items()
+    }
+    knots, first = np.unique(np.concatenate([times, *latent.values()]), return_index=True)
+    from_reading = first < len(times)
+    channels = {}
+    for name, r in readings.items():
+        on_knots = np.full(len(knots), np.nan)
+        on_knots[from_reading] = r[first[from_reading]]
+        own = np.isin(knots, latent[name])
+        here = from_reading | own
+        known = None if noises is None else noises[name][first[here]]
+        part = smooth_channel(knots[here], on_knots[here], own[here], resolutions.get(name), known)
+        channels[name] = extend(_put_on_knots(part, knots, here))
+    return next(iter(channels.values())).times, channels
+
+
+def _put_on_knots(channel: Thermometer, knots: Array, here: NDArray[np.bool_]) -> Thermometer:
+    """Put a column's instrument on all knots; those of other columns are NaN and carry nothing."""
+    from scipy.sparse import csr_array
+
+    K, rows = len(knots), np.flatnonzero(here)
+    trajectory, deviation, sd = np.full(K, np.nan), np.zeros(K), np.full(K, 1e-6)
+    real = np.zeros(K, dtype=bool)
+    trajectory[here], deviation[here], sd[here] = channel.trajectory, channel.deviation, channel.sd
+    real[here] = channel.real
+    part = channel.mixing.tocoo()
+    others = np.flatnonzero(~here)
+    mixing = csr_array(
+        (
+            np.concatenate([part.data, np.ones(len(others))]),
+            (
+                np.concatenate([rows[part.row], others]),
+                np.concatenate([rows[part.col], others]),
+            ),
+        ),
+        shape=(K, K),
+    )
+    return Thermometer(knots, trajectory, deviation, sd, mixing, real, channel.noise)

@@ -339,7 +339,7 @@ def legend_above(axis: Any) -> int:
 
 def _draw_curve(axis: Any, curve: Curve) -> None:
     label = curve.name or None
-    if curve.kind == "points":
+    if curve.kind == "points" or len(curve.x) == 1:
         # Zero-length strokes with round caps: a tenth of the size of as many markers.
         x = np.column_stack([curve.x, curve.x, np.full(len(curve.x), np.nan)]).ravel()
         y = np.column_stack([curve.y, curve.y, np.full(len(curve.y), np.nan)]).ravel()

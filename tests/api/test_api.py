@@ -34,6 +34,9 @@ def examples():
 def test_an_example_of_a_docstring(inside, example):
     if "board" in example.docstring and not (inside / "board").is_dir():
         pytest.skip("the reference data are absent")
+    for library in ("pandas", "xarray"):
+        if f"to_{library}" in example.docstring:
+            pytest.importorskip(library)
     said: list[str] = []
     failed, _ = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example, out=said.append)
 
@@ -105,6 +108,7 @@ def test_epochs_as_csv_are_the_export(epochs, world, tmp_path):
 
 
 def test_epochs_as_a_data_frame(epochs):
+    pytest.importorskip("pandas")
     frame = epochs.to_pandas()
 
     assert list(frame.index) == list(range(1, 151))

@@ -55,8 +55,14 @@ def test_it_runs_from_the_wheel_alone(installed, tmp_path):
     assert Path(where.stdout.strip()).is_relative_to(installed.parents[1])
 
 
-def test_the_wheel_has_the_page_and_the_reports_templates(installed):
+def test_the_wheel_has_every_file_of_the_package(installed):
+    """Templates, style sheets, the dashboard's page and py.typed, beside the modules."""
     (package,) = (installed.parents[1] / "lib").glob("python*/site-packages/thermocald")
-    for folder in ("output/dashboard/static", "output/study/templates"):
-        here = {p.name for p in (ROOT / "thermocald" / folder).iterdir() if p.is_file()}
-        assert here <= {p.name for p in (package / folder).iterdir()}
+    here, there = (
+        {p.relative_to(folder).as_posix() for p in folder.rglob("*")
+         if p.is_file() and p.suffix != ".pyc"}
+        for folder in (ROOT / "thermocald", package)
+    )  # fmt: skip
+    assert here == there
+    others = {name for name in here if not name.endswith(".py")}
+    assert {"py.typed", "templates/report.html.j2", "output/dashboard/static/page.js"} <= others

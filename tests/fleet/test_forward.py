@@ -58,6 +58,8 @@ def test_server_and_store_give_the_same(filled, server, make_result, monkeypatch
             series.settings,
         )
         assert np.array_equal(found.testfield.points, series.testfield.points)
+        with ServerStore(address(server)) as another:
+            assert another.last_epoch(found) == there.last_epoch(found) == 20
         names = [*store.column_names(series), "blur"]
         monkeypatch.setattr("thermocald.store.server.reader._BLOCK", 7)  # of 20 epochs
         mine, theirs = store.series_columns(series, names), there.series_columns(found, names)

@@ -51,6 +51,11 @@ def deviation_figure(camera: CameraStudy) -> Figure:
     )
 
 
+def has_course(camera: CameraStudy) -> bool:
+    """Whether any series has two epochs, between which a curve could be drawn."""
+    return any(len(study.series) > 1 for study in camera.series)
+
+
 def _time_panel(camera: CameraStudy, title: str, unit: str, k: int) -> Panel:
     scale, label = scaled(unit, extent(camera, k))
     curves = []
@@ -102,7 +107,7 @@ def _temperature_panels(camera: CameraStudy) -> list[Panel]:
 
 def principal_point_figure(camera: CameraStudy, name: str = "principal-point") -> Figure | None:
     """The path of the principal point on the sensor (the reference's Figures 4 and 6)."""
-    if not {"x0", "y0"} <= set(free_parameters(camera)):
+    if not {"x0", "y0"} <= set(free_parameters(camera)) or not has_course(camera):
         return None
     curves, words = [], []
     for i, study in enumerate(camera.series):

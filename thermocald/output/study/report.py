@@ -127,7 +127,7 @@ def save_figures(study: Study, folder: Path) -> list[Path]:
 
 def _panel_figures(camera: CameraStudy) -> list[Figure]:
     made = (
-        figures.deviation_figure(camera),
+        figures.deviation_figure(camera) if figures.has_course(camera) else None,
         figures.principal_point_figure(camera),
         figures.movement_figure(camera),
         figures.significance_figure(camera),

@@ -12,6 +12,7 @@ from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
+from uuid import UUID
 
 import numpy as np
 
@@ -30,7 +31,6 @@ from thermocald.store.server.connection import Connected, ServerAddress
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-    from uuid import UUID
 
     from numpy.typing import NDArray
     from psycopg import Connection
@@ -57,7 +57,6 @@ class ServerStore(Connected, SeriesReader):
 
     def __init__(self, address: ServerAddress) -> None:
         self.path = Path(str(address))
-        self._keys: list[UUID] = []
         super().__init__(address)
 
     @property
@@ -82,7 +81,7 @@ class ServerStore(Connected, SeriesReader):
         )
         return [
             StoredSeries(
-                self._number(key),
+                key.int,
                 parse_head(json.loads(head), self.path),
                 parse_testfield(csv, self.path),
                 start,
@@ -95,7 +94,7 @@ class ServerStore(Connected, SeriesReader):
 
     def last_epoch(self, series: StoredSeries) -> int | None:
         """The number of the last epoch, None if there is none."""
-        key = self._keys[series.id]
+        key = _key(series)
         ((last,),) = self._query("SELECT max(number) FROM epoch WHERE series = %s", (key,))
         return None if last is None else int(last)
 
@@ -104,13 +103,13 @@ class ServerStore(Connected, SeriesReader):
     ) -> dict[str, NDArray[Any]]:
         """Columns (E,) over all epochs by name, with times as they were stamped."""
         with self._transaction("columns cannot be read") as connection:
-            return _read_columns(connection, self._keys[series.id], series, names)
+            return _read_columns(connection, _key(series), series, names)
 
     def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
         """(E, 16, 16) covariances of some epochs, NaN for those without a result."""
         rows = self._query(
             f"SELECT number, covariance {_LATEST} AND number = ANY(%s)",
-            (self._keys[series.id], [int(n) for n in numbers]),
+            (_key(series), [int(n) for n in numbers]),
         )
         found = {number: unpack_covariance(bytes(data)) for number, data in rows if data}
         missing = np.full((16, 16), np.nan)
@@ -125,7 +124,7 @@ class ServerStore(Connected, SeriesReader):
             f"SELECT {', '.join(fields)} FROM epoch WHERE series = %s AND number >= %s "
             "AND number <= coalesce(%s, number) ORDER BY number, revision"
         )
-        values = (self._keys[series.id], first, last)
+        values = (_key(series), first, last)
         latest: StoredEpoch | None = None
         for row in self._stream(statement, values):
             stored = _epoch(row, details)
@@ -146,19 +145,19 @@ class ServerStore(Connected, SeriesReader):
             "SELECT number, observations FROM epoch WHERE series = %s AND number >= %s "
             "AND number <= %s AND observations IS NOT NULL ORDER BY number, revision"
         )
-        rows = self._stream(statement, (self._keys[series.id], first, last))
+        rows = self._stream(statement, (_key(series), first, last))
         return unpack_rows({number: bytes(data) for number, data in rows if data})
 
     def events(self, series: StoredSeries | None = None, since_utc: float = 0.0) -> list[Event]:
         """What happened, oldest first; of one series, or of all that the address selects."""
-        keys = [self._keys[s.id] for s in ([series] if series else self.all_series())]
+        keys = [_key(s) for s in ([series] if series else self.all_series())]
         rows = self._query(
             "SELECT utc, kind, text, series, epoch, data FROM event "
             "WHERE utc >= %s AND series = ANY(%s) ORDER BY utc, id",
             (since_utc, keys),
         )
         return [
-            Event(utc, kind, text, self._number(key), epoch, json.loads(data))
+            Event(utc, kind, text, key.int, epoch, json.loads(data))
             for utc, kind, text, key, epoch, data in rows
         ]
 
@@ -186,12 +185,6 @@ class ServerStore(Connected, SeriesReader):
     def _label(self, series: StoredSeries) -> str:
         return f"{series.identity['station']}: {series.camera}/{series.name}"
 
-    def _number(self, key: UUID) -> int:
-        """The handle of a series in this process; `StoredSeries.id` is a number."""
-        if key not in self._keys:
-            self._keys.append(key)
-        return self._keys.index(key)
-
     def _stream(self, statement: str, values: Sequence[Any]) -> Iterator[tuple[Any, ...]]:
         """Rows by a server-side cursor: a year of epochs in constant memory."""
         with (
@@ -207,6 +200,11 @@ _EPOCH = (
     "number", "revision", "frame_time", "temperature_time", "clock_trusted", "status", "reason",
     "sigma0", "redundancy", "n_observations", "rejected", "temperatures", "extra", "frame", "note",
 )  # fmt: skip
+
+
+def _key(series: StoredSeries) -> UUID:
+    """Return a series' key at the server, which is its id in every process that reads it."""
+    return UUID(int=series.id)
 
 
 def _epoch(row: tuple[Any, ...], details: bool) -> StoredEpoch:

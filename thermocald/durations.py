@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["short_duration"]
-
 
 def short_duration(seconds: float) -> str:
     """A duration in the largest unit of which there are two: `90 s`, `2 min`, `3 h`, `12 d`.

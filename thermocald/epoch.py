@@ -11,8 +11,6 @@ if TYPE_CHECKING:
 
     from thermocald.photogrammetry.field.testfield import Observations
 
-__all__ = ["Epoch"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Epoch:

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     Item = TypeVar("Item")
     Result = TypeVar("Result")
 
-__all__ = ["in_order", "processes"]
 
 _WAITING = 2  # items a process that are handed out ahead: what they hold is in memory
 

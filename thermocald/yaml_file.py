@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from collections.abc import Hashable
     from pathlib import Path
 
-__all__ = ["dump_yaml", "read_yaml"]
 
 _MOST_VALUES = 100_000
 _MOST_BYTES = 20_000_000

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import corner_camera as scene
 import numpy as np
 
-from thermocald.photogrammetry.camera.camera_model import project
+from thermocald.photogrammetry.camera.camera_model import EOP, PRINCIPAL, project
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.photogrammetry.parameters import EOP, PRINCIPAL
 from thermocald.photogrammetry.series.adjustment import SeriesSettings, adjust_series
 from thermocald.photogrammetry.series.normals import ObservationGrid, linearise
 

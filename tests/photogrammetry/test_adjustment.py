@@ -14,8 +14,12 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     partials,
 )
-from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, adjust
-from thermocald.photogrammetry.epoch.cold_start import cold_start, pose_only
+from thermocald.photogrammetry.epoch.adjustment import (
+    AdjustmentSettings,
+    adjust,
+    cold_start,
+    pose_only,
+)
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 FREE = np.array([0, 1, 2, 3, 4, 5, 6, 7, 10, 11, 12, 13, 14, 15])

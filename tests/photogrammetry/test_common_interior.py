@@ -6,10 +6,9 @@ import corner_camera as scene
 import numpy as np
 import pytest
 
-from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, project
+from thermocald.photogrammetry.camera.camera_model import PRINCIPAL, InteriorOrientation, project
 from thermocald.photogrammetry.epoch.common_interior import adjust_common_interior
 from thermocald.photogrammetry.field.testfield import Observations, TestField
-from thermocald.photogrammetry.parameters import PRINCIPAL
 
 STATIONS = [
     scene.looking_at(centre, [150, 180, 160], roll)

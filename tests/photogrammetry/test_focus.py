@@ -7,7 +7,7 @@ import pytest
 
 from tests.photogrammetry.fields import SMALL_SENSOR
 from thermocald.photogrammetry.field.testfield import Observations
-from thermocald.photogrammetry.frame.focus import blur_trend, frame_figures
+from thermocald.photogrammetry.frame.measurement import blur_trend, frame_figures
 
 
 def _points(n: int, rng: np.random.Generator) -> np.ndarray:

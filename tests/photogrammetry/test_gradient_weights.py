@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.photogrammetry.single_targets import SingleTargets, single_targets
-from thermocald.photogrammetry.frame.gradient_weights import GradientWeights
+from thermocald.photogrammetry.frame.tracking import GradientWeights
 from thermocald.photogrammetry.targets.circle import fit_circles
 from thermocald.photogrammetry.targets.frame_status import NoiseModel
 

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from mount_cases import Tremble, simulate, small_field, standardised
 
-from thermocald.photogrammetry.camera.camera_model import project
+from thermocald.photogrammetry.camera.camera_model import PRINCIPAL, PRINCIPAL_POINT, project
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.photogrammetry.parameters import PRINCIPAL, PRINCIPAL_POINT
 from thermocald.photogrammetry.series.adjustment import SeriesSettings, adjust_series
 from thermocald.photogrammetry.series.mount import drift_period
 from thermocald.photogrammetry.series.movement import Movement

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from thermocald.acquisition.calibrator import CalibratedEpoch, Calibrator
     from thermocald.epoch import Epoch
 
-__all__ = ["EPOCHS_OF_A_BLOCK", "calibrated_epochs"]
 
 EPOCHS_OF_A_BLOCK = 200
 

@@ -16,11 +16,11 @@ from thermocald.photogrammetry.epoch.adjustment import (
     Adjustment,
     AdjustmentSettings,
     adjust,
+    cold_start,
     failed,
+    pose_only,
 )
-from thermocald.photogrammetry.epoch.cold_start import cold_start, pose_only
-from thermocald.photogrammetry.frame.focus import frame_figures
-from thermocald.photogrammetry.frame.measurement import Prior
+from thermocald.photogrammetry.frame.measurement import Prior, frame_figures
 from thermocald.photogrammetry.frame.tracking import Tracker
 from thermocald.photogrammetry.targets.image_file import EncodedImage
 
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
-__all__ = ["CalibratedEpoch", "Calibrator"]
 
 _WRONG_START = 5.0  # times the usual sigma0: the camera has been knocked
 
@@ -42,7 +41,7 @@ _WRONG_START = 5.0  # times the usual sigma0: the camera has been knocked
 class CalibratedEpoch:
     """An epoch with its observations and its adjustment.
 
-    extra: columns for the store, of `focus.frame_figures`; searched: why the whole frame was
+    extra: columns for the store, of `measurement.frame_figures`; searched: why the whole frame was
     searched, empty where it was not.
     """
 

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from thermocald.acquisition.link import Link
     from thermocald.hal import Clock
 
-__all__ = ["DeviceLoop"]
 
 log = logging.getLogger(__name__)
 

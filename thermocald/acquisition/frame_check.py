@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from thermocald.acquisition.calibrator import Calibrator
     from thermocald.hal import Frame
 
-__all__ = ["FrameCheck", "check_frame"]
 
 _BLURRED_PX = 3.0
 _SATURATED = 0.02

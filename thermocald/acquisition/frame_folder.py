@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from thermocald.config import FramesConfig
     from thermocald.hal import Frame
 
-__all__ = ["Deleted", "FrameFolder"]
 
 log = logging.getLogger(__name__)
 

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
     T = TypeVar("T")
 
-__all__ = ["Link", "LinkEvent", "LinkState"]
 
 log = logging.getLogger(__name__)
 

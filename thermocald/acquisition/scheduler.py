@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
     from thermocald.hal import Clock
 
-__all__ = ["Schedule", "ScheduleStats", "Tick"]
 
 _LATEST_START = 0.1  # of a period: a tick that would begin later is skipped
 _REMEMBERED = 1000

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
     from thermocald.hal import Clock
 
-__all__ = ["ClockStep", "SteadyClock", "machine_clock_trusted"]
 
 log = logging.getLogger(__name__)
 

@@ -10,16 +10,6 @@ from pydantic import ConfigDict, Field, ValidationInfo, field_validator, model_v
 
 from thermocald.config.section import Name, Period, Section, keys, relative_to_file, wrong
 
-__all__ = [
-    "CalibrationConfig",
-    "CameraConfig",
-    "DeviceConfig",
-    "OutputConfig",
-    "Prior",
-    "SensorConfig",
-    "ThermometerConfig",
-]
-
 InteriorName = Literal["c", "x0", "y0", "A1", "A2", "A3", "B1", "B2", "C1", "C2"]
 ParameterName = Literal[InteriorName, "omega", "phi", "kappa", "X0", "Y0", "Z0"]
 

@@ -11,18 +11,6 @@ from pydantic_core import PydanticCustomError
 
 from thermocald.addresses import without_secrets
 
-__all__ = [
-    "Name",
-    "Period",
-    "Positive",
-    "Section",
-    "in_words",
-    "keys",
-    "nearest",
-    "relative_to_file",
-    "wrong",
-]
-
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
 Period = Annotated[float, Field(ge=0.05, le=86400.0)]
 Positive = Annotated[float, Field(gt=0.0, le=1e9)]

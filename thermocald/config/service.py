@@ -11,8 +11,6 @@ from pydantic import Field, field_validator, model_validator
 from thermocald.addresses import is_loopback
 from thermocald.config.section import Name, Positive, Section, relative_to_file, wrong
 
-__all__ = ["DashboardConfig", "ForwardConfig", "FramesConfig", "LoggingConfig", "StoreConfig"]
-
 
 class StoreConfig(Section):
     """Where results go. durable: what is stored survives a power cut, at the price of a sync."""

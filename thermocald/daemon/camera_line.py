@@ -23,7 +23,7 @@ from thermocald.acquisition.pipeline import Pipeline
 from thermocald.daemon.epoch_keeper import EpochKeeper
 from thermocald.daemon.plan import running_series
 from thermocald.errors import ConfigurationError
-from thermocald.photogrammetry.parameters import PARAMETER_NAMES, PRINCIPAL
+from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES, PRINCIPAL
 from thermocald.store.series import Event
 
 if TYPE_CHECKING:

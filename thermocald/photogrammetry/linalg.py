@@ -15,23 +15,6 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
 
-__all__ = [
-    "MAD_TO_SD",
-    "best_level",
-    "correlation_matrix",
-    "diagonal_scale",
-    "eliminate",
-    "explained",
-    "inverse_of_determined",
-    "mad_sd",
-    "orthonormal_combinations",
-    "root_of",
-    "scaled_inverse",
-    "scaled_solve",
-    "stacked_inverses",
-    "symmetric_power",
-    "unit_diagonal",
-]
 
 MAD_TO_SD = 1.4826
 """Median absolute deviation of a normal distribution to its standard deviation."""

@@ -18,7 +18,7 @@ from thermocald.errors import GeometryError, ImageError
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES, IOP_NAMES, Sensor
 from thermocald.photogrammetry.field.planes import target_normals
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.photogrammetry.frame.circles import circle_observations
+from thermocald.photogrammetry.frame.measurement import circle_observations
 from thermocald.photogrammetry.network.adjustment import Network, Photo, adjust_network, advice
 from thermocald.photogrammetry.network.bundle import Distance
 from thermocald.photogrammetry.targets import ring_code

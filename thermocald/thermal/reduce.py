@@ -27,8 +27,7 @@ import numpy as np
 
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, project
-from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, adjust
-from thermocald.photogrammetry.epoch.cold_start import cold_start
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, adjust, cold_start
 from thermocald.photogrammetry.epoch.geometry import GeometryBounds
 from thermocald.photogrammetry.field.planes import plane_fit
 from thermocald.photogrammetry.field.testfield import Observations

@@ -401,7 +401,7 @@ def test_covariance_in_opencv_is_that_of_the_scatter(tmp_path, plain):
     assert sd == pytest.approx(np.sqrt(np.diag(stated)))
     rng = np.random.default_rng(1)
     samples = rng.multivariate_normal(plain.interior.as_array(), Q, 400)
-    from thermocald.photogrammetry.camera.model_families import BrownOpenCV
+    from thermocald.photogrammetry.camera.conversions import BrownOpenCV
 
     values = np.array(
         [

@@ -178,8 +178,7 @@ class Camera(Result):
         >>> K.shape, distortion.shape
         ((3, 3), (5,))
         """
-        from thermocald.photogrammetry.camera.conversions import to_family
-        from thermocald.photogrammetry.camera.model_families import BrownOpenCV
+        from thermocald.photogrammetry.camera.conversions import BrownOpenCV, to_family
 
         found = to_family(self.model, BrownOpenCV(5), None).values
         fx, fy, cx, cy = found[:4]

@@ -12,10 +12,10 @@ import numpy as np
 from thermocald.errors import GeometryError, ImageError, UsageError
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.camera_files.camera_file import CameraFile
-from thermocald.photogrammetry.epoch.cold_start import cold_start, pose_only
+from thermocald.photogrammetry.epoch.adjustment import cold_start, pose_only
 from thermocald.photogrammetry.epoch.common_interior import CommonInterior, adjust_common_interior
 from thermocald.photogrammetry.frame.measurement import Prior, measure
-from thermocald.photogrammetry.orientation.approximate import approximate_orientation
+from thermocald.photogrammetry.orientation import approximate_orientation
 from thermocald.photogrammetry.targets.image_file import decode_grey
 
 if TYPE_CHECKING:

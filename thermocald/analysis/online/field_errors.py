@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import partials, project
-from thermocald.photogrammetry.epoch.whitening import point_covariances
+from thermocald.photogrammetry.epoch.gauss_markov import point_covariances
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array

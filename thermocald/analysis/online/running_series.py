@@ -23,11 +23,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import (
+    EOP,
+    IOP,
+    PARAMETER_NAMES,
+    PRINCIPAL,
     ExteriorOrientation,
     InteriorOrientation,
     project,
 )
-from thermocald.photogrammetry.parameters import EOP, IOP, PARAMETER_NAMES, PRINCIPAL
 from thermocald.photogrammetry.series.adjustment import adjusted, result
 from thermocald.photogrammetry.series.known import KnownSeries
 from thermocald.photogrammetry.series.mount import FEWEST_EPOCHS, drift_period

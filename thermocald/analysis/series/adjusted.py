@@ -9,8 +9,12 @@ import numpy as np
 
 from thermocald.analysis.series.still_field import still_field
 from thermocald.errors import DataError
-from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation, InteriorOrientation
-from thermocald.photogrammetry.parameters import EOP, IOP
+from thermocald.photogrammetry.camera.camera_model import (
+    EOP,
+    IOP,
+    ExteriorOrientation,
+    InteriorOrientation,
+)
 from thermocald.photogrammetry.series.adjustment import (
     SeriesAdjustment,
     SeriesSettings,

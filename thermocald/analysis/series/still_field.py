@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.photogrammetry.camera.camera_model import EOP, IOP
 from thermocald.photogrammetry.field.planes import field_sheets
-from thermocald.photogrammetry.parameters import EOP, IOP
 from thermocald.photogrammetry.series.board_motion import board_movements
 from thermocald.photogrammetry.series.field_motion import (
     FEWEST_EPOCHS,

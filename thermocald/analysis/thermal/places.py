@@ -17,10 +17,9 @@ import numpy as np
 
 from thermocald.analysis.thermal.correction import require_inside
 from thermocald.errors import ConfigurationError, DataError
-from thermocald.photogrammetry.camera.camera_model import InteriorOrientation
+from thermocald.photogrammetry.camera.camera_model import EOP, InteriorOrientation
 from thermocald.photogrammetry.epoch.measuring import Line, Plane, place_on, resect
 from thermocald.photogrammetry.field.testfield import Observations, TestField
-from thermocald.photogrammetry.parameters import EOP
 from thermocald.result import Result, new_figure
 from thermocald.store.recording.table import Table
 from thermocald.yaml_file import read_yaml

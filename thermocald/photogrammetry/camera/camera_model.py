@@ -1,12 +1,15 @@
 """The camera model of CONVENTIONS §2: Brown's model in photogrammetric notation.
 
-The distortion is evaluated at the ideal point, so object point → image point is closed form and
-image point → ray is an iteration. All functions are pure and take arrays; image points are px with
-(0, 0) at the centre of the top-left pixel, y down; object points, projection centre, and interior
-orientation are mm; angles rad; `R = Rx(omega) Ry(phi) Rz(kappa)` turns camera into object axes.
+The 16 parameters of an oriented camera, their names, units and places in a vector, and what they
+do: projection, partials, rays. The distortion is evaluated at the ideal point, so object point →
+image point is closed form and image point → ray is an iteration. All functions are pure and take
+arrays; image points are px with (0, 0) at the centre of the top-left pixel, y down; object points,
+projection centre, and interior orientation are mm; angles rad; `R = Rx(omega) Ry(phi) Rz(kappa)`
+turns camera into object axes.
 
-Parameter vectors are ordered as `IOP_NAMES` and `EOP_NAMES`. Leading dimensions of `iop` and `eop`
-are epochs; points are shared by all epochs or carry the same leading dimensions.
+Parameter vectors are ordered as `PARAMETER_NAMES`: the ten of the interior orientation, then the
+six of the exterior. Leading dimensions of `iop` and `eop` are epochs; points are shared by all
+epochs or carry the same leading dimensions.
 
 Source: Brown, D. C. (1971): Close-range camera calibration; Luhmann, T. et al. (2014):
 Close-Range Photogrammetry and 3D Imaging, 2nd ed., sections 2.4 and 3.3; the affinity terms as
@@ -23,7 +26,6 @@ from typing import TYPE_CHECKING, ClassVar, Self
 import numpy as np
 
 from thermocald.errors import GeometryError
-from thermocald.photogrammetry.parameters import EOP_NAMES, IOP_NAMES, PARAMETER_NAMES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -32,23 +34,46 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
 
-__all__ = [
-    "EOP_NAMES",
-    "IOP_NAMES",
-    "PARAMETER_NAMES",
-    "CameraModel",
-    "ExteriorOrientation",
-    "InteriorOrientation",
-    "Sensor",
-    "camera_coordinates",
-    "distort",
-    "image_to_mm",
-    "image_to_px",
-    "partials",
-    "project",
-    "rays",
-    "rotation",
-]
+IOP_NAMES = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2", "C1", "C2")
+EOP_NAMES = ("omega", "phi", "kappa", "X0", "Y0", "Z0")
+PARAMETER_NAMES = IOP_NAMES + EOP_NAMES
+PARAMETER_COUNT = len(PARAMETER_NAMES)
+
+IOP = slice(0, 10)
+"""Interior orientation."""
+EOP = slice(10, 16)
+"""Exterior orientation."""
+PRINCIPAL = slice(0, 3)
+"""c, x0, y0: what thermal drift is reported of."""
+PRINCIPAL_POINT = slice(1, 3)
+"""x0, y0."""
+ROTATION = slice(10, 13)
+"""omega, phi, kappa."""
+POSITION = slice(13, 16)
+"""X0, Y0, Z0."""
+
+EOP_COLUMNS = np.arange(EOP.start, EOP.stop)
+"""The exterior orientation as an index array."""
+EOP_COLUMNS.flags.writeable = False
+
+UNITS = {
+    **dict.fromkeys(("c", "x0", "y0", "X0", "Y0", "Z0"), "mm"),
+    "A1": "mm⁻²",
+    "A2": "mm⁻⁴",
+    "A3": "mm⁻⁶",
+    "B1": "mm⁻¹",
+    "B2": "mm⁻¹",
+    "C1": "1",
+    "C2": "1",
+    **dict.fromkeys(("omega", "phi", "kappa"), "rad"),
+}
+"""Unit of each parameter."""
+
+
+def free_columns(names: tuple[str, ...]) -> list[int]:
+    """Positions of the named interior parameters, in the order of `PARAMETER_NAMES`."""
+    return [i for i, name in enumerate(IOP_NAMES) if name in names]
+
 
 _UPWARDS = np.array([1.0, -1.0])  # image coordinates in mm go up, in px down
 _TURNS = np.array([-1.0, 1.0, 1.0])

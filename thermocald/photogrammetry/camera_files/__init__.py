@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import CameraModel
 
-__all__ = ["FORMATS", "Format", "ImportedCamera", "file_name", "read", "recognised", "write"]
 
 FORMATS: dict[str, Format] = {
     module.FORMAT.name: module.FORMAT

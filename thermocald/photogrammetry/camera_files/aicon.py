@@ -23,8 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.errors import ConfigurationError
-from thermocald.photogrammetry.camera.conversions import to_family
-from thermocald.photogrammetry.camera.model_families import MeasuredPoint
+from thermocald.photogrammetry.camera.conversions import MeasuredPoint, to_family
 from thermocald.photogrammetry.camera_files.camera_record import (
     ForeignCamera,
     Format,
@@ -42,7 +41,6 @@ if TYPE_CHECKING:
     )
     from thermocald.photogrammetry.camera.conversions import Family
 
-__all__ = ["FORMAT"]
 
 # In the order of our ten: c x0 y0 A1 A2 A3 B1 B2 C1 C2.
 _NAMES = ("Ck", "Xh", "Yh", "A1", "A2", "A3", "B1", "B2", "C1", "C2")

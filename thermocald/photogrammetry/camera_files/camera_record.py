@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
 
-__all__ = ["ForeignCamera", "Format", "ImportedCamera", "Record", "header"]
 
 _LARGEST = 1e9
 _PITCH = re.compile(r"pixel_pitch_mm[\"']?\s*[:=]\s*([0-9.eE+-]+)")

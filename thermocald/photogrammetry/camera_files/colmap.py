@@ -8,8 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from thermocald.errors import ConfigurationError
-from thermocald.photogrammetry.camera.conversions import to_family
-from thermocald.photogrammetry.camera.model_families import BrownOpenCV
+from thermocald.photogrammetry.camera.conversions import BrownOpenCV, to_family
 from thermocald.photogrammetry.camera_files.camera_record import (
     ForeignCamera,
     Format,
@@ -17,8 +16,6 @@ from thermocald.photogrammetry.camera_files.camera_record import (
     header,
 )
 from thermocald.photogrammetry.camera_files.file_text import number
-
-__all__ = ["FORMAT"]
 
 # Where each model's parameters stand in fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6.
 _SLOTS: dict[str, tuple[tuple[int, ...], ...]] = {

@@ -13,8 +13,6 @@ from thermocald.errors import ConfigurationError
 if TYPE_CHECKING:
     from thermocald.arrays import Array
 
-__all__ = ["number", "numbers", "yaml_document", "yaml_text"]
-
 
 def yaml_document(text: str, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> Any:
     """What a YAML text holds; ConfigurationError for a text that is not YAML."""

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from thermocald.errors import ConfigurationError
-from thermocald.photogrammetry.camera.conversions import to_family
-from thermocald.photogrammetry.camera.model_families import BrownOpenCV
+from thermocald.photogrammetry.camera.conversions import BrownOpenCV, to_family
 from thermocald.photogrammetry.camera_files.camera_record import (
     ForeignCamera,
     Format,
@@ -14,8 +13,6 @@ from thermocald.photogrammetry.camera_files.camera_record import (
     header,
 )
 from thermocald.photogrammetry.camera_files.file_text import numbers, yaml_document, yaml_text
-
-__all__ = ["FORMAT"]
 
 
 def _encode(record: Record) -> tuple[str, str]:

@@ -11,8 +11,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from thermocald.errors import ConfigurationError
-from thermocald.photogrammetry.camera.conversions import to_family
-from thermocald.photogrammetry.camera.model_families import Metashape
+from thermocald.photogrammetry.camera.conversions import Metashape, to_family
 from thermocald.photogrammetry.camera_files.camera_record import (
     ForeignCamera,
     Format,
@@ -20,8 +19,6 @@ from thermocald.photogrammetry.camera_files.camera_record import (
     header,
 )
 from thermocald.photogrammetry.camera_files.file_text import number, numbers
-
-__all__ = ["FORMAT"]
 
 _FAMILY = Metashape()
 

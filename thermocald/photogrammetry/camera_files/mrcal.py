@@ -5,8 +5,7 @@ from __future__ import annotations
 import ast
 
 from thermocald.errors import ConfigurationError
-from thermocald.photogrammetry.camera.conversions import to_family
-from thermocald.photogrammetry.camera.model_families import BrownOpenCV
+from thermocald.photogrammetry.camera.conversions import BrownOpenCV, to_family
 from thermocald.photogrammetry.camera_files.camera_record import (
     ForeignCamera,
     Format,
@@ -14,8 +13,6 @@ from thermocald.photogrammetry.camera_files.camera_record import (
     header,
 )
 from thermocald.photogrammetry.camera_files.file_text import numbers
-
-__all__ = ["FORMAT"]
 
 _COUNTS = {f"LENSMODEL_OPENCV{n}": n for n in (4, 5, 8, 12)} | {"LENSMODEL_PINHOLE": 0}
 

@@ -16,8 +16,6 @@ from thermocald.photogrammetry.camera.camera_model import (
 from thermocald.photogrammetry.camera_files.camera_record import Format, ImportedCamera, Record
 from thermocald.photogrammetry.camera_files.file_text import number, numbers
 
-__all__ = ["FORMAT"]
-
 _VERSION = "thermocald-camera/1"
 
 

@@ -13,8 +13,7 @@ import numpy as np
 import yaml
 
 from thermocald.errors import ConfigurationError
-from thermocald.photogrammetry.camera.conversions import to_family
-from thermocald.photogrammetry.camera.model_families import BrownOpenCV
+from thermocald.photogrammetry.camera.conversions import BrownOpenCV, to_family
 from thermocald.photogrammetry.camera_files.camera_record import (
     ForeignCamera,
     Format,
@@ -26,7 +25,6 @@ from thermocald.photogrammetry.camera_files.file_text import number, numbers, ya
 if TYPE_CHECKING:
     from thermocald.arrays import Array
 
-__all__ = ["FORMAT"]
 
 _COUNTS = (0, 4, 5, 8, 12)
 

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from thermocald.errors import ConfigurationError
-from thermocald.photogrammetry.camera.conversions import to_family
-from thermocald.photogrammetry.camera.model_families import BrownOpenCV
+from thermocald.photogrammetry.camera.conversions import BrownOpenCV, to_family
 from thermocald.photogrammetry.camera_files.camera_record import (
     ForeignCamera,
     Format,
@@ -21,8 +20,6 @@ from thermocald.photogrammetry.camera_files.file_text import (
     yaml_document,
     yaml_text,
 )
-
-__all__ = ["FORMAT"]
 
 _COUNT = {"plumb_bob": 5, "rational_polynomial": 8}
 

@@ -12,17 +12,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, PARAMETER_NAMES, rotation
+from thermocald.photogrammetry.camera.camera_model import EOP, IOP_NAMES, PARAMETER_NAMES, rotation
 from thermocald.photogrammetry.field.planes import plane_fit
-from thermocald.photogrammetry.parameters import EOP
 
 if TYPE_CHECKING:
     from collections.abc import Container, Iterable
 
     from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
-
-__all__ = ["GeometryBounds", "image_coverage", "obliqueness_deg", "uncertain", "weaknesses"]
 
 
 @dataclass(frozen=True, slots=True)

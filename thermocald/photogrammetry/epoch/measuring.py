@@ -17,16 +17,22 @@ import numpy as np
 
 from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera.camera_model import (
+    EOP,
+    IOP,
     IOP_NAMES,
     ExteriorOrientation,
     partials,
     rays,
     rotation,
 )
-from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, adjust, failed
-from thermocald.photogrammetry.epoch.cold_start import NO_BOUNDS, mirror_pose
-from thermocald.photogrammetry.orientation.approximate import approximate_orientation
-from thermocald.photogrammetry.parameters import EOP, IOP
+from thermocald.photogrammetry.epoch.adjustment import (
+    NO_BOUNDS,
+    AdjustmentSettings,
+    adjust,
+    failed,
+    mirror_pose,
+)
+from thermocald.photogrammetry.orientation import approximate_orientation
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

@@ -16,15 +16,6 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array, Mask
     from thermocald.photogrammetry.epoch.gauss_markov import Solution
 
-__all__ = [
-    "TRUSTED_REDUNDANCY",
-    "Rejections",
-    "chi2_2d",
-    "fails_global_test",
-    "most_rejected",
-    "point_tests",
-    "snoop",
-]
 
 TRUSTED_REDUNDANCY = 20
 """From here on the residuals themselves give the noise."""

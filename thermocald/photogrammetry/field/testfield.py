@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
 
-__all__ = ["KINDS", "Observations", "TestField"]
 
 KINDS = ("circle", "marker_corner", "chess_corner")
 

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array, Index
     from thermocald.photogrammetry.camera.camera_model import Sensor
 
-__all__ = ["approximate"]
 
 _FLIP = np.diag([1.0, -1.0, -1.0])  # our camera axes to OpenCV's
 _INLIER_PX = 6.0

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.photogrammetry.camera.camera_model import EOP
 from thermocald.photogrammetry.epoch.snooping import TRUSTED_REDUNDANCY
-from thermocald.photogrammetry.parameters import EOP
 from thermocald.photogrammetry.series.covariances import (
     all_cofactors,
     line_weights,

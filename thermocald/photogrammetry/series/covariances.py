@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.photogrammetry.camera.camera_model import EOP, EOP_COLUMNS
 from thermocald.photogrammetry.linalg import root_of
-from thermocald.photogrammetry.parameters import EOP, EOP_COLUMNS
 from thermocald.photogrammetry.series.cofactors import among_all, cofactors
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.parameters import EOP
+from thermocald.photogrammetry.camera.camera_model import EOP
 from thermocald.photogrammetry.series.normals import right_hand_sides
 
 if TYPE_CHECKING:

@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.camera.camera_model import project
+from thermocald.photogrammetry.camera.camera_model import EOP, IOP, PARAMETER_NAMES, project
 from thermocald.photogrammetry.epoch.snooping import Rejections
-from thermocald.photogrammetry.parameters import EOP, IOP, PARAMETER_NAMES
 from thermocald.photogrammetry.series.design import Design, State, offset_weights
 from thermocald.photogrammetry.series.movement import STILL, Movement
 from thermocald.photogrammetry.series.normals import (

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.parameters import EOP, IOP, free_columns
+from thermocald.photogrammetry.camera.camera_model import EOP, IOP, free_columns
 from thermocald.photogrammetry.series.mount import FEWEST_EPOCHS, estimate_movement
 from thermocald.photogrammetry.series.movement import STILL, Movement, together
 from thermocald.photogrammetry.series.normals import linearise

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.parameters import EOP
+from thermocald.photogrammetry.camera.camera_model import EOP
 from thermocald.photogrammetry.series.adjustment import epoch_variance
 from thermocald.photogrammetry.series.cofactors import among_all
 from thermocald.photogrammetry.series.common_sums import CommonSums, Shared, kinds_of

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.photogrammetry.camera.camera_model import EOP, EOP_COLUMNS
 from thermocald.photogrammetry.linalg import mad_sd, stacked_inverses, symmetric_power
-from thermocald.photogrammetry.parameters import EOP, EOP_COLUMNS
 from thermocald.photogrammetry.series.jumps import Perspective, jumps
 from thermocald.photogrammetry.series.movement import STILL, Movement
 from thermocald.photogrammetry.series.variance_components import components

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.photogrammetry.camera.camera_model import EOP
 from thermocald.photogrammetry.linalg import symmetric_power
-from thermocald.photogrammetry.parameters import EOP
 from thermocald.photogrammetry.series.variance_components import mean_variance
 
 if TYPE_CHECKING:

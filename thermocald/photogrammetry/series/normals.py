@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.photogrammetry.camera.camera_model import partials, project
-from thermocald.photogrammetry.parameters import EOP, IOP
+from thermocald.photogrammetry.camera.camera_model import EOP, IOP, partials, project
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -13,13 +13,16 @@ from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import (
+    EOP,
+    EOP_COLUMNS,
+    IOP,
     PARAMETER_NAMES,
     ExteriorOrientation,
     InteriorOrientation,
+    free_columns,
 )
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, Adjustment
 from thermocald.photogrammetry.epoch.geometry import GeometryBounds
-from thermocald.photogrammetry.parameters import EOP, EOP_COLUMNS, IOP, free_columns
 from thermocald.photogrammetry.series.movement import STILL, Movement
 
 if TYPE_CHECKING:

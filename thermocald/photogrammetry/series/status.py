@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.photogrammetry.camera.camera_model import PRINCIPAL_POINT
 from thermocald.photogrammetry.epoch.geometry import weaknesses
 from thermocald.photogrammetry.epoch.snooping import (
     TRUSTED_REDUNDANCY,
     fails_global_test,
     most_rejected,
 )
-from thermocald.photogrammetry.parameters import PRINCIPAL_POINT
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

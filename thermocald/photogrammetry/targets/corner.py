@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array, Image, Single
 
-__all__ = ["REACH_PX", "CornerFit", "fit_corners"]
 
 REACH_PX = 10.0
 """Farther along the edges no pixels are used."""

@@ -1,7 +1,7 @@
 """Circles found in a frame without prior knowledge.
 
 A frame is thresholded against its local mean, so that uneven light does no harm; contours that are
-ellipses are candidates. What they are is for others to say (`ring_reading`, `identification`).
+ellipses are candidates. What they are is for others to say (`ring_code`, `orientation`).
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
 
-__all__ = ["Candidates", "find_circles"]
 
 _BLOCK_SHARE = 1 / 40  # of the image's width: the neighbourhood of the local mean, full size
 _SMALLEST_BLOCK = 25

@@ -1,1 +1,0 @@
-"""Approximate orientation, and the identification of targets that rests on it."""

@@ -21,9 +21,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from thermocald.acquisition.device_loop import Schedule
 from thermocald.acquisition.pairing import pair_readings
 from thermocald.acquisition.pipeline import AcquiredEpoch, make_epoch
-from thermocald.acquisition.scheduler import Schedule
 from thermocald.analysis.online.observer import OnlineObserver
 from thermocald.hal import SystemClock, VirtualClock, open_device
 from thermocald.photogrammetry.targets.image_file import decode_grey

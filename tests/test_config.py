@@ -10,12 +10,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from thermocald.config import Config, devices, load_config, parse_config
+from thermocald.config import Config, InteriorName, ParameterName, load_config, parse_config
 from thermocald.errors import ConfigurationError
+from thermocald.files import dump_yaml
 from thermocald.hal import driver_names, option_names
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, PARAMETER_NAMES
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
-from thermocald.yaml_file import dump_yaml
 
 
 def document(**changes) -> dict:
@@ -50,8 +50,8 @@ def test_defaults():
 
 def test_names_are_those_of_the_camera_model():
     """config is a layer below photogrammetry and must repeat them."""
-    assert get_args(devices.InteriorName) == IOP_NAMES
-    assert get_args(devices.ParameterName) == PARAMETER_NAMES
+    assert get_args(InteriorName) == IOP_NAMES
+    assert get_args(ParameterName) == PARAMETER_NAMES
     assert parse(document()).calibration.free == DEFAULT_FREE
     assert parse(document()).calibration.snooping_alpha == AdjustmentSettings().snooping_alpha
 

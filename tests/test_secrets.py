@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from tests.commands import call
-from thermocald.acquisition.link import Link
+from thermocald.acquisition.device_loop import Link
 from thermocald.addresses import CleanFormatter, without_secrets
 from thermocald.errors import ConfigurationError, DeviceDenied, DeviceGone, UsageError
 from thermocald.hal import Device, SystemClock, VirtualClock, open_device

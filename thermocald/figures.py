@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from thermocald.atomic_file import new_file
+from thermocald.files import new_file
 from thermocald.numbers import coefficient, shortened, superscript
 
 if TYPE_CHECKING:

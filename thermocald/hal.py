@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self, runtim
 
 from pydantic import ConfigDict, ValidationError
 
-from thermocald.config.section import Section, in_words, keys
+from thermocald.config import Section, in_words, keys
 from thermocald.errors import ConfigurationError, DriverMissing, WrongDevice
 from thermocald.names import channel_fault as channel_fault
 from thermocald.names import require_channels

@@ -8,8 +8,8 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from thermocald.atomic_file import write_text
 from thermocald.errors import DriverMissing
+from thermocald.files import write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -11,11 +11,11 @@ import numpy as np
 
 from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.study import study as studies
-from thermocald.atomic_file import write_text
 from thermocald.discovery import result as discoveries
 from thermocald.discovery.entries import effects_of
 from thermocald.discovery.model import build_model
 from thermocald.errors import DataError
+from thermocald.files import write_text
 from thermocald.output.printed import calibration_document, calibration_lines, discovery_lines
 from thermocald.output.study.document import study_document
 from thermocald.output.study.summary import study_lines

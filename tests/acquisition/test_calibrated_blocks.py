@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from thermocald.acquisition.calibrated_blocks import EPOCHS_OF_A_BLOCK, calibrated_epochs
-from thermocald.acquisition.calibrator import Calibrator
+from thermocald.acquisition.calibrator import EPOCHS_OF_A_BLOCK, Calibrator, calibrated_epochs
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.field.testfield import Observations

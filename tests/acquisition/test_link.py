@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from thermocald.acquisition.link import Link
+from thermocald.acquisition.device_loop import Link
 from thermocald.errors import DeviceDenied, DeviceGone, DeviceNotFound
 from thermocald.hal import VirtualClock, open_device
 

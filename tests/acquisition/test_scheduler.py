@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from thermocald.acquisition.scheduler import Schedule
+from thermocald.acquisition.device_loop import Schedule
 from thermocald.hal import VirtualClock
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from thermocald.acquisition.scheduler import Schedule
+from thermocald.acquisition.device_loop import Schedule
 from thermocald.acquisition.steady_clock import SteadyClock
 from thermocald.hal import VirtualClock
 

@@ -26,9 +26,9 @@ import typer
 
 from tests.cli.test_import import photograph
 from tests.photogrammetry.network_cases import convergent_stations
-from thermocald.atomic_file import new_file, write_text
 from thermocald.cli import application, main
 from thermocald.errors import OutputError
+from thermocald.files import new_file, write_text
 from thermocald.photogrammetry import camera_files
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 from thermocald.physics.presets import preset_simulation

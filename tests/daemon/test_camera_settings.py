@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from thermocald.acquisition.link import Link
+from thermocald.acquisition.device_loop import Link
 from thermocald.acquisition.pipeline import AcquiredEpoch
 from thermocald.config import parse_config
 from thermocald.daemon.camera_line import link_status

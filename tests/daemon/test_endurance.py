@@ -188,7 +188,7 @@ def test_the_rhythm_holds_while_the_interpreter_is_busy():
     script = """
 import json, sys, threading, time
 import numpy as np
-from thermocald.acquisition.scheduler import Schedule
+from thermocald.acquisition.device_loop import Schedule
 from thermocald.hal import SystemClock
 sys.setswitchinterval(0.0005)
 stop = threading.Event()

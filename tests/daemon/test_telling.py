@@ -54,7 +54,7 @@ def journal(tmp_path):
 @pytest.fixture
 def log(journal):
     handler = JournalHandler(journal.path)
-    log = logging.Logger("thermocald.acquisition.link")  # noqa: LOG001 - apart from pytest's
+    log = logging.Logger("thermocald.acquisition.device_loop")  # noqa: LOG001 - apart from pytest's
     log.addHandler(handler)
     yield log
     handler.close()
@@ -67,7 +67,7 @@ def test_an_event_has_its_fields(log, journal):
     assert entry["MESSAGE"] == "camera one is out: unplugged"
     assert (entry["THERMOCALD_DEVICE"], entry["THERMOCALD_EVENT"]) == ("one", "device_out")
     assert (entry["PRIORITY"], entry["SYSLOG_IDENTIFIER"]) == ("4", "thermocald")
-    assert entry["THERMOCALD_LOGGER"] == "thermocald.acquisition.link"
+    assert entry["THERMOCALD_LOGGER"] == "thermocald.acquisition.device_loop"
     assert entry["THERMOCALD_THREAD"] == "MainThread"
     assert entry["CODE_FILE"].endswith("test_telling.py")
     assert int(entry["CODE_LINE"]) > 0

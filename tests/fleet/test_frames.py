@@ -14,8 +14,7 @@ import psycopg
 
 from tests.fleet.conftest import address, count
 from thermocald.errors import ServerError
-from thermocald.fleet.forward import Forwarder
-from thermocald.fleet.frames import FrameRule
+from thermocald.fleet.forward import Forwarder, FrameRule
 from thermocald.store.database.store import Store
 from thermocald.store.server.reader import ServerStore
 

@@ -9,10 +9,8 @@ import psycopg
 import pytest
 
 from tests.fleet.conftest import address, count
-from thermocald.fleet.cursor import Cursor
-from thermocald.fleet.findings import add_findings
-from thermocald.fleet.forward import Forwarder
-from thermocald.fleet.overview import read_overview
+from thermocald.fleet.forward import Cursor, Forwarder
+from thermocald.fleet.overview import add_findings, read_overview
 from thermocald.store.database.store import Store
 from thermocald.store.server.connection import ServerAddress, create_tables
 from thermocald.store.server.fleet_reader import FleetReader

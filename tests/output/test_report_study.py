@@ -10,8 +10,8 @@ import pytest
 
 from thermocald.analysis.study.measured import Clip
 from thermocald.analysis.study.study import StudySettings, study
-from thermocald.atomic_file import write_text
 from thermocald.errors import OutputError
+from thermocald.files import write_text
 from thermocald.output.study.document import study_document
 from thermocald.output.study.report import cut_clip, render_study, save_figures
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES

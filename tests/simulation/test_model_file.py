@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from thermocald.errors import ConfigurationError
+from thermocald.files import dump_yaml
 from thermocald.physics.device import read_camera_device, read_programme
 from thermocald.physics.model import ModelEffect
 from thermocald.physics.model_file import model_document, parse_model, read_model, write_model
 from thermocald.physics.testfields import demonstration_field, demonstration_model
-from thermocald.yaml_file import dump_yaml
 
 
 def full_model():

@@ -10,9 +10,9 @@ from typer.testing import CliRunner
 
 from thermocald.cli import application
 from thermocald.errors import ThermocaldError
+from thermocald.files import dump_yaml
 from thermocald.physics.presets import preset_names, preset_simulation
 from thermocald.store.recording.reader import read_recording
-from thermocald.yaml_file import dump_yaml
 
 PROGRAMME = {
     "format": "thermocald-programme/1",

@@ -20,6 +20,7 @@ from thermocald.errors import (
     TestFieldError,
     ThermocaldError,
 )
+from thermocald.files import read_yaml
 from thermocald.photogrammetry.camera_files.camera_file import read_camera
 from thermocald.photogrammetry.camera_files.file_text import number
 from thermocald.photogrammetry.targets.image_file import decode_grey, image_size
@@ -27,7 +28,6 @@ from thermocald.store.logger.photographs import read_photograph
 from thermocald.store.recording.reader import read_recording
 from thermocald.store.recording.table import Table
 from thermocald.store.recording.testfield_file import read_testfield
-from thermocald.yaml_file import read_yaml
 
 HEAD = """format: thermocald-recording/1
 name: x

@@ -6,7 +6,7 @@ acquisition not.
                                           calibrated when there is time
 
 Two threads, one calibrates and one keeps, so that a slow disk or a slow adjustment never holds the
-camera up.
+camera up. `check_frame` looks at one frame before a series begins.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ import math
 import threading
 from collections import deque
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from thermocald.acquisition.calibrator import CalibratedEpoch
+from thermocald.acquisition.pairing import PairedReadings
 from thermocald.epoch import Epoch
 from thermocald.errors import DataError
 from thermocald.photogrammetry.epoch.adjustment import failed
@@ -26,10 +27,10 @@ from thermocald.photogrammetry.field.planes import observations_from_lists
 from thermocald.photogrammetry.targets.image_file import EncodedImage
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from thermocald.acquisition.calibrator import Calibrator
-    from thermocald.acquisition.pairing import PairedReadings, Readings
+    from thermocald.acquisition.pairing import Readings
     from thermocald.hal import Clock, Frame
 
 log = logging.getLogger(__name__)
@@ -296,3 +297,51 @@ class Pipeline:
                 elif self._stopping and not self._threads[0].is_alive():
                     return None
                 self._changed.wait(_IDLE_S)
+
+
+_BLURRED_PX = 3.0
+_SATURATED = 0.02
+_LOW_CONTRAST = 30.0
+_NAMED = 5
+
+_RULES: tuple[tuple[str, Callable[[float], bool], str], ...] = (
+    ("saturation", lambda v: v > _SATURATED, "saturated: less light, or a shorter exposure"),
+    ("blur", lambda v: v > _BLURRED_PX, "blurred: focus, or hold the camera still"),
+    ("contrast", lambda v: abs(v) < _LOW_CONTRAST, "of low contrast: more light"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameCheck:
+    """What was found, sentence by sentence; failed: why no series can begin, empty if one can."""
+
+    found: tuple[str, ...]
+    failed: str = ""
+
+
+def check_frame(name: str, calibrator: Calibrator, frame: Frame) -> FrameCheck:
+    """Measure and adjust a frame, and say what a person can mend."""
+    nothing = PairedReadings(float("nan"), {}, float("nan"))
+    calibrated = calibrate_frame(calibrator, make_epoch(1, frame, nothing), frame)
+    result, seen = calibrated.adjustment, calibrated.epoch.observations
+    field = calibrator.testfield
+    found: list[str] = []
+    if seen is not None and len(seen):
+        blur = calibrated.extra.get("blur_px")
+        blurred = "" if blur is None else f", blur {blur:.2f} px"
+        found.append(f"{name}: {len(seen)} of {len(field)} targets{blurred}")
+        found += _remarks(field.names, seen.targets, seen.quality)
+    if not result.ok:
+        return FrameCheck(tuple(found), f"{result.status}: {result.reason}")
+    c, sd = result.values[0], result.sd[0]
+    found.append(f"{name}: sigma0 {result.sigma0:.2f}, c {c:.5f} ± {sd:.5f} mm")
+    return FrameCheck(tuple(found))
+
+
+def _remarks(names: tuple[str, ...], targets: Any, quality: Mapping[str, Any]) -> Iterator[str]:
+    for key, bad, words in _RULES:
+        rows = [int(t) for t, v in zip(targets, quality.get(key, ()), strict=False) if bad(v)]
+        if rows:
+            shown = ", ".join(names[row] for row in rows[:_NAMED])
+            more = f" and {len(rows) - _NAMED} more" if len(rows) > _NAMED else ""
+            yield f"  target {shown}{more}: {words}"

@@ -19,10 +19,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import typer
 
 from thermocald import __version__
-from thermocald.atomic_file import cannot_write
 from thermocald.cli.commands import COMMANDS, Group, add_commands
 from thermocald.cli.common import log_to_stderr, say
 from thermocald.errors import ThermocaldError
+from thermocald.files import cannot_write
 
 _INTERRUPTED = 130
 _VERBOSE = ("--verbose", "-v")

@@ -7,10 +7,10 @@ from typing import Annotated
 
 import typer
 
-from thermocald.atomic_file import make_folder
 from thermocald.cli.common import progress, write_result
 from thermocald.cli.options import DEFAULT_FREE_TEXT, FreeOption, JsonOption, free_names
 from thermocald.errors import DataError, UsageError
+from thermocald.files import make_folder
 
 
 def calibrate(

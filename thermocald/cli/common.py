@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from thermocald import atomic_file
+from thermocald import files
 from thermocald.addresses import CleanFormatter, without_secrets
 from thermocald.result import jsonable
 
@@ -134,4 +134,4 @@ def write_parts(parts: Iterable[str], destination: str | Path) -> None:
             sys.stdout.write(part)
             sys.stdout.flush()  # whoever reads it waits for it
         return
-    atomic_file.write_parts(Path(destination), parts)
+    files.write_parts(Path(destination), parts)

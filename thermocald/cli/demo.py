@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from thermocald.atomic_file import make_folder
 from thermocald.cli.common import progress, say, write_json
 from thermocald.cli.options import JsonOption, SeedOption
 from thermocald.errors import DataError
+from thermocald.files import make_folder
 
 if TYPE_CHECKING:
     from thermocald.analysis.series.epochs import Epochs

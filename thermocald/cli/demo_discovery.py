@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from thermocald.atomic_file import make_folder
 from thermocald.cli.common import say
+from thermocald.files import make_folder
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from thermocald.atomic_file import write_text
 from thermocald.cli.commands import expert
 from thermocald.cli.common import progress, say, write_result
 from thermocald.cli.options import JobsOption, JsonOption, TimezoneOption, takes_log_options
 from thermocald.errors import UsageError
+from thermocald.files import write_text
 
 if TYPE_CHECKING:
     from thermocald.analysis.thermal.calibrations import Calibration

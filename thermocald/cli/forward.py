@@ -14,7 +14,7 @@ from thermocald.config import Config, load_config
 from thermocald.errors import UsageError
 
 if TYPE_CHECKING:
-    from thermocald.fleet.frames import FrameRule
+    from thermocald.fleet.forward import FrameRule
 
 __all__ = ["forward"]
 
@@ -74,7 +74,7 @@ def forward(
 
 
 def _configured(config: Config) -> FrameRule | None:
-    from thermocald.fleet.frames import FrameRule
+    from thermocald.fleet.forward import FrameRule
 
     section = config.forward
     if section.frames == "none":

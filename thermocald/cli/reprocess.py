@@ -93,7 +93,7 @@ def _analyse(
     sources: list[Path], out: Path, do: str, sets: int, engine: str, jobs: int, json: str | None
 ) -> None:
     from thermocald.cli.series_task import analyse, find_series_tasks, lost
-    from thermocald.fleet.tasks import run_tasks
+    from thermocald.fleet.reprocess import run_tasks
 
     tasks = find_series_tasks(sources, out, do, sets)
     outcomes = []

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from thermocald.atomic_file import make_folder, write_text
 from thermocald.errors import DataError, OutputError, ThermocaldError, UsageError
+from thermocald.files import make_folder, write_text
 from thermocald.result import jsonable
 from thermocald.store.server.connection import ServerAddress, is_server
 from thermocald.store.sources import source_name

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from thermocald.atomic_file import make_folder
 from thermocald.cli.commands import expert, subcommands
 from thermocald.cli.common import default_config, say, write_json
 from thermocald.cli.options import ConfigOption, JsonOption
 from thermocald.errors import DataError, UsageError
+from thermocald.files import make_folder
 
 if TYPE_CHECKING:
     from thermocald.config import Config

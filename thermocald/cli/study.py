@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from thermocald.atomic_file import make_folder
 from thermocald.cli.commands import expert
 from thermocald.cli.common import progress, write_result
 from thermocald.cli.options import (
@@ -21,6 +20,7 @@ from thermocald.cli.options import (
     free_names,
 )
 from thermocald.errors import UsageError
+from thermocald.files import make_folder
 from thermocald.store.server.connection import is_server
 from thermocald.store.sources import require_source
 

@@ -314,7 +314,7 @@ def check(
         )
     found = assess_field(targets, model, place, at, roll, sigma)
     if report is not None:
-        from thermocald.atomic_file import write_text
+        from thermocald.files import write_text
         from thermocald.output.field_check import render_field_check
 
         write_text(report, render_field_check(found))

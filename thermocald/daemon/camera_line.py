@@ -16,10 +16,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 from thermocald.acquisition.calibrator import CalibratedEpoch
-from thermocald.acquisition.device_loop import DeviceLoop
-from thermocald.acquisition.frame_check import check_frame
-from thermocald.acquisition.link import Link
-from thermocald.acquisition.pipeline import Pipeline
+from thermocald.acquisition.device_loop import DeviceLoop, Link
+from thermocald.acquisition.pipeline import Pipeline, check_frame
 from thermocald.daemon.epoch_keeper import EpochKeeper
 from thermocald.daemon.plan import running_series
 from thermocald.errors import ConfigurationError
@@ -29,11 +27,10 @@ from thermocald.store.series import Event
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from thermocald.acquisition.frame_check import FrameCheck
+    from thermocald.acquisition.device_loop import LinkEvent
     from thermocald.acquisition.frame_folder import FrameFolder
-    from thermocald.acquisition.link import LinkEvent
     from thermocald.acquisition.pairing import Readings
-    from thermocald.acquisition.pipeline import AcquiredEpoch
+    from thermocald.acquisition.pipeline import AcquiredEpoch, FrameCheck
     from thermocald.acquisition.steady_clock import SteadyClock
     from thermocald.daemon.live_state import LiveState
     from thermocald.daemon.output_loop import OutputLoop

@@ -109,7 +109,7 @@ def _stored(config: Config, session: Session) -> int:
 
 def _check(config: Config, say: Callable[[str], None]) -> None:
     """One frame and one reading; DataError says what is to be mended first."""
-    from thermocald.acquisition.frame_check import check_frame
+    from thermocald.acquisition.pipeline import check_frame
     from thermocald.daemon.plan import plan_cameras
     from thermocald.hal import SystemClock, open_device
 
@@ -207,7 +207,7 @@ def session_of(
 
 
 def _steps(path: Path) -> list[Any]:
-    from thermocald.yaml_file import read_yaml
+    from thermocald.files import read_yaml
 
     steps = read_yaml(path, ConfigurationError).get("programme")
     if not isinstance(steps, list) or not steps:

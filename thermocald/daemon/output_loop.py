@@ -7,12 +7,12 @@ import threading
 from collections import deque
 from typing import TYPE_CHECKING, Any
 
-from thermocald.acquisition.link import Link
+from thermocald.acquisition.device_loop import Link
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from thermocald.acquisition.link import LinkEvent
+    from thermocald.acquisition.device_loop import LinkEvent
     from thermocald.hal import Clock, Output
 
 

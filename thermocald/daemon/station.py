@@ -15,9 +15,8 @@ import time
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from thermocald.acquisition.device_loop import DeviceLoop
+from thermocald.acquisition.device_loop import DeviceLoop, Link
 from thermocald.acquisition.frame_folder import FrameFolder
-from thermocald.acquisition.link import Link
 from thermocald.acquisition.pairing import Readings, require_columns
 from thermocald.daemon.camera_line import CameraLine, link_status
 from thermocald.daemon.output_loop import OutputLoop
@@ -29,7 +28,7 @@ from thermocald.store.series import Event, LoggedReading
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from thermocald.acquisition.link import LinkEvent
+    from thermocald.acquisition.device_loop import LinkEvent
     from thermocald.acquisition.steady_clock import SteadyClock
     from thermocald.config import Config, OutputConfig
     from thermocald.daemon.epoch_keeper import EpochKeeper

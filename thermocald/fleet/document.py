@@ -7,9 +7,8 @@ import textwrap
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
-from thermocald.durations import short_duration
-from thermocald.fleet.findings import add_findings
-from thermocald.fleet.overview import CameraOverview, camera_types, read_overview
+from thermocald.fleet.overview import CameraOverview, add_findings, camera_types, read_overview
+from thermocald.numbers import short_duration
 from thermocald.store.server.connection import ServerAddress
 
 if TYPE_CHECKING:

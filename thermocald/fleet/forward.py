@@ -4,20 +4,26 @@
 
 It runs in a process of its own and only reads the store, so that a slow, full or absent server
 never delays a tick. A batch that fails is sent again, with growing pauses; a row that the server
-refuses for what it holds is found by halving, noted and passed over.
+refuses for what it holds is found by halving, noted and passed over. The cursor is a small file
+next to the store, replaced as a whole; losing it costs time and nothing else, as the server passes
+over rows that it has already.
+
+Frames are far larger than all else: a rule chooses among those that the daemon keeps, and a daily
+limit bounds them. Retention deletes a frame when its time has come, whether it was sent or not.
 """
 
 from __future__ import annotations
 
+import json
 import logging
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, Self
 
-from thermocald.errors import ServerError, ServerGone, StoreVersionError
-from thermocald.fleet.cursor import Cursor
-from thermocald.fleet.frames import FrameSender
+from thermocald.errors import ServerError, ServerGone, StoreError, StoreVersionError
+from thermocald.files import write_text
+from thermocald.names import FileFolder
 from thermocald.store.database.examination import KEPT
 from thermocald.store.database.store import Store
 from thermocald.store.server.writer import ServerWriter
@@ -26,12 +32,186 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
-    from thermocald.fleet.frames import FrameRule
+    from thermocald.store.database.examination import KeptFrame
     from thermocald.store.series import StoredSeries
     from thermocald.store.server.connection import ServerAddress
 
+_COUNTED = (*KEPT, "frame")
+
+
+@dataclass(slots=True)
+class Cursor:
+    """The last ids sent of each growing table, to one server and from one store.
+
+    server: its whole address but a password; identity, inode: of the store and its file, since
+    another store under the old name, or a restored one, is sent from its start; sent: {table: id},
+    `frame`: the last epoch whose frame was looked at; refused: rows that the server does not take,
+    {table: ids}, for a person to look at; day, frame_bytes: what frames have taken on that day
+    (UTC, days since 1970).
+    """
+
+    server: str
+    station: str
+    identity: str
+    inode: int
+    sent: dict[str, int] = field(default_factory=lambda: dict.fromkeys(_COUNTED, 0))
+    refused: dict[str, list[int]] = field(default_factory=dict)
+    day: int = 0
+    frame_bytes: int = 0
+
+    @classmethod
+    def read(cls, path: Path, store: Store, server: str, station: str) -> Self:
+        """As left by an earlier run, or at the start if there is none, or it is of something else.
+
+        Raises StoreError where the store is missing.
+        """
+        try:
+            inode = store.path.stat().st_ino
+        except OSError as error:
+            raise StoreError(f"{store.path}: cannot be read: {error.strerror}") from error
+        fresh = cls(server, station, store.identity, inode)
+        try:
+            found = cls(**json.loads(path.read_text(encoding="utf-8")))
+            same = (found.server, found.station, found.identity, found.inode) == (
+                server, station, fresh.identity, inode,
+            )  # fmt: skip
+            found.sent = {**fresh.sent, **found.sent}
+            sound = {*found.sent} == {*_COUNTED} and all(
+                type(n) is int for n in (*found.sent.values(), found.day, found.frame_bytes)
+            )
+            sound = sound and all(type(ids) is list for ids in found.refused.values())
+        except (OSError, ValueError, TypeError, AttributeError):
+            return fresh
+        return found if same and sound else fresh
+
+    @property
+    def rows_refused(self) -> int:
+        return sum(map(len, self.refused.values()))
+
+    def write(self, path: Path) -> None:
+        """Replace the file as a whole. Raises OutputError where it cannot be written."""
+        write_text(path, json.dumps(asdict(self)))
+
 
 log = logging.getLogger(__name__)
+
+_ROWS = 1000
+_DAY_S = 86400
+_LARGEST = 64_000_000
+"""Bytes of a frame: a raw of 48 megapixels is below, and a row of PostgreSQL may be far larger."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRule:
+    """Which frames are sent.
+
+    folder: where the daemon keeps them; choose: `events` (epochs without a result, or in which the
+    camera moved), `every_n`, or `all` that are kept; daily_bytes: what is above waits for the next
+    day.
+    """
+
+    folder: Path
+    choose: Literal["events", "every_n", "all"] = "events"
+    every_n: int = 360
+    daily_bytes: int = 200_000_000
+
+    def wants(self, frame: KeptFrame) -> bool:
+        """Whether the frame of an epoch is one to send."""
+        if frame.path is None or self.choose == "all":
+            return frame.path is not None
+        return frame.eventful if self.choose == "events" else frame.number % self.every_n == 0
+
+
+class FrameSender:
+    """Sends the chosen frames of a store, from where its cursor stands."""
+
+    def __init__(self, rule: FrameRule, clock: Callable[[], float] = time.time) -> None:
+        self.rule = rule
+        self._clock = clock
+        self._files = FileFolder(rule.folder)
+        self._full_on = -1  # the day whose limit was reported
+
+    def send(
+        self,
+        store: Store,
+        writer: ServerWriter,
+        series: Mapping[int, StoredSeries],
+        cursor: Cursor,
+        keep: Callable[[], None],
+        stop: Callable[[], bool],
+    ) -> int:
+        """Send what waits; how many were sent. `keep` writes the cursor.
+
+        A frame that retention has deleted is passed over. Raises ServerGone, ServerError.
+        """
+        count = 0
+        while frames := store.frames_after(cursor.sent["frame"], _ROWS):
+            for frame in frames:
+                if frame.series not in series or stop():
+                    keep()
+                    return count
+                data = self._read(frame) if self.rule.wants(frame) else None
+                if data is not None:
+                    if not self._room(cursor, len(data)):
+                        keep()
+                        return count
+                    count += self._send(writer, series[frame.series], frame, data, cursor)
+                    cursor.sent["frame"] = frame.id
+                    keep()
+                cursor.sent["frame"] = frame.id
+            keep()
+        return count
+
+    def _read(self, frame: KeptFrame) -> bytes | None:
+        assert frame.path is not None
+        path = self._files.find(frame.path)
+        try:
+            if path is None:
+                return None
+            if path.stat().st_size > _LARGEST:
+                log.warning("%s: has more than %d MB and is not sent", path, _LARGEST // 10**6)
+                return None
+            return path.read_bytes()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            log.warning("%s: cannot be read and is not sent: %s", path, error.strerror)
+            return None
+
+    def _room(self, cursor: Cursor, size: int) -> bool:
+        day = int(self._clock() // _DAY_S)
+        if day != cursor.day:
+            cursor.day, cursor.frame_bytes = day, 0
+        # one frame a day goes through whatever its size, else nothing ever would
+        if cursor.frame_bytes and cursor.frame_bytes + size > self.rule.daily_bytes:
+            if self._full_on != day:
+                log.warning(
+                    "%d MB of frames were sent today; the others wait for tomorrow",
+                    cursor.frame_bytes // 10**6,
+                )
+                self._full_on = day
+            return False
+        cursor.frame_bytes += size
+        return True
+
+    @staticmethod
+    def _send(
+        writer: ServerWriter, series: StoredSeries, frame: KeptFrame, data: bytes, cursor: Cursor
+    ) -> bool:
+        try:
+            writer.write_frame(series, frame, data)
+        except ServerGone:
+            cursor.frame_bytes -= len(data)
+            raise
+        except ServerError as error:
+            if not error.about_values:
+                cursor.frame_bytes -= len(data)
+                raise
+            log.error("frame %s is refused and passed over: %s", frame.path, error)
+            cursor.refused.setdefault("frame", []).append(frame.id)
+            return False
+        return True
+
 
 BATCH = 200
 """Rows of a transaction: about 1 MB of epochs with 150 targets."""

@@ -4,23 +4,26 @@
 
 A block depends on nothing but its recording: it begins with a search of the whole frame, whoever
 computes it, so a cluster gives the same bits as one core. A file that is there is not made again,
-which is how an interrupted run goes on. A block that fails, or kills its process, is reported and
-costs nothing but itself.
+which is how an interrupted run goes on. A block that fails is reported and costs nothing but
+itself; one whose process dies is tried again before it is given up.
 """
 
 from __future__ import annotations
 
 import logging
 import os
+from concurrent.futures import as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from importlib import import_module
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from thermocald.acquisition.calibrator import Calibrator
-from thermocald.errors import DataError, OutputError, ThermocaldError
-from thermocald.fleet.tasks import run_tasks
+from thermocald.errors import DataError, OutputError, ServerGone, ThermocaldError, UsageError
+from thermocald.parallel import processes
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.store.recording.parquet_table import write_parquet
@@ -28,8 +31,98 @@ from thermocald.store.recording.reader import open_recording
 from thermocald.store.series import EpochResult
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
+
+    Item = TypeVar("Item")
+    Result = TypeVar("Result")
     from pathlib import Path
+
+_ROUNDS = 3
+"""How often an item is handed to a cluster whose workers died of it, or of something else."""
+
+
+def run_tasks(
+    work: Callable[[Item], Result],
+    items: Sequence[Item],
+    lost: Callable[[Item, str], Result],
+    engine: str = "local",
+    jobs: int = 1,
+) -> Iterator[Result]:
+    """The results of `work` for all items, in the order in which they are done.
+
+    work: a function of a module, which raises nothing; lost: the result of an item whose process
+    died every time, and why; engine: `local`, with `jobs` processes, or the address of a Dask
+    scheduler, `tcp://host:8786`, whose workers see the same files. Raises UsageError, ServerGone.
+    """
+    if engine == "local":
+        return map(work, items) if jobs == 1 else _processes(work, items, lost, jobs)
+    if "://" in engine:
+        return _cluster(work, items, lost, engine)
+    raise UsageError(f"--engine {engine}: there is `local`, or a scheduler's tcp://HOST:PORT")
+
+
+def _processes(
+    work: Callable[[Item], Result],
+    items: Sequence[Item],
+    lost: Callable[[Item, str], Result],
+    jobs: int,
+) -> Iterator[Result]:
+    """On processes of this machine; where one dies, its items are tried again one by one."""
+    again: list[Item] = []
+    with processes(jobs) as pool:
+        futures = {pool.submit(work, item): item for item in items}
+        for future in as_completed(futures):
+            try:
+                yield future.result()
+            except BrokenProcessPool:
+                again.append(futures[future])
+    for item in again:
+        with processes(1) as pool:
+            try:
+                yield pool.submit(work, item).result()
+            except BrokenProcessPool:
+                yield lost(item, "its process died twice")
+
+
+def _cluster(
+    work: Callable[[Item], Result],
+    items: Sequence[Item],
+    lost: Callable[[Item, str], Result],
+    address: str,
+) -> Iterator[Result]:
+    try:
+        distributed: Any = import_module("distributed")
+    except ImportError as error:
+        raise UsageError(
+            f"--engine {address} needs Dask: pip install 'thermocald[dask]'"
+        ) from error
+    try:
+        client = distributed.Client(address, timeout="20s", set_as_default=False)
+    except (OSError, TimeoutError) as error:
+        raise ServerGone(f"{address}: the scheduler cannot be reached ({error})") from error
+    with client:
+        waiting = list(items)
+        for left in reversed(range(_ROUNDS)):
+            again: list[Item] = []
+            futures = client.map(work, waiting, pure=False, retries=1)
+            which = {future.key: item for future, item in zip(futures, waiting, strict=True)}
+            for future in distributed.as_completed(futures, loop=client.loop):
+                item = which[future.key]
+                if future.status == "finished":
+                    yield future.result()
+                elif left and isinstance(future.exception(), distributed.KilledWorker):
+                    # its workers died: of it, or because somebody ends workers now and then
+                    again.append(item)
+                else:
+                    yield lost(item, _first_line(future.exception()))
+                future.release()
+            waiting = again
+            if not waiting:
+                return
+
+
+def _first_line(error: BaseException | None) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 log = logging.getLogger(__name__)

@@ -11,8 +11,8 @@ import numpy as np
 
 from thermocald.analysis.thermal.correction import correct_points, image_corrections
 from thermocald.analysis.thermal.timed_rows import STANDARD_INPUT, RowBlock, row_blocks
-from thermocald.atomic_file import make_folder, new_file
 from thermocald.errors import DataError, ImageError, ThermocaldError, UsageError
+from thermocald.files import make_folder, new_file
 from thermocald.output.image_metadata import with_metadata
 
 if TYPE_CHECKING:

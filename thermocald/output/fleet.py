@@ -8,9 +8,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-from thermocald.durations import short_duration
 from thermocald.figures import BAND, PALETTE, drawing_style, label_axes, new_drawing
-from thermocald.numbers import parameter_label, shortened
+from thermocald.numbers import parameter_label, short_duration, shortened
 from thermocald.report import (
     Answer,
     Chapter,

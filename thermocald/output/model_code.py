@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING
 
-from thermocald.atomic_file import write_text
+from thermocald.files import write_text
 
 if TYPE_CHECKING:
     from pathlib import Path

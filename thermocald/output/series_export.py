@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.analysis.series.epochs import CSV_COLUMNS, csv_text
-from thermocald.atomic_file import make_folder, new_file
 from thermocald.errors import DriverMissing, UsageError
+from thermocald.files import make_folder, new_file
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.store.recording.reader import open_recording
 from thermocald.store.sources import open_source

@@ -45,6 +45,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.files import read_yaml
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES, ExteriorOrientation, Sensor
 from thermocald.physics.effect import PARAMETER_UNITS
 from thermocald.physics.heat import (
@@ -58,7 +59,6 @@ from thermocald.physics.heat import (
 )
 from thermocald.physics.model_file import QuantityReader, read_sensor
 from thermocald.physics.scene import Look
-from thermocald.yaml_file import read_yaml
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

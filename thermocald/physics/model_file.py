@@ -42,8 +42,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.atomic_file import write_text
 from thermocald.errors import ConfigurationError
+from thermocald.files import dump_yaml, read_yaml, write_text
 from thermocald.photogrammetry.camera.camera_model import (
     EOP_NAMES,
     IOP_NAMES,
@@ -54,7 +54,6 @@ from thermocald.photogrammetry.camera.camera_model import (
 from thermocald.physics import catalogue
 from thermocald.physics.effect import PARAMETER_UNITS
 from thermocald.physics.model import RATED, ModelEffect, ThermalModel
-from thermocald.yaml_file import dump_yaml, read_yaml
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence

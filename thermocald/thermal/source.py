@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.acquisition.calibrated_blocks import calibrated_epochs
-from thermocald.acquisition.calibrator import Calibrator
+from thermocald.acquisition.calibrator import Calibrator, calibrated_epochs
 from thermocald.errors import DataError
 from thermocald.photogrammetry.linalg import MAD_TO_SD
 from thermocald.photogrammetry.series.blocks import recut

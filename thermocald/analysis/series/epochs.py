@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.acquisition.calibrated_blocks import calibrated_epochs
-from thermocald.atomic_file import write_parts
+from thermocald.acquisition.calibrator import calibrated_epochs
 from thermocald.errors import DataError, DriverMissing
+from thermocald.files import write_parts
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.series.spool import released
 from thermocald.photogrammetry.series.words import Words

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.acquisition.calibrated_blocks import EPOCHS_OF_A_BLOCK, calibrated_epochs
-from thermocald.acquisition.calibrator import Calibrator
+from thermocald.acquisition.calibrator import EPOCHS_OF_A_BLOCK, Calibrator, calibrated_epochs
 from thermocald.analysis.series.adjusted import table_of_series
 from thermocald.analysis.series.drift import with_drifts
 from thermocald.analysis.series.epochs import Epochs

@@ -17,12 +17,12 @@ import numpy as np
 
 from thermocald.analysis.thermal.correction import require_inside
 from thermocald.errors import ConfigurationError, DataError
+from thermocald.files import read_yaml
 from thermocald.photogrammetry.camera.camera_model import EOP, InteriorOrientation
 from thermocald.photogrammetry.epoch.measuring import Line, Plane, place_on, resect
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.result import Result, new_figure
 from thermocald.store.recording.table import Table
-from thermocald.yaml_file import read_yaml
 
 if TYPE_CHECKING:
     from pathlib import Path

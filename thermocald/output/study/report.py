@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.atomic_file import make_folder
 from thermocald.errors import ImageError
 from thermocald.figures import Figure, draw_figure, draw_matrix, save
+from thermocald.files import make_folder
 from thermocald.numbers import parameter_label, plain
 from thermocald.output.study import figures, tables
 from thermocald.output.study.summary import answer_sentences, detail_sentences

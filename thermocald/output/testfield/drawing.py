@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.atomic_file import cannot_write
 from thermocald.errors import DriverMissing
+from thermocald.files import cannot_write
 from thermocald.output.testfield.layout import STRIP
 from thermocald.output.testfield.pen import GREY, Pen, crop_marks, draw_marker, rulers, square
 from thermocald.output.testfield.plan import draw_plan

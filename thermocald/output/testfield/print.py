@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from thermocald.atomic_file import cannot_write, new_file
 from thermocald.errors import UsageError
+from thermocald.files import cannot_write, new_file
 from thermocald.output.testfield.board import draw_board
 from thermocald.output.testfield.drawing import (
     pages_of,

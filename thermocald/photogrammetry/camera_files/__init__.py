@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.atomic_file import write_text
 from thermocald.errors import ConfigurationError, DataError, UsageError
+from thermocald.files import write_text
 from thermocald.photogrammetry.camera_files import (
     aicon,
     colmap,

@@ -5,15 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from thermocald.atomic_file import write_text
 from thermocald.errors import ConfigurationError, UsageError
+from thermocald.files import read_yaml, write_text
 from thermocald.photogrammetry.camera.camera_model import (
     IOP_NAMES,
     CameraModel,
     InteriorOrientation,
     Sensor,
 )
-from thermocald.yaml_file import read_yaml
 
 if TYPE_CHECKING:
     from pathlib import Path

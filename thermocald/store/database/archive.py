@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.atomic_file import make_folder, new_file
+from thermocald.files import make_folder, new_file
 from thermocald.names import FileFolder
 from thermocald.store.database.store import Store
 from thermocald.store.recording.writer import RecordingWriter

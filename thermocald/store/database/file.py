@@ -20,8 +20,8 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from thermocald.atomic_file import cannot_write, output_place
 from thermocald.errors import StoreError, StoreFullError, StoreVersionError, ThermocaldError
+from thermocald.files import cannot_write, output_place
 from thermocald.store import schema
 from thermocald.store.database.columns import DamageError
 

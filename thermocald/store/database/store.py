@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from thermocald.atomic_file import cannot_write
 from thermocald.errors import StoreError, StoreFullError
+from thermocald.files import cannot_write
 from thermocald.names import file_name, require_channels
 from thermocald.store.database import columns as column_chunks
 from thermocald.store.database.columns import COLUMN_NAMES, status_codes

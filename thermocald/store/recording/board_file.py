@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.errors import TestFieldError, UsageError
+from thermocald.files import read_yaml
 from thermocald.photogrammetry.network.bundle import Distance
 from thermocald.photogrammetry.targets import boards
-from thermocald.yaml_file import read_yaml
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from thermocald.errors import RecordingError
+from thermocald.files import dump_yaml, read_yaml
 from thermocald.names import require_channels
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, InteriorOrientation, Sensor
-from thermocald.yaml_file import dump_yaml, read_yaml
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

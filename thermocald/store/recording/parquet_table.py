@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.atomic_file import new_file
 from thermocald.errors import RecordingError, UsageError
+from thermocald.files import new_file
 from thermocald.store.recording.table import Chunk, Table
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.atomic_file import write_text
 from thermocald.errors import TestFieldError
+from thermocald.files import write_text
 from thermocald.photogrammetry.field.testfield import KINDS, TestField
 from thermocald.store.recording.table import Table
 

@@ -8,8 +8,8 @@ import os
 import shutil
 from typing import TYPE_CHECKING, Self
 
-from thermocald.atomic_file import cannot_write
 from thermocald.errors import RecordingError
+from thermocald.files import cannot_write
 from thermocald.names import require_channels
 from thermocald.store.recording.head import Head, head_yaml
 from thermocald.store.recording.readings import READINGS, Readings, write_readings

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from thermocald.errors import ConfigurationError, RecordingError
-from thermocald.yaml_file import dump_yaml, read_yaml
+from thermocald.files import dump_yaml, read_yaml
 
 
 @pytest.fixture

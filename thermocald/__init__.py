@@ -18,11 +18,13 @@ if TYPE_CHECKING:
     from thermocald.analysis.thermal.thermal_camera import Along, ThermalCamera, load_camera
     from thermocald.api import (
         calibrate,
+        catalogue,
         discover,
         fit,
         import_photographs,
         open,  # noqa: A004
         open_all,
+        plan,
         read_testfield,
         reference_study,
         simulate,
@@ -32,6 +34,15 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.results import Calibration, Discovery, Study
     from thermocald.series import Series
+    from thermocald.toolbox import (
+        check_testfield,
+        compare_cameras,
+        convert_camera,
+        correct,
+        fit_calibrations,
+        predict,
+        survey_testfield,
+    )
 
 __version__ = "0.1.0"
 
@@ -48,16 +59,25 @@ __all__ = [
     "TestField",
     "ThermalCamera",
     "calibrate",
+    "catalogue",
+    "check_testfield",
+    "compare_cameras",
+    "convert_camera",
+    "correct",
     "discover",
     "fit",
+    "fit_calibrations",
     "import_photographs",
     "load_camera",
     "open",
     "open_all",
+    "plan",
+    "predict",
     "read_testfield",
     "reference_study",
     "simulate",
     "study",
+    "survey_testfield",
 ]
 
 # the others are in `api`; a camera alone has not to wait for what analyses series
@@ -71,7 +91,14 @@ _PLACES = {
     "LiveCamera": "analysis.thermal.live_camera",
     "Series": "series",
     "Study": "results",
+    "check_testfield": "toolbox",
+    "compare_cameras": "toolbox",
+    "convert_camera": "toolbox",
+    "correct": "toolbox",
+    "fit_calibrations": "toolbox",
     "load_camera": "analysis.thermal.thermal_camera",
+    "predict": "toolbox",
+    "survey_testfield": "toolbox",
     "TestField": "photogrammetry.field.testfield",
     "ThermalCamera": "analysis.thermal.thermal_camera",
 }

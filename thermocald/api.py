@@ -11,20 +11,28 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera, load_camera
 from thermocald.errors import UsageError
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
-from thermocald.series import RecordedSeries, Series, open_every_series, open_series, source_of
+from thermocald.series import (
+    RecordedSeries,
+    Series,
+    check_exterior,
+    free_names,
+    open_every_series,
+    open_series,
+    source_of,
+)
 
 if TYPE_CHECKING:
+    from thermocald.discovery.plan import Plan
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.physics.model import ModelEffect, ThermalModel
+    from thermocald.physics.presets import Catalogue
     from thermocald.results import Calibration, Discovery, Study
 
 Progress = Callable[[int], None] | None
-Effects = Mapping[str, Mapping[str, Any]] | Iterable[str]
+Effects = Mapping[str, Mapping[str, Any]] | Iterable[str | Path] | Path
 
 
 def open(source: Path | str, series: str | None = None) -> Series:  # noqa: A001
@@ -121,7 +129,7 @@ def calibrate(
     *,
     camera: Path | str | None = None,
     pixel_pitch: float | None = None,
-    free: Iterable[str] = DEFAULT_FREE,
+    free: str | Iterable[str] = DEFAULT_FREE,
     progress: Progress = None,
 ) -> Calibration:
     """Calibrate a camera from photographs of a test field, which share one interior orientation.
@@ -153,7 +161,7 @@ def calibrate(
         paths,
         read_testfield(testfield),
         file.sensor,
-        AdjustmentSettings(free=tuple(free)),
+        AdjustmentSettings(free=free_names(free)),
         file.principal_distance,
         file.interior,
         progress,
@@ -175,7 +183,7 @@ def study(
     confusion_mm: float | None = None,
     thermometer_sd: float | None = None,
     exterior: str = "auto",
-    free: Iterable[str] = DEFAULT_FREE,
+    free: str | Iterable[str] = DEFAULT_FREE,
     jobs: int = 1,
     progress: Progress = None,
 ) -> Study:
@@ -202,6 +210,7 @@ def study(
     if window % 2 == 0:
         raise UsageError(f"window is {window}; it must be odd, so that it has a centre")
     _refuse_twice(series)
+    check_exterior(exterior)
     settings = StudySettings(
         window=window, alpha=alpha, sets=sets, seed=seed, distance_mm=distance_mm, grid=grid,
         focus_mm=focus_mm, f_number=f_number, confusion_mm=confusion_mm,
@@ -209,7 +218,7 @@ def study(
     )  # fmt: skip
     named = [*labels, *[None] * (len(series) - len(labels))]
     measured = [
-        one.measured(label, thermometer_sd, exterior, tuple(free), jobs)
+        one.measured(label, thermometer_sd, exterior, free_names(free), jobs)
         for label, one in zip(named, series, strict=True)
     ]
     refuse_copies(measured)
@@ -320,9 +329,53 @@ def discover(
     return as_result(Discovery, found, name=name, before=old)
 
 
-def simulate(
-    preset: str,
+def plan(
+    series: Series | None = None,
     *,
+    preset: str | None = None,
+    model: Path | str | None = None,
+    testfield: str | None = None,
+    programme: Path | str | None = None,
+    strength_px: float = 0.1,
+    seeds: int = 2,
+    progress: Progress = None,
+) -> Plan:
+    """Find which effects a set-up would show, before anything is heated.
+
+    The set-up is a series (its own epochs and noise), a preset of `simulate`, or a model and a
+    programme; testfield: a testfield.csv, or markers, circles, plain; strength_px: of each effect;
+    seeds: repetitions; progress: receives how many effects are done. Raises UsageError where no
+    set-up is given.
+
+    >>> tc.plan(model="camera.yaml")
+    Traceback (most recent call last):
+    thermocald.errors.UsageError: --plan needs a recording of the set-up, or --preset, or ...
+    """
+    from thermocald.discovery.plan import plan_power, set_ups
+
+    thermal, course = (None if p is None else source_of(p) for p in (model, programme))
+    source = None if series is None else series.observed()
+    inputs = set_ups(source, thermal, preset, testfield, course, seeds)
+    return plan_power(inputs, strength_px, lambda: (progress or (lambda _: None))(1))
+
+
+def catalogue() -> Catalogue:
+    """List the presets that `simulate` knows, and the effects that a camera may have.
+
+    >>> [p["preset"] for p in tc.catalogue().as_dict()["presets"]][:2]
+    ['nexus5-cold', 'nexus5-warm']
+    """
+    from thermocald.physics.presets import Catalogue
+
+    return Catalogue()
+
+
+def simulate(
+    preset: str | None = None,
+    *,
+    model: Path | str | None = None,
+    camera: Path | str | None = None,
+    programme: Path | str | None = None,
     effects: Effects = (),
     own_effects: bool = True,
     lamp: Sequence[tuple[float, float]] | None = None,
@@ -332,16 +385,20 @@ def simulate(
     epochs: int | None = None,
     frames: bool = False,
     out: Path | str | None = None,
+    model_out: Path | str | None = None,
     progress: Progress = None,
 ) -> Series:
     """Simulate a camera that warms up, as one series.
 
-    preset: a camera of the reference study (`rpi-v2.1-heating`, `nexus5-cold`, …); effects: to add,
-    {name: {parameter: value}}; own_effects: keep those of the preset; lamp: [(from s, W)], what
-    heats the housing instead of the preset's heat; testfield: by default a corner of 147 circles;
-    epochs: by default the preset's 150; frames: render frames instead of image points; out: the
-    folder of the recording, by default one that goes when the program ends. The series knows its
-    `truth`. Raises ConfigurationError for an unknown preset or effect.
+    preset: a camera of the reference study (`rpi-v2.1-heating`, `nexus5-cold`, …); model, camera,
+    programme: files (YAML) that replace its thermal model, its heat, thermometers and noise, and
+    what is done to it; effects: to add, {name: {parameter: value}}, or effect files; own_effects:
+    keep those of the preset; lamp: [(from s, W)], what heats the housing instead; testfield: a
+    file, or markers, circles, plain, by default a corner of 147 circles; epochs: by default the
+    preset's 150; frames: render frames instead of image points; out: the folder of the recording,
+    by default one that goes when the program ends; model_out: writes the model that was simulated.
+    The series knows its `truth` and its `simulation`. Raises ConfigurationError for an unknown
+    preset or effect, UsageError without a preset or model and programme.
 
     >>> simulated = tc.simulate("rpi-v2.1-heating", effects={"thermal_lag": {"tau": 75}}, seed=1)
     >>> len(simulated)
@@ -351,31 +408,38 @@ def simulate(
     import shutil
     import tempfile
 
+    from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.physics.heat import Course
-    from thermocald.physics.presets import preset_simulation
+    from thermocald.physics.model_file import write_model
+    from thermocald.physics.presets import given_simulation
+    from thermocald.physics.testfields import load_field
 
-    field = None if testfield is None else read_testfield(testfield)
-    simulation = preset_simulation(preset, seed, series, field)
-    model = simulation.model
-    if not own_effects:
-        model = replace(model, effects=())
+    thermal, device, course_file = (
+        None if p is None else source_of(p) for p in (model, camera, programme)
+    )
+    if testfield is not None and not isinstance(testfield, TestField):
+        testfield = load_field(str(source_of(testfield)))
+    simulation = given_simulation(preset, thermal, device, testfield, course_file, seed, series)
+    simulated = simulation.model if own_effects else replace(simulation.model, effects=())
     for effect in _effects(effects):
-        model = model.with_effect(effect)
-    programme = simulation.programme
+        simulated = simulated.with_effect(effect)
+    course = simulation.programme
     if epochs is not None:
-        programme = replace(programme, epochs=epochs)
+        course = replace(course, epochs=epochs)
     if lamp is not None:
         times, watts = (list(column) for column in zip(*lamp, strict=True))
         steps = Course.steps([*times, times[-1] + 1e9], watts)
-        programme = replace(programme, sources={"housing": steps})
-    simulation = replace(simulation, model=model, programme=programme)
+        course = replace(course, sources={"housing": steps})
+    simulation = replace(simulation, model=simulated, programme=course)
     if out is None:
         folder = Path(tempfile.mkdtemp(prefix="thermocald-"))
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
         out = folder / series
     simulation.write(source_of(out), with_frames=frames, advance=progress or (lambda _: None))
+    if model_out is not None:
+        write_model(source_of(model_out), replace(simulated, exterior=simulation.exterior))
     made = open(out)
-    made.truth = np.array(simulation.truth.iop)
+    made.simulation = simulation
     return made
 
 
@@ -413,8 +477,12 @@ def _structure(
 
 
 def _effects(given: Effects) -> list[ModelEffect]:
+    from thermocald.physics.model_file import read_effects
     from thermocald.thermal.effect_options import effect_with, parse_effect
 
     if isinstance(given, Mapping):
         return [effect_with(name, values) for name, values in given.items()]
-    return [parse_effect(text) for text in ((given,) if isinstance(given, str) else given)]
+    found: list[ModelEffect] = []
+    for one in (given,) if isinstance(given, str | Path) else given:
+        found += read_effects(source_of(one)) if isinstance(one, Path) else [parse_effect(one)]
+    return found

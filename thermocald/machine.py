@@ -10,17 +10,23 @@ vcgencmd get_throttled (the bits); systemd-timesyncd(8) for the clock; kernel do
 
 from __future__ import annotations
 
+import ctypes
 import grp
 import importlib.util
 import os
 import pwd
 import shutil
+import time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Self
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
-    from pathlib import Path
+
+NOT_BEFORE = 1_700_000_000.0  # no machine has taken frames with this program before then
+_SYNCHRONISED = Path("/run/systemd/timesync/synchronized")
+_STA_UNSYNC = 0x40
 
 State = Literal["ok", "missing", "warning", "not needed"]
 
@@ -81,9 +87,10 @@ class Machine:
     has_module: Callable[[str], bool] = _has_module
 
     @classmethod
-    def here(cls, root: Path, clock_trusted: bool | None) -> Self:
+    def here(cls, root: Path) -> Self:
         """The machine whose root folder is given, for the user who runs the program."""
-        return cls(root, _user_name(), os.getuid(), frozenset(_group_names()), clock_trusted)
+        trusted = machine_clock_trusted() if root == Path("/") else None
+        return cls(root, _user_name(), os.getuid(), frozenset(_group_names()), trusted)
 
     def findings(self) -> list[Finding]:
         """Everything that was looked at, in the order in which it is best mended."""
@@ -330,3 +337,31 @@ def _group_names() -> list[str]:
         except KeyError:
             continue
     return names
+
+
+class _Timex(ctypes.Structure):
+    """struct timex of adjtimex(2): only `status` is read."""
+
+    _fields_ = (
+        ("modes", ctypes.c_uint),
+        ("offset", ctypes.c_long),
+        ("freq", ctypes.c_long),
+        ("maxerror", ctypes.c_long),
+        ("esterror", ctypes.c_long),
+        ("status", ctypes.c_int),
+        ("rest", ctypes.c_char * 256),
+    )
+
+
+def machine_clock_trusted() -> bool:
+    """Whether the machine's clock is synchronised, as systemd-timesyncd or the kernel say."""
+    if time.time() < NOT_BEFORE:
+        return False
+    if _SYNCHRONISED.exists():
+        return True
+    timex = _Timex()
+    try:
+        answer = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(timex))
+    except (OSError, AttributeError):
+        return False
+    return answer >= 0 and not timex.status & _STA_UNSYNC

@@ -18,6 +18,7 @@ from thermocald.analysis.series.recorded import recorded_table
 from thermocald.analysis.series.stored import replay_into, table_of_stored
 from thermocald.analysis.study.input import from_recording, from_store
 from thermocald.errors import DataError, UsageError
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
 from thermocald.photogrammetry.series.result import EXTERIOR_CHOICES
 from thermocald.photogrammetry.series.spool import give_back
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from thermocald.analysis.study.measured import MeasuredSeries
     from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
+    from thermocald.physics.simulation import Simulation
     from thermocald.store.recording.head import Head
     from thermocald.store.recording.reader import Recording
     from thermocald.store.series import StoredSeries
@@ -60,8 +62,8 @@ class Series(ABC):
     source: str
     place: str
     """The same for two that are the same."""
-    truth: Array | None = None
-    """Of a simulated series the true interior orientation (E, 10), else None."""
+    simulation: Simulation | None = None
+    """Where a simulated series comes from, else None."""
 
     @property
     def name(self) -> str:
@@ -77,6 +79,11 @@ class Series(ABC):
     @abstractmethod
     def frame_time(self) -> Array:
         """(E,) s UTC: when each frame was taken."""
+
+    @property
+    def truth(self) -> Array | None:
+        """Of a simulated series the true interior orientation (E, 10), else None."""
+        return None if self.simulation is None else np.array(self.simulation.truth.iop)
 
     @property
     def time(self) -> NDArray[np.datetime64]:
@@ -111,7 +118,7 @@ class Series(ABC):
         self,
         *,
         exterior: str = "auto",
-        free: Iterable[str] = DEFAULT_FREE,
+        free: str | Iterable[str] = DEFAULT_FREE,
         store: Path | str | None = None,
         jobs: int = 1,
         progress: Progress = None,
@@ -130,10 +137,9 @@ class Series(ABC):
         >>> bool(abs(epochs.c[-1] - epochs.c[0]) > 3 * epochs.sd_c[0])
         True
         """
-        if exterior not in (*EXTERIOR_CHOICES, "stored"):
-            choices = ", ".join(EXTERIOR_CHOICES)
-            raise UsageError(f"exterior {exterior!r}: must be one of {choices}")
-        settings = AdjustmentSettings(free=tuple(free))
+        if exterior != "stored":
+            check_exterior(exterior)
+        settings = AdjustmentSettings(free=free_names(free))
         if store is not None:
             return self._kept(source_of(store), settings, exterior, progress, jobs)
         return self._calibrated(settings, exterior, progress, jobs)
@@ -156,11 +162,11 @@ class Series(ABC):
     @abstractmethod
     def measured(
         self,
-        label: str | None,
-        thermometer_sd: float | None,
-        exterior: str,
-        free: tuple[str, ...],
-        jobs: int,
+        label: str | None = None,
+        thermometer_sd: float | None = None,
+        exterior: str = "auto",
+        free: tuple[str, ...] = DEFAULT_FREE,
+        jobs: int = 1,
     ) -> MeasuredSeries:
         """Return the series as a study reads it."""
 
@@ -212,11 +218,11 @@ class RecordedSeries(Series):
 
     def measured(
         self,
-        label: str | None,
-        thermometer_sd: float | None,
-        exterior: str,
-        free: tuple[str, ...],
-        jobs: int,
+        label: str | None = None,
+        thermometer_sd: float | None = None,
+        exterior: str = "auto",
+        free: tuple[str, ...] = DEFAULT_FREE,
+        jobs: int = 1,
     ) -> MeasuredSeries:
         """As the base says."""
         found = from_recording(self.recording, label, thermometer_sd, exterior, free, jobs=jobs)
@@ -264,11 +270,11 @@ class KeptSeries(Series):
 
     def measured(
         self,
-        label: str | None,
-        thermometer_sd: float | None,
-        exterior: str,
-        free: tuple[str, ...],  # noqa: ARG002
-        jobs: int,
+        label: str | None = None,
+        thermometer_sd: float | None = None,
+        exterior: str = "auto",
+        free: tuple[str, ...] = DEFAULT_FREE,  # noqa: ARG002
+        jobs: int = 1,
     ) -> MeasuredSeries:
         """As the base says; `free` is the store's own."""
         with open_source(self.path) as store:
@@ -309,6 +315,27 @@ def open_every_series(source: Path) -> list[Series]:
     if not found:
         raise DataError(f"{source_name(source)}: the store holds no series")
     return found
+
+
+def check_exterior(exterior: str) -> None:
+    """Raise UsageError for a choice of exterior orientation that there is not."""
+    if exterior not in EXTERIOR_CHOICES:
+        choices = ", ".join(EXTERIOR_CHOICES)
+        raise UsageError(f"--exterior {exterior}: must be one of {choices}")
+
+
+def free_names(given: str | Iterable[str]) -> tuple[str, ...]:
+    """Return which interior orientation is estimated, in its order, from names or `c,x0,y0`.
+
+    `none` frees nothing. Raises UsageError for a name that there is not.
+    """
+    names = [n.strip() for n in given.split(",")] if isinstance(given, str) else list(given)
+    if names in (["none"], [""]):
+        return ()
+    for name in names:
+        if name not in IOP_NAMES:
+            raise UsageError(f"--free: {name!r} is no IOP; there are {', '.join(IOP_NAMES)}, none")
+    return tuple(name for name in IOP_NAMES if name in names)
 
 
 def source_of(text: Path | str) -> Path:

@@ -7,18 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+import thermocald as tc
 from benchmarks.adjustment import EXTERIOR, INTERIOR
 from benchmarks.long_recording import write_long_recording
 from thermocald.analysis.series import adjusted, recorded
-from thermocald.analysis.study.input import load_series as measured
 from thermocald.analysis.study.study import StudySettings, study
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.photogrammetry.series.blocks import GridBlocks, gathered
 from thermocald.photogrammetry.series.long_series import adjust_long_series
 from thermocald.photogrammetry.series.result import SeriesSettings
+from thermocald.series import RecordedSeries
 from thermocald.store.recording.reader import Recording, open_recording
 from thermocald.thermal.reduce import reduce_series
-from thermocald.thermal.source import condensed, load_series
+from thermocald.thermal.source import condensed
 
 DAY = 8640
 SAME = 1e-9  # of the principal distance, or of a rate
@@ -73,7 +74,8 @@ def test_the_study(day, monkeypatch):
         monkeypatch.setattr(
             Recording, "blocks", lambda _, windows=None, b=blocks: b.blocks(windows)
         )
-        (camera,) = study(measured(day.recording), StudySettings(sets=1000)).cameras
+        measured = RecordedSeries(day.recording).measured()
+        (camera,) = study([measured], StudySettings(sets=1000)).cameras
         found.append(camera)
     one, many = found
     np.testing.assert_allclose(many.iop[:3], one.iop[:3], rtol=0, atol=SAME * INTERIOR.c)
@@ -88,7 +90,7 @@ def test_the_study(day, monkeypatch):
 
 @pytest.mark.slow
 def test_the_fit(day):
-    (series,) = load_series(day.recording.path)
+    series = tc.open(day.recording.path).observed()
     rates = []
     for size in (DAY, 500):
         short = condensed(series, day.blocks(size), TOGETHER)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermocald.analysis.study.input import load_series
+import thermocald as tc
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.physics.presets import preset_simulation
@@ -30,7 +30,7 @@ def recording(tmp_path):
 
 
 def test_epochs_without_a_result_are_counted_and_the_rest_is_relative(recording):
-    (series,) = load_series(recording, free=FREE, exterior="series")
+    series = tc.open(recording).measured(free=FREE, exterior="series")
     assert series.number.tolist() == [1, 2, 4, 5, 6, 8, 9, 10]
     assert sum(series.without_result.values()) == 2
     assert series.free == FREE
@@ -43,7 +43,7 @@ def test_epochs_without_a_result_are_counted_and_the_rest_is_relative(recording)
 
 
 def test_the_thermometers_noise_may_be_given(recording):
-    (series,) = load_series(recording, thermometer_sd=0.25, free=FREE)
+    series = tc.open(recording).measured(thermometer_sd=0.25, free=FREE)
     assert [t.sd for t in series.thermometers] == [0.25, 0.25]
 
 
@@ -64,7 +64,7 @@ def test_a_store_is_read_in_columns_without_broken_epochs(recording, tmp_path):
             if epoch.number == 6:
                 result = EpochResult("too_few_targets", "3 targets")
             store.append(stored, epoch, result)
-    (series,) = load_series(tmp_path / "s.db", exterior="per_epoch")
+    series = tc.open(tmp_path / "s.db").measured(exterior="per_epoch")
     assert series.label == "nexus5-warm"
     assert series.number.tolist() == [1, 2, 3, 4, 7, 8, 9, 10]
     assert series.without_result == {"too few targets": 1, "no standard deviation": 1}
@@ -82,11 +82,11 @@ def test_a_store_without_any_result_is_one_error(recording, tmp_path):
         stored = store.create_series(opened.head, opened.testfield)
         store.append(stored, opened.epochs[0], EpochResult("weak_geometry", "one plane"))
     with pytest.raises(DataError, match=r"no epoch has a result \(1 × weak geometry\)"):
-        load_series(tmp_path / "s.db", exterior="per_epoch")
+        tc.open(tmp_path / "s.db").measured(exterior="per_epoch")
 
 
 def test_an_empty_store_is_one_error(tmp_path):
     with Store.open(tmp_path / "s.db", "append", durable=False):
         pass
     with pytest.raises(DataError, match="holds no series"):
-        load_series(tmp_path / "s.db")
+        tc.open_all(tmp_path / "s.db")

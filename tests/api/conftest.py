@@ -19,7 +19,14 @@ def world(tmp_path_factory):
     for k in (1, 2):
         tc.simulate("rpi-v2.1-heating", seed=k, series=f"M{k}", out=folder / f"M{k}")
     assert call("replay", "M1", "--store", "thermocald.db", folder=folder).returncode == 0
-    tc.fit(tc.open(folder / "M1"), tc.open(folder / "M2")).save(folder / "camera.yaml")
+    M1 = tc.open(folder / "M1")
+    camera = tc.fit(M1, tc.open(folder / "M2"))
+    camera.save(folder / "camera.yaml")
+    for name, temperature in (("cold", 20.0), ("warm", 45.0)):
+        camera.at(temperature, extrapolate=True).write(folder / f"{name}.json")
+    first = M1.frame_time[3]
+    rows = f"{first},1000,900\n{first + 60},1500,1200\n"
+    (folder / "points.csv").write_text(f"time,x,y\n{rows}")
     photographs(folder)
     (folder / "log.csv").rename(folder / "logger.csv")
     board = Path(__file__).resolve().parents[3] / "shared" / "data" / "chessboard"

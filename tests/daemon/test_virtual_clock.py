@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermocald.acquisition.steady_clock import SteadyClock
 from thermocald.config import parse_config
 from thermocald.daemon.given_config import demo_config
 from thermocald.daemon.service import Service
@@ -26,8 +25,7 @@ def run(tmp_path):
         document["cameras"][0]["options"] |= camera or {}
         document["thermometers"][0]["options"] |= thermometer or {}
         config = parse_config(document, Path("config.yaml"))
-        clock = SteadyClock(VirtualClock(START), synchronised=lambda: True)
-        Service(config, epochs=epochs, until_finished=True, clock=clock).run()
+        Service(config, epochs=epochs, until_finished=True, clock=VirtualClock(START)).run()
         with Store.open(config.store.path) as store:
             series = store.find_series()
             names = ["frame_time", "temperature_time", "temperature", "c", "sd_c"]

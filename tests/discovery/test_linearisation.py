@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import thermocald as tc
 from benchmarks.adjustment import EXTERIOR, INTERIOR, SENSOR
 from benchmarks.long_recording import INTERVAL_S, RATES, field_of, write_long_recording
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
@@ -12,7 +13,6 @@ from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.thermal.reduce import reduce_series
 from thermocald.thermal.series import SeriesInput
-from thermocald.thermal.source import load_series
 
 NAMES = ("c", "x0", "y0")
 
@@ -52,7 +52,7 @@ def test_the_scatter_of_long_series(tmp_path):
     for seed in range(10):
         path = tmp_path / f"{seed}"
         write_long_recording(path, 30_000, 21, seed=seed)
-        (series,) = load_series(path)
+        series = tc.open(path).observed()
         assert series.counts is not None  # on means
         fitted = fit_thermal_model([reduce_series(series, affinity=False, strict=False)], [])
         sds = fitted.model.sds

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from thermocald.discovery.evidence import load_together
-from thermocald.discovery.result import discover_series
-from thermocald.physics.presets import preset_simulation
-from thermocald.thermal.reduce import reduce_together
+import thermocald as tc
 
 DISTORTION = [{"decentering_drift"}, {"radial_distortion_drift"}]
 
@@ -23,11 +20,11 @@ DISTORTION = [{"decentering_drift"}, {"radial_distortion_drift"}]
     ],
 )
 def test_effects_of_a_preset_are_named(preset, expected, tmp_path):
-    m1, m2 = tmp_path / "M1", tmp_path / "M2"
-    for path, seed in ((m1, 1), (m2, 2)):
-        preset_simulation(preset, seed, path.name).write(path)
+    m1, m2 = (
+        tc.simulate(preset, seed=k, series=f"M{k}", out=tmp_path / f"M{k}") for k in (1, 2)
+    )
 
-    found = discover_series(reduce_together(load_together(m1, [m2], lambda _: None)))
+    found = tc.discover(m1, verify=[m2])
 
     assert [{e.effect, *e.alternative_names} for e in found.effects] == expected
     assert found.stages[-1].fit.chi2_reduced == pytest.approx(1.0, abs=0.02)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import thermocald as tc
 from thermocald.cli import application
-from thermocald.discovery.evidence import load_together
 from thermocald.fleet.forward import Forwarder
 from thermocald.physics.presets import preset_simulation
 from thermocald.store.database.store import Store
@@ -54,7 +53,7 @@ def test_a_server_gives_what_the_file_gives(places):
 def test_discover_and_correct_read_a_server_too(places, tmp_path):
     file, server = places
     # what is discovered follows from these
-    (here,), (there,) = (load_together(Path(place), (), lambda _: None) for place in places)
+    here, there = (tc.open(place).observed() for place in places)
     assert "secret" not in there.name
     assert np.array_equal(here.frame_times, there.frame_times)
     assert np.array_equal(here.grid.points, there.grid.points, equal_nan=True)

@@ -9,13 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import thermocald as tc
 from tests.store.conftest import N_TARGETS
-from thermocald.analysis.study.input import load_series as load_study
 from thermocald.cli import application
 from thermocald.store.database.store import Store
 from thermocald.store.series import Event
 from thermocald.store.sources import open_source
-from thermocald.thermal.source import load_series
 
 EPOCHS = 40
 # name → {first epoch, last epoch: seconds that its times are wrong by}; the step that was followed
@@ -61,8 +60,8 @@ def test_every_analysis_reads_the_right_times(stores, clock, capsys):
     assert np.abs(np.diff(times)).max() > 3000
     tables = []
     for path in (stamped, right):
-        (fitted,) = load_series(path)  # fit and discover
-        (studied,) = load_study(path, exterior="per_epoch")
+        fitted = tc.open(path).observed()  # fit and discover
+        studied = tc.open(path).measured(exterior="per_epoch")
         application()(["export", str(path), "--exterior", "stored"], standalone_mode=False)
         rows = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
         with open_source(path) as store:

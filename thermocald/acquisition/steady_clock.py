@@ -10,21 +10,18 @@ step is reported.
 
 from __future__ import annotations
 
-import ctypes
 import logging
-import time
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from thermocald.hal import SystemClock
+from thermocald.machine import NOT_BEFORE, machine_clock_trusted
 
 if TYPE_CHECKING:
     import threading
     from collections.abc import Callable
 
     from thermocald.hal import Clock
-
 
 log = logging.getLogger(__name__)
 
@@ -33,9 +30,6 @@ _WRONG_S = 1.0
 _CONFIRM_S = 60.0  # for which a new time must stand before it is followed
 _LEAP_S = 3600.0
 _SETTLE_S = 86400.0  # after a leap, before anything is deleted for its age
-_NOT_BEFORE = 1_700_000_000.0  # no machine has taken frames with this program before then
-_SYNCHRONISED = Path("/run/systemd/timesync/synchronized")
-_STA_UNSYNC = 0x40
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +106,7 @@ class SteadyClock:
                 return None
             return self._report(ClockStep(self.utc(), step, adopted=False))
         # a clock that shows a time before this program existed has just learned the time, too
-        learned |= self.utc() < _NOT_BEFORE <= self._machine.utc()
+        learned |= self.utc() < NOT_BEFORE <= self._machine.utc()
         if learned or now - self._seen_at >= self._confirm_s:
             self._offset = offset
             return self._report(ClockStep(self.utc(), pending, adopted=True))
@@ -136,32 +130,4 @@ class SteadyClock:
     def settled(self) -> bool:
         """Whether ages may be judged by this clock: it is trusted, and has not leapt for a day."""
         since_leap = self._machine.monotonic() - self._leapt_at
-        return self.trusted() and since_leap >= _SETTLE_S and self.utc() >= _NOT_BEFORE
-
-
-class _Timex(ctypes.Structure):
-    """struct timex of adjtimex(2): only `status` is read."""
-
-    _fields_ = (
-        ("modes", ctypes.c_uint),
-        ("offset", ctypes.c_long),
-        ("freq", ctypes.c_long),
-        ("maxerror", ctypes.c_long),
-        ("esterror", ctypes.c_long),
-        ("status", ctypes.c_int),
-        ("rest", ctypes.c_char * 256),
-    )
-
-
-def machine_clock_trusted() -> bool:
-    """Whether the machine's clock is synchronised, as systemd-timesyncd or the kernel say."""
-    if time.time() < _NOT_BEFORE:
-        return False
-    if _SYNCHRONISED.exists():
-        return True
-    timex = _Timex()
-    try:
-        answer = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(timex))
-    except (OSError, AttributeError):
-        return False
-    return answer >= 0 and not timex.status & _STA_UNSYNC
+        return self.trusted() and since_leap >= _SETTLE_S and self.utc() >= NOT_BEFORE

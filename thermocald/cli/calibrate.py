@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from thermocald.cli.common import progress, write_result
-from thermocald.cli.options import DEFAULT_FREE_TEXT, FreeOption, JsonOption, free_names
+from thermocald.cli.options import DEFAULT_FREE, FreeOption, JsonOption
 from thermocald.errors import DataError, UsageError
 from thermocald.files import make_folder
 
@@ -41,7 +41,7 @@ def calibrate(
     report: Annotated[
         Path | None, typer.Option(help="Write residuals and coverage as one HTML file.")
     ] = None,
-    free: FreeOption = DEFAULT_FREE_TEXT,
+    free: FreeOption = DEFAULT_FREE,
     json: JsonOption = None,
 ) -> None:
     """Calibrate a camera from photographs of a test field.
@@ -64,7 +64,7 @@ def calibrate(
         )
     with progress(None, "measuring") as advance:
         result = tc.calibrate(
-            images, testfield, camera=camera, pixel_pitch=pixel_pitch, free=free_names(free),
+            images, testfield, camera=camera, pixel_pitch=pixel_pitch, free=free,
             progress=advance,
         )  # fmt: skip
     written = []

@@ -31,34 +31,11 @@ def convert(
 
     Example: thermocald camera convert calibration.xml --to opencv --out camera.yaml
     """
-    from thermocald.photogrammetry import camera_files
+    import thermocald as tc
 
-    camera = camera_files.read(source, from_, pixel_pitch)
-    read = "exact" if camera.exact else f"fitted, largest residual {camera.largest_px:.3g} px"
-    statement = camera_files.write(
-        camera.model, out, to, camera.covariance,
-        f"converted from {source.name} ({camera.format}, {read})", camera.name,
-    )  # fmt: skip
-    interior = camera.model.interior
-    sensor = camera.model.sensor
-    document = {
-        "format": "thermocald-camera-conversion/1",
-        "source": str(source),
-        "source_format": camera.format,
-        "exact_import": camera.exact,
-        "largest_px": camera.largest_px,
-        "rms_px": camera.rms_px,
-        "out": str(out),
-        "out_format": to,
-        "statement": statement,
-        "width": sensor.width,
-        "height": sensor.height,
-        "pixel_pitch": sensor.pixel_pitch,
-        **{name: getattr(interior, name) for name in type(interior).__dataclass_fields__},
-    }
-    if write_result(document, json):
-        typer.echo(f"{source} ({camera.format}): {read}")
-        typer.echo(f"{out} ({to}): {statement}")
+    found = tc.convert_camera(source, out, to, format=from_, pixel_pitch=pixel_pitch)
+    if write_result(found.as_dict(), json):
+        typer.echo(str(found))
 
 
 def at(
@@ -74,20 +51,17 @@ def at(
     Example: thermocald camera at camera.thermal.yaml --temperature 35 --to ros -o cam.yaml
     """
     import thermocald as tc
-    from thermocald.analysis.thermal.predictions import describe_camera
-    from thermocald.photogrammetry import camera_files
 
     thermal = tc.load_camera(model)
     if thermal.warning:
         say(f"warning: {thermal.warning}")
     with warnings_said():
-        camera = thermal.at(temperature, extrapolate=extrapolate)
-    document, lines = describe_camera(thermal, camera, 10.0)
+        found = tc.predict(thermal, temperature, extrapolate=extrapolate)
+    document, lines = found.as_dict(), found.lines()
     if out is not None:
+        assert found.state is not None
         comment = f"{thermal.model.camera} at {temperature:g} °C, of {model.name}"
-        statement = camera_files.write(
-            camera.model, out, to, camera.covariance, comment, thermal.model.camera
-        )
+        statement = found.state.write(out, to, comment)
         document |= {"out": str(out), "out_format": to, "statement": statement}
         lines.append(f"{out} ({to}): {statement}")
     if write_result(document, json):
@@ -109,11 +83,9 @@ def diff(
 
     Example: thermocald camera diff cold.json warm.json
     """
-    from thermocald.analysis.camera.difference import CameraDifference
-    from thermocald.photogrammetry import camera_files
+    import thermocald as tc
 
-    a, b = (camera_files.read(path, pixel_pitch=pixel_pitch) for path in (cold, warm))
-    found = CameraDifference((str(cold), str(warm)), a.model, b.model, (a.covariance, b.covariance))
+    found = tc.compare_cameras(cold, warm, pixel_pitch=pixel_pitch)
     if report is not None:
         found.report(report)
     if write_result(found.as_dict(), json):

@@ -19,8 +19,6 @@ from thermocald.cli.options import (
 )
 from thermocald.errors import UsageError
 
-_USUAL_THERMOMETER_SD = 0.05  # K, where no fit has found it
-
 
 @takes_log_options
 def correct(
@@ -57,37 +55,28 @@ def correct(
     Example: thermocald correct --model camera.thermal.yaml --log weather.csv points.csv
     """
     import thermocald as tc
-    from thermocald.analysis.thermal.model_log import read_model_log
-    from thermocald.analysis.thermal.timed_rows import first_times
-    from thermocald.output.corrected import Correction
-    from thermocald.store.logger.clock import device_clock
 
     thermal = tc.load_camera(model)
     if thermal.warning:
         say(f"warning: {thermal.warning}")
-    clock = device_clock(timezone, ambiguous=ambiguous)
-    header, near = first_times(points, clock)
-    table = read_model_log(thermal, log, log_options, near)
-    if image_size is not None:
-        thermal = thermal.for_images(*_size(image_size))
-    if temperature_sd is None:
-        temperature_sd = thermal.thermometer_sd or _USUAL_THERMOMETER_SD
-    done = Correction(thermal, table, clock, to, temperature_sd, extrapolate, say)
+    done = tc.correct(
+        points, thermal, log=log, log_options=log_options, to=to, temperature_sd=temperature_sd,
+        size=None if image_size is None else _size(image_size), timezone=timezone,
+        ambiguous=ambiguous, extrapolate=extrapolate, say=say,
+    )  # fmt: skip
     with warnings_said():
-        if "image" in header:
-            if out is None:
-                raise UsageError("--out is missing: the folder for the corrected images")
+        if done.of_images and out is None:
+            raise UsageError("--out is missing: the folder for the corrected images")
+        if out is not None:
             with progress(None, "correcting images") as advance:
-                done.write_images(points, out, advance)
+                done.write(out, advance)
+        elif json == "-":
+            collections.deque(done.lines(), 0)
         else:
-            lines = done.lines(points)
-            if out is None and json == "-":
-                collections.deque(lines, 0)
-            else:
-                write_parts(lines, out or "-")
+            write_parts(done.lines(), "-")
     if write_result(done.as_dict(), json) and out is not None:
         typer.echo(f"{out}: {done}")
-    done.require_all(points)
+    done.require_all()
 
 
 def _size(text: str) -> tuple[int, int]:

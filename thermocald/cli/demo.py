@@ -19,13 +19,13 @@ from thermocald.errors import DataError
 from thermocald.files import make_folder
 
 if TYPE_CHECKING:
-    from thermocald.analysis.series.epochs import Epochs
+    from thermocald import Epochs
     from thermocald.arrays import Array
     from thermocald.daemon.station import Station
 
-__all__ = ["demo"]
-
-_NAMES = ("c", "x0", "y0")
+_NAMES = ("c", "x0", "y0")  # the first of the interior orientation
+_HIDDEN = "thermal_lag"
+_TAU_S = 75.0
 
 
 def demo(
@@ -72,22 +72,18 @@ def demo(
 
 def _acquire(out: Path, epochs: int, seed: int) -> _Run:
     """Have the daemon take the epochs on a virtual clock, then write their recording."""
-    from thermocald.acquisition.steady_clock import SteadyClock
-    from thermocald.analysis.series.stored import table_of_stored
+    import thermocald as tc
     from thermocald.daemon.given_config import demo_config
     from thermocald.daemon.service import Service
     from thermocald.daemon.systemd import set_up_logging
     from thermocald.hal import VirtualClock, open_device
-    from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
     from thermocald.store.database.archive import archive_series
     from thermocald.store.database.store import Store
-    from thermocald.store.sources import open_source
 
     make_folder(out)
     config = demo_config(out, seed)
-    machine = VirtualClock()
-    begin = machine.utc() - machine.monotonic()
-    clock = SteadyClock(machine, synchronised=lambda: True)
+    clock = VirtualClock()
+    begin = clock.utc() - clock.monotonic()
     taken = 0
     set_up_logging("warning")
     with progress(epochs, "epochs") as advance:
@@ -104,44 +100,44 @@ def _acquire(out: Path, epochs: int, seed: int) -> _Run:
         advance(epochs - taken)
     with Store.open(config.store.path) as store:
         archive_series(store, store.find_series(), out / "M1")
-    with open_source(config.store.path) as source:
-        series = source.find_series()
-        table = table_of_stored(source, series, AdjustmentSettings(), "series")
+    series = tc.open(config.store.path)
+    table = series.calibrate(exterior="series")
     with open_device("camera", "mock", {"seed": seed}, VirtualClock()) as camera:
-        states = [camera.truth(float(utc) - begin) for utc in table.frame_time]
-    truth = np.array([np.concatenate([at.iop[0], at.eop[0]]) for at in states])
+        truth = np.array([camera.truth(float(utc) - begin).iop[0] for utc in table.frame_time])
     return _Run(table, truth, series.head.camera.sensor.pixel_pitch, len(series.testfield))
 
 
 @dataclass(frozen=True, eq=False)
 class _Run:
     table: Epochs
-    truth: Array  # (E, 16) at the frames' times
+    truth: Array  # (E, 10) at the frames' times
     pitch: float
     targets: int
 
 
 def _compare(run: _Run) -> list[dict[str, Any]]:
     """Per kelvin and over the series: the drift put in and the drift found."""
-    from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
-
     table, ok = run.table, run.table.ok & np.isfinite(run.table.temperature)
     t = table.temperature[ok] - table.temperature[ok].mean()
     hottest = int(np.argmax(table.temperature[ok]))
     rows = []
-    for name in _NAMES:
-        k = IOP_NAMES.index(name)
+    for k, name in enumerate(_NAMES):
         found, sd, true = table.values[ok, k], table.sd[ok, k], run.truth[ok, k]
         error = (found - found.mean()) - (true - true.mean())
+        drifts = {
+            "in": float(true[hottest] - true[0]),
+            "found": float(found[hottest] - found[0]),
+            "sd": float(np.hypot(sd[hottest], sd[0])),
+        }
         rows.append(
             {
                 "name": name,
-                "drift_in_mm": float(true[hottest] - true[0]),
-                "drift_found_mm": float(found[hottest] - found[0]),
-                "sd_drift_found_mm": float(np.hypot(sd[hottest], sd[0])),
-                "drift_in_px": float(true[hottest] - true[0]) / run.pitch,
-                "drift_found_px": float(found[hottest] - found[0]) / run.pitch,
-                "sd_drift_found_px": float(np.hypot(sd[hottest], sd[0])) / run.pitch,
+                "drift_in_mm": drifts["in"],
+                "drift_found_mm": drifts["found"],
+                "sd_drift_found_mm": drifts["sd"],
+                "drift_in_px": drifts["in"] / run.pitch,
+                "drift_found_px": drifts["found"] / run.pitch,
+                "sd_drift_found_px": drifts["sd"] / run.pitch,
                 "rate_in_mm_per_k": float(true @ t / (t @ t)),
                 "rate_found_mm_per_k": float(found @ t / (t @ t)),
                 "scatter_over_sd": float(np.sqrt(np.mean(error**2) / np.mean(sd**2))),
@@ -177,7 +173,40 @@ def _tell(document: dict[str, Any]) -> None:
 
 
 def _discover(out: Path, seed: int, quiet: bool) -> dict[str, Any]:
-    """A camera with a lag that its model does not have: found, named, added."""
-    from thermocald.cli.demo_discovery import discover_hidden_effect
+    """Simulate M1 and M2 with a hidden lag, discover it on M1, prove it on M2; the document."""
+    import thermocald as tc
 
-    return discover_hidden_effect(out, seed, quiet)
+    say(f"hiding an effect: the camera follows the thermometer with a lag of {_TAU_S:.0f} s")
+    folder = out / "discovery"
+    make_folder(folder)
+    M1, M2 = (
+        tc.simulate(
+            "rpi-v2.1-heating", effects={_HIDDEN: {"tau": _TAU_S}}, own_effects=False,
+            seed=seed + number, series=name, out=folder / name,
+        )
+        for number, name in enumerate(("M1", "M2"))
+    )  # fmt: skip
+    say("discovering: where do model and measurement disagree, and why?")
+    found = tc.discover(M1, verify=[M2], say=say)
+    document = found.as_dict()
+    document["model"] = str(found.save(folder / "camera.thermal.yaml"))
+    document["hidden"] = {"effect": _HIDDEN, "tau_s": _TAU_S}
+    if not quiet:
+        _tell_effect(document)
+    return document
+
+
+def _tell_effect(document: dict[str, Any]) -> None:
+    hidden = document["hidden"]
+    typer.echo(f"\nhidden:    {hidden['effect']}, tau {hidden['tau_s']:.0f} s")
+    for effect in document["effects"]:
+        typer.echo(f"found:     {effect['effect']}: {effect['statement']}")
+    for label, key in (("on M1", "fit"), ("on M2", "verify")):
+        gap = document["gap"][key]
+        if gap is not None:
+            typer.echo(
+                f"gap {label}: {gap['before']['rms_px']:.3f} → {gap['after']['rms_px']:.3f} px, "
+                f"reduced χ² {gap['before']['chi2_reduced']:.2f} → "
+                f"{gap['after']['chi2_reduced']:.2f}"
+            )
+    typer.echo(f"model:     {document['model']}")

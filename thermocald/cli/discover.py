@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from thermocald.cli.commands import expert
-from thermocald.cli.common import say, write_result
+from thermocald.cli.common import progress, say, write_result
 from thermocald.cli.options import JobsOption, JsonOption
 from thermocald.errors import UsageError
-
-if TYPE_CHECKING:
-    pass
-
-__all__ = ["discover"]
 
 
 def discover(
@@ -57,13 +52,20 @@ def discover(
 
     Example: thermocald discover M1 --verify M2 --model-out camera.yaml --report discovery.html
     """
+    import thermocald as tc
+
     if plan:
-        _plan(recording, model, preset, testfield, programme, strength, seeds, json)
+        with progress(None, "planning") as advance:
+            planned = tc.plan(
+                None if recording is None else tc.open(recording), preset=preset, model=model,
+                testfield=testfield, programme=programme, strength_px=strength, seeds=seeds,
+                progress=advance,
+            )  # fmt: skip
+        if write_result(planned.as_dict(), json):
+            typer.echo(str(planned))
         return
     if recording is None:
         raise UsageError("M1 is missing: the folder of the recording to explain")
-    import thermocald as tc
-
     others = [tc.open(path) for path in verify or ()]
     found = tc.discover(tc.open(recording), verify=others, model=model, jobs=jobs, say=say)
     document = found.as_dict()
@@ -75,24 +77,3 @@ def discover(
         found.report(report)
     if write_result(document, json):
         typer.echo(str(found))
-
-
-def _plan(
-    recording: Path | None,
-    model: Path | None,
-    preset: str | None,
-    testfield: str | None,
-    programme: Path | None,
-    strength: float,
-    seeds: int,
-    json: str | None,
-) -> None:
-    from thermocald.cli.common import progress
-    from thermocald.discovery.plan import plan_power, set_ups
-
-    with progress(None, "planning") as advance:
-        inputs = set_ups(recording, model, preset, testfield, programme, seeds)
-        result = plan_power(inputs, strength, lambda: advance(1))
-    if write_result(result.as_json(), json):
-        for line in result.lines():
-            typer.echo(line)

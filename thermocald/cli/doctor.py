@@ -25,11 +25,9 @@ def doctor(
 
     Example: thermocald doctor
     """
-    from thermocald.acquisition.steady_clock import machine_clock_trusted
     from thermocald.machine import Machine, finding_lines
 
-    trusted = machine_clock_trusted() if root == Path("/") else None
-    findings = Machine.here(root, trusted).findings()
+    findings = Machine.here(root).findings()
     if write_result({"format": "thermocald-doctor/1", "findings": findings}, json):
         typer.echo("\n".join(finding_lines(findings)))
     if any(finding.state == "missing" for finding in findings):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -12,12 +12,6 @@ from thermocald.cli.common import progress, say, write_result
 from thermocald.cli.options import JobsOption, JsonOption, TimezoneOption, takes_log_options
 from thermocald.errors import UsageError
 from thermocald.files import write_text
-
-if TYPE_CHECKING:
-    from thermocald.analysis.thermal.calibrations import Calibration
-    from thermocald.analysis.thermal.thermal_camera import ThermalCamera
-    from thermocald.store.logger.clock import DeviceClock
-    from thermocald.store.logger.temperatures import LogOptions
 
 
 @takes_log_options
@@ -77,15 +71,14 @@ def fit(
     Example: thermocald fit 21.5=cold.json 48=warm.json -o camera.thermal.yaml
     """
     import thermocald as tc
-    from thermocald.store.logger.clock import device_clock
 
-    calibrations = _calibrations(inputs)
+    calibrations = _temperatures(inputs)
     if calibrations:
         if effect or model or type_name:
             raise UsageError("--effect, --model and --type are for series, not for calibrations")
-        camera = _of_calibrations(
-            calibrations, log, log_options, device_clock(timezone, ambiguous=ambiguous),
-            reference_temperature, temperature_sd,
+        camera = tc.fit_calibrations(
+            calibrations, log=log, log_options=log_options, timezone=timezone,
+            ambiguous=ambiguous, T0=reference_temperature, temperature_sd=temperature_sd, say=say,
         )  # fmt: skip
     elif log is not None:
         raise UsageError("--log is for calibrations; a recording has its own temperatures")
@@ -114,41 +107,18 @@ def fit(
         typer.echo(f"{output}: {camera}")
 
 
-def _calibrations(inputs: list[str]) -> list[Calibration]:
-    """The inputs as calibrations, where they are; UsageError where only some are."""
-    from thermocald.analysis.thermal.calibrations import is_calibration, read_calibration
-
-    found: list[Calibration] = []
+def _temperatures(inputs: list[str]) -> dict[str, float | None]:
+    """{file: °C} of calibrations, where the inputs are some; UsageError for no temperature."""
+    found: dict[str, float | None] = {}
     for text in inputs:
         label, equals, rest = text.partition("=")
-        path = Path(rest if equals and not Path(text).exists() else text)
-        if not is_calibration(path):
+        name = rest if equals and not Path(text).exists() else text
+        if Path(name).suffix != ".json":
             if found:
                 raise UsageError(f"{text}: is no calibration; fit series and calibrations apart")
-            return []
+            return {}
         try:
-            degrees = float(label) if str(path) == rest else None
+            found[name] = float(label) if name == rest else None
         except ValueError:
             raise UsageError(f"{text}: {label!r} is not a temperature in °C") from None
-        found.append(read_calibration(path, degrees))
     return found
-
-
-def _of_calibrations(
-    given: list[Calibration], log: Path | None, options: LogOptions, clock: DeviceClock,
-    T0: float | None, temperature_sd: float,
-) -> ThermalCamera:  # fmt: skip
-    from thermocald.analysis.thermal.calibrations import with_log
-    from thermocald.analysis.thermal.camera_fit import fit_to_calibrations
-    from thermocald.store.logger.temperatures import read_log
-
-    channel = "temperature"
-    if log is not None:
-        spans = [c.span(clock) for c in given]
-        near = float(min(s.min() for s in spans)), float(max(s.max() for s in spans))
-        table = read_log(log, options, near)
-        channel = next(iter(table.channels))
-        for note in table.notes:
-            say(note)
-        given = [with_log(c, table, clock) for c in given]
-    return fit_to_calibrations(given, T0, temperature_sd, channel)

@@ -11,9 +11,6 @@ from typing import Annotated, Any
 import typer
 
 from thermocald.cli.commands import expert
-from thermocald.errors import UsageError
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
-from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
 
 JsonOption = Annotated[
     str | None, typer.Option("--json", help="Write the result as JSON; - for standard output.")
@@ -46,6 +43,7 @@ FreeOption = Annotated[
         "--free", help="Interior orientation to estimate, separated by commas; the rest is held."
     ),
 ]
+DEFAULT_FREE = "c,x0,y0,A1,A2,A3,B1,B2"
 JobsOption = Annotated[
     int, expert(min=1, max=256, help="Processes; the results are the same to the bit.")
 ]
@@ -129,30 +127,3 @@ def takes_log_options(command: Callable[..., None]) -> Callable[..., None]:
     called.__signature__ = inspect.Signature([*kept[:-1], *added, last])  # type: ignore[attr-defined]
     called.__annotations__ = {p.name: p.annotation for p in [*kept, *added]}
     return called
-
-
-def free_names(text: str) -> tuple[str, ...]:
-    """Names of IOP from a comma-separated list; `none` frees nothing."""
-    if text.strip().lower() in ("", "none"):
-        return ()
-    names = tuple(name.strip() for name in text.split(","))
-    for name in names:
-        if name not in IOP_NAMES:
-            raise UsageError(f"--free: {name!r} is no IOP; there are {', '.join(IOP_NAMES)}, none")
-    return tuple(name for name in IOP_NAMES if name in names)
-
-
-def adjustment_settings(free: str) -> AdjustmentSettings:
-    """The settings of an epoch's adjustment from `--free`."""
-    return AdjustmentSettings(free=free_names(free))
-
-
-DEFAULT_FREE_TEXT = ",".join(DEFAULT_FREE)
-
-
-def check_exterior(exterior: str) -> None:
-    """Raise UsageError for a word of `--exterior` that there is not."""
-    from thermocald.photogrammetry.series.result import EXTERIOR_CHOICES
-
-    if exterior not in EXTERIOR_CHOICES:
-        raise UsageError(f"--exterior {exterior}: must be one of {', '.join(EXTERIOR_CHOICES)}")

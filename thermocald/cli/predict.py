@@ -48,32 +48,19 @@ def predict(
     Example: thermocald predict --model camera.thermal.yaml --temperature 35
     """
     import thermocald as tc
-    from thermocald.analysis.thermal import predictions
-    from thermocald.analysis.thermal.model_log import read_model_log
 
-    if sum(option is not None for option in (temperature, log, test, programme)) != 1:
-        raise UsageError("give one of --temperature, --log, --test, --programme")
     thermal = tc.load_camera(model)
     if thermal.warning:
         say(f"warning: {thermal.warning}")
-    with warnings_said():
-        if temperature is not None:
-            others = _channels(channel or [])
-            state = thermal.at(temperature, channels=others or None, extrapolate=extrapolate)
-            document, lines = predictions.describe_camera(thermal, state, distance)
-        elif log is not None:
-            table = read_model_log(thermal, log, log_options)
-            document, lines = predictions.predict_along(thermal, table, extrapolate)
-        elif test is not None:
-            with progress(None, "reading and measuring") as advance:
-                document, lines = predictions.check_prediction(thermal, test, advance)
-        else:
-            assert programme is not None
-            document, lines = predictions.advise_warm_up(
-                thermal, programme, camera, distance, wanted
-            )
-    if write_result(document, json):
-        typer.echo("\n".join(lines))
+    with warnings_said(), progress(None, "reading and measuring") as advance:
+        found = tc.predict(
+            thermal, temperature, channels=_channels(channel or []) or None, log=log,
+            log_options=log_options, test=() if test is None else tc.open_all(test),
+            programme=programme, camera=camera, distance_m=distance, wanted_mm=wanted,
+            extrapolate=extrapolate, progress=advance,
+        )  # fmt: skip
+    if write_result(found.as_dict(), json):
+        typer.echo(str(found))
 
 
 def _channels(given: list[str]) -> dict[str, float]:

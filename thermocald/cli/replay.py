@@ -10,13 +10,11 @@ import typer
 from thermocald.cli.commands import expert
 from thermocald.cli.common import progress, say, write_parts, write_result
 from thermocald.cli.options import (
-    DEFAULT_FREE_TEXT,
+    DEFAULT_FREE,
     ExteriorOption,
     FreeOption,
     JobsOption,
     JsonOption,
-    check_exterior,
-    free_names,
 )
 from thermocald.errors import DataError, UsageError
 
@@ -27,7 +25,7 @@ def replay(
         Path | None, typer.Option(help="Keep all in this store; an interrupted replay goes on.")
     ] = None,
     exterior: ExteriorOption = "auto",
-    free: FreeOption = DEFAULT_FREE_TEXT,
+    free: FreeOption = DEFAULT_FREE,
     jobs: JobsOption = 1,
     json: JsonOption = None,
 ) -> None:
@@ -37,11 +35,10 @@ def replay(
     """
     import thermocald as tc
 
-    check_exterior(exterior)
     series = tc.open(recording)
     with progress(len(series), "calibrating") as advance:
         table = series.calibrate(
-            exterior=exterior, free=free_names(free), store=store, jobs=jobs, progress=advance
+            exterior=exterior, free=free, store=store, jobs=jobs, progress=advance
         )
     document = {**table.as_dict(), "recording": recording, "store": store}
     if write_result(document, json):
@@ -64,7 +61,7 @@ def export(
             "again: auto (of a recording), per_epoch, series, mount.",
         ),
     ] = "",
-    free: FreeOption = DEFAULT_FREE_TEXT,
+    free: FreeOption = DEFAULT_FREE,
     series: Annotated[
         str | None, typer.Option(help="Which of a store: CAMERA/SERIES or SERIES.")
     ] = None,
@@ -99,8 +96,6 @@ def export(
 
     folder = source.is_dir()
     exterior = exterior or ("auto" if folder else "stored")
-    if folder or exterior != "stored":
-        check_exterior(exterior)
     if format_ not in ("csv", "json", "parquet"):
         raise UsageError(f"--format {format_}: csv, json and parquet are written")
     style = series_export.style_of(units, time_, separator, decimal)
@@ -111,7 +106,7 @@ def export(
     opened = tc.open(source, series)
     with progress(len(opened) if folder else None, "calibrating") as advance:
         table = opened.calibrate(
-            exterior=exterior, free=free_names(free), jobs=jobs, progress=advance
+            exterior=exterior, free=free, jobs=jobs, progress=advance
         )
     if format_ == "csv" and style.is_plain and not extra:
         write_parts(table.csv_lines(), output)

@@ -9,7 +9,7 @@ import typer
 
 from thermocald.cli.commands import expert
 from thermocald.cli.common import progress, say, write_json, write_result
-from thermocald.cli.options import DEFAULT_FREE_TEXT, FreeOption, JobsOption, JsonOption
+from thermocald.cli.options import DEFAULT_FREE, FreeOption, JobsOption, JsonOption
 from thermocald.errors import DataError, OutputError, UsageError
 from thermocald.store.server.connection import is_server
 from thermocald.store.sources import source_name
@@ -28,7 +28,7 @@ def reprocess(
     ] = "calibrate",
     engine: Annotated[str, expert(help="local, or a Dask scheduler: tcp://HOST:8786.")] = "local",
     jobs: JobsOption = 1,
-    free: FreeOption = DEFAULT_FREE_TEXT,
+    free: FreeOption = DEFAULT_FREE,
     sets: Annotated[
         int, expert(min=100, max=10_000_000, help="Of a study's Monte-Carlo.")
     ] = 100_000,
@@ -52,8 +52,8 @@ def reprocess(
 def _calibrate(
     archives: list[Path], out: Path, free: str, engine: str, jobs: int, json: str | None
 ) -> None:
-    from thermocald.cli.options import free_names
     from thermocald.fleet.reprocess import find_blocks, run_blocks
+    from thermocald.series import free_names
 
     for archive in archives:
         if is_server(archive):

@@ -75,6 +75,7 @@ def start(
 
     Example: thermocald session start --camera phone-1 --series M1 --start cold --epochs 150
     """
+    import thermocald as tc
     from thermocald.daemon import desk
 
     read = _configuration(config, mock)
@@ -84,7 +85,8 @@ def start(
         from thermocald.daemon.separating import Heating, separating
 
         heating = Heating(max_temperature, max_rate, max_duty)
-        text, session, watch = separating(read, session, until_separated, evidence, heating, say)
+        known = None if evidence is None else tc.open(evidence).observed()
+        text, session, watch = separating(read, session, until_separated, known, heating, say)
         (typer.echo if dry_run else say)(text)
         if dry_run:
             return

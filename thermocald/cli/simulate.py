@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -49,22 +48,21 @@ def simulate(
 
     Example: thermocald simulate --preset rpi-v2.1-heating --out rpi-M1 --seed 1
     """
-    from thermocald.physics import presets
+    import thermocald as tc
 
     if list_:
-        if write_result(presets.simulation_catalogue(), json):
-            typer.echo("\n".join(presets.catalogue_lines()))
+        known = tc.catalogue()
+        if write_result(known.as_dict(), json):
+            typer.echo(str(known))
         return
     if out is None:
         raise UsageError("--out is missing: the folder of the recording to write")
-    simulation = presets.given_simulation(
-        preset, model, camera, testfield, programme, seed, series, effect or ()
-    )
-    with progress(simulation.programme.epochs, "simulating") as advance:
-        simulation.write(out, with_frames=frames, advance=advance)
-    if model_out is not None:
-        from thermocald.physics.model_file import write_model
-
-        write_model(model_out, replace(simulation.model, exterior=simulation.exterior))
-    if write_result({**simulation.as_dict(), "recording": str(out)}, json):
-        typer.echo(f"{out}: {simulation.lines()[0]}")
+    with progress(None, "simulating") as advance:
+        made = tc.simulate(
+            preset, model=model, camera=camera, programme=programme, effects=effect or (),
+            seed=seed, series=series, testfield=testfield, frames=frames, out=out,
+            model_out=model_out, progress=advance,
+        )  # fmt: skip
+    assert made.simulation is not None
+    if write_result({**made.simulation.as_dict(), "recording": str(out)}, json):
+        typer.echo(f"{out}: {made.simulation.lines()[0]}")

@@ -10,14 +10,12 @@ import typer
 from thermocald.cli.commands import expert
 from thermocald.cli.common import progress, write_result
 from thermocald.cli.options import (
-    DEFAULT_FREE_TEXT,
+    DEFAULT_FREE,
     ExteriorOption,
     FreeOption,
     JobsOption,
     JsonOption,
     SeedOption,
-    check_exterior,
-    free_names,
 )
 from thermocald.errors import UsageError
 from thermocald.files import make_folder
@@ -61,7 +59,7 @@ def study(
         float | None, expert(min=0.0, help="Noise of the thermometers, K [estimated].")
     ] = None,
     exterior: ExteriorOption = "auto",
-    free: FreeOption = DEFAULT_FREE_TEXT,
+    free: FreeOption = DEFAULT_FREE,
     jobs: JobsOption = 1,
     reference: Annotated[
         bool, expert("--reference", help="Study the presets instead, next to the reference study.")
@@ -94,7 +92,6 @@ def study(
         "thermometer_sd": thermometer_sd,
         "jobs": jobs,
     }
-    check_exterior(exterior)
     # Refused before the work, not after it.
     for path in (report, figures):
         if path is not None:
@@ -103,7 +100,7 @@ def study(
         with progress(None, "simulating, adjusting, studying") as advance:
             result = tc.reference_study(progress=advance, **settings)
     else:
-        result = _study(inputs or [], settings, exterior, free_names(free))
+        result = _study(inputs or [], settings, exterior, free)
     written = []
     if report is not None:
         written.append(str(result.report(report)))
@@ -114,7 +111,7 @@ def study(
 
 
 def _study(
-    inputs: list[str], settings: dict[str, Any], exterior: str, free: tuple[str, ...]
+    inputs: list[str], settings: dict[str, Any], exterior: str, free: str
 ) -> Study:
     import thermocald as tc
 

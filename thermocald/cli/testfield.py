@@ -16,7 +16,6 @@ from thermocald.errors import UsageError
 if TYPE_CHECKING:
     from thermocald.output.testfield.board import Board
     from thermocald.output.testfield.layout import Design
-    from thermocald.photogrammetry.network.bundle import Distance
 
 CameraFile = Annotated[
     Path | None,
@@ -53,8 +52,6 @@ Spacing = Annotated[float, expert("--spacing", help="Of an AprilGrid, over the s
 Dictionary = Annotated[str, expert("--dictionary", help="Of a ChArUco board: OpenCV's name.")]
 Legacy = Annotated[bool, expert("--legacy", help="ChArUco as OpenCV drew it before 4.6.")]
 Point = tuple[float, float, float]
-
-_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".pgm"}
 
 
 def print_(
@@ -226,35 +223,12 @@ def survey(
     Example: thermocald testfield survey photos/ --field field/testfield.csv --scale R65 R89 340.12
     --out surveyed.csv
     """
-    from thermocald.photogrammetry import camera_files
-    from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
-    from thermocald.photogrammetry.survey import picture_of
-    from thermocald.photogrammetry.survey import survey as run
-    from thermocald.store.recording.testfield_file import read_testfield, write_testfield
+    import thermocald as tc
 
-    measured = _distances(scale, scale_sd, distances)
-    pictures = [picture_of(path) for path in _photos(photos)]
-    known = None if camera is None else camera_files.read(camera, pixel_pitch=pixel_pitch).model
-    if hold_camera and known is None:
-        raise UsageError("--hold-camera needs --camera")
-    pitch = known.sensor.pixel_pitch if known is not None else pixel_pitch
-    if pitch is None:
-        pitch = 0.001
-        say("pixel pitch not given: 0.001 mm assumed, the camera's mm are only as good")
-    result = run(
-        pictures,
-        measured,
-        pitch,
-        nominal=None if field is None else read_testfield(field),
-        interior=None if known is None else known.interior,
-        free=() if hold_camera else IOP_NAMES,
-        progress=say,
-    )
-    write_testfield(out, result.field)
-    if camera_out is not None:
-        network = result.network
-        comment = f"self-calibration in the survey of {out.name}, sigma0 {network.sigma0:.2f}"
-        camera_files.write(network.camera, camera_out, "json", network.interior_covariance, comment)
+    result = tc.survey_testfield(
+        photos, scale=scale, scale_sd=scale_sd, distances=distances, field=field, camera=camera,
+        hold_camera=hold_camera, pixel_pitch=pixel_pitch, out=out, camera_out=camera_out, say=say,
+    )  # fmt: skip
     if write_result({**result.as_dict(), "testfield": str(out)}, json):
         typer.echo(f"{out}: " + "\n".join(result.lines()))
 
@@ -294,25 +268,20 @@ def check(
     Example: thermocald testfield check --paper A4
     Example: thermocald testfield check field/testfield.csv --from 900 900 700
     """
-    from thermocald.analysis.field.advice import assess_field
+    import thermocald as tc
     from thermocald.output.testfield.layout import field_of, lay_out
-    from thermocald.photogrammetry import camera_files
-    from thermocald.photogrammetry.camera.camera_model import RASPBERRY_PI_V2
-    from thermocald.store.recording.testfield_file import read_testfield
 
-    if field is None:
-        targets = field_of(lay_out(_design(paper, flat, landscape, diameter)))
-    else:
-        targets = read_testfield(field)
-    if camera is not None:
-        model = camera_files.read(camera, pixel_pitch=pixel_pitch).model
-    else:
-        model = RASPBERRY_PI_V2
+    drawn = _design(paper, flat, landscape, diameter)
+    targets = field_of(lay_out(drawn)) if field is None else tc.read_testfield(field)
+    if camera is None:
         say(
             "no --camera: a Raspberry Pi camera v2.1 (3280 × 2464 px of 1.12 µm, 3.04 mm) is "
             "assumed"
         )
-    found = assess_field(targets, model, place, at, roll, sigma)
+    found = tc.check_testfield(
+        targets, camera=camera, pixel_pitch=pixel_pitch, place=place, look_at=at,
+        roll=roll, sigma_px=sigma,
+    )  # fmt: skip
     if report is not None:
         from thermocald.files import write_text
         from thermocald.output.field_check import render_field_check
@@ -352,41 +321,6 @@ def _design(paper: str, flat: bool, landscape: bool | None, diameter: float | No
     return Design(
         page, diameter if diameter is not None else default_diameter(page), sheets=1 if flat else 3
     )
-
-
-def _photos(paths: list[Path]) -> list[Path]:
-    """The files, folders replaced by the pictures in them; UsageError for what is not there."""
-    found: list[Path] = []
-    for path in paths:
-        if path.is_dir():
-            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in _SUFFIXES)
-            if not inside:
-                raise UsageError(f"{path}: the folder holds no pictures")
-            found += inside
-        elif path.is_file():
-            found.append(path)
-        else:
-            raise UsageError(f"{path}: there is no such file")
-    if len(set(found)) < len(found):
-        raise UsageError("a photograph is given twice")
-    return found
-
-
-def _distances(
-    scale: tuple[str, str, float] | None, sigma: float, file: Path | None
-) -> list[Distance]:
-    from thermocald.photogrammetry.network.bundle import Distance
-    from thermocald.store.recording.board_file import read_distances
-
-    found = [] if scale is None else [Distance(scale[0], scale[1], scale[2], sigma)]
-    if file is not None:
-        found += read_distances(file)
-    if not found:
-        raise UsageError("the scale is missing: --scale A B MM, or --distances FILE")
-    for d in found:
-        if not (d.length > 0 and d.sigma > 0) or d.a == d.b:
-            raise UsageError(f"{d.a} to {d.b}, {d.length:g} ± {d.sigma:g} mm, is not a distance")
-    return found
 
 
 group = subcommands(print_=print_, import_=import_, survey=survey, check=check)

@@ -237,8 +237,8 @@ def enforce_retention(config: Config) -> list[str]:
     if told is not None:
         return [str(sentence) for sentence in told["deleted"]]
     from thermocald.acquisition.frame_folder import FrameFolder
-    from thermocald.acquisition.steady_clock import machine_clock_trusted
     from thermocald.daemon.store_guard import StoreGuard
+    from thermocald.machine import machine_clock_trusted
     from thermocald.store.series import Event
 
     guard = StoreGuard(config.store.path)

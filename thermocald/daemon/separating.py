@@ -37,17 +37,18 @@ class Heating:
 
 
 def separating(
-    config: Config, session: Session, text: str, evidence: Path | None, heating: Heating,
+    config: Config, session: Session, text: str, known: SeriesInput | None, heating: Heating,
     say: Callable[[str], None],
 ) -> tuple[str, Session, Watch]:  # fmt: skip
-    """Return the programme that separates two effects, in words, and the session with it."""
+    """Return the programme that separates two effects, in words, and the session with it.
+
+    known: an earlier series of the camera, None without one.
+    """
     from thermocald.discovery.experiment import read_alternatives
-    from thermocald.thermal.source import load_series
 
     if session.programme:
         raise UsageError("--until-separated plans the programme: leave --programme out")
     names = read_alternatives(text)
-    known = load_series(evidence)[0] if evidence is not None else None
     found = _experiments(config, session, names, heating, known)
     watch = Watch(config.store.path, session, names, known, say)
     return _described(found, names), _with_programme(session, found[0]), watch

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 
     from thermocald.config import Config
     from thermocald.daemon.control import Request
+    from thermocald.hal import Clock
 
 
 log = logging.getLogger(__name__)
@@ -58,8 +59,8 @@ class Service:
 
     path: of the configuration, which SIGHUP reads again; until_finished: end when all recordings
     have been played or all epochs taken; else it takes requests at its control socket; on_turn:
-    called in every turn, True ends the service; clock: a virtual one, on which rendered devices
-    take no time. Other arguments as `Station`.
+    called in every turn, True ends the service; clock: a virtual machine's, on which rendered
+    devices take no time. Other arguments as `Station`.
     """
 
     def __init__(
@@ -73,10 +74,11 @@ class Service:
         hang_after_s: float = 60.0,
         start_condition: str = "",
         on_turn: Callable[[Station], bool] | None = None,
-        clock: SteadyClock | None = None,
+        clock: Clock | None = None,
     ) -> None:
         self.config = config
-        self.clock = clock or SteadyClock()
+        trusted = None if clock is None else lambda: True
+        self.clock = SteadyClock(clock, synchronised=trusted)
         self.live = LiveState.beside(config.store.path)
         self._path = path
         self._options: dict[str, Any] = {

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.discovery import criteria
-from thermocald.errors import DataError, UsageError
+from thermocald.errors import DataError
 from thermocald.photogrammetry.field.planes import field_sheets
 from thermocald.photogrammetry.series.board_motion import board_movements, refined
 from thermocald.photogrammetry.series.field_motion import (
@@ -29,65 +29,16 @@ from thermocald.photogrammetry.series.field_motion import (
     wandering_targets,
 )
 from thermocald.photogrammetry.series.normals import ObservationGrid
-from thermocald.store.recording.reader import open_recording
-from thermocald.store.server.connection import is_server
-from thermocald.store.sources import require_source, source_name
 from thermocald.thermal.reduce import with_points, without_targets
 from thermocald.thermal.scan import cosines
-from thermocald.thermal.source import load_series, series_input
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-    from pathlib import Path
+    from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
     from thermocald.thermal.series import ReducedSeries, SeriesInput
-
-
-def load_together(
-    first: Path, others: Sequence[Path], say: Callable[[str], None], jobs: int = 1
-) -> list[SeriesInput]:
-    """Read M1 and the recordings to prove it on; refuses those of another camera or thermometer.
-
-    jobs: processes that measure frames.
-    """
-    places = [_place(p) for p in (first, *others)]
-    for k, path in enumerate(others, start=1):
-        if places[k] == places[0]:
-            raise UsageError(
-                f"{path} is the recording to explain itself; --verify needs another recording of "
-                "the same camera, made at another time"
-            )
-        if places[k] in places[1:k]:
-            raise UsageError(f"{path} is given to --verify twice; one time is enough")
-    out = []
-    for path in (first, *others):
-        say(f"reading {source_name(path)}")
-        out.append(_read(path, say, jobs))
-    require_other_series(out)
-    return out
-
-
-def _read(path: Path, say: Callable[[str], None], jobs: int) -> SeriesInput:
-    """Read one series: a recording's, or the only one of a store or of what an address selects."""
-    if path.is_dir():
-        return series_input(open_recording(path), say, jobs=jobs)
-    found = load_series(require_source(path))
-    if len(found) > 1:
-        there = ", ".join(f"{s.camera}/{s.series}" for s in found)
-        remedy = (
-            "select one with ?station=…&camera=…&series=… in the address"
-            if is_server(path)
-            else "make recordings of them with `thermocald archive`"
-        )
-        raise DataError(f"{source_name(path)}: holds several series ({there}); {remedy}")
-    return found[0]
-
-
-def _place(source: Path) -> str:
-    return str(source) if is_server(source) else str(source.resolve())
 
 
 def require_other_series(series: Sequence[SeriesInput]) -> None:

@@ -64,8 +64,8 @@ class Plan:
                         pairs[key] = catalogue.get(effect).experiment_against(catalogue.get(other))
         return [(a, b, experiment) for (a, b), experiment in sorted(pairs.items())]
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the plan as a document."""
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `discover --plan --json` writes."""
         return {
             "format": "thermocald-plan/1",
             "strength_px": self.strength_px,
@@ -78,14 +78,13 @@ class Plan:
             ],
         }
 
-    def lines(self) -> list[str]:
-        """Write the plan for people."""
+    def __str__(self) -> str:
         out = [f"effects of {self.strength_px:g} px RMS, {self.repetitions} recordings each:"]
         for name, said in self.found.items():
             words = ", ".join(f"{k} × {n}" for k, n in sorted(said.items()))
             out.append(f"  {name:26s} found {self.power(name):4.0%}   said: {words}")
         out += [f"  ambiguous: {a} and {b}; {e}" for a, b, e in self.ambiguous()]
-        return out
+        return "\n".join(out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +110,7 @@ class SetUp:
 
 
 def set_ups(
-    recording: Path | None,
+    source: SeriesInput | None,
     model: Path | None,
     preset: str | None,
     testfield: str | None,
@@ -120,12 +119,10 @@ def set_ups(
 ) -> list[SetUp]:
     """Prepare recordings of the set-up with no effect but the model's, one per seed.
 
-    A recording may stand for the set-up: then its own epochs and noise are used, once.
+    A measured series may stand for the set-up: then its own epochs and noise are used, once.
     """
-    from thermocald.store.recording.reader import read_recording
-
-    if recording is not None:
-        return [SetUp(series_input(read_recording(recording)))]
+    if source is not None:
+        return [SetUp(source)]
     if preset is None and (model is None or programme is None):
         raise UsageError(
             "--plan needs a recording of the set-up, or --preset, or --model and --programme"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,12 +13,11 @@ import numpy as np
 from thermocald.analysis.thermal.correction import correct_points, image_corrections
 from thermocald.analysis.thermal.timed_rows import STANDARD_INPUT, RowBlock, row_blocks
 from thermocald.errors import DataError, ImageError, ThermocaldError, UsageError
-from thermocald.files import make_folder, new_file
+from thermocald.files import make_folder, new_file, write_parts
 from thermocald.output.image_metadata import with_metadata
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-    from pathlib import Path
 
     from thermocald.analysis.thermal.correction import ImageCorrection
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
@@ -32,10 +32,13 @@ _SAID = 20  # rows that are named
 class Correction:
     """What is corrected with which model and log, and what came of it.
 
-    to: °C to correct to, None for the model's T₀; temperature_sd K, of a reading of the log; say:
-    is told of each row that cannot be corrected.
+    path: the CSV, `-` is standard input; of_images: whether it names images, not points; to: °C to
+    correct to, None for the model's T₀; temperature_sd K, of a reading of the log; say: is told of
+    each row that cannot be corrected.
     """
 
+    path: Path
+    of_images: bool
     thermal: ThermalCamera
     log: TemperatureLog
     clock: DeviceClock
@@ -86,25 +89,35 @@ class Correction:
         """°C."""
         return self.thermal.model.T0 if self.to is None else self.to
 
-    def lines(self, path: Path) -> Iterator[str]:
+    def write(self, out: Path | str, advance: Callable[[int], None] | None = None) -> None:
+        """Write the corrected CSV, or the corrected images into a folder.
+
+        advance: receives how many images are done.
+        """
+        if self.of_images:
+            self._write_images(Path(out), advance or (lambda _: None))
+        else:
+            write_parts(Path(out), self.lines())
+
+    def lines(self) -> Iterator[str]:
         """Yield the corrected CSV of points, a block of rows at a time.
 
         `-` is standard input: rows are corrected as they come in. Rows that cannot be corrected are
         kept in `refused`. Raises DataError where none can.
         """
-        for block in row_blocks(path, ("x", "y"), self.clock):
-            yield self._corrected(self._possible(block, path), path)
-        self._require_any(path, self.points)
+        for block in row_blocks(self.path, ("x", "y"), self.clock):
+            yield self._corrected(self._possible(block))
+        self._require_any(self.points)
 
-    def write_images(self, path: Path, out: Path, advance: Callable[[int], None]) -> None:
+    def _write_images(self, out: Path, advance: Callable[[int], None]) -> None:
         """Correct the images that a CSV of time and image names, into a folder.
 
         EXIF is kept. Images that cannot be corrected are kept in `refused`. Raises DataError where
         none can, UsageError where one would be overwritten.
         """
         make_folder(out)
-        for block in row_blocks(path, (), self.clock):
-            possible = self._possible(block, path)
+        for block in row_blocks(self.path, (), self.clock):
+            possible = self._possible(block)
             if not possible.lines:
                 continue
             corrections = image_corrections(
@@ -112,27 +125,29 @@ class Correction:
                 self.extrapolate,
             )  # fmt: skip
             for line, row, c in zip(possible.lines, possible.rows, corrections, strict=True):
-                source, written = path.parent / row["image"], out / row["image"].rsplit("/", 1)[-1]
+                source = self.path.parent / row["image"]
+                written = out / row["image"].rsplit("/", 1)[-1]
                 try:
                     _write_corrected(source, written, c)
                 except ImageError as cause:
-                    self._refuse(path, line, str(cause))
+                    self._refuse(line, str(cause))
                 else:
                     self.images.append(_told(source, written, c))
                 advance(1)
-        self._require_any(path, len(self.images))
+        self._require_any(len(self.images))
 
-    def require_all(self, path: Path) -> None:
+    def require_all(self) -> None:
         """Raise DataError where a row was refused."""
         if self.refused:
             count = len(self.refused) + self.points + len(self.images)
             lines = ", ".join(str(r["line"]) for r in self.refused[:_SAID])
             raise DataError(
-                f"{path}: {len(self.refused)} of {count} rows were not corrected: lines {lines}"
+                f"{self.path}: {len(self.refused)} of {count} rows were not corrected: lines "
+                + lines
                 + (", …" if len(self.refused) > _SAID else "")
             )
 
-    def _possible(self, block: RowBlock, path: Path) -> RowBlock:
+    def _possible(self, block: RowBlock) -> RowBlock:
         """The rows that lie in the image and in the time of the log; the others are said."""
         log = self.log.times
         step = float(np.median(np.diff(log))) if len(log) > 1 else 0.0
@@ -149,10 +164,10 @@ class Correction:
                 "or binned (--size)?",
             )
         for line, reason in possible.refused:
-            self._refuse(path, line, reason)
+            self._refuse(line, reason)
         return possible
 
-    def _corrected(self, block: RowBlock, path: Path) -> str:
+    def _corrected(self, block: RowBlock) -> str:
         if not len(block.times):
             return ""
         try:
@@ -161,16 +176,16 @@ class Correction:
                 self.extrapolate,
             )  # fmt: skip
         except ThermocaldError as cause:
-            if path != STANDARD_INPUT:
+            if self.path != STANDARD_INPUT:
                 raise
             # of what comes in one row must not stop the others
             if len(block.times) == 1:
-                self._refuse(path, block.lines[0], str(cause))
+                self._refuse(block.lines[0], str(cause))
                 return ""
             ones = [
                 block.kept(np.arange(len(block.times)) == i, "") for i in range(len(block.times))
             ]
-            return "".join(self._corrected(one, path) for one in ones)
+            return "".join(map(self._corrected, ones))
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         if not self.points:
@@ -186,16 +201,16 @@ class Correction:
         self.extrapolated_rows += int((found.extrapolated > 0).sum())
         return text.getvalue()
 
-    def _refuse(self, path: Path, line: int, reason: str) -> None:
+    def _refuse(self, line: int, reason: str) -> None:
         self.refused.append({"line": line, "reason": reason})
         if len(self.refused) <= _SAID:
-            self.say(f"{path}, line {line}: not corrected: {reason}")
+            self.say(f"{self.path}, line {line}: not corrected: {reason}")
 
-    def _require_any(self, path: Path, count: int) -> None:
+    def _require_any(self, count: int) -> None:
         if not count:
             first = self.refused[0]
             raise DataError(
-                f"{path}: no row was corrected; line {first['line']}: {first['reason']}"
+                f"{self.path}: no row was corrected; line {first['line']}: {first['reason']}"
             )
 
     def _rms(self, squares: float) -> float:

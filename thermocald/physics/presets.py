@@ -38,12 +38,12 @@ from thermocald.physics.device import (
 )
 from thermocald.physics.heat import Course, HeatNetwork, Link, SimulatedThermometer
 from thermocald.physics.model import ModelEffect, ThermalModel
-from thermocald.physics.model_file import read_effects, read_model
+from thermocald.physics.model_file import read_model
 from thermocald.physics.simulation import Simulation
 from thermocald.physics.testfields import corner_field, corner_view, load_field
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Mapping
     from pathlib import Path
 
     from thermocald.photogrammetry.field.testfield import TestField
@@ -237,39 +237,18 @@ def _effects(preset: Preset, way: Any, warming: float) -> list[ModelEffect]:
 
 
 def given_simulation(
-    preset: str | None = None,
-    model: Path | None = None,
-    camera: Path | None = None,
-    testfield: str | None = None,
-    programme: Path | None = None,
-    seed: int = 0,
-    series: str = "M1",
-    effects: Iterable[Path] = (),
-) -> Simulation:
-    """Return the simulation that a preset and files describe, effects of effect files added.
-
-    Raises UsageError where neither preset nor model and programme are given.
-    """
-    simulation = _described(preset, model, camera, testfield, programme, seed, series)
-    for path in effects:
-        found = simulation.model
-        for one in read_effects(path):
-            found = found.with_effect(one)
-        simulation = replace(simulation, model=found)
-    return simulation
-
-
-def _described(
     preset: str | None,
     model: Path | None,
     camera: Path | None,
-    testfield: str | None,
+    field: TestField | None,
     programme: Path | None,
-    seed: int,
-    series: str,
+    seed: int = 0,
+    series: str = "M1",
 ) -> Simulation:
+    """Return the simulation that a preset and files describe.
 
-    field: TestField | None = load_field(testfield) if testfield is not None else None
+    Raises UsageError where neither preset nor model and programme are given.
+    """
     if preset is not None:
         simulation = preset_simulation(preset, seed, series, field)
         if camera is not None:
@@ -290,30 +269,30 @@ def _described(
     else:
         network, thermometers = default_heat()
         device = CameraDevice(thermal.camera, thermal.sensor, network, thermometers)
-    if field is None:
-        field = load_field("circles")
-    return Simulation(thermal, device, field, read_programme(programme), seed)
+    chosen = load_field("circles") if field is None else field
+    return Simulation(thermal, device, chosen, read_programme(programme), seed)
 
 
-def simulation_catalogue() -> dict[str, list[dict[str, Any]]]:
-    """Return presets and effects, as `simulate --list --json` writes them."""
-    return {
-        "presets": [{"preset": one.name, "about": one.about} for one in PRESETS.values()],
-        "effects": [
-            {"effect": name, "kind": effect.kind, "parameters": effect.units()}
-            for name in catalogue.names()
-            if (effect := catalogue.get(name))
-        ],
-    }
+class Catalogue:
+    """The presets, and the effects of model files."""
 
+    def as_dict(self) -> dict[str, list[dict[str, Any]]]:
+        """Return what `simulate --list --json` writes."""
+        return {
+            "presets": [{"preset": one.name, "about": one.about} for one in PRESETS.values()],
+            "effects": [
+                {"effect": name, "kind": effect.kind, "parameters": effect.units()}
+                for name in catalogue.names()
+                if (effect := catalogue.get(name))
+            ],
+        }
 
-def catalogue_lines() -> list[str]:
-    """Return presets and effects as lines for people."""
-    lines = ["presets", *(f"  {p.name:<18} {p.about}" for p in PRESETS.values())]
-    lines.append("effects (for model files)")
-    for name in catalogue.names():
-        effect = catalogue.get(name)
-        searched = ", ".join(f"{k} [{p.unit}]" for k, p in effect.nonlinear.items())
-        linear = ", ".join(f"{k} [{effect.linear[k]}]" for k in effect.usual)
-        lines.append(f"  {name:<24} {'; '.join(t for t in (searched, linear) if t)}")
-    return lines
+    def __str__(self) -> str:
+        lines = ["presets", *(f"  {p.name:<18} {p.about}" for p in PRESETS.values())]
+        lines.append("effects (for model files)")
+        for name in catalogue.names():
+            effect = catalogue.get(name)
+            searched = ", ".join(f"{k} [{p.unit}]" for k, p in effect.nonlinear.items())
+            linear = ", ".join(f"{k} [{effect.linear[k]}]" for k in effect.usual)
+            lines.append(f"  {name:<24} {'; '.join(t for t in (searched, linear) if t)}")
+        return "\n".join(lines)

@@ -20,11 +20,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.acquisition.calibrator import Calibrator, calibrated_epochs
-from thermocald.errors import DataError
 from thermocald.photogrammetry.linalg import MAD_TO_SD
 from thermocald.photogrammetry.series.blocks import recut
 from thermocald.photogrammetry.series.normals import ObservationGrid
-from thermocald.store.sources import open_source, source_name
 from thermocald.store.stored_blocks import StoredBlocks
 from thermocald.thermal import criteria
 from thermocald.thermal.series import SeriesInput
@@ -32,7 +30,6 @@ from thermocald.thermal.thermometer import estimate_reading_noise
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
-    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -434,21 +431,3 @@ def _start_input(
         series=head.series,
         interior=camera.interior,
     )
-
-
-def load_series(
-    path: Path, advance: Callable[[int], None] | None = None, jobs: int = 1
-) -> list[SeriesInput]:
-    """Read the series of a recording (a folder) or of a store (a file).
-
-    advance: receives how many frames were measured; jobs: processes that measure.
-    """
-    if path.is_dir():
-        from thermocald.store.recording.reader import open_recording
-
-        return [series_input(open_recording(path), advance=advance, jobs=jobs)]
-    with open_source(path) as store:
-        found = [stored_input(store, s, f"{store.path}: {s.name}") for s in store.all_series()]
-    if not found:
-        raise DataError(f"{source_name(path)}: the store holds no series")
-    return found

@@ -184,12 +184,13 @@ class Camera(Result):
         fx, fy, cx, cy = found[:4]
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), np.array(found[4:])
 
-    def write(self, path: Path | str, format: str = "") -> str:  # noqa: A002
+    def write(self, path: Path | str, format: str = "", comment: str = "") -> str:  # noqa: A002
         """Write the camera for another program; returns how exact the file is.
 
         format: opencv, ros, colmap, mrcal, kalibr, metashape, aicon, json; by default what the
-        file's name says: `ros.yaml`, or a suffix that one format has (`.xml`, `.json`, …). Raises
-        UsageError where that is none or several, GeometryError for a model without rays.
+        file's name says: `ros.yaml`, or a suffix that one format has (`.xml`, `.json`, …); comment:
+        a line for its head, by default the temperature. Raises UsageError where the name says none
+        or several, GeometryError for a model without rays.
 
         >>> tc.load_camera("camera.yaml").at(35.0).write("ros.yaml")
         'exact: both models give the same pixels'
@@ -197,7 +198,8 @@ class Camera(Result):
         from thermocald.photogrammetry import camera_files
 
         target = Path(path)
-        comment = "" if np.isnan(self.temperature) else f"at {self.temperature:g} degC"
+        if not comment and not np.isnan(self.temperature):
+            comment = f"at {self.temperature:g} degC"
         covariance = self.covariance if self.covariance.any() else None
         chosen = format or _format_of(target)
         return camera_files.write(self.model, target, chosen, covariance, comment, self.name)

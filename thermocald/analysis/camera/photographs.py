@@ -314,18 +314,25 @@ def _posed(
 
 
 def images_of(given: Sequence[Path]) -> list[Path]:
-    """Files as given, folders as the images that they hold, by name; UsageError where none."""
+    """List files as given, folders as the images that they hold, by name.
+
+    Raises UsageError where there is none, for a file that is not there, and for one given twice.
+    """
     images: list[Path] = []
     for path in given:
-        if not path.is_dir():
+        if path.is_file():
             images.append(path)
             continue
+        if not path.is_dir():
+            raise UsageError(f"{path}: there is no such file")
         found = sorted(p for p in path.iterdir() if p.suffix.lower() in _IMAGES)
         if not found:
             raise UsageError(f"{path}: the folder holds no image ({', '.join(sorted(_IMAGES))})")
         images += found
     if not images:
         raise UsageError("give at least one photograph")
+    if len(set(images)) < len(images):
+        raise UsageError("a photograph is given twice")
     return images
 
 

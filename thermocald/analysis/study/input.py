@@ -8,7 +8,6 @@ its covariance matrices.
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,15 +19,14 @@ from thermocald.analysis.study.measured import Clip, MeasuredSeries, Thermometer
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
-from thermocald.photogrammetry.series.spool import ColumnSpool, give_back, released
+from thermocald.photogrammetry.series.spool import ColumnSpool, released
 from thermocald.photogrammetry.series.words import Words
-from thermocald.store.recording.reader import open_recording
 from thermocald.store.recording.readings import interpolate_readings
-from thermocald.store.sources import open_source
 from thermocald.thermal.thermometer import estimate_reading_noise
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
+    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -50,46 +48,6 @@ def refuse_copies(series: Sequence[MeasuredSeries]) -> None:
                 raise DataError(
                     f"{one.source} holds the same epochs as {other.source}; give each series once"
                 )
-
-
-def load_series(
-    source: Path | Recording,
-    label: str | None = None,
-    thermometer_sd: float | None = None,
-    exterior: str = "auto",
-    free: Sequence[str] = DEFAULT_FREE,
-    advance: Callable[[int], None] | None = None,
-    jobs: int = 1,
-) -> list[MeasuredSeries]:
-    """Every series of a recording (a folder, or one that is open) or a store (a file).
-
-    label: what the study treats as one camera, by default the camera's name, in a store with the
-    start condition; thermometer_sd: K, by default from the readings; free: IOP to estimate, for a
-    recording (a store knows its own); advance: receives how many epochs of a recording are done;
-    jobs: processes that calibrate. Raises DataError where nothing can be studied.
-    """
-    if isinstance(source, Path):
-        if not source.is_dir():
-            return _of_store(source, label, thermometer_sd, exterior, jobs)
-        source = open_recording(source)
-    found = [from_recording(source, label, thermometer_sd, exterior, free, advance, jobs)]
-    del source  # where it was opened here
-    give_back()
-    return found
-
-
-def _of_store(
-    path: Path, label: str | None, thermometer_sd: float | None, exterior: str, jobs: int
-) -> list[MeasuredSeries]:
-    """Every series of a store."""
-    with open_source(path) as store:
-        found = [
-            from_store(store, one, label, thermometer_sd, exterior, jobs)
-            for one in store.all_series()
-        ]
-    if not found:
-        raise DataError(f"{path}: the store holds no series")
-    return found
 
 
 def from_recording(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,22 +19,48 @@ from thermocald.physics.device import (
 )
 from thermocald.physics.simulation import Simulation
 from thermocald.physics.testfields import demonstration_field
-from thermocald.store.sources import require_source
+from thermocald.result import Result
 from thermocald.thermal.reduce import reduce_series
-from thermocald.thermal.source import load_series
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Sequence
     from pathlib import Path
+
+    from matplotlib.figure import Figure
 
     from thermocald.analysis.camera.camera import Camera
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
     from thermocald.store.logger.temperatures import TemperatureLog
+    from thermocald.thermal.series import SeriesInput
 
-Told = tuple[dict[str, Any], list[str]]
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Prediction(Result):
+    """What a thermal camera predicts.
+
+    thermal: the camera; document: what `predict` writes with `--json`; said: what it prints; state:
+    of a camera at one temperature, else None.
+    """
+
+    thermal: ThermalCamera
+    document: dict[str, Any]
+    said: list[str]
+    state: Camera | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `thermocald predict --json` writes."""
+        return self.document
+
+    def lines(self) -> list[str]:
+        """Return what `thermocald predict` prints."""
+        return self.said
+
+    def plot(self) -> Figure:
+        """Draw the camera's distortion at its temperature, else its drift with temperature."""
+        return self.thermal.plot() if self.state is None else self.state.plot()
 
 
-def describe_camera(thermal: ThermalCamera, camera: Camera, distance: float) -> Told:
+def describe_camera(thermal: ThermalCamera, camera: Camera, distance: float) -> Prediction:
     """Say what a camera is, and what its uncertainty and drift mean on a plane at `distance` m."""
     error = camera.object_error(distance * 1000.0)
     reference = thermal.at(thermal.model.T0, extrapolate=True)
@@ -51,10 +77,10 @@ def describe_camera(thermal: ThermalCamera, camera: Camera, distance: float) -> 
         f"from this orientation's uncertainty; the drift since {thermal.model.T0:g} °C is up to "
         f"{plain(document['drift_from_reference_mm'], 'mm', 3)}"
     )
-    return document, [*camera.lines(), in_space]
+    return Prediction(thermal, document, [*camera.lines(), in_space], camera)
 
 
-def predict_along(thermal: ThermalCamera, log: TemperatureLog, extrapolate: bool) -> Told:
+def predict_along(thermal: ThermalCamera, log: TemperatureLog, extrapolate: bool) -> Prediction:
     """Predict the camera along a log, a row a reading."""
     along = thermal.along(
         log.times, dict(log.channels), extrapolate=extrapolate,
@@ -76,13 +102,12 @@ def predict_along(thermal: ThermalCamera, log: TemperatureLog, extrapolate: bool
     }
     lines = [",".join(header)]
     lines += [",".join(f"{v:.10g}" for v in row) for row in rows]
-    return document, lines
+    return Prediction(thermal, document, lines)
 
 
-def check_prediction(thermal: ThermalCamera, path: Path, advance: Callable[[int], None]) -> Told:
-    """Hold each series of a recording or a store against what the model predicts of it."""
+def check_prediction(thermal: ThermalCamera, inputs: Sequence[SeriesInput]) -> Prediction:
+    """Hold measured series against what the model predicts of them."""
     found, lines = [], []
-    inputs = load_series(require_source(path), advance)
     series = [reduce_series(s, affinity=False, strict=False) for s in inputs]
     for s in series:
         sensor = s.source.sensor
@@ -102,12 +127,12 @@ def check_prediction(thermal: ThermalCamera, path: Path, advance: Callable[[int]
         "camera": thermal.model.camera,
         "series": found,
     }
-    return document, lines
+    return Prediction(thermal, document, lines)
 
 
 def advise_warm_up(
     thermal: ThermalCamera, programme: Path, camera: Path | None, distance: float, wanted: float
-) -> Told:
+) -> Prediction:
     """Say how long the camera needs within a programme until it is steady to `wanted` mm at
     `distance` m; camera: its file, which says how it warms.
     """
@@ -137,4 +162,4 @@ def advise_warm_up(
     else:
         said = f"is steady to {wanted:g} mm at {distance:g} m after {advice.steady_from:.0f} s"
     worst = f"(up to {document['error_at_begin_mm']:.1f} mm before)"
-    return document, [f"{thermal.model.camera} {said} {worst}"]
+    return Prediction(thermal, document, [f"{thermal.model.camera} {said} {worst}"])

@@ -8,7 +8,8 @@ Conventions and what is exact: docs/reference/camera_files.md and `photogrammetr
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -104,6 +105,57 @@ def read(
         return found
     except (ConfigurationError, DataError) as cause:
         raise ConfigurationError(f"{path} ({chosen.about}): {cause}") from cause
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Conversion:
+    """A camera file written in another format; statement: how exact what was written is."""
+
+    source: Path
+    camera: ImportedCamera
+    out: Path
+    to: str
+    statement: str
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the document that `camera convert` writes with `--json`."""
+        camera, sensor, interior = self.camera, self.camera.model.sensor, self.camera.model.interior
+        return {
+            "format": "thermocald-camera-conversion/1",
+            "source": str(self.source),
+            "source_format": camera.format,
+            "exact_import": camera.exact,
+            "largest_px": camera.largest_px,
+            "rms_px": camera.rms_px,
+            "out": str(self.out),
+            "out_format": self.to,
+            "statement": self.statement,
+            "width": sensor.width,
+            "height": sensor.height,
+            "pixel_pitch": sensor.pixel_pitch,
+            **{name: getattr(interior, name) for name in type(interior).__dataclass_fields__},
+        }
+
+    def __str__(self) -> str:
+        camera = self.camera
+        return (
+            f"{self.source} ({camera.format}): {camera.how_read}\n"
+            f"{self.out} ({self.to}): {self.statement}"
+        )
+
+
+def convert(
+    source: Path,
+    out: Path,
+    to: str,
+    format: str | None = None,  # noqa: A002
+    pixel_pitch: float | None = None,
+) -> Conversion:
+    """Read a camera file and write it in another format; errors as of `read` and `write`."""
+    camera = read(source, format, pixel_pitch)
+    comment = f"converted from {source.name} ({camera.format}, {camera.how_read})"
+    statement = write(camera.model, out, to, camera.covariance, comment, camera.name)
+    return Conversion(source, camera, out, to, statement)
 
 
 def _text(path: Path) -> str:

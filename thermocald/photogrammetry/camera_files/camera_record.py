@@ -47,6 +47,11 @@ class ImportedCamera:
     rms_px: float
     covariance: Array | None = None
 
+    @property
+    def how_read(self) -> str:
+        """How well our model is the file's, in words."""
+        return "exact" if self.exact else f"fitted, largest residual {self.largest_px:.3g} px"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForeignCamera:

@@ -1,0 +1,326 @@
+"""The front door's toolbox: files of cameras, predictions, corrections, test fields.
+
+Each function is what a command does, as in `thermocald.api`; units and errors are as there.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from thermocald.analysis.thermal.thermal_camera import ThermalCamera, load_camera
+from thermocald.errors import UsageError
+from thermocald.series import source_of
+from thermocald.store.logger.clock import device_clock
+from thermocald.store.logger.temperatures import LogOptions, log_options
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from thermocald.analysis.camera.camera import Camera
+    from thermocald.analysis.camera.difference import CameraDifference
+    from thermocald.analysis.field.advice import FieldAssessment
+    from thermocald.analysis.thermal.predictions import Prediction
+    from thermocald.output.corrected import Correction
+    from thermocald.photogrammetry.camera_files import Conversion
+    from thermocald.photogrammetry.field.testfield import TestField
+    from thermocald.photogrammetry.survey import Survey
+    from thermocald.series import Series
+
+    Model = ThermalCamera | Path | str
+    LogRead = LogOptions | Mapping[str, Any] | None
+    Point = tuple[float, float, float]
+
+_USUAL_THERMOMETER_SD = 0.05  # K, where no fit has found it
+
+
+def convert_camera(
+    source: Path | str,
+    out: Path | str,
+    to: str,
+    *,
+    format: str | None = None,  # noqa: A002
+    pixel_pitch: float | None = None,
+) -> Conversion:
+    """Convert a camera file, exactly where the conventions allow, else by a fit that says how well.
+
+    to, format: opencv, ros, colmap, mrcal, kalibr, metashape, aicon, json; the source's is told by
+    its content; pixel_pitch mm, where it does not say it. Raises ConfigurationError naming the
+    file, UsageError for an unknown format.
+
+    >>> print(tc.convert_camera("cold.json", "cold.xml", "metashape").statement)
+    exact: both models give the same pixels
+    """
+    from thermocald.photogrammetry import camera_files
+
+    return camera_files.convert(source_of(source), source_of(out), to, format, pixel_pitch)
+
+
+def compare_cameras(
+    first: Path | str, second: Path | str, *, pixel_pitch: float | None = None
+) -> CameraDifference:
+    """Compare two camera files of any format: parameters, and by how much the image differs.
+
+    pixel_pitch mm, where they do not say it. The result is second minus first, with standard
+    deviations where both have a covariance. Raises ConfigurationError for cameras of other sizes.
+
+    >>> found = tc.compare_cameras("cold.json", "warm.json")
+    >>> found.rms_px > 0, found.has_sd
+    (True, True)
+    """
+    from thermocald.analysis.camera.difference import CameraDifference
+    from thermocald.photogrammetry import camera_files
+
+    a, b = (camera_files.read(source_of(p), pixel_pitch=pixel_pitch) for p in (first, second))
+    names = str(first), str(second)
+    return CameraDifference(names, a.model, b.model, (a.covariance, b.covariance))
+
+
+def predict(
+    model: Model,
+    temperature: float | None = None,
+    *,
+    channels: Mapping[str, float] | None = None,
+    log: Path | str | None = None,
+    log_options: LogRead = None,
+    test: Sequence[Series] = (),
+    programme: Path | str | None = None,
+    camera: Path | str | None = None,
+    distance_m: float = 10.0,
+    wanted_mm: float = 5.0,
+    extrapolate: bool = False,
+    progress: Callable[[int], None] | None = None,
+) -> Prediction:
+    """Predict a camera: at one temperature °C, along a log, of series, or through a programme.
+
+    channels: {name: °C} of other thermometers; log: a logger's file, a recording or a store,
+    log_options: how it is to be read; test: measured series, to hold against the prediction;
+    programme: what is done to the camera, which camera's file (YAML) says how it warms: when it is
+    steady to wanted_mm at distance_m. Raises UsageError unless one of the four is given, and far
+    outside the model's validity unless `extrapolate`.
+
+    >>> tc.predict("camera.yaml", 35.0).document["temperature"]
+    35.0
+    """
+    from thermocald.analysis.thermal import predictions
+    from thermocald.analysis.thermal.model_log import read_model_log
+
+    if sum((temperature is not None, log is not None, bool(test), programme is not None)) != 1:
+        raise UsageError("give one of --temperature, --log, --test, --programme")
+    thermal = _thermal(model)
+    if temperature is not None:
+        state = thermal.at(temperature, channels=channels, extrapolate=extrapolate)
+        return predictions.describe_camera(thermal, state, distance_m)
+    if log is not None:
+        table = read_model_log(thermal, source_of(log), _log_options(log_options))
+        return predictions.predict_along(thermal, table, extrapolate)
+    if test:
+        inputs = [one.observed(progress) for one in test]
+        return predictions.check_prediction(thermal, inputs)
+    assert programme is not None
+    device = None if camera is None else source_of(camera)
+    return predictions.advise_warm_up(thermal, source_of(programme), device, distance_m, wanted_mm)
+
+
+def correct(
+    points: Path | str,
+    model: Model,
+    *,
+    log: Path | str,
+    log_options: LogRead = None,
+    to: float | None = None,
+    temperature_sd: float | None = None,
+    size: tuple[int, int] | None = None,
+    timezone: str | None = None,
+    ambiguous: str = "order",
+    extrapolate: bool = False,
+    say: Callable[[str], None] | None = None,
+) -> Correction:
+    """Correct image points, or images, that were taken at known temperatures.
+
+    points: a CSV with time, x, y (px) or with time, image; `-` is standard input; log: a logger's
+    file, a recording or a store; to °C: by default the model's T0; temperature_sd K, of a reading,
+    by default as the fit found it; size: width and height px where images are binned; timezone,
+    ambiguous: of times without a zone; say: is told of each row that cannot be corrected. Nothing
+    is done before the result is written. Raises DataError for a table that cannot be read.
+
+    >>> tc.correct("points.csv", "camera.yaml", log="M1").write("corrected.csv")
+    >>> len(open("corrected.csv").readlines())
+    3
+    """
+    from thermocald.analysis.thermal.model_log import read_model_log
+    from thermocald.analysis.thermal.timed_rows import first_times
+    from thermocald.output.corrected import Correction
+
+    thermal, path = _thermal(model), source_of(points)
+    clock = device_clock(timezone, ambiguous=ambiguous)
+    header, near = first_times(path, clock)
+    table = read_model_log(thermal, source_of(log), _log_options(log_options), near)
+    if size is not None:
+        thermal = thermal.for_images(*size)
+    if temperature_sd is None:
+        temperature_sd = thermal.thermometer_sd or _USUAL_THERMOMETER_SD
+    return Correction(
+        path, "image" in header, thermal, table, clock, to, temperature_sd, extrapolate,
+        say or (lambda _: None),
+    )  # fmt: skip
+
+
+def fit_calibrations(
+    calibrations: Mapping[str, float | None],
+    *,
+    log: Path | str | None = None,
+    log_options: LogRead = None,
+    timezone: str | None = None,
+    ambiguous: str = "order",
+    T0: float | None = None,
+    temperature_sd: float = 0.1,
+    say: Callable[[str], None] | None = None,
+) -> ThermalCamera:
+    """Fit a thermal model to photographs that were calibrated at two temperatures or more.
+
+    calibrations: {file: °C}, what `calibrate` wrote as JSON; log: of a thermometer, says the
+    temperatures at the photographs' times; timezone, ambiguous: of these; T0 °C, by default the
+    mean; temperature_sd K, of each temperature; say: receives notes about the log. Raises
+    UsageError where a temperature is missing or cameras differ, DataError for too narrow a range.
+
+    >>> tc.fit_calibrations({"cold.json": 20.0, "warm.json": 45.0}).model.T0
+    32.5
+    """
+    from thermocald.analysis.thermal.calibrations import is_calibration, read_calibration, with_log
+    from thermocald.analysis.thermal.camera_fit import fit_to_calibrations
+    from thermocald.store.logger.temperatures import read_log
+
+    for name in calibrations:
+        if not is_calibration(source_of(name)):
+            raise UsageError(f"{name}: is no calibration; fit series and calibrations apart")
+    given = [read_calibration(source_of(name), T) for name, T in calibrations.items()]
+    channel = "temperature"
+    if log is not None:
+        clock = device_clock(timezone, ambiguous=ambiguous)
+        spans = [c.span(clock) for c in given]
+        near = float(min(s.min() for s in spans)), float(max(s.max() for s in spans))
+        table = read_log(source_of(log), _log_options(log_options), near)
+        channel = next(iter(table.channels))
+        for note in table.notes:
+            (say or (lambda _: None))(note)
+        given = [with_log(c, table, clock) for c in given]
+    return fit_to_calibrations(given, T0, temperature_sd, channel)
+
+
+def survey_testfield(
+    photographs: Sequence[Path | str],
+    *,
+    scale: tuple[str, str, float] | None = None,
+    scale_sd: float = 0.1,
+    distances: Path | str | None = None,
+    field: TestField | Path | str | None = None,
+    camera: Path | str | None = None,
+    hold_camera: bool = False,
+    pixel_pitch: float | None = None,
+    out: Path | str | None = None,
+    camera_out: Path | str | None = None,
+    say: Callable[[str], None] | None = None,
+) -> Survey:
+    """Measure a test field from photographs of it: coordinates and their standard deviations.
+
+    photographs: files, or folders of them, of one camera; scale: two targets and their distance mm,
+    scale_sd mm; distances: more of them, a CSV (a, b, length, sigma in mm); field: as it was
+    printed, for plain circles; camera: a file of any format, hold_camera: trust it; pixel_pitch mm,
+    by default the camera file's, else 0.001; out, camera_out: the testfield.csv and the camera
+    (JSON) to write; say: is told what is done. Raises UsageError where the scale is missing,
+    GeometryError where photographs do not carry it. Source: bundle adjustment, Luhmann et al. 2019,
+    chapter 4.4.
+
+    >>> tc.survey_testfield(["photos"], field="M1/testfield.csv")
+    Traceback (most recent call last):
+    thermocald.errors.UsageError: the scale is missing: --scale A B MM, or --distances FILE
+    """
+    from thermocald.analysis.camera.photographs import images_of
+    from thermocald.api import read_testfield
+    from thermocald.photogrammetry import camera_files
+    from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
+    from thermocald.photogrammetry.network.bundle import Distance
+    from thermocald.photogrammetry.survey import picture_of, survey
+    from thermocald.store.recording.board_file import read_distances
+    from thermocald.store.recording.testfield_file import write_testfield
+
+    measured = [] if scale is None else [Distance(*scale, scale_sd)]
+    if distances is not None:
+        measured += read_distances(source_of(distances))
+    if not measured:
+        raise UsageError("the scale is missing: --scale A B MM, or --distances FILE")
+    for d in measured:
+        if not (d.length > 0 and d.sigma > 0) or d.a == d.b:
+            raise UsageError(f"{d.a} to {d.b}, {d.length:g} ± {d.sigma:g} mm, is not a distance")
+    if hold_camera and camera is None:
+        raise UsageError("--hold-camera needs --camera")
+    pictures = [picture_of(path) for path in images_of([source_of(p) for p in photographs])]
+    tell = say or (lambda _: None)
+    known = None
+    if camera is not None:
+        known = camera_files.read(source_of(camera), pixel_pitch=pixel_pitch).model
+        pixel_pitch = known.sensor.pixel_pitch
+    if pixel_pitch is None:
+        pixel_pitch = 0.001
+        tell("pixel pitch not given: 0.001 mm assumed, the camera's mm are only as good")
+    found = survey(
+        pictures,
+        measured,
+        pixel_pitch,
+        nominal=None if field is None else read_testfield(field),
+        interior=None if known is None else known.interior,
+        free=() if hold_camera else IOP_NAMES,
+        progress=tell,
+    )
+    if out is not None:
+        write_testfield(source_of(out), found.field)
+    if camera_out is not None:
+        n, name = found.network, "the survey" if out is None else f"the survey of {Path(out).name}"
+        comment = f"self-calibration in {name}, sigma0 {n.sigma0:.2f}"
+        target = source_of(camera_out)
+        camera_files.write(n.camera, target, "json", n.interior_covariance, comment)
+    return found
+
+
+def check_testfield(
+    field: TestField | Path | str,
+    *,
+    camera: Camera | Path | str | None = None,
+    pixel_pitch: float | None = None,
+    place: Point | None = None,
+    look_at: Point | None = None,
+    roll: float = 0.0,
+    sigma_px: float = 0.03,
+) -> FieldAssessment:
+    """Assess a test field: what a camera sees of it, how well it would be calibrated, what to add.
+
+    camera: a file of any format, by default a Raspberry Pi camera v2.1; pixel_pitch mm, where that
+    does not say it; place X, Y, Z mm where it stands, by default where the field just fills its
+    image; look_at X, Y, Z mm, by default the field's middle; roll degrees; sigma_px of an image
+    coordinate. Raises ConfigurationError for a camera file that cannot be read.
+
+    >>> tc.check_testfield("M1/testfield.csv").as_dict()["calibrates"]
+    True
+    """
+    from thermocald.analysis.camera.camera import Camera
+    from thermocald.analysis.field.advice import assess_field
+    from thermocald.api import read_testfield
+    from thermocald.photogrammetry import camera_files
+    from thermocald.photogrammetry.camera.camera_model import RASPBERRY_PI_V2
+
+    if camera is None:
+        model = RASPBERRY_PI_V2
+    elif isinstance(camera, Camera):
+        model = camera.model
+    else:
+        model = camera_files.read(source_of(camera), pixel_pitch=pixel_pitch).model
+    return assess_field(read_testfield(field), model, place, look_at, roll, sigma_px)
+
+
+def _thermal(model: Model) -> ThermalCamera:
+    return model if isinstance(model, ThermalCamera) else load_camera(model)
+
+
+def _log_options(given: LogRead) -> LogOptions:
+    return given if isinstance(given, LogOptions) else log_options(**(given or {}))

@@ -26,7 +26,7 @@ effects:
   - effect: thermal_lag
     parameters: {tau: {value: 75.0, sd: 2.0, unit: s}}
 """
-_PROGRAMME = """format: thermocald-programme/1
+PROGRAMME = """format: thermocald-programme/1
 name: warm-up
 epochs: 90
 interval: 20.0
@@ -104,7 +104,7 @@ def _rounded(value: Any) -> Any:
 def write_inputs(folder: Path) -> None:
     """Small files that commands read."""
     (folder / "lag.yaml").write_text(_LAG)
-    (folder / "programme.yaml").write_text(_PROGRAMME)
+    (folder / "programme.yaml").write_text(PROGRAMME)
     camera = {
         "format": "thermocald-camera/1",
         "name": "pi",

@@ -44,6 +44,7 @@ SECTIONS: dict[str, Callable[[int, np.random.Generator], list[Row]]] = {
     "online": audit_camera.online,
     "significance": audit_study.significance,
     "thermal": audit_thermal.thermal,
+    "distortion": audit_thermal.distortion,
     "thermometer": audit_thermal.thermometer,
     "outside": audit_thermal.outside,
     "discovery": audit_thermal.discovery,

@@ -15,6 +15,7 @@ from pyarrow import parquet
 from benchmarks.adjustment import EXTERIOR, INTERIOR, SENSOR, SIGMA_PX
 from benchmarks.adjustment import corner_field as whole_field
 from thermocald.photogrammetry.camera.camera_model import project
+from thermocald.physics.distortion import follow_angle
 from thermocald.store.recording.head import CameraSpec, Channel, Head
 from thermocald.store.recording.reader import RecordingWriter
 
@@ -112,6 +113,7 @@ def _points(field: TestField, T: Array, rng: np.random.Generator) -> Array:
     values = np.tile(INTERIOR.as_array(), (len(T), 1))
     for column, rate in RATES.items():
         values[:, column] += rate * (T - 15.0)
+    values = follow_angle(values, INTERIOR.c)
     seen = project(SENSOR, values, np.tile(EXTERIOR.as_array(), (len(T), 1)), field.points)
     out: Array = seen + rng.normal(0, SIGMA_PX, seen.shape)
     return out

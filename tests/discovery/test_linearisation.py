@@ -11,6 +11,7 @@ from benchmarks.long_recording import INTERVAL_S, RATES, field_of, write_long_re
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.series.normals import ObservationGrid
+from thermocald.physics.distortion import follow_angle
 from thermocald.thermal.reduce import reduce_series
 from thermocald.thermal.series import SeriesInput
 
@@ -25,6 +26,7 @@ def series_of(epochs):
     values = np.tile(INTERIOR.as_array(), (epochs, 1))
     for column, rate in RATES.items():
         values[:, column] += rate * (T - 15.0)
+    values = follow_angle(values, INTERIOR.c)
     points = project(SENSOR, values, np.tile(EXTERIOR.as_array(), (epochs, 1)), field.points)
     weights = np.zeros((*points.shape[:2], 3))
     weights[..., :2] = 1e4

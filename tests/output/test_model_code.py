@@ -24,7 +24,7 @@ INTERIOR = InteriorOrientation(3.04, 0.012, -0.018, A1=-4e-3, A2=5e-4, A3=-2e-5,
 RATES = {"c": 2e-4, "x0": -4e-4, "y0": 2e-4}
 
 
-def thermal_camera(affine=False):
+def thermal_camera(affine=False, distortion="angle"):
     from dataclasses import replace
 
     interior = replace(INTERIOR, C1=1e-3, C2=-5e-4) if affine else INTERIOR
@@ -35,7 +35,7 @@ def thermal_camera(affine=False):
     return ThermalCamera(
         ThermalModel(
             camera="rpi */ x", sensor=SENSOR, T0=35.0, interior=interior, rates=RATES,
-            effects=effects, validity={"housing": (20.0, 55.0)},
+            effects=effects, distortion=distortion, validity={"housing": (20.0, 55.0)},
         )
     )  # fmt: skip
 
@@ -56,12 +56,13 @@ def truth(camera, T, X):
     return model.project(ExteriorOrientation.from_array(np.zeros(6)), X * np.array([1.0, -1, -1]))
 
 
+KINDS = [(False, "angle"), (True, "angle"), (False, "image")]
 TEMPERATURES = (20.0, 31.7, 35.0, 55.0)
 
 
-@pytest.mark.parametrize("affine", [False, True])
-def test_the_python_module_is_the_model(tmp_path, affine):
-    camera = thermal_camera(affine)
+@pytest.mark.parametrize(("affine", "distortion"), KINDS)
+def test_the_python_module_is_the_model(tmp_path, affine, distortion):
+    camera = thermal_camera(affine, distortion)
     (tmp_path / "m.py").write_text(python_module(camera, "m"))
     module = runpy.run_path(str(tmp_path / "m.py"))
     X = points()

@@ -33,6 +33,7 @@ def history(epochs=400, step=5.0, fine=0.25, T=None, board=None):
 
 
 def model(*listed, rates=None):
+    """A camera whose parameters are the sum of their courses: the distortion does not follow c."""
     return ThermalModel(
         camera="test",
         sensor=Sensor(3280, 2464, 0.00112),
@@ -40,6 +41,7 @@ def model(*listed, rates=None):
         interior=InteriorOrientation(c=3.0, A1=-0.004),
         rates=rates if rates is not None else {"c": 2e-4, "x0": -4e-4, "y0": 3e-4},
         effects=listed,
+        distortion="image",
     )
 
 

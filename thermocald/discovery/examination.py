@@ -22,6 +22,7 @@ from thermocald.discovery.validation import (
     is_confirmed,
     measure_block_gains,
 )
+from thermocald.thermal.basis import choose_distortion
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.movement import (
     WAVES,
@@ -107,6 +108,10 @@ def examine_series(
         field.append((*boards, *wandering))
         displaced.append(tuple(groups))
         cleaned.append(without)
+    # asked for where nothing of the field moves
+    distortion, _ = choose_distortion(cleaned)
+    cleaned = [e.in_basis(distortion) for e in cleaned]
+    series = [e.in_basis(distortion) for e in series]
     say("measuring noise")
     growth = noise_growth(cleaned)
     if growth is not None:

@@ -61,12 +61,13 @@ def estimate_level(fitter: HypothesisFitter, fit: Fit) -> tuple[Array, Array]:
     normal = T.T @ np.block([[A, coupling[:_P].T], [coupling[:_P], own]]) @ T
     empty = np.diag(normal) <= 0
     normal[empty, empty] = 1e12  # a coefficient of another series
-    variance = np.diag(scaled_inverse(normal))[:_P] + _add_field_errors(fitter.series[0])
-    return level, np.sqrt(variance)
+    along = fitter.series[0].along[:_P, :_P]
+    Q = scaled_inverse(normal)[:_P, :_P] + _field_errors(fitter.series[0])
+    return along @ level, np.sqrt(np.einsum("ij,jk,ik->i", along, Q, along))
 
 
-def _add_field_errors(series: ReducedSeries) -> Array:
-    """Return variances (16,) that the errors of the targets' coordinates give the level."""
+def _field_errors(series: ReducedSeries) -> Array:
+    """Return the covariance (16, 16) that the errors of the targets' coordinates give the level."""
     weights = series.weights[..., :2].sum(axis=0)
     A = series.columns[..., :_P]
     WA = A * weights[..., None]
@@ -74,7 +75,7 @@ def _add_field_errors(series: ReducedSeries) -> Array:
     moved = inverse_of_determined(np.einsum("tci,tcj->ij", WA, A)) @ (
         lever * series.source.field.sigmas.ravel()
     )
-    return np.asarray(np.einsum("ij,ij->i", moved, moved))
+    return np.asarray(moved @ moved.T)
 
 
 def build_model(discovery: Discovery, old: ThermalModel | None = None) -> ThermalModel:
@@ -104,6 +105,7 @@ def build_model(discovery: Discovery, old: ThermalModel | None = None) -> Therma
         interior=InteriorOrientation.from_array(values[:10]),
         rates=rates,
         effects=tuple(effects),
+        distortion=e.distortion,
         exterior=ExteriorOrientation.from_array(values[10:]),
         image_sigma=float(1.0 / np.sqrt(np.mean(weights[weights > 0]))),
         sds={

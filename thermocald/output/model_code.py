@@ -56,7 +56,7 @@ static inline void {id}_interior(double T, double p[10])
         if (T > knee[k][0])
             for (i = 0; i < 10; i++)
                 p[i] += (T - knee[k][0]) * knee[k][i + 1];
-}}
+{follow_c}}}
 
 static inline void {id}_opencv(double T, double K[9], double dist[5])
 {{
@@ -122,7 +122,7 @@ def interior(T):
     for knee, *rate in KNEES:
         if T > knee:
             p = [v + (T - knee) * r for v, r in zip(p, rate)]
-    return p
+{follow_python}    return p
 
 
 def opencv(T):
@@ -148,6 +148,21 @@ def project(T, X, Y, Z):
     dy = y * radial + B2 * (r2 + 2 * y * y) + 2 * B1 * x * y
     return (WIDTH - 1) / 2 + (x0 + x + dx) / PITCH, (HEIGHT - 1) / 2 - (y0 + y + dy) / PITCH
 '''
+
+_FOLLOW_C = """\
+    /* the lens keeps its rays' angles: distortion follows c */
+    double s = {c0} / p[0];
+    p[3] *= s * s;
+    p[4] *= s * s * s * s;
+    p[5] *= s * s * s * s * s * s;
+    p[6] *= s;
+    p[7] *= s;
+"""
+
+_FOLLOW_PYTHON = """\
+    s = {c0} / p[0]  # the lens keeps its rays' angles: distortion follows c
+    p[3:8] = p[3] * s**2, p[4] * s**4, p[5] * s**6, p[6] * s, p[7] * s
+"""
 
 
 def c_header(camera: ThermalCamera, name: str) -> str:
@@ -182,6 +197,8 @@ def _fields(camera: ThermalCamera, name: str) -> dict[str, object]:
     identifier = identifier if identifier[:1].isalpha() else f"camera_{identifier}"
     reference, limits = next(iter(model.validity.items()), ("the thermometer", (-273.0, 1000.0)))
     affine = any(any(row[8:]) for row in p) or any(any(k[9:]) for k in camera.steady_knees())
+    follow = model.distortion == "angle"
+    c0 = repr(float(model.interior.c))
     exact = "C1 or C2 are not zero: OpenCV's parameters are then not exact, the projection is."
     return {
         "name": _plain(model.name or model.camera),
@@ -198,6 +215,8 @@ def _fields(camera: ThermalCamera, name: str) -> dict[str, object]:
         "p1": _row(p[1]),
         "p2": _row(p[2]),
         "n": len(camera.steady_knees()),
+        "follow_c": _FOLLOW_C.format(c0=c0) if follow else "",
+        "follow_python": _FOLLOW_PYTHON.format(c0=c0) if follow else "",
         "exact": exact if affine else "OpenCV's parameters are exact.",
     }
 

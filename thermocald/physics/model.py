@@ -23,6 +23,7 @@ from thermocald.photogrammetry.camera.camera_model import (
 )
 from thermocald.physics import catalogue
 from thermocald.physics.catalogue import drive
+from thermocald.physics.distortion import angle_derivatives, follow_angle
 from thermocald.physics.effect import Displacement, Influence
 
 if TYPE_CHECKING:
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
+    from thermocald.physics.distortion import Distortion
     from thermocald.physics.history import History
 
 _LEFT_OVER = 1.5  # times the noise: what an untested model may leave and state a band
@@ -93,6 +95,7 @@ class ThermalModel:
     deviations of `interior.c`, `rates.c`, … (those of effects stand with them); covariance_names,
     covariance: the full matrix where the model was fitted (`interior.c`, `thermal_lag.tau`, …), or
     () and None;
+    distortion: what it follows while c changes, the `angle` or the place in the `image`;
     image_sigma: px, of one coordinate of an image point; exterior: of the set-up, or None;
     validity: {channel: (low, high)} °C that it was fitted on; fitted_on: what it was fitted on,
     free mappings; evidence: free text and numbers, e.g. of a discovery.
@@ -105,6 +108,7 @@ class ThermalModel:
     rates: Mapping[str, float] = field(default_factory=dict)
     effects: tuple[ModelEffect, ...] = ()
     exterior: ExteriorOrientation | None = None
+    distortion: Distortion = "angle"
     image_sigma: float = 0.04
     sds: Mapping[str, float] = field(default_factory=dict)
     covariance_names: tuple[str, ...] = ()
@@ -153,11 +157,26 @@ class ThermalModel:
         for effect in self.effects:
             total = total + catalogue.get(effect.name).influence(history, effect.values, test_field)
         drive = self.drive(history)
-        iop = self.interior.as_array() + (drive - self.T0)[:, None] * self.rate_vector + total.iop
+        linear = self.interior.as_array() + (drive - self.T0)[:, None] * self.rate_vector
+        iop = self.carried(linear + total.iop)
         eop = total.eop + (self.exterior.as_array() if self.exterior else 0.0)
         return Prediction(
             iop, eop, drive, total.scale, total.displacements, total.noise_factor, total.blur_factor
         )
+
+    def carried(self, linear: Array) -> Array:
+        """Return the interior orientations (…, 10) of those that rates and effects add up to."""
+        return follow_angle(linear, self.interior.c) if self.distortion == "angle" else linear
+
+    def carried_derivatives(self, linear: Array, J: Array, names: Sequence[str] = ()) -> Array:
+        """Return ∂ interior orientation / ∂ unknowns (…, 10, p) of those of the linear ones.
+
+        names: of the unknowns, where `interior.c` may be among them.
+        """
+        if self.distortion == "image":
+            return J
+        place = list(names).index("interior.c") if "interior.c" in names else None
+        return angle_derivatives(linear, self.interior.c, J, place)
 
     def with_effect(self, effect: ModelEffect, **changes: Any) -> ThermalModel:
         """Return the next version of the model, with one effect more."""

@@ -7,6 +7,7 @@ camera: {name: rpi-v2.1, width: 3280, height: 2464, pixel_pitch: 0.00112}     # 
 reference_temperature: {value: 25.0, unit: degC}                              # T₀
 interior:                                    # at T₀
 c: {value: 3.04, sd: 0.0002, unit: mm}
+distortion: angle                            # or image: what A and B follow while c changes
 rates:                                       # the base model
 x0: {value: -0.0004, sd: 2.0e-06, unit: mm/K}
 effects:                                     # names and parameters of the catalogue
@@ -52,12 +53,15 @@ from thermocald.photogrammetry.camera.camera_model import (
     Sensor,
 )
 from thermocald.physics import catalogue
+from thermocald.physics.distortion import BASES
 from thermocald.physics.effect import PARAMETER_UNITS
 from thermocald.physics.model import RATED, ModelEffect, ThermalModel
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
+
+    from thermocald.physics.distortion import Distortion
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,8 +259,9 @@ def effect_document(effect: ModelEffect) -> dict[str, Any]:
 
 MODEL_FORMAT = "thermocald-model/1"
 _KEYS = (
-    "format", "name", "version", "camera", "reference_temperature", "interior", "rates", "effects",
-    "exterior", "image_sigma", "validity", "fitted_on", "evidence", "covariance",
+    "format", "name", "version", "camera", "reference_temperature", "interior", "distortion",
+    "rates", "effects", "exterior", "image_sigma", "validity", "fitted_on", "evidence",
+    "covariance",
 )  # fmt: skip
 
 
@@ -307,6 +312,7 @@ def parse_model(document: Mapping[str, Any], path: Path | str = "model") -> Ther
         rates=rates,
         effects=tuple(effect_of(reader) for reader in top.items("effects")),
         exterior=_read_exterior(top, exterior),
+        distortion=_read_distortion(top),
         image_sigma=top.number("image_sigma", "px", 0.04, above=0.0),
         sds=sds,
         covariance_names=names,
@@ -317,6 +323,14 @@ def parse_model(document: Mapping[str, Any], path: Path | str = "model") -> Ther
         name=top.text("name", ""),
         version=top.whole("version", "1") if "version" in document else 1,
     )
+
+
+def _read_distortion(top: QuantityReader) -> Distortion:
+    found = top.text("distortion", BASES[0])
+    for basis in BASES:
+        if found == basis:
+            return basis
+    raise top.fail("distortion", f"is {found[:40]!r}; it follows the {' or the '.join(BASES)}")
 
 
 def read_sensor(camera: QuantityReader) -> Sensor:
@@ -392,6 +406,7 @@ def model_document(model: ThermalModel) -> dict[str, Any]:
         },
         "reference_temperature": write_quantity(model.T0, "degC"),
         "interior": numbers("interior", asdict(model.interior)),
+        "distortion": model.distortion,
         "rates": numbers("rates", {n: model.rates[n] for n in RATED if n in model.rates}, "/K"),
         "effects": [effect_document(effect) for effect in model.effects],
     }

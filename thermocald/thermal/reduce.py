@@ -13,8 +13,8 @@ All is done in parts of the series, so that a long one needs no more memory than
 Where a series is linearised: one camera for its mean image, and what the partials leave.
 
 The normal equations of a series hold partial derivatives at one point. An error of that point is
-one of the rates: the point is as sharp as the mean image is. The image does not follow the
-principal distance in straight lines: over the range of a year that is a hundred-thousandth.
+one of the rates: the point is as sharp as the mean image is. Where the distortion follows the
+angle, the image follows the principal distance in straight lines.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.errors import DataError
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, project
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, adjust, cold_start
 from thermocald.photogrammetry.epoch.geometry import GeometryBounds
 from thermocald.photogrammetry.field.planes import plane_fit
@@ -41,7 +41,7 @@ from thermocald.photogrammetry.series.normals import (
 from thermocald.physics.history import History
 from thermocald.thermal import criteria
 from thermocald.thermal.random_effects import group_hidden_targets
-from thermocald.thermal.series import ReducedSeries, SeriesInput, solve
+from thermocald.thermal.series import ReducedSeries, SeriesInput, scaled_basis, solve
 from thermocald.thermal.thermometer import Thermometer, thermometers
 
 if TYPE_CHECKING:
@@ -51,6 +51,7 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array, Mask
     from thermocald.photogrammetry.series.normals import ObservationGrid, Partials
+    from thermocald.physics.distortion import Distortion
 
 
 def no_temperature(source: SeriesInput, reference: str) -> str:
@@ -251,28 +252,6 @@ def linearise_series(source: SeriesInput, affinity: bool) -> Partials:
     return linearise(source.sensor, source.field, found.values[:10], found.values[10:])
 
 
-def curvature(source: SeriesInput, at: Partials, weights: Array, misclosure: Array) -> Array:
-    """Return what the partials leave of the image's movement with the principal distance (E, T, 2)
-    px.
-
-    A tenth of a per mille of the movement, which the rates of a year would hold. The principal
-    distance is that of the image's scale and shift; the principal point moves the image in straight
-    lines, and what a mount does is small against either.
-    """
-    A = at.A[:, :, :3]
-    N = normal_matrices(weights, A)
-    change = solve(N, right_hand_sides(weights, misclosure, A))[:, 0]
-    low, high = at.iop.copy(), at.iop.copy()
-    step = 1e-3 * float(at.iop[0])
-    low[0], high[0] = at.iop[0] - step, at.iop[0] + step
-    ends = project(source.sensor, np.stack([low, high]), at.eop, source.field.points)
-    second = np.nan_to_num((ends.sum(axis=0) - 2.0 * at.predicted) / step**2)
-    # a gross error that is not known yet is not the camera's
-    change = np.where(np.abs(change) < 0.02 * at.iop[0], change, 0.0)
-    out: Array = 0.5 * np.square(change)[:, None, None] * second
-    return out
-
-
 def reduce_series(
     source: SeriesInput,
     T0: float | None = None,
@@ -346,18 +325,18 @@ def _reduce(
     instruments: Mapping[str, Thermometer],
     at: Partials,
     scale: Array | None,
+    distortion: Distortion = "angle",
 ) -> ReducedSeries:
     X = source.field.points
     A = np.concatenate([at.A, at.B * X[:, None, :]], axis=-1)
     used = source.grid.observed.any(axis=0)
     if scale is None:
         scale = np.sqrt(np.mean(np.sum(A[used] ** 2, axis=1), axis=0))
-    A = A / scale
+    A = (A / scale) @ scaled_basis(at.iop, scale, distortion)
     misclosure = source.grid.points - at.predicted
     weights = source.grid.weights
     seen = source.grid.observed
     bad = find_spikes(misclosure, seen)
-    misclosure -= curvature(source, at, source.grid.reject(bad).weights, misclosure)
     offsets = np.zeros((len(X), 2))
     for turn in range(5):
         w = source.grid.reject(bad).weights
@@ -401,6 +380,7 @@ def _reduce(
         correlation=_measure_slowness(v),
         gross=int(bad.sum()),
         hidden=group_hidden_targets(w / variance, misclosure - offsets, A),
+        distortion=distortion,
     )
 
 
@@ -505,4 +485,5 @@ def with_points(evidence: ReducedSeries, grid: ObservationGrid) -> ReducedSeries
         evidence.thermometers,
         evidence.at,
         evidence.scale,
+        evidence.distortion,
     )

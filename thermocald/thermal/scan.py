@@ -331,7 +331,7 @@ def _compute_bend(fitter: HypothesisFitter, fit: Fit, series: int, beyond: Array
     step = moved + level
     parameters = step / e.scale
     points = e.source.field.points * (1.0 + parameters[:, None, 16:])
-    seen = project(e.source.sensor, e.at.iop + parameters[:, :10],
+    seen = project(e.source.sensor, e.orientations(parameters),
                    e.at.eop + parameters[:, 10:16], points)  # fmt: skip
     straight = e.at.predicted + np.einsum("tik,ek->eti", e.columns, step)
     there = e.weights[..., :1] > 0

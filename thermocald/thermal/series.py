@@ -21,6 +21,7 @@ import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.linalg import best_level, explained, unit_diagonal
+from thermocald.physics.distortion import distortion_along, follow_angle
 from thermocald.physics.history import History
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.series.normals import ObservationGrid, Partials
+    from thermocald.physics.distortion import Distortion
     from thermocald.thermal.random_effects import HiddenTargets, Movement
     from thermocald.thermal.thermometer import Thermometer
 
@@ -121,7 +123,8 @@ class ReducedSeries:
 
     source: what was recorded; times (E,) s from its start; history: smoothed readings;
     thermometers: the columns as instruments; at: linearisation; scale (19,): px per unit of each
-    column; columns (T, 2, 19): ∂ image points / ∂ scaled columns.
+    column; columns (T, 2, 19): ∂ image points / ∂ scaled columns; distortion: what it follows in
+    the column of c, which takes A and B along (`angle`) or leaves them.
 
     N (E, 19, 19), b (E, 19): normal equations in px-scaled columns, weighted by the noise found; yy
     (E,): bᵀN⁻¹b; values (E, 19): the free camera of each epoch, scaled; residuals (E, T, 2) px:
@@ -161,6 +164,7 @@ class ReducedSeries:
     movement: Movement | None = None
     tremble: Array | None = None
     bend: Array | None = None
+    distortion: Distortion = "angle"
 
     @property
     def readings_history(self) -> History:
@@ -185,6 +189,32 @@ class ReducedSeries:
             values=self.values / f,
             hidden=replace(self.hidden, vectors=self.hidden.vectors * f) if self.hidden else None,
         )
+
+    @property
+    def along(self) -> Array:
+        """∂ camera and field scales / ∂ columns (19, 19), both scaled."""
+        return scaled_basis(self.at.iop, self.scale, self.distortion)
+
+    def in_basis(self, distortion: Distortion) -> ReducedSeries:
+        """Let the distortion follow the angle, or the image."""
+        if distortion == self.distortion:
+            return self
+        new = scaled_basis(self.at.iop, self.scale, distortion)
+        M = np.linalg.solve(self.along, new)
+        return replace(
+            self,
+            distortion=distortion,
+            columns=self.columns @ M,
+            N=M.T @ self.N @ M,
+            b=self.b @ M,
+            values=self.values @ np.linalg.inv(M).T,
+            hidden=replace(self.hidden, vectors=self.hidden.vectors @ M) if self.hidden else None,
+        )
+
+    def orientations(self, parameters: Array) -> Array:
+        """Return the interior orientations (E, 10) of movements (E, 19) in the columns' units."""
+        linear = self.at.iop + parameters[:, :10]
+        return follow_angle(linear, self.at.iop[0]) if self.distortion == "angle" else linear
 
     def weighted(self, factor: Array | float) -> ReducedSeries:
         """Multiply the weight of each epoch by a factor (E,), or of all by one.
@@ -263,6 +293,14 @@ class ReducedSeries:
     def dof(self) -> float:
         """Image coordinates that the free cameras do not use up."""
         return float(np.sum(2 * self.n - self.N.shape[1]))
+
+
+def scaled_basis(iop: Array, scale: Array, distortion: Distortion) -> Array:
+    """Return ∂ camera and field scales / ∂ columns (19, 19), both px-scaled, at an orientation."""
+    out = np.eye(len(scale))
+    if distortion == "angle":
+        out[:10, :10] = distortion_along(iop)
+    return out * scale[:, None] / scale
 
 
 def unit_directions(names: Sequence[str]) -> Array:

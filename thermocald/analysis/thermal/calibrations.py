@@ -3,7 +3,8 @@
 Each calibration gives an interior orientation with its covariance; together they give the interior
 orientation at T₀ and the rates of c, x0, y0 by generalised least squares (Koch, Parameter
 Estimation and Hypothesis Testing in Linear Models, 3.2). What the model does not move (distortion,
-affinity) is one value, and the test of the sum of squares says whether that holds.
+affinity) is one value, or follows the
+angle, and the test of the sum of squares says whether that holds.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     Sensor,
 )
+from thermocald.physics.distortion import BASES, choose_basis, distortion_along
 from thermocald.physics.model import RATED, ThermalModel
 from thermocald.store.recording.readings import interpolate_readings
 
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from thermocald.arrays import Array, Index
+    from thermocald.physics.distortion import Distortion
     from thermocald.store.logger.clock import DeviceClock
     from thermocald.store.logger.temperatures import TemperatureLog
 
@@ -149,19 +152,19 @@ def fit_calibrations(
         )
     at = round(float(T.mean()), 1) if T0 is None else T0
     rated = [i for i, k in enumerate(free) if IOP_NAMES[k] in RATED]
-    A = np.vstack([_design(len(free), rated, t - at) for t in T])
     y = np.concatenate([c.camera.interior.as_array()[free] for c in calibrations])
     blocks = [c.covariance[np.ix_(free, free)] for c in calibrations]
-    rates = np.zeros(len(free))
-    for _ in range(2):  # what the temperature's sd does is known with the rates
-        moved = temperature_sd**2 * np.outer(rates, rates)
-        weight = np.linalg.inv(block_diag(*(block + moved for block in blocks)))
-        covariance = np.linalg.inv(A.T @ weight @ A)
-        covariance = 0.5 * (covariance + covariance.T)
-        x = covariance @ A.T @ weight @ y
-        rates[rated] = x[len(free) :]
-    left = y - A @ x
-    square, redundancy = float(left @ weight @ left), len(y) - len(x)
+    mean = np.zeros(10)
+    mean[free] = y.reshape(len(T), -1).mean(axis=0)
+    found_in: dict[Distortion, tuple[Array, Array, float]] = {}
+    for basis in BASES:
+        M = np.eye(10) if basis == "image" else distortion_along(mean)
+        M = M[np.ix_(free, free)]
+        A = np.vstack([_design(M, rated, t - at) for t in T])
+        found_in[basis] = _adjusted(A, y, blocks, M[:, rated], temperature_sd)
+    distortion, sure = choose_basis({basis: s for basis, (_, _, s) in found_in.items()})
+    x, covariance, square = found_in[distortion]
+    redundancy = len(y) - len(x)
     missing = bool(redundancy and square > chi2.ppf(1 - _LEVEL, redundancy))
     sigma0 = float(np.sqrt(square / redundancy)) if redundancy else 1.0
     if missing:
@@ -178,6 +181,7 @@ def fit_calibrations(
         at,
         InteriorOrientation.from_array(values),
         {name: found.get(f"rates.{name}", 0.0) for name in RATED},
+        distortion=distortion,
         sds=sds,
         covariance_names=tuple(names),
         covariance=tuple(tuple(row) for row in covariance.tolist()),
@@ -192,7 +196,7 @@ def fit_calibrations(
     ]  # fmt: skip
     evidence = {"fit": {
         "effect_missing": missing, "misfit_px": round(max(rms), 5),
-        "significance_sigmas": round(sigma0, 1),
+        "significance_sigmas": round(sigma0, 1), "distortion_sigmas": round(sure, 1),
     }}  # fmt: skip
     model = replace(model, fitted_on=tuple(told), evidence=evidence)
     return CalibrationsFit(model, tuple(calibrations), sigma0, missing, rms)
@@ -221,18 +225,31 @@ def _require_alike(first: Calibration, other: Calibration, free: Index) -> None:
         )
 
 
-def _design(size: int, rated: list[int], dT: float) -> Array:
-    """∂ parameters of one calibration / ∂ (interior at T₀, rates)."""
-    A = np.zeros((size, size + len(rated)))
-    A[:, :size] = np.eye(size)
-    for column, row in enumerate(rated):
-        A[row, size + column] = dT
-    return A
+def _design(moved: Array, rated: list[int], dT: float) -> Array:
+    """∂ parameters of one calibration / ∂ (interior, rates); moved: what a rate takes along."""
+    return np.hstack([np.eye(len(moved)), dT * moved[:, rated]])
+
+
+def _adjusted(
+    A: Array, y: Array, blocks: list[Array], by_rate: Array, temperature_sd: float
+) -> tuple[Array, Array, float]:
+    """The unknowns, their covariance, and the weighted sum of squares that is left."""
+    slope = np.zeros(len(by_rate))
+    for _ in range(2):  # what the temperature's sd does is known with the rates
+        moved = temperature_sd**2 * np.outer(slope, slope)
+        weight = np.linalg.inv(block_diag(*(block + moved for block in blocks)))
+        covariance = np.asarray(np.linalg.inv(A.T @ weight @ A), dtype=float)
+        covariance = 0.5 * (covariance + covariance.T)
+        x = covariance @ A.T @ weight @ y
+        slope = by_rate @ x[len(by_rate) :]
+    left = y - A @ x
+    return x, covariance, float(left @ weight @ left)
 
 
 def _rms(model: ThermalModel, calibration: Calibration, temperature: float) -> float:
     """By how much the image of a calibration and of the model differ, px."""
     values = model.interior.as_array() + (temperature - model.T0) * model.rate_vector
+    values = model.carried(values)
     camera = CameraModel(model.sensor, InteriorOrientation.from_array(values))
     difference = CameraDifference(("model", calibration.name), camera, calibration.camera)
     return difference.rms_px

@@ -13,6 +13,7 @@ from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.analysis.thermal.type_model import fit_with_type, type_model, weight_of_type
 from thermocald.physics.model_file import model_document
+from thermocald.thermal.basis import choose_distortion
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from thermocald.physics.model import ModelEffect, ThermalModel
     from thermocald.thermal.series import ReducedSeries
 
+_NUMBERS = ("interior", "distortion", "rates", "effects", "validity")
+
 
 def fit_camera(
     series: Sequence[ReducedSeries], listed: Sequence[ModelEffect], T0: float | None
@@ -32,7 +35,10 @@ def fit_camera(
     held = []
     for k, left_out in enumerate(series if len(series) > 1 else ()):
         rest = [s for i, s in enumerate(series) if i != k]
-        model = fit_thermal_model(rest, list(fitted.model.effects), fitted.model.T0, search=False)
+        model = fit_thermal_model(
+            rest, list(fitted.model.effects), fitted.model.T0, search=False,
+            distortion=fitted.model.distortion,
+        )  # fmt: skip
         held.append(predicted_error(model.model, left_out, fitted.series[k].thermometer_sd))
     return ThermalCamera(fitted.model, _document(fitted, held))
 
@@ -52,10 +58,9 @@ def fit_type(
     cameras = list(dict.fromkeys(s.source.camera for s in series))
     if T0 is None:
         T0 = round(float(np.mean([s.history.temperature().mean() for s in series])), 1)
-    models = [
-        fit_thermal_model([s for s in series if s.source.camera == c], listed, T0).model
-        for c in cameras
-    ]
+    own = [[s for s in series if s.source.camera == c] for c in cameras]
+    distortion, _ = choose_distortion(series)
+    models = [fit_thermal_model(s, listed, T0, distortion=distortion).model for s in own]
     found = type_model(models, name)
     document = {
         "format": "thermocald-fit/1",
@@ -90,7 +95,7 @@ def fit_to_calibrations(
 
 def _numbers(model: ThermalModel) -> dict[str, Any]:
     written = model_document(model)
-    return {k: written[k] for k in ("interior", "rates", "effects", "validity")}
+    return {k: written[k] for k in _NUMBERS}
 
 
 def _document(fitted: FittedModel, held: Sequence[PredictedError]) -> dict[str, Any]:
@@ -100,7 +105,7 @@ def _document(fitted: FittedModel, held: Sequence[PredictedError]) -> dict[str, 
         "reference_temperature": fitted.model.T0,
         **_numbers(fitted.model),
         "sigma0": fitted.sigma0,
-        **fitted.missing.as_mapping(),
+        **fitted.model.evidence["fit"],
         "band": not fitted.model.misses_an_effect,
         "series": [asdict(s) | {"left_over_in_noise": s.left_over} for s in fitted.series],
         "prediction_test": [asdict(h) for h in held],

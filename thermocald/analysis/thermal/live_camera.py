@@ -179,8 +179,11 @@ class LiveCamera:
         if history is not None:
             values = values + _influence(self._signals, history)
         self._now = _LiveState(
-            self, row[0], values, beyond, lambda: self._derivatives(D, moved, history)
-        )
+            self, row[0], model.carried(values), beyond,
+            lambda: model.carried_derivatives(
+                values, self._derivatives(D, moved, history), self.thermal.parameters
+            ),
+        )  # fmt: skip
         return self._now
 
     def correct(self, frame: NDArray[Any], to: float | None = None) -> NDArray[Any]:
@@ -253,7 +256,7 @@ class LiveCamera:
     def _derivatives(
         self, D: float, moved: Mapping[str, tuple[float, ...]], history: History | None
     ) -> Array:
-        """∂ IOP / ∂ parameters (10, p), as `along` has them."""
+        """∂ linear IOP / ∂ parameters (10, p), as `along` has them."""
         model = self.thermal.model
         J = np.zeros((10, len(self.thermal.parameters)))
         for i, name in enumerate(self.thermal.parameters):

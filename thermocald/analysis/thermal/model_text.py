@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from thermocald.numbers import with_sd
+from thermocald.physics.distortion import SURE
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -44,6 +45,16 @@ def model_lines(document: Mapping[str, Any]) -> list[str]:
         )
     else:
         lines.append(f"  valid from {low:g} to {high:g} °C, {T0}")
+    sure = document.get("distortion_sigmas")
+    if sure is not None and document["distortion"] == "image":
+        lines.append(
+            f"  the distortion keeps its place in the image, not its angle ({sure:.1f} sd)"
+        )
+    elif sure is not None and sure < SURE:
+        lines.append(
+            "  the distortion is taken to follow the angle while c changes; the data cannot tell "
+            f"it from one that keeps its place in the image ({abs(sure):.1f} sd)"
+        )
     if "type" in document:
         kind = document["type"]
         lines.append(f"  with what {kind['cameras']} cameras of the type {kind['name']} say of it")

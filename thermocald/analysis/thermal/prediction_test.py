@@ -108,6 +108,7 @@ def _as_fitted(model: ThermalModel, series: ReducedSeries) -> ReducedSeries:
             f"{series.source.name}: has no temperature column {reference!r}, which the model was "
             f"fitted on; there are: {', '.join(history.readings)}"
         )
+    series = series.in_basis(model.distortion)
     return replace(series, history=replace(history, T0=model.T0, reference=reference))
 
 

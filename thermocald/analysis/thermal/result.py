@@ -149,6 +149,7 @@ class _Parts:
             rates,
             tuple(self.effect(e, k) for e in self.listed),
             level.exteriors[k] if level else ExteriorOrientation.from_array(s.at.eop),
+            distortion=s.distortion,
             name=s.source.camera,
             version=1,
         )
@@ -163,7 +164,7 @@ class _Parts:
         names = [f"interior.{p}" for p in FREE_INTERIOR]
         rows = [np.zeros(len(Q)) for _ in names]
         for i, c in enumerate(_INTERIOR):
-            rows[i][i] = 1.0 / scale[c]
+            rows[i][:n] = self.series[0].along[c, _INTERIOR] / scale[c]
         for u in self.unknowns:
             names.append(u.name)
             rows.append(np.concatenate([np.zeros(n), u.row, np.zeros(len(Q) - n - size)]))
@@ -204,7 +205,7 @@ class _Parts:
         averaged = float(np.sqrt(np.median(s.source.per_row)))
         reading = self.fitter.series[k].thermometers[s.history.reference].noise * averaged
         # a constant of each target is taken off: of the thermometer's noise nothing else is
-        drift = s.at.A[..., :10] @ model.rate_vector
+        drift = s.columns[..., :10] @ (model.rate_vector * s.scale[:10])
         noise = np.hypot(sigma / averaged, reading / averaged * np.sqrt(np.mean(drift**2)))
         if self.growth is not None:
             noise *= float(np.sqrt(np.mean(self.growth.noise[k] ** 2)))
@@ -225,8 +226,11 @@ def fitted_model(
     listed: Sequence[ModelEffect],
     growth: NoiseGrowth | None,
     moved: Sequence[Moved],
+    distortion_sigmas: float | None = None,
 ) -> FittedModel:
-    """The model of a fit; series: as they came, unblocked; growth, moved: of effects beyond it."""
+    """The model of a fit; series: as they came, unblocked; growth, moved: of effects beyond it;
+    distortion_sigmas: how sure it is what the distortion follows, None where that was given.
+    """
     parts = _Parts(fitter, fit, series, listed, growth, moved)
     starts = [parts.model(k, None) for k in range(len(series))]
     level = estimate_level(series, starts)
@@ -240,6 +244,7 @@ def fitted_model(
     fits = tuple(parts.fit_of(k, level, sigma) for k in range(len(series)))
     gap = replace(gap, left_over=max(f.left_over for f in fits))
     first = parts.model(0, level)
+    told = {} if distortion_sigmas is None else {"distortion_sigmas": round(distortion_sigmas, 1)}
     channels = dict.fromkeys(c for s in series for c in s.source.readings)
     model = replace(
         first,
@@ -254,7 +259,7 @@ def fitted_model(
              "rms_px": round(f.rms_px, 5), "thermometer_sd_K": round(f.thermometer_sd, 5)}
             for s, f in zip(series, fits, strict=True)
         ),
-        evidence={"fit": gap.as_mapping()},
+        evidence={"fit": gap.as_mapping() | told},
     )  # fmt: skip
     sigma0 = sigma * float(np.sqrt(np.median(stated)))
     return FittedModel(model, tuple(names), covariance, sigma0, fits, gap)

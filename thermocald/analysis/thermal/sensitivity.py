@@ -82,7 +82,7 @@ def reading_operators(history: History, model: ThermalModel) -> list[tuple[Array
         S = kind.sensitivity(history, **nonlinear)
         if S.nnz:
             channel = kind.channel(history, **nonlinear)
-            found.append((_weights(effect.name, coefficients), channel, S))
+            found.append((_weights(model, effect.name, coefficients), channel, S))
     return found
 
 
@@ -97,7 +97,7 @@ def unresolved(
         if kind.kind == "image":
             continue
         left = kind.unresolved(history, rate_jump, **nonlinear)
-        weights = _rates(model) if kind.is_drive else _weights(effect.name, coefficients)
+        weights = _rates(model) if kind.is_drive else _weights(model, effect.name, coefficients)
         if np.any(left) and np.any(weights):
             found.append((weights, left))
     return found
@@ -106,11 +106,17 @@ def unresolved(
 def _rates(model: ThermalModel) -> Array:
     weights = np.zeros(len(_COLUMNS))
     weights[: len(IOP_NAMES)] = model.rate_vector
-    return weights
+    return _carried(model, weights)
 
 
-def _weights(name: str, coefficients: Mapping[str, float]) -> Array:
+def _weights(model: ThermalModel, name: str, coefficients: Mapping[str, float]) -> Array:
     weights = np.zeros(len(_COLUMNS))
     for key, value in coefficients.items():
         weights[_COLUMNS.index(catalogue.get(name).column(key))] = value
-    return weights
+    return _carried(model, weights)
+
+
+def _carried(model: ThermalModel, weights: Array) -> Array:
+    """Let the distortion follow what moves c, about T₀."""
+    moved = model.carried_derivatives(model.interior.as_array(), weights[:10, None])[:, 0]
+    return np.concatenate([moved, weights[10:]])

@@ -27,17 +27,18 @@ __all__ = ["SteadyCamera", "steady_camera"]
 class SteadyCamera:
     """p(T) and ∂p/∂(parameters) as polynomials in T - T₀, and from each knee on in T - T_k.
 
-    knees: T_k, slope, ∂slope, ∂/∂T_k of each.
+    knees: T_k, slope, ∂slope, ∂/∂T_k of each. They are linear: `model` carries the distortion.
     """
 
-    T0: float
+    model: ThermalModel
+    names: tuple[str, ...]
     p: tuple[Array, Array, Array]
     J: tuple[Array, Array, Array]
     knees: tuple[tuple[float, Array, Array, Array], ...]
 
     def at(self, T: float) -> tuple[Array, Array, Array]:
         """Values (10,), their slope (10,) per K, and the derivatives (10, p) at T °C."""
-        dT = T - self.T0
+        dT = T - self.model.T0
         p0, p1, p2 = self.p
         J0, J1, J2 = self.J
         values = p0 + dT * (p1 + dT * p2)
@@ -48,7 +49,9 @@ class SteadyCamera:
                 values = values + (T - knee) * rate
                 slope = slope + rate
                 J = J + (T - knee) * by_rate + by_knee
-        return values, slope, J
+        columns = np.column_stack([slope, J])
+        carried = self.model.carried_derivatives(values, columns, ("slope", *self.names))
+        return self.model.carried(values), carried[:, 0], carried[:, 1:]
 
 
 def steady_camera(
@@ -86,7 +89,7 @@ def steady_camera(
                 continue
             for key, row in own:
                 add(f"{effect.name}.{key}", float(effect.values[key]), row, power, factor)
-    return SteadyCamera(model.T0, (p[0], p[1], p[2]), (J[0], J[1], J[2]), tuple(knees))
+    return SteadyCamera(model, names, (p[0], p[1], p[2]), (J[0], J[1], J[2]), tuple(knees))
 
 
 def _knee(

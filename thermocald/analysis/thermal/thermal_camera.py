@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from thermocald.physics.model import ThermalModel
 
 _CHUNK = 20_000  # times in one go
-_TOLD = ("effect_missing", "misfit_px", "significance_sigmas")
+_TOLD = ("effect_missing", "misfit_px", "significance_sigmas", "distortion_sigmas")
 
 
 def seconds(times: ArrayLike) -> Array:
@@ -132,6 +132,7 @@ class ThermalCamera(Result):
             "format": "thermocald-fit/1",
             "camera": self.model.camera,
             "reference_temperature": self.model.T0,
+            "distortion": self.model.distortion,
             **{k: written.get(k) or {} for k in ("interior", "rates", "effects", "validity")},
             **{k: evidence[k] for k in _TOLD if k in evidence},
         }
@@ -299,11 +300,13 @@ class ThermalCamera(Result):
         steady = None if relative_to is None else self._steady.at(relative_to)[2]
         for first in range(0, len(instants), _CHUNK):
             part = history.at(history.times[first : first + _CHUNK])
-            found, matrix = self._propagated(part, outside[first : first + _CHUNK], steady)
+            linear, matrix = self._propagated(part, outside[first : first + _CHUNK], steady)
+            found = self.model.carried(linear)
             if temperature_sd:
-                rates = self.model.rate_vector
+                rates = np.broadcast_to(self.model.rate_vector[:, None], (len(found), 10, 1))
+                slope = self.model.carried_derivatives(linear, rates)
                 share = _noise_share(t - begin, part.times) * temperature_sd**2
-                matrix += share[:, None, None] * np.outer(rates, rates)
+                matrix += share[:, None, None] * slope * np.swapaxes(slope, 1, 2)
             values.append(found)
             covariance.append(matrix)
         return Along(
@@ -318,10 +321,12 @@ class ThermalCamera(Result):
     def _propagated(
         self, history: History, outside: Array, steady: Array | None
     ) -> tuple[Array, Array]:
-        values = self.model.predict(history).iop
+        """Return the linear orientation (E, 10), and the covariance of the carried one."""
+        values = self._linear.predict(history).iop
         J = np.zeros((*values.shape, len(self.parameters)))
         for i, name in enumerate(self.parameters):
             J[:, :, i] = self._derivative(history, name)
+        J = self.model.carried_derivatives(values, J, self.parameters)
         if steady is not None:
             J -= steady
         covariance = np.einsum("epi,ij,eqj->epq", J, self.covariance, J, optimize=True)
@@ -331,7 +336,7 @@ class ThermalCamera(Result):
         return values, covariance
 
     def _derivative(self, history: History, name: str) -> Array:
-        """∂ IOP / ∂ one parameter, (E, 10)."""
+        """∂ linear IOP / ∂ one parameter, (E, 10)."""
         group, key = name.split(".", 1)
         result = np.zeros((len(history.times), 10))
         if group == "interior":
@@ -349,8 +354,13 @@ class ThermalCamera(Result):
             moved = replace(effect, values={**effect.values, key: value + sign * step})
             listed = list(self.model.effects)
             listed[place] = moved
-            sides.append(replace(self.model, effects=tuple(listed)).predict(history).iop)
+            sides.append(replace(self._linear, effects=tuple(listed)).predict(history).iop)
         return np.asarray((sides[0] - sides[1]) / (2.0 * step))
+
+    @cached_property
+    def _linear(self) -> ThermalModel:
+        """The model without what the distortion does: rates and effects add up."""
+        return replace(self.model, distortion="image")
 
     @cached_property
     def validity(self) -> Validity | None:
@@ -370,7 +380,7 @@ class ThermalCamera(Result):
         return steady_camera(self.model, self.parameters, channels)
 
     def steady_polynomials(self) -> tuple[Array, Array, Array]:
-        """The parameters of the steady camera as polynomials in T - T0: three times (10,).
+        """The linear parameters of the steady camera as polynomials in T - T0: three times (10,).
 
         UsageError for a model that needs more than one thermometer.
         """

@@ -22,6 +22,7 @@ from thermocald.analysis.thermal.result import FittedModel, fitted_model
 from thermocald.analysis.thermal.terms import term_of, without_chance_events
 from thermocald.errors import DataError
 from thermocald.physics import catalogue
+from thermocald.thermal.basis import choose_distortion
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.movement import add_jumps_to_noise
 from thermocald.thermal.noise import calibrate_thermometers, estimate_noise_slope, weight_slow_noise
@@ -32,6 +33,7 @@ from thermocald.thermal.series import in_blocks
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from thermocald.physics.distortion import Distortion
     from thermocald.physics.model import ModelEffect
     from thermocald.thermal.hypothesis import Fit
     from thermocald.thermal.series import ReducedSeries
@@ -46,21 +48,24 @@ def fit_thermal_model(
     search: bool = True,
     fixed: Sequence[str] = (),
     priors: Mapping[str, tuple[float, float]] | None = None,
+    distortion: Distortion | None = None,
 ) -> FittedModel:
     """Fit the base model and some effects to all series together.
 
     listed: effects with start values; with `search` their non-linear parameters are looked for over
     their whole range first (an event always is); fixed: names such as `thermal_lag.tau` that keep
     their start values; priors: {such a name: (value, sd) known beforehand}; T0 °C: by default the
-    mean temperature. Raises DataError for series of
-    different cameras, or of one temperature.
+    mean temperature; distortion: what it follows, by default as the series have it. Raises
+    DataError for series of different cameras, or of one temperature.
     """
     checked = _checked(series, listed)
     temperatures = np.concatenate([s.history.temperature() for s in checked])
     reference = round(float(temperatures.mean()), 1) if T0 is None else T0
     scale = checked[0].scale
+    basis, sure = (distortion, None) if distortion else choose_distortion(checked)
     checked = [
-        replace(s.rescaled(scale), history=replace(s.history, T0=reference)) for s in checked
+        replace(s.in_basis(basis).rescaled(scale), history=replace(s.history, T0=reference))
+        for s in checked
     ]
     index = checked[0].source.field.index
     rows = [index[t] for t in targets_of(listed) if t in index]
@@ -71,7 +76,7 @@ def fit_thermal_model(
         others = [reweight(s, n) for s, n in zip(others, growth.noise, strict=True)]
     fitter, fit = _fitted(others, listed, search, frozenset(fixed), dict(priors or {}))
     moved = [moved_targets(s, np.array(rows)) for s in others] if rows else []
-    return fitted_model(fitter, fit, others, listed, growth, moved)
+    return fitted_model(fitter, fit, others, listed, growth, moved, sure)
 
 
 def targets_of(listed: Sequence[ModelEffect]) -> tuple[str, ...]:

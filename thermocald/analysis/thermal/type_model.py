@@ -59,6 +59,7 @@ def type_model(models: Sequence[ThermalModel], name: str) -> ThermalModel:
     first = models[0]
     for m in models[1:]:
         same = [e.name for e in m.effects] == [e.name for e in first.effects]
+        same = same and m.distortion == first.distortion
         if m.sensor != first.sensor or m.T0 != first.T0 or not same:
             raise DataError(
                 f"the models of {first.camera} and {m.camera} are not alike: sensor, reference "
@@ -120,7 +121,7 @@ def fit_with_type(series: Sequence[ReducedSeries], kind: ThermalModel) -> Fitted
         for key in catalogue.get(e.name).nonlinear
         if f"{e.name}.{key}" not in priors
     ]
-    fitted = fit_thermal_model(series, kind.effects, kind.T0, False, fixed, priors)
+    fitted = fit_thermal_model(series, kind.effects, kind.T0, False, fixed, priors, kind.distortion)
     return replace(fitted, model=shrunk_to_type(fitted.model, kind, priors))
 
 

@@ -1,0 +1,105 @@
+"""Series of a camera that keeps its angles, rendered by OpenCV, and of one that does not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.audit_thermal import NAMES, fitted, seen, seen_by_opencv, simulated
+from thermocald.analysis.thermal.model_text import model_lines
+from thermocald.analysis.thermal.thermal_camera import ThermalCamera
+from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation
+from thermocald.photogrammetry.field.testfield import Observations
+from thermocald.photogrammetry.series.adjustment import SeriesSettings, adjust_series
+from thermocald.physics.model import ModelEffect
+from thermocald.thermal.basis import choose_distortion
+from thermocald.thermal.reduce import reduce_series
+
+SEEDS = range(1, 7)
+
+
+def off(f, s):
+    """Errors of the rates of c, x0, y0 over their standard deviations."""
+    return np.array(
+        [(f.model.rates[n] - s.model.rates[n]) / f.sd(f"rates.{n}") for n in NAMES]
+    )  # fmt: skip
+
+
+def test_the_rates_of_an_opencv_camera_whose_f_changes():
+    errors = []
+    for seed in SEEDS:
+        s = simulated(seed, ())
+        f = fitted(seen_by_opencv(s))
+        assert f.model.distortion == "angle"
+        assert f.missing.found is False
+        errors.append(off(f, s))
+    assert np.abs(errors).max() < 3.0
+    # eighteen numbers know a standard deviation to 17 %
+    assert 0.5 < np.sqrt(np.mean(np.square(errors))) < 1.5
+
+
+def test_the_same_series_epoch_by_epoch():
+    """`study` and `replay`: A and B are free in each epoch, c has its rate."""
+    errors = []
+    for seed in SEEDS[:3]:
+        s = simulated(seed, ())
+        source = seen_by_opencv(s)
+        observed = []
+        for points, there in zip(source.grid.points, source.grid.observed, strict=True):
+            rows = np.flatnonzero(there)
+            observed.append(Observations(rows, points[rows], np.full((len(rows), 2), 0.04)))
+        found = adjust_series(
+            source.sensor, source.field, observed, s.model.interior,
+            ExteriorOrientation.from_array(s.truth.eop[0]), SeriesSettings(),
+        )  # fmt: skip
+        T = s.true_history.temperature()
+        T = T - T.mean()
+        for column, name in enumerate(NAMES):
+            rate = T @ found.values[:, column] / (T @ T)
+            left = found.values[:, column] - found.values[:, column].mean() - rate * T
+            sd = np.sqrt(left @ left / (len(T) - 2) / (T @ T))
+            errors.append((rate - s.model.rates[name]) / sd)
+    assert np.abs(errors).max() < 3.0
+
+
+def test_a_camera_whose_distortion_keeps_its_place_in_the_image():
+    said = 0
+    for seed in SEEDS:
+        s = simulated(seed, ())
+        s = replace(s, model=replace(s.model, distortion="image"))
+        f = fitted(seen(s))
+        lines = "\n".join(model_lines(ThermalCamera(f.model).as_dict() | {"band": True}))
+        if f.model.distortion == "image":
+            said += 1
+            assert np.abs(off(f, s)).max() < 3.0
+            assert "keeps its place in the image" in lines
+        else:
+            assert "the data cannot tell" in lines
+    assert said >= 4  # 25 ± 10 in χ², 9 are asked for
+
+
+@pytest.mark.parametrize("effect", [
+    ModelEffect("thermal_lag", {"tau": 120.0}),
+    ModelEffect("permanent_set", {"c": 2e-5, "x0": 6e-5, "y0": -4e-5}),
+    ModelEffect("mount_motion", {"phi": 2e-6, "Z0": 2e-3}),
+    ModelEffect("nonlinear_expansion", {"c": 2e-6, "x0": 6e-6, "y0": -4e-6}),
+], ids=lambda e: e.name)  # fmt: skip
+def test_what_the_series_say_does_not_hang_on_an_effect(effect):
+    """The basis is asked before any hypothesis is."""
+    for seed in SEEDS[:3]:
+        reduced = reduce_series(seen(simulated(seed, (effect,))), affinity=False, strict=False)
+        assert choose_distortion([reduced])[0] == "angle"
+
+
+def test_series_change_their_basis_and_back():
+    e = reduce_series(seen(simulated(1, ())), affinity=False, strict=False)
+    other = e.in_basis("image")
+    same = other.in_basis("angle")
+    assert other.distortion == "image"
+    np.testing.assert_allclose(same.N, e.N, rtol=1e-9, atol=1e-9 * np.abs(e.N).max())
+    np.testing.assert_allclose(same.values, e.values, rtol=0, atol=1e-7 * np.abs(e.values).max())
+    # one camera in two parametrisations moves the image by the same
+    moved = [np.einsum("tik,ek->eti", s.columns, s.values) for s in (e, other)]
+    np.testing.assert_allclose(*moved, atol=1e-6)

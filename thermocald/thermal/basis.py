@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.photogrammetry.camera.camera_model import EOP
 from thermocald.photogrammetry.linalg import unit_diagonal
-from thermocald.photogrammetry.parameters import EOP
 from thermocald.physics.distortion import BASES, choose_basis
 
 if TYPE_CHECKING:

@@ -23,6 +23,7 @@ from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentS
 from thermocald.photogrammetry.series.result import EXTERIOR_CHOICES
 from thermocald.photogrammetry.series.spool import give_back
 from thermocald.store.recording.reader import open_recording
+from thermocald.store.recording.sense import interior_doubts
 from thermocald.store.server.connection import is_server
 from thermocald.store.sources import open_source, require_source, source_name
 from thermocald.thermal.source import series_input, stored_input
@@ -159,6 +160,19 @@ class Series(ABC):
     ) -> Epochs:
         raise UsageError(f"{store}: {self.source} is in a store already")
 
+    def doubts(self, epochs: Epochs | None = None) -> list[str]:
+        """Return what cannot have been meant in what was recorded, a sentence each.
+
+        epochs: as calibrated, for what their interior orientation tells of the camera.
+
+        >>> tc.open("M1").doubts()
+        []
+        """
+        if epochs is None or not epochs.ok.any():
+            return []
+        c, x0, y0 = np.median(epochs.values[epochs.ok, :3], axis=0).tolist()
+        return interior_doubts(self.head.camera, c, x0, y0)
+
     @abstractmethod
     def measured(
         self,
@@ -196,6 +210,10 @@ class RecordedSeries(Series):
     def temperatures(self) -> dict[str, Array]:
         """As the recording's, interpolated to the frames' times."""
         return {name: self.recording.columns.at_frame(name) for name in self.head.channels}
+
+    def doubts(self, epochs: Epochs | None = None) -> list[str]:
+        """As the base says, with times, readings and repeated epochs."""
+        return [*self.recording.doubts(), *super().doubts(epochs)]
 
     def _calibrated(
         self, settings: AdjustmentSettings, exterior: str, progress: Progress, jobs: int

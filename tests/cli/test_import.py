@@ -225,3 +225,134 @@ def test_the_readme_leads_to_a_plot_in_ten_commands():
         for option in (w for w in words if w.startswith("--")):
             assert option in told.output, command
     assert "study.html" in commands[-1]
+
+
+def log_of(place, values, head="Time;Temperature", step=15):
+    """A log of values from 11:59:45 in Berlin on, every `step` s."""
+    rows = "".join(
+        f"2026-06-14 {11 + (3585 + step * i) // 3600}:{(3585 + step * i) // 60 % 60:02d}:"
+        f"{(3585 + step * i) % 60:02d};{value}\n"
+        for i, value in enumerate(values)
+    )
+    (place / "log.csv").write_text(f"{head}\n{rows}", encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    "other",
+    [{"make": "Canon"}, {"model": "imx477"}, {"focal": 6.0}, {"serial": "B2"}, {"nothing": True},
+     {"model": ""}],
+)  # fmt: skip
+def test_the_photograph_of_another_camera_is_refused(place, other):
+    for i in range(6):
+        exif = Image.Exif()
+        odd = other if i == 3 else {}
+        exif[0x010F], exif[0x0110] = odd.get("make", "RaspberryPi"), odd.get("model", "imx219")
+        inner = exif.get_ifd(0x8769)
+        inner[0x9003], inner[0xA431] = f"2026:06:14 12:00:{10 * i:02d}", odd.get("serial", "A1")
+        inner[0x920A], inner[0xA405] = odd.get("focal", 3.04), 29
+        if odd.get("nothing"):
+            del exif[0x010F], exif[0x0110], inner[0xA431], inner[0x920A]
+        Image.fromarray(np.full((48, 64), 90 + i, np.uint8)).save(
+            place / "photos" / f"{i}.jpg", exif=exif
+        )
+    with pytest.raises(ThermocaldError, match=r"3\.jpg is of .*one recording is of one camera"):
+        run(*arguments(place, "--timezone", "Europe/Berlin"))
+    assert not (place / "M1").exists()
+
+
+def test_a_copy_of_a_photograph_is_left_out(place):
+    for of, copy in (("2.jpg", "2 (1).jpg"), ("4.jpg", "IMG_9.jpeg")):
+        (place / "photos" / copy).write_bytes((place / "photos" / of).read_bytes())
+    result = run(*arguments(place, "--timezone", "Europe/Berlin"))
+    assert result.exit_code == 0
+    assert "6 epochs" in result.stdout
+    assert "photographs: 2.jpg is a copy of 2 (1).jpg: left out" in result.stderr
+    assert "photographs: IMG_9.jpeg is a copy of 4.jpg: left out" in result.stderr
+
+
+def test_two_photographs_of_one_time_are_told(place):
+    photograph(place / "photos" / "3a.jpg", "2026:06:14 12:00:30", "250", focal=(305, 100))
+    result = run(*arguments(place, "--timezone", "Europe/Berlin"))
+    assert "doubtful: 1 photographs have the time of another one, the first 3.jpg and 3a.jpg" in (
+        result.stderr
+    )
+
+
+@pytest.mark.parametrize(
+    ("values", "left"),
+    [
+        ([21.0, 21.1, 85.0, 21.2, 21.3, 21.4, 21.5, 21.6], "1 readings"),
+        ([85.0, 21.1, 21.1, 21.2, 21.3, 21.4, 21.5, 21.6], "1 readings"),
+        ([21.0, 21.1, 21.1, 21.2, 85.0, 85.0, 21.5, 21.6], "2 readings"),
+        ([21.0, 21.1, 0.0, 21.2, 21.3, 21.4, 21.5, 21.6], "1 readings"),
+        ([21.0, 21.1, 21.1, 21.2, 21.3, -40.0, 21.5, 21.6], "1 readings"),
+        ([21.0, 21.1, 127.94, 21.2, 21.3, 21.4, 21.5, 21.6], "1 readings"),
+    ],
+)
+def test_what_the_logger_did_not_measure_is_left_empty(place, values, left):
+    log_of(place, values, "Time;Temp °C")
+    result = run(*arguments(place, "--timezone", "Europe/Berlin"))
+    assert f"doubtful: {left} of 'Temp °C' are what a thermometer gives without" in result.stderr
+    columns = read_recording(place / "M1").columns
+    at_frame = columns.at_frame("Temp °C")
+    assert np.nanmax(at_frame) < 22
+    assert np.nanmin(at_frame) > 20
+    if values[0] < 85:
+        assert np.isfinite(at_frame).all()  # between the readings on both sides
+
+
+def test_a_reading_that_leaps_is_told_and_kept(place):
+    log_of(place, [21.0, 21.1, 21.1, 43.7, 21.3, 21.4, 21.5, 21.6])
+    result = run(*arguments(place, "--timezone", "Europe/Berlin"))
+    assert "1 readings of 'Temperature' leap away and back (the first 43.7 °C" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("later", "words"),
+    [
+        (lambda v: 1.8 * v + 32, "from °C to °F"),
+        (lambda v: v + 273.15, "from °C to K"),
+        (lambda v: 10 * v, "to tenths"),
+    ],
+)
+@pytest.mark.parametrize("back", [False, True])
+def test_a_unit_that_changes_midway_is_refused(place, later, words, back):
+    values = [21.0, 21.1, 21.1, 21.2, 21.3, 21.4, 21.5, 21.6]
+    mixed = [v if i < 4 else round(later(v), 2) for i, v in enumerate(values)]
+    log_of(place, mixed[::-1] if back else mixed)
+    with pytest.raises(ThermocaldError) as caught:
+        run(*arguments(place, "--timezone", "Europe/Berlin"))
+    said = str(caught.value)
+    assert "log.csv, line 6, column 'Temperature': the unit seems to change" in said
+    assert back or words in said
+    assert "--unit" in said
+
+
+def test_a_unit_that_is_stated_is_taken(place):
+    log_of(place, [20.0, 20.0, 20.1, 20.0, 68.0, 68.1, 68.0, 68.0])
+    result = run(*arguments(place, "--timezone", "Europe/Berlin", "--unit", "degC"))
+    assert result.exit_code == 0
+    assert "doubtful" in result.stderr
+    assert read_recording(place / "M1").columns.at_frame("Temperature").max() > 60
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["Setpoint", "setpoint temp", "T_set", "Set Temp (°C)", "Solltemperatur", "T_soll",
+     "Target Temperature", "desired_temp", "consigne", "SP °C", "Temp max", "min temp",
+     "avg temperature", "Forecast °C", "目标温度", "temp_set"],
+)  # fmt: skip
+def test_what_a_thermometer_was_to_show_is_no_reference(place, name):
+    rows = "".join(f"2026-06-14 12:00:{10 * i:02d};40.0;{21 + 0.1 * i:.1f}\n" for i in range(6))
+    (place / "log.csv").write_text(f"Time;{name};Temp\n{rows}", encoding="utf-8")
+    result = run(*arguments(place, "--timezone", "Europe/Berlin"))
+    assert "temperatures from 'Temp' (guessed" in result.stderr
+    assert list(read_recording(place / "M1").columns.temperatures) == ["Temp"]
+
+
+@pytest.mark.parametrize(
+    "name", ["Temp housing", "Sensor 1 °C", "T1", "Settle tank T", "spot temp"]
+)
+def test_a_name_that_only_looks_so_is_a_temperature(place, name):
+    log_of(place, [21.0, 21.1, 21.1, 21.2, 21.3, 21.4, 21.5, 21.6], f"Time;{name}")
+    assert run(*arguments(place, "--timezone", "Europe/Berlin")).exit_code == 0

@@ -34,15 +34,19 @@ def replay(
     Example: thermocald replay rpi-heating-M1 --store thermocald.db
     """
     import thermocald as tc
+    from thermocald.store.recording.sense import doubt_lines
 
     series = tc.open(recording)
     with progress(len(series), "calibrating") as advance:
         table = series.calibrate(
             exterior=exterior, free=free, store=store, jobs=jobs, progress=advance
         )
-    document = {**table.as_dict(), "recording": recording, "store": store}
+    doubts = series.doubts(table)
+    document = {**table.as_dict(), "recording": recording, "store": store, "doubts": doubts}
     if write_result(document, json):
         typer.echo(str(table))
+    for line in doubt_lines(doubts):
+        say(line)
     if not table.ok.any():
         why = next(iter(table.without_result), "there is no epoch")
         raise DataError(f"{recording}: no epoch has a result: {why}")

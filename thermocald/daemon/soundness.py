@@ -15,8 +15,10 @@ if TYPE_CHECKING:
 
     from thermocald.config import DeviceConfig
     from thermocald.hal import Kind
+    from thermocald.store.recording.reader import Recording
 
 _SHOWN = 20  # lines of a kind
+_TRIED = 3  # epochs of a recording that are calibrated
 
 
 def examine(source: Path, probe: bool, say: Callable[[str], None]) -> dict[str, Any]:
@@ -43,7 +45,9 @@ def _is_system(path: Path) -> bool:
 
 
 def _recording(path: Path) -> dict[str, Any]:
+    from thermocald.store.logger.photographs import strange_photographs
     from thermocald.store.recording.reader import read_recording
+    from thermocald.store.recording.sense import doubt_lines
 
     recording = read_recording(path)
     columns = recording.columns
@@ -58,13 +62,20 @@ def _recording(path: Path) -> dict[str, Any]:
     readings = {
         name: int(np.isfinite(values).sum()) for name, values in columns.temperatures.items()
     }
+    doubts = [
+        *recording.doubts(),
+        *strange_photographs([e.frame for e in recording.epochs if e.frame is not None]),
+        *_calibration_doubts(recording),
+    ]
+    sort = "a doubtful" if doubts else "a sound"
     lines = [
-        f"{path}: a sound recording of camera {recording.camera.name}, series {recording.series}",
+        f"{path}: {sort} recording of camera {recording.camera.name}, series {recording.series}",
         f"  {len(columns)} epochs, {frames} frames, {len(recording.testfield)} targets",
         *(f"  {name}: {n} of {len(columns)} readings" for name, n in readings.items()),
     ]
     if seen:
         lines.append(f"  {np.median(seen):.0f} targets an epoch (median), {min(seen)} at least")
+    lines += [f"  {line}" for line in doubt_lines(doubts)]
     return {
         "format": "thermocald-check/1",
         "kind": "recording",
@@ -75,8 +86,26 @@ def _recording(path: Path) -> dict[str, Any]:
         "frames": frames,
         "targets": len(recording.testfield),
         "readings": readings,
+        "doubts": doubts,
         "lines": lines,
     }
+
+
+def _calibration_doubts(recording: Recording) -> list[str]:
+    """Return what is doubtful in the interior orientation that some epochs give."""
+    from thermocald.acquisition.calibrator import Calibrator
+    from thermocald.store.recording.sense import interior_doubts
+
+    calibrator = Calibrator.of_recording(recording)
+    last = len(recording) - 1
+    tried = [
+        calibrator.calibrate(recording.epochs[row]).adjustment
+        for row in np.unique(np.linspace(0, last, _TRIED).astype(int)).tolist()
+    ]
+    found = [a.values[:3] for a in tried if a.ok]
+    if not found:
+        return [f"none of {len(tried)} epochs can be calibrated: {tried[0].reason}"]
+    return interior_doubts(recording.camera, *np.median(found, axis=0).tolist())
 
 
 def _config(path: Path, probe: bool) -> dict[str, Any]:

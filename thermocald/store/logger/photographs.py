@@ -6,10 +6,13 @@ Exif 2.32: DateTimeOriginal, SubSecTimeOriginal, OffsetTimeOriginal.
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import re
 import struct
 import warnings
+from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
@@ -18,6 +21,7 @@ from thermocald.errors import DataError, DriverMissing, ImageError
 from thermocald.store.logger.moments import parse_moment
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
 
@@ -33,7 +37,7 @@ _DIAGONAL_35MM = 43.2666  # mm, of 36 × 24
 @dataclass(frozen=True, slots=True)
 class Photograph:
     """A file, when it was taken as the camera wrote it, its size px, and what EXIF says of the
-    camera: name, principal distance mm, pixel pitch mm; None where it does not.
+    camera: name, principal distance mm, pixel pitch mm, serial number; None where it does not.
     """
 
     path: Path
@@ -43,6 +47,12 @@ class Photograph:
     camera: str = ""
     focal_length: float | None = None
     pixel_pitch: float | None = None
+    serial: str = ""
+
+    @property
+    def body(self) -> tuple[str, str, float | None]:
+        """What is the same in all photographs of one camera with one lens."""
+        return self.camera, self.serial, self.focal_length
 
 
 def find_photographs(paths: list[Path]) -> list[Path]:
@@ -92,7 +102,64 @@ def read_photograph(path: Path, source: str = "exif") -> Photograph:
     return Photograph(
         path, moment, width, height, _camera(details), focal,
         _pixel_pitch(details, focal, width, height),
+        str(details.get(0xA431) or "").strip("\0 "),
     )  # fmt: skip
+
+
+def other_camera(photographs: Sequence[Photograph]) -> str | None:
+    """Return a sentence on the first photograph that is not of the camera of most, or None.
+
+    EXIF tells: name, serial number, focal length (a zoom, another lens) within 2 %.
+    """
+    usual = Counter(p.body for p in photographs).most_common(1)[0][0]
+    for photograph in photographs:
+        name, serial, focal = photograph.body
+        same_lens = focal == usual[2] or (focal and usual[2] and abs(focal / usual[2] - 1) < 0.02)
+        if (name, serial) != usual[:2] or not same_lens:
+            return (
+                f"{photograph.path.name} is of {_body(photograph.body)}, the others of "
+                f"{_body(usual)}"
+            )
+    return None
+
+
+def _body(body: tuple[str, str, float | None]) -> str:
+    name, serial, focal = body
+    parts = [name or "a camera without a name", serial, f"{focal:g} mm" if focal else ""]
+    return " ".join(part for part in parts if part)
+
+
+def find_copies(paths: Sequence[Path]) -> dict[int, int]:
+    """Return {position: of the first one with the same bytes} of files that are there twice."""
+    sizes = Counter(path.stat().st_size for path in paths)
+    first: dict[bytes, int] = {}
+    copies = {}
+    for i, path in enumerate(paths):
+        if sizes[path.stat().st_size] > 1:
+            with path.open("rb") as file:
+                key = hashlib.file_digest(file, "sha256").digest()
+            if (known := first.setdefault(key, i)) != i:
+                copies[i] = known
+    return copies
+
+
+def strange_photographs(paths: Sequence[Path]) -> list[str]:
+    """Return what is doubtful in the frames of a recording, a sentence each."""
+    there = list(dict.fromkeys(path for path in paths if path.is_file()))
+    found = []
+    if copies := find_copies(there):
+        one, of = next(iter(copies.items()))
+        found.append(
+            f"{len(copies)} frames are copies of another one, the first {there[one].name} of "
+            f"{there[of].name}"
+        )
+    known = []
+    for path in there:
+        with suppress(DataError, DriverMissing, ImageError):
+            known.append(read_photograph(path))
+    if len(known) > 1 and (other := other_camera(known)):
+        found.append(other)
+    return found
 
 
 def moment_taken(path: Path) -> datetime | None:

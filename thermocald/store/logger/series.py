@@ -17,6 +17,7 @@ from thermocald.epoch import Epoch
 from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.camera_files.camera_file import read_camera
+from thermocald.store.logger.photographs import find_copies, other_camera
 from thermocald.store.logger.temperatures import LogOptions, TemperatureLog, read_log
 from thermocald.store.recording.head import CameraSpec, Channel, Head
 from thermocald.store.recording.reader import EpochColumns, Recording
@@ -41,7 +42,7 @@ class PhotographSeries:
     """Photographs in the order of time, times (n,) s UTC, and the log they were paired with.
 
     reading (n,): the row of the log next to each, -1 where there is none near; at_frame (n,) °C of
-    the first channel, NaN where the log does not say.
+    the first channel, NaN where the log does not say; notes: what was left out, for people.
     """
 
     photographs: tuple[Photograph, ...]
@@ -49,6 +50,7 @@ class PhotographSeries:
     log: TemperatureLog
     reading: NDArray[np.int64]
     at_frame: Array
+    notes: tuple[str, ...] = ()
 
     @property
     def interval(self) -> float:
@@ -82,7 +84,7 @@ class PhotographSeries:
         step = float(np.median(np.diff(self.log.times)))
         low, high = np.nanmin(self.at_frame), np.nanmax(self.at_frame)
         lines = [f"photographs: {len(self.times)}, {head.width} × {head.height} px, {span}"]
-        lines += self.log.notes
+        lines += [*self.notes, *self.log.notes]
         lines.append(
             f"log: {iso(self.log.times[0])} to {iso(self.log.times[-1])}, every {step:.4g} s"
         )
@@ -107,8 +109,8 @@ def put_together(
 ) -> PhotographSeries:
     """Photographs and a logger's file on one clock.
 
-    Raises DataError for photographs of different sizes, for times that do not say their zone, and
-    where log and photographs do not overlap.
+    Copies of one photograph are left out. Raises DataError for photographs of different sizes or
+    cameras, for times that do not say their zone, and where log and photographs do not overlap.
     """
     sizes = {(p.width, p.height) for p in photographs}
     if len(sizes) > 1:
@@ -118,12 +120,28 @@ def put_together(
             f"{photographs[0].width} × {photographs[0].height}: one recording is of one camera in "
             "one position; import them apart"
         )
+    if strange := other_camera(photographs):
+        raise DataError(
+            f"{strange}: one recording is of one camera with one lens; import them apart"
+        )
+    copies = find_copies([p.path for p in photographs])
+    notes = [
+        f"photographs: {photographs[i].path.name} is a copy of {photographs[k].path.name}: left out"
+        for i, k in copies.items()
+    ]
+    photographs = [p for i, p in enumerate(photographs) if i not in copies]
     # by name first: within a second it is the order in which they were taken
     named = sorted(photographs, key=lambda p: p.path.name)
     times = camera_clock.utc([p.moment for p in named], lambda i: str(named[i].path))
     order = np.argsort(times, kind="stable")
     times = times[order]
     placed = tuple(named[i] for i in order.tolist())
+    if (same := np.flatnonzero(np.diff(times) == 0)).size:
+        first, second = (p.path.name for p in placed[same[0] : same[0] + 2])
+        notes.append(
+            f"doubtful: {len(same)} photographs have the time of another one, the first {first} "
+            f"and {second}: taken in the order of their names"
+        )
     logged = read_log(log, options, (float(times[0]), float(times[-1])))
     _overlap(times, logged.times)
     reading = _next_to(times, logged.times)
@@ -134,7 +152,7 @@ def put_together(
             "no photograph has a temperature: the log has gaps wherever photographs were taken "
             f"({iso(times[0])} to {iso(times[-1])})"
         )
-    return PhotographSeries(placed, times, logged, reading, at_frame)
+    return PhotographSeries(placed, times, logged, reading, at_frame, tuple(notes))
 
 
 def _size(photograph: Photograph) -> tuple[int, int]:

@@ -28,6 +28,7 @@ from thermocald.store.logger.moments import (
     parse_moment,
 )
 from thermocald.store.logger.units import UNITS, stated_unit, to_celsius
+from thermocald.store.recording.sense import find_spikes, find_unit_change
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -45,7 +46,11 @@ _TEMPERATURE_NAME = re.compile(
 )
 _OTHER_NAME = re.compile(
     r"hum|feucht|\brh\b|%|press|druck|hpa|mbar|volt|batt|\bnr\b|index|count|record|lux|light|dew|taupunkt"
-    r"|alarm|limit|threshold|set.?point|serial|trusted|湿度|露点|序号"
+    r"|alarm|limit|threshold|serial|trusted|湿度|露点|序号"
+    # what a thermometer is to show, not what it shows
+    r"|(?<![^\W_])(?:set|sp|soll|goal|min|max|avg|mean|std)(?![^\W_])|set.?(?:point|temp|value|wert)"
+    r"|temp\w*[ _]?set|soll|consigne|desired|target|wanted|nominal|reference value|forecast"
+    r"|prognose|heat.?index|wind.?chill|feels|设定|目标"
     r"|^epoch$|pixel|^(?:c|x0|y0|sigma0)$|^sd_|^#$|^no\.?$",
     re.IGNORECASE,
 )
@@ -515,6 +520,8 @@ def _celsius(table: _Table, name: str, options: LogOptions) -> tuple[Array, list
     elif unit != "degC" and options.unit is None:
         notes.append(f"log: {name!r} is converted from {unit}, as {source} says")
     celsius = to_celsius(values, unit)
+    celsius, said = _measured(table, name, celsius, options)
+    notes += said
     wrong = (celsius < _PLAUSIBLE_C[0]) | (celsius > _PLAUSIBLE_C[1])
     if wrong.any():
         i = int(np.argmax(wrong))
@@ -524,6 +531,42 @@ def _celsius(table: _Table, name: str, options: LogOptions) -> tuple[Array, list
             "Another unit (--unit), or another column (--temperature-column)?"
         )
     return celsius, notes
+
+
+def _measured(
+    table: _Table, name: str, celsius: Array, options: LogOptions
+) -> tuple[Array, list[str]]:
+    """Return a column (n,) °C without what its thermometer gives unmeasured, and notes on it.
+
+    Raises DataError where the unit changes midway and was not stated.
+    """
+    if changed := find_unit_change(celsius):
+        row, words = changed
+        last = celsius[:row][np.isfinite(celsius[:row])][-1]
+        where = f"{table.where(row)}, column {name!r}: the unit seems to change {words} here"
+        if options.unit is None:
+            raise DataError(
+                f"{where} ({celsius[row]:.4g} after {last:.4g} °C): import the parts by "
+                "themselves, or say --unit if it is one unit"
+            )
+        return celsius, [f"doubtful: {where}"]
+    spikes = find_spikes(celsius)
+    measured = celsius.copy()
+    notes = []
+    for said, sort in (("left empty", False), ("kept", True)):
+        found = [s for s in spikes if s.measured is sort]
+        if not found:
+            continue
+        first = found[0].first
+        why = "leap away and back" if sort else "are what a thermometer gives without a measurement"
+        notes.append(
+            f"doubtful: {sum(s.stop - s.first for s in found)} readings of {name!r} {why} (the "
+            f"first {celsius[first]:.4g} °C, {table.where(first)}): {said}"
+        )
+    for spike in spikes:
+        if not spike.measured:
+            measured[spike.first : spike.stop] = np.nan
+    return measured, notes
 
 
 def _unit(table: _Table, name: str) -> tuple[str | None, str]:

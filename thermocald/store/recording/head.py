@@ -82,12 +82,16 @@ class _Reader:
             )
         return text
 
-    def positive(self, key: str, unit: str) -> float:
+    def positive(self, key: str, unit: str, bounds: tuple[float, float] = (1e-9, 1e9)) -> float:
+        """A number above 0; bounds: what a camera or a thermometer can have."""
         value = self.number(key)
         if value is None:
             raise self.fail(key, "is missing")
         if value <= 0:
             raise self.fail(key, f"is {value:g} {unit}; it must be above 0")
+        if not bounds[0] <= value <= bounds[1]:
+            between = f"{bounds[0]:g} to {bounds[1]:g} {unit}"
+            raise self.fail(key, f"is {value:g} {unit}; {between} are possible")
         return value
 
     def number(self, key: str) -> float | None:
@@ -138,7 +142,7 @@ def parse_head(document: Mapping[str, Any], path: Path) -> Head:
     return Head(
         name=top.text("name", path.resolve().parent.name),
         series=top.text("series", "M1"),
-        interval=top.positive("interval", "s"),
+        interval=top.positive("interval", "s", (1e-4, 1e8)),
         camera=_camera(top),
         channels=_channels(top) if "temperatures" in document else {},
         extra=_plain(top, {key: value for key, value in document.items() if key not in known}),
@@ -157,19 +161,19 @@ def _plain(top: _Reader, extra: Mapping[str, Any]) -> dict[str, Any]:
 def _camera(top: _Reader) -> CameraSpec:
     mapping, camera = top.inner("camera")
     pitch = camera.positive("pixel_pitch", "mm")
-    if pitch > 0.1:
+    if not 1e-5 <= pitch <= 0.1:
         raise camera.fail("pixel_pitch", f"is {pitch:g} mm; pixels are a few thousandths of a mm")
     sensor = Sensor(camera.size("width"), camera.size("height"), pitch)
     distance = None
     if mapping.get("principal_distance") is not None:
-        distance = camera.positive("principal_distance", "mm")
+        distance = camera.positive("principal_distance", "mm", (1e-3, 1e5))
     interior = None
     if mapping.get("interior") is not None:
         values, reader = camera.inner("interior")
         for key in values:
             if key not in IOP_NAMES:
                 raise reader.fail(key, f"is unknown; known are {', '.join(IOP_NAMES)}")
-        reader.positive("c", "mm")
+        reader.positive("c", "mm", (1e-3, 1e5))
         interior = InteriorOrientation.from_mapping({k: reader.number(k) or 0.0 for k in values})
     return CameraSpec(camera.text("name", "camera"), sensor, distance, interior)
 
@@ -189,7 +193,9 @@ def _channels(top: _Reader) -> dict[str, Channel]:
         if unit != "degC":
             raise inner.fail("unit", f"is {unit!r}; temperatures must be in degC: convert them")
         resolution = (
-            None if inner.number("resolution") is None else inner.positive("resolution", "K")
+            None
+            if inner.number("resolution") is None
+            else inner.positive("resolution", "K", (1e-6, 100.0))
         )
         channels[name] = Channel(unit, resolution)
     return channels

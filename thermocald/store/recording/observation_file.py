@@ -14,6 +14,7 @@ import numpy as np
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.store.recording.parquet_table import ParquetTable, parse_once
+from thermocald.store.recording.sense import frame_fault, point_fault
 from thermocald.store.recording.table import Chunk, Table
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
+    from thermocald.photogrammetry.camera.camera_model import Sensor
 
 
 _GRID_POINTS, _GRID_EPOCHS = 300_000, 4_000  # of a grid: 12 MB
@@ -84,7 +86,9 @@ def _join(blocks: list[_Block]) -> _Block:
 class ObservationFile:
     """The file of a recording; numbers: the (E,) epoch numbers of epochs.csv, increasing."""
 
-    def __init__(self, path: Path, field: TestField, numbers: NDArray[np.int64]) -> None:
+    def __init__(
+        self, path: Path, field: TestField, numbers: NDArray[np.int64], sensor: Sensor
+    ) -> None:
         self._table: Table | ParquetTable
         if path.suffix == ".parquet":
             self._table = ParquetTable(path, _REQUIRED)
@@ -92,8 +96,7 @@ class ObservationFile:
             table = Table(path, _REQUIRED)
             long = path.stat().st_size >= LONG_FROM_BYTES
             self._table = parse_once(table, _REQUIRED) if long else table
-        self._field = field
-        self._numbers = numbers
+        self._field, self._numbers, self._sensor = field, numbers, sensor
         self._quality = self._numeric_extras()
         self._has_covariances = "sxy" in self._table.columns
 
@@ -245,6 +248,10 @@ class ObservationFile:
             values[:, column] = chunk.numbers(name)
             if column >= 2:
                 chunk.check(name, values[:, column] <= 0, "a standard deviation must be above 0 px")
+        if fault := point_fault(values):
+            chunk.fail(*fault)
+        if outside := frame_fault(values[:, :2], self._sensor):
+            chunk.fail(outside[0], "x", outside[1])
         if self._has_covariances:
             values[:, 4] = chunk.numbers("sxy")
             too_large = np.abs(values[:, 4]) >= values[:, 2] * values[:, 3]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -27,6 +28,7 @@ from thermocald.store.recording.readings import (
     temperature_at_frame,
     temperatures_at_frame,
 )
+from thermocald.store.recording.sense import reading_doubts, time_doubts, time_fault
 from thermocald.store.recording.table import Table
 from thermocald.store.recording.testfield_file import (
     read_testfield,
@@ -168,6 +170,34 @@ class Recording:
             return self.epochs[row].observations
         return next(self._observation_file.some(slice(row, row + 1)))
 
+    def doubts(self) -> list[str]:
+        """Return what is doubtful in times, readings and repeated epochs, a sentence each.
+
+        Observations too many for memory are not read.
+        """
+        columns = self.columns
+        found = list(time_doubts(columns.numbers, columns.frame_time, self.interval))
+        for name, values in columns.temperatures.items():
+            found += reading_doubts(values, name)
+        if columns.readings is not None:
+            for name, values in columns.readings.channels.items():
+                found += reading_doubts(values, f"{name} of {READINGS}")
+        if repeated := [f for f, n in Counter(columns.frames).items() if f and n > 1]:
+            found.append(f"{len(repeated)} frames stand in several epochs, the first {repeated[0]}")
+        if self.has_observations and not self.is_long:
+            first: dict[bytes, int] = {}
+            twice = []
+            for epoch in self.epochs:
+                if (o := epoch.observations) is not None and len(o):
+                    same = first.setdefault(o.targets.tobytes() + o.points.tobytes(), epoch.number)
+                    twice += [(epoch.number, same)] if same != epoch.number else []
+            if twice:
+                found.append(
+                    f"{len(twice)} epochs hold the image points of another one: epoch "
+                    f"{twice[0][0]} those of {twice[0][1]}"
+                )
+        return found
+
     @property
     def is_long(self) -> bool:
         """Whether its observations are read in parts, as they are too many for memory."""
@@ -181,7 +211,9 @@ class Recording:
 
     @cached_property
     def _observation_file(self) -> ObservationFile:
-        return ObservationFile(self._observation_path, self.testfield, self.columns.numbers)
+        return ObservationFile(
+            self._observation_path, self.testfield, self.columns.numbers, self.camera.sensor
+        )
 
 
 class _Epochs(Sequence[Epoch]):
@@ -285,6 +317,8 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
                 ),
             )
             previous[name] = float(latest[-1])
+            if fault := time_fault(columns[-1]):
+                chunk.fail(fault[0], name, fault[1])
         for name, readings in temperatures.items():
             readings.append(chunk.numbers(name, empty_is_nan=True))
             untimed = np.isfinite(readings[-1]) & np.isnan(times["temperature_time"][-1])
@@ -310,6 +344,8 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
     if not numbers:
         raise RecordingError(f"{folder / 'epochs.csv'}: holds no epochs")
     joined = {name: np.concatenate(columns) for name, columns in times.items()}
+    if len(joined["frame_time"]) > 2 and np.ptp(joined["frame_time"]) == 0:
+        table.fail(1, "frame_time", "all epochs have one time; write when each frame was taken")
     return EpochColumns(
         np.concatenate(numbers),
         joined["frame_time"],

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.store.recording.sense import time_fault
 from thermocald.store.recording.table import Table
 
 if TYPE_CHECKING:
@@ -54,6 +55,8 @@ def read_readings(path: Path, channels: Sequence[str]) -> Readings:
         steps = np.diff(times, prepend=before)
         chunk.check("time", steps <= 0, "times must increase")
         before = float(times[-1])
+        if fault := time_fault(times):
+            chunk.fail(fault[0], "time", fault[1])
         parts["time"].append(times)
         for name in channels:
             values = chunk.numbers(name, empty_is_nan=True)

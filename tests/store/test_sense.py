@@ -1,0 +1,316 @@
+"""What can be read and cannot have been meant: refused with one line, or called doubtful."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+
+import numpy as np
+import pytest
+
+import thermocald as tc
+from tests.commands import call
+from thermocald.errors import RecordingError, TestFieldError, ThermocaldError
+from thermocald.store.recording.reader import read_recording
+from thermocald.store.recording.sense import find_spikes, find_unit_change, interior_doubts
+
+SIZE = "width: 3280, height: 2464"
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory):
+    """A warming camera before a field of 147 targets, 40 epochs."""
+    path = tmp_path_factory.mktemp("sense") / "whole"
+    assert (
+        call("simulate", "--preset", "rpi-v2.1-heating", "--seed", 1, "--out", path).returncode == 0
+    )
+    for name in ("epochs.csv", "observations.csv"):
+        header, *rows = (path / name).read_text().splitlines()
+        rows = [row for row in rows if int(row.split(",")[0]) <= 40]
+        (path / name).write_text("\n".join([header, *rows]) + "\n")
+    return path
+
+
+@pytest.fixture
+def recording(simulated, tmp_path):
+    return shutil.copytree(simulated, tmp_path / "M")
+
+
+def head(path, old: str, new: str) -> None:
+    file = path / "recording.yaml"
+    assert old in file.read_text()
+    file.write_text(file.read_text().replace(old, new))
+
+
+def change(path, name: str, **columns) -> None:
+    """Columns of a table as functions of their values and the row from 0."""
+    with (path / name).open(newline="") as file:
+        names, *rows = csv.reader(file)
+    for column, function in columns.items():
+        k = names.index(column)
+        for i, row in enumerate(rows):
+            row[k] = str(function(row[k], i))
+    with (path / name).open("w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([names, *rows])
+
+
+def scaled(factor: float, shift: float = 0.0):
+    return lambda text, _: f"{factor * float(text) + shift:.15g}"
+
+
+def exchanged(path) -> None:
+    with (path / "observations.csv").open(newline="") as file:
+        names, *rows = csv.reader(file)
+    with (path / "observations.csv").open("w", newline="") as file:
+        header = [{"x": "y", "y": "x", "sx": "sy", "sy": "sx"}.get(n, n) for n in names]
+        csv.writer(file, lineterminator="\n").writerows([header, *rows])
+
+
+def put(value: str, *rows: int):
+    return lambda text, i: value if i in rows else text
+
+
+OTHER_IMAGES = {
+    "width and height exchanged": (
+        lambda p: head(p, SIZE, "width: 2464, height: 3280"), "width and height (or x and y)"),
+    "x and y exchanged": (exchanged, "width and height (or x and y)"),
+    "half the size": (
+        lambda p: head(p, SIZE, "width: 1640, height: 1232"), "another camera, mode, or crop"),
+    "a crop": (lambda p: head(p, SIZE, "width: 1920, height: 1080"), "another camera"),
+    "points from the centre": (
+        lambda p: change(p, "observations.csv", x=scaled(1, -1639.5), y=scaled(1, -1231.5)),
+        "from the centre of the image"),
+    "points in mm": (
+        lambda p: change(p, "observations.csv", x=scaled(0.00112), y=scaled(0.00112)), "in mm"),
+    "points in parts of the width": (
+        lambda p: change(p, "observations.csv", x=scaled(1 / 3280), y=scaled(1 / 3280)), "in mm"),
+    "points in percent": (
+        lambda p: change(p, "observations.csv", x=scaled(200), y=scaled(200)), "lie outside"),
+    "y upwards from below": (
+        lambda p: change(p, "observations.csv", y=scaled(-1)), "lie outside"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OTHER_IMAGES)
+def test_points_of_another_image_are_refused(recording, name):
+    damage, message = OTHER_IMAGES[name]
+    damage(recording)
+    with pytest.raises(RecordingError, match=r"observations\.csv, line \d+, column x") as caught:
+        read_recording(recording)
+    assert message in str(caught.value)
+    for command in ("check", "replay", "export"):
+        done = call(command, recording)
+        assert done.returncode == 1
+        assert done.stderr.count("\n") == 1
+        assert "Traceback" not in done.stderr
+
+
+def test_some_gross_errors_off_the_image_are_left_to_the_adjustment(recording):
+    rows = (5, 500, 1500, 2500, 3500)
+    change(recording, "observations.csv", x=put("-400", *rows), y=put("9000", *rows))
+    epochs = tc.open(recording).calibrate()
+    assert epochs.ok.all()
+
+
+NUMBERS = {
+    "observations.csv": [
+        ("x", "1e308"), ("y", "-1e308"), ("x", "1e7"), ("sx", "1e-300"), ("sy", "1e300"),
+        ("sx", "5e-324"), ("sy", "1e-9"), ("sx", "1e5"),
+    ],
+    "testfield.csv": [("sX", "1e-300"), ("sZ", "5e-324"), ("X", "1e308"), ("diameter", "1e300"),
+                      ("sY", "1e300")],
+    "epochs.csv": [("frame_time", "1e300"), ("temperature", "1e300"), ("frame_time", "1.6e12"),
+                   ("temperature_time", "1.6e15"), ("frame_time", "1e11")],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("file", "column", "value"), [(f, c, v) for f, cells in NUMBERS.items() for c, v in cells]
+)
+def test_numbers_that_nothing_measures_are_refused(recording, file, column, value):
+    last = len((recording / file).read_text().splitlines()) - 2
+    change(recording, file, **{column: put(value, last)})
+    with pytest.raises((RecordingError, TestFieldError)) as caught:
+        read_recording(recording)
+    assert f"{file}, line {last + 2}, column {column}: " in str(caught.value)
+
+
+HEADS = [
+    ("interval: 10.0", "interval: 1.0e-300"), ("interval: 10.0", "interval: 1.0e+300"),
+    ("pixel_pitch: 0.00112", "pixel_pitch: 1.0e-300"),
+    ("principal_distance: 3.04", "principal_distance: 1.0e+300"),
+    ("principal_distance: 3.04", "principal_distance: 1.0e-300"),
+    ("resolution: 0.0625", "resolution: 1.0e-300"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("old", "new"), HEADS)
+def test_a_head_that_no_camera_has_is_refused(recording, old, new):
+    head(recording, old, new)
+    with pytest.raises(RecordingError, match=r"recording\.yaml, key .*(possible|thousandths)"):
+        read_recording(recording)
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e3, "ms"), (1e6, "µs"), (1e9, "ns")])
+def test_times_in_another_unit_are_named(recording, factor, unit):
+    change(recording, "epochs.csv", frame_time=scaled(factor), temperature_time=scaled(factor))
+    with pytest.raises(RecordingError, match=f"are they {unit}"):
+        read_recording(recording)
+
+
+def test_one_time_for_all_epochs_is_refused(recording):
+    change(recording, "epochs.csv", frame_time=lambda *_: "1600000000")
+    with pytest.raises(RecordingError, match="all epochs have one time"):
+        read_recording(recording)
+
+
+def fahrenheit(text: str, i: int) -> str:
+    return text if i < 20 else f"{1.8 * float(text) + 32:.4f}"
+
+
+def repeat_epoch(path) -> None:
+    file = path / "observations.csv"
+    header, *rows = file.read_text().splitlines()
+    others = [row for row in rows if not row.startswith("18,")]
+    copied = ["18," + row.partition(",")[2] for row in rows if row.startswith("17,")]
+    file.write_text("\n".join([header, *others, *copied]) + "\n")
+
+
+DOUBTS = {
+    "a principal distance of another lens": (
+        lambda p: head(p, "principal_distance: 3.04", "principal_distance: 6.0"),
+        "0.507 times"),
+    "the pixels of a binned mode": (
+        lambda p: head(p, "pixel_pitch: 0.00112", "pixel_pitch: 0.00224"), "2 times"),
+    "the size of a larger mode": (
+        lambda p: head(p, SIZE, "width: 6560, height: 4928"), "off the centre of 6560 × 4928"),
+    "a mirrored image": (
+        lambda p: change(p, "observations.csv", y=scaled(-1, 2463)), "can be calibrated"),
+    "another field": (
+        lambda p: change(p, "testfield.csv", X=lambda t, i: 37.0 * ((i * 7) % 41)),
+        "can be calibrated"),
+    "some epochs of one time": (
+        lambda p: change(p, "epochs.csv", frame_time=put("1600000100.0", *range(10, 20))),
+        "10 epochs have the time of another one, the first 11 and 12"),
+    "times in minutes": (
+        lambda p: change(p, "epochs.csv", frame_time=scaled(1 / 60),
+                         temperature_time=scaled(1 / 60)), "every 0.167 s"),
+    "times in days": (
+        lambda p: change(p, "epochs.csv", frame_time=scaled(1 / 86400),
+                         temperature_time=scaled(1 / 86400)), "every 0.000116 s"),
+    "an hour as the interval": (
+        lambda p: head(p, "interval: 10.0", "interval: 3600"), "every 10 s"),
+    "an epoch twice": (repeat_epoch, "1 epochs hold the image points of another one: epoch 18"),
+    "85.00 of a DS18B20": (
+        lambda p: change(p, "epochs.csv", temperature=put("85.0", 12, 30, 31)),
+        "3 readings are what it gives without a measurement, the first 85 °C at reading 13"),
+    "zeros of a lost sensor": (
+        lambda p: change(p, "epochs.csv", board_temperature=put("0.0", 12)),
+        "board_temperature: 1 readings are"),
+    "°C, then °F": (lambda p: change(p, "epochs.csv", temperature=fahrenheit), "from °C to °F"),
+    "a reading that leaps": (
+        lambda p: change(p, "epochs.csv", temperature=put("71.3", 12)), "leap away and back"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DOUBTS)
+def test_what_is_doubtful_is_told(recording, name):
+    damage, message = DOUBTS[name]
+    damage(recording)
+    checked = call("check", recording)
+    assert checked.returncode == 0
+    assert "a doubtful recording" in checked.stdout
+    (line,) = [text for text in checked.stdout.splitlines() if message in text]
+    assert line.startswith("  doubtful: ")
+    if "can be calibrated" in message:
+        return
+    replayed = call("replay", recording)
+    assert replayed.returncode == 0
+    assert message in replayed.stderr
+
+
+def test_width_and_height_exchanged_in_the_middle_of_the_image(recording):
+    """Targets that lie where both images are: the points tell nothing, the principal point does."""
+    file = recording / "observations.csv"
+    header, *rows = file.read_text().splitlines()
+    kept = [r for r in rows if float(r.split(",")[2]) < 2460]
+    file.write_text("\n".join([header, *kept]) + "\n")
+    assert call("check", recording).stdout.startswith(f"{recording}: a sound recording")
+    head(recording, SIZE, "width: 2464, height: 3280")
+    checked, replayed = call("check", recording), call("replay", recording)
+    for text in (checked.stdout, replayed.stderr):
+        assert "px off the centre of 2464 × 3280 px: width and height look exchanged" in text
+
+
+def test_a_whole_recording_has_no_doubts(recording):
+    assert tc.open(recording).doubts() == []
+    assert "doubtful" not in call("check", recording).stdout + call("replay", recording).stderr
+
+
+def wave(n: int = 60) -> np.ndarray:
+    rng = np.random.default_rng(4)
+    return 24.0 + 6.0 * np.sin(np.arange(n) / 9.0) + rng.normal(0, 0.03, n)
+
+
+@pytest.mark.parametrize("value", [85.0, 127.94, 0.0, -40.0, -45.0, 125.0, 130.0, -46.85])
+@pytest.mark.parametrize("rows", [[0], [20], [20, 21], [59], [5, 30, 31, 32]])
+def test_what_a_thermometer_gives_unmeasured_is_found(value, rows):
+    values = wave()
+    values[rows] = value
+    found = [i for s in find_spikes(values) for i in range(s.first, s.stop)]
+    assert found == rows
+    assert not any(s.measured for s in find_spikes(values))
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        wave(),
+        np.r_[wave(30), wave(30) + 40.0],  # carried into the sun
+        np.r_[np.full(20, 20.0), 20.0 + 65.0 * (1 - np.exp(-np.arange(60) / 3.0))],  # a kettle
+        np.linspace(20.0, 120.0, 60),  # through 85 °C
+        np.full(40, 85.0),  # at 85 °C
+        np.r_[np.full(9, np.nan), wave(20)],
+        np.full(9, np.nan),
+        np.empty(0),
+    ],
+)
+def test_what_was_measured_is_no_spike(values):
+    assert find_spikes(values) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "other"),
+    [
+        ("from °C to °F", lambda v: 1.8 * v + 32),
+        ("from °C to K", lambda v: v + 273.15),
+        ("to tenths", lambda v: 10 * v),
+    ],
+)
+def test_a_unit_that_changes_is_found_both_ways(words, other):
+    values = np.r_[wave(30), other(wave(60)[30:])]
+    assert find_unit_change(values) == (30, words)
+    back = {"from °C to °F": "from °F to °C", "from °C to K": "from K to °C"}
+    back["to tenths"] = "from tenths"
+    assert find_unit_change(values[::-1]) == (30, back[words])
+    values[[3, 29, 31]] = np.nan
+    assert find_unit_change(values) == (30, words)
+
+
+@pytest.mark.parametrize("rise", [9.0, 15.0, 25.0, 35.0, 60.0])
+def test_a_camera_that_is_carried_changes_no_unit(rise):
+    assert find_unit_change(np.r_[wave(30), wave(60)[30:] + rise]) is None
+
+
+def test_lenses_near_what_is_stated_are_not_doubted(recording):
+    camera = read_recording(recording).camera
+    for c in (2.6, 3.04, 3.6):
+        assert interior_doubts(camera, c, 0.1, -0.1) == []
+    assert len(interior_doubts(camera, 4.0, 0.9, 0.0)) == 2
+
+
+def test_errors_are_one_line_each(recording):
+    head(recording, SIZE, "width: 2464, height: 3280")
+    with pytest.raises(ThermocaldError) as caught:
+        tc.open(recording).calibrate()
+    assert "\n" not in str(caught.value)

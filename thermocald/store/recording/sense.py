@@ -1,0 +1,238 @@
+"""The sense of what was recorded: values that can be read, and cannot have been meant.
+
+What no camera and no thermometer can give is refused where it is read; what is only unlikely is a
+doubt, one sentence each, which `check`, `replay` and `import` tell.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from thermocald.arrays import Array
+    from thermocald.photogrammetry.camera.camera_model import Sensor
+    from thermocald.store.recording.head import CameraSpec
+
+LATEST_S = 7.26e9  # the year 2200
+_UNITS = {1e3: "ms", 1e6: "µs", 1e9: "ns"}  # of times, by how many are a second
+_NOT_MEASURED = (85.0, 127.9375, 127.94, 0.0, -40.0, -45.0, -46.85, 125.0, 130.0, 150.0, -0.0625)
+"""°C that thermometers give without having measured: at power-on, unplugged, all zeros or ones."""
+_LEAP_K = 5.0  # in one interval, by which no camera warms
+_LONGEST_SPIKE = 3  # readings
+_AROUND = 3  # readings before and after a change of the unit
+_FEWEST = 20  # image points that tell something of all
+_MOST_OUTSIDE = 0.02  # of the image points: gross errors are rarer
+_SMALLEST_EXTENT = 0.02  # of the image: less are millimetres, not px
+_FARTHEST_PX = 1e6
+_SIGMAS_PX = (1e-6, 1e4)
+_RHYTHM = 5.0  # times the stated interval
+_DISTANCES = (0.8, 1.25)  # fitted to stated principal distance
+_CENTRE = 0.1  # of the image's diagonal
+
+
+def time_fault(times: Array) -> tuple[int, str] | None:
+    """Return the first row of times (n,) s that are no seconds since 1970, and what they are."""
+    late = times > LATEST_S
+    if not late.any():
+        return None
+    row = int(np.argmax(late))
+    year = 1970 + times[row] / 31_556_952
+    unit = next((u for n, u in _UNITS.items() if 3e8 < times[row] / n < LATEST_S), None)
+    hint = f": are they {unit}? " if unit else ": "
+    return row, f"{times[row]:.15g} s is the year {year:.0f}{hint}Write seconds since 1970"
+
+
+def point_fault(values: Array) -> tuple[int, str, str] | None:
+    """Return the first row of x, y, sx, sy (n, 4) px that no measurement gives, column and why."""
+    far = np.abs(values[:, :2]) > _FARTHEST_PX
+    odd = (values[:, 2:4] < _SIGMAS_PX[0]) | (values[:, 2:4] > _SIGMAS_PX[1])
+    wrong = np.hstack([far, odd])
+    if not wrong.any():
+        return None
+    row, column = (int(i) for i in np.argwhere(wrong)[0])
+    value = f"{values[row, column]:g} px"
+    if column < 2:
+        return row, "xy"[column], f"{value} lies on no image; leave the row out"
+    low, high = _SIGMAS_PX
+    return row, ("sx", "sy")[column - 2], (
+        f"a standard deviation of {value} is none; image points are measured to between {low:g} "
+        f"and {high:g} px"
+    )  # fmt: skip
+
+
+def frame_fault(points: Array, sensor: Sensor) -> tuple[int, str] | None:
+    """Return the first of image points (n, 2) px off the image where so many are, and a hint."""
+    n, size = len(points), np.array([sensor.width, sensor.height], dtype=float)
+    if n < _FEWEST:
+        return None
+    most = np.abs(points).max(axis=0)
+    if (most < _SMALLEST_EXTENT * size).all():
+        return 0, (
+            f"all image points lie within {most[0]:.3g} × {most[1]:.3g} px of {sensor.width} × "
+            f"{sensor.height}: are they in mm? Write px from the centre of the top-left pixel"
+        )
+    outside = ((points < -1.0) | (points > size)).any(axis=1)
+    count = int(outside.sum())
+    if count <= _MOST_OUTSIDE * n:
+        return None
+
+    def within(other: Array, shift: Array | float = 0.0) -> bool:
+        moved = points + shift
+        return bool(np.mean((moved >= -1.0) & (moved <= other)) > 1.0 - _MOST_OUTSIDE)
+
+    if within(size, size / 2.0):
+        hint = "are they counted from the centre of the image? (0, 0) is the top-left pixel"
+    elif within(size[::-1]):
+        hint = "are width and height (or x and y) exchanged?"
+    else:
+        hint = "is the size that of another camera, mode, or crop?"
+    return int(np.argmax(outside)), (
+        f"{count} of {n} image points lie outside of the {sensor.width} × {sensor.height} px of "
+        f"recording.yaml: {hint}"
+    )
+
+
+class Spike(NamedTuple):
+    """Readings `first` to `stop` (exclusive), in a leap up and back; measured: whether they may be
+    what a thermometer measured, not what it gives without.
+    """
+
+    first: int
+    stop: int
+    measured: bool
+
+
+def find_spikes(values: Array) -> list[Spike]:
+    """Return the readings (n,) °C, NaN for none, that leap away for a moment and come back.
+
+    A leap has `_LEAP_K` and ten of the series' usual steps; at the ends only a value that is known
+    to be no measurement is one.
+    """
+    known = np.flatnonzero(np.isfinite(values))
+    v = values[known]
+    if len(v) < _AROUND + 1:
+        return []
+    steps = np.diff(v)
+    leap = max(_LEAP_K, 10.0 * float(np.median(np.abs(steps))))
+    found: list[Spike] = []
+    # a spike begins where a leap ends, or with the first reading
+    for first in [0, *(np.flatnonzero(np.abs(steps) > leap) + 1).tolist()]:
+        if found and known[first] < found[-1].stop:
+            continue
+        ends = np.flatnonzero(np.abs(steps[first : first + _LONGEST_SPIKE]) > leap)
+        if len(ends) == 0 and first + _LONGEST_SPIKE < len(v):
+            continue
+        stop = first + (int(ends[0]) + 1 if len(ends) else len(v) - first)
+        measured = not all(np.isclose(x, _NOT_MEASURED, atol=0.006).any() for x in v[first:stop])
+        inner = first > 0 and stop < len(v)
+        if stop - first > _LONGEST_SPIKE or (measured and not inner):
+            continue
+        if inner:
+            away = min(abs(v[first] - v[first - 1]), abs(v[stop - 1] - v[stop]))
+            if abs(v[stop] - v[first - 1]) > 0.5 * away:
+                continue
+        found.append(Spike(int(known[first]), int(known[stop - 1]) + 1, measured))
+    return found
+
+
+def find_unit_change(values: Array) -> tuple[int, str] | None:
+    """Return the first reading (n,) from which on a thermometer writes another unit, and which.
+
+    Told by a step onto the value that the readings before it have in the other unit.
+    """
+    known = np.flatnonzero(np.isfinite(values))
+    v = values[known]
+    steps = np.abs(np.diff(v))
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    for i in (np.flatnonzero(steps > max(_LEAP_K, 10.0 * usual)) + 1).tolist():
+        before, after = v[max(i - _AROUND, 0) : i], v[i : i + _AROUND]
+        if len(before) < _AROUND or len(after) < _AROUND:
+            continue
+        level, now = float(before[-1]), float(after[0])
+        if max(np.ptp(before), np.ptp(after)) > 0.25 * abs(now - level):
+            continue
+        others = {
+            "from °C to °F": 1.8 * level + 32.0,
+            "from °F to °C": (level - 32.0) / 1.8,
+            "from °C to K": level + 273.15,
+            "from K to °C": level - 273.15,
+            "to tenths": 10.0 * level,
+            "from tenths": 0.1 * level,
+        }
+        for words, value in others.items():
+            allowed = 1.0 + 4.0 * usual + 0.05 * abs(now - level)
+            if abs(now - value) < allowed:
+                return int(known[i]), words
+    return None
+
+
+def reading_doubts(values: Array, label: str) -> Iterator[str]:
+    """Yield what is doubtful in a thermometer's readings (n,) °C at the epochs."""
+    if changed := find_unit_change(values):
+        row, words = changed
+        yield (
+            f"{label}: the unit seems to change {words} at reading {row + 1}: "
+            f"{values[:row][np.isfinite(values[:row])][-1]:g}, then {values[row]:g}"
+        )
+    if spikes := find_spikes(values):
+        first = spikes[0]
+        why = "leap away and back" if first.measured else "are what it gives without a measurement"
+        yield (
+            f"{label}: {sum(s.stop - s.first for s in spikes)} readings {why}, the first "
+            f"{values[first.first]:g} °C at reading {first.first + 1}; leave them empty"
+        )
+
+
+def time_doubts(numbers: NDArray[np.int64], times: Array, interval: float) -> Iterator[str]:
+    """Yield what is doubtful in the times (E,) s of epochs with numbers (E,)."""
+    if len(times) < 2:
+        return
+    steps = np.diff(times)
+    if (steps == 0).any():
+        row = int(np.argmax(steps == 0))
+        yield (
+            f"{int((steps == 0).sum()) + 1} epochs have the time of another one, the first "
+            f"{numbers[row]} and {numbers[row + 1]}"
+        )
+    # epochs that are missing lengthen a step, not the time from one number to the next
+    rhythm = float(np.median(steps / np.diff(numbers)))
+    if rhythm > 0 and not 1.0 / _RHYTHM < rhythm / interval < _RHYTHM:
+        yield (
+            f"frames follow one another every {rhythm:.3g} s, recording.yaml says {interval:.4g} s:"
+            " is frame_time in seconds?"
+        )
+
+
+def interior_doubts(camera: CameraSpec, c: float, x0: float, y0: float) -> list[str]:
+    """Return what is doubtful in an interior orientation, mm, estimated for a camera."""
+    sensor, found = camera.sensor, []
+    stated = camera.principal_distance
+    if stated is not None and not _DISTANCES[0] < c / stated < _DISTANCES[1]:
+        found.append(
+            f"the principal distance is {c:.3f} mm where {stated:g} mm is stated, "
+            f"{c / stated:.3g} times: is one of distance, pixel pitch, image size another camera's?"
+        )
+    pitch, W, H = sensor.pixel_pitch, sensor.width, sensor.height
+    if math.hypot(x0, y0) > _CENTRE * math.hypot(W, H) * pitch:
+        exchanged = (W - H) / 2.0
+        near = abs(x0 / pitch + exchanged) + abs(y0 / pitch + exchanged) < _CENTRE * abs(W - H)
+        why = "width and height look exchanged" if near and W != H else (
+            "is the image size that of another camera, mode, or crop?"
+        )  # fmt: skip
+        found.append(
+            f"the principal point lies {x0 / pitch:+.0f}, {-y0 / pitch:+.0f} px off the centre of "
+            f"{W} × {H} px: {why}"
+        )
+    return found
+
+
+def doubt_lines(doubts: Sequence[str]) -> list[str]:
+    """Return doubts as lines for a person."""
+    return [f"doubtful: {text}" for text in doubts]

@@ -154,6 +154,7 @@ def test_a_result_is_what_the_command_says(epochs, world):
     document = json.loads(call("replay", "M1", "--json", "-", folder=world).stdout)
 
     assert said.strip() == str(epochs).strip()
+    assert document.pop("doubts") == tc.open(world / "M1").doubts(epochs)
     assert {k: v for k, v in document.items() if k not in ("recording", "store")} == json.loads(
         json.dumps(epochs.as_dict())
     )

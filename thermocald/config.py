@@ -215,7 +215,8 @@ class CameraConfig(DeviceConfig):
 
     series: what it takes when no session runs, None for nothing: the device is closed then.
     thermometers: by name, the first is the reference; testfield: None if epochs are only
-    acquired; calibration: what differs from the common settings is given in full.
+    acquired; thermal_model: in place of a test field, the camera is predicted and, with control
+    points, posed; calibration: what differs from the common settings is given in full.
     """
 
     period_s: Period = 10.0
@@ -228,12 +229,38 @@ class CameraConfig(DeviceConfig):
     """Nominal; helps to find a first orientation."""
     testfield: Path | None = None
     """A testfield.csv; without it frames are only taken."""
+    thermal_model: Path | None = None
+    """In place of a test field: the camera is predicted from its thermometers."""
+    control_points: Path | None = None
+    """With a thermal model: surveyed points that give its pose in each frame."""
+    control_unit: Literal["mm", "m"] = "m"
+    """Of the control points' coordinates in a CSV."""
+    control_reference: Path | None = None
+    """A frame in which the control points' x, y are; without it they are coded targets."""
+    mount_sd_deg: Annotated[float, Field(gt=0.0, le=10.0)] | None = None
+    """How far the mount turns about an axis in an hour; None: not known."""
     thermometers: tuple[Name, ...] = ()
     """By name; the first is the reference."""
     calibration: CalibrationConfig | None = None
     """Of this camera, in full, in place of the common one."""
 
-    _testfield = field_validator("testfield")(relative_to_file)
+    _files = field_validator("testfield", "thermal_model", "control_points", "control_reference")(
+        relative_to_file
+    )
+
+    @model_validator(mode="after")
+    def _one_task(self) -> Self:
+        if self.thermal_model is None:
+            for key in ("control_points", "control_reference", "mount_sd_deg"):
+                if getattr(self, key) is not None:
+                    raise wrong(f"`{key}` needs a `thermal_model`")
+        elif self.testfield is not None:
+            raise wrong("either `testfield` or `thermal_model`: calibrated or predicted")
+        elif not self.thermometers:
+            raise wrong("`thermal_model` needs `thermometers`, the reference first")
+        if self.control_points is None and self.control_reference is not None:
+            raise wrong("`control_reference` needs `control_points`")
+        return self
 
 
 def _resolved(value: Any, folder: Path) -> Any:
@@ -407,10 +434,10 @@ def parse_config(
     for where, kind, device in _devices(config):
         _check_options(f"{path}: {where}", kind, device, option_names)
     for i, camera in enumerate(config.cameras):
-        if camera.testfield is not None and not camera.testfield.is_file():
-            raise ConfigurationError(
-                f"{path}: cameras[{i}].testfield: there is no file {camera.testfield}"
-            )
+        for key in ("testfield", "thermal_model", "control_points", "control_reference"):
+            file = getattr(camera, key)
+            if file is not None and not file.is_file():
+                raise ConfigurationError(f"{path}: cameras[{i}].{key}: there is no file {file}")
     return config
 
 

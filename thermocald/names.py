@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
     from thermocald.errors import ThermocaldError
 
+WITH_VALUES = ("ok", "predicted", "resected", "last_pose")
+"""Statuses of epochs in which nothing is wrong: calibrated, or a thermal model's camera at work."""
+
 _PARAMETERS = (
     "c", "x0", "y0", "A1", "A2", "A3", "B1", "B2", "C1", "C2", "omega", "phi", "kappa", "X0", "Y0",
     "Z0",
@@ -32,6 +35,7 @@ OUR_COLUMNS = frozenset(
         "device", "series", "state", "stored", "lost", "online",
         "pixel_pitch", "skew_s", "event", "innovation_chi2", "innovation_bound",
         "drift_px_per_min", *(f"drift_{name}_px" for name in ("c", "x0", "y0")),
+        "reading_age_s", "unknown_past_px", "outside_K", "opencv",
         "blur_px", "blur_trend_x", "blur_trend_y", "blur_curvature", "contrast", "grey", "noise",
         "saturation", "epochs", "per_point", "channels", "target",
     )

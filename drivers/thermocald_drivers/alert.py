@@ -23,6 +23,7 @@ from pydantic import Field, model_validator
 
 from thermocald.errors import ConfigurationError, DeviceGone
 from thermocald.hal import DriverOptions, Output
+from thermocald.names import WITH_VALUES
 from thermocald_drivers import support
 
 if TYPE_CHECKING:
@@ -297,7 +298,7 @@ class Watch:
         if moment[1] is not None and self._seen.get(device) == moment:
             return []
         self._seen[device] = moment
-        failed = 0 if result.get("status") == "ok" else self._failed.get(device, 0) + 1
+        failed = 0 if result.get("status") in WITH_VALUES else self._failed.get(device, 0) + 1
         self._failed[device] = failed
         before, self._lost = self._lost, int(result.get("lost", self._lost))
         lost = max(0, self._lost - before)

@@ -55,6 +55,20 @@ class CalibratedEpoch:
     searched: str = ""
 
 
+class EpochCalibrator(Protocol):
+    """What a pipeline asks: of this module's calibrator, and of one that predicts."""
+
+    testfield: TestField
+
+    def calibrate(
+        self, epoch: Epoch, image: NDArray[Any] | EncodedImage | None = None
+    ) -> CalibratedEpoch:
+        """Make a result of an epoch; never raises for data."""
+
+    def reset(self) -> None:
+        """Forget where the camera was."""
+
+
 class _Camera(Protocol):
     @property
     def sensor(self) -> Sensor: ...

@@ -29,7 +29,7 @@ from thermocald.photogrammetry.targets.image_file import EncodedImage
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
-    from thermocald.acquisition.calibrator import Calibrator
+    from thermocald.acquisition.calibrator import EpochCalibrator
     from thermocald.acquisition.pairing import Readings
     from thermocald.hal import Clock, Frame
 
@@ -45,7 +45,7 @@ def make_epoch(number: int, frame: Frame, paired: PairedReadings) -> Epoch:
     return Epoch(number, frame.utc, paired.utc, paired.temperatures)
 
 
-def calibrate_frame(calibrator: Calibrator, epoch: Epoch, frame: Frame) -> CalibratedEpoch:
+def calibrate_frame(calibrator: EpochCalibrator, epoch: Epoch, frame: Frame) -> CalibratedEpoch:
     """Measure and adjust; a frame that is not an image gives the status `bad_frame`, no error."""
     try:
         if (lists := frame.metadata.get("observations")) is not None:
@@ -98,7 +98,7 @@ class Pipeline:
     def __init__(
         self,
         name: str,
-        calibrator: Calibrator | None,
+        calibrator: EpochCalibrator | None,
         readings: Readings,
         thermometers: Sequence[str],
         keeper: Keeper,
@@ -319,7 +319,7 @@ class FrameCheck:
     failed: str = ""
 
 
-def check_frame(name: str, calibrator: Calibrator, frame: Frame) -> FrameCheck:
+def check_frame(name: str, calibrator: EpochCalibrator, frame: Frame) -> FrameCheck:
     """Measure and adjust a frame, and say what a person can mend."""
     nothing = PairedReadings(float("nan"), {}, float("nan"))
     calibrated = calibrate_frame(calibrator, make_epoch(1, frame, nothing), frame)

@@ -52,13 +52,9 @@ def measure(
     --control gcp.csv --seen 2026-05-04T09:00:00Z --plane water.yaml --length-unit m
     """
     import thermocald as tc
+    from thermocald.analysis.thermal.control_points import UNITS, ControlPoints
     from thermocald.analysis.thermal.model_log import read_model_log
-    from thermocald.analysis.thermal.places import (
-        UNITS,
-        ControlPoints,
-        measure_places,
-        read_surface,
-    )
+    from thermocald.analysis.thermal.places import measure_places, read_surface
     from thermocald.analysis.thermal.timed_rows import first_times, row_blocks, seconds_of
     from thermocald.store.logger.clock import device_clock
 
@@ -69,6 +65,8 @@ def measure(
         say(f"warning: {thermal.warning}")
     clock = device_clock(timezone, ambiguous=ambiguous)
     given = ControlPoints.read(control, length_unit)
+    if given.assumed:
+        say(given.assumed)
     surface = read_surface(plane, given)
     table = read_model_log(thermal, log, log_options, first_times(points, clock)[1])
     rows = list(row_blocks(points, ("x", "y", "sx", "sy"), clock))

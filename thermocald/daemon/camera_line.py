@@ -15,7 +15,7 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
-from thermocald.acquisition.calibrator import CalibratedEpoch
+from thermocald.acquisition.calibrator import CalibratedEpoch, Calibrator
 from thermocald.acquisition.device_loop import DeviceLoop, Link
 from thermocald.acquisition.pipeline import Pipeline, check_frame
 from thermocald.daemon.epoch_keeper import EpochKeeper
@@ -214,7 +214,7 @@ class SeriesRun:
         )
 
     def _weighed(self, seen: Observations) -> Observations:
-        assert self.plan.calibrator is not None
+        assert isinstance(self.plan.calibrator, Calibrator)
         return self.plan.calibrator.weighed(seen)
 
     def _remember(self) -> None:
@@ -223,7 +223,7 @@ class SeriesRun:
             return
         self._remembered = True
         assert self.running is not None
-        assert self.plan.calibrator is not None
+        assert isinstance(self.plan.calibrator, Calibrator)
         for epoch, reported, begun in self.keeper.recent(_REMEMBERED):
             if begun:
                 self.running.reset()
@@ -306,7 +306,7 @@ class CameraLine:
 
     def check(self) -> None:
         """Look at the next frame and keep none; `checked` then says what was found."""
-        if self.plan.calibrator is None:
+        if not isinstance(self.plan.calibrator, Calibrator):
             raise ConfigurationError(f"camera {self.plan.name!r}: a session needs its `testfield`")
         self.checked = None
         self._replace(None, checking=True)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from thermocald.daemon.plan import check_series, series_head
 from thermocald.daemon.store_guard import Row
 from thermocald.errors import StoreError
+from thermocald.names import WITH_VALUES
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.store.series import NOT_CALIBRATED, EpochResult, Event, StoredSeries
 
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _CATCH_UP_BATCH = 200
+_LATEST = 4000  # epochs, whose readings effects with a memory still feel
+_DETAILED = 100
 
 
 class EpochKeeper:
@@ -103,6 +106,19 @@ class EpochKeeper:
         except StoreError as error:
             log.warning("earlier epochs cannot be read: %s", error)
 
+    def latest(self) -> Iterator[StoredEpoch]:
+        """The last epochs as they are stored, the very last with all details."""
+        series = self.series
+        if series is None:
+            return
+        last = self.first_number - 1
+        try:
+            detailed = max(0, last - _DETAILED)
+            yield from self._guard.epochs(series, last - _LATEST, detailed, details=False)
+            yield from self._guard.epochs(series, detailed + 1)
+        except StoreError as error:
+            log.warning("earlier epochs cannot be read: %s", error)
+
     def first_rows(self, count: int) -> list[dict[str, Any]]:
         """The first epochs with a result that are stored, as rows for the outputs."""
         series = self.series
@@ -124,7 +140,7 @@ class EpochKeeper:
         epoch = acquired.epoch if calibrated is None else calibrated.epoch
         deferred = calibrated is None and self.plan.calibrator is not None
         eventful = calibrated is not None and (
-            not calibrated.adjustment.ok or "event" in calibrated.extra
+            calibrated.adjustment.status not in WITH_VALUES or "event" in calibrated.extra
         )
         result = None
         extra = {
@@ -166,7 +182,8 @@ class EpochKeeper:
             log.log(level, "the calibration of epoch %d waits: %s", epoch.number, error)
             self._searched_to = min(self._searched_to, epoch.number - 1)
             return
-        wanted = self._frames.wanted(epoch.number, not calibrated.adjustment.ok)
+        failed = calibrated.adjustment.status not in WITH_VALUES
+        wanted = self._frames.wanted(epoch.number, failed)
         stored = self._stored(epoch.number)
         if not wanted and stored is not None and stored.epoch.frame is not None:
             self._frames.delete(stored.epoch.frame)

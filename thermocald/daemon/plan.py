@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from thermocald.analysis.online.running_series import RunningSeries
+    from thermocald.analysis.thermal.gauge import GaugeCalibrator
     from thermocald.config import CalibrationConfig, CameraConfig, Config
     from thermocald.hal import Camera, Clock, Frame
 
@@ -33,7 +34,8 @@ class CameraPlan:
     """One camera of the configuration, ready to be started.
 
     series: the one being taken, empty for none; sensor, testfield, calibrator: None if its epochs
-    are only acquired.
+    are only acquired; of a gauge the test field holds the control points, and there may be none;
+    extra: what the head of a series keeps besides.
     """
 
     config: CameraConfig
@@ -41,8 +43,9 @@ class CameraPlan:
     camera: Camera
     sensor: Sensor | None
     testfield: TestField | None
-    calibrator: Calibrator | None
+    calibrator: Calibrator | GaugeCalibrator | None
     series: str
+    extra: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -65,28 +68,52 @@ def require_thermometer_columns(
 def _plan(config: Config, one: CameraConfig, clock: Clock) -> CameraPlan:
     camera: Camera = open_device("camera", one.driver, one.options, clock)
     calibration = config.calibration_of(one)
-    sensor, field = _sensor(one), None
+    if one.thermal_model is not None:
+        return _plan_gauge(one, calibration, camera)
+    sensor, targets = _sensor(one), None
     if one.testfield is not None:
-        field = read_testfield(one.testfield)
+        targets = read_testfield(one.testfield)
         if sensor is None:
             raise ConfigurationError(
                 f"camera {one.name!r}: a test field needs `sensor: {{width_px: …, height_px: …, "
                 "pixel_pitch_mm: …}}` too"
             )
     elif (scene := camera.known_scene()) is not None:
-        field, sensor = scene.testfield, sensor or scene.sensor
+        targets, sensor = scene.testfield, sensor or scene.sensor
     _check_size(one, camera, sensor)
     calibrator = None
-    if field is not None and sensor is not None:
+    if targets is not None and sensor is not None:
         calibrator = Calibrator(
             sensor,
-            field,
+            targets,
             adjustment_settings(calibration),
             nominal_c=one.principal_distance_mm,
             interior=_held(one, calibration),
             sigma_floor_px=calibration.sigma_floor_px,
         )
-    return CameraPlan(one, calibration, camera, sensor, field, calibrator, one.series or "")
+    return CameraPlan(one, calibration, camera, sensor, targets, calibrator, one.series or "")
+
+
+def _plan_gauge(one: CameraConfig, calibration: CalibrationConfig, camera: Camera) -> CameraPlan:
+    """A camera that is predicted by its thermal model, and posed by control points."""
+    from thermocald.analysis.thermal.gauge import plan_gauge
+    from thermocald.analysis.thermal.thermal_camera import ThermalCamera
+
+    assert one.thermal_model is not None
+    thermal = ThermalCamera.load(one.thermal_model)
+    sensor = _sensor(one) or thermal.model.sensor
+    _check_size(one, camera, sensor)
+    thermal = thermal.for_images(sensor.width, sensor.height)
+    gauge, origin = plan_gauge(
+        thermal, one.control_points, one.control_unit, one.control_reference, one.mount_sd_deg,
+        calibration.snooping_alpha,
+    )  # fmt: skip
+    extra: dict[str, Any] = {"thermal_model": thermal.model.name or thermal.model.camera}
+    if len(gauge.testfield):
+        extra["control_origin_mm"] = origin
+    return CameraPlan(
+        one, calibration, camera, gauge.sensor, gauge.testfield, gauge, one.series or "", extra
+    )
 
 
 def _check_size(one: CameraConfig, camera: Camera, sensor: Sensor | None) -> None:
@@ -117,8 +144,10 @@ def adjustment_settings(calibration: CalibrationConfig) -> AdjustmentSettings:
 
 def running_series(plan: CameraPlan) -> RunningSeries | None:
     """The series of this camera as it is adjusted while it is taken; None if nothing is shared."""
-    if plan.sensor is None or plan.testfield is None:
+    if not isinstance(plan.calibrator, Calibrator):
         return None
+    assert plan.sensor is not None
+    assert plan.testfield is not None
     from thermocald.analysis.online.running_series import RunningSeries
 
     running = RunningSeries(
@@ -149,7 +178,7 @@ def series_head(
     plan: CameraPlan, frame: Frame, channels: Iterable[str]
 ) -> tuple[Head, TestField, dict[str, Any]]:
     """(head, test field, settings) of the series that begins with a frame."""
-    extra: dict[str, Any] = {}
+    extra: dict[str, Any] = dict(plan.extra)
     sensor = plan.sensor
     if sensor is None:
         # nothing is computed from it: the series is acquired only
@@ -165,8 +194,8 @@ def series_head(
         channels={name: Channel() for name in channels},
         extra=extra,
     )
-    field = plan.testfield or TestField.build([], np.empty((0, 3)))
-    return head, field, _settings(plan.calibration)
+    targets = plan.testfield or TestField.build([], np.empty((0, 3)))
+    return head, targets, _settings(plan.calibration)
 
 
 def _settings(calibration: CalibrationConfig) -> dict[str, Any]:

@@ -34,6 +34,7 @@ from thermocald.daemon.systemd import (
 )
 from thermocald.errors import DataError, ThermocaldError
 from thermocald.hal import option_names
+from thermocald.names import WITH_VALUES
 from thermocald.store.series import Event
 
 if TYPE_CHECKING:
@@ -237,7 +238,7 @@ class Service:
                 parts.append(f"{camera.plan.name}: {camera.link.why or camera.link.state}")
                 continue
             text = f"{camera.plan.name}: epoch {last['epoch']}, {last['temperature']:.1f} °C"
-            if last["status"] == "ok":
+            if last["status"] in WITH_VALUES:
                 text += f", c {last['c']:.4f} mm, {last['state']}"
             else:
                 text += f", {last['status']}"

@@ -15,6 +15,7 @@ import time
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from thermocald.acquisition.calibrator import Calibrator
 from thermocald.acquisition.device_loop import DeviceLoop, Link
 from thermocald.acquisition.frame_folder import FrameFolder
 from thermocald.acquisition.pairing import Readings, require_columns
@@ -214,16 +215,22 @@ class Station:
 
     def make_observer(self, plan: CameraPlan, keeper: EpochKeeper) -> Any:
         """The online estimate of a camera; None if it is only acquired."""
-        if plan.sensor is None or plan.testfield is None:
+        if plan.sensor is None or plan.testfield is None or plan.calibrator is None:
             return None
-        from thermocald.analysis.online.observer import OnlineObserver
 
         def tell(kind: str, text: str, utc: float, epoch: int) -> None:
             series: StoredSeries | None = keeper.series
             log.warning("camera %s: %s", plan.name, text, extra={"event": kind})
             self.guard.event(Event(utc, kind, text, None if series is None else series.id, epoch))
 
-        return OnlineObserver(plan.sensor, plan.testfield, tell)
+        if isinstance(plan.calibrator, Calibrator):
+            from thermocald.analysis.online.observer import OnlineObserver
+
+            return OnlineObserver(plan.sensor, plan.testfield, tell)
+        from thermocald.analysis.thermal.gauge import GaugeObserver
+
+        plan.calibrator.remember(keeper.latest())
+        return GaugeObserver(plan.calibrator, tell)
 
     def status(self) -> dict[str, Any]:
         """For `thermocald status`, JSON-able but for NaN."""

@@ -24,6 +24,7 @@ import numpy as np
 
 from thermocald.analysis.statistics.dependence import dependence
 from thermocald.analysis.statistics.random_effects import odd_specimens, population
+from thermocald.names import WITH_VALUES
 from thermocald.numbers import short_duration
 from thermocald.store.server.fleet_reader import FleetReader
 
@@ -163,7 +164,7 @@ def _camera(record: CameraRecord, state: StationState | None, now: float) -> Cam
         state,
         now - record.last_time,
         float(np.median(on_the_way)) if on_the_way else math.nan,
-        sum(e.status == "ok" for e in recent) / len(recent) if recent else math.nan,
+        sum(e.status in WITH_VALUES for e in recent) / len(recent) if recent else math.nan,
         record.last_ok,
         known[0] if known else math.nan,
         record.range,
@@ -332,7 +333,7 @@ def _stuck_for(camera: CameraOverview, known: Sequence[float]) -> float:
 def _calibration(camera: CameraOverview, now: float) -> Iterator[Finding]:
     recent = camera.record.recent
     if len(recent) >= _FEWEST and camera.ok < _LEAST_OK:
-        failed = [e.status for e in recent if e.status != "ok"]
+        failed = [e.status for e in recent if e.status not in WITH_VALUES]
         often = max(sorted({*failed}), key=failed.count)
         yield Finding(
             "calibrate", f"{len(failed)} of the last {len(recent)} epochs have no result: {often}"

@@ -10,6 +10,7 @@ import math
 import textwrap
 from typing import Any
 
+from thermocald.names import WITH_VALUES
 from thermocald.numbers import duration, with_sd
 
 __all__ = ["WIDTH", "status_lines", "status_warnings"]
@@ -61,7 +62,7 @@ def _camera(name: str, camera: dict[str, Any]) -> list[str]:
         temperature = last.get("temperature")
         at = "" if temperature is None else f" at {temperature:.2f} °C"
         lines[0] += f", epoch {last.get('epoch', '?')}{at}"
-        if last.get("status") == "ok":
+        if last.get("status") in WITH_VALUES:
             lines += _orientation(last)
             lines += _wrapped(f"  {_movement(last)}")
             if said := (last.get("online") or {}).get("orientation"):

@@ -349,6 +349,7 @@ def series_input(
 
     A long one with observations is condensed while it is read.
     """
+    recording.head.require_calibrated(str(recording.path))
     if recording.has_observations and len(recording) > limit_rows(len(recording.testfield)):
         whole = replace(_read_epochs(recording), columns=_read_columns(recording))
         return condensed(whole, recording)
@@ -397,6 +398,7 @@ def _read_epochs(recording: Recording) -> SeriesInput:
 
 def stored_input(store: SeriesReader, series: StoredSeries, name: str) -> SeriesInput:
     """Read the arrays of a series in a store; a long one is condensed while it is read."""
+    series.head.require_calibrated(store.where)
     numbers = store.series_columns(series, ["epoch"])["epoch"].astype(np.int64)
     if len(numbers) <= limit_rows(len(series.testfield)):
         epochs = [e.epoch for e in store.epochs(series)]

@@ -43,6 +43,7 @@ def recorded_table(
     epochs are done; jobs: processes, with the same bits for any number. Raises DataError where no
     epoch has a result.
     """
+    recording.head.require_calibrated(str(recording.path))
     adjusted = SeriesSettings.of(settings, exterior)
     calibrator = Calibrator.of_recording(recording, settings)
     head, targets = recording.head, recording.testfield

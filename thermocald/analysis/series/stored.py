@@ -101,6 +101,9 @@ def table_of_stored(
     if size == 0:
         raise DataError(f"{store.path}: series {series.name!r} has no epochs")
     ok = columns["status"] == "ok"
+    if exterior != "stored":
+        series.head.require_calibrated(str(store.path))
+    known = ok | series.head.predicted
     reasons = [""] * size
     if not ok.all():
         rows = {int(n): i for i, n in enumerate(columns["epoch"]) if not ok[i]}
@@ -111,8 +114,8 @@ def table_of_stored(
         columns["epoch"].astype(np.int64),
         columns["frame_time"],
         next(iter(store.temperatures_at_frame(series).values()), np.full(size, np.nan)),
-        _parameters(store, series, "", ok),
-        _parameters(store, series, "sd_", ok),
+        _parameters(store, series, "", known),
+        _parameters(store, series, "sd_", known),
         np.where(ok, columns["sigma0"], np.nan),
         columns["n_observations"].astype(np.int64),
         columns["n_rejected"].astype(np.int64),

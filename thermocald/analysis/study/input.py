@@ -99,6 +99,7 @@ def from_store(
     jobs: int = 1,
 ) -> MeasuredSeries:
     """One series of a store; DataError where no epoch has a result."""
+    series.head.require_calibrated(store.where)
     start = f"-{series.start}" if series.start else ""
     label = label or series.camera + start
     count = len(store.series_columns(series, ["epoch"])["epoch"])

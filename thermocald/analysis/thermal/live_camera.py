@@ -149,6 +149,11 @@ class LiveCamera:
             if name.split(".")[0] in {e.name for e in self._drives}
         }
 
+    @property
+    def keeps_all(self) -> bool:
+        """Whether every reading is kept and asked at each update."""
+        return self._asks_along
+
     def update(self, time: Any, temperature: float | Mapping[str, float]) -> Camera:
         """Take a reading and return the camera now, the same as `along` says of the history so far.
 

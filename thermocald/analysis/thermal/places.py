@@ -15,78 +15,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from thermocald.analysis.thermal.control_points import UNITS
 from thermocald.analysis.thermal.correction import require_inside
 from thermocald.errors import ConfigurationError, DataError
 from thermocald.files import read_yaml
 from thermocald.photogrammetry.camera.camera_model import EOP, InteriorOrientation
 from thermocald.photogrammetry.epoch.measuring import Line, Plane, place_on, resect
-from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.result import Result, new_figure
-from thermocald.store.recording.table import Table
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from matplotlib.figure import Figure
 
+    from thermocald.analysis.thermal.control_points import ControlPoints
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
     from thermocald.arrays import Array
     from thermocald.photogrammetry.epoch.adjustment import Adjustment
     from thermocald.store.logger.temperatures import TemperatureLog
-
-UNITS = {"mm": 1.0, "m": 1000.0}
-"""Lengths that control points and planes may be given in, in mm."""
-
-_ROUND_MM = 1e6  # national grids: coordinates count from a round number near the points
-
-
-@dataclass(frozen=True, eq=False)
-class ControlPoints:
-    """Surveyed points and where they were seen.
-
-    field: coordinates in mm from `origin` (3,) mm; seen: image points px; unit: of the file.
-    """
-
-    field: TestField
-    seen: Observations
-    origin: Array
-    unit: str
-
-    @classmethod
-    def read(cls, path: Path, unit: str) -> ControlPoints:
-        """Read a CSV with target, X, Y, Z, sX, sY, sZ (mm or m) and x, y, sx, sy (px).
-
-        Raises DataError naming file, line and column.
-        """
-        table = Table(
-            path, ("target", "X", "Y", "Z", "sX", "sY", "sZ", "x", "y", "sx", "sy"), DataError
-        )
-        names: list[str] = []
-        columns: dict[str, list[Array]] = {n: [] for n in table.columns if n and n != "target"}
-        wanted = ("X", "Y", "Z", "sX", "sY", "sZ", "x", "y", "sx", "sy")
-        for chunk in table.chunks():
-            names += [word.strip() for word in chunk.text("target")]
-            for name in wanted:
-                values = chunk.numbers(name)
-                if name[0] == "s":
-                    chunk.check(name, values <= 0, "a standard deviation must be above 0")
-                columns[name].append(values)
-        if not names:
-            raise DataError(f"{path}: holds no control points")
-        if len(set(names)) < len(names):
-            twice = next(n for n in names if names.count(n) > 1)
-            raise DataError(f"{path}: target {twice!r} is duplicated")
-        whole = {name: np.concatenate(columns[name]) for name in wanted}
-        scale = UNITS[unit]
-        points = scale * np.stack([whole[n] for n in "XYZ"], axis=1)
-        origin = np.round(points.mean(axis=0) / _ROUND_MM) * _ROUND_MM
-        sigmas = scale * np.stack([whole[n] for n in ("sX", "sY", "sZ")], axis=1)
-        field = TestField.build(names, points - origin, sigmas)
-        image = np.stack([whole["x"], whole["y"]], axis=1)
-        seen = Observations(
-            np.arange(len(names)), image, np.stack([whole["sx"], whole["sy"]], axis=1)
-        )
-        return cls(field, seen, origin, unit)
 
 
 def read_surface(path: Path, control: ControlPoints) -> Plane | Line:
@@ -240,6 +186,8 @@ def measure_places(
     """
     if not len(observed):
         raise DataError("there is no image point to be measured")
+    if not len(control.seen):
+        raise DataError("the control points have no x, y, sx, sy: where were they seen?")
     require_inside(log, np.append(times, when))
     readings = dict(log.channels)
     then = camera.along(log.times, readings, [when], extrapolate, temperature_sd=thermometer_sd)

@@ -30,6 +30,11 @@ class Validity:
     low: float
     high: float
 
+    def distance(self, T: float) -> tuple[float, bool]:
+        """How many kelvin a temperature lies outside, and whether that is too far to be used."""
+        beyond = max(self.low - T, T - self.high)
+        return (beyond if beyond > _MARGIN_K else 0.0), self._is_far(T)
+
     def beyond(self, T: float, extrapolate: bool) -> float:
         """How many kelvin a temperature lies outside; warns or refuses."""
         low, high = self.low, self.high

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from thermocald.errors import StoreError
-from thermocald.names import relative_path
+from thermocald.names import WITH_VALUES, relative_path
 from thermocald.store.database.columns import (
     all_rows,
     checked_chunks,
@@ -210,7 +210,7 @@ def frames_after(connection: sqlite3.Connection, after: int, limit: int) -> Iter
         path, happened = None, False
         try:
             path = relative_path(frame, f"epoch {number}: frame", StoreError) if frame else None
-            happened = status not in ("ok", NOT_CALIBRATED) or "event" in json.loads(extra)
+            happened = status not in (*WITH_VALUES, NOT_CALIBRATED) or "event" in json.loads(extra)
         except (StoreError, ValueError) as error:
             log.warning("%s; its frame is left out", error)
         yield KeptFrame(id_, series, number, time, path, happened)

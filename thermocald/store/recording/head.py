@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from thermocald.errors import RecordingError
+from thermocald.errors import DataError, RecordingError
 from thermocald.files import dump_yaml, read_yaml
 from thermocald.names import require_channels
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, InteriorOrientation, Sensor
@@ -56,6 +56,20 @@ class Head:
     camera: CameraSpec
     channels: Mapping[str, Channel] = field(default_factory=dict)
     extra: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def predicted(self) -> bool:
+        """Whether its cameras were predicted by a thermal model, not calibrated."""
+        return "thermal_model" in self.extra
+
+    def require_calibrated(self, where: str) -> None:
+        """Raise DataError for a series whose cameras a thermal model predicted."""
+        if self.predicted:
+            raise DataError(
+                f"{where}: series {self.series!r} was predicted by the thermal model "
+                f"{self.extra['thermal_model']!r}; nothing in it was calibrated. `thermocald "
+                "export` of its store has the cameras"
+            )
 
 
 class _Reader:

@@ -76,7 +76,7 @@ function showCamera(camera) {
     if (status.pid) { $("state").textContent = "no epoch yet"; $("state").className = ""; }
     return;
   }
-  const online = last.online || {}, good = last.status === "ok";
+  const online = last.online || {}, good = ["ok", "predicted", "resected", "last_pose"].includes(last.status);
   const state = $("state");
   state.className = good ? last.state : "failed";
   state.textContent = good ? (online.sentence || last.state) : `${last.status}: ${last.reason}`;

@@ -1,0 +1,120 @@
+"""The daemon without a test field: a thermal model predicts, control points pose."""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+import pytest
+import yaml
+
+from tests.commands import call
+from thermocald.physics.testfields import demonstration_field, demonstration_model
+from thermocald.store.database.store import Store
+
+
+@pytest.fixture
+def thermal_model(small_camera, tmp_path):
+    """The rendered camera's own model, as a fit would have left it."""
+    document = yaml.safe_load(small_camera.read_text())
+    document["validity"] = {"temperature": [15.0, 60.0]}
+    names = ["interior.c", "interior.x0", "interior.y0", "rates.c", "rates.x0", "rates.y0"]
+    sds = [4e-4, 5e-4, 5e-4, 4e-6, 4e-6, 4e-6]
+    document["covariance"] = {"parameters": names, "matrix": np.diag(np.square(sds)).tolist()}
+    path = tmp_path / "camera.thermal.yaml"
+    path.write_text(yaml.safe_dump(document))
+    return path
+
+
+@pytest.fixture
+def control_points(tmp_path):
+    """Every corner of a few markers of the rendered field, in metres of a national grid."""
+    field = demonstration_field("markers")
+    path = tmp_path / "gcp.csv"
+    with path.open("w", newline="") as out:
+        rows = csv.writer(out)
+        rows.writerow(["target", "X", "Y", "Z", "sX", "sY", "sZ", "kind", "code"])
+        for i, name in enumerate(field.names):
+            if i % 40 < 4:  # whole markers
+                at = field.points[i] / 1000 + (192_000, 313_000, 138)
+                row = [name, *(f"{v:.6f}" for v in at), 2e-4, 2e-4, 2e-4]
+                rows.writerow([*row, field.kinds[i], field.codes[i]])
+    return path
+
+
+def at_work(devices, thermal_model, **options):
+    return devices(thermal_model=str(thermal_model), series="gauge", **options)
+
+
+def test_predicted_epochs_through_a_restart(daemon, devices, thermal_model):
+    daemon.configure(**at_work(devices, thermal_model))
+    daemon.start()
+    daemon.until(lambda: len(daemon.results()) >= 5)
+    daemon.kill()
+    daemon.start()
+    count = len(daemon.results())
+    daemon.until(lambda: len(daemon.results()) >= count + 4)
+    assert daemon.stop() == 0
+    numbers, words = daemon.stored()
+    assert numbers == list(range(1, len(numbers) + 1))
+    assert set(words) == {"predicted"}
+    row = daemon.results()[-1]
+    assert row["sd_c"] > 0
+    assert row["X0"] is None
+    assert row["reading_age_s"] < 5
+    done = call("export", daemon.store)
+    assert done.returncode == 0, done.stderr
+    last = list(csv.DictReader(done.stdout.splitlines()))[-1]
+    assert last["status"] == "predicted"
+    assert float(last["c"]) == pytest.approx(row["c"])
+
+
+def test_posed_epochs_are_those_of_the_rendered_camera(
+    daemon, devices, thermal_model, control_points
+):
+    daemon.configure(**at_work(devices, thermal_model, control_points=str(control_points)))
+    daemon.start("--epochs", "6")
+    assert daemon.wait() == 0
+    _, words = daemon.stored()
+    assert set(words) == {"resected"}
+    with Store.open(daemon.store) as store:
+        series = store.find_series()
+        origin = np.array(series.head.extra["control_origin_mm"])
+        epochs = list(store.epochs(series))
+    assert origin.tolist() == [192e6, 313e6, 0.0]
+    pose = demonstration_model(demonstration_field("markers")).exterior.as_array()
+    grid = np.array([192e6, 313e6, 138e3]) - origin
+    for one in epochs:
+        error = one.result.values[10:] - pose - np.concatenate([np.zeros(3), grid])
+        C = one.result.covariance[10:, 10:]
+        assert error @ np.linalg.solve(C, error) < 30
+
+
+@pytest.mark.parametrize("command", ["study", "discover", "fit"])
+def test_predictions_are_not_taken_for_calibrations(daemon, devices, thermal_model, command):
+    daemon.configure(**at_work(devices, thermal_model))
+    daemon.start("--epochs", "4")
+    assert daemon.wait() == 0
+    done = call(command, daemon.store, *(["-o", "m.yaml"] if command == "fit" else []))
+    assert done.returncode == 1
+    assert "nothing in it was calibrated" in " ".join(done.stderr.split())
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [({"testfield": "{model}"}, "either `testfield` or `thermal_model`"),
+     ({"thermometers": []}, "needs `thermometers`"),
+     ({"control_points": "none.csv"}, "there is no file"),
+     ({"thermal_model": None, "mount_sd_deg": 0.01}, "needs a `thermal_model`"),
+     ({"control_reference": "{model}"}, "needs `control_points`")],
+)  # fmt: skip
+def test_what_does_not_go_together_is_said(daemon, devices, thermal_model, options, words):
+    options = {k: v.format(model=thermal_model) if isinstance(v, str) else v
+               for k, v in options.items()}  # fmt: skip
+    document = at_work(devices, thermal_model)
+    document["cameras"][0] |= options
+    daemon.configure(**document)
+    done = call("check", daemon.config)
+    assert done.returncode == 2
+    assert words in " ".join(done.stderr.split())

@@ -1,0 +1,133 @@
+"""Natural control points: centres of crosses, patches found again, errors over their sds."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from thermocald.errors import ConfigurationError
+from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.photogrammetry.frame.templates import MATCHING_SD, Templates
+
+SIZE = (640, 480)
+FINE = 8  # a scene is drawn so many times as large and averaged
+NOISE = 2.0
+CLICK = 1.0
+
+
+def scene(centres: np.ndarray, affine: np.ndarray, seed: int, light: float = 1.0) -> np.ndarray:
+    """White crosses on dark boards in grass, drawn fine and averaged: (H, W) without noise.
+
+    affine (2, 3): of the whole scene, px.
+    """
+    rng = np.random.default_rng(seed)
+    grass = rng.normal(0, 1, (SIZE[1] + 80, SIZE[0] + 80)).astype(np.float32)
+    grass = 90 + 60 * cv2.GaussianBlur(grass, (0, 0), 2.5)
+    to_fine = np.array([[FINE, 0, (FINE - 1) / 2], [0, FINE, (FINE - 1) / 2], [0, 0, 1.0]])
+    whole = np.vstack([affine, [0, 0, 1]])
+    from_grass = np.array([[1, 0, -40], [0, 1, -40], [0, 0, 1.0]])
+    fine = cv2.warpAffine(
+        grass, (to_fine @ whole @ from_grass)[:2], (SIZE[0] * FINE, SIZE[1] * FINE),
+        flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT,
+    )  # fmt: skip
+    for k, centre in enumerate(centres):
+        turn = 0.3 * k
+        R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        for half, grey in (((9, 9), 40.0), ((8, 2.2), 230.0), ((2.2, 8), 230.0)):
+            corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half @ R.T + centre
+            corners = corners @ affine[:, :2].T + affine[:, 2]
+            shifted = np.round((corners * FINE + (FINE - 1) / 2) * 16).astype(np.int32)
+            cv2.fillConvexPoly(fine, shifted, grey, cv2.LINE_AA, 4)
+    image = cv2.resize(fine, SIZE, interpolation=cv2.INTER_AREA)
+    return light * cv2.GaussianBlur(image, (0, 0), 0.8)
+
+
+def noisy(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    return np.clip(np.round(image + rng.normal(0, NOISE, image.shape)), 0, 255).astype(np.uint8)
+
+
+STILL = np.array([[1.0, 0, 0], [0, 1, 0]])
+
+
+def placed(rng: np.random.Generator, n: int = 6):
+    """Centres, their field, and clicks at whole pixels."""
+    grid = np.stack(np.meshgrid([110, 320, 530], [120, 340]), axis=-1).reshape(-1, 2)[:n]
+    centres = grid + rng.uniform(-20, 20, (n, 2))
+    field = TestField.build([f"g{i}" for i in range(n)], np.zeros((n, 3)), 1.0)
+    clicks = np.round(centres + rng.normal(0, 0.5, (n, 2)))
+    return centres, field, Observations(np.arange(n), clicks, np.full((n, 2), CLICK))
+
+
+def test_centres_of_crosses_are_better_than_the_clicks_and_have_true_sds():
+    ratio, errors, clicked = [], [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        centres, field, clicks = placed(rng)
+        made = Templates(noisy(scene(centres, STILL, seed), rng), field, clicks)
+        found = made.reference
+        assert all(p.symmetric for p in made.patches)
+        error = found.points - centres
+        errors.append(error)
+        clicked.append(clicks.points - centres)
+        ratio.append(error / found.sigmas)
+    assert np.std(errors) < 0.1 * np.std(clicked)
+    # the grass about a board is not symmetric, and its share in the sd is an estimate
+    assert 0.6 < np.sqrt(np.mean(np.square(ratio))) < 1.3
+
+
+def test_patches_are_found_again_with_true_sds():
+    """A camera that turns and zooms a little, in other light: error over sd from frame to frame."""
+    ratio = []
+    for seed in range(10):
+        rng = np.random.default_rng(50 + seed)
+        centres, field, clicks = placed(rng)
+        made = Templates(noisy(scene(centres, STILL, seed), rng), field, clicks)
+        for k in range(3):
+            turn, zoom = 0.004 * k, 1 + 0.001 * k
+            A = zoom * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+            affine = np.column_stack([A, rng.uniform(-6, 6, 2)])
+            image = noisy(scene(centres, affine, seed, 1.0 - 0.2 * k), rng)
+            seen = made.measure(image).observations
+            assert len(seen) == 6
+            true = made.reference.points @ A.T + affine[:, 2]
+            ratio.append((seen.points - true) / seen.quality[MATCHING_SD][:, None])
+    rms = np.sqrt(np.mean(np.square(np.concatenate(ratio))))
+    assert 0.8 < rms < 1.2, f"error/sd {rms:.2f}"
+
+
+def test_hidden_points_are_left_out_and_the_dark_gives_none():
+    rng = np.random.default_rng(4)
+    centres, field, clicks = placed(rng)
+    clear = scene(centres, STILL, 4)
+    made = Templates(noisy(clear, rng), field, clicks)
+    hidden = clear.copy()
+    x, y = np.round(centres[2]).astype(int)
+    hidden[y - 25 : y + 25, x - 25 : x + 25] = 120  # a cow
+    found = made.measure(noisy(hidden, rng))
+    assert found.observations.targets.tolist() == [0, 1, 3, 4, 5]
+    assert set(found.missed) == {2}
+    night = made.measure(noisy(0.02 * clear, rng))
+    assert not night.status.ok
+    assert len(night.observations) == 0
+    again = made.measure(noisy(clear, rng))
+    assert len(again.observations) == 6
+
+
+def test_another_scene_is_not_taken_for_it():
+    rng = np.random.default_rng(6)
+    centres, field, clicks = placed(rng)
+    made = Templates(noisy(scene(centres, STILL, 6), rng), field, clicks)
+    found = made.measure(noisy(scene(np.zeros((0, 2)), STILL, 7), rng))
+    assert found.status.word == "too_few"
+    assert len(found.observations) == 0
+
+
+def test_clicks_outside_the_reference_are_said(tmp_path):
+    rng = np.random.default_rng(8)
+    centres, field, clicks = placed(rng)
+    path = tmp_path / "reference.png"
+    cv2.imwrite(str(path), noisy(scene(centres, STILL, 8), rng))
+    clicks.points[:4] += 5000
+    with pytest.raises(ConfigurationError, match="2 control points have x, y within"):
+        Templates.read(path, field, clicks)

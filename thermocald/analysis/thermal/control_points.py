@@ -1,0 +1,212 @@
+"""Control points of a gauge: surveyed coordinates, and where they were seen.
+
+Read from a CSV, from the GeoJSON of a GNSS receiver, and from pyorc's camera configuration.
+Coordinates of UTM or a national grid have seven digits before the comma: an origin is subtracted
+before anything is computed, and kept.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.errors import DataError, TestFieldError
+from thermocald.photogrammetry.field.testfield import KINDS, Observations, TestField
+from thermocald.store.recording.table import Table
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import ArrayLike
+
+    from thermocald.arrays import Array
+
+UNITS = {"mm": 1.0, "m": 1000.0}
+"""Lengths that control points and planes may be given in, in mm."""
+
+_ROUND_MM = 1e6  # coordinates count from a round number near the points
+_SURVEYED_MM = 20.0  # a GNSS receiver with corrections, where nothing is said
+_CLICKED_PX = 1.0
+# receivers' names of columns and properties
+_NAMES: dict[str, tuple[str, ...]] = {
+    "target": ("target", "name", "id", "point", "label"),
+    "X": ("X", "easting", "east", "E"),
+    "Y": ("Y", "northing", "north", "N"),
+    "Z": ("Z", "height", "elevation", "altitude", "H"),
+    "sX": ("sX", "sE", "easting_rms", "hrms", "lateral_rms"),
+    "sY": ("sY", "sN", "northing_rms", "hrms", "lateral_rms"),
+    "sZ": ("sZ", "sH", "elevation_rms", "vrms"),
+    "x": ("x",), "y": ("y",), "sx": ("sx",), "sy": ("sy",),
+    "diameter": ("diameter",),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class ControlPoints:
+    """Surveyed points and where they were seen.
+
+    field: coordinates in mm from `origin` (3,) mm; seen: image points px, none where the file has
+    none; unit: of the file; assumed: what it does not say, in a sentence.
+    """
+
+    field: TestField
+    seen: Observations
+    origin: Array
+    unit: str
+    assumed: str = ""
+
+    @classmethod
+    def read(cls, path: Path, unit: str) -> ControlPoints:
+        """Read a CSV with target, X, Y, Z, sX, sY, sZ and, where they were seen, x, y, sx, sy (px);
+        kind, code and diameter as in a test field. GeoJSON and pyorc's JSON are in metres.
+
+        unit: of the coordinates, mm or m. Raises DataError naming file, line and column.
+        """
+        if path.suffix.lower() in (".json", ".geojson"):
+            return _from_json(path)
+        return _from_table(path, unit)
+
+    @classmethod
+    def build(
+        cls, names: list[str], points: Array, sigmas: ArrayLike, unit: str, where: str,
+        seen: tuple[Array, Array] | None = None, assumed: str = "", **looks: Any,
+    ) -> ControlPoints:  # fmt: skip
+        """Build from coordinates (n, 3) in a unit, with standard deviations; seen: image points and
+        theirs, (n, 2) px each, NaN where a point was not seen.
+        """
+        scale = UNITS[unit]
+        if not names:
+            raise DataError(f"{where}: holds no control points")
+        if not np.isfinite(points).all():
+            row = int(np.argmin(np.isfinite(points).all(axis=1)))
+            raise DataError(f"{where}, {names[row]}: a control point needs X, Y and Z")
+        origin = np.round(scale * points.mean(axis=0) / _ROUND_MM) * _ROUND_MM
+        try:
+            field = TestField.build(
+                names, scale * points - origin, scale * np.asarray(sigmas), **looks
+            )
+        except TestFieldError as error:
+            raise DataError(f"{where}: {error}") from error
+        image = Observations.none()
+        if seen is not None:
+            rows = np.flatnonzero(np.isfinite(seen[0]).all(axis=1))
+            image = Observations(rows, seen[0][rows], seen[1][rows])
+        return cls(field, image, origin, unit, assumed)
+
+
+def _from_table(path: Path, unit: str) -> ControlPoints:
+    table = Table(path, (), DataError)
+    there = {
+        wanted: found
+        for wanted, names in _NAMES.items()
+        if (found := next((n for n in names if n in table.columns), None)) is not None
+    }
+    for wanted in ("target", "X", "Y", "Z", "sX", "sY", "sZ"):
+        if wanted not in there:  # the table says it best
+            Table(path, (wanted,), DataError)
+    if clicked := "x" in there:
+        Table(path, ("x", "y", "sx", "sy"), DataError)
+    names: list[str] = []
+    texts: dict[str, list[str]] = {n: [] for n in ("kind", "code") if n in table.columns}
+    columns: dict[str, list[Array]] = {n: [] for n in there if n != "target"}
+    for chunk in table.chunks():
+        names += [word.strip() for word in chunk.text(there["target"])]
+        for wanted, values in columns.items():
+            column = chunk.numbers(there[wanted], empty_is_nan=wanted in ("x", "y", "diameter"))
+            if wanted[0] == "s":
+                chunk.check(there[wanted], column <= 0, "a standard deviation must be above 0")
+            values.append(column)
+        for wanted, words in texts.items():
+            words += [word.strip() for word in chunk.text(wanted)]
+    if not names:
+        raise DataError(f"{path}: holds no control points")
+    whole = {n: np.concatenate(values) for n, values in columns.items()}
+    looks: dict[str, Any] = {}
+    if "kind" in texts:
+        looks["kinds"] = [kind or KINDS[0] for kind in texts["kind"]]
+        if wrong := set(looks["kinds"]) - set(KINDS):
+            raise DataError(f"{path}: kind {min(wrong)!r} is none of {', '.join(KINDS)}")
+    if "code" in texts:
+        looks["codes"] = texts["code"]
+    if "diameter" in whole:
+        looks["diameters"] = UNITS[unit] * whole["diameter"]
+
+    def stacked(*wanted: str) -> Array:
+        return np.stack([whole[n] for n in wanted], axis=1)
+
+    seen = (stacked("x", "y"), stacked("sx", "sy")) if clicked else None
+    sigmas = stacked("sX", "sY", "sZ")
+    return ControlPoints.build(
+        names, stacked("X", "Y", "Z"), sigmas, unit, str(path), seen, **looks
+    )
+
+
+def _from_json(path: Path) -> ControlPoints:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path}: cannot be read as JSON: {error}") from error
+    try:
+        if isinstance(document, dict) and "gcps" in document:
+            return _from_pyorc(document, str(path))
+        if isinstance(document, dict) and document.get("type") == "FeatureCollection":
+            return _from_features(document, str(path))
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise DataError(f"{path}: is no sound JSON of control points: {error}") from error
+    raise DataError(f"{path}: is neither pyorc's camera configuration (gcps) nor GeoJSON")
+
+
+def _from_pyorc(document: dict[str, Any], where: str) -> ControlPoints:
+    gcps = document["gcps"]
+    points = np.array(gcps["dst"], dtype=float)
+    image = np.array(gcps["src"], dtype=float)
+    if points.ndim != 2 or points.shape[1] == 2:  # on the water
+        points = np.column_stack([points, np.full(len(points), float(gcps["z_0"]))])
+    names = [f"gcp{i}" for i in range(len(points))]
+    assumed = (
+        f"{where} has no standard deviations: {_SURVEYED_MM:g} mm for coordinates and "
+        f"{_CLICKED_PX:g} px for clicks are taken"
+    )
+    seen = (image, np.full(image.shape, _CLICKED_PX))
+    return ControlPoints.build(names, points, _SURVEYED_MM / 1000, "m", where, seen, assumed)
+
+
+def _from_features(document: dict[str, Any], where: str) -> ControlPoints:
+    names, rows, sigmas, image, missing = [], [], [], [], 0
+    for i, feature in enumerate(document["features"]):
+        if feature["geometry"]["type"] != "Point":
+            continue
+        properties = feature.get("properties") or {}
+        asked = {w: _property(properties, w) for w in ("target", "Z", "sX", "sY", "sZ", "x", "y")}
+        at = [float(v) for v in feature["geometry"]["coordinates"]]
+        if len(at) == 2:
+            at.append(np.nan if asked["Z"] is None else float(asked["Z"]))
+        names.append(f"p{i + 1}" if asked["target"] is None else str(asked["target"]))
+        rows.append(at[:3])
+        stated = [asked[w] for w in ("sX", "sY", "sZ")]
+        missing += None in stated
+        sigmas.append([_SURVEYED_MM / 1000 if s is None else float(s) for s in stated])
+        image.append([np.nan if asked[w] is None else float(asked[w]) for w in ("x", "y")])
+    points = np.array(rows).reshape(-1, 3)
+    if len(points) and (np.abs(points[:, 0]) <= 180).all() and (np.abs(points[:, 1]) <= 90).all():
+        crs = str(document.get("crs", "")).upper()
+        if not crs or "CRS84" in crs or "4326" in crs:
+            raise DataError(
+                f"{where}: the coordinates look like degrees; write them in metres: UTM, or a "
+                "national grid"
+            )
+    assumed = f"{where}: {missing} points without standard deviations: {_SURVEYED_MM:g} mm is taken"
+    seen = np.array(image).reshape(-1, 2)
+    return ControlPoints.build(
+        names, points, sigmas, "m", where, (seen, np.full(seen.shape, _CLICKED_PX)),
+        assumed if missing else "",
+    )  # fmt: skip
+
+
+def _property(properties: dict[str, Any], wanted: str) -> Any:
+    names = [name.lower() for name in _NAMES[wanted]] if wanted not in "xy" else [wanted]
+    given = {str(k) if wanted in "xy" else str(k).lower(): v for k, v in properties.items()}
+    return next((given[n] for n in names if given.get(n) is not None), None)

@@ -1,0 +1,411 @@
+"""A camera at work, before no test field: its thermal model predicts it, control points pose it.
+
+    readings ─► predicted interior orientation, with covariance ─┐
+    frame ─► control points in the image ────────────────────────┴─► resection ─► row of the store
+
+One more kind of calibrator, which the daemon's pipeline runs as it runs the others. Nothing is
+calibrated, and no row has the status `ok`: a study or a fit must not take for measured what a model
+has said.
+
+    predicted      interior orientation, there are no control points
+    resected       and the pose that they give, with the predicted camera as prior
+    last_pose      they are hidden or too few: the last pose, with what the mount may have moved
+    outside_range  predicted beyond the temperatures of the fit, with widened covariance, or not at
+                   all where that is too far
+    no_temperature the reading is too old, or there was none
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from thermocald.acquisition.calibrator import CalibratedEpoch
+from thermocald.analysis.thermal.control_points import ControlPoints
+from thermocald.analysis.thermal.predictor import Predictor
+from thermocald.errors import ConfigurationError, ImageError
+from thermocald.photogrammetry.camera.camera_model import (
+    EOP,
+    IOP,
+    IOP_NAMES,
+    ExteriorOrientation,
+    partials,
+    project,
+)
+from thermocald.photogrammetry.epoch.adjustment import Adjustment, failed
+from thermocald.photogrammetry.epoch.measuring import resect
+from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.photogrammetry.frame.measurement import Prior
+from thermocald.photogrammetry.frame.templates import MATCHING_SD, Templates
+from thermocald.photogrammetry.frame.tracking import Tracker
+from thermocald.photogrammetry.targets.image_file import EncodedImage
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from thermocald.analysis.thermal.predictor import PredictedCamera
+    from thermocald.analysis.thermal.thermal_camera import ThermalCamera
+    from thermocald.arrays import Array
+    from thermocald.epoch import Epoch
+    from thermocald.photogrammetry.frame.measurement import Measurement
+    from thermocald.store.series import StoredEpoch
+
+_FEWEST = 3  # control points, with an earlier pose
+_CONFIRMED = 2  # epochs in a row that show another pose
+_MOVED_ALPHA = 1e-6
+_UNMODELLED_PX = 0.05  # of a control point from frame to frame: light, air, the template
+
+
+class _Finder(Protocol):
+    """What measures control points in a frame: a Tracker or Templates."""
+
+    def measure(self, image: NDArray[Any] | EncodedImage) -> Measurement: ...
+    def reset(self) -> None: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """A pose as it was resected: what later frames are compared with.
+
+    time s; predicted (10,), eop (6,) and its covariance (6, 6); seen: the control points then.
+    """
+
+    time: float
+    predicted: Array
+    temperature: float
+    eop: ExteriorOrientation
+    covariance: Array
+    seen: Observations
+
+
+@dataclass(frozen=True, eq=False)
+class Movement:
+    """A turn (3,) rad about the camera's axes and a shift (3,) mm since a time, with covariance."""
+
+    since: float
+    values: Array
+    covariance: Array
+
+    @property
+    def chi2(self) -> float:
+        """Chi-square with six degrees of freedom of no movement."""
+        return float(self.values @ np.linalg.solve(self.covariance, self.values))
+
+    def sentence(self) -> str:
+        """Return turn and shift in words."""
+        sd = np.sqrt(np.diag(self.covariance))
+        turn, shift = (np.linalg.norm(self.values[k]) for k in (slice(0, 3), slice(3, 6)))
+        sd_turn, sd_shift = (np.linalg.norm(sd[k]) for k in (slice(0, 3), slice(3, 6)))
+        return (
+            f"the camera was moved: it turned by {math.degrees(turn):.4f} ± "
+            f"{math.degrees(sd_turn):.4f}° and shifted by {shift:.1f} ± {sd_shift:.1f} mm"
+            + ("; turn and shift can hardly be separated here" if sd_shift > shift else "")
+        )
+
+
+class GaugeCalibrator:
+    """Predicts and poses the epochs of one camera, one after the other.
+
+    control, finder: control points and what measures them, None without; mount_sd_deg: how much the
+    mount turns about each axis in an hour, as a random walk, NaN where that is not known.
+    """
+
+    def __init__(
+        self,
+        thermal: ThermalCamera,
+        control: TestField | None = None,
+        finder: _Finder | None = None,
+        mount_sd_deg: float = math.nan,
+        snooping_alpha: float = 0.001,
+    ) -> None:
+        self.thermal = thermal
+        self.sensor = thermal.model.sensor
+        self.testfield = control or TestField.build([], np.empty((0, 3)))
+        self.predictor = Predictor(thermal)
+        self._finder = finder
+        self._mount = math.radians(mount_sd_deg)
+        self._alpha = snooping_alpha
+        self.pose: Pose | None = None
+        """The last one that control points gave."""
+        self._reference: Pose | None = None
+        self._moved: list[Pose] = []
+        self._number = 0
+        self.movement: Movement | None = None
+        """What the last epoch showed, where that was a movement of the camera."""
+
+    def reset(self) -> None:
+        """Look for the control points anew."""
+        if self._finder is not None:
+            self._finder.reset()
+
+    def remember(self, stored: Iterable[StoredEpoch]) -> None:
+        """Go on from earlier epochs: their readings, and the last pose."""
+        for one in stored:
+            self.predictor.take(one.epoch.temperature_time, one.epoch.temperatures)
+            self._number = one.epoch.number
+            covariance, result = one.result.covariance, one.result
+            if result.status == "resected" and covariance is not None:
+                if (seen := one.epoch.observations) is None:
+                    continue
+                keep = ~np.isin(seen.targets, result.rejected)
+                known = self.predictor.at(one.epoch.frame_time)
+                if known is not None:
+                    pose = Pose(
+                        one.epoch.frame_time, known.camera.values, known.camera.temperature,
+                        ExteriorOrientation.from_array(result.values[EOP]),
+                        covariance[EOP, EOP], seen.select(keep),
+                    )  # fmt: skip
+                    self.pose, self._reference = pose, self._reference or pose
+
+    def calibrate(
+        self, epoch: Epoch, image: NDArray[Any] | EncodedImage | None = None
+    ) -> CalibratedEpoch:
+        """Predict the camera of an epoch, and pose it. Never raises for data."""
+        self.predictor.take(epoch.temperature_time, epoch.temperatures)
+        in_order = epoch.number > self._number
+        self._number = max(self._number, epoch.number)
+        now = self.predictor.at(epoch.frame_time)
+        epoch, measured, why = self._measured(epoch, image)
+        if now is None:
+            names = next(iter(epoch.temperatures), "the reference thermometer")
+            bad = failed("no_temperature", f"no reading of {names} so far", measured)
+            return CalibratedEpoch(epoch, bad, {})
+        extra = {
+            "reading_age_s": now.age_s, "unknown_past_px": now.unknown_px, "outside_K": now.beyond,
+        }  # fmt: skip
+        limits = self.thermal.validity
+        outside = "" if limits is None or not now.beyond else (
+            f"{now.camera.temperature:.1f} °C is {now.beyond:.1f} K outside the {limits.low:g} to "
+            f"{limits.high:g} °C that the model was fitted on"
+        )  # fmt: skip
+        if now.far:
+            bad = failed("outside_range", f"{outside}: nothing is predicted there", measured)
+            return CalibratedEpoch(epoch, bad, extra)
+        result = self._posed(epoch, now, measured, why, in_order)
+        if self.movement is not None:
+            extra["event"] = 1.0
+        if outside:
+            result = replace(result, status="outside_range", reason=f"{outside}: sds are widened")
+        elif not now.has_reading:
+            old = f"the last reading is {now.age_s:.0f} s old: the covariance grows"
+            result = replace(result, status="no_temperature", reason=old)
+        return CalibratedEpoch(epoch, result, extra)
+
+    def _measured(
+        self, epoch: Epoch, image: NDArray[Any] | EncodedImage | None
+    ) -> tuple[Epoch, Observations | None, str]:
+        """The epoch with its control points, the same, and why there are none."""
+        self.movement = None
+        if self._finder is None or epoch.observations is not None:
+            return epoch, epoch.observations, "no control point is seen"
+        if image is None and epoch.frame is None:
+            return epoch, None, epoch.note or "there is no frame"
+        try:
+            if image is None:
+                assert epoch.frame is not None
+                image = EncodedImage(epoch.frame)
+            found = self._finder.measure(image)
+        except ImageError as error:
+            return epoch, None, str(error)
+        why = found.status.reason or found.status.word
+        return replace(epoch, observations=found.observations), found.observations, why
+
+    def _posed(
+        self, epoch: Epoch, now: PredictedCamera, seen: Observations | None, why: str,
+        in_order: bool,
+    ) -> Adjustment:  # fmt: skip
+        camera = now.camera
+        if not len(self.testfield):
+            return self._unposed("predicted", "", now)
+        if seen is None or len(seen) < _FEWEST:
+            count = 0 if seen is None else len(seen)
+            return self._without(epoch, now, seen, f"{count} control points are seen ({why})")
+        start = None if self.pose is None else self.pose.eop
+        result = self._resected(now, seen, start)
+        if not result.ok:
+            return self._without(epoch, now, seen, f"{result.status}: {result.reason}")
+        assert result.exterior is not None
+        keep = seen.select(~np.isin(seen.targets, result.rejected))
+        pose = Pose(
+            epoch.frame_time, camera.values, camera.temperature, result.exterior,
+            result.covariance[EOP, EOP], keep,
+        )  # fmt: skip
+        if in_order:
+            self._watch(pose)
+            self.pose = pose
+        return replace(result, status="resected", reason="")
+
+    def _resected(
+        self, now: PredictedCamera, seen: Observations, start: ExteriorOrientation | None
+    ) -> Adjustment:
+        camera = now.camera
+        result = resect(
+            self.sensor, camera.interior, camera.covariance, self.testfield, seen, start,
+            self._alpha,
+        )  # fmt: skip
+        if not result.ok and start is not None and len(seen) > _FEWEST:  # it was turned by much
+            again = self._resected(now, seen, None)
+            return again if again.ok else result
+        return result
+
+    def _unposed(self, status: str, reason: str, now: PredictedCamera) -> Adjustment:
+        camera = now.camera
+        known = tuple(n for n, sd in camera.sd.items() if sd > 0)
+        blank = failed(status, reason, None, known)
+        covariance = np.zeros((16, 16))
+        covariance[IOP, IOP] = camera.covariance
+        return replace(blank, interior=camera.interior, covariance=covariance)
+
+    def _without(
+        self, epoch: Epoch, now: PredictedCamera, seen: Observations | None, why: str
+    ) -> Adjustment:
+        """The last pose with what the mount may have done since; the camera alone before any."""
+        last = self.pose
+        targets = np.empty(0, dtype=np.int64) if seen is None else seen.targets
+        if last is None:
+            return replace(self._unposed("predicted", f"no pose so far: {why}", now))
+        hours = max(epoch.frame_time - last.time, 0.0) / 3600.0
+        covariance = np.zeros((16, 16))
+        covariance[IOP, IOP] = now.camera.covariance
+        covariance[EOP, EOP] = last.covariance
+        still = "; as if the mount had stood still since, for its movement is not known"
+        if math.isfinite(self._mount):
+            covariance[range(10, 13), range(10, 13)] += self._mount**2 * hours
+            still = f"; the mount may have moved for {hours:.2f} h"
+        blank = self._unposed("last_pose", why + still, now)
+        n = len(targets)
+        return replace(
+            blank, exterior=last.eop, covariance=covariance, targets=targets,
+            residuals=np.full((n, 2), np.nan), redundancy_numbers=np.full((n, 2), np.nan),
+            test_values=np.full(n, np.nan),
+        )  # fmt: skip
+
+    def _watch(self, pose: Pose) -> None:
+        """Compare with the reference; two epochs in a row that moved make it a movement."""
+        if self._reference is None:
+            self._reference = pose
+            return
+        found = self.compare(self._reference, pose)
+        if found is None or found.chi2 <= _bound(_MOVED_ALPHA, 6):
+            self._moved.clear()
+            return
+        self._moved.append(pose)
+        if len(self._moved) >= _CONFIRMED:
+            self.movement = replace(found, since=self._moved[0].time)
+            self._reference = pose
+            self._moved.clear()
+
+    def compare(self, then: Pose, now: Pose) -> Movement | None:
+        """Return how the camera moved between two poses, None where too few points are in both.
+
+        Of the same points the errors of their coordinates cancel, and so does what the model is
+        off by at both times; image noise and the rates' error are left.
+        """
+        both = np.intersect1d(then.seen.targets, now.seen.targets)
+        if len(both) < _FEWEST:
+            return None
+        a, b = (p.seen.select(np.searchsorted(p.seen.targets, both)) for p in (then, now))
+        points, eop = self.testfield.points[both], then.eop.as_array()
+        seen = np.array([project(self.sensor, p.predicted, eop, points) for p in (then, now)])
+        moved = (b.points - a.points - (seen[1] - seen[0])).ravel()
+        _, A, _ = partials(self.sensor, then.predicted, eop, points)
+        A = A.reshape(-1, 16)
+        noise = (_matching(a) ** 2 + _matching(b) ** 2 + _UNMODELLED_PX**2).ravel()
+        N = A[:, EOP].T @ (A[:, EOP] / noise[:, None])
+        scale = np.sqrt(np.diag(N))
+        inverse = np.linalg.pinv(N / np.outer(scale, scale), rcond=1e-12) / np.outer(scale, scale)
+        gain = inverse @ (A[:, EOP] / noise[:, None]).T
+        drift = gain @ A[:, IOP] @ self._rates_root(now.temperature - then.temperature)
+        return Movement(now.time, gain @ moved, inverse + drift @ drift.T)
+
+    def _rates_root(self, change_k: float) -> Array:
+        """A root (10, n) of the covariance of what the model says of a change of temperature."""
+        thermal = self.thermal
+        rows = [k for k, n in enumerate(thermal.parameters) if n.startswith("rates.")]
+        names = [IOP_NAMES.index(thermal.parameters[k].split(".")[1]) for k in rows]
+        block = thermal.covariance[np.ix_(rows, rows)] * change_k**2
+        root = np.zeros((10, len(rows) + 1))
+        if rows:
+            values, vectors = np.linalg.eigh(block)
+            root[names, : len(rows)] = vectors * np.sqrt(np.maximum(values, 0.0))
+        root[:, -1] = math.sqrt(2.0) * self.predictor.noise_k * thermal.model.rate_vector
+        return root
+
+
+class GaugeObserver:
+    """Tells what happens at a gauge: the status of its rows when it changes, and movements.
+
+    tell(kind, text, utc, epoch).
+    """
+
+    def __init__(
+        self, gauge: GaugeCalibrator, tell: Callable[[str, str, float, int], None]
+    ) -> None:
+        self._gauge, self._tell = gauge, tell
+        self._status = self._reason = ""
+
+    def observe(self, calibrated: CalibratedEpoch) -> dict[str, float]:
+        """Take an epoch in; nothing more is to be stored of it."""
+        epoch, result = calibrated.epoch, calibrated.adjustment
+        if (moved := self._gauge.movement) is not None:
+            self._tell("camera_moved", moved.sentence(), moved.since, epoch.number)
+        if result.status != self._status and (self._status or not _usual(result.status)):
+            text = result.reason or f"{result.status} again"
+            self._tell(result.status, text, epoch.frame_time, epoch.number)
+        self._status, self._reason = result.status, result.reason
+        return {}
+
+    def report(self) -> dict[str, Any]:
+        """For status and page."""
+        words = {
+            "predicted": "predicted by its thermal model",
+            "resected": "predicted by its thermal model, posed by control points",
+        }
+        return {"state": self._status, "sentence": self._reason or words.get(self._status, "")}
+
+
+def plan_gauge(
+    thermal: ThermalCamera, control: Path | None, unit: str, reference: Path | None,
+    mount_sd_deg: float | None, snooping_alpha: float,
+) -> tuple[GaugeCalibrator, list[float]]:  # fmt: skip
+    """Return the calibrator of a gauge, and the origin of its coordinates, mm."""
+    mount = math.nan if mount_sd_deg is None else mount_sd_deg
+    if control is None:
+        return GaugeCalibrator(thermal, mount_sd_deg=mount), [0.0, 0.0, 0.0]
+    given = ControlPoints.read(control, unit)
+    finder: _Finder
+    if reference is None:
+        if not any(given.field.codes):
+            raise ConfigurationError(
+                f"{control}: no control point has a code; `control_reference` names the frame in "
+                "which x, y are those of natural points"
+            )
+        prior = Prior(thermal.model.sensor, thermal.model.interior)
+        finder = Tracker(given.field, prior)
+    else:
+        finder = Templates.read(reference, given.field, given.seen)
+    return GaugeCalibrator(thermal, given.field, finder, mount, snooping_alpha), [
+        float(v) for v in given.origin
+    ]
+
+
+def _matching(seen: Observations) -> Array:
+    """Standard deviations (n, 2) px from frame to frame: what all frames share is not in them."""
+    own = seen.quality.get(MATCHING_SD)
+    return seen.sigmas if own is None else np.stack([own, own], axis=1)
+
+
+def _usual(status: str) -> bool:
+    return status in ("predicted", "resected")
+
+
+def _bound(alpha: float, freedom: int) -> float:
+    from scipy.stats import chi2
+
+    return float(chi2.ppf(1.0 - alpha, freedom))

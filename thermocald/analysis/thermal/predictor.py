@@ -1,0 +1,182 @@
+"""The camera that a thermal model predicts from a thermometer's readings, as they come.
+
+What happened before the first reading and within a gap is not known, and effects with a memory
+still feel it. A second camera has therefore come through the unknown time warmer, by as much as
+temperatures change in such a time; how far apart both are is one standard deviation of what is not
+known. It fades as the memories do, whichever effects the model has.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.analysis.camera.camera import Camera
+from thermocald.analysis.camera.image_grid import image_grid
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from thermocald.analysis.thermal.live_camera import LiveCamera
+    from thermocald.analysis.thermal.thermal_camera import ThermalCamera
+    from thermocald.arrays import Array
+
+USUAL_THERMOMETER_SD = 0.05  # K, where no fit has found it
+_LONG_S = 30 * 86400.0  # after so long at one temperature everything has settled
+_DAY_S = 6 * 3600.0  # temperatures farther apart in time have little in common
+_USUAL_RANGE_K = 20.0  # of a model that does not say on what it was fitted
+_CHANGED_S = 60.0  # in which a camera came from elsewhere to where it is
+_GAP_S = 120.0  # between readings a straight line will do
+_BACK_S = 10.0  # a clock that is set back by less makes a reading late, not unknown
+_REMEMBERED = 4000  # readings
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedCamera:
+    """A camera as it is predicted: `camera`, with the covariance of model, thermometer and past.
+
+    age_s: of its last reading; unknown_px: what the unknown past adds, the largest sd in the image;
+    beyond: K outside the temperatures of the fit, `far` if nothing should be predicted there.
+    """
+
+    camera: Camera
+    age_s: float
+    unknown_px: float
+    beyond: float
+    far: bool
+
+    @property
+    def has_reading(self) -> bool:
+        """Whether the temperature of its time is known."""
+        return self.age_s <= _GAP_S
+
+
+class Predictor:
+    """Follows the readings of one camera's thermometers.
+
+    thermometer_sd: K, of a reading; by default what the fit found.
+    """
+
+    def __init__(self, thermal: ThermalCamera, thermometer_sd: float | None = None) -> None:
+        self.thermal = thermal
+        noise = thermometer_sd if thermometer_sd is not None else thermal.thermometer_sd
+        self.noise_k = USUAL_THERMOMETER_SD if noise is None else noise
+        # beyond the temperatures of the fit it is judged here, tick by tick and without a warning
+        self._free = replace(thermal, model=replace(thermal.model, validity={}))
+        named = (e.values.get("channel") for e in thermal.model.effects)
+        self._channels = tuple(dict.fromkeys(str(c) for c in named if c))
+        self._pair: tuple[LiveCamera, LiveCamera] | None = None
+        self._now: tuple[Camera, Camera] | None = None
+        self._recent: deque[tuple[float, dict[str, float]]] = deque(maxlen=_REMEMBERED)
+        self._since_begin = 0
+
+    def take(self, time: float, readings: Mapping[str, float]) -> None:
+        """Take readings {channel: °C}, the first is the reference; failed ones are NaN or missing.
+
+        time: s UTC.
+        """
+        row = self._row(readings)
+        if row is None or not math.isfinite(time):
+            return
+        if self._recent and time <= (last := self._recent[-1][0]):
+            if time > last - _BACK_S:
+                return
+            self._pair = None  # the clock was set back: how long ago all was is not known
+            self._recent.clear()
+        self._since_begin += 1
+        if self._pair is not None and self._pair[0].keeps_all and self._since_begin > _REMEMBERED:
+            self._begin_again()
+        if self._pair is None:
+            self._begin(time, row)
+        elif time - self._recent[-1][0] > _GAP_S:
+            self._cross_gap(time, row)
+        self._recent.append((time, row))
+        assert self._pair is not None
+        self._now = (self._pair[0].update(time, row), self._pair[1].update(time, row))
+
+    def at(self, time: float) -> PredictedCamera | None:
+        """Return the camera of now (time: s UTC), None before the first reading."""
+        if self._now is None:
+            return None
+        camera, other = self._now
+        read = self._recent[-1][0]
+        age = max(time - read, 0.0)
+        if self._recent[0][0] < time < read - _BACK_S:  # an epoch that had to wait
+            camera, age = self._earlier(time), 0.0
+        T, unknown = camera.temperature, other.values - self._now[0].values
+        rates = self.thermal.model.rate_vector
+        covariance = camera.covariance + np.outer(unknown, unknown)
+        drifted = self.noise_k**2 + (self._change(age) ** 2 if age > _GAP_S else 0.0)
+        covariance = covariance + drifted * np.outer(rates, rates)
+        beyond = far = 0.0
+        if (validity := self.thermal.validity) is not None:
+            beyond, far = validity.distance(T)
+            covariance = covariance + np.diag((rates * beyond) ** 2)
+        model = self.thermal.model
+        now = Camera(model.sensor, T, camera.values, covariance, beyond, model.camera)
+        return PredictedCamera(now, age, _largest_px(now, unknown), beyond, bool(far))
+
+    def _row(self, readings: Mapping[str, float]) -> dict[str, float] | None:
+        """The reference and the channels that the model names; None where one was not read yet."""
+        reference = next(iter(readings), None)
+        if reference is None:
+            return None
+        row = {n: float(readings.get(n, math.nan)) for n in (reference, *self._channels)}
+        if math.isnan(row[reference]):
+            return None
+        missing = [n for n, v in row.items() if math.isnan(v)]
+        if missing and not self._recent:
+            return None
+        return row | {n: self._recent[-1][1][n] for n in missing}
+
+    def _begin(self, time: float, row: dict[str, float]) -> None:
+        self._pair = (self._free.live(), self._free.live())
+        self._since_begin = 0
+        warmer = self._warmer(row, math.inf)
+        self._pair[1].update(time - _LONG_S, warmer)
+        self._pair[1].update(time - _CHANGED_S, warmer)
+
+    def _begin_again(self) -> None:
+        """Follow the last readings only, for a model that asks for all that there are."""
+        kept = list(self._recent)[_REMEMBERED // 2 :]
+        self._begin(*kept[0])
+        assert self._pair is not None
+        for time, row in kept:
+            for one in self._pair:
+                one.update(time, row)
+
+    def _cross_gap(self, time: float, row: dict[str, float]) -> None:
+        """Lead the other camera through a gap that was warmer than the line across it."""
+        assert self._pair is not None
+        last, before = self._recent[-1]
+        gap = time - last
+        # a line that is held at both ends leaves most to its middle
+        self._pair[1].update(last + 0.1 * gap, self._warmer(before, 0.5 * gap))
+        self._pair[1].update(time - 0.1 * gap, self._warmer(row, 0.5 * gap))
+
+    def _warmer(self, row: Mapping[str, float], seconds: float) -> dict[str, float]:
+        return {name: value + self._change(seconds) for name, value in row.items()}
+
+    def _change(self, seconds: float) -> float:
+        """How much a temperature changes in a time, K: one standard deviation."""
+        v = self.thermal.validity
+        spread = (_USUAL_RANGE_K if v is None else v.high - v.low) / math.sqrt(12.0)
+        return spread * math.sqrt(-math.expm1(-2.0 * seconds / _DAY_S))
+
+    def _earlier(self, time: float) -> Camera:
+        times = [t for t, _ in self._recent]
+        rows = {n: np.array([row[n] for _, row in self._recent]) for n in self._recent[0][1]}
+        return self._free.along(times, rows, [time])[0]
+
+
+def _largest_px(camera: Camera, shift: Array) -> float:
+    """By how much a change of the interior orientation moves an image point at most, px."""
+    if not np.abs(shift).any():
+        return 0.0
+    moved = replace(camera, covariance=np.outer(shift, shift))
+    spread = moved.point_covariance(image_grid(camera.sensor))
+    return float(np.sqrt(np.trace(spread, axis1=1, axis2=2).max()))

@@ -92,8 +92,9 @@ def test_yaml_is_valid(block, tmp_path):
     for camera in document.get("cameras", []):
         for thermometer in set(camera.get("thermometers", [])) - known:
             document.setdefault("thermometers", []).append({"name": thermometer, "driver": "mock"})
-        if "testfield" in camera:
-            (tmp_path / camera["testfield"]).touch()
+        for key in ("testfield", "thermal_model", "control_points", "control_reference"):
+            if key in camera:
+                (tmp_path / camera[key]).touch()
     parse_config(document, tmp_path / "config.yaml", option_names)
 
 

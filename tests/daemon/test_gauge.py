@@ -62,6 +62,10 @@ def test_predicted_epochs_through_a_restart(daemon, devices, thermal_model):
     assert row["sd_c"] > 0
     assert row["X0"] is None
     assert row["reading_age_s"] < 5
+    camera = row["opencv"]
+    assert (camera["width"], camera["height"]) == (820, 616)
+    assert camera["fx"] == pytest.approx(row["c"] / 0.00448)
+    assert camera["sd_fx"] == pytest.approx(row["sd_c"] / 0.00448)
     done = call("export", daemon.store)
     assert done.returncode == 0, done.stderr
     last = list(csv.DictReader(done.stdout.splitlines()))[-1]

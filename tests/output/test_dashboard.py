@@ -137,6 +137,41 @@ def test_health_and_metrics(client_of, folders):
     assert "thermocald_up 0.0" in client.get("/metrics").text
 
 
+def test_the_camera_of_now_in_opencv_terms_and_for_ros(client_of, folders):
+    """Both are one camera, which OpenCV projects as the program does."""
+    import cv2
+    import yaml
+
+    from thermocald.photogrammetry.camera.camera_model import Sensor, project
+    from thermocald.photogrammetry.camera.conversions import opencv_terms
+
+    client = client_of()
+    assert client.get("/camera.json").status_code == 404
+    values = np.array([3.04, 0.012, -0.021, -6e-3, 4e-4, 0, 2e-5, -3e-5, 0, 0])
+    sensor = Sensor(3280, 2464, 0.00112)
+    sds = np.array([1e-4, 2e-4, 3e-4, 0, 0, 0, 0, 0, 0, 0])
+    names = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2", "C1", "C2")
+    row = {
+        **dict(zip(names, values.tolist(), strict=True)), "status": "resected", "epoch": 7,
+        "temperature": 21.5, "frame_time": 1.6e9, "pixel_pitch": 0.00112, "X0": 1.0, "sd_X0": 0.1,
+        "opencv": opencv_terms(sensor, values, np.diag(sds**2)),
+    }  # fmt: skip
+    (folders[1] / "rpi.json").write_text(json.dumps({"row": row}))
+    now = client.get("/camera.json", params={"camera": "rpi"}).json()
+    assert (now["width"], now["height"], now["status"]) == (3280, 2464, "resected")
+    assert now["sd_fx"] == pytest.approx(1e-4 / 0.00112)
+    assert now["pose"]["X0"] == 1.0
+    K = np.array([[now["fx"], 0, now["cx"]], [0, now["fy"], now["cy"]], [0, 0, 1]])
+    terms = np.array([now[k] for k in ("k1", "k2", "p1", "p2", "k3")])
+    points = np.array([[0.3, 0.2, -1.0], [-0.4, 0.1, -1.0]])
+    seen, _ = cv2.projectPoints(points * [1, -1, -1], np.zeros(3), np.zeros(3), K, terms)
+    assert seen[:, 0] == pytest.approx(project(sensor, values, np.zeros(6), points), abs=1e-9)
+    ros = yaml.safe_load(client.get("/camera.yaml").text)
+    assert ros["camera_matrix"]["data"] == pytest.approx(K.ravel().tolist())
+    assert ros["distortion_coefficients"]["data"] == pytest.approx(terms.tolist())
+    assert "degC" in client.get("/camera.yaml").text
+
+
 def test_status_last_epoch_frame_and_events(client_of):
     client = client_of()
     assert client.get("/api/status").json()["cameras"]["rpi"]["last"]["epoch"] == 1200

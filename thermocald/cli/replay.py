@@ -109,9 +109,7 @@ def export(
         raise UsageError("--units, --time, --separator and --decimal are for csv and parquet")
     opened = tc.open(source, series)
     with progress(len(opened) if folder else None, "calibrating") as advance:
-        table = opened.calibrate(
-            exterior=exterior, free=free, jobs=jobs, progress=advance
-        )
+        table = opened.calibrate(exterior=exterior, free=free, jobs=jobs, progress=advance)
     if format_ == "csv" and style.is_plain and not extra:
         write_parts(table.csv_lines(), output)
     elif format_ == "json" and not extra:

@@ -110,9 +110,7 @@ def study(
         typer.echo("\n".join([str(result), *(f"written: {line}" for line in written)]))
 
 
-def _study(
-    inputs: list[str], settings: dict[str, Any], exterior: str, free: str
-) -> Study:
+def _study(inputs: list[str], settings: dict[str, Any], exterior: str, free: str) -> Study:
     import thermocald as tc
 
     labels: list[str | None] = []

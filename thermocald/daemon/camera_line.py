@@ -21,7 +21,8 @@ from thermocald.acquisition.pipeline import Pipeline, check_frame
 from thermocald.daemon.epoch_keeper import EpochKeeper
 from thermocald.daemon.plan import running_series
 from thermocald.errors import ConfigurationError
-from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES, PRINCIPAL
+from thermocald.photogrammetry.camera.camera_model import IOP, PARAMETER_NAMES, PRINCIPAL
+from thermocald.photogrammetry.camera.conversions import opencv_terms
 from thermocald.store.series import Event
 
 if TYPE_CHECKING:
@@ -240,6 +241,8 @@ class SeriesRun:
         report |= {} if self.running is None else self.running.report()
         row["state"] = report.get("state", "unknown")
         row |= self._drift(row)
+        if (camera := self._camera(acquired.calibrated)) is not None:
+            row["opencv"] = camera
         self.last = {**row, "online": report}
         for output in station.outputs:
             output.put(row)
@@ -250,6 +253,16 @@ class SeriesRun:
             if station.preview and now - self._previewed >= _PREVIEW_EVERY_S:
                 self._previewed = now
                 station.live.write_frame(name, acquired.frame)
+
+    def _camera(self, calibrated: CalibratedEpoch | None) -> dict[str, float] | None:
+        """The camera of an epoch in OpenCV's terms."""
+        if calibrated is None or self.plan.sensor is None:
+            return None
+        result = calibrated.adjustment
+        if result.interior is None:
+            return None
+        values = result.interior.as_array()
+        return opencv_terms(self.plan.sensor, values, result.covariance[IOP, IOP])
 
     def _drift(self, row: dict[str, Any]) -> dict[str, float]:
         """Against the start of the series, where the size of the pixels is known."""

@@ -72,6 +72,8 @@ def build_application(
             Route("/api/cameras/{camera}/epoch", _epoch),
             Route("/api/cameras/{camera}/frame", _frame),
             Route("/api/series.csv", _csv),
+            Route("/camera.json", _camera_json),
+            Route("/camera.yaml", _camera_yaml),
             Route("/healthz", _health),
             Route("/metrics", _metrics),
         ],
@@ -254,6 +256,19 @@ def _epoch(request: Request) -> Response:
 def _frame(request: Request) -> Response:
     data = _view(request).last_frame(request.path_params["camera"])
     return Response(data, media_type="image/jpeg")
+
+
+def _camera_json(request: Request) -> Response:
+    return JSONResponse(_view(request).current_camera(_camera_asked(request)))
+
+
+def _camera_yaml(request: Request) -> Response:
+    text = _view(request).camera_info(_camera_asked(request))
+    return Response(text, media_type="application/yaml")
+
+
+def _camera_asked(request: Request) -> str | None:
+    return request.query_params.get("camera")
 
 
 def _csv(request: Request) -> Response:

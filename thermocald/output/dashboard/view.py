@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.errors import DataError, StoreError, ThermocaldError
-from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
+from thermocald.photogrammetry.camera.camera_model import (
+    EOP_NAMES,
+    IOP_NAMES,
+    PARAMETER_NAMES,
+    CameraModel,
+    InteriorOrientation,
+    Sensor,
+)
 from thermocald.store.database.store import Store
 
 if TYPE_CHECKING:
@@ -87,6 +94,48 @@ class View:
     def last_epoch(self, camera: str) -> bytes:
         """The last epoch's row, targets and residuals as JSON; DataError if there is none."""
         return self._file(camera, "json")
+
+    def current_camera(self, name: str | None) -> dict[str, Any]:
+        """The camera of now in OpenCV's terms, with its pose where there is one; name: None for the
+        only one. DataError where there is none, or its last epoch has no result.
+        """
+        there = list(self.status().get("cameras", {}))
+        if name is None:
+            if len(there) != 1:
+                raise DataError(
+                    f"say which with ?camera=…; there are: {', '.join(there) or 'none'}"
+                )
+            name = there[0]
+        row = json.loads(self.last_epoch(name)).get("row", {})
+        if not row.get("opencv"):
+            raise DataError(
+                f"camera {name!r}: its last epoch has no result: {row.get('status', 'unknown')}"
+            )
+        about = ("series", "epoch", "frame_time", "temperature", "status", "reason")
+        pose = {n: row.get(n) for k in EOP_NAMES for n in (k, f"sd_{k}")}
+        return {
+            "format": "thermocald-current-camera/1", "camera": name,
+            "age_s": max(0.0, time.time() - (self._live / f"{name}.json").stat().st_mtime),
+            **{key: row.get(key) for key in about}, **row["opencv"],
+            "pixel_pitch_mm": row.get("pixel_pitch"),
+            "interior": {n: row.get(n) for k in IOP_NAMES for n in (k, f"sd_{k}")},
+            "pose": None if pose["X0"] is None else pose,
+        }  # fmt: skip
+
+    def camera_info(self, name: str | None) -> str:
+        """The camera of now as ROS' camera_info YAML; errors as `current_camera`."""
+        now = self.current_camera(name)
+        sensor = Sensor(int(now["width"]), int(now["height"]), float(now["pixel_pitch_mm"]))
+        interior = InteriorOrientation.from_array([now["interior"][n] or 0.0 for n in IOP_NAMES])
+        about = f"{now['status']}, epoch {now['epoch']}"
+        if now["temperature"] is not None:
+            about += f", {now['temperature']:.2f} degC"
+        # imported where they are used: few ask, and the page's process is small
+        from thermocald.photogrammetry.camera_files import FORMATS
+        from thermocald.photogrammetry.camera_files.camera_record import Record
+
+        record = Record(CameraModel(sensor, interior), now["camera"], None, about)
+        return FORMATS["ros"].encode(record)[0]
 
     def last_frame(self, camera: str) -> bytes:
         """The last frame as JPEG; DataError if there is none."""

@@ -165,6 +165,33 @@ def to_family(model: CameraModel, family: Family, covariance: Array | None = Non
     )
 
 
+def opencv_terms(sensor: Sensor, values: Array, covariance: Array) -> dict[str, float]:
+    """Return OpenCV's terms with sds, and the size of the image, by the closed form; quickly.
+
+    values (10,), covariance (10, 10). Exact without an affinity and a shear, as `exact` says.
+    """
+    c, x0, y0, A1, A2, A3, B1, B2, C1, C2 = values.tolist()
+    f = 1.0 / sensor.pixel_pitch
+    centre = sensor.centre
+    terms: dict[str, tuple[float, dict[int, float]]] = {
+        "fx": ((1 + C1) * c * f, {0: (1 + C1) * f, 8: c * f}),
+        "fy": (c * f, {0: f}),
+        "cx": (float(centre[0]) + x0 * f, {1: f}),
+        "cy": (float(centre[1]) - y0 * f, {2: -f}),
+        "k1": (A1 * c**2, {0: 2 * A1 * c, 3: c**2}),
+        "k2": (A2 * c**4, {0: 4 * A2 * c**3, 4: c**4}),
+        "p1": (-B2 * c, {0: -B2, 7: -c}),
+        "p2": (B1 * c, {0: B1, 6: c}),
+        "k3": (A3 * c**6, {0: 6 * A3 * c**5, 5: c**6}),
+    }
+    found: dict[str, float] = {"width": sensor.width, "height": sensor.height}
+    for name, (value, partial) in terms.items():
+        j = np.zeros(10)
+        j[list(partial)] = list(partial.values())
+        found |= {name: value, f"sd_{name}": float(j @ covariance @ j) ** 0.5}
+    return {**found, "exact": float(C1 == 0 and C2 == 0)}
+
+
 def from_family(
     sensor: Sensor, family: Family, values: Array, covariance: Array | None = None
 ) -> Conversion:

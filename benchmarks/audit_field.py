@@ -15,7 +15,8 @@ from thermocald.photogrammetry.camera.camera_model import (
     project,
 )
 from thermocald.photogrammetry.field.testfield import Observations, TestField
-from thermocald.photogrammetry.network.adjustment import Distance, Photo, adjust_network
+from thermocald.photogrammetry.network.adjustment import Photo, adjust_network
+from thermocald.photogrammetry.network.datum import Distance
 from thermocald.photogrammetry.survey import surveyed_field
 
 if TYPE_CHECKING:

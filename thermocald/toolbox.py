@@ -241,7 +241,7 @@ def survey_testfield(
     from thermocald.api import read_testfield
     from thermocald.photogrammetry import camera_files
     from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
-    from thermocald.photogrammetry.network.bundle import Distance
+    from thermocald.photogrammetry.network.datum import Distance
     from thermocald.photogrammetry.survey import picture_of, survey
     from thermocald.store.recording.board_file import read_distances
     from thermocald.store.recording.testfield_file import write_testfield

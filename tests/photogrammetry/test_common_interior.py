@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from thermocald.photogrammetry.camera.camera_model import PRINCIPAL, InteriorOrientation, project
-from thermocald.photogrammetry.epoch.common_interior import adjust_common_interior
 from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.photogrammetry.network.common_interior import adjust_common_interior
 
 STATIONS = [
     scene.looking_at(centre, [150, 180, 160], roll)

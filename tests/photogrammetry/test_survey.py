@@ -11,7 +11,7 @@ from thermocald.errors import GeometryError, ImageError
 from thermocald.output.testfield.layout import TRIM, Design, field_of, lay_out, paper_size
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.photogrammetry.network.adjustment import Distance
+from thermocald.photogrammetry.network.datum import Distance
 from thermocald.photogrammetry.survey import Picture, survey
 from thermocald.physics.scene import Scene
 

@@ -20,7 +20,7 @@ from thermocald.photogrammetry.field.planes import target_normals
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.frame.measurement import circle_observations
 from thermocald.photogrammetry.network.adjustment import Network, Photo, adjust_network, advice
-from thermocald.photogrammetry.network.bundle import Distance
+from thermocald.photogrammetry.network.datum import Distance
 from thermocald.photogrammetry.targets import ring_code
 from thermocald.photogrammetry.targets.circle import fit_circles
 from thermocald.photogrammetry.targets.detection import find_circles

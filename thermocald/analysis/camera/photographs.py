@@ -13,8 +13,8 @@ from thermocald.errors import GeometryError, ImageError, UsageError
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.camera_files.camera_file import CameraFile
 from thermocald.photogrammetry.epoch.adjustment import cold_start, pose_only
-from thermocald.photogrammetry.epoch.common_interior import CommonInterior, adjust_common_interior
 from thermocald.photogrammetry.frame.measurement import Prior, measure
+from thermocald.photogrammetry.network.common_interior import CommonInterior, adjust_common_interior
 from thermocald.photogrammetry.orientation import approximate_orientation
 from thermocald.photogrammetry.targets.image_file import decode_grey
 

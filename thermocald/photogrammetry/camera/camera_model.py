@@ -395,9 +395,7 @@ def partials(
     moment[..., :2, :] += by_ideal[..., 1::-1, :]
     np.multiply(by_ideal[..., :2, :], crosswise, out=pair)
     np.subtract(pair[..., 0, :], pair[..., 1, :], out=moment[..., 2, :])
-    np.matmul(
-        _turning_axes(e, R) * (i[..., 0, None, None] * _TURNS), moment, out=out[..., 10:13, :]
-    )
+    np.matmul(turning_axes(e, R) * (i[..., 0, None, None] * _TURNS), moment, out=out[..., 10:13, :])
     image_points = measured.transpose(*range(1, measured.ndim), 0)
     return image_points, _points_first(out), _points_first(by_point)
 
@@ -408,7 +406,7 @@ def _points_first(array: Array) -> Array:
     return array.transpose(*range(1, last - 1), last, 0, last - 1)
 
 
-def _turning_axes(eop: Array, R: Array) -> Array:
+def turning_axes(eop: Array, R: Array) -> Array:
     """The axes (..., 3, 3) about which omega, phi, kappa turn the camera, in its frame (rows)."""
     axes = np.zeros(R.shape)
     axes[..., 0, :] = R[..., 0, :]

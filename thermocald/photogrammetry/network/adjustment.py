@@ -1,15 +1,10 @@
 """The adjustment of a network of photographs: result, checks, snooping for gross errors.
 
-The test of a point is vᵀ Qvv⁻¹ v, chi² with two degrees of freedom: data snooping that does not
-depend on the image's axes. Its limit holds for all points of the network together.
-
-Source: Baarda, W. (1968): A testing procedure for use in geodetic networks; Förstner, W., Wrobel,
-B. (2016): Photogrammetric Computer Vision, section 4.6.4.
-
 A self-calibrating bundle adjustment without control: interior orientation common to all
-photographs, datum by inner constraints over the targets, scale by measured distances, gross errors
-found by Baarda's data snooping in its two-dimensional form. A network that cannot carry the result
-is refused with its reasons (`network_checks`).
+photographs, datum by inner constraints over the targets, scale by measured distances. The test of a
+point is vᵀ Qvv⁻¹ v, chi² with two degrees of freedom: data snooping that does not depend on the
+image's axes; its limit holds for all points of the network together. A network that cannot carry
+the result is refused with its reasons.
 
 Source: Luhmann, T. et al. (2014): Close-Range Photogrammetry and 3D Imaging, 2nd ed., sections
 4.4 and 7.3; Baarda, W. (1968): A testing procedure for use in geodetic networks; Förstner, W.,
@@ -32,7 +27,8 @@ from thermocald.photogrammetry.camera.camera_model import (
     Sensor,
 )
 from thermocald.photogrammetry.network import bundle as nb
-from thermocald.photogrammetry.network.bundle import Datum, Distance, bring_to_datum, covariance
+from thermocald.photogrammetry.network.bundle import covariance
+from thermocald.photogrammetry.network.datum import Datum, Distance, bring_to_datum
 from thermocald.photogrammetry.network.start import approximate
 
 if TYPE_CHECKING:
@@ -276,10 +272,7 @@ def snoop(sensor: Sensor, bundle: Bundle, rays: ImageRays, free: Index) -> Clean
         rejected |= (
             candidates & (tests >= worst[rays.target]) & (tests > 0.3 * tests[candidates].max())
         )
-    plain = nb.ImageRays(
-        rays.photo, rays.target, rays.points, np.broadcast_to(np.eye(2), (len(rays), 2, 2))
-    )
-    sizes = np.linalg.norm(nb.residuals(sensor, bundle, plain), axis=1)
+    sizes = np.linalg.norm(nb.residuals(sensor, bundle, rays.in_pixels()), axis=1)
     return Cleaned(part, used, photos, targets, rejected, tests, sizes)
 
 
@@ -433,21 +426,7 @@ def _collect(
     photos: Sequence[Photo], m: int, names: Sequence[str]
 ) -> tuple[ImageRays, dict[str, str]]:
     """All rays of targets that enough photographs show, and what was left out."""
-    photo, target, points, whitening = [], [], [], []
-    for i, p in enumerate(photos):
-        o = p.observations
-        photo.append(np.full(len(o), i))
-        target.append(np.asarray(o.targets, dtype=np.int64))
-        points.append(o.points)
-        C = np.zeros((len(o), 2, 2))
-        C[:, 0, 0], C[:, 1, 1] = o.sigmas[:, 0] ** 2, o.sigmas[:, 1] ** 2
-        if o.covariances is not None:
-            C[:, 0, 1] = C[:, 1, 0] = o.covariances
-        whitening.append(np.linalg.inv(np.linalg.cholesky(C)))
-    rays = nb.ImageRays(
-        np.concatenate(photo), np.concatenate(target), np.concatenate(points).astype(float),
-        np.concatenate(whitening),
-    )  # fmt: skip
+    rays = nb.ImageRays.collect([p.observations for p in photos])
     seen = np.bincount(rays.target, minlength=m)
     left_out = {
         names[int(t)]: "fewer than three photographs show it"
@@ -510,8 +489,7 @@ def _stations(
 
 def _residuals_px(sensor: Sensor, bundle: Bundle, rays: ImageRays) -> tuple[Array, ...]:
     """Residuals per photograph, (n, 2) px each."""
-    units = np.broadcast_to(np.eye(2), (len(rays), 2, 2))
-    v = nb.residuals(sensor, bundle, nb.ImageRays(rays.photo, rays.target, rays.points, units))
+    v = nb.residuals(sensor, bundle, rays.in_pixels())
     return tuple(v[rays.photo == i] for i in range(len(bundle.centres)))
 
 

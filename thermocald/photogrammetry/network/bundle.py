@@ -1,26 +1,17 @@
-"""Bundle adjustment: datum, normal equations and covariance of photographs and points.
+"""Bundle adjustment of photographs and points: normal equations, iteration and covariance.
 
-Position and orientation by inner constraints over all targets (the mean standard deviation is
-smallest, and no target is privileged): they coincide in the mean with the nominal field if there is
-one, else the origin is the centroid and Z the normal of the best plane, towards the cameras. Scale
-by measured distances, with their standard deviations, in a rigorous sequential adjustment.
-
-The reduced matrix is inverted in the gauge of its own null space, the targets follow by back
-substitution, and an S-transformation brings all of it to the datum in which the mean standard
-deviation of the targets is smallest.
-
-Source: Baarda, W. (1973): S-transformations and criterion matrices; Granshaw, S. I. (1980): Bundle
-adjustment methods in engineering photogrammetry, Photogrammetric Record 10(56).
-
-The targets are eliminated block by block (Schur complement), the gauge of seven (position,
-orientation, scale) is left free and its null space added to the reduced matrix, which makes it
-regular without constraining anything that the photographs determine.
+The targets are eliminated block by block (Schur complement). In a free network the gauge of seven
+(position, orientation, scale) is left free and its null space added to the reduced matrix, which
+makes it regular without constraining anything that the photographs determine; the targets follow by
+back substitution, and an S-transformation brings all of it to the datum in which the mean standard
+deviation of the targets is smallest. Where the targets are known their places and standard
+deviations are observations, and nothing is free.
 
 Rotations are updated in object space (`R ← exp([w]×) R`), so no camera can look into a gimbal lock.
 
-Source: Granshaw, S. I. (1980): Bundle adjustment methods in engineering photogrammetry,
-Photogrammetric Record 10(56); Triggs, B. et al. (2000): Bundle adjustment — a modern synthesis,
-sections 6 and 9.
+Source: Baarda, W. (1973): S-transformations and criterion matrices; Granshaw, S. I. (1980): Bundle
+adjustment methods in engineering photogrammetry, Photogrammetric Record 10(56); Triggs, B. et al.
+(2000): Bundle adjustment — a modern synthesis, sections 6 and 9.
 """
 
 from __future__ import annotations
@@ -37,6 +28,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     partials,
     project,
 )
+from thermocald.photogrammetry.linalg import unit_diagonal
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -45,139 +37,17 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array, Index
     from thermocald.photogrammetry.camera.camera_model import Sensor
-
-
-@dataclass(frozen=True, slots=True)
-class Distance:
-    """A measured distance between two targets, mm, with its standard deviation."""
-
-    a: str
-    b: str
-    length: float
-    sigma: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Datum:
-    """A bundle in its datum, the targets' covariance (3m, 3m) mm² in it, and how it was brought
-    there: `x_new = scale · turn · x + shift`.
-    """
-
-    bundle: Bundle
-    covariance: Array
-    scale: float
-    turn: Array
-    sd_scale: float
-    statement: str
-
-
-def bring_to_datum(
-    bundle: Bundle,
-    covariance: Array,
-    distances: Sequence[Distance],
-    index: dict[str, int],
-    nominal: Array | None,
-) -> Datum:
-    """Scale and place a free network whose covariance (3m, 3m) has inner constraints.
-
-    index: the row of each target by name; nominal (m, 3) mm, NaN where unknown.
-    """
-    scaled, Q, scale, sd_scale = _scaled(bundle.points, covariance, distances, index)
-    turn, shift, where = _placement(scaled, scale * bundle.centres, nominal, distances[0], index)
-    m = len(scaled)
-    points = scaled @ turn.T + shift
-    blocks = Q.reshape(m, 3, m, 3)
-    turned = np.einsum("ab,mbnc,dc->mand", turn, blocks, turn, optimize=True).reshape(3 * m, 3 * m)
-    placed = Bundle(
-        bundle.interior,
-        turn @ bundle.rotations,
-        scale * bundle.centres @ turn.T + shift,
-        points,
-    )
-    by = ", ".join(f"{d.a}–{d.b} = {d.length:g} ± {d.sigma:g} mm" for d in distances)
-    statement = f"inner constraints over {m} targets, {where}; scale by {by}"
-    return Datum(placed, turned, scale, turn, sd_scale, statement)
-
-
-def _scaled(
-    points: Array, Q: Array, distances: Sequence[Distance], index: dict[str, int]
-) -> tuple[Array, Array, float, float]:
-    """Points and covariance with the scale that the distances give; the scale and its relative sd.
-
-    The estimate is linear in the network's points and the measured distances: ln L = ln l + lambda
-    with the network's own covariance; one distance fixes the scale, further ones also correct the
-    shape, each to its weight.
-    """
-    n, m3 = len(distances), points.size
-    H, r, noise = np.zeros((n, m3)), np.zeros(n), np.zeros(n)
-    for i, d in enumerate(distances):
-        missing = [name for name in (d.a, d.b) if name not in index]
-        if missing:
-            raise GeometryError(
-                f"the distance {d.a}–{d.b} cannot give the scale: target {' and '.join(missing)} "
-                "was not determined; at least three photographs must show both of its ends"
-            )
-        a, b = index[d.a], index[d.b]
-        e = points[b] - points[a]
-        length = float(np.linalg.norm(e))
-        H[i, 3 * b : 3 * b + 3], H[i, 3 * a : 3 * a + 3] = e / length**2, -e / length**2
-        r[i], noise[i] = np.log(d.length / length), (d.sigma / d.length) ** 2
-    # distances without a standard deviation must not make V singular
-    V = H @ Q @ H.T + np.diag(np.maximum(noise, 1e-18))
-    P = np.linalg.inv(V)
-    ones = np.ones(n)
-    weight = float(ones @ P @ ones)
-    a_row = ones @ P / weight
-    lam = float(a_row @ r)
-    M = P - np.outer(P @ ones, a_row)
-    centred = (points - points.mean(axis=0)).ravel()
-    gain = Q @ H.T @ M
-    shape = points + (gain @ r).reshape(-1, 3)
-    scale = float(np.exp(lam))
-    F = gain + np.outer(centred, a_row)
-    T = np.eye(m3) - F @ H
-    Qs = scale**2 * (T @ Q @ T.T + (F * noise) @ F.T)
-    return scale * shape, Qs, scale, float(np.sqrt(1.0 / weight))
-
-
-def _placement(
-    points: Array,
-    centres: Array,
-    nominal: Array | None,
-    first: Distance,
-    index: dict[str, int],
-) -> tuple[Array, Array, str]:
-    """The turn (3, 3) and shift (3,) into the datum, and what it is in words."""
-    if nominal is not None:
-        known = np.isfinite(nominal).all(axis=1)
-        if known.sum() >= 3:
-            turn, shift = _rigid(points[known], nominal[known])
-            return turn, shift, f"in the mean on the nominal coordinates of {known.sum()} targets"
-    centroid = points.mean(axis=0)
-    _, _, Vt = np.linalg.svd(points - centroid)
-    z = Vt[2] * (1.0 if (centres.mean(axis=0) - centroid) @ Vt[2] > 0 else -1.0)
-    along = points[index[first.b]] - points[index[first.a]]
-    along = along - (along @ z) * z
-    # a distance along the normal gives no direction: the field's longest side does
-    if np.linalg.norm(along) < 1e-3 * np.linalg.norm(np.ptp(points, axis=0)):
-        along = Vt[0]
-    x = along / np.linalg.norm(along)
-    turn = np.array([x, np.cross(z, x), z])
-    where = f"origin at their centroid, Z normal to their plane, X along {first.a}–{first.b}"
-    return turn, -turn @ centroid, where
-
-
-def _rigid(points: Array, onto: Array) -> tuple[Array, Array]:
-    """The rotation and shift of least squares (Arun et al. 1987), no reflection."""
-    p, q = points.mean(axis=0), onto.mean(axis=0)
-    U, _, Vt = np.linalg.svd((points - p).T @ (onto - q))
-    turn = Vt.T @ np.diag([1.0, 1.0, np.sign(np.linalg.det(Vt.T @ U.T))]) @ U.T
-    return turn, q - turn @ p
+    from thermocald.photogrammetry.field.testfield import Observations
 
 
 _N_IOP = len(IOP_NAMES)
 # Eigenvalues of the scaled matrix below this are rounding errors of its elements.
 _SINGULAR = 1e-13
+SINGULAR = (
+    "the normal matrix is singular: these photographs do not separate the parameters; take some "
+    "from other directions or hold parameters fixed"
+)
+_LEAST_SIGMA_MM = 1e-6  # of a coordinate without sigma alongside others with one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -222,9 +92,9 @@ def covariance(
     W = -np.einsum("mij,umj->umi", inverses, normals.B.reshape(-1, m, 3)).reshape(-1, 3 * m)
     Qcp = Qc @ W
     Qp = W.T @ Qcp
-    for t in range(m):
-        Qp[3 * t : 3 * t + 3, 3 * t : 3 * t + 3] += inverses[t]
-    cofactors = np.eye(2) - _adjusted_cofactors(linearised, rays, free, Qc, Qcp, Qp)
+    blocks = np.einsum("mimj->mij", Qp.reshape(m, 3, m, 3))  # a view
+    blocks += inverses
+    cofactors = np.eye(2) - adjusted_cofactors(linearised, rays, free, Qc, Qcp, blocks)
 
     K = np.linalg.solve(null_p.T @ null_p, null_p.T)
     KQ = K @ Qp
@@ -238,15 +108,18 @@ def covariance(
     return Covariance(interior, centres, inner, cofactors, weakest)
 
 
-def _adjusted_cofactors(
+def adjusted_cofactors(
     linearised: tuple[Array, Array, Array, Array],
     rays: ImageRays,
     free: Index,
     Qc: Array,
     Qcp: Array,
-    Qp: Array,
+    targets: Array,
 ) -> Array:
-    """The cofactors (n, 2, 2) of the adjusted, whitened image points; independent of the gauge."""
+    """The cofactors (n, 2, 2) of the adjusted, whitened image points; independent of the gauge.
+
+    Qc (u, u), Qcp (u, 3m), targets (m, 3, 3): cofactors of cameras, between both, of each target.
+    """
     _, by_interior, by_pose, by_point = linearised
     J = np.concatenate([by_interior[:, :, free], by_pose], axis=2)
     f = len(free)
@@ -255,7 +128,7 @@ def _adjusted_cofactors(
     rows = 3 * rays.target[:, None] + np.arange(3)
     cameras = Qc[columns[:, :, None], columns[:, None, :]]
     mixed = Qcp[columns[:, :, None], rows[:, None, :]]
-    points = Qp[rows[:, :, None], rows[:, None, :]]
+    points = targets[rays.target]
     half = J @ mixed @ np.swapaxes(by_point, 1, 2)
     total: Array = (
         J @ cameras @ np.swapaxes(J, 1, 2)
@@ -282,11 +155,31 @@ class ImageRays:
     def __len__(self) -> int:
         return len(self.photo)
 
+    @classmethod
+    def collect(cls, photographs: Sequence[Observations]) -> ImageRays:
+        """The image points of photographs, one after the other; targets keep their rows."""
+        points = np.concatenate([o.points for o in photographs]).astype(float)
+        C = np.zeros((len(points), 2, 2))
+        sigmas = np.concatenate([o.sigmas for o in photographs])
+        C[:, 0, 0], C[:, 1, 1] = sigmas[:, 0] ** 2, sigmas[:, 1] ** 2
+        xy = [np.zeros(len(o)) if o.covariances is None else o.covariances for o in photographs]
+        C[:, 0, 1] = C[:, 1, 0] = np.concatenate(xy)
+        return cls(
+            np.repeat(np.arange(len(photographs)), [len(o) for o in photographs]),
+            np.concatenate([o.targets for o in photographs]).astype(np.int64),
+            points,
+            np.linalg.inv(np.linalg.cholesky(C)),
+        )
+
     def select(self, keep: NDArray[np.bool_]) -> ImageRays:
         """The rays of a mask."""
         return ImageRays(
             self.photo[keep], self.target[keep], self.points[keep], self.whitening[keep]
         )
+
+    def in_pixels(self) -> ImageRays:
+        """The same rays with residuals in px, whatever their sigmas."""
+        return replace(self, whitening=np.broadcast_to(np.eye(2), self.whitening.shape))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -310,6 +203,28 @@ class Bundle:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class KnownTargets:
+    """What is known of the targets beforehand: places (m, 3) mm with weights (m, 3) mm⁻², and which
+    of them (m,) are uncertain; the others are held.
+    """
+
+    points: Array
+    weights: Array
+    uncertain: NDArray[np.bool_]
+
+    @classmethod
+    def build(cls, points: Array, sigmas: Array) -> KnownTargets:
+        """From places and standard deviations (m, 3) mm, 0 for what is exact."""
+        uncertain = np.asarray((sigmas > 0).any(axis=1))
+        weights = np.where(uncertain[:, None], np.maximum(sigmas, _LEAST_SIGMA_MM) ** -2, 1.0)
+        return cls(points, weights, uncertain)
+
+    def cost(self, bundle: Bundle) -> float:
+        """The weighted sum of squares of the targets' corrections."""
+        return float(np.sum(self.weights * (bundle.points - self.points) ** 2))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class NormalEquations:
     """Normal equations: cameras (interior first, then six per photo) and targets."""
 
@@ -330,9 +245,16 @@ def residuals(sensor: Sensor, bundle: Bundle, rays: ImageRays) -> Array:
 
 
 def linearise(
-    sensor: Sensor, bundle: Bundle, rays: ImageRays, weights: Array
+    sensor: Sensor,
+    bundle: Bundle,
+    rays: ImageRays,
+    weights: Array,
+    known: KnownTargets | None = None,
 ) -> tuple[Array, Array, Array, Array]:
-    """Whitened residuals (n, 2), partials by interior (n, 2, 10), pose (…, 6), target (…, 3)."""
+    """Whitened residuals (n, 2), partials by interior (n, 2, 10), pose (…, 6), target (…, 3).
+
+    The partials by a target that is held are 0.
+    """
     eop = bundle.exteriors()[rays.photo]
     points = bundle.points[rays.target]
     computed, by_parameter, by_point = partials(sensor, bundle.interior, eop, points[:, None, :])
@@ -348,11 +270,17 @@ def linearise(
     by_pose = np.concatenate([by_point @ cross, -by_point], axis=2)
     v = (root @ np.nan_to_num(rays.points - computed[:, 0])[..., None])[..., 0]
     by_interior = np.nan_to_num(by_parameter[:, 0, :, :_N_IOP])
+    if known is not None:
+        by_point = by_point * known.uncertain[rays.target, None, None]
     return v, root @ by_interior, root @ by_pose, root @ by_point
 
 
 def normal_equations(
-    bundle: Bundle, rays: ImageRays, free: Index, linearised: tuple[Array, Array, Array, Array]
+    bundle: Bundle,
+    rays: ImageRays,
+    free: Index,
+    linearised: tuple[Array, Array, Array, Array],
+    known: KnownTargets | None = None,
 ) -> NormalEquations:
     """The normal equations of a bundle in blocks: camera and poses, targets, and between them.
 
@@ -389,6 +317,9 @@ def normal_equations(
     D, d = np.zeros((m, 3, 3)), np.zeros((m, 3))
     np.add.at(D, rays.target, np.swapaxes(by_point, 1, 2) @ by_point)
     np.add.at(d, rays.target, np.einsum("nai,na->ni", by_point, v))
+    if known is not None:
+        D += known.weights[:, :, None] * np.eye(3)
+        d += known.weights * (known.points - bundle.points)
     return NormalEquations(A, B, D, a, d)
 
 
@@ -450,15 +381,40 @@ def _turn(w: Array) -> Array:
     return turned
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Step:
+    """A step of cameras (u,) and targets (m, 3), and its size: stepᵀ N step."""
+
+    cameras: Array
+    targets: Array
+    size: float
+
+    def taken(self, bundle: Bundle, free: Index, fraction: float) -> Bundle:
+        """The bundle after a fraction of the step."""
+        dc, f = fraction * self.cameras, len(free)
+        interior, pose = bundle.interior.copy(), dc[f:].reshape(-1, 6)
+        interior[free] += dc[:f]
+        return Bundle(
+            interior,
+            _turn(pose[:, :3]) @ bundle.rotations,
+            bundle.centres + pose[:, 3:],
+            bundle.points + fraction * self.targets,
+        )
+
+
 def _step(
-    bundle: Bundle, normals: NormalEquations, free: Index, damping: float
-) -> tuple[Bundle, float] | None:
-    """The bundle after one damped step, and the step's size in standard deviations; None if the
-    matrix is not positive definite.
+    bundle: Bundle, normals: NormalEquations, free: Index, damping: float, gauge: bool
+) -> _Step | None:
+    """The damped step; None if the matrix is not positive definite.
+
+    gauge: whether position, orientation and scale are free.
     """
     S, s, inverses = reduce_targets(normals, damping)
-    null, _ = null_space(bundle.centres, bundle.points, len(free))
-    scaled, scales, _ = regularise(S, null)
+    if gauge:
+        null, _ = null_space(bundle.centres, bundle.points, len(free))
+        scaled, scales, _ = regularise(S, null)
+    else:
+        scaled, scales = unit_diagonal(S)
     scaled = scaled + damping * np.eye(len(scaled))
     try:
         np.linalg.cholesky(scaled)
@@ -466,16 +422,8 @@ def _step(
         return None
     dc = scales * np.linalg.solve(scaled, scales * s)
     dp = np.einsum("mij,mj->mi", inverses, normals.d - (dc @ normals.B).reshape(-1, 3))
-    interior = bundle.interior.copy()
-    interior[free] += dc[: len(free)]
-    pose = dc[len(free) :].reshape(-1, 6)
-    moved = Bundle(
-        interior, _turn(pose[:, :3]) @ bundle.rotations, bundle.centres + pose[:, 3:],
-        bundle.points + dp,
-    )  # fmt: skip
-    # half of stepᵀ N step: the predicted decrease of the sum of squares, in its own unit
-    size = float(dc @ normals.a + dp.ravel() @ normals.d.ravel())
-    return moved, size
+    # the predicted decrease of the sum of squares, in its own unit
+    return _Step(dc, dp, float(dc @ normals.a + dp.ravel() @ normals.d.ravel()))
 
 
 def solve(
@@ -487,41 +435,64 @@ def solve(
     weights: Array | None = None,
     robust: bool = False,
     iterations: int = 30,
+    known: KnownTargets | None = None,
 ) -> tuple[Bundle, Array]:
-    """Adjust the bundle to the rays (Levenberg-Marquardt).
+    """Adjust the bundle to the rays.
 
+    A free network by damped steps (Levenberg-Marquardt); with known targets by whole or shorter
+    ones (Gauss-Newton), which follow the narrow valley of a weak geometry to its end.
     free: which of `IOP_NAMES` are unknown (indices); weights (n,) factors of the rays' weights, 0
-    leaves one out; `robust` renews them in each iteration (Cauchy, scaled by the median residual).
+    leaves one out; `robust` renews them in each iteration (Cauchy, scaled by the median residual);
+    known: what is known of the targets, None for a free network.
     Returns the bundle and the final weights. Raises GeometryError where it cannot converge.
     """
+
+    def cost_of(bundle: Bundle, v: Array) -> float:
+        prior = 0.0 if known is None else known.cost(bundle)
+        return float(w @ np.sum(v * v, axis=1)) + prior
+
+    gauge = known is None
     w = np.ones(len(rays)) if weights is None else weights
-    damping = 1e-6
+    damping = 1e-6 if gauge else 0.0
     v = residuals(sensor, bundle, rays)
     for _ in range(iterations):
         if robust:
             w = _cauchy(v) * (1.0 if weights is None else weights > 0)
-        cost = float(w @ np.sum(v * v, axis=1))
-        normals = normal_equations(bundle, rays, free, linearise(sensor, bundle, rays, w))
+        cost = cost_of(bundle, v)
+        linearised = linearise(sensor, bundle, rays, w, known)
+        normals = normal_equations(bundle, rays, free, linearised, known)
+        fraction = 1.0
         for _attempt in range(12):
-            step = _step(bundle, normals, free, damping)
-            if step is not None and step[0].interior[0] > 0:
-                v_new = residuals(sensor, step[0], rays)
-                new = float(w @ np.sum(v_new * v_new, axis=1))
-                if new <= cost * (1 + 1e-12):
-                    break
-            damping = max(damping * 10, 1e-9)
+            step = _step(bundle, normals, free, damping, gauge)
+            if step is not None:
+                trial = step.taken(bundle, free, fraction)
+                if trial.interior[0] > 0:
+                    v_new = residuals(sensor, trial, rays)
+                    new = cost_of(trial, v_new)
+                    if new <= cost * (1 + 1e-12):
+                        break
+            elif not gauge:
+                raise GeometryError(SINGULAR)
+            if gauge:
+                damping = max(damping * 10, 1e-9)
+            else:
+                fraction /= 2
         else:
             # no step lowers the sum: it is the minimum to within rounding, or hopeless
-            if step is not None and step[1] < 1e-4:
+            if step is not None and step.size < 1e-4:
                 return bundle, w
             raise GeometryError(
                 "the bundle adjustment does not converge: take more photographs, from more sides, "
                 "or give approximate camera data"
             )
-        bundle, v = step[0], v_new
-        damping = max(damping / 10, 1e-12)
-        if step[1] < 1e-8 or (robust and cost - new < 1e-6 * cost):
+        bundle, v = trial, v_new
+        if gauge:
+            damping = max(damping / 10, 1e-12)
+        if step.size < 1e-8 or (robust and cost - new < 1e-6 * cost):
             break
+    else:
+        if not gauge:
+            raise GeometryError(f"the adjustment did not converge in {iterations} iterations")
     return _normalised(bundle), w
 
 

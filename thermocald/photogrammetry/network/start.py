@@ -264,11 +264,8 @@ def approximate(
             if found is None:
                 continue
             bundle, photos, used = found
-            plain = ImageRays(
-                used.photo, used.target, used.points,
-                np.broadcast_to(np.eye(2), (len(used), 2, 2)),
-            )  # fmt: skip
-            median = float(np.median(np.linalg.norm(residuals(sensor, bundle, plain), axis=1)))
+            off = residuals(sensor, bundle, used.in_pixels())
+            median = float(np.median(np.linalg.norm(off, axis=1)))
             # five percent more or fewer image points decide nothing
             missing = round(20 * (1 - len(used) / len(rays)))
             if best is None or (missing, median) < best[:2]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from thermocald.errors import TestFieldError, UsageError
 from thermocald.files import read_yaml
-from thermocald.photogrammetry.network.bundle import Distance
+from thermocald.photogrammetry.network.datum import Distance
 from thermocald.photogrammetry.targets import boards
 
 if TYPE_CHECKING:

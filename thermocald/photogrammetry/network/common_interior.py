@@ -1,0 +1,244 @@
+"""Several photographs of one camera: one interior orientation, an exterior one per photograph.
+
+A bundle adjustment whose targets are known: their coordinates are unknowns with the test field's
+sigmas as prior, so that a target is where it is in all photographs. The weights of the image points
+do not depend on the unknowns, so that the iteration ends at the minimum of the sum of squares. A
+photograph too poor to carry an interior orientation of its own takes part all the same.
+
+Source: Luhmann et al. (2014), section 7.3 (test-field calibration); the elimination of points as
+Brown, D. C. (1976): The bundle adjustment - progress and prospects.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.errors import GeometryError
+from thermocald.photogrammetry.camera.camera_model import (
+    ExteriorOrientation,
+    InteriorOrientation,
+    free_columns,
+    turning_axes,
+)
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
+from thermocald.photogrammetry.epoch.geometry import image_coverage, obliqueness_deg, uncertain
+from thermocald.photogrammetry.epoch.snooping import chi2_2d
+from thermocald.photogrammetry.field.planes import plane_fit
+from thermocald.photogrammetry.linalg import diagonal_scale, scaled_inverse
+from thermocald.photogrammetry.network.bundle import (
+    SINGULAR,
+    Bundle,
+    ImageRays,
+    KnownTargets,
+    adjusted_cofactors,
+    linearise,
+    normal_equations,
+    reduce_targets,
+    residuals,
+    solve,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from thermocald.arrays import Array, Index, Mask
+    from thermocald.photogrammetry.camera.camera_model import Sensor
+    from thermocald.photogrammetry.field.testfield import Observations, TestField
+
+_ITERATIONS = 60
+_ROUNDS = 10
+_BEHIND = 1e6  # of `residuals`
+_UNTESTABLE = 1e-6  # of its variance: a ray whose residual the unknowns take up
+_LARGEST_OBLIQUENESS_NEEDED_DEG = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class CommonInterior:
+    """One camera from several photographs.
+
+    interior; covariance (16, 16), its EOP block zero; exteriors, exterior_covariances (n, 6, 6);
+    sigma0; redundancy; used: masks of the observations per photograph; residuals per photograph
+    (n, 2) px; reasons: why the geometry is weak, empty where it is not.
+    """
+
+    interior: InteriorOrientation
+    covariance: Array
+    exteriors: tuple[ExteriorOrientation, ...]
+    exterior_covariances: Array
+    sigma0: float
+    redundancy: int
+    used: tuple[Mask, ...]
+    residuals: tuple[Array, ...]
+    reasons: tuple[str, ...]
+
+    @property
+    def sd(self) -> Array:
+        """Standard deviations (16,), 0 where held."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def adjust_common_interior(
+    sensor: Sensor,
+    testfield: TestField,
+    photographs: Sequence[Observations],
+    interior: InteriorOrientation,
+    exteriors: Sequence[ExteriorOrientation],
+    settings: AdjustmentSettings | None = None,
+    fitting: Sequence[Mask] | None = None,
+) -> CommonInterior:
+    """Adjust photographs that share an interior orientation, from start values.
+
+    fitting: masks of the observations that take part at first, per photograph; what fits the result
+    comes back. Raises GeometryError where the adjustment does not converge or is singular.
+    """
+    s = settings or AdjustmentSettings()
+    free = np.array(free_columns(s.free), dtype=np.int64)
+    seen = np.unique(np.concatenate([o.targets for o in photographs]))
+    rays = ImageRays.collect(photographs)
+    rays = ImageRays(rays.photo, np.searchsorted(seen, rays.target), rays.points, rays.whitening)
+    known = KnownTargets.build(testfield.points[seen], testfield.sigmas[seen])
+    bundle = Bundle(
+        interior.as_array(),
+        np.array([e.rotation for e in exteriors]),
+        np.array([e.centre for e in exteriors]),
+        known.points,
+    )
+    used = np.ones(len(rays), dtype=bool)
+    if fitting is not None and s.snooping_alpha > 0:
+        used = np.concatenate(list(fitting))
+    for _ in range(_ROUNDS):
+        if np.abs(residuals(sensor, bundle, rays)[used]).max(initial=0.0) >= _BEHIND:
+            raise GeometryError("targets came to lie behind the camera during the iteration")
+        weights = used.astype(float)
+        bundle, _ = solve(
+            sensor, bundle, rays, free, weights=weights, iterations=_ITERATIONS, known=known
+        )
+        Q, shares = _cofactors(sensor, bundle, rays, free, weights, known)
+        v = residuals(sensor, bundle, rays)
+        kept = snoop_rays(ray_tests(v, shares, used), rays.target, used, s.snooping_alpha)
+        if np.array_equal(kept, used):
+            break
+        used = kept
+    n = int(np.count_nonzero(used))
+    redundancy = 2 * n - len(free) - 6 * len(photographs)
+    if redundancy < s.bounds.minimum_redundancy:
+        raise GeometryError(
+            f"{n} image points in {len(photographs)} photographs leave a redundancy of "
+            f"{redundancy}; at least {s.bounds.minimum_redundancy} is needed"
+        )
+    variance = (float(np.sum(v[used] ** 2)) + known.cost(bundle)) / redundancy
+    Q *= variance if s.scale == "posterior" else 1.0
+    covariance = np.zeros((16, 16))
+    covariance[np.ix_(free, free)] = Q[: len(free), : len(free)]
+    eops = bundle.exteriors()
+    ends = np.cumsum([len(o) for o in photographs])[:-1]
+    return CommonInterior(
+        InteriorOrientation.from_array(bundle.interior),
+        covariance,
+        tuple(ExteriorOrientation.from_array(e) for e in eops),
+        _of_angles(Q[len(free) :, len(free) :], bundle, eops),
+        float(np.sqrt(variance)),
+        redundancy,
+        tuple(np.split(used, ends)),
+        tuple(np.split(residuals(sensor, bundle, rays.in_pixels()), ends)),
+        tuple(_weaknesses(sensor, bundle.interior, eops, known, rays.select(used), covariance, s)),
+    )
+
+
+def _cofactors(
+    sensor: Sensor,
+    bundle: Bundle,
+    rays: ImageRays,
+    free: Index,
+    weights: Array,
+    known: KnownTargets,
+) -> tuple[Array, Array]:
+    """The cofactors (u, u) of camera and poses, and those (n, 2, 2) of all adjusted image points.
+
+    Raises GeometryError where the photographs do not carry it.
+    """
+    used = linearise(sensor, bundle, rays, weights, known)
+    normals = normal_equations(bundle, rays, free, used, known)
+    S, _, inverses = reduce_targets(normals, 0.0)
+    scale = diagonal_scale(S)
+    try:
+        np.linalg.cholesky(S * np.outer(scale, scale))
+        Q = scaled_inverse(S)
+    except np.linalg.LinAlgError:
+        raise GeometryError(SINGULAR) from None
+    W = -np.einsum("mij,umj->umi", inverses, normals.B.reshape(len(Q), -1, 3))
+    mixed = np.einsum("uv,vmi->umi", Q, W)
+    targets = inverses + np.einsum("umi,umj->mij", W, mixed)
+    every = linearise(sensor, bundle, rays, np.ones(len(rays)), known)
+    return Q, adjusted_cofactors(every, rays, free, Q, mixed.reshape(len(Q), -1), targets)
+
+
+def _of_angles(Q: Array, bundle: Bundle, eops: Array) -> Array:
+    """Covariances (k, 6, 6) of exterior orientations, from those of turns about the object's axes
+    and of projection centres, (6k, 6k).
+    """
+    k = len(eops)
+    J = np.broadcast_to(np.eye(6), (k, 6, 6)).copy()
+    axes = bundle.rotations @ np.swapaxes(turning_axes(eops, bundle.rotations), 1, 2)
+    J[:, :3, :3] = np.linalg.inv(axes)
+    blocks = np.einsum("kikj->kij", Q.reshape(k, 6, k, 6))
+    result: Array = J @ blocks @ np.swapaxes(J, 1, 2)
+    return result
+
+
+def ray_tests(v: Array, shares: Array, used: Mask) -> Array:
+    """Chi-square (2) of whitened residuals (n, 2), of which the unknowns explain the cofactors
+    `shares` (n, 2, 2).
+    """
+    V = np.eye(2) + np.where(used, -1.0, 1.0)[:, None, None] * shares
+    testable = np.linalg.det(V) > _UNTESTABLE
+    V[~testable] = np.eye(2)
+    test = np.einsum("ni,nij,nj->n", v, np.linalg.inv(V), v)
+    return np.where(testable, test, 0.0)
+
+
+def snoop_rays(tests: Array, target: Index, used: Mask, alpha: float) -> Mask:
+    """Which image points stay; of the rays of one target only the worst goes at a time."""
+    if alpha <= 0:
+        return used
+    limit = chi2_2d(alpha) * max(float(np.median(tests[used])) / (2 * np.log(2)), 1e-12)
+    worst = np.zeros(1 + int(target.max(initial=0)))
+    np.maximum.at(worst, target[used], tests[used])
+    kept: Mask = (tests <= limit) | (used & (tests < worst[target]))
+    return kept
+
+
+def _weaknesses(
+    sensor: Sensor,
+    values: Array,
+    eops: Array,
+    known: KnownTargets,
+    rays: ImageRays,
+    covariance: Array,
+    s: AdjustmentSettings,
+) -> list[str]:
+    """Why the photographs do not carry the free parameters."""
+    reasons: list[str] = []
+    if not s.free:
+        return reasons
+    _, axes, flat = plane_fit(known.points[np.unique(rays.target)])
+    if flat and "c" in s.free:
+        angles = [obliqueness_deg(eop, axes[2]) for eop in eops]
+        if max(angles) < _LARGEST_OBLIQUENESS_NEEDED_DEG:
+            reasons.append(
+                f"one plane, in all {len(eops)} photographs within {max(angles):.0f}° of frontal "
+                f"(some at {_LARGEST_OBLIQUENESS_NEEDED_DEG:.0f}° and more are needed): principal "
+                "distance and distance to the field cannot be separated, however small the "
+                "residuals are"
+            )
+    coverage = image_coverage(sensor, rays.points)
+    if coverage < s.bounds.coverage:
+        reasons.append(
+            f"the targets cover {coverage:.1%} of the image in all photographs together (at least "
+            f"{s.bounds.coverage:.0%} are needed)"
+        )
+    sd = np.sqrt(np.diag(covariance))
+    return reasons + uncertain(sensor, values, sd, s.free, s.bounds)

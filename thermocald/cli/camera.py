@@ -10,6 +10,7 @@ import typer
 from thermocald.cli.commands import expert, subcommands
 from thermocald.cli.common import say, warnings_said, write_result
 from thermocald.cli.options import ExtrapolateOption, JsonOption, PixelPitchOption
+from thermocald.errors import UsageError
 
 _FORMATS = "opencv, ros, colmap, mrcal, kalibr, metashape, aicon, json"
 
@@ -41,18 +42,34 @@ def convert(
 def at(
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="A thermal model, from `fit`.")],
     temperature: Annotated[float, typer.Option(help="°C: a camera that has long been there.")],
-    to: Annotated[str, typer.Option(help=f"Format to write: {_FORMATS}.")] = "json",
+    to: Annotated[str, typer.Option(help=f"Format to write: {_FORMATS}, pyorc.")] = "json",
     out: Annotated[Path | None, typer.Option("--out", "-o", help="The file to write.")] = None,
+    renew: Annotated[
+        Path | None, typer.Option(help="With --to pyorc: its camera configuration.")
+    ] = None,
+    reference: Annotated[
+        Path | None, typer.Option(help="With --to pyorc: the image its points were clicked in.")
+    ] = None,
+    frame: Annotated[
+        Path | None, typer.Option(help="With --to pyorc: measure its points in this image.")
+    ] = None,
     extrapolate: ExtrapolateOption = False,
     json: JsonOption = None,
 ) -> None:
     """Give the camera at one temperature, as a file of any program.
 
     Example: thermocald camera at camera.thermal.yaml --temperature 35 --to ros -o cam.yaml
+    Example: thermocald camera at camera.thermal.yaml --temperature 35 --to pyorc --renew site.json
+    --reference clicked.jpg --frame now.jpg -o warm.json
     """
     import thermocald as tc
+    from thermocald.output import pyorc
 
+    if (to == "pyorc") != (renew is not None) or (renew is not None and out is None):
+        raise UsageError("--to pyorc needs --renew, its camera configuration, and --out")
     thermal = tc.load_camera(model)
+    if renew is not None:
+        thermal = thermal.for_images(*pyorc.image_size(renew))
     if thermal.warning:
         say(f"warning: {thermal.warning}")
     with warnings_said():
@@ -61,7 +78,13 @@ def at(
     if out is not None:
         assert found.state is not None
         comment = f"{thermal.model.camera} at {temperature:g} °C, of {model.name}"
-        statement = found.state.write(out, to, comment)
+        if renew is None:
+            statement = found.state.write(out, to, comment)
+        else:
+            renewed = pyorc.renew_configuration(renew, found.state, reference, frame)
+            if renewed.control.assumed:
+                say(renewed.control.assumed)
+            statement = renewed.write(out)
         document |= {"out": str(out), "out_format": to, "statement": statement}
         lines.append(f"{out} ({to}): {statement}")
     if write_result(document, json):

@@ -132,15 +132,20 @@ class Camera(Result):
         result: Array = np.sqrt(variance) * distance_mm / self.interior.c
         return result
 
-    def resect(self, control: TestField, seen: Observations) -> Adjustment:
+    def resect(
+        self, control: TestField, seen: Observations, snooping_alpha: float = 0.001
+    ) -> Adjustment:
         """Return the pose that control points give, with this camera as it is known.
 
-        The covariance (16, 16) of the result joins camera and pose; its status says why there is
-        none.
+        snooping_alpha: error probability of a single test for gross errors, 0 for none. The
+        covariance (16, 16) of the result joins camera and pose; its status says why there is none.
         """
         from thermocald.photogrammetry.epoch.measuring import resect
 
-        return resect(self.sensor, self.interior, self.covariance, control, seen)
+        return resect(
+            self.sensor, self.interior, self.covariance, control, seen,
+            snooping_alpha=snooping_alpha,
+        )  # fmt: skip
 
     def on_plane(
         self,

@@ -1,0 +1,213 @@
+"""pyorc's camera configuration renewed: read by the real package, and the real river."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.cli.test_measure import ORIGIN_M, POSE, write_model
+from tests.commands import call
+from tests.main_paths.crooked import CAMERA, PITCH, SIZE, project
+from thermocald.analysis.camera.camera import Camera
+from thermocald.analysis.thermal.control_points import ControlPoints
+from thermocald.errors import DataError
+from thermocald.output.pyorc import opencv_pose, renew_configuration
+from thermocald.photogrammetry.camera.camera_model import (
+    ExteriorOrientation,
+    InteriorOrientation,
+    Sensor,
+)
+
+RIVER = Path(__file__).resolve().parents[3] / "shared" / "data" / "river"
+WARM = 36.0
+SITE = {"crs": "EPSG:28992", "resolution": 0.03, "window_size": 15, "is_nadir": False}
+
+
+@pytest.fixture(scope="module")
+def pyorc():
+    """The real package, whose import leaves a thread behind."""
+    return pytest.importorskip("pyorc", reason="pip install pyopenrivercam")
+
+
+def configuration(path: Path, n: int = 8) -> tuple[Path, np.ndarray]:
+    """A site in a national grid, clicked when the camera was cold; also its true points in mm."""
+    rng = np.random.default_rng(1)
+    y = rng.uniform(8_000, 28_000, n)
+    points = np.column_stack(
+        [np.where(np.arange(n) % 2, 0.3, -0.3) * y, y, rng.uniform(-200, 2_500, n)]
+    )
+    warm = {"c": 0.4e-3, "x0": 0.35e-3, "y0": -0.2e-3}
+    interior = {k: CAMERA[k] + warm[k] * (WARM - 20.0) for k in warm}
+    src = project(points, POSE, **interior)
+    document = {
+        "width": SIZE[0], "height": SIZE[1], **SITE, "lens_position": None,
+        "gcps": {"src": src.tolist(), "dst": (points / 1000 + ORIGIN_M).tolist(), "h_ref": 1.2,
+                 "z_0": 138.0},
+        "camera_matrix": [[2700.0, 0, 1640.0], [0, 2700.0, 1232.0], [0, 0, 1.0]],
+        "dist_coeffs": [[0.0], [0.0], [0.0], [0.0]],
+    }  # fmt: skip
+    path.write_text(json.dumps(document))
+    return path, points
+
+
+def renewed(tmp_path: Path) -> tuple[dict, np.ndarray, np.ndarray]:
+    """What `camera at --to pyorc` writes, points mm, and where the true camera sees them."""
+    write_model(tmp_path / "model.yaml")
+    old, points = configuration(tmp_path / "site.json")
+    done = call(
+        "camera", "at", tmp_path / "model.yaml", "--temperature", WARM, "--to", "pyorc", "--renew",
+        old, "-o", tmp_path / "warm.json",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "pose from 8 control points" in done.stdout
+    assert "20 mm" in done.stderr
+    src = np.array(json.loads(old.read_text())["gcps"]["src"])
+    return json.loads((tmp_path / "warm.json").read_text()), points, src
+
+
+def test_the_camera_is_the_warm_one_and_all_else_stays(tmp_path):
+    document, points, src = renewed(tmp_path)
+    assert {k: document[k] for k in SITE} == SITE
+    K = np.array(document["camera_matrix"])
+    assert K[0, 0] == pytest.approx((CAMERA["c"] + 0.4e-3 * 16) / PITCH)
+    true = POSE[3:] / 1000 + ORIGIN_M
+    assert document["lens_position"] == pytest.approx(true.tolist(), abs=2e-3)
+    import cv2
+
+    at = points / 1000 + ORIGIN_M
+    seen, _ = cv2.projectPoints(
+        at, np.array(document["rvec"]), np.array(document["tvec"]), K,
+        np.array(document["dist_coeffs"]),
+    )  # fmt: skip
+    # the iteration ends with a step that is small against 20 mm
+    assert seen[:, 0] == pytest.approx(src, abs=0.05)
+
+
+def assert_projects(read, path: Path, points: np.ndarray, ours: np.ndarray) -> None:
+    """The file's pose to 1e-6 px; as pyorc solves for it again, to its matrix's 32 bits."""
+    assert read.project_points(points.tolist()) == pytest.approx(ours, abs=3e-4)
+    document = json.loads(path.read_text())
+    read.rvec, read.tvec = document["rvec"], document["tvec"]
+    assert read.project_points(points.tolist()) == pytest.approx(ours, abs=1e-6)
+
+
+def test_the_real_pyorc_projects_as_we_do(tmp_path, pyorc):
+    write_model(tmp_path / "model.yaml")
+    _, points, _ = renewed(tmp_path)
+    read = pyorc.load_camera_config(str(tmp_path / "warm.json"))
+    import thermocald as tc
+
+    camera = tc.load_camera(tmp_path / "model.yaml").at(WARM)
+    done = renew_configuration(tmp_path / "site.json", camera)
+    ours = done.camera.project(
+        points + 1000 * ORIGIN_M - done.control.origin, done.pose.exterior.as_array()
+    )
+    assert_projects(read, tmp_path / "warm.json", points / 1000 + ORIGIN_M, ours)
+    assert read.gcps["z_0"] == 138.0
+
+
+def test_opencv_pose_is_the_same_camera():
+    pose = ExteriorOrientation.from_array(POSE)
+    rvec, tvec = opencv_pose(pose, np.zeros(3))
+    import cv2
+
+    R, _ = cv2.Rodrigues(rvec)
+    assert -R.T @ tvec * 1000 == pytest.approx(POSE[3:])
+    assert R[2] == pytest.approx(-pose.rotation[:, 2])
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [(["--to", "pyorc", "-o", "x.json"], "needs --renew"),
+     (["--to", "ros", "--renew", "site.json", "-o", "x.yaml"], "needs --renew"),
+     (["--to", "pyorc", "--renew", "model.yaml", "-o", "x.json"], "cannot be read as JSON"),
+     (["--to", "pyorc", "--renew", "site.json", "--frame", "a.png", "-o", "x.json"], "together")],
+)  # fmt: skip
+def test_what_is_missing_is_said(tmp_path, monkeypatch, options, words):
+    write_model(tmp_path / "model.yaml")
+    configuration(tmp_path / "site.json")
+    monkeypatch.chdir(tmp_path)
+    done = call("camera", "at", "model.yaml", "--temperature", "20", *options)
+    assert done.returncode in (1, 2)
+    assert words in " ".join(done.stderr.split())
+    assert "Traceback" not in done.stderr
+
+
+def test_three_points_are_too_few(tmp_path):
+    write_model(tmp_path / "model.yaml")
+    path, _ = configuration(tmp_path / "site.json", 3)
+    import thermocald as tc
+
+    with pytest.raises(DataError, match="no pose"):
+        renew_configuration(path, tc.load_camera(tmp_path / "model.yaml").at(20.0))
+
+
+def river_camera() -> Camera:
+    """The Geul's camera as pyorc solved it, known to a hundredth of its focal length."""
+    document = json.loads((RIVER / "geul-pyorc.json").read_text())
+    f, (k1, k2) = document["camera_matrix"][0][0], np.ravel(document["dist_coeffs"])[:2]
+    pitch = 0.003
+    c = f * pitch
+    interior = InteriorOrientation(c, 0.5 * pitch, -0.5 * pitch, k1 / c**2, k2 / c**4)
+    Q = np.zeros((10, 10))
+    Q[[0, 1, 2, 3], [0, 1, 2, 3]] = np.square([0.02 * c, 10 * pitch, 10 * pitch, 0.02 / c**2])
+    return Camera(Sensor(1920, 1080, pitch), np.nan, interior.as_array(), Q)
+
+
+def pyorc_residuals() -> np.ndarray:
+    """Clicks minus projection of the pose that pyorc solves, (6, 2) px: OpenCV's solvePnP."""
+    import cv2
+
+    document = json.loads((RIVER / "geul-pyorc.json").read_text())
+    dst, src = (np.array(document["gcps"][k], dtype=float) for k in ("dst", "src"))
+    K, k = (np.array(document[key]) for key in ("camera_matrix", "dist_coeffs"))
+    _, rvec, tvec = cv2.solvePnP(dst - dst.mean(axis=0), src, K, k)
+    seen, _ = cv2.projectPoints(dst - dst.mean(axis=0), rvec, tvec, K, k)
+    return src - seen[:, 0]
+
+
+@pytest.mark.skipif(not RIVER.is_dir(), reason="the river's frames are not here: ../shared/data")
+def test_the_crosses_of_the_geul():
+    """A pose with sds from six points; frames that are found again to a tenth of a pixel.
+
+    pyorc's own camera was fitted to the clicks; with a prior of 2 % on its focal length ours fits
+    as well, and in the other frames the same points give the same pose.
+    """
+    camera = river_camera()
+    path = RIVER / "geul-pyorc.json"
+    first = renew_configuration(path, camera)
+    assert first.pose.status == "ok"
+    assert first.pose.sigma0 < 3  # 20 mm and 1 px are what nobody stated
+    theirs = pyorc_residuals()
+    # theirs are the smallest that their camera allows, ours are weighed against the survey's
+    assert np.square(first.pose.residuals).sum() < 1.1 * np.square(theirs).sum()
+    found = [
+        renew_configuration(path, camera, RIVER / "geul-0.jpg", RIVER / f"geul-{k}.jpg")
+        for k in (0, 4, 9)
+    ]
+    still = found[0].control.seen
+    better = still.sigmas.max(axis=1) < 0.3
+    assert better.sum() >= 3
+    for other in found[1:]:
+        assert len(other.control.seen) == 6
+        assert np.abs(other.control.seen.points - still.points).max() < 0.2
+        moved = other.pose.values[10:] - found[0].pose.values[10:]
+        assert (np.abs(moved) < 0.3 * found[0].pose.sd[10:]).all()
+    clicks = ControlPoints.read(path, "m").seen
+    assert np.abs(still.points - clicks.points).max() < 3
+
+
+@pytest.mark.skipif(not RIVER.is_dir(), reason="the river's frames are not here: ../shared/data")
+def test_the_real_pyorc_reads_the_geul_renewed(tmp_path, pyorc):
+    camera = river_camera()
+    done = renew_configuration(
+        RIVER / "geul-pyorc.json", camera, RIVER / "geul-0.jpg", RIVER / "geul-9.jpg"
+    )
+    done.write(tmp_path / "new.json")
+    read = pyorc.load_camera_config(str(tmp_path / "new.json"))
+    at = done.control.field.points
+    ours = done.camera.project(at, done.pose.exterior.as_array())
+    assert_projects(read, tmp_path / "new.json", (at + done.control.origin) / 1000, ours)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import psycopg
@@ -42,6 +43,50 @@ def test_two_stations_of_one_name_are_told_apart_and_reported(server, two):
     now, cameras = read_overview(place, Path("x"))
     add_findings(cameras, [], now)
     assert "twins" in {finding.kind for camera in cameras for finding in camera.findings}
+
+
+@pytest.mark.parametrize("names", [("gauge-7", "gauge-7"), ("gauge-7", "gauge-8")])
+@pytest.mark.parametrize("behind", [0, 3])
+def test_a_copied_store_that_runs_at_two_stations_is_reported(
+    server, two, make_epoch, make_result, names, behind
+):
+    """Its identity is copied with it: what the two take afterwards tells them apart."""
+    place = address(server)
+    clone = two[0].with_name("clone.db")
+    shutil.copyfile(two[0], clone)
+    for path, ahead in ((two[0], behind), (clone, 0)):
+        with Store.open(path, "append", durable=False) as store:
+            (series,) = store.all_series()
+            for i in range(6, 9 + ahead):
+                epoch = make_epoch(i)
+                shift = 0.0 if path == two[0] else 4.0 + 10.0 * behind
+                epoch = replace(epoch, frame_time=epoch.frame_time + shift)
+                store.append(series, epoch, make_result(i))
+    cursors = [path.with_name(f"{path.stem}.cursor") for path in (two[0], clone)]
+
+    def kinds() -> set[str]:
+        now, cameras = read_overview(place, Path("x"))
+        add_findings(cameras, [], now)
+        return {finding.kind for camera in cameras for finding in camera.findings}
+
+    Forwarder(two[0], place, names[0], cursors[0]).send_waiting()
+    assert "twins" not in kinds()
+    Forwarder(clone, place, names[1], cursors[1]).send_waiting()
+    one_name = names[0] == names[1]
+    assert count(server, "series") == (1 if one_name else 2)
+    assert count(server, "epoch") == (11 + behind if one_name else 16 + behind)  # each is there
+    assert ("twins" in kinds()) == one_name
+
+
+def test_epochs_calibrated_again_are_no_twins(server, two, make_result):
+    place = address(server)
+    with Store.open(two[0], "append", durable=False) as store:
+        (series,) = store.all_series()
+        for i in (4, 5):
+            store.amend(series, i, make_result(200 + i))
+    Forwarder(two[0], place, "gauge-7").send_waiting()
+    _, cameras = read_overview(place, Path("x"))
+    assert not cameras[0].record.copied
 
 
 def test_one_station_that_got_a_new_store_is_no_twin(server, two):

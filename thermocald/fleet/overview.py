@@ -10,7 +10,7 @@ network, or its daemon; `sensor`: a thermometer that gives nothing, the same for
 cannot be; `calibrate`: no result, an old one, a temperature outside what was calibrated, a camera
 that moved; `odd`: rates unlike those of the other cameras of its type; `clock`: a station whose
 clock is not that of the server; `refused`: rows that the server does not take; `twins`: two
-stations of one name.
+stations of one name, or with copies of one store.
 """
 
 from __future__ import annotations
@@ -287,6 +287,12 @@ def _late(camera: CameraOverview, now: float) -> Iterator[Finding]:
             "twins",
             f"{camera.state.stores} stores report under its station's name: the card of one is a "
             "copy; give each station its own name (forward.station)",
+        )
+    if camera.record.copied:
+        yield Finding(
+            "twins",
+            "epochs of one number were taken at two times: its store runs at two stations, or a "
+            "backup was restored; move the store of a copied card away, and it makes its own",
         )
     if camera.state is not None and camera.state.refused:
         yield Finding(

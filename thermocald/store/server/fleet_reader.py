@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 
 RECENT = 60
+_COMPARED = 12  # of them, with others of the same number
 SPREAD = 120
 FEWEST = 6
 """Epochs that are read of the end of a camera's last series, spread over all, and at least each."""
@@ -74,7 +75,8 @@ class CameraRecord:
     """A camera at a station: its last series' head, last epochs (newest first), spread samples.
 
     epochs, results: of all its series; last_ok: s UTC, of the last epoch with a result; range: °C
-    of the reference in all epochs with a result; both NaN without.
+    of the reference in all epochs with a result; both NaN without; copied: whether one of its last
+    epochs was taken at two times, as two copies of one store take them.
     """
 
     station: str
@@ -87,6 +89,7 @@ class CameraRecord:
     results: int = 0
     last_ok: float = math.nan
     range: tuple[float, float] = (math.nan, math.nan)
+    copied: bool = False
     recent: list[RecentEpoch] = field(default_factory=list)
     samples: list[Sample] = field(default_factory=list)
 
@@ -146,7 +149,8 @@ class FleetReader(Connected):
     def _read_recent(self, current: Mapping[Any, CameraRecord]) -> None:
         """The last epochs; the summary says in which slots they are, so in which month."""
         rows = self._query(
-            "SELECT s.key, e.frame_time, e.received, e.status, e.temperatures "
+            "SELECT s.key, e.frame_time, e.received, e.status, e.temperatures, e.number, "
+            "e.revision "
             "FROM unnest(%s::uuid[], %s::float8[]) s(key, last) "
             "CROSS JOIN LATERAL (SELECT min(first) AS t FROM (SELECT first, "
             "sum(epochs) OVER (ORDER BY slot DESC) - epochs AS later FROM summary "
@@ -157,11 +161,31 @@ class FleetReader(Connected):
             "ORDER BY s.key, e.frame_time DESC, e.revision DESC",
             ([*current], [r.last_time for r in current.values()], RECENT, RECENT, RECENT),
         )
-        for key, frame_time, received, status, temperatures in rows:
+        newest: list[tuple[Any, int, int, float]] = []
+        for key, frame_time, received, status, temperatures, number, revision in rows:
             recent = current[key].recent
+            if len(recent) < _COMPARED:
+                newest.append((key, number, revision, frame_time))
             if not recent or recent[-1].frame_time != frame_time:  # an older revision follows
                 values = {n: _nan(v) for n, v in json.loads(temperatures).items()}
                 recent.append(RecentEpoch(frame_time, _nan(received), status, values))
+
+        self._find_copies(current, newest)
+
+    def _find_copies(
+        self,
+        current: Mapping[Any, CameraRecord],
+        newest: Sequence[tuple[Any, int, int, float]],
+    ) -> None:
+        """Mark series of which one of the newest epochs was taken at two times: by two stores."""
+        columns = [list(column) for column in zip(*newest, strict=True)] or [[]] * 4
+        for (key,) in self._query(
+            "SELECT DISTINCT s.key FROM unnest(%s::uuid[], %s::int8[], %s::int4[], %s::float8[]) "
+            "s(key, number, revision, at) WHERE EXISTS (SELECT FROM epoch o WHERE o.series = s.key "
+            "AND o.number = s.number AND o.revision = s.revision AND o.frame_time <> s.at)",
+            tuple(columns),
+        ):
+            current[key].copied = True
 
     def _read_samples(
         self,

@@ -84,12 +84,12 @@ def in_words(path: Path | str, error: ValidationError) -> str:
     """The first error, as file or place (or none), dotted key, value and what is allowed."""
     first = error.errors()[0]
     where = "".join(
-        f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]
+        f"[{part}]" if isinstance(part, int) else f".{_key(part)}" for part in first["loc"]
     ).lstrip(".")
     place = f"{path}: " if str(path) else ""
     context = first.get("ctx", {})
     if first["type"] == "unknown_key":
-        where = f"{where}.{context['key']}".lstrip(".")
+        where = f"{where}.{_key(context['key'])}".lstrip(".")
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
     message = without_secrets(first["msg"])
     if first["type"] == "missing":
@@ -100,6 +100,11 @@ def in_words(path: Path | str, error: ValidationError) -> str:
         return f"{place}{where + ': ' if where else ''}{message}{more}"
     message = message[0].lower() + message[1:]
     return f"{place}{where}: is {_short(first['input'])}; {message}{more}"
+
+
+def _key(key: str) -> str:
+    """A key as it stands, or quoted where it is not of letters."""
+    return key if key.isprintable() and len(key) <= 60 else _short(key)
 
 
 def _short(value: Any) -> str:

@@ -24,6 +24,10 @@ if TYPE_CHECKING:
 
 OUR_TIMES = ("time", "temperature_time", "frame_time", "timestamp")
 """Names of a column of seconds in files of ours, which may count from any day."""
+TIME_NAME = re.compile(
+    r"time|date|zeit|datum|uhr|stamp|tijd|heure|fecha|hora|utc|时间|日期|changed", re.IGNORECASE
+)
+"""In the head of a column of times."""
 SEPARATORS = {";": "semicolon", "\t": "tab", "|": "bar", ",": "comma"}
 _LARGEST_BYTES = 2_000_000_000
 _CHUNK = 1 << 20
@@ -223,7 +227,10 @@ def _names(above: list[list[str]], width: int) -> tuple[str, ...]:
     """
     wide = [row for row in above if len(row) > width][-1:]
     narrow = [row for row in above if len(row) == width - 1 and width > 2][-1:]
-    header = [row for row in above if len(row) == width][:2] or wide or narrow
+    rows = [row for row in above if len(row) == width]
+    # a logger's serial number may stand above in as many fields
+    named = next((i for i, row in enumerate(rows) if any(map(TIME_NAME.search, row))), 0)
+    header = rows[named : named + 2] or wide or narrow
     names: list[str] = []
     for i in range(max(width, *(len(row) for row in header)) if header else width):
         parts = [row[i] for row in header if i < len(row) and row[i]]

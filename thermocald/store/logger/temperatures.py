@@ -20,7 +20,7 @@ from thermocald.errors import DataError, UsageError
 from thermocald.names import channel_fault
 from thermocald.numbers import column_label
 from thermocald.store.logger.clock import DeviceClock, device_clock, time_zone
-from thermocald.store.logger.dialect import OUR_TIMES, LoggerFile, open_log
+from thermocald.store.logger.dialect import OUR_TIMES, TIME_NAME, LoggerFile, open_log
 from thermocald.store.logger.moments import (
     MomentFormat,
     day_and_month,
@@ -36,9 +36,6 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
 
-_TIME_NAME = re.compile(
-    r"time|date|zeit|datum|uhr|stamp|tijd|heure|fecha|hora|utc|时间|日期|changed", re.IGNORECASE
-)
 _TEMPERATURE_NAME = re.compile(
     r"temp|°\s*[cf]|deg\s*[cf]|celsius|fahrenheit|kelvin|thermo|ds18|pt100|housing|geh[äa]use"
     r"|\bt\d*\b|[\[(][cf][\])]|\bsensor|温度|[℃℉]",
@@ -389,7 +386,7 @@ def _time_columns(file: LoggerFile, options: LogOptions) -> tuple[str, ...]:
     kinds = {name: _kind(file.column(name)) for name in file.names}
     ours = [n for n in OUR_TIMES if kinds.get(n) in ("number", "seconds")]
     moments = [n for n, kind in kinds.items() if kind == "moment"]
-    moments += [n for n, kind in kinds.items() if kind == "seconds" and _TIME_NAME.search(n)]
+    moments += [n for n, kind in kinds.items() if kind == "seconds" and TIME_NAME.search(n)]
     if ours or moments:
         return ((ours or moments)[0],)
     dates = [n for n, kind in kinds.items() if kind == "date"]

@@ -314,3 +314,19 @@ def test_errors_are_one_line_each(recording):
     with pytest.raises(ThermocaldError) as caught:
         tc.open(recording).calibrate()
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("rows", [[0], [0, 1, 2], [39]])
+@pytest.mark.parametrize("column", ["frame_time", "temperature_time"])
+def test_a_clock_that_was_not_set_is_refused(recording, column, rows):
+    value = "85.0" if rows[0] == 0 else "3.2e9"
+    change(recording, "epochs.csv", **{column: put(value, *rows)})
+    with pytest.raises(RecordingError, match=rf"column {column}: is 5\d years after the row"):
+        read_recording(recording)
+
+
+def test_a_spike_beside_a_change_of_the_unit_hides_neither():
+    values = np.r_[wave(30), 1.8 * wave(60)[30:] + 32]
+    values[[27, 33]] = 85.0, 185.0
+    assert find_unit_change(values) == (30, "from °C to °F")
+    assert find_spikes(values)[0][:2] == (27, 28)

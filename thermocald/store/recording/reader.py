@@ -316,9 +316,9 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
                     f"time runs backwards: {v[row]:.3f} s after {l[row]:.3f} s"
                 ),
             )
-            previous[name] = float(latest[-1])
-            if fault := time_fault(columns[-1]):
+            if fault := time_fault(columns[-1], previous[name]):
                 chunk.fail(fault[0], name, fault[1])
+            previous[name] = float(latest[-1])
         for name, readings in temperatures.items():
             readings.append(chunk.numbers(name, empty_is_nan=True))
             untimed = np.isfinite(readings[-1]) & np.isnan(times["temperature_time"][-1])

@@ -54,9 +54,9 @@ def read_readings(path: Path, channels: Sequence[str]) -> Readings:
         times = chunk.numbers("time")
         steps = np.diff(times, prepend=before)
         chunk.check("time", steps <= 0, "times must increase")
-        before = float(times[-1])
-        if fault := time_fault(times):
+        if fault := time_fault(times, before):
             chunk.fail(fault[0], "time", fault[1])
+        before = float(times[-1])
         parts["time"].append(times)
         for name in channels:
             values = chunk.numbers(name, empty_is_nan=True)

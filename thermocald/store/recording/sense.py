@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.store.recording.head import CameraSpec
 
-LATEST_S = 7.26e9  # the year 2200
+_LATEST_S = 7.26e9  # the year 2200
+_LONGEST_PAUSE_S = 3.2e8  # ten years
 _UNITS = {1e3: "ms", 1e6: "µs", 1e9: "ns"}  # of times, by how many are a second
 _NOT_MEASURED = (85.0, 127.9375, 127.94, 0.0, -40.0, -45.0, -46.85, 125.0, 130.0, 150.0, -0.0625)
 """°C that thermometers give without having measured: at power-on, unplugged, all zeros or ones."""
@@ -37,16 +38,29 @@ _DISTANCES = (0.8, 1.25)  # fitted to stated principal distance
 _CENTRE = 0.1  # of the image's diagonal
 
 
-def time_fault(times: Array) -> tuple[int, str] | None:
-    """Return the first row of times (n,) s that are no seconds since 1970, and what they are."""
-    late = times > LATEST_S
-    if not late.any():
-        return None
-    row = int(np.argmax(late))
-    year = 1970 + times[row] / 31_556_952
-    unit = next((u for n, u in _UNITS.items() if 3e8 < times[row] / n < LATEST_S), None)
-    hint = f": are they {unit}? " if unit else ": "
-    return row, f"{times[row]:.15g} s is the year {year:.0f}{hint}Write seconds since 1970"
+def time_fault(times: Array, before: float = math.nan) -> tuple[int, str] | None:
+    """Return the first row of times (n,) s that are no seconds since 1970, and what they are.
+
+    before: the time of the row before them, not finite for none. A clock that was not set says
+    1970.
+    """
+    late = times > _LATEST_S
+    if late.any():
+        row = int(np.argmax(late))
+        year = 1970 + times[row] / 31_556_952
+        unit = next((u for n, u in _UNITS.items() if 3e8 < times[row] / n < _LATEST_S), None)
+        hint = f": are they {unit}? " if unit else ": "
+        return row, f"{times[row]:.15g} s is the year {year:.0f}{hint}Write seconds since 1970"
+    pauses = np.diff(times, prepend=before)
+    leaps = np.isfinite(pauses) & (pauses > _LONGEST_PAUSE_S)
+    if leaps.any():
+        row = int(np.argmax(leaps))
+        years = (times[row] - (times[row - 1] if row else before)) / 31_556_952
+        return row, (
+            f"is {years:.0f} years after the row before: a clock that was not set? Correct the "
+            "times, or leave the rows out"
+        )
+    return None
 
 
 def point_fault(values: Array) -> tuple[int, str, str] | None:
@@ -145,8 +159,12 @@ def find_spikes(values: Array) -> list[Spike]:
 def find_unit_change(values: Array) -> tuple[int, str] | None:
     """Return the first reading (n,) from which on a thermometer writes another unit, and which.
 
-    Told by a step onto the value that the readings before it have in the other unit.
+    Told by a step onto the value that the readings before it have in the other unit; spikes are
+    passed over.
     """
+    values = values.copy()
+    for spike in find_spikes(values):
+        values[spike.first : spike.stop] = np.nan
     known = np.flatnonzero(np.isfinite(values))
     v = values[known]
     steps = np.abs(np.diff(v))

@@ -198,8 +198,9 @@ class Calibration(Result):
     def as_dict(self) -> dict[str, Any]:
         """Return what `thermocald calibrate --json` writes."""
         document = calibration_document(
-            self.photographs, self.file.name, self.file.sensor, self.pitch_assumed
-        )
+            self.photographs, self.file.name, self.file.sensor, self.pitch_assumed,
+            self.file.principal_distance,
+        )  # fmt: skip
         converted: dict[str, Any] = jsonable(document)
         return converted
 

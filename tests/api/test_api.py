@@ -108,6 +108,17 @@ def test_epochs_as_csv_are_the_export(epochs, world, tmp_path):
     assert (tmp_path / "ours.csv").read_text() == (tmp_path / "theirs.csv").read_text()
 
 
+def test_bands_of_drawings_hold_95_percent(epochs, camera):
+    bars = epochs.plot().axes[0].collections[0].get_segments()
+    drawn = np.array([bar[1, 1] - bar[0, 1] for bar in bars])
+    np.testing.assert_allclose(drawn, 2 * 1.96 * 1e3 * epochs.sd_c[epochs.ok])
+    axis = camera.plot().axes[1]
+    outline = axis.collections[0].get_paths()[0].vertices
+    first = outline[np.isclose(outline[:, 0], axis.lines[0].get_xdata()[0]), 1]
+    expected = 2 * 1.96 * 1e3 * np.sqrt(camera.at(float(outline[:, 0].min())).covariance[1, 1])
+    np.testing.assert_allclose(np.ptp(first), expected, rtol=1e-9)
+
+
 def test_epochs_as_a_data_frame(epochs):
     pytest.importorskip("pandas")
     frame = epochs.to_pandas()

@@ -77,6 +77,11 @@ def test_the_python_module_is_the_model(tmp_path, affine, distortion):
             assert np.abs(image[0][:, 0] - truth(camera, T, X)).max() < 1e-9
     with pytest.raises(ValueError, match="behind"):
         module["project"](35.0, 0.0, 0.0, -1.0)
+    for T in (17.9, 57.1, 95.0, float("nan")):
+        for call in (module["interior"], module["opencv"], lambda T: module["project"](T, 0, 0, 1)):
+            with pytest.raises(ValueError, match="outside the 20 to 55 degC"):
+                call(T)
+    assert len(module["interior"](18.1)) == 10
 
 
 @pytest.mark.parametrize(("compiler", "flags"), [("cc", ["-std=c99"]), ("c++", ["-x", "c++"])])
@@ -92,10 +97,11 @@ def test_the_header_compiles_without_warnings_and_is_the_model(tmp_path, compile
 #include "rpi-2.h"
 int main(void)
 {
-    double t, X[3], uv[2] = {0, 0}, K[9], d[5];
+    double t, X[3], uv[2] = {0, 0}, K[9] = {0}, d[5] = {0}, p[10];
     while (scanf("%lf %lf %lf %lf", &t, X, X + 1, X + 2) == 4) {
         int seen = rpi_2_project(t, X, uv);
-        rpi_2_opencv(t, K, d);
+        if (rpi_2_opencv(t, K, d) != rpi_2_valid(t) || rpi_2_interior(t, p) != rpi_2_valid(t))
+            return 1;
         printf("%d %d %.17g %.17g", rpi_2_valid(t), seen, uv[0], uv[1]);
         printf(" %.17g %.17g %.17g %.17g", K[0], K[4], K[2], K[5]);
         printf(" %.17g %.17g %.17g %.17g %.17g\\n", d[0], d[1], d[2], d[3], d[4]);
@@ -108,6 +114,12 @@ int main(void)
         [compiler, *flags, "-Wall", "-Wextra", "-Werror", "-O1", "main.c", "-o", "main"],
         cwd=tmp_path, check=True,
     )  # fmt: skip
+    outside = [17.9, 57.1, 95.0]
+    said = subprocess.run(
+        [tmp_path / "main"], input="".join(f"{t} 0.1 0.1 2\n" for t in [*outside, "nan"]),
+        capture_output=True, text=True, check=True,
+    ).stdout  # fmt: skip
+    assert [line.split() for line in said.splitlines()] == 4 * [13 * ["0"]]
     given = "".join(f"{t!r} {x!r} {y!r} {z!r}\n" for t in TEMPERATURES for x, y, z in X.tolist())
     said = subprocess.run(
         [tmp_path / "main"], input=given, capture_output=True, text=True, check=True

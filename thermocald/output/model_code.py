@@ -31,8 +31,8 @@ _C = """\
    {id}_project(35.0, X, uv);           X in OpenCV's camera frame: x right, y down, z forward
 
    T is the temperature in degC of {reference}, of a camera that has long been there.
-   Fitted from {low} to {high} degC: {id}_valid(T) says whether T lies there (2 K of margin).
-   {exact} */
+   Fitted from {low} to {high} degC; beyond (2 K of margin) {id}_valid, {id}_interior, {id}_opencv
+   and {id}_project return 0 and write nothing, else 1. {exact} */
 #ifndef {guard}
 #define {guard}
 
@@ -42,7 +42,7 @@ static const double {id}_pitch = {pitch}; /* mm */
 static inline int {id}_valid(double T) {{ return T >= {low} - 2.0 && T <= {high} + 2.0; }}
 
 /* c, x0, y0 (mm), A1, A2, A3, B1, B2, C1, C2 at T */
-static inline void {id}_interior(double T, double p[10])
+static inline int {id}_interior(double T, double p[10])
 {{
     static const double p0[10] = {{{p0}}};
     static const double p1[10] = {{{p1}}};
@@ -50,19 +50,23 @@ static inline void {id}_interior(double T, double p[10])
     static const double knee[{n} + 1][11] = {{{knees}}};
     double d = T - ({T0});
     int i, k;
+    if (!{id}_valid(T))
+        return 0;
     for (i = 0; i < 10; i++)
         p[i] = p0[i] + d * (p1[i] + d * p2[i]);
     for (k = 0; k < {n}; k++)
         if (T > knee[k][0])
             for (i = 0; i < 10; i++)
                 p[i] += (T - knee[k][0]) * knee[k][i + 1];
-{follow_c}}}
+{follow_c}    return 1;
+}}
 
-static inline void {id}_opencv(double T, double K[9], double dist[5])
+static inline int {id}_opencv(double T, double K[9], double dist[5])
 {{
     double p[10], c2;
     int i;
-    {id}_interior(T, p);
+    if (!{id}_interior(T, p))
+        return 0;
     c2 = p[0] * p[0];
     for (i = 0; i < 9; i++)
         K[i] = 0.0;
@@ -76,15 +80,15 @@ static inline void {id}_opencv(double T, double K[9], double dist[5])
     dist[2] = -p[7] * p[0];
     dist[3] = p[6] * p[0];
     dist[4] = p[5] * c2 * c2 * c2;
+    return 1;
 }}
 
-/* 1, and the image point in px, (0, 0) the centre of the upper left pixel; 0 behind the camera */
+/* The image point in px, (0, 0) the centre of the upper left pixel; 0 behind the camera too */
 static inline int {id}_project(double T, const double X[3], double uv[2])
 {{
     double p[10], x, y, r2, radial, dx, dy;
-    if (!(X[2] > 0.0))
+    if (!(X[2] > 0.0) || !{id}_interior(T, p))
         return 0;
-    {id}_interior(T, p);
     x = p[0] * X[0] / X[2];
     y = -p[0] * X[1] / X[2];
     r2 = x * x + y * y;
@@ -103,7 +107,7 @@ _PYTHON = '''\
 """{name}: thermal camera model, written by thermocald. No dependencies.
 
 T is the temperature in degC of {reference}, of a camera that has long been there. Fitted from {low}
-to {high} degC. {exact}
+to {high} degC; beyond (2 K of margin) every function raises ValueError. {exact}
 """
 
 WIDTH, HEIGHT, PITCH = {width}, {height}, {pitch}  # px, px, mm
@@ -117,6 +121,8 @@ KNEES = ({knees})
 
 def interior(T):
     """c, x0, y0 (mm), A1, A2, A3, B1, B2, C1, C2 at T."""
+    if not VALID[0] - 2 <= T <= VALID[1] + 2:
+        raise ValueError("%r degC lies outside the %g to %g degC of the fit" % (T, *VALID))
     d = T - T0
     p = [a + d * (b + d * c) for a, b, c in zip(P0, P1, P2)]
     for knee, *rate in KNEES:

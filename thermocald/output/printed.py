@@ -11,7 +11,8 @@ import numpy as np
 from thermocald.discovery.result import field_lines, mount_lines
 from thermocald.numbers import UNITS, plain, with_sd
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES, IOP_NAMES
-from thermocald.store.logger.photographs import moment_taken
+from thermocald.photogrammetry.camera.plausibility import doubts_of_interior
+from thermocald.store.logger.photographs import focal_length, moment_taken
 
 if TYPE_CHECKING:
     from thermocald.analysis.camera.photographs import PhotographResult, Photographs
@@ -62,9 +63,12 @@ def discovery_lines(found: Discovery) -> list[str]:
 
 
 def calibration_document(
-    result: Photographs, name: str, sensor: Sensor, assumed: bool
+    result: Photographs, name: str, sensor: Sensor, assumed: bool, nominal: float | None = None
 ) -> dict[str, Any]:
-    """Return what `thermocald calibrate --json` writes; assumed: the pixel pitch is."""
+    """Return what `thermocald calibrate --json` writes; assumed: the pixel pitch is.
+
+    nominal: the focal length mm, by default EXIF's.
+    """
     document: dict[str, Any] = {
         "format": "thermocald-calibration/1",
         "camera": {
@@ -81,11 +85,16 @@ def calibration_document(
         "n_photographs": len(result.photographs),
         "interior": None,
         "correlations": None,
+        "doubts": [],
         "photographs": [_photograph(p) for p in result.photographs],
     }
     if result.interior is not None:
         values = result.interior.as_array()
         document["interior_estimated"] = result.estimated
+        nominal = nominal or focal_length(Path(result.photographs[0].path))
+        if result.estimated and not assumed:
+            c, x0, y0 = values[:3].tolist()
+            document["doubts"] = doubts_of_interior(sensor, (c, x0, y0), nominal)
         document["interior"] = dict(zip(IOP_NAMES, values.tolist(), strict=True))
         if result.estimated:
             sd = np.sqrt(np.diag(result.covariance)[:10])
@@ -142,6 +151,7 @@ def calibration_lines(document: dict[str, Any]) -> list[str]:
             rows.append((name, with_sd(interior[name], sd, UNITS[name]), px))
         width = [max(len(row[k]) for row in rows) for k in range(3)]
         lines += ["  ".join(f"{t:<{w}}" for t, w in zip(row, width, strict=True)) for row in rows]
+        lines += [f"in doubt: {text}" for text in document["doubts"]]
         if document["camera"]["pixel_pitch_assumed"]:
             lines.append(
                 "the pixel pitch is not known and taken as 1 µm: c, x0, y0 in mm are thousandths "

@@ -16,8 +16,10 @@ import numpy as np
 
 from thermocald.acquisition.calibrator import calibrated_epochs
 from thermocald.errors import DataError, DriverMissing
+from thermocald.figures import BAND
 from thermocald.files import write_parts
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
+from thermocald.photogrammetry.camera.plausibility import doubts_of_interior
 from thermocald.photogrammetry.series.spool import released
 from thermocald.photogrammetry.series.words import Words
 from thermocald.physics.effect import PARAMETER_UNITS
@@ -241,6 +243,17 @@ class Epochs(Result):
         out[~self.ok] = np.nan
         return out
 
+    @property
+    def doubts(self) -> list[str]:
+        """Sentences: why the camera that was found cannot be what the recording says it is."""
+        if self.head is None or not self.ok.any():
+            return []
+        rows = np.flatnonzero(self.ok)
+        rows = rows[:: 1 + len(rows) // _ROWS]
+        c, x0, y0 = np.median(self.values[rows, :3], axis=0).tolist()
+        camera = self.head.camera
+        return doubts_of_interior(camera.sensor, (c, x0, y0), camera.principal_distance)
+
     def as_dict(self) -> dict[str, Any]:
         """Return what `thermocald replay --json` writes, without the names of files."""
         ok = self.ok
@@ -254,6 +267,7 @@ class Epochs(Result):
             "sigma0": float(np.median(self.sigma0[ok])) if ok.any() else None,
             "noise_ratio": None if self.adjustment is None else self.adjustment.noise_ratio,
             "rejected": int(self.n_rejected.sum()),
+            "doubts": self.doubts,
             "left_out": list(self.left_out),
             "field_movements": [
                 {**m.as_json(), "sentence": m.sentence} for m in self.field_movements
@@ -281,6 +295,7 @@ class Epochs(Result):
                 f"sigma0 {document['sigma0']:.2f}: image points scatter that many times as much as "
                 "their stated standard deviations say"
             )
+        out += [f"in doubt: {text}" for text in document["doubts"]]
         if document["exterior_choice"]:
             out.append(f"--exterior {self.exterior}: {document['exterior_choice']}")
         out += [f"{moved.sentence}; this is taken off" for moved in self.field_movements]
@@ -301,7 +316,7 @@ class Epochs(Result):
         return out
 
     def plot(self, against: str = "time") -> Figure:
-        """Draw how c, x0 and y0 changed since the first epoch, µm, with a band of one sd.
+        """Draw how c, x0 and y0 changed since the first epoch, µm, with 95 % of each epoch.
 
         against: `time` or `temperature`. Needs matplotlib (extra `report`).
         """
@@ -311,7 +326,7 @@ class Epochs(Result):
         for axis, name in zip(axes[:, 0], _DRAWN, strict=True):
             y, sd = 1e3 * getattr(self, name)[ok], 1e3 * getattr(self, f"sd_{name}")[ok]
             y = y - y[:1]
-            axis.errorbar(x, y, np.nan_to_num(sd), fmt=".", ms=3, lw=0.6)
+            axis.errorbar(x, y, BAND * np.nan_to_num(sd), fmt=".", ms=3, lw=0.6)
             axis.set_ylabel(f"change of {name} in µm")
             axis.grid(alpha=0.3)
         if against != "temperature":

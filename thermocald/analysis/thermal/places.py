@@ -18,6 +18,7 @@ import numpy as np
 from thermocald.analysis.thermal.control_points import UNITS
 from thermocald.analysis.thermal.correction import require_inside
 from thermocald.errors import ConfigurationError, DataError
+from thermocald.figures import BAND
 from thermocald.files import read_yaml
 from thermocald.photogrammetry.camera.camera_model import EOP, InteriorOrientation
 from thermocald.photogrammetry.epoch.measuring import Line, Plane, place_on, resect
@@ -159,7 +160,8 @@ class Places(Result):
     def plot(self) -> Figure:
         figure, axes = new_figure(1, panel=(6.0, 4.0))
         ax = axes[0, 0]
-        ax.errorbar(self.points[:, 0], self.points[:, 1], 2 * self.sd[:, 1], 2 * self.sd[:, 0], "o")
+        x, y = self.points.T[:2]
+        ax.errorbar(x, y, BAND * self.sd[:, 1], BAND * self.sd[:, 0], "o")
         ax.plot(self.without[:, 0], self.without[:, 1], "x", label="without thermal correction")
         ax.set(xlabel=f"X / {self.unit}", ylabel=f"Y / {self.unit}", aspect="equal")
         ax.legend()

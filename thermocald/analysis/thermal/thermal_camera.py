@@ -29,6 +29,7 @@ from thermocald.analysis.thermal.model_text import model_lines
 from thermocald.analysis.thermal.steady import SteadyCamera, steady_camera
 from thermocald.analysis.thermal.validity import Validity
 from thermocald.errors import ConfigurationError, UsageError
+from thermocald.figures import BAND
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.physics import catalogue
 from thermocald.physics.history import History
@@ -140,7 +141,7 @@ class ThermalCamera(Result):
     def plot(self) -> Figure:
         """Draw c, x0 and y0 of the steady camera against the temperature, µm from those at T0.
 
-        The range is that which the model was fitted on, with a band of one standard deviation.
+        The range is that which the model was fitted on, with a band of 95 %.
         """
         limits = next(iter(self.model.validity.values()), (self.model.T0 - 15, self.model.T0 + 15))
         T = np.linspace(*limits, 60)
@@ -149,9 +150,9 @@ class ThermalCamera(Result):
         figure, axes = new_figure(3)
         for k, axis in enumerate(axes[:, 0]):
             y = 1e3 * np.array([s.values[k] - base.values[k] for s in states])
-            sd = 1e3 * np.array([np.sqrt(s.covariance[k, k]) for s in states])
+            band = 1e3 * BAND * np.array([np.sqrt(s.covariance[k, k]) for s in states])
             axis.plot(T, y)
-            axis.fill_between(T, y - sd, y + sd, alpha=0.3)
+            axis.fill_between(T, y - band, y + band, alpha=0.3)
             axis.set_ylabel(f"change of {IOP_NAMES[k]} in µm")
             axis.grid(alpha=0.3)
         axes[0, 0].set_title(f"{self.model.camera}, from {self.model.T0:g} °C")

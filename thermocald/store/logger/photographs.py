@@ -170,6 +170,14 @@ def moment_taken(path: Path) -> datetime | None:
         return None
 
 
+def focal_length(path: Path) -> float | None:
+    """Return the focal length that a photograph's EXIF says, mm, None where it does not."""
+    try:
+        return read_photograph(path, "file").focal_length
+    except (DriverMissing, ImageError):
+        return None
+
+
 def _exif_moment(path: Path, details: dict[int, Any]) -> datetime:
     for when, part, offset in _TIME_TAGS:
         text = str(details.get(when) or "").strip("\0 ")

@@ -16,6 +16,7 @@ import numpy as np
 from thermocald.epoch import Epoch
 from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import Sensor
+from thermocald.photogrammetry.camera.plausibility import doubts_of_pitch
 from thermocald.photogrammetry.camera_files.camera_file import read_camera
 from thermocald.store.logger.photographs import find_copies, other_camera
 from thermocald.store.logger.temperatures import LogOptions, TemperatureLog, read_log
@@ -186,7 +187,7 @@ def camera_of(
     distance: float | None = None,
     dry_run: bool = False,
 ) -> tuple[CameraSpec, list[str]]:
-    """Return the camera of photographs, and what of it was taken from EXIF.
+    """Return the camera of photographs, what of it was taken from EXIF, and what EXIF denies.
 
     file: a camera file, which then says it all; pitch, distance mm: instead of EXIF's; dry_run: a
     pixel pitch that nobody knows is no error, but noted.
@@ -199,6 +200,7 @@ def camera_of(
                 f"{file}: is of {known.sensor.width} × {known.sensor.height} px, the photographs "
                 f"have {photograph.width} × {photograph.height}"
             )
+        notes += doubts_of_pitch(known.sensor.pixel_pitch, photograph.pixel_pitch)
         return CameraSpec(known.name, known.sensor, known.principal_distance, known.interior), notes
     if distance is None and photograph.focal_length is not None:
         distance = photograph.focal_length
@@ -214,6 +216,8 @@ def camera_of(
         said = f"pixel pitch {pitch:.5f} mm from EXIF (--pixel-pitch)" if pitch else unknown
         notes.append(f"camera: {said}")
         pitch = pitch or 0.001
+    else:
+        notes += doubts_of_pitch(pitch, photograph.pixel_pitch)
     sensor = Sensor(photograph.width, photograph.height, pitch)
     return CameraSpec(photograph.camera or "camera", sensor, distance), notes
 

@@ -1,4 +1,4 @@
-"""hwmon, iio and thermal zones over a sysfs tree: each row of docs/how-to/thermometers.md."""
+"""hwmon, iio and thermal zones over a sysfs tree, and each of its faults."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""MQTT with a broker on loopback: each row of docs/how-to/laboratory.md's table for outputs."""
+"""MQTT with a broker on loopback, and each of its faults."""
 
 from __future__ import annotations
 

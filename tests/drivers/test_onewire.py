@@ -1,4 +1,4 @@
-"""DS18B20: real w1_slave contents, and the faults of docs/how-to/thermometers.md."""
+"""DS18B20: real w1_slave contents, and its faults."""
 
 from __future__ import annotations
 

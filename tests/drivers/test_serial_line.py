@@ -1,4 +1,4 @@
-"""Line protocols over a real tty (a pseudo terminal): each row of docs/how-to/thermometers.md."""
+"""Line protocols over a real tty (a pseudo terminal), and each of its faults."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ PALE, GREY = "#9fb4c1", "#555555"
 BAND = 1.96  # standard deviations: 95 % on every page
 _MOST_POINTS = 800
 _PANEL_INCHES = (3.4, 2.5)
-_LEGEND_LETTERS = 52  # in a line above a panel
+_LEGEND_LETTERS = 43  # in a line above a panel
 _FEW_ARROWS = 25
 _DECADES = 3.0  # that an axis must span to be logarithmic
 _STYLE: dict[str, Any] = {
@@ -269,6 +269,7 @@ def _fill(axis: Any, panel: Panel, *, legend: bool) -> int:
         use_logarithm(axis)
     if panel.equal:
         axis.set_aspect("equal", adjustable="datalim")
+        axis.locator_params(nbins=5)  # narrow: more labels would touch
     label_axes(axis, panel.x_label, panel.y_label)
     names = {c.name for c in panel.curves if c.name}
     rows = legend_above(axis) if legend and len(names) > 1 else 0

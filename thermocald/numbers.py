@@ -20,6 +20,7 @@ UNITS = {
 }
 _SYMBOLS = {"sigma0": "σ₀", "x0": "x₀", "y0": "y₀"}
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_COMPUTED = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?)e([+-]?\d{1,3})(?![\w.]*\w)")
 _MINUS = "−"
 
 
@@ -52,6 +53,11 @@ def shortened(text: str, most: int) -> str:
 def superscript(exponent: int) -> str:
     """An exponent as raised digits."""
     return str(exponent).translate(_SUPERSCRIPT)
+
+
+def typeset_powers(text: str) -> str:
+    """Return a text in which numbers as a computer prints them, 1.2e-06, read 1.2·10⁻⁶."""
+    return _COMPUTED.sub(lambda m: f"{m[1]}·10{superscript(int(m[2]))}", text)
 
 
 def with_sd(value: float, sd: float, unit: str = "") -> str:

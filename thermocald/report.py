@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from thermocald import __version__
 from thermocald.figures import Figure, draw_matrix, draw_panel, inline_svg
+from thermocald.numbers import typeset_powers
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -104,6 +105,7 @@ def render_report(
         undefined=StrictUndefined,
         trim_blocks=True,
     )
+    environment.filters["powers"] = typeset_powers
     at = made or datetime.now(tz=UTC)
     versions = ", ".join(f"{name} {version(name)}" for name in ("numpy", "scipy"))
     return environment.get_template("report.html.j2").render(

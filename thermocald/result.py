@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 class Result(ABC):
     """What an analysis found; `print` shows what the command prints."""
 
+    heading = "What was found"
     caption = "What was found over time, and its standard deviations."
 
     @abstractmethod
@@ -35,7 +36,7 @@ class Result(ABC):
     def report(self, path: Path | str, title: str = "") -> Path:
         """Write the result as one HTML file that works offline.
 
-        title: of the page, by default the first line. Returns the file's path; raises OutputError
+        title: of the page, by default the result's `heading`. Returns the file's path; raises OutputError
         where it cannot be written.
         """
         from thermocald.report import Answer, Chapter, Section, of_drawing, render_report
@@ -43,7 +44,7 @@ class Result(ABC):
         first, *others = self.lines()
         proof = of_drawing(self.plot(), "proof", "The result drawn", self.caption)
         said = Section("What the command prints", printed="\n".join(others))
-        chapter = Chapter(title or first, Answer(f"{first}.", proof), (said,))
+        chapter = Chapter(title or self.heading, Answer(f"{first}.", proof), (said,))
         write_text(Path(path), render_report(chapter.title, [chapter]))
         return Path(path)
 

@@ -20,9 +20,7 @@ DISTORTION = [{"decentering_drift"}, {"radial_distortion_drift"}]
     ],
 )
 def test_effects_of_a_preset_are_named(preset, expected, tmp_path):
-    m1, m2 = (
-        tc.simulate(preset, seed=k, series=f"M{k}", out=tmp_path / f"M{k}") for k in (1, 2)
-    )
+    m1, m2 = (tc.simulate(preset, seed=k, series=f"M{k}", out=tmp_path / f"M{k}") for k in (1, 2))
 
     found = tc.discover(m1, verify=[m2])
 

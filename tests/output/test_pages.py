@@ -36,7 +36,7 @@ from thermocald.thermal.reduce import reduce_together
 
 LONG = "Temp °C LGR SN 20493821 SEN SN 20493821 of the northern river bank, behind the gauge"
 NAMES = (LONG, "相机外壳温度传感器", "درجة حرارة غلاف الكاميرا")
-_MARKS = re.compile(r"<bound|object at 0x|\bnan\b|\bNone\b|np\.float")
+_MARKS = re.compile(r"\d\.?\d*e[+-]?\d+\b|<bound|object at 0x|\bnan\b|\bNone\b|np\.float")
 _TEXT = """() => { const all = document.body.cloneNode(true);
   all.querySelectorAll('script, style').forEach(e => e.remove()); return all.textContent; }"""
 # Quadrilaterals of texts in one drawing that cross; a hair's breadth is none.

@@ -11,8 +11,9 @@ import numpy as np
 from thermocald.discovery.result import field_lines, mount_lines
 from thermocald.numbers import UNITS, plain, with_sd
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES, IOP_NAMES
-from thermocald.photogrammetry.camera.plausibility import doubts_of_interior
 from thermocald.store.logger.photographs import focal_length, moment_taken
+from thermocald.store.recording.head import CameraSpec
+from thermocald.store.recording.sense import doubt_lines, interior_doubts
 
 if TYPE_CHECKING:
     from thermocald.analysis.camera.photographs import PhotographResult, Photographs
@@ -94,7 +95,8 @@ def calibration_document(
         nominal = nominal or focal_length(Path(result.photographs[0].path))
         if result.estimated and not assumed:
             c, x0, y0 = values[:3].tolist()
-            document["doubts"] = doubts_of_interior(sensor, (c, x0, y0), nominal)
+            spec = CameraSpec(name, sensor, nominal)
+            document["doubts"] = interior_doubts(spec, c, x0, y0)
         document["interior"] = dict(zip(IOP_NAMES, values.tolist(), strict=True))
         if result.estimated:
             sd = np.sqrt(np.diag(result.covariance)[:10])
@@ -151,7 +153,7 @@ def calibration_lines(document: dict[str, Any]) -> list[str]:
             rows.append((name, with_sd(interior[name], sd, UNITS[name]), px))
         width = [max(len(row[k]) for row in rows) for k in range(3)]
         lines += ["  ".join(f"{t:<{w}}" for t, w in zip(row, width, strict=True)) for row in rows]
-        lines += [f"in doubt: {text}" for text in document["doubts"]]
+        lines += doubt_lines(document["doubts"])
         if document["camera"]["pixel_pitch_assumed"]:
             lines.append(
                 "the pixel pitch is not known and taken as 1 µm: c, x0, y0 in mm are thousandths "

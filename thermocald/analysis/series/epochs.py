@@ -19,7 +19,6 @@ from thermocald.errors import DataError, DriverMissing
 from thermocald.figures import BAND
 from thermocald.files import write_parts
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
-from thermocald.photogrammetry.camera.plausibility import doubts_of_interior
 from thermocald.photogrammetry.series.spool import released
 from thermocald.photogrammetry.series.words import Words
 from thermocald.physics.effect import PARAMETER_UNITS
@@ -182,6 +181,11 @@ class Epochs(Result):
     drifts: tuple[Course, ...] = ()
     head: Head | None = None
 
+    heading = "Every epoch of a series"
+    caption = (
+        "Change of each parameter since the first epoch; bars hold 95 % of an epoch's own noise."
+    )
+
     def __len__(self) -> int:
         return len(self.number)
 
@@ -243,17 +247,6 @@ class Epochs(Result):
         out[~self.ok] = np.nan
         return out
 
-    @property
-    def doubts(self) -> list[str]:
-        """Sentences: why the camera that was found cannot be what the recording says it is."""
-        if self.head is None or not self.ok.any():
-            return []
-        rows = np.flatnonzero(self.ok)
-        rows = rows[:: 1 + len(rows) // _ROWS]
-        c, x0, y0 = np.median(self.values[rows, :3], axis=0).tolist()
-        camera = self.head.camera
-        return doubts_of_interior(camera.sensor, (c, x0, y0), camera.principal_distance)
-
     def as_dict(self) -> dict[str, Any]:
         """Return what `thermocald replay --json` writes, without the names of files."""
         ok = self.ok
@@ -267,7 +260,6 @@ class Epochs(Result):
             "sigma0": float(np.median(self.sigma0[ok])) if ok.any() else None,
             "noise_ratio": None if self.adjustment is None else self.adjustment.noise_ratio,
             "rejected": int(self.n_rejected.sum()),
-            "doubts": self.doubts,
             "left_out": list(self.left_out),
             "field_movements": [
                 {**m.as_json(), "sentence": m.sentence} for m in self.field_movements
@@ -295,7 +287,6 @@ class Epochs(Result):
                 f"sigma0 {document['sigma0']:.2f}: image points scatter that many times as much as "
                 "their stated standard deviations say"
             )
-        out += [f"in doubt: {text}" for text in document["doubts"]]
         if document["exterior_choice"]:
             out.append(f"--exterior {self.exterior}: {document['exterior_choice']}")
         out += [f"{moved.sentence}; this is taken off" for moved in self.field_movements]

@@ -16,13 +16,13 @@ import numpy as np
 from thermocald.epoch import Epoch
 from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import Sensor
-from thermocald.photogrammetry.camera.plausibility import doubts_of_pitch
 from thermocald.photogrammetry.camera_files.camera_file import read_camera
 from thermocald.store.logger.photographs import find_copies, other_camera
 from thermocald.store.logger.temperatures import LogOptions, TemperatureLog, read_log
 from thermocald.store.recording.head import CameraSpec, Channel, Head
 from thermocald.store.recording.reader import EpochColumns, Recording
 from thermocald.store.recording.readings import Readings, interpolate_readings
+from thermocald.store.recording.sense import pitch_doubts
 from thermocald.store.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
@@ -200,7 +200,7 @@ def camera_of(
                 f"{file}: is of {known.sensor.width} × {known.sensor.height} px, the photographs "
                 f"have {photograph.width} × {photograph.height}"
             )
-        notes += doubts_of_pitch(known.sensor.pixel_pitch, photograph.pixel_pitch)
+        notes += pitch_doubts(known.sensor.pixel_pitch, photograph.pixel_pitch)
         return CameraSpec(known.name, known.sensor, known.principal_distance, known.interior), notes
     if distance is None and photograph.focal_length is not None:
         distance = photograph.focal_length
@@ -217,7 +217,7 @@ def camera_of(
         notes.append(f"camera: {said}")
         pitch = pitch or 0.001
     else:
-        notes += doubts_of_pitch(pitch, photograph.pixel_pitch)
+        notes += pitch_doubts(pitch, photograph.pixel_pitch)
     sensor = Sensor(photograph.width, photograph.height, pitch)
     return CameraSpec(photograph.camera or "camera", sensor, distance), notes
 

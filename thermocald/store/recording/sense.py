@@ -36,6 +36,7 @@ _SIGMAS_PX = (1e-6, 1e4)
 _RHYTHM = 5.0  # times the stated interval
 _DISTANCES = (0.8, 1.25)  # fitted to stated principal distance
 _CENTRE = 0.1  # of the image's diagonal
+_PITCH_OPTION = "--pixel-pitch, or pixel_pitch in recording.yaml or the camera file"
 
 
 def time_fault(times: Array, before: float = math.nan) -> tuple[int, str] | None:
@@ -236,6 +237,7 @@ def interior_doubts(camera: CameraSpec, c: float, x0: float, y0: float) -> list[
         found.append(
             f"the principal distance is {c:.3f} mm where {stated:g} mm is stated, "
             f"{c / stated:.3g} times: is one of distance, pixel pitch, image size another camera's?"
+            f" Pixels of {camera.sensor.pixel_pitch * stated / c:.3g} mm would fit ({_PITCH_OPTION})"
         )
     pitch, W, H = sensor.pixel_pitch, sensor.width, sensor.height
     if math.hypot(x0, y0) > _CENTRE * math.hypot(W, H) * pitch:
@@ -249,6 +251,18 @@ def interior_doubts(camera: CameraSpec, c: float, x0: float, y0: float) -> list[
             f"{W} × {H} px: {why}"
         )
     return found
+
+
+def pitch_doubts(pitch: float, known: float | None) -> list[str]:
+    """Return what is doubtful in a pixel pitch, mm, where photographs' EXIF gives another."""
+    if known is None or _DISTANCES[0] < pitch / known < _DISTANCES[1]:
+        return []
+    doubt = (
+        f"a pixel pitch of {pitch:.4g} mm is {pitch / known:.2f} of the {known:.4g} mm that follow "
+        "from the EXIF of the photographs: the pixels of an image that was binned or made smaller "
+        f"are larger than the sensor's ({_PITCH_OPTION})"
+    )
+    return [doubt]
 
 
 def doubt_lines(doubts: Sequence[str]) -> list[str]:

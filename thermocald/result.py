@@ -36,8 +36,8 @@ class Result(ABC):
     def report(self, path: Path | str, title: str = "") -> Path:
         """Write the result as one HTML file that works offline.
 
-        title: of the page, by default the result's `heading`. Returns the file's path; raises OutputError
-        where it cannot be written.
+        title: of the page, by default `heading`. Returns the file's path; raises OutputError where
+        it cannot be written.
         """
         from thermocald.report import Answer, Chapter, Section, of_drawing, render_report
 

@@ -182,9 +182,7 @@ class Epochs(Result):
     head: Head | None = None
 
     heading = "Every epoch of a series"
-    caption = (
-        "Change of each parameter since the first epoch; bars hold 95 % of an epoch's own noise."
-    )
+    caption = "Change of each parameter since the first epoch; bars hold 95 % of its own noise."
 
     def __len__(self) -> int:
         return len(self.number)

@@ -237,7 +237,8 @@ def interior_doubts(camera: CameraSpec, c: float, x0: float, y0: float) -> list[
         found.append(
             f"the principal distance is {c:.3f} mm where {stated:g} mm is stated, "
             f"{c / stated:.3g} times: is one of distance, pixel pitch, image size another camera's?"
-            f" Pixels of {camera.sensor.pixel_pitch * stated / c:.3g} mm would fit ({_PITCH_OPTION})"
+            f" Pixels of {camera.sensor.pixel_pitch * stated / c:.3g} mm would fit "
+            f"({_PITCH_OPTION})"
         )
     pitch, W, H = sensor.pixel_pitch, sensor.width, sensor.height
     if math.hypot(x0, y0) > _CENTRE * math.hypot(W, H) * pitch:

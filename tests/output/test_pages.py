@@ -299,6 +299,15 @@ def test_a_report_as_a_page(name, page_text, open_page):
     keep(page, f"{name}-a4")
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "bars"), [("discovery", 1), ("discovery-unexplained", 0)])
+def test_a_candidate_is_blue_only_where_it_is_named(name, bars, page_text, open_page):
+    page = open_page(page_text(name), 1280)
+    blue = """() => [...document.querySelectorAll('#candidates svg g[id*="patch_"] path')]
+      .filter(p => getComputedStyle(p).fill === 'rgb(0, 114, 178)').length"""
+    assert page.evaluate(blue) == bars
+
+
 def keep(page, name: str) -> None:
     """Keep a picture of the whole page where THERMOCALD_PAGES says."""
     if folder := os.environ.get("THERMOCALD_PAGES"):

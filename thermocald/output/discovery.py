@@ -424,7 +424,8 @@ def _candidates(d: Discovery) -> Section:
     rows = [(name, s, _left_px(d, s.fit)) for name, s in singles.items()]
     best = x.best.names[len(x.base.terms) :]
     combined = len(best) > 1 and x.adequate
-    bars = [(name, left, name.split(" ")[0] in best) for name, _, left in rows]
+    named = x.adequate and bool(best)
+    bars = [(name, left, named and name.split(" ")[0] in best) for name, _, left in rows]
     if combined:
         bars.insert(0, (" + ".join(best), _left_px(d, x.best.fit), True))
     if not bars:
@@ -432,8 +433,8 @@ def _candidates(d: Discovery) -> Section:
     with drawing_style():
         drawing = new_drawing(9.0, 0.8 + 0.3 * len(bars))
         axis = drawing.subplots()
-        for place, (_, left, named) in enumerate(bars):
-            axis.barh(-place, left, 0.7, color=_FOUND if named else PALE)
+        for place, (_, left, found) in enumerate(bars):
+            axis.barh(-place, left, 0.7, color=_FOUND if found else PALE)
             axis.annotate(f"{left:.3f}", (left, -place), (4, 0), fontsize=8, va="center",
                           textcoords="offset points")  # fmt: skip
         axis.axvline(noise, ls="--", color=GREY, lw=1.2, label="noise")
@@ -444,8 +445,8 @@ def _candidates(d: Discovery) -> Section:
         legend_above(axis)
     figure = of_drawing(
         drawing, "candidates", "The candidates, each alone",
-        "What the base model with one effect more leaves of M1. Blue: named. The dashed line is "
-        "the noise, below which nothing can be explained.",
+        f"What the base model with one effect more leaves of M1. {'Blue: named. ' if named else ''}"
+        "The dashed line is the noise, below which nothing can be explained.",
     )  # fmt: skip
     items = tuple((name, _why(d, name, s, left, noise)) for name, s, left in rows)
     return Section("The candidates, and why each lost", (), (figure,), (), items)

@@ -205,7 +205,7 @@ function draw(columns, name) {
     margin: { l: 70, r: 15, t: 36, b: 40 }, colorway: PALETTE, showlegend: columns.channels.length > 1,
     paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", uirevision: "same",
     font: { color: colour("--ink") }, legend: { orientation: "h", y: 1.04, x: 0 },
-    xaxis: { gridcolor: colour("--line"), anchor: "y5" }, hovermode: "x",
+    xaxis: { gridcolor: colour("--line"), anchor: "y5", nticks: innerWidth < 600 ? 4 : 10, tickangle: 0 }, hovermode: "x",
   };
   const panels = [[columns.channels, "°C"], [["c"], "c in mm"], [["x0"], "x₀ in mm"], [["y0"], "y₀ in mm"],
     [["sigma0"], "σ₀ (no unit)"]];

@@ -9,7 +9,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # tests start hundreds of processes: none of them compiles what another one has compiled
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup demo test quick golden lint test-slow test-lowest bench hil docs lock deb release clean
+.PHONY: help setup demo test quick golden lint test-slow test-lowest bench hil docs pictures lock deb release clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
@@ -71,6 +71,9 @@ hil: $(STAMP) ## the laboratory: real kernel drivers without hardware (needs roo
 docs: $(if $(wildcard $(BIN)/mkdocs),,$(STAMP)) ## the documentation as a site in build/site
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 	@echo "build/site/index.html"
+
+pictures: $(STAMP) ## the README's two pictures, in docs/pictures
+	$(BIN)/python docs/_site/pictures.py
 
 lock: $(STAMP) ## resolve the locks again: CI's, the Debian packages', the lowest
 	$(BIN)/python -m pip install --quiet uv

@@ -7,6 +7,7 @@ which one it is.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,35 +17,36 @@ import numpy as np
 from thermocald.analysis.series.drift import with_drifts
 from thermocald.analysis.series.recorded import recorded_table
 from thermocald.analysis.series.stored import replay_into, table_of_stored
-from thermocald.analysis.study.input import from_recording, from_store
+from thermocald.analysis.study.input import measured_series, stored_series
 from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
 from thermocald.photogrammetry.series.result import EXTERIOR_CHOICES
 from thermocald.photogrammetry.series.spool import give_back
-from thermocald.store.recording.reader import open_recording
+from thermocald.store.recording.reader import Recording, open_recording
 from thermocald.store.recording.sense import interior_doubts
 from thermocald.store.server.connection import is_server
 from thermocald.store.sources import open_source, require_source, source_name
-from thermocald.thermal.source import series_input, stored_input
+from thermocald.store.stored_recording import StoredRecording
+from thermocald.thermal.source import series_input
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Iterator
 
     from numpy.typing import NDArray
 
     from thermocald.analysis.series.epochs import Epochs
     from thermocald.analysis.study.measured import MeasuredSeries
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.field.testfield import TestField
+    from thermocald.photogrammetry.field.testfield import Observations, TestField
     from thermocald.physics.simulation import Simulation
     from thermocald.store.recording.head import Head
-    from thermocald.store.recording.reader import Recording
     from thermocald.store.series import StoredSeries
     from thermocald.thermal.series import SeriesInput
 
     Progress = Callable[[int], None] | None
     Say = Callable[[str], None] | None
+    Source = Recording | StoredRecording
 
 
 class Series(ABC):
@@ -143,12 +145,8 @@ class Series(ABC):
         settings = AdjustmentSettings(free=free_names(free))
         if store is not None:
             return self._kept(source_of(store), settings, exterior, progress, jobs)
-        return self._calibrated(settings, exterior, progress, jobs)
-
-    @abstractmethod
-    def _calibrated(
-        self, settings: AdjustmentSettings, exterior: str, progress: Progress, jobs: int
-    ) -> Epochs: ...
+        with self._opened() as source:
+            return with_drifts(self._table(source, settings, exterior, progress, jobs)[0])
 
     def _kept(
         self,
@@ -174,22 +172,44 @@ class Series(ABC):
         return interior_doubts(self.head.camera, c, x0, y0)
 
     @abstractmethod
+    def _opened(self) -> AbstractContextManager[Source]:
+        """Open its source for reading."""
+
+    @abstractmethod
+    def _table(
+        self,
+        source: Source,
+        settings: AdjustmentSettings,
+        exterior: str,
+        progress: Progress,
+        jobs: int,
+    ) -> tuple[Epochs, Callable[[int], Observations | None]]:
+        """Return its epochs adjusted, and what shows an epoch's observations."""
+
     def measured(
         self,
         label: str | None = None,
         thermometer_sd: float | None = None,
         exterior: str = "auto",
-        free: tuple[str, ...] = DEFAULT_FREE,
+        free: Iterable[str] = DEFAULT_FREE,
         jobs: int = 1,
     ) -> MeasuredSeries:
-        """Return the series as a study reads it."""
+        """Return the series as a study reads it; label: what it treats as one camera."""
+        settings = AdjustmentSettings(free=tuple(free))
+        with self._opened() as source:
+            table, observations = self._table(source, settings, exterior, None, jobs)
+            name = label or self.camera
+            found = measured_series(source, table, observations, name, thermometer_sd)
+        give_back()
+        return found
 
-    @abstractmethod
     def observed(self, progress: Progress = None, jobs: int = 1, say: Say = None) -> SeriesInput:
         """Return the series as a thermal model and discovery read it; frames are measured.
 
         say: is told so beforehand.
         """
+        with self._opened() as source:
+            return series_input(source, say, progress, jobs)
 
 
 class RecordedSeries(Series):
@@ -198,7 +218,7 @@ class RecordedSeries(Series):
     def __init__(self, recording: Recording) -> None:
         self.recording = recording
         self.head, self.testfield = recording.head, recording.testfield
-        self.source = str(recording.path)
+        self.source = recording.title
         self.place = str(recording.path.resolve()) if recording.path.name else str(id(recording))
 
     @property
@@ -215,13 +235,21 @@ class RecordedSeries(Series):
         """As the base says, with times, readings and repeated epochs."""
         return [*self.recording.doubts(), *super().doubts(epochs)]
 
-    def _calibrated(
-        self, settings: AdjustmentSettings, exterior: str, progress: Progress, jobs: int
-    ) -> Epochs:
+    def _opened(self) -> AbstractContextManager[Source]:
+        return nullcontext(self.recording)
+
+    def _table(
+        self,
+        source: Source,
+        settings: AdjustmentSettings,
+        exterior: str,
+        progress: Progress,
+        jobs: int,
+    ) -> tuple[Epochs, Callable[[int], Observations | None]]:
+        assert isinstance(source, Recording)
         if exterior == "stored":
             raise UsageError(f"exterior 'stored': {self.source} is a recording, not a store")
-        table, _ = recorded_table(self.recording, settings, exterior, progress, jobs)
-        return with_drifts(table)
+        return recorded_table(source, settings, exterior, progress, jobs)
 
     def _kept(
         self,
@@ -233,23 +261,6 @@ class RecordedSeries(Series):
     ) -> Epochs:
         tell = progress or (lambda _: None)
         return replay_into(store, self.recording, settings, exterior, tell, jobs)
-
-    def measured(
-        self,
-        label: str | None = None,
-        thermometer_sd: float | None = None,
-        exterior: str = "auto",
-        free: tuple[str, ...] = DEFAULT_FREE,
-        jobs: int = 1,
-    ) -> MeasuredSeries:
-        """As the base says."""
-        found = from_recording(self.recording, label, thermometer_sd, exterior, free, jobs=jobs)
-        give_back()
-        return found
-
-    def observed(self, progress: Progress = None, jobs: int = 1, say: Say = None) -> SeriesInput:
-        """As the base says."""
-        return series_input(self.recording, say, progress, jobs)
 
 
 class KeptSeries(Series):
@@ -265,48 +276,50 @@ class KeptSeries(Series):
     @cached_property
     def frame_time(self) -> Array:
         """As the store's, corrected where the clock was wrong."""
-        with open_source(self.path) as store:
-            times: Array = store.series_columns(self.stored, ["frame_time"])["frame_time"]
-        return times
+        with self._opened() as source:
+            return source.columns.frame_time
 
     @cached_property
     def temperatures(self) -> dict[str, Array]:
         """As the store's, interpolated to the frames' times."""
-        with open_source(self.path) as store:
-            return store.temperatures_at_frame(self.stored)
+        with self._opened() as source:
+            return {name: source.columns.at_frame(name) for name in self.head.channels}
 
-    def _calibrated(
+    @contextmanager
+    def _opened(self) -> Iterator[StoredRecording]:
+        with open_source(self.path) as store:
+            yield StoredRecording(store, self.stored)
+
+    def _table(
         self,
+        source: Source,
         settings: AdjustmentSettings,
         exterior: str,
         progress: Progress,  # noqa: ARG002
         jobs: int,
-    ) -> Epochs:
-        with open_source(self.path) as store:
-            table = table_of_stored(store, self.stored, settings, exterior, jobs)
-            return with_drifts(table)
+    ) -> tuple[Epochs, Callable[[int], Observations | None]]:
+        assert isinstance(source, StoredRecording)
+        return table_of_stored(source, settings, exterior, jobs), source.observations
 
     def measured(
         self,
         label: str | None = None,
         thermometer_sd: float | None = None,
         exterior: str = "auto",
-        free: tuple[str, ...] = DEFAULT_FREE,  # noqa: ARG002
+        free: Iterable[str] = (),  # noqa: ARG002
         jobs: int = 1,
     ) -> MeasuredSeries:
-        """As the base says; `free` is the store's own."""
-        with open_source(self.path) as store:
-            return from_store(store, self.stored, label, thermometer_sd, exterior, jobs)
+        """As the base says, by default labelled with the start condition; `free` is the store's.
 
-    def observed(
-        self,
-        progress: Progress = None,  # noqa: ARG002
-        jobs: int = 1,  # noqa: ARG002
-        say: Say = None,  # noqa: ARG002
-    ) -> SeriesInput:
-        """As the base says."""
-        with open_source(self.path) as store:
-            return stored_input(store, self.stored, f"{store.path}: {self.stored.name}")
+        `exterior="per_epoch"` gives the epochs as they were stored.
+        """
+        start = self.stored.start
+        label = label or (f"{self.camera}-{start}" if start else self.camera)
+        if exterior == "per_epoch":
+            with self._opened() as source:
+                return stored_series(source, label, thermometer_sd)
+        own = self.stored.settings.get("free", DEFAULT_FREE)
+        return super().measured(label, thermometer_sd, exterior, own, jobs)
 
 
 def open_series(source: Path, name: str | None = None) -> Series:

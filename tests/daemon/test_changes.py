@@ -18,6 +18,7 @@ from thermocald.physics.testfields import demonstration_field, demonstration_mod
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import Head
 from thermocald.store.recording.reader import read_recording, write_recording
+from thermocald.store.stored_recording import StoredRecording
 
 EPOCHS, WHEN = 70, 41
 HAPPENS = ("nothing", "knock", "slip", "wrong_lens", "target_moved")
@@ -81,7 +82,7 @@ def told(store, name: str) -> list[tuple[str, int]]:
 def test_what_was_stored_is_what_replay_makes_of_it(store):
     """The late epochs; at an early one the daemon cannot know what the later ones say."""
     series = store.find_series("nothing")
-    replayed = table_of_stored(store, series, AdjustmentSettings(), "series")
+    replayed = table_of_stored(StoredRecording(store, series), AdjustmentSettings(), "series")
     names = [
         f"{kind}_{n}" for kind in ("series", "sd_series", "level_sd") for n in ("c", "x0", "y0")
     ]

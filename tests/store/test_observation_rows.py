@@ -12,7 +12,7 @@ from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head
 from thermocald.store.series import EpochResult
 from thermocald.store.sources import open_source
-from thermocald.store.stored_blocks import StoredBlocks
+from thermocald.store.stored_recording import StoredRecording
 
 EPOCHS, TARGETS = 40, 75  # more than one row of details an epoch
 
@@ -56,12 +56,12 @@ def test_a_block_holds_what_its_epochs_hold(path):
         want = ObservationGrid.from_observations(
             series.testfield, [epochs.get(int(n)) for n in numbers]
         )
-        ((first, grid),) = StoredBlocks(store, series, numbers).blocks()
+        ((first, grid),) = StoredRecording(store, series).blocks()
         assert first == 0
         np.testing.assert_array_equal(grid.points, want.points)
         np.testing.assert_array_equal(grid.weights, want.weights)
         windows = [slice(5, 9), slice(20, 22)]
-        (_, few), (_, more) = StoredBlocks(store, series, numbers).blocks(windows)
+        (_, few), (_, more) = StoredRecording(store, series).blocks(windows)
         np.testing.assert_array_equal(few.points, want.points[5:9])
         np.testing.assert_array_equal(more.points, want.points[20:22])
 

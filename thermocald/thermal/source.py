@@ -23,7 +23,7 @@ from thermocald.acquisition.calibrator import Calibrator, calibrated_epochs
 from thermocald.photogrammetry.linalg import MAD_TO_SD
 from thermocald.photogrammetry.series.blocks import recut
 from thermocald.photogrammetry.series.normals import ObservationGrid
-from thermocald.store.stored_blocks import StoredBlocks
+from thermocald.store.recording.reader import Recording
 from thermocald.thermal import criteria
 from thermocald.thermal.series import SeriesInput
 from thermocald.thermal.thermometer import estimate_reading_noise
@@ -38,9 +38,8 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.series.blocks import ObservationBlocks
     from thermocald.store.recording.head import Head
-    from thermocald.store.recording.reader import Recording
     from thermocald.store.recording.readings import Readings
-    from thermocald.store.series import SeriesReader, StoredSeries
+    from thermocald.store.stored_recording import StoredRecording
 
 _POINTS = 1_300_000  # image points of all rows: 300 MB while they are reduced
 _FEWEST, _MOST = 2_000, 10_000  # rows
@@ -304,17 +303,19 @@ def _roughness(values: Array) -> float:
 
 
 def measure_epochs(
-    recording: Recording, advance: Callable[[int], None] | None = None, jobs: int = 1
+    source: Recording | StoredRecording,
+    advance: Callable[[int], None] | None = None,
+    jobs: int = 1,
 ) -> list[Epoch]:
-    """List a recording's epochs with observations; frames are measured where they are not.
+    """List the epochs of a series with observations; frames are measured where they are not.
 
     jobs: processes that measure, with the same bits for any number.
     """
-    if recording.has_observations:
-        return list(recording.epochs)
-    calibrator = Calibrator.of_recording(recording)
+    if not isinstance(source, Recording) or source.has_observations:
+        return list(source.epochs)
+    calibrator = Calibrator.of_recording(source)
     epochs = []
-    for done in calibrated_epochs(calibrator, recording.iter_epochs(), jobs):
+    for done in calibrated_epochs(calibrator, source.iter_epochs(), jobs):
         epochs.append(done.epoch)
         if advance is not None:
             advance(1)
@@ -339,28 +340,27 @@ def epochs_input(head: Head, field: TestField, epochs: Sequence[Epoch], name: st
 
 
 def series_input(
-    recording: Recording,
+    source: Recording | StoredRecording,
     say: Callable[[str], None] | None = None,
     advance: Callable[[int], None] | None = None,
     jobs: int = 1,
 ) -> SeriesInput:
-    """Read the arrays of a recording; its frames are measured where they have not been, on `jobs`
-    processes.
+    """Read the arrays of a recording, or of a series in a store.
 
-    A long one with observations is condensed while it is read.
+    Frames are measured where they have not been, on `jobs` processes. A long series with
+    observations is condensed while it is read.
     """
-    recording.head.require_calibrated(str(recording.path))
-    if recording.has_observations and len(recording) > limit_rows(len(recording.testfield)):
-        whole = replace(_read_epochs(recording), columns=_read_columns(recording))
-        return condensed(whole, recording)
-    if not recording.has_observations and say is not None:
-        say(f"measuring the {len(recording.columns)} frames of {recording.path}")
-    epochs = measure_epochs(recording, advance, jobs)
-    source = epochs_input(recording.head, recording.testfield, epochs, f"{recording.path}")
-    log = recording.columns.readings
+    source.head.require_calibrated(source.title)
+    if source.has_observations and len(source) > limit_rows(len(source.testfield)):
+        return condensed(replace(_read_epochs(source), columns=_read_columns(source)), source)
+    if not source.has_observations and say is not None:
+        say(f"measuring the {len(source)} frames of {source.title}")
+    epochs = measure_epochs(source, advance, jobs)
+    found = epochs_input(source.head, source.testfield, epochs, source.title)
+    log = source.columns.readings
     if log is not None:
-        source = replace(source, **_cut_log(source, log))
-    return replace(source, columns=_read_columns(recording))
+        found = replace(found, **_cut_log(found, log))
+    return replace(found, columns=_read_columns(source))
 
 
 def _cut_log(source: SeriesInput, log: Readings) -> dict[str, Any]:
@@ -375,10 +375,10 @@ def _cut_log(source: SeriesInput, log: Readings) -> dict[str, Any]:
     return {"reading_times": log.times[rows], "readings": channels}
 
 
-def _read_columns(recording: Recording) -> dict[str, NDArray[np.float64]]:
+def _read_columns(source: Recording | StoredRecording) -> dict[str, NDArray[np.float64]]:
     """Read the further columns of epochs.csv that hold numbers, such as a humidity."""
     out = {}
-    for name, texts in recording.columns.extra.items():
+    for name, texts in source.columns.extra.items():
         try:
             values = np.array([float(t) if t.strip() else np.nan for t in texts])
         except ValueError:
@@ -387,29 +387,13 @@ def _read_columns(recording: Recording) -> dict[str, NDArray[np.float64]]:
     return out
 
 
-def _read_epochs(recording: Recording) -> SeriesInput:
-    """Read a recording's epochs without their image points."""
-    columns = recording.columns
+def _read_epochs(source: Recording | StoredRecording) -> SeriesInput:
+    """Read the epochs of a series without their image points."""
+    columns = source.columns
     return _start_input(
-        recording.head, recording.testfield, f"{recording.path}", columns.numbers,
+        source.head, source.testfield, source.title, columns.numbers,
         columns.frame_time, columns.temperature_time, columns.temperatures,
     )  # fmt: skip
-
-
-def stored_input(store: SeriesReader, series: StoredSeries, name: str) -> SeriesInput:
-    """Read the arrays of a series in a store; a long one is condensed while it is read."""
-    series.head.require_calibrated(store.where)
-    numbers = store.series_columns(series, ["epoch"])["epoch"].astype(np.int64)
-    if len(numbers) <= limit_rows(len(series.testfield)):
-        epochs = [e.epoch for e in store.epochs(series)]
-        return epochs_input(series.head, series.testfield, epochs, name)
-    names = ["frame_time", "temperature_time", *series.head.channels]
-    columns = store.series_columns(series, names)
-    whole = _start_input(
-        series.head, series.testfield, name, numbers, columns["frame_time"],
-        columns["temperature_time"], {n: columns[n] for n in series.head.channels},
-    )  # fmt: skip
-    return condensed(whole, StoredBlocks(store, series, numbers))
 
 
 def _start_input(

@@ -19,7 +19,7 @@ from thermocald.photogrammetry.series.spool import ColumnSpool
 from thermocald.photogrammetry.series.words import Words
 from thermocald.store.database.store import Store
 from thermocald.store.series import EpochResult
-from thermocald.store.stored_blocks import StoredBlocks
+from thermocald.store.stored_recording import StoredRecording
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
     from thermocald.store.recording.reader import Recording
-    from thermocald.store.series import SeriesReader, StoredSeries
+    from thermocald.store.series import StoredSeries
 
 
 def replay_into(
@@ -63,7 +63,8 @@ def replay_into(
                 store.append(series, done.epoch, result, extra=done.extra)
             advance(1)
         # while the store is open: targets are left out of a long series by reading it again
-        return with_drifts(table_of_stored(store, series, settings, exterior, jobs))
+        source = StoredRecording(store, series)
+        return with_drifts(table_of_stored(source, settings, exterior, jobs))
 
 
 def _series(store: Store, recording: Recording, settings: AdjustmentSettings) -> StoredSeries:
@@ -88,34 +89,31 @@ def _series(store: Store, recording: Recording, settings: AdjustmentSettings) ->
 
 
 def table_of_stored(
-    store: SeriesReader,
-    series: StoredSeries,
-    settings: AdjustmentSettings,
-    exterior: str,
-    jobs: int = 1,
+    source: StoredRecording, settings: AdjustmentSettings, exterior: str, jobs: int = 1
 ) -> Epochs:
-    """The table of a series in an open store. Raises DataError where it has no epochs."""
-    names = ["epoch", "frame_time", "sigma0", "n_observations", "n_rejected", "status"]
-    columns = store.series_columns(series, names)
-    size = len(columns["epoch"])
+    """Return the table of a series in an open store. Raises DataError where it has no epochs."""
+    store, series, size = source.store, source.series, len(source)
     if size == 0:
         raise DataError(f"{store.path}: series {series.name!r} has no epochs")
+    names = ["sigma0", "n_observations", "n_rejected", "status"]
+    columns = {n: c[:size] for n, c in store.series_columns(series, names).items()}
     ok = columns["status"] == "ok"
     if exterior != "stored":
         series.head.require_calibrated(str(store.path))
     known = ok | series.head.predicted
     reasons = [""] * size
     if not ok.all():
-        rows = {int(n): i for i, n in enumerate(columns["epoch"]) if not ok[i]}
+        rows = {int(n): i for i, n in enumerate(source.columns.numbers) if not ok[i]}
         for stored in store.epochs(series, details=False):
             if stored.epoch.number in rows:
                 reasons[rows[stored.epoch.number]] = stored.result.reason
+    reference = next(iter(series.head.channels), None)
     apart = Epochs(
-        columns["epoch"].astype(np.int64),
-        columns["frame_time"],
-        next(iter(store.temperatures_at_frame(series).values()), np.full(size, np.nan)),
-        _parameters(store, series, "", known),
-        _parameters(store, series, "sd_", known),
+        source.columns.numbers,
+        source.columns.frame_time,
+        np.full(size, np.nan) if reference is None else source.columns.at_frame(reference),
+        _parameters(source, "", known),
+        _parameters(source, "sd_", known),
         np.where(ok, columns["sigma0"], np.nan),
         columns["n_observations"].astype(np.int64),
         columns["n_rejected"].astype(np.int64),
@@ -127,22 +125,16 @@ def table_of_stored(
     if not ok.any() or exterior == "stored":
         return apart
     return table_of_series(
-        series.head,
-        series.testfield,
-        apart,
-        StoredBlocks(store, series, apart.number),
-        SeriesSettings.of(settings, exterior),
+        series.head, series.testfield, apart, source, SeriesSettings.of(settings, exterior),
         jobs=jobs,
-    )
+    )  # fmt: skip
 
 
-def _parameters(
-    store: SeriesReader, series: StoredSeries, prefix: str, ok: NDArray[np.bool_]
-) -> Array:
+def _parameters(source: StoredRecording, prefix: str, ok: NDArray[np.bool_]) -> Array:
     """Columns (E, 16) of all parameters, one after the other, for a year of epochs must fit."""
     spool = ColumnSpool(len(ok), 16)
     for k, name in enumerate(PARAMETER_NAMES):
-        column = store.series_columns(series, [f"{prefix}{name}"])[f"{prefix}{name}"]
+        column = source.store.series_columns(source.series, [f"{prefix}{name}"])[f"{prefix}{name}"]
         spool.array[:, k] = np.where(ok, column[: len(ok)], np.nan)
         spool.release()
     return spool.array

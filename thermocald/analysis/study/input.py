@@ -12,13 +12,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.series.recorded import recorded_table
-from thermocald.analysis.series.stored import table_of_stored
 from thermocald.analysis.statistics.correlations import correlations_of
 from thermocald.analysis.study.measured import Clip, MeasuredSeries, Thermometer
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
-from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
 from thermocald.photogrammetry.series.spool import ColumnSpool, released
 from thermocald.photogrammetry.series.words import Words
 from thermocald.store.recording.readings import interpolate_readings
@@ -26,7 +23,6 @@ from thermocald.thermal.thermometer import estimate_reading_noise
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
-    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -35,7 +31,7 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import Observations
     from thermocald.store.recording.head import Head
     from thermocald.store.recording.reader import Recording
-    from thermocald.store.series import SeriesReader, StoredSeries
+    from thermocald.store.stored_recording import StoredRecording
 
 _MOST_MATRICES = 5000
 
@@ -50,80 +46,40 @@ def refuse_copies(series: Sequence[MeasuredSeries]) -> None:
                 )
 
 
-def from_recording(
-    recording: Recording,
-    label: str | None = None,
+def measured_series(
+    source: Recording | StoredRecording,
+    table: Epochs,
+    observations: Callable[[int], Observations | None],
+    label: str,
     thermometer_sd: float | None = None,
-    exterior: str = "auto",
-    free: Sequence[str] = DEFAULT_FREE,
-    advance: Callable[[int], None] | None = None,
-    jobs: int = 1,
 ) -> MeasuredSeries:
-    """A recording, its frames measured where they are not, adjusted as one series."""
-    columns, camera = recording.columns, recording.camera
-    settings = AdjustmentSettings(free=tuple(free))
-    table, observations = recorded_table(recording, settings, exterior, advance, jobs)
-    thermometers = [
-        _thermometer(
-            name,
-            columns.frame_time,
-            *columns.readings_of(name),
-            channel.resolution,
-            thermometer_sd,
-        )
-        for name, channel in recording.channels.items()
-    ]
-    ok = table.ok
-    framed = [i for i, frame in enumerate(columns.frames) if frame and ok[i]]
-    clip = None
-    if len(framed) > 1:
-        first, last = framed[0], framed[-1]
-        clip = _clip(
-            (recording.path / columns.frames[first], recording.path / columns.frames[last]),
-            (int(columns.numbers[first]), int(columns.numbers[last])),
-            (observations(first), observations(last)),
-            recording.testfield.names,
-            camera.sensor.centre,
-        )
-    return _from_table(
-        recording.head, str(recording.path), table, thermometers, label or camera.name, clip
-    )
+    """Return a series that was adjusted together, as the study reads it.
+
+    table: of its epochs; observations: what an epoch (from 0) shows; label: what the study treats
+    as one camera; thermometer_sd K, by default from the readings. Raises DataError where no epoch
+    has a result.
+    """
+    thermometers = _thermometers(source, np.ones(len(table), dtype=bool), thermometer_sd)
+    clip = _clip(source, table.ok, observations) if table.ok.any() else None
+    return _from_table(source.head, source.title, table, thermometers, label, clip)
 
 
-def from_store(
-    store: SeriesReader,
-    series: StoredSeries,
-    label: str | None = None,
-    thermometer_sd: float | None = None,
-    exterior: str = "auto",
-    jobs: int = 1,
+def stored_series(
+    recording: StoredRecording, label: str, thermometer_sd: float | None = None
 ) -> MeasuredSeries:
-    """One series of a store; DataError where no epoch has a result."""
-    series.head.require_calibrated(store.where)
-    start = f"-{series.start}" if series.start else ""
-    label = label or series.camera + start
-    count = len(store.series_columns(series, ["epoch"])["epoch"])
-    if exterior != "per_epoch" and count:
-        free = tuple(series.settings.get("free", DEFAULT_FREE))
-        table = table_of_stored(store, series, AdjustmentSettings(free=free), exterior, jobs)
-        thermometers = _stored_thermometers(store, series, table.frame_time, thermometer_sd)
-        source = f"{store.path}: {series.camera}/{series.name}"
-        clip = _stored_clip(store, series, table.number[table.ok])
-        return _from_table(series.head, source, table, thermometers, label, clip)
-    return _from_columns(store, series, label, thermometer_sd)
+    """Return a series as it was stored; one column at a time, for a year of epochs must fit.
 
-
-def _from_columns(
-    store: SeriesReader, series: StoredSeries, label: str, thermometer_sd: float | None
-) -> MeasuredSeries:
-    """A series as it was stored; one column at a time, for a year of epochs must fit."""
+    Arguments and errors as of `measured_series`.
+    """
+    recording.head.require_calibrated(recording.title)
+    store, series, size = recording.store, recording.series, len(recording)
 
     def column(name: str) -> Array:
-        values: Array = store.series_columns(series, [name])[name]
+        values: Array = store.series_columns(series, [name])[name][:size]
         return values
 
-    ok, lost = _assessed(store.series_columns(series, ["status"])["status"].tolist())
-    source = f"{store.path}: {series.camera}/{series.name}"
+    ok, lost = _assessed(column("status").tolist())
+    source = recording.title
     if not ok.any():
         raise DataError(f"{source}: no epoch has a result ({_in_words(lost)})")
     count = int(ok.sum())
@@ -139,8 +95,7 @@ def _from_columns(
         values, sds, count = _columns(values, whole), _columns(sds, whole), int(whole.sum())
     if not count:
         raise DataError(f"{source}: no epoch has a result ({_in_words(lost)})")
-    number = column("epoch")[ok].astype(np.int64)
-    frame_time = column("frame_time")[ok]
+    number, frame_time = recording.columns.numbers[ok], recording.columns.frame_time[ok]
     rows = _spread(count, _MOST_MATRICES)
     covariances = store.covariances(series, number[rows].tolist())[:, :10, :10]
     have = np.isfinite(covariances).all(axis=(1, 2))
@@ -152,7 +107,7 @@ def _from_columns(
         source,
         number,
         frame_time - frame_time[0],
-        tuple(_stored_thermometers(store, series, frame_time, thermometer_sd)),
+        _thermometers(recording, ok, thermometer_sd),
         values,
         sds,
         column("sigma0")[ok],
@@ -161,7 +116,7 @@ def _from_columns(
         rows[have],
         str(series.settings.get("exterior", "per_epoch")),
         lost,
-        _stored_clip(store, series, number),
+        _clip(recording, ok, recording.observations),
         float(frame_time[0]),
     )
 
@@ -175,8 +130,6 @@ def _from_table(
     clip: Clip | None,
 ) -> MeasuredSeries:
     """A series that was adjusted together; thermometers at the times of all its epochs."""
-    adjustment = table.adjustment
-    assert adjustment is not None  # table_of_series always has one
     ok, lost = _assessed(table.status)
     ok = _whole(ok, table.values[:, :10], table.sd[:, :10], lost)
     released(table.values)
@@ -184,6 +137,8 @@ def _from_table(
     if not ok.any():
         why = next((reason for reason in table.reasons if reason), _in_words(lost))
         raise DataError(f"{source}: no epoch has a result: {why}")
+    adjustment = table.adjustment
+    assert adjustment is not None  # a table with a result has one
     of = np.arange(len(ok)) if table.sampled is None else table.sampled
     have = np.flatnonzero(ok[of] & adjustment.ok)
     some = have[_spread(len(have), _MOST_MATRICES)]
@@ -225,34 +180,17 @@ def _columns(values: Array, ok: NDArray[np.bool_]) -> Array:
     return spool.array
 
 
-def _thermometer(
-    name: str,
-    frame_time: Array,
-    reading_time: Array,
-    readings: Array,
-    resolution: float | None,
-    sd: float | None,
-) -> Thermometer:
-    values = interpolate_readings(frame_time, reading_time, readings)
-    known = estimate_reading_noise(reading_time, readings, resolution) if sd is None else sd
-    return Thermometer(name, values, known)
-
-
-def _stored_thermometers(
-    store: SeriesReader, series: StoredSeries, frame_time: Array, sd: float | None
-) -> list[Thermometer]:
-    reading_time = store.series_columns(series, ["temperature_time"])["temperature_time"]
-    return [
-        _thermometer(
-            name,
-            frame_time,
-            reading_time,
-            store.series_columns(series, [name])[name],
-            channel.resolution,
-            sd,
-        )
-        for name, channel in series.head.channels.items()
-    ]
+def _thermometers(
+    source: Recording | StoredRecording, rows: NDArray[np.bool_], sd: float | None
+) -> tuple[Thermometer, ...]:
+    """Every channel at the times of some frames (E,), its noise as given or from the readings."""
+    columns, found = source.columns, []
+    for name, channel in source.head.channels.items():
+        times, readings = columns.readings_of(name)
+        values = interpolate_readings(columns.frame_time[rows], times, readings)
+        noise = estimate_reading_noise(times, readings, channel.resolution) if sd is None else sd
+        found.append(Thermometer(name, values, noise))
+    return tuple(found)
 
 
 def _assessed(status: Sequence[str]) -> tuple[NDArray[np.bool_], dict[str, int]]:
@@ -292,37 +230,27 @@ def _spread(count: int, most: int) -> NDArray[np.int64]:
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
 
 
-def _stored_clip(
-    store: SeriesReader, series: StoredSeries, number: NDArray[np.int64]
-) -> Clip | None:
-    first, last = (next(store.epochs(series, int(n), int(n))).epoch for n in number[[0, -1]])
-    if first.frame is None or last.frame is None:
-        return None
-    folder = store.path.parent
-    return _clip(
-        (folder / first.frame, folder / last.frame),
-        (first.number, last.number),
-        (first.observations, last.observations),
-        series.testfield.names,
-        series.head.camera.sensor.centre,
-    )
-
-
 def _clip(
-    frames: tuple[Path, Path],
-    numbers: tuple[int, int],
-    observations: tuple[Observations | None, Observations | None],
-    names: Sequence[str],
-    centre: Array,
+    source: Recording | StoredRecording,
+    ok: NDArray[np.bool_],
+    observations: Callable[[int], Observations | None],
 ) -> Clip | None:
     """A clip about the target nearest to the image centre that both ends show; None without."""
-    first, last = observations
-    if first is None or last is None or not all(path.is_file() for path in frames):
+    ends = source.framed(ok)
+    if len(ends) != 2 or not all(frame.is_file() for _, frame in ends):
+        return None
+    (i, first_frame), (k, last_frame) = ends
+    first, last = observations(i), observations(k)
+    if first is None or last is None:
         return None
     both = np.isin(first.targets, last.targets)
     if not both.any():
         return None
     points = first.points[both]
-    k = int(np.argmin(np.linalg.norm(points - centre, axis=1)))
-    target = names[int(first.targets[both][k])]
-    return Clip(target, *frames, *numbers, (float(points[k, 0]), float(points[k, 1])))
+    nearest = int(np.argmin(np.linalg.norm(points - source.head.camera.sensor.centre, axis=1)))
+    target = source.testfield.names[int(first.targets[both][nearest])]
+    numbers = source.columns.numbers
+    return Clip(
+        target, first_frame, last_frame, int(numbers[i]), int(numbers[k]),
+        (float(points[nearest, 0]), float(points[nearest, 1])),
+    )  # fmt: skip

@@ -15,8 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.analysis.study.input import from_recording
+from thermocald.analysis.series.recorded import recorded_table
+from thermocald.analysis.study.input import measured_series
 from thermocald.analysis.study.study import StudySettings, study_camera
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.physics.presets import PRESETS, preset_simulation
 from thermocald.store.recording.reader import open_recording
 
@@ -130,7 +132,9 @@ def reference_series(
         for name, seed in SERIES:
             path = Path(folder) / name
             preset_simulation(preset, seed, name).write(path)
-            one = from_recording(open_recording(path), preset, exterior="series")
+            recording = open_recording(path)
+            table, seen = recorded_table(recording, AdjustmentSettings(), "series")
+            one = measured_series(recording, table, seen, preset)
             # The folder is gone when the study is read.
             measured.append(replace(one, source=f"preset {preset}, series {name}, seed {seed}"))
             advance(1)

@@ -118,6 +118,11 @@ class Recording:
         return self.head.series
 
     @property
+    def title(self) -> str:
+        """What messages call it."""
+        return str(self.path)
+
+    @property
     def interval(self) -> float:
         return self.head.interval
 
@@ -197,6 +202,11 @@ class Recording:
                     f"{twice[0][0]} those of {twice[0][1]}"
                 )
         return found
+
+    def framed(self, ok: NDArray[np.bool_]) -> list[tuple[int, Path]]:
+        """The first and the last of some epochs (E,), from 0, whose frames were kept, and these."""
+        rows = [i for i, frame in enumerate(self.columns.frames) if frame and ok[i]]
+        return [(i, self.path / self.columns.frames[i]) for i in rows[:1] + rows[1:][-1:]]
 
     @property
     def is_long(self) -> bool:

@@ -96,7 +96,8 @@ def svg(figure: Figure) -> str:
 def jsonable(value: Any) -> Any:
     """Return a value as JSON has it: NaN and infinity as null, paths as text.
 
-    Arrays and tuples become lists, dataclasses mappings of their fields.
+    Arrays and tuples become lists, what has `as_dict` that document, other dataclasses mappings of
+    their fields, named as `metadata={"json": …}` says, left out where that is empty.
     """
     if isinstance(value, dict):
         return {str(key): jsonable(inner) for key, inner in value.items()}
@@ -108,7 +109,10 @@ def jsonable(value: Any) -> Any:
         return None
     if isinstance(value, Path):
         return str(value)
+    if hasattr(value, "as_dict"):
+        return jsonable(value.as_dict())
     fields = getattr(value, "__dataclass_fields__", None)
     if fields is not None and not isinstance(value, type):
-        return {name: jsonable(getattr(value, name)) for name in fields}
+        named = {name: field.metadata.get("json", name) for name, field in fields.items()}
+        return {key: jsonable(getattr(value, name)) for name, key in named.items() if key}
     return value

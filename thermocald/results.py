@@ -94,10 +94,7 @@ class Discovery(Result, discoveries.Discovery):
     name: str = ""
     before: ThermalModel | None = None
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return what `thermocald discover --json` writes, CONVENTIONS §4."""
-        document: dict[str, Any] = jsonable(self.as_json(None))
-        return document
+    as_dict = discoveries.Discovery.as_dict
 
     def lines(self) -> list[str]:
         """Return what `thermocald discover` prints."""
@@ -139,7 +136,7 @@ class Discovery(Result, discoveries.Discovery):
         effects = [one for entry in self.effects for one in effects_of(entry)]
         if not effects:
             return None
-        evidence = {"verdict": self.verdict, "gap": self.as_json(None)["gap"]}
+        evidence = {"verdict": self.verdict, "gap": self.as_dict()["gap"]}
         said = "; ".join(e.statement for e in self.effects)
         write_effects(Path(path), effects, said, evidence)
         return Path(path)

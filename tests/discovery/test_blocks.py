@@ -43,5 +43,5 @@ def test_what_is_unexplained_in_a_long_series(short_blocks, evidence_of):
     found = discover_series(evidence)
     rows = {what: sigmas for what, _, sigmas in resolve(found.examination).rows}
     assert "rate of temperature" in rows
-    assert found.as_json(None)["effects"][0]["evidence"]["base_misfit"]["against"]
+    assert found.as_dict()["effects"][0]["evidence"]["base_misfit"]["against"]
     assert "<svg" in report_html(found, "long")

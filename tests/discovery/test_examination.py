@@ -110,7 +110,7 @@ def test_document(evidence_of):
     evidence, truth = evidence_of("thermal_lag", seed=25)
     said: list[str] = []
     found = discover_series(evidence, said.append)
-    document = found.as_json("model.yaml")
+    document = found.as_dict()
     # how far it is: each stage once, in the order of the work
     stages = ("targets that moved", "measuring noise", "base model", "effect 1")
     first = [next(i for i, line in enumerate(said) if line.startswith(s)) for s in stages]

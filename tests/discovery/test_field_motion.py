@@ -25,7 +25,7 @@ def test_a_board_that_moves_is_reported_and_the_cameras_effect_is_named(evidence
     found = discover_series(evidence)
 
     assert tuple(e.effect for e in found.effects) == effects
-    document = found.as_json(None)["field"]["movements"]
+    document = found.as_dict()["field"]["movements"]
     assert [(m["recording"], m["kind"]) for m in document] == [("M1", kind)]
     assert document[0]["targets"] == [str(i + 1) for i in BOARD]
     # what one camera sees of it is across the rays
@@ -41,11 +41,11 @@ def test_a_target_that_wanders_is_reported_and_no_displacement(evidence_of, effe
     found = discover_series(evidence)
 
     assert tuple(e.effect for e in found.effects) == effects
-    (moved,) = found.as_json(None)["field"]["movements"]
+    (moved,) = found.as_dict()["field"]["movements"]
     assert (moved["kind"], moved["targets"]) == ("wander", [str(TARGET + 1)])
 
 
 def test_a_field_that_stands_is_not_reported(evidence_of):
     evidence, _ = evidence_of(px=0.1, seed=2)
 
-    assert "field" not in discover_series(evidence).as_json(None)
+    assert "field" not in discover_series(evidence).as_dict()

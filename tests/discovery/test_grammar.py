@@ -124,5 +124,5 @@ def test_a_discovery_says_the_formula_and_the_gap_closes():
     (entry,) = found.effects
     assert (found.verdict, entry.effect) == ("unexplained", "unnamed")
     assert "tanh((T − " in entry.statement
-    assert entry.as_json()["evidence"]["proposal"]["transferable"] is True
+    assert entry.evidence["proposal"]["transferable"] is True
     assert found.excess_closed() > 0.8

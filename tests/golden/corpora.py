@@ -42,7 +42,7 @@ CORPORA = {"blind": blind, "real-corners": real}
 
 def told(discovery: Any) -> dict[str, Any]:
     """Verdict, names, alternatives, estimates and the gap, of one case."""
-    document = discovery.as_json(None)
+    document = discovery.as_dict()
     return {
         "verdict": document["verdict"],
         "effects": {

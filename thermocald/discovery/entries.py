@@ -17,7 +17,7 @@ constant and no more, while their sum is as well determined as one lag alone wou
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -196,26 +196,13 @@ class EffectFound:
     alternatives: list[dict[str, Any]]
     gap_before: Gap
     gap_after: Gap
-    term: Term | None = None
+    term: Term | None = field(default=None, metadata={"json": ""})
 
     @property
     def alternative_names(self) -> list[str]:
         """Effects of the catalogue that the data cannot exclude."""
         others = ("resembles", "formula")
         return [a["effect"] for a in self.alternatives if not any(a.get(k) for k in others)]
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the entry as the document has it."""
-        return {
-            "effect": self.effect,
-            "statement": self.statement,
-            "where": self.where,
-            "estimates": self.estimates,
-            "evidence": self.evidence,
-            "alternatives": self.alternatives,
-            "gap_before": self.gap_before.as_json(),
-            "gap_after": self.gap_after.as_json(),
-        }
 
 
 def effects_of(found: EffectFound) -> list[ModelEffect]:
@@ -316,19 +303,16 @@ def _sum_normal_equations(
 class TradeOff:
     """names: of two time constants; value, sd s: of their sum."""
 
-    names: tuple[str, str]
-    value: float
+    names: tuple[str, str] = field(metadata={"json": "parameters"})
+    value: float = field(metadata={"json": "sum"})
     sd: float
+    unit: str = "s"
 
     @property
     def sentence(self) -> str:
         """What is added to a statement."""
-        total = say_estimate({"value": self.value, "sd": self.sd, "unit": "s"})
+        total = say_estimate({"value": self.value, "sd": self.sd, "unit": self.unit})
         return f"; the time constants are not separable, their sum is {total}"
-
-    def as_json(self) -> dict[str, Any]:
-        """Return it for the evidence of the effect."""
-        return {"parameters": list(self.names), "sum": self.value, "sd": self.sd, "unit": "s"}
 
 
 def find_trade_off(fitter: HypothesisFitter, fit: Fit, number: int) -> TradeOff | None:

@@ -7,7 +7,7 @@ on a plane at 10 m.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,15 +35,8 @@ class Gap:
     rms_px: float
     chi2_reduced: float
     object_mm_at_10m: float
-    floor: float = 1.0  # of chi2_reduced: what the measurement leaves about its own cameras
-
-    def as_json(self) -> dict[str, float]:
-        """Return the gap as the document has it."""
-        return {
-            "rms_px": self.rms_px,
-            "chi2_reduced": self.chi2_reduced,
-            "object_mm_at_10m": self.object_mm_at_10m,
-        }
+    # of chi2_reduced: what the measurement leaves about its own cameras
+    floor: float = field(default=1.0, metadata={"json": ""})
 
 
 def fit_first(fitter: HypothesisFitter, terms: Sequence[Term]) -> Fit:

@@ -124,7 +124,7 @@ def build_model(discovery: Discovery, old: ThermalModel | None = None) -> Therma
 
 
 def _evidence(discovery: Discovery) -> dict[str, Any]:
-    document = discovery.as_json(None)
+    document = discovery.as_dict()
     out: dict[str, Any] = {"verdict": discovery.verdict, "gap": document["gap"]}
     for entry in document["effects"]:
         out[entry["effect"]] = {

@@ -28,6 +28,7 @@ from thermocald.discovery.search import enrich_term
 from thermocald.discovery.unnamed import NO_PROPOSAL, describe_unnamed, propose_entry, resolve
 from thermocald.discovery.validation import cross_validation
 from thermocald.physics import catalogue
+from thermocald.result import jsonable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
 def field_of(x: Examination) -> dict[str, Any] | None:
     """Describe the movements for the document; None where the field stood still."""
     movements = [
-        {"recording": e.source.name, **m.as_json()}
+        {"recording": e.source.name, **m.as_dict()}
         for e, found in zip(x.original, x.field_movements, strict=True)
         for m in found
     ]
@@ -168,36 +169,39 @@ class Discovery:
             return None
         return 1.0 - (after.chi2_reduced - after.floor) / (before.chi2_reduced - before.floor)
 
-    def as_json(self, model: str | None) -> dict[str, Any]:
-        """Return CONVENTIONS §4; what the mount and the test field did stands under `mount`,
-        `field`.
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `discover --json` writes, CONVENTIONS §4.
+
+        What the mount and the test field did stands under `mount` and `field`.
         """
         mount, field = mount_of(self.examination), field_of(self.examination)
         first, last = self.stages[0], self.stages[-1]
         others = [
-            {"recording": e.source.name, "before": b.as_json(), "after": a.as_json()}
+            {"recording": e.source.name, "before": b, "after": a}
             for e, b, a in zip(
                 self.examination.fitter.series[1:], first.others, last.others, strict=True
             )
         ]
         verify = {k: others[0][k] for k in ("before", "after")} if others else None
-        effects = [e.as_json() for e in self.effects]
+        effects = [jsonable(e) for e in self.effects]
         if effects:  # where the base model is wrong stands with the first of its causes
-            misfit = resolve(self.examination).as_json()
+            misfit = resolve(self.examination)
             effects[0]["evidence"] = {**effects[0]["evidence"], "base_misfit": misfit}
-        return {
+        document = {
             "format": "thermocald-discovery/1",
             "verdict": self.verdict,
             "effects": effects,
             "gap": {
-                "fit": {"before": first.fit.as_json(), "after": last.fit.as_json()},
+                "fit": {"before": first.fit, "after": last.fit},
                 "verify": verify,
                 **({"verify_each": others} if len(others) > 1 else {}),
             },
-            "model": model,
+            "model": None,
             **({"mount": mount} if mount is not None else {}),
             **({"field": field} if field is not None else {}),
         }
+        written: dict[str, Any] = jsonable(document)
+        return written
 
     @property
     def headline(self) -> str:
@@ -255,7 +259,7 @@ def _make_entry(
     evidence: dict[str, Any] = {
         "score_gain": without,
         "penalty": x.best.penalties[k],
-        "absolute_test": [a.as_json() for a in x.adequacy],
+        "absolute_test": jsonable(x.adequacy),
         "cross_validation": blocks,
         "inflation_for_correlated_noise": e.correlation,
     }

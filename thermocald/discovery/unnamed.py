@@ -13,6 +13,7 @@ from thermocald.discovery.gap import Gap, fit_first
 from thermocald.discovery.proposal import propose
 from thermocald.photogrammetry.linalg import explained, inverse_of_determined
 from thermocald.physics import catalogue
+from thermocald.result import jsonable
 from thermocald.thermal.scan import examine_all
 from thermocald.thermal.series import COLUMNS, unit_directions
 
@@ -218,7 +219,7 @@ def propose_entry(
         {
             **{k: v for k, v in description.evidence.items() if k != "bridge"},
             "proposal": _describe_proposal(found, term, examination),
-            **({"not_separable": together.as_json()} if together is not None else {}),
+            **({"not_separable": jsonable(together)} if together is not None else {}),
         },
         alternatives,
         gap,
@@ -243,7 +244,7 @@ def _describe_proposal(found: Proposal, term: Term, x: Examination) -> dict[str,
             "explained": float(found.surrogates.gain),
             "largest_of_surrogates": float(found.surrogates.surrogates.max()),
         },
-        "absolute_test": [a.as_json() for a in x.adequacy],
+        "absolute_test": jsonable(x.adequacy),
     }
 
 
@@ -260,7 +261,7 @@ class Misfit:
     targets: tuple[str, ...]
     regions: dict[tuple[int, int], float]
 
-    def as_json(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, Any]:
         """Return the misfit as an effect's evidence has it."""
         return {
             "against": [

@@ -231,7 +231,7 @@ class Adequacy:
         """Nothing significant is left, or nothing that matters."""
         return self.significance < criteria.SIGNIFICANT or self.misfit_px < criteria.NEGLIGIBLE_PX
 
-    def as_json(self) -> dict[str, float]:
+    def as_dict(self) -> dict[str, float]:
         """Return the test for an effect's evidence."""
         return {"sigmas": float(self.significance), "misfit_px": float(self.misfit_px)}
 

@@ -260,7 +260,7 @@ class Epochs(Result):
             "rejected": int(self.n_rejected.sum()),
             "left_out": list(self.left_out),
             "field_movements": [
-                {**m.as_json(), "sentence": m.sentence} for m in self.field_movements
+                {**m.as_dict(), "sentence": m.sentence} for m in self.field_movements
             ],
             "parameters": [{**c.as_dict(), "sd_mean_level": level[c.name]} for c in self.drifts],
             "without_result": [

@@ -81,7 +81,7 @@ def _series(study: SeriesStudy, distance_mm: float) -> dict[str, Any]:
         "noise_ratio": study.noise_ratio,
         "image_noise_ratio": s.image_noise_ratio,
         "exterior_choice": s.choice or None,
-        "field_movements": [m.as_json() for m in s.field_movements],
+        "field_movements": list(s.field_movements),
         "exterior": s.exterior,
         "free": list(s.free),
         "deviations": {name: jsonable(d) for name, d in study.deviations.items()},

@@ -108,7 +108,7 @@ class FieldMovement:
             return f"the board of {who} creeps, by {size} over the series"
         return f"target {self.targets[0]} wanders by {size} RMS"
 
-    def as_json(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, Any]:
         """For a document."""
         knocked = self.kind == "knock"
         return {

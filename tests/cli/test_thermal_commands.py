@@ -85,7 +85,7 @@ def folder(tmp_path_factory):
     simulated(3, name="other", epochs=30, interval=60.0).write(path / "other")
     other_sensor(path / "M2", path / "binned", 1640, 1232, 0.00224,
                  lambda x, y, sx, sy: ((x - 0.5) / 2, (y - 0.5) / 2, sx / 2, sy / 2))  # fmt: skip
-    other_sensor(path / "M2", path / "crop", 3000, 2000, 0.00112,
+    other_sensor(path / "M2", path / "crop", 3600, 2464, 0.00112,
                  lambda x, y, sx, sy: (x - 140, y - 232, sx, sy))  # fmt: skip
     with_columns(path / "M2", path / "swapped", ("board_temperature", "temperature"))
     with_columns(path / "M2", path / "board", ("board_temperature",))

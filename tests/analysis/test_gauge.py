@@ -33,7 +33,7 @@ START = 1.7e9
 def thermal_camera(tau: float | None = None) -> ThermalCamera:
     """The crooked camera about 20 °C, valid from -5 to 45 °C; tau s: it follows with a lag."""
     parameters = [f"interior.{n}" for n in NAMES] + [f"rates.{n}" for n in NAMES]
-    covariance = np.diag([SD[n] ** 2 for n in NAMES] + [SD_RATE**2] * 3)
+    covariance = np.diag([SD[n] ** 2 for n in NAMES] + [SD_RATE**2] * 3).tolist()
     effects = () if tau is None else (ModelEffect("thermal_lag", {"tau": tau}, {}),)
     return ThermalCamera(
         ThermalModel(

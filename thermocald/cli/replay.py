@@ -8,13 +8,14 @@ from typing import Annotated
 import typer
 
 from thermocald.cli.commands import expert
-from thermocald.cli.common import progress, say, write_parts, write_result
+from thermocald.cli.common import progress, say, warnings_said, write_parts, write_result
 from thermocald.cli.options import (
     DEFAULT_FREE,
     ExteriorOption,
     FreeOption,
     JobsOption,
     JsonOption,
+    TimezoneOption,
 )
 from thermocald.errors import DataError, UsageError
 
@@ -27,15 +28,34 @@ def replay(
     exterior: ExteriorOption = "auto",
     free: FreeOption = DEFAULT_FREE,
     jobs: JobsOption = 1,
+    model: Annotated[
+        Path | None, typer.Option(help="Of photographs of a scene: the camera's thermal model.")
+    ] = None,
+    log: Annotated[
+        Path | None, typer.Option(help="With --model: a logger's file, a recording, or a store.")
+    ] = None,
+    times: Annotated[
+        str, expert("--times", help="With --model, when each was taken: exif, name, or file.")
+    ] = "exif",
+    timezone: TimezoneOption = None,
     json: JsonOption = None,
 ) -> None:
     """Calibrate every epoch of a recording, and say what the series is worth.
 
+    With --model, RECORDING is a folder of photographs of a scene without a test field: what does
+    not move in it is compared with what the thermal model predicts.
+
     Example: thermocald replay rpi-heating-M1 --store thermocald.db
+    Example: thermocald replay photos --model camera.thermal.yaml --log weather.csv --timezone UTC
     """
     import thermocald as tc
     from thermocald.store.recording.sense import doubt_lines
 
+    if (model is None) != (log is None):
+        raise UsageError("--model and --log go together")
+    if model is not None and log is not None:
+        _follow_scene(recording, model, log, times, timezone, json)
+        return
     series = tc.open(recording)
     with progress(len(series), "calibrating") as advance:
         table = series.calibrate(
@@ -50,6 +70,31 @@ def replay(
     if not table.ok.any():
         why = next(iter(table.without_result), "there is no epoch")
         raise DataError(f"{recording}: no epoch has a result: {why}")
+
+
+def _follow_scene(
+    folder: Path, model: Path, log: Path, times: str, timezone: str | None, json: str | None
+) -> None:
+    import thermocald as tc
+    from thermocald.analysis.thermal.model_log import read_model_log
+    from thermocald.analysis.thermal.scene import follow_scene
+    from thermocald.store.logger.clock import device_clock
+    from thermocald.store.logger.photographs import SOURCES, find_photographs, read_photograph
+    from thermocald.store.logger.temperatures import log_options
+
+    if times not in SOURCES:
+        raise UsageError(f"--times {times}: must be one of {', '.join(SOURCES)}")
+    thermal = tc.load_camera(model)
+    pictures = [read_photograph(path, times) for path in find_photographs([folder])]
+    paths = [picture.path for picture in pictures]
+    clock = device_clock(timezone)
+    taken = clock.utc([p.moment for p in pictures], lambda i: str(paths[i])).tolist()
+    read = read_model_log(thermal, log, log_options(timezone=timezone), (min(taken), max(taken)))
+    with warnings_said(), progress(len(paths), "following") as advance:
+        frames = list(zip(paths, taken, strict=True))
+        found = follow_scene(thermal, read, frames, advance=advance)
+    if write_result(found.as_dict(), json):
+        typer.echo(str(found))
 
 
 def export(

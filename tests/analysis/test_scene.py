@@ -1,0 +1,147 @@
+"""The scene as a check: rendered banks with moving water, other light, a mount that turns."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates, spline_filter
+
+from tests.analysis.test_gauge import RATES, START, thermal_camera
+from tests.commands import call
+from thermocald.analysis.thermal.scene import SceneTracker, common_movement, follow_scene
+from thermocald.errors import DataError
+from thermocald.photogrammetry.camera.camera_model import project, rotation
+from thermocald.store.logger.temperatures import TemperatureLog
+
+WIDTH, HEIGHT = 410, 308
+NOISE = 2.0
+
+
+def camera(more_per_kelvin: float = 0.0):
+    """The gauge's camera for small frames; more: µm that c changes per kelvin beside the model."""
+    thermal = thermal_camera().for_images(WIDTH, HEIGHT)
+    rates = {**RATES, "c": RATES["c"] + 1e-3 * more_per_kelvin}
+    return replace(thermal, model=replace(thermal.model, rates=rates))
+
+
+def texture(rng: np.random.Generator, smooth: float = 1.8) -> np.ndarray:
+    noise = rng.normal(0, 1, (HEIGHT, WIDTH)).astype(np.float32)
+    coarse = cv2.GaussianBlur(rng.normal(0, 1, (HEIGHT, WIDTH)).astype(np.float32), (0, 0), 8)
+    fine = cv2.GaussianBlur(noise, (0, 0), smooth)
+    return 120 + 25 * fine / fine.std() + 20 * coarse / coarse.std()
+
+
+class Bank:
+    """What does not move, as the cold camera sees it, and water over a half of the frame."""
+
+    def __init__(self, seed: int) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.bank = spline_filter(texture(self.rng).astype(float))
+        self.cold = camera().at(20.0)
+        u, v = np.meshgrid(np.arange(WIDTH, dtype=float), np.arange(HEIGHT, dtype=float))
+        self.pixels = np.stack([u.ravel(), v.ravel()], axis=1)
+
+    def frame(self, now, turn=(0.0, 0.0, 0.0), light: float = 1.0) -> np.ndarray:
+        """As a camera sees it that has turned; each pixel looks up where the cold one saw it."""
+        rays = now.rays(self.pixels) @ rotation(np.array(turn)).T
+        at = project(self.cold.sensor, self.cold.values, np.zeros(6), rays / -rays[:, 2:])
+        # OpenCV's remap rounds to 1/32 px, which a whole frame has in common
+        image = map_coordinates(self.bank, at.T[::-1], prefilter=False, mode="nearest")
+        image = image.reshape(HEIGHT, WIDTH)
+        water = np.zeros((HEIGHT, WIDTH), np.float32)
+        water[165:300, 20:] = 1.0
+        water = cv2.GaussianBlur(water, (0, 0), 3)
+        image = light * (image * (1 - water) + texture(self.rng, 3.0) * water)
+        noisy = image + self.rng.normal(0, NOISE, image.shape)
+        return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.slow
+def test_turn_and_principal_distance_have_true_sds():
+    """40 scenes with half of the frame moving by itself: error over sd."""
+    ratio = []
+    for seed in range(40):
+        bank, thermal = Bank(seed), camera()
+        tracker = SceneTracker(bank.frame(bank.cold))
+        now = thermal.at(20.0 + bank.rng.uniform(-15, 15))
+        turn = bank.rng.normal(0, 1e-3, 3)
+        rows, moved = tracker.follow(bank.frame(now, turn, bank.rng.uniform(0.8, 1.1)))
+        found = common_movement(bank.cold, now, tracker.points[rows], moved)
+        ratio.append((found.values - [*turn, 0.0]) / np.sqrt(np.diag(found.covariance)))
+    rms = np.sqrt(np.mean(np.square(ratio), axis=0))
+    assert np.sqrt(np.mean(np.square(ratio))) == pytest.approx(1.0, abs=0.15), rms
+
+
+def series(folder, seed: int, beside: float, count: int = 8):
+    """Frames of a day from 10 to 40 °C, whose camera changes by `beside` µm/K more than known."""
+    bank, true = Bank(seed), camera(beside)
+    bank.cold = true.at(10.0)
+    frames, times = [], START + 3600.0 * np.arange(count)
+    temperatures = np.linspace(10.0, 40.0, count)
+    for k, T in enumerate(temperatures):
+        path = folder / f"{seed}-{k}.png"
+        turn = bank.rng.normal(0, 2e-4, 3)
+        cv2.imwrite(str(path), bank.frame(true.at(T), turn if k else np.zeros(3)))
+        frames.append((path, times[k]))
+    log = TemperatureLog(times, {"housing": temperatures})
+    return follow_scene(camera(), log, frames)
+
+
+def test_a_model_that_lacks_an_effect_is_found_and_one_that_holds_is_not(tmp_path):
+    held = series(tmp_path, 100, 0.0)
+    assert held.seen.sum() == 7
+    assert not held.model_misses, held.lines()
+    found = series(tmp_path, 200, 0.3)
+    slope, sd = (v[3] for v in found.per_kelvin)
+    assert slope == pytest.approx(0.3e-3, abs=3 * sd)
+    assert "the model misses an effect" in str(found)
+    assert "cannot tell" in str(held)
+    assert held.as_dict()["frames"][0]["reason"] == "the reference frame"
+
+
+def test_replay_follows_a_folder_of_photographs(tmp_path):
+    """By the command: names tell the times, the log is a CSV, the model a file."""
+    photographs = tmp_path / "photographs"
+    photographs.mkdir()
+    bank, thermal = Bank(300), camera()
+    with (tmp_path / "log.csv").open("w") as log:
+        log.write("time,temperature\n")
+        for k, T in enumerate((20.0, 24.0, 28.0, 32.0, 36.0)):
+            name = f"{20260504 + k}-120000.png"
+            cv2.imwrite(str(photographs / name), bank.frame(thermal.at(T)))
+            log.write(f"2026-05-0{4 + k}T12:00:00Z,{T}\n")
+    thermal.save(tmp_path / "camera.yaml")
+    done = call(
+        "replay", photographs, "--model", tmp_path / "camera.yaml", "--log", tmp_path / "log.csv",
+        "--times", "name", "--timezone", "UTC",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "4 of 5 frames follow the reference frame" in done.stdout
+    assert "as it should be" in done.stdout
+    alone = call("replay", photographs, "--model", tmp_path / "camera.yaml")
+    assert alone.returncode == 2
+    assert "go together" in alone.stderr
+
+
+def test_a_frame_of_night_and_one_of_elsewhere_have_no_movement(tmp_path):
+    bank, other = Bank(7), Bank(8)
+    images = [bank.frame(bank.cold), bank.frame(bank.cold) // 60, other.frame(bank.cold)]
+    frames = []
+    for k, image in enumerate(images):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), image)
+        frames.append((tmp_path / f"{k}.png", START + k))
+    log = TemperatureLog(START + np.arange(3.0), {"housing": np.full(3, 20.0)})
+    course = follow_scene(camera(), log, frames)
+    assert not course.seen.any()
+    assert "too few features" in course.reasons[2]
+    assert "hardly changed" in str(course)
+
+
+def test_nothing_to_follow_is_said(tmp_path):
+    with pytest.raises(DataError, match="features"):
+        SceneTracker(np.full((HEIGHT, WIDTH), 90, np.uint8))
+    with pytest.raises(DataError, match="at least one more"):
+        follow_scene(camera(), TemperatureLog(np.array([START]), {}), [])

@@ -1,0 +1,328 @@
+"""The scene itself as a check of a thermal model: what does not move, seen by a camera that stands.
+
+Features of a reference frame are found again in every frame. Most of what a river shows moves by
+itself (water, leaves, shadows); what has a common movement is the camera's. Of it the thermal
+model's prediction is taken off; the rest is a turn of the mount about three axes and a change of
+the principal distance, which the model did not predict.
+
+From one place a shift of the principal point cannot be told from a turn, nor a shift of the camera
+from either where depths are unknown: what is stated as a turn may be any of them. The principal
+distance can be told, by the scale. Standard deviations are those of the features that take part.
+
+Source: Fischler, M. and Bolles, R. (1981): Random sample consensus, CACM 24(6); Lucas, B. and
+Kanade, T. (1981), in OpenCV's pyramidal form, forwards and backwards.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+from thermocald.analysis.thermal.correction import require_inside
+from thermocald.errors import DataError, ImageError
+from thermocald.numbers import with_sd
+from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, partials
+from thermocald.photogrammetry.targets.frame_status import inspect_frame
+from thermocald.photogrammetry.targets.image_file import decode_grey
+from thermocald.result import Result, new_figure
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from matplotlib.figure import Figure
+    from numpy.typing import NDArray
+
+    from thermocald.analysis.camera.camera import Camera
+    from thermocald.analysis.thermal.thermal_camera import ThermalCamera
+    from thermocald.arrays import Array
+    from thermocald.store.logger.temperatures import TemperatureLog
+
+_MOST_FEATURES = 600
+_FEWEST = 12  # that have a common movement
+_APART_PX = 12
+_WINDOW_PX = 21
+_BACK_PX = 0.3  # forwards and backwards again
+_DRAWS = 300
+_NEAR_PX = 0.6  # of a common movement: a draw's followers
+_TUKEY = 4.685
+_ROUNDS = 10
+_WORD_SIGMAS = 4.0
+_LOCKED_PX = 0.004  # of matching, as a function of the pixel's part moved: common to all features
+
+
+@dataclass(frozen=True, eq=False)
+class SceneMovement:
+    """What a frame shows beside the model's prediction.
+
+    values (4,): turns about the camera's x, y and z axis in rad, change of the principal distance
+    mm; covariance (4, 4); locked (4,): the part of the sds that further frames do not lessen;
+    features: how many have it in common, of `tracked`.
+    """
+
+    values: Array
+    covariance: Array
+    locked: Array
+    features: int
+    tracked: int
+
+
+class SceneTracker:
+    """Follows the features of a reference frame (H, W)."""
+
+    def __init__(self, reference: NDArray[Any]) -> None:
+        self._reference = _eight_bit(reference)
+        corners = cv2.goodFeaturesToTrack(
+            self._reference, _MOST_FEATURES, 0.005, _APART_PX, blockSize=7
+        )
+        found = np.zeros((0, 2)) if corners is None else np.asarray(corners).reshape(-1, 2)
+        margin = _WINDOW_PX
+        height, width = reference.shape
+        inside = ((found >= margin) & (found < np.array([width, height]) - margin)).all(axis=1)
+        self.points: NDArray[np.float32] = found[inside].astype(np.float32)
+        if len(self.points) < _FEWEST:
+            raise DataError(
+                f"the reference frame has {len(self.points)} features; at least {_FEWEST} are "
+                "needed that do not move: another frame, more light"
+            )
+
+    def follow(self, image: NDArray[Any]) -> tuple[NDArray[np.int64], Array]:
+        """Rows of the features that are found again, and how far they moved (n, 2) px."""
+        image = _eight_bit(image)
+        options: dict[str, Any] = {
+            "winSize": (_WINDOW_PX, _WINDOW_PX), "maxLevel": 3,
+            "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-3),
+        }  # fmt: skip
+        start: Any = None
+        there, found, _ = cv2.calcOpticalFlowPyrLK(
+            self._reference, image, self.points, start, **options
+        )
+        back, again, _ = cv2.calcOpticalFlowPyrLK(image, self._reference, there, start, **options)
+        same = np.abs(back - self.points).max(axis=1) < _BACK_PX
+        rows = np.flatnonzero((found.ravel() == 1) & (again.ravel() == 1) & same)
+        return rows, (there - self.points)[rows].astype(float)
+
+
+def common_movement(
+    then: Camera, now: Camera, points: Array, moved: Array, seed: int = 0
+) -> SceneMovement | None:
+    """Estimate what features have in common beside the prediction; None where too few have it.
+
+    then, now: the predicted cameras; points (n, 2) px in the reference frame; moved (n, 2) px.
+    """
+    predicted = then.as_seen_by(points, now.interior) - points
+    left = moved - predicted
+    rays = then.rays(points)
+    _, J, _ = partials(then.sensor, then.values, np.zeros(6), rays / -rays[:, 2:])
+    A = J[:, :, [10, 11, 12, 0]]
+    scale = np.abs(A).max(axis=(0, 1))
+    A = A / scale
+    x = _consensus(A, left, np.random.default_rng(seed))
+    if x is None:
+        return None
+    weight = np.ones(len(left))
+    spread = _NEAR_PX
+    for _ in range(_ROUNDS):
+        r = left - A @ x
+        size = np.linalg.norm(r, axis=1)
+        near = size < 3 * _NEAR_PX
+        if near.sum() < _FEWEST:
+            return None
+        spread = max(1.4826 * float(np.median(np.abs(r[near]))), 1e-3)
+        weight = np.clip(1 - (size / (_TUKEY * spread)) ** 2, 0.0, None) ** 2
+        if (weight > 0).sum() < _FEWEST:
+            return None
+        N = np.einsum("nci,n,ncj->ij", A, weight, A)
+        x = np.linalg.solve(N, np.einsum("nci,n,nc->i", A, weight, left))
+    r = left - A @ x
+    inverse = np.linalg.inv(N)
+    # windows overlap: features near each other have their errors in common
+    cells = np.unique(points // (2 * _WINDOW_PX), axis=0, return_inverse=True)[1].ravel()
+    score = np.zeros((cells.max() + 1, 4))
+    np.add.at(score, cells, np.einsum("nci,n,nc->ni", A, weight, r))
+    used, groups = int((weight > 0).sum()), np.unique(cells[weight > 0]).size
+    covariance = inverse @ (score.T @ score) @ inverse * groups / max(groups - 2, 1)
+    covariance += _LOCKED_PX**2 * np.eye(4)
+    whole = covariance / np.outer(scale, scale)
+    return SceneMovement(x / scale, whole, _LOCKED_PX / scale, used, len(points))
+
+
+def _consensus(A: Array, left: Array, rng: np.random.Generator) -> Array | None:
+    """The movement that most features follow, of two features drawn at a time."""
+    best, most = np.zeros(4), 0
+    for _ in range(_DRAWS if len(left) >= _FEWEST else 0):
+        pair = rng.choice(len(left), 2, replace=False)
+        M = A[pair].reshape(4, 4)
+        # two features hardly tell the scale: a little weight on none
+        x = np.linalg.solve(M.T @ M + 1e-6 * np.eye(4), M.T @ left[pair].ravel())
+        count = int((np.abs(left - A @ x).max(axis=1) < _NEAR_PX).sum())
+        if count > most:
+            best, most = np.asarray(x, dtype=float), count
+    return best if most >= _FEWEST else None
+
+
+@dataclass(frozen=True, eq=False)
+class SceneCourse(Result):
+    """What a series of frames shows beside a thermal model's prediction.
+
+    names (E); times (E,) s UTC; temperatures (E,) °C; values (E, 4) and sd (E, 4) as of
+    `SceneMovement`, NaN where a frame shows nothing; features (E,); locked (4,); pitch_rad: of a
+    pixel.
+    """
+
+    camera: str
+    names: tuple[str, ...]
+    times: Array
+    temperatures: Array
+    values: Array
+    sd: Array
+    features: NDArray[np.int64]
+    reasons: tuple[str, ...]
+    locked: Array
+    pitch_rad: float
+
+    @cached_property
+    def seen(self) -> NDArray[np.bool_]:
+        """(E,): frames with a common movement."""
+        return np.isfinite(self.values[:, 0])
+
+    @cached_property
+    def per_kelvin(self) -> tuple[Array, Array]:
+        """Slopes (4,) of `values` against the temperature, and their standard deviations.
+
+        Those are of the larger of stated and found scatter; NaN where the temperature did not
+        change.
+        """
+        T = self.temperatures[self.seen]
+        slopes, sds = np.full(4, np.nan), np.full(4, np.nan)
+        if len(T) < 4 or np.ptp(T) < 1.0:
+            return slopes, sds
+        for k in range(4):
+            y, s = self.values[self.seen, k], self.sd[self.seen, k]
+            A = np.column_stack([np.ones(len(T)), T - T.mean()]) / s[:, None]
+            inverse = np.linalg.inv(A.T @ A)
+            x = inverse @ A.T @ (y / s)
+            scatter = float(np.sum((y / s - A @ x) ** 2) / (len(T) - 2))
+            ends = 2.0 * self.locked[k] / np.ptp(T)
+            slopes[k], sds[k] = x[1], np.hypot(np.sqrt(inverse[1, 1] * max(1.0, scatter)), ends)
+        return slopes, sds
+
+    @property
+    def model_misses(self) -> bool:
+        """Whether the principal distance changes with the temperature beside the prediction."""
+        slope, sd = (v[3] for v in self.per_kelvin)
+        return bool(abs(slope) > _WORD_SIGMAS * sd)
+
+    def as_dict(self) -> dict[str, Any]:
+        slopes, sds = self.per_kelvin
+        keys = ("turn_x", "turn_y", "turn_z", "c")
+        frames = [
+            {
+                "frame": name, "time": time, "temperature": T, "features": int(count),
+                "reason": why, **dict(zip(keys, v, strict=True)),
+                **{f"sd_{k}": s for k, s in zip(keys, sd, strict=True)},
+            }
+            for name, time, T, count, why, v, sd in zip(
+                self.names, self.times.tolist(), self.temperatures.tolist(), self.features,
+                self.reasons, self.values.tolist(), self.sd.tolist(), strict=True,
+            )
+        ]  # fmt: skip
+        return {
+            "format": "thermocald-scene/1", "camera": self.camera, "frames": frames,
+            "per_kelvin": dict(zip(keys, slopes.tolist(), strict=True)),
+            "sd_per_kelvin": dict(zip(keys, sds.tolist(), strict=True)),
+            "model_misses_an_effect": self.model_misses,
+        }  # fmt: skip
+
+    def lines(self) -> list[str]:
+        out = [f"{int(self.seen.sum())} of {len(self.names)} frames follow the reference frame"]
+        slopes, sds = self.per_kelvin
+        if np.isfinite(slopes).all():
+            out.append(
+                "principal distance beside the model: "
+                f"{with_sd(1e3 * slopes[3], 1e3 * sds[3], 'µm')} per kelvin"
+                + (": the model misses an effect" if self.model_misses else ", as it should be")
+            )
+            px = [with_sd(slopes[k] / self.pitch_rad, sds[k] / self.pitch_rad) for k in (0, 1)]
+            out.append(
+                f"turn of the mount, or principal point, which one place cannot tell: {px[0]} px "
+                f"per kelvin about x, {px[1]} about y"
+            )
+        else:
+            out.append("the temperature hardly changed: the model cannot be checked")
+        reasons = [why for why in self.reasons if why]
+        out += [f"{reasons.count(why)} × {why}" for why in sorted(set(reasons))]
+        return out
+
+    def plot(self) -> Figure:
+        figure, axes = new_figure(2)
+        hours = (self.times - self.times[0]) / 3600
+        for k, label in enumerate(("about x", "about y", "about z")):
+            y = np.degrees(self.values[:, k])
+            axes[0, 0].errorbar(hours, y, np.degrees(self.sd[:, k]), fmt=".", label=label)
+        axes[0, 0].set_ylabel("turn in °")
+        axes[0, 0].legend()
+        axes[1, 0].errorbar(hours, 1e3 * self.values[:, 3], 1e3 * self.sd[:, 3], fmt=".")
+        axes[1, 0].set(ylabel="c beside the model in µm", xlabel="hours")
+        return figure
+
+
+def follow_scene(
+    thermal: ThermalCamera,
+    log: TemperatureLog,
+    frames: Sequence[tuple[Path, float]],
+    extrapolate: bool = False,
+    advance: Callable[[int], None] = lambda _: None,
+) -> SceneCourse:
+    """Follow the scene of frames (file, s UTC), the first of which is the reference.
+
+    Raises DataError where there is no temperature, or nothing to follow.
+    """
+    if len(frames) < 2:
+        raise DataError("a scene needs a reference frame and at least one more")
+    frames = sorted(frames, key=lambda frame: frame[1])
+    times = np.array([time for _, time in frames])
+    require_inside(log, times)
+    reference = decode_grey(frames[0][0])
+    thermal = thermal.for_images(reference.shape[1], reference.shape[0])
+    along = thermal.along(log.times, dict(log.channels), times, extrapolate)
+    tracker = SceneTracker(reference)
+    E = len(frames)
+    values, sd = np.full((E, 4), np.nan), np.full((E, 4), np.nan)
+    locked = np.zeros(4)
+    features, reasons = np.zeros(E, dtype=np.int64), [""] * E
+    for k, (path, _) in enumerate(frames):
+        if k == 0:
+            reasons[k] = "the reference frame"
+            continue
+        try:
+            image = decode_grey(path)
+            status = inspect_frame(image, (reference.shape[1], reference.shape[0]))
+            found = None
+            reasons[k] = status.reason
+            if status.ok:
+                rows, moved = tracker.follow(image)
+                found = common_movement(
+                    along[0], along[k], tracker.points[rows].astype(float), moved, k
+                )
+                reasons[k] = "" if found else "too few features have a common movement"
+        except ImageError as error:
+            reasons[k] = str(error)
+            found = None
+        if found is not None:
+            values[k], sd[k] = found.values, np.sqrt(np.diag(found.covariance))
+            features[k], locked = found.features, found.locked
+        advance(1)
+    interior = InteriorOrientation.from_array(along.values[0])
+    return SceneCourse(
+        thermal.model.camera, tuple(path.name for path, _ in frames), times, along.temperatures,
+        values, sd, features, tuple(reasons), locked, thermal.model.sensor.pixel_pitch / interior.c,
+    )  # fmt: skip
+
+
+def _eight_bit(image: NDArray[Any]) -> NDArray[np.uint8]:
+    return image if image.dtype == np.uint8 else (image >> 8).astype(np.uint8)

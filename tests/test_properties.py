@@ -95,7 +95,8 @@ def test_any_value_anywhere_in_a_configuration(amount):
             one_line(error)
             return
         again = config.model_dump(mode="json", by_alias=True)
-        assert parse_config(again, SHIPPED, option_names=option_names) == config
+        # as text: a driver's option may be NaN, which the driver refuses
+        assert repr(parse_config(again, SHIPPED, option_names=option_names)) == repr(config)
         for number in numbers(config):
             assert math.isfinite(number)
 

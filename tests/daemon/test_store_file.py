@@ -8,6 +8,7 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,7 +33,14 @@ def path(tmp_path):
 
 @pytest.fixture
 def guard(path):
-    guard = StoreGuard(path, durable=False)
+    guard = keeping(path)
+    yield guard
+    guard.close()
+
+
+def keeping(path, durable=False) -> StoreGuard:
+    """A guard with epochs 1, 2, 3, and a `keep` that notes what it told of each."""
+    guard = StoreGuard(path, durable=durable)
     head = Head("a", "M1", 10.0, CameraSpec("rpi", Sensor(640, 480, 0.001)), {"t": Channel()})
     field = TestField.build(["a"], np.zeros((1, 3)))
     series = guard.store.create_series(head, field, start="cold")
@@ -48,8 +56,7 @@ def guard(path):
     guard.keep = keep
     for number in (1, 2, 3):
         keep(number)
-    yield guard
-    guard.close()
+    return guard
 
 
 def numbers(path) -> list[int]:
@@ -284,3 +291,61 @@ def test_the_running_daemon_says_so_and_loses_nothing(daemon, devices):
     numbers, _ = daemon.stored()
     assert stored <= set(numbers)
     assert numbers == list(range(1, len(numbers) + 1))
+
+
+@pytest.fixture
+def ext4(tmp_path):
+    """A disk of 16 MB with a file system that goes read-only at its first error, as SD cards do:
+    its folder, how to break it, and how to mend it.
+    """
+    image, folder = tmp_path / "disk.img", tmp_path / "card"
+    folder.mkdir()
+    image.write_bytes(bytes(16_000_000))
+
+    def tool(*command: object) -> subprocess.CompletedProcess[str]:
+        words = [str(word) for word in command]
+        return subprocess.run(words, capture_output=True, text=True, check=False)
+
+    mount = ("mount", "-o", "loop,errors=remount-ro", image, folder)
+    if os.geteuid() or not all(map(shutil.which, ("mkfs.ext4", "mount", "e2fsck"))):
+        pytest.skip("needs root, mount and mkfs.ext4")
+    if tool("mkfs.ext4", "-q", image).returncode or tool(*mount).returncode:
+        pytest.skip("no file system can be mounted from a file here")
+    device = Path(tool("findmnt", "-no", "SOURCE", folder).stdout.strip()).name
+    trigger = Path(f"/sys/fs/ext4/{device}/trigger_fs_error")
+
+    def broken() -> None:
+        trigger.write_text("test")
+
+    def mended() -> None:
+        # what is still open keeps the broken one alive: its image is checked and mounted elsewhere
+        tool("umount", "-l", folder)
+        shutil.copy(image, other := image.with_name("checked.img"))
+        tool("e2fsck", "-fy", other)
+        assert tool(*mount[:-2], other, folder).returncode == 0
+
+    if not trigger.exists():
+        tool("umount", "-l", folder)
+        pytest.skip("this kernel cannot be asked for an error of a file system")
+    yield folder, broken, mended
+    while tool("umount", "-l", folder).returncode == 0:
+        pass
+
+
+def test_a_disk_that_becomes_read_only_while_the_daemon_writes(ext4):
+    folder, broken, mended = ext4
+    path = folder / "kept.db"
+    guard = keeping(path, durable=True)
+    broken()
+    for number in (4, 5, 6):
+        guard.keep(number)
+    assert guard.status()["state"] == "out"
+    assert [guard.told[number] for number in (4, 5, 6)] == [False] * 3
+    assert (guard.waiting, guard.lost) == (3, 0)
+    assert numbers(path) == [1, 2, 3]
+    mended()
+    guard.keep(7)
+    assert guard.status()["state"] == "results_only"  # a card of 16 MB has no room for more
+    assert (guard.waiting, guard.lost) == (0, 0)
+    guard.close()
+    assert numbers(path) == [1, 2, 3, 4, 5, 6, 7]

@@ -362,3 +362,24 @@ def test_a_name_that_cannot_be_given_is_refused(tmp_path, name, words):
     path.write_text(TWO, encoding="utf-8")
     with pytest.raises((UsageError, DataError), match=words):
         read_log(path, log_options(timezone="Europe/Berlin", name=[name]))
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        "Logger,7\nFirmware,2\nDate Time,Temp (°F)",
+        "Logger 7,\nDate Time,Temp\n,°F",
+        "Date Time,Temperature, F",
+        "Date Time,Temperature,°F",
+        "Station,Turm\nDate Time,Temperature, F",
+    ],
+)
+def test_the_unit_is_found_in_any_head(tmp_path, head):
+    """A head that is not found is °F read as °C."""
+    path = tmp_path / "log.csv"
+    rows = "".join(f"2026-06-14 12:0{i}:00,{70 + i}.25\n" for i in range(6))
+    path.write_text(f"{head}\n{rows}", encoding="utf-8")
+    (values,) = read_log(
+        path, LogOptions(clock=DeviceClock(zone=time_zone("UTC")))
+    ).channels.values()
+    assert values == pytest.approx((np.arange(70.25, 76) - 32) / 1.8)

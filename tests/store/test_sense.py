@@ -117,8 +117,8 @@ NUMBERS = {
         ("x", "1e308"), ("y", "-1e308"), ("x", "1e7"), ("sx", "1e-300"), ("sy", "1e300"),
         ("sx", "5e-324"), ("sy", "1e-9"), ("sx", "1e5"),
     ],
-    "testfield.csv": [("sX", "1e-300"), ("sZ", "5e-324"), ("X", "1e308"), ("diameter", "1e300"),
-                      ("sY", "1e300")],
+    "testfield.csv": [("sX", "1e-300"), ("sX", "2e7"), ("sZ", "5e-324"), ("X", "1e308"),
+                      ("diameter", "1e300"), ("sY", "1e300")],
     "epochs.csv": [("frame_time", "1e300"), ("temperature", "1e300"), ("frame_time", "1.6e12"),
                    ("temperature_time", "1.6e15"), ("frame_time", "1e11")],
 }  # fmt: skip

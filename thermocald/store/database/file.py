@@ -126,15 +126,24 @@ class StoreFile:
 
 
 def written_elsewhere(path: Path) -> bool:
-    """Whether a file with several names is being written under another of them.
+    """Whether a file with several names is being written under another of them, or was and its
+    writer was killed.
 
-    Then what was committed last is in a -wal file that cannot be found from this name. Nothing is
-    opened here: SQLite's locks of this process would end with it.
+    Then what was committed last is in a -wal file that cannot be found from this name, but where
+    the other name is in the same folder. Nothing is opened here: SQLite's locks of this process
+    would end with it.
     """
     found = path.stat()
     wal = path.resolve().with_name(f"{path.resolve().name}-wal")
     if found.st_nlink < 2 or wal.exists():
         return False
+    here = (found.st_dev, found.st_ino)
+    for left in wal.parent.glob("*-wal"):
+        if (
+            _identity(left.with_name(left.name.removesuffix("-wal"))) == here
+            and left.stat().st_size
+        ):
+            return True
     try:
         locks = Path("/proc/locks").read_text(encoding="ascii")
     except OSError:
@@ -214,7 +223,7 @@ def connect(path: Path, mode: Mode, *, durable: bool) -> sqlite3.Connection:
         raise StoreError(f"{path}: there is no such store")
     if mode == "read" and written_elsewhere(path):
         raise StoreError(
-            f"{path}: is being written under another of its names (hard links), and lacks what "
+            f"{path}: is or was written under another of its names (hard links), and lacks what "
             "was written last; read it under that name"
         )
     with in_words(path, "the store cannot be opened", reading=True):

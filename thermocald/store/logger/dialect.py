@@ -37,6 +37,7 @@ _CONSISTENT = 0.8
 _PREAMBLE = 12
 _COMMA_NUMBER = re.compile(r"[+-]?\d+,\d+\s*[^\d\s.,:]{0,4}")
 _POINT_NUMBER = re.compile(r"[+-]?\d+\.\d+\s*[^\d\s.,:]{0,4}")
+_BARE_UNIT = re.compile(r"[°º]?\s*[CFK]|℃|℉|deg\s?[CFK]|%", re.IGNORECASE)
 _READING = re.compile(
     r"(?:[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?\s*(?:[°º]?\s*[CFK]|℃|℉|deg\s?[CF]|%)?)?"
     r"|unavailable|unknown|none|null|n/?an?|-+|err(?:or)?",
@@ -225,12 +226,14 @@ def _names(above: list[list[str]], width: int) -> tuple[str, ...]:
     it, one that is wider (a serial number stands in the first row alone) or one field narrower (the
     rows end with a separator).
     """
-    wide = [row for row in above if len(row) > width][-1:]
+    wide = [_with_units(row, width) for row in above if len(row) > width][-1:]
     narrow = [row for row in above if len(row) == width - 1 and width > 2][-1:]
     rows = [row for row in above if len(row) == width]
     # a logger's serial number may stand above in as many fields
-    named = next((i for i, row in enumerate(rows) if any(map(TIME_NAME.search, row))), 0)
-    header = rows[named : named + 2] or wide or narrow
+    named = next((i for i, row in enumerate(rows) if any(map(TIME_NAME.search, row))), None)
+    if named is None and any(TIME_NAME.search(name) for row in wide for name in row):
+        rows = wide
+    header = rows[named or 0 :][:2] or wide or narrow
     names: list[str] = []
     for i in range(max(width, *(len(row) for row in header)) if header else width):
         parts = [row[i] for row in header if i < len(row) and row[i]]
@@ -239,6 +242,17 @@ def _names(above: list[list[str]], width: int) -> tuple[str, ...]:
             name += "'"
         names.append(name)
     return tuple(names)
+
+
+def _with_units(row: list[str], width: int) -> list[str]:
+    """A head of more fields than the data has: `Temperature, F` without quotes is one of them."""
+    joined: list[str] = []
+    for i, name in enumerate(row):
+        if joined and len(joined) + len(row) - i > width and _BARE_UNIT.fullmatch(name):
+            joined[-1] += f", {name}"
+        else:
+            joined.append(name)
+    return joined
 
 
 def _decimal(rows: tuple[tuple[str, ...], ...], separator: str) -> str:

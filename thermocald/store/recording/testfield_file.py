@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _MOST_TARGETS = 4000
 _LARGEST_MM = 1e9  # a thousand kilometres
-_SMALLEST_SIGMA_MM = 1e-9
+_SIGMAS_MM = (1e-9, 1e5)
 _REQUIRED = ("target", "X", "Y", "Z", "diameter", "sX", "sY", "sZ")
 
 # No camera of ours can look at a field smaller than this; one in metres is (a room: 6 "mm").
@@ -72,8 +72,8 @@ def _read(table: Table, *, may_be_empty: bool = False) -> TestField:
                 chunk.check(column, numbers <= 0, "a diameter must be above 0 mm, or left empty")
             if column.startswith("s"):
                 chunk.check(column, numbers < 0, "a standard deviation must not be negative")
-                tiny = (numbers > 0) & (numbers < _SMALLEST_SIGMA_MM)
-                chunk.check(column, tiny, "is no standard deviation; 0 holds a coordinate fixed")
+                odd = (numbers > 0) & ((numbers < _SIGMAS_MM[0]) | (numbers > _SIGMAS_MM[1]))
+                chunk.check(column, odd, "is no standard deviation; 0 holds a coordinate fixed")
             values.extend(numbers.tolist())
         empty = ("",) * len(chunk)
         for row, text in enumerate(chunk.text("kind") if "kind" in table.columns else empty):

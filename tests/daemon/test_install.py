@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import site
 import subprocess
 import sys
 import venv
@@ -34,7 +33,9 @@ def installed(tmp_path_factory) -> Path:
     subprocess.run([python, "-m", "pip", "install", "--quiet", "--no-deps", wheel], check=True)
     (packages,) = (folder / "venv/lib").glob("python*/site-packages")
     # a plain path, so that the editable install of the checkout there is not followed
-    (packages / "dependencies.pth").write_text("\n".join(site.getsitepackages()) + "\n")
+    (packages / "dependencies.pth").write_text(
+        "\n".join(path for path in sys.path if path.endswith("-packages")) + "\n"
+    )
     return folder / "venv/bin/thermocald"
 
 

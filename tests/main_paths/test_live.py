@@ -63,7 +63,7 @@ def agree(live: list[dict[str, str]], replayed: list[dict[str, str]]) -> None:
     seen = column(b, "n_observations").sum()
     assert rejected <= 1.2 * expected + 10 + 0.002 * seen, (rejected, expected)
     ratio = np.median(column(a, "sigma0")) / np.median(column(b, "sigma0"))
-    assert 0.8 <= ratio <= 1.25, f"sigma0 {ratio:.3f} of replay's"
+    assert 0.93 <= ratio <= 1.07, f"sigma0 {ratio:.3f} of replay's"
     assert column(a, "sigma0").max() < 3 * np.median(column(a, "sigma0"))
     for name in MAIN:  # the series' result, which stands next to the epoch's own
         difference = float(a[-1][f"series_{name}"]) - float(b[-1][name])
@@ -78,11 +78,12 @@ def test_real_cameras(shared, program, tmp_path, camera):
     live, replayed, said = live_and_replayed(program, shared / "data" / camera, tmp_path)
     agree(live, replayed)
     assert len(good(live)) == len(good(replayed)) >= 100
-    assert said.count("was moved") <= 1
+    assert "was moved" not in said
     for name in MAIN:
-        ratio = column(good(live), name).std(ddof=1) / np.median(column(good(live), f"sd_{name}"))
-        # the aim is 0.9 to 1.1; replay's own rows have 0.95 to 1.00 here
-        assert 0.7 <= ratio <= 1.4, f"scatter of {name} is {ratio:.2f} of its sd"
+        values, sds = column(good(live), name), column(good(live), f"sd_{name}")
+        ratio = ((values - values.mean()) / sds).std(ddof=1)
+        # 0.9 to 1.1 but for cam1: eight of its targets wander, which the first rows could not know
+        assert 0.8 <= ratio <= (1.4 if camera == "aviary-cam1" else 1.2), f"{name}: {ratio:.2f} sd"
 
 
 KINDS = [k if k == "surveyed" else pytest.param(k, marks=pytest.mark.slow) for k in crooked.KINDS]

@@ -179,10 +179,10 @@ class SeriesRun:
         return self.pipeline.stop(max(0.1, deadline - time.monotonic()))
 
     def _observe(self, calibrated: CalibratedEpoch, in_order: bool) -> CalibratedEpoch:
-        """Test the epoch against those before, then adjust it with what all of them tell."""
+        """Adjust the epoch with what its series tells, then test it against those before."""
         seen = calibrated.epoch.observations
-        extra = self.observer.observe(calibrated) if self.observer and in_order else {}
         adjusted = calibrated.adjustment
+        columns: dict[str, float] = {}
         if self.running is not None and seen is not None:
             if in_order and self.first > 1 and not self.running.epochs:
                 self._remember()
@@ -195,11 +195,13 @@ class SeriesRun:
                 # what breaks in the series must not cost an epoch that has a result of its own
                 log.exception("camera %s: the series was not adjusted", self.plan.name)
                 self.running.reset()
-                columns = {"series_restarted": 1.0}
-            extra |= columns
+                adjusted, columns = calibrated.adjustment, {"series_restarted": 1.0}
             if "series_restarted" in columns:
                 self._tell_restart(calibrated)
-        return replace(calibrated, adjustment=adjusted, extra={**calibrated.extra, **extra})
+        if self.observer is not None and in_order:
+            tremble = None if self.running is None else self.running.tremble
+            columns |= self.observer.observe(calibrated, adjusted, tremble)
+        return replace(calibrated, adjustment=adjusted, extra={**calibrated.extra, **columns})
 
     def _tell_restart(self, calibrated: CalibratedEpoch) -> None:
         epoch = calibrated.epoch

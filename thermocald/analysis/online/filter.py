@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from thermocald.analysis.online.field_errors import EpochErrors
-from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
+from thermocald.photogrammetry.camera.camera_model import EOP, PARAMETER_NAMES
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -113,12 +113,14 @@ class OnlineFilter:
         self._readings, self._warmed = 0, False
 
     def update(
-        self, adjustment: Adjustment, temperature: float, errors: EpochErrors | None = None
-    ) -> Innovation | None:
+        self, adjustment: Adjustment, temperature: float, errors: EpochErrors | None = None,
+        tremble: Array | None = None,
+    ) -> Innovation | None:  # fmt: skip
         """Take an epoch in; None if it has no result.
 
         temperature: °C at the frame, NaN where it is not known: the last one then still holds;
-        errors: the epoch's covariance split into noise and common errors, by default all is noise.
+        errors: the epoch's covariance split into noise and common errors, by default all is noise;
+        tremble (6, 6): covariance of the mount's movements about its mean, of the epochs so far.
         """
         if not adjustment.ok:
             return None
@@ -127,14 +129,18 @@ class OnlineFilter:
         variance = np.diag(adjustment.covariance)
         free = np.flatnonzero(variance > 0)
         if not self.epochs or not np.array_equal(free, self._free):
-            self._start(adjustment, errors, free, temperature)
+            self._start(adjustment, errors, free, temperature, tremble)
             return Innovation(0.0, 0.0, len(free), "")
         before = self._rise
         if not np.isnan(temperature):
             self._read(temperature)
         unknown = self.settings.unknown_step if np.isnan(self.T0) else 0.0
         self._predict(np.hypot(self._rise - before, unknown))
-        return self._take_in(adjustment, errors)
+        innovation = self._take_in(adjustment, errors)
+        if not self._surprised and tremble is not None:
+            # a knock is not judged by a movement that it is part of
+            self._tremble = tremble
+        return innovation
 
     @property
     def rates(self) -> Array:
@@ -191,8 +197,10 @@ class OnlineFilter:
         errors: EpochErrors,
         free: NDArray[np.int64],
         temperature: float,
+        tremble: Array | None,
     ) -> None:
         self._free = free
+        self._tremble = np.zeros((6, 6)) if tremble is None else tremble
         self._held = adjustment.values.copy()
         sd = np.sqrt(np.diag(adjustment.covariance))[free]
         rate_scale = np.full(3, self.sensor.pixel_pitch)
@@ -219,7 +227,9 @@ class OnlineFilter:
     def _scaled(self, errors: EpochErrors) -> tuple[Array, Array]:
         """Noise (n, n) and influence (n, m) of the scaled free parameters."""
         s = self._scale[: len(self._free)]
-        noise: Array = errors.noise[np.ix_(self._free, self._free)] / np.outer(s, s)
+        moves = np.zeros((16, 16))
+        moves[EOP, EOP] = self._tremble
+        noise: Array = (errors.noise + moves)[np.ix_(self._free, self._free)] / np.outer(s, s)
         influence: Array = errors.influence[self._free] / s[:, None]
         return noise, influence
 

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from thermocald.acquisition.calibrator import CalibratedEpoch
     from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
+    from thermocald.photogrammetry.epoch.adjustment import Adjustment
     from thermocald.photogrammetry.field.testfield import TestField
 
 __all__ = ["OnlineObserver", "given_exterior"]
@@ -73,14 +74,22 @@ class OnlineObserver:
         self._reported: set[int] = set()
         self._equilibrium = Equilibrium("unknown", float("nan"), float("nan"))
 
-    def observe(self, calibrated: CalibratedEpoch) -> dict[str, float]:
-        """Take an epoch in; returns columns for the store."""
-        epoch, adjustment = calibrated.epoch, calibrated.adjustment
+    def observe(
+        self, calibrated: CalibratedEpoch, adjusted: Adjustment | None = None,
+        tremble: Array | None = None,
+    ) -> dict[str, float]:  # fmt: skip
+        """Take an epoch in; returns columns for the store.
+
+        adjusted: its result given its series, by default that of the epoch by itself; tremble
+        (6, 6): covariance of the mount's movements about its mean, as the epochs up to this one
+        show it.
+        """
+        epoch, adjustment = calibrated.epoch, adjusted or calibrated.adjustment
         temperature = next(iter(epoch.temperatures.values()), math.nan)
         if not adjustment.ok or epoch.observations is None:
             return {}
         errors = self._errors.split(adjustment, epoch.observations)
-        innovation = self.filter.update(adjustment, temperature, errors)
+        innovation = self.filter.update(adjustment, temperature, errors, tremble)
         if innovation is None:
             return {}
         self._watch_targets(calibrated)

@@ -55,6 +55,8 @@ _OFTEN, _SELDOM = 0.1, 0.5  # shares of new epochs after which that is done othe
 _SOON = 0.05  # share for the series, whose own level moves with it, where there is time
 _MOST_TARGETS = 400  # seen in a series: the normal matrix of their offsets is a full one
 _TURNED_PX, _STAYS = 30.0, 2  # beyond one linearisation, and for so many epochs in a row
+_USUAL_TREMBLE_PX = 0.08  # the most that mounts of the real cameras do that were looked at
+_LEFT = 0.1  # of the error probability of the series' test of a point, for a second one
 _DOUBTED = 5  # epochs in a row that carry a result of their own and have none in the series
 
 _ESTIMATED = PARAMETER_NAMES[PRINCIPAL]
@@ -208,6 +210,21 @@ class RunningSeries:
         self._doubts = self._away = 0
 
     @property
+    def tremble(self) -> Array:
+        """Covariance (6, 6) of the exterior orientation by which the mount moves about its mean.
+
+        As long as the epochs do not show it, what mounts of cameras usually do.
+        """
+        s = None if self._series is None else self._series.sample
+        if s is not None and s.exterior != "per_epoch":
+            return s.movement.covariance
+        covariance = np.zeros((6, 6))
+        if self._kept:
+            angle = _USUAL_TREMBLE_PX * self._sensor.pixel_pitch / self._kept[-1].alone[0]
+            covariance[:3, :3] = angle**2 * np.eye(3)
+        return covariance
+
+    @property
     def any(self) -> bool:
         """Whether there is something that epochs share, and something of their own beside it."""
         s = self._asked
@@ -242,7 +259,7 @@ class RunningSeries:
         self._keep(calibrated, seen)
         own, whole = self._adjusted()
         columns |= self._columns(whole)
-        if self._doubted(own, whole):
+        if not weak and self._doubted(own, whole):  # what is weak contradicts nothing
             columns["series_restarted"] = 1.0
         values = None if own is None else own.values - self._level
         if own is None or own.status != "ok" or values is None:
@@ -289,9 +306,10 @@ class RunningSeries:
             still = "the camera stands still" if asked == "auto" else "as configured"
             said = f"{still}: one orientation for {n} epochs"
         elif asked == "auto":
+            good = int(series.found.estimate.system.good.sum())
             said = (
-                f"each epoch has its own orientation: {n} of the {FEWEST_EPOCHS} epochs that show "
-                "whether the camera stands still"
+                f"each epoch has its own orientation: {good} of the {FEWEST_EPOCHS} good epochs "
+                "that show whether the camera stands still"
             )
         else:
             said = "each epoch has its own orientation, as configured"
@@ -359,16 +377,45 @@ class RunningSeries:
         in the series.
         """
         newest, n, T = self._kept[-1], len(self._kept), len(self._field)
-        more = self._series is None or self._shows_more(newest.grid)
-        rows: list[int | None] = [None, None]
-        if more or self.epochs >= self._look_at[1]:
-            rows[1] = self._look()
-        if self._offsets and (more or self.epochs >= self._look_at[0]):
-            rows[0] = self._look_at_each()
-        return tuple(
-            None if t is None else t.further(newest.grid, n) if row is None else t.epoch(row, T)
-            for t, row in zip((self._each, self._series), rows, strict=True)
-        )  # type: ignore[return-value]
+        known = self._series is not None and not self._shows_more(newest.grid)
+        if self._series is not None and known and self.epochs < self._look_at[1]:
+            whole = self._series.further(newest.grid, n)
+            if whole.status == "ok":
+                return self._further(newest.grid, whole), whole
+        row = self._look()
+        assert self._series is not None
+        whole = self._series.epoch(row, T)
+        if not self._offsets:
+            return None, whole
+        if self._each is not None and self.epochs < self._look_at[0] and whole.status == "ok":
+            return self._further(newest.grid, whole), whole
+        self._each = self._look_at_each()
+        own = self._each.epoch(row, T)
+        return replace(own, rejected=own.rejected | self._gross()[row]), whole
+
+    def _further(self, grid: ObservationGrid, whole: _Epoch) -> _Epoch | None:
+        """The own result of an epoch that its series does not contradict."""
+        if self._each is None:
+            return None
+        gross = whole.rejected & self._binds
+        own = self._each.further(grid.reject(gross[None]), len(self._kept))
+        return replace(own, rejected=own.rejected | gross)
+
+    def _gross(self) -> Mask:
+        """Image points (E, T) of the kept epochs that their series contradicts.
+
+        One orientation for all of them, or a mount that moves by little, shows errors that an epoch
+        with an orientation of its own takes up.
+        """
+        assert self._series is not None
+        s = self._series.sample
+        rejected = s.spread(self._series.seen, len(self._field)).rejected
+        return rejected & s.ok[:, None] & self._binds
+
+    @property
+    def _binds(self) -> bool:
+        """Whether the series has one orientation, or one and small movements about it."""
+        return self._series is not None and self._series.sample.exterior != "per_epoch"
 
     def _shows_more(self, grid: ObservationGrid) -> bool:
         """Whether an epoch shows targets that none of those adjusted together did."""
@@ -414,10 +461,10 @@ class RunningSeries:
             self._series = self._together(still, start, s, moved)
         return row
 
-    def _look_at_each(self) -> int:
-        """Adjust the kept epochs with an orientation of their own; the row of the newest."""
+    def _look_at_each(self) -> _Together:
+        """Adjust the kept epochs with an orientation of their own."""
         assert self._series is not None
-        kept, grid, start, row = self._laid_out()
+        kept, grid, start, _ = self._laid_out()
         moved = self._series.moved
         still = [
             _still(ObservationGrid(grid.points[k : k + 1], grid.weights[k : k + 1]), moved, k)
@@ -425,12 +472,15 @@ class RunningSeries:
         ]
         grid = ObservationGrid(
             np.concatenate([g.points for g in still]), np.concatenate([g.weights for g in still])
-        )
+        ).reject(self._gross())
         s = replace(self._own, drift_period=self._period)
-        self._each = each = self._together(grid, start, s, moved)
+        if self._binds:
+            # the series has tested every point: only what is far off is left to a second test
+            s = replace(s, snooping_alpha=_LEFT * s.snooping_alpha)
+        each = self._together(grid, start, s, moved)
         self._level = self._moved_level(kept, each.sample)
         self._look_at[0] = self._again(_OFTEN)
-        return row
+        return each
 
     def _together(
         self, grid: ObservationGrid, start: Array, s: SeriesSettings,

@@ -189,10 +189,16 @@ def result(found: Adjusted) -> SeriesAdjustment:
     return SeriesAdjustment(
         s, values, relative, level, sigma0, redundancy, use, observed & ~use,
         estimate.residuals, estimate.offsets if series.has_offsets else estimate.offsets * np.nan,
-        np.sqrt(offset_cofactors(system) * pooled), tuple(status), tuple(reasons), still,
+        _sds(offset_cofactors(system) * pooled), tuple(status), tuple(reasons), still,
         np.sqrt(excess), np.sqrt(np.diag(trend + mount_trend)),
         _noise_ratio(sigma0, sound), movement, found.choice,
     )  # fmt: skip
+
+
+def _sds(variances: Array) -> Array:
+    """Standard deviations; NaN where rounding has left nothing of a variance."""
+    known = variances >= 0
+    return np.where(known, np.sqrt(np.where(known, variances, 0.0)), np.nan)
 
 
 def _excess(series: SeriesEstimator, values: Array, variances: Array, sound: Mask) -> Array:

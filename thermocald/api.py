@@ -149,7 +149,7 @@ def calibrate(
         images_of,
         unknown_camera,
     )
-    from thermocald.photogrammetry.camera_files.camera_file import read_camera
+    from thermocald.photogrammetry.camera_files import read_camera
     from thermocald.results import Calibration
 
     paths = images_of(_paths(images))

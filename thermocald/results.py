@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from thermocald.analysis.camera.photographs import Photographs
     from thermocald.analysis.study.reference import Comparison
     from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation
-    from thermocald.photogrammetry.camera_files.camera_file import CameraFile
+    from thermocald.photogrammetry.camera_files import CameraFile
     from thermocald.physics.model import ThermalModel
 
 _Kind = TypeVar("_Kind")
@@ -230,7 +230,7 @@ class Calibration(Result):
 
         Raises DataError where nothing was estimated.
         """
-        from thermocald.photogrammetry.camera_files.camera_file import write_camera
+        from thermocald.photogrammetry.camera_files import write_camera
 
         if self.photographs.interior is None or not self.photographs.estimated:
             why = self.photographs.reason

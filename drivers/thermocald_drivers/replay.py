@@ -96,7 +96,7 @@ class ReplayCamera(_Replay, Camera):
         monotonic, utc = self._times(epoch.frame_time)
         metadata: dict[str, Any] = {"epoch": epoch.number}
         if epoch.observations is not None and self._recording is not None:
-            from thermocald.photogrammetry.field.planes import observations_to_lists
+            from thermocald.photogrammetry.field.testfield import observations_to_lists
 
             field = self._recording.testfield
             metadata["observations"] = observations_to_lists(epoch.observations, field)

@@ -17,7 +17,7 @@ from thermocald.cli import application
 from thermocald.errors import ThermocaldError
 from thermocald.photogrammetry import camera_files
 from thermocald.photogrammetry.camera.camera_model import CameraModel, ExteriorOrientation, Sensor
-from thermocald.photogrammetry.camera_files.camera_file import read_camera
+from thermocald.photogrammetry.camera_files import read_camera
 from thermocald.physics.device import CameraDevice, Programme, default_heat
 from thermocald.physics.heat import Course
 from thermocald.physics.model import ModelEffect

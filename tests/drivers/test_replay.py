@@ -15,8 +15,11 @@ from thermocald.errors import (
 )
 from thermocald.hal import VirtualClock, open_device
 from thermocald.photogrammetry.camera.camera_model import Sensor
-from thermocald.photogrammetry.field.planes import observations_from_lists
-from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.photogrammetry.field.testfield import (
+    Observations,
+    TestField,
+    observations_from_lists,
+)
 from thermocald.store.recording.head import CameraSpec, Channel, Head
 from thermocald.store.recording.reader import RecordingWriter, read_recording
 

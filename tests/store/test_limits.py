@@ -21,8 +21,8 @@ from thermocald.errors import (
     ThermocaldError,
 )
 from thermocald.files import read_yaml
-from thermocald.photogrammetry.camera_files.camera_file import read_camera
-from thermocald.photogrammetry.camera_files.file_text import number
+from thermocald.photogrammetry.camera_files import read_camera
+from thermocald.photogrammetry.camera_files.camera_record import number
 from thermocald.photogrammetry.targets.image_file import decode_grey, image_size
 from thermocald.store.logger.photographs import read_photograph
 from thermocald.store.recording.reader import read_recording

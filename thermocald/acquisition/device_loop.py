@@ -136,13 +136,12 @@ class Link:
         clock: Clock,
         *,
         period_s: float = 1.0,
-        is_open: bool = False,
         on_event: Callable[[LinkEvent], None] | None = None,
     ) -> None:
         self.kind = kind
         self.name = name
         self.device = device
-        self.state: LinkState = "open" if is_open else "closed"
+        self.state: LinkState = "closed"
         self.why = ""
         self.out_since = 0.0
         self.since = math.nan

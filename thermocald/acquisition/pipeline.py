@@ -23,7 +23,7 @@ from thermocald.acquisition.pairing import PairedReadings
 from thermocald.epoch import Epoch
 from thermocald.errors import DataError
 from thermocald.photogrammetry.epoch.adjustment import failed
-from thermocald.photogrammetry.field.planes import observations_from_lists
+from thermocald.photogrammetry.field.testfield import observations_from_lists
 from thermocald.photogrammetry.targets.image_file import EncodedImage
 
 if TYPE_CHECKING:

@@ -56,8 +56,7 @@ class ClockStep:
 class SteadyClock:
     """A clock for devices and the store; threads may share it.
 
-    synchronised: whether the machine knows the time; confirm_s: for how long a new time must stand
-    before it is followed.
+    synchronised: whether the machine knows the time.
     """
 
     def __init__(
@@ -65,11 +64,9 @@ class SteadyClock:
         machine: Clock | None = None,
         *,
         synchronised: Callable[[], bool] | None = None,
-        confirm_s: float = _CONFIRM_S,
     ) -> None:
         self._machine = machine or SystemClock()
         self._synchronised = synchronised or machine_clock_trusted
-        self._confirm_s = confirm_s
         self._offset = self._machine.utc() - self._machine.monotonic()
         self._seen = self._offset
         self._seen_at = float("-inf")
@@ -107,7 +104,7 @@ class SteadyClock:
             return self._report(ClockStep(self.utc(), step, adopted=False))
         # a clock that shows a time before this program existed has just learned the time, too
         learned |= self.utc() < NOT_BEFORE <= self._machine.utc()
-        if learned or now - self._seen_at >= self._confirm_s:
+        if learned or now - self._seen_at >= _CONFIRM_S:
             self._offset = offset
             return self._report(ClockStep(self.utc(), pending, adopted=True))
         if not stepped:

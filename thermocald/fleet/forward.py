@@ -138,7 +138,6 @@ class FrameSender:
         series: Mapping[int, StoredSeries],
         cursor: Cursor,
         keep: Callable[[], None],
-        stop: Callable[[], bool],
     ) -> int:
         """Send what waits; how many were sent. `keep` writes the cursor.
 
@@ -147,7 +146,7 @@ class FrameSender:
         count = 0
         while frames := store.frames_after(cursor.sent["frame"], _ROWS):
             for frame in frames:
-                if frame.series not in series or stop():
+                if frame.series not in series:
                     keep()
                     return count
                 data = self._read(frame) if self.rule.wants(frame) else None
@@ -258,8 +257,8 @@ class Forwarder:
         self._reported = -_REPORT_S
         self._waiting = 0  # as last reported
 
-    def send_waiting(self, stop: Callable[[], bool] = lambda: False) -> Progress:
-        """Send all that waits, batch by batch, until nothing waits or `stop()`.
+    def send_waiting(self) -> Progress:
+        """Send all that waits, batch by batch, until nothing waits.
 
         What was sent stays sent when it raises. Raises ServerGone (try again), ServerError,
         StoreError.
@@ -270,7 +269,7 @@ class Forwarder:
             count = {**dict.fromkeys(KEPT, 0), "frame": 0}
             if self._waits(store, cursor):
                 with ServerWriter(self.address, self.station, store.identity) as writer:
-                    self._send_all(store, writer, cursor, count, stop)
+                    self._send_all(store, writer, cursor, count)
             return Progress(count, cursor.rows_refused - before)
 
     def _waits(self, store: Store, cursor: Cursor) -> bool:
@@ -285,11 +284,10 @@ class Forwarder:
         writer: ServerWriter,
         cursor: Cursor,
         count: dict[str, int],
-        stop: Callable[[], bool],
     ) -> None:
         series = {one.id: one for one in store.all_series()}
         for table in KEPT:
-            while not stop():
+            while True:
                 if self._report_is_due:  # also while much waits
                     self._report(store, writer, cursor)
                 rows = store.rows_after(table, cursor.sent[table], self.batch)
@@ -305,7 +303,7 @@ class Forwarder:
                 count[table] += len(rows) - len(bad)
         if self._frames is not None:
             keep = partial(cursor.write, self._path)
-            count["frame"] = self._frames.send(store, writer, series, cursor, keep, stop)
+            count["frame"] = self._frames.send(store, writer, series, cursor, keep)
         if self._waiting:
             self._report(store, writer, cursor)
 

@@ -26,6 +26,7 @@ from thermocald.analysis.statistics.dependence import dependence
 from thermocald.analysis.statistics.random_effects import odd_specimens, population
 from thermocald.names import WITH_VALUES
 from thermocald.numbers import short_duration
+from thermocald.photogrammetry.linalg import MAD_TO_SD
 from thermocald.store.server.fleet_reader import FleetReader
 
 if TYPE_CHECKING:
@@ -227,7 +228,7 @@ def _shift(residual: Array) -> tuple[float, float]:
     last = max(3, len(residual) // 10)
     before, after = residual[:-last], residual[-last:]
     size = abs(float(np.median(after) - np.median(before)))
-    scatter = 1.4826 * float(np.median(np.abs(before - np.median(before))))
+    scatter = MAD_TO_SD * float(np.median(np.abs(before - np.median(before))))
     sd = 1.2533 * scatter * math.sqrt(1 / len(before) + 1 / last)
     return size, size / sd if sd > 0 else math.inf if size > 0 else 0.0
 

@@ -70,10 +70,10 @@ def explained(N: Array, b: Array, ridge: float = 0.0) -> Array:
     return total
 
 
-def eliminate(N: Array, b: Array, kept: int, ridge: float = 1e-12) -> tuple[Array, Array]:
+def eliminate(N: Array, b: Array, kept: int) -> tuple[Array, Array]:
     """Reduce normal equations (p, p), (p,) to their first `kept` unknowns."""
     beside = N[:kept, kept:]
-    X = scaled_solve(N[kept:, kept:], np.column_stack([beside.T, b[kept:]]), ridge)
+    X = scaled_solve(N[kept:, kept:], np.column_stack([beside.T, b[kept:]]), 1e-12)
     return N[:kept, :kept] - beside @ X[:, :kept], b[:kept] - beside @ X[:, kept]
 
 

@@ -137,8 +137,7 @@ def targets_in(
     not within some pixels of its place is another one and is left out.
     """
     corners = measure_corners(image, locate_markers(image, field))
-    round_ = np.array([kind == "circle" for kind in field.kinds]) & np.isfinite(field.diameters)
-    rows = np.flatnonzero(round_)
+    rows = np.flatnonzero(field.circles & np.isfinite(field.diameters))
     points = field.points[rows]
     view = exterior.centre - points
     view /= np.linalg.norm(view, axis=1, keepdims=True)
@@ -154,7 +153,7 @@ def targets_in(
         & (np.abs(np.sum(view * n, axis=1)) > _LARGEST_TILT_COSINE)
     )
     rows, maps = rows[seen], maps.select(seen)
-    coded = np.array([ring_code.is_ring(field.codes[row]) for row in rows], dtype=bool)
+    coded = ring_code.have_rings(field, rows)
     fit = fit_circles(image, maps, coded)
     off = np.linalg.norm(fit.points - maps.centre, axis=1)
     return corners.joined(circle_observations(rows, fit, fit.good & (off < _GROSS_PX)))

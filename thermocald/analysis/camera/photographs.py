@@ -11,7 +11,7 @@ import numpy as np
 
 from thermocald.errors import GeometryError, ImageError, UsageError
 from thermocald.photogrammetry.camera.camera_model import Sensor
-from thermocald.photogrammetry.camera_files.camera_file import CameraFile
+from thermocald.photogrammetry.camera_files import CameraFile
 from thermocald.photogrammetry.epoch.adjustment import cold_start, pose_only
 from thermocald.photogrammetry.frame.measurement import Prior, measure
 from thermocald.photogrammetry.network.common_interior import CommonInterior, adjust_common_interior

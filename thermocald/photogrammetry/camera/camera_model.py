@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 IOP_NAMES = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2", "C1", "C2")
 EOP_NAMES = ("omega", "phi", "kappa", "X0", "Y0", "Z0")
 PARAMETER_NAMES = IOP_NAMES + EOP_NAMES
-PARAMETER_COUNT = len(PARAMETER_NAMES)
 
 IOP = slice(0, 10)
 """Interior orientation."""
@@ -47,10 +46,6 @@ PRINCIPAL = slice(0, 3)
 """c, x0, y0: what thermal drift is reported of."""
 PRINCIPAL_POINT = slice(1, 3)
 """x0, y0."""
-ROTATION = slice(10, 13)
-"""omega, phi, kappa."""
-POSITION = slice(13, 16)
-"""X0, Y0, Z0."""
 
 EOP_COLUMNS = np.arange(EOP.start, EOP.stop)
 """The exterior orientation as an index array."""

@@ -1,22 +1,70 @@
-"""What every camera file's module works on: the camera to be written, the camera that was read."""
+"""What every camera file works on: the camera to be written, the camera that was read, our own
+JSON.
+
+Numbers and YAML in the text of a file are read here; what is wrong there is an error that names it.
+"""
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import yaml
 
 from thermocald.errors import ConfigurationError
-from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
+from thermocald.photogrammetry.camera.camera_model import (
+    IOP_NAMES,
+    CameraModel,
+    InteriorOrientation,
+    Sensor,
+)
 from thermocald.photogrammetry.camera.conversions import Family, from_family
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from thermocald.arrays import Array
+
+
+def yaml_document(text: str, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> Any:
+    """What a YAML text holds; ConfigurationError for a text that is not YAML."""
+    try:
+        return yaml.load(text, loader)
+    except (yaml.YAMLError, ValueError) as cause:
+        raise ConfigurationError(f"no valid YAML: {str(cause).splitlines()[0]}") from None
+
+
+def yaml_text(document: dict[str, Any]) -> str:
+    """A document as YAML, one line for each list of numbers."""
+    return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=10_000)
+
+
+def number(value: Any, what: str) -> float:
+    """A finite number, or an error that names it."""
+    try:
+        result = float(value)
+    except (TypeError, ValueError):
+        raise ConfigurationError(f"{what} is {value!r}, not a number") from None
+    except OverflowError:
+        raise ConfigurationError(f"{what} is too large a number") from None
+    if not math.isfinite(result):
+        raise ConfigurationError(f"{what} is {value!r}, not a finite number")
+    return result
+
+
+def numbers(values: Any, what: str, counts: tuple[int, ...]) -> Array:
+    """A list of finite numbers of one of some lengths, or an error that names it."""
+    if not isinstance(values, list | tuple | np.ndarray):
+        raise ConfigurationError(f"{what} is missing or no list")
+    result = np.array([number(v, what) for v in np.ravel(np.asarray(values, dtype=object))])
+    if len(result) not in counts:
+        wanted = " or ".join(map(str, counts))
+        raise ConfigurationError(f"{what} has {len(result)} numbers, not {wanted}")
+    return result
 
 
 _LARGEST = 1e9
@@ -131,3 +179,61 @@ def _pitch(text: str, given: float | None) -> float:
     if not (math.isfinite(pitch) and 1e-5 < pitch < 1):
         raise ConfigurationError(f"pixel pitch {pitch:g} mm: between 0.00001 and 1 mm are possible")
     return pitch
+
+
+_VERSION = "thermocald-camera/1"
+
+
+def _encode_own(record: Record) -> tuple[str, str]:
+    sensor, interior = record.model.sensor, record.model.interior
+    values: dict[str, float] = {}
+    for k, name in enumerate(IOP_NAMES):
+        values[name] = float(getattr(interior, name))
+        if record.covariance is not None:
+            values[f"sd_{name}"] = float(np.sqrt(record.covariance[k, k]))
+    document = {
+        "format": _VERSION,
+        "name": record.name,
+        "comment": record.comment,
+        "sensor": {
+            "width": sensor.width, "height": sensor.height, "pixel_pitch": sensor.pixel_pitch,
+        },
+        "interior": values,
+        "covariance": None
+        if record.covariance is None
+        else {"parameters": list(IOP_NAMES), "matrix": record.covariance.tolist()},
+    }  # fmt: skip
+    return json.dumps(document, indent=1, allow_nan=False) + "\n", "exact: it is our own model"
+
+
+def _decode_own(text: str) -> ImportedCamera:
+    try:
+        document = json.loads(text)
+    except json.JSONDecodeError as cause:
+        raise ConfigurationError(f"no valid JSON: {cause}") from None
+    if not isinstance(document, dict) or document.get("format") != _VERSION:
+        raise ConfigurationError(f"no camera file: format is not {_VERSION!r}")
+    head, values = document.get("sensor"), document.get("interior")
+    if not isinstance(head, dict) or not isinstance(values, dict):
+        raise ConfigurationError("sensor or interior is missing")
+    width, height = (int(number(head.get(side), f"sensor.{side}")) for side in ("width", "height"))
+    own = number(head.get("pixel_pitch"), "sensor.pixel_pitch")
+    if "c" not in values:
+        raise ConfigurationError("interior.c is missing")
+    interior = InteriorOrientation.from_mapping(
+        {name: number(values[name], f"interior.{name}") for name in IOP_NAMES if name in values}
+    )
+    covariance = None
+    if document.get("covariance") is not None:
+        matrix = document["covariance"].get("matrix")
+        covariance = numbers(matrix, "covariance.matrix", (100,)).reshape(10, 10)
+    return ImportedCamera(
+        CameraModel(Sensor(width, height, own), interior), "json",
+        str(document.get("name", "camera")), True, 0.0, 0.0, covariance,
+    )  # fmt: skip
+
+
+OWN = Format(
+    "json", ".json", "thermocald's own, with covariance", _encode_own, _decode_own,
+    lambda text: f'"{_VERSION}"' in text[:200],
+)  # fmt: skip

@@ -13,26 +13,17 @@ apart is taken for two boards. Boards that touch in one plane count as one.
 
 Source: planes one after the other as Fischler, Bolles (1981), Comm. ACM 24, 381-395 (RANSAC), with
 every target as a seed instead of a random one.
-
-A camera that replays measurements instead of pictures gives a Frame whose metadata hold, under
-`observations`, {"target": [name …], "x": [px …], "y": […], "sx": […], "sy": […]} and, where it is
-known, "sxy" px². Names, not rows: the receiver has a test field of its own.
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.errors import TestFieldError
-from thermocald.photogrammetry.field.testfield import Observations
-
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from numpy.typing import ArrayLike, NDArray
 
     from thermocald.arrays import Array
@@ -51,7 +42,7 @@ _LOCAL = 8
 @lru_cache(maxsize=16)
 def field_normals(testfield: TestField) -> Array:
     """`target_normals` of a field's circles, by row; NaN for what is not a circle."""
-    circles = np.array([kind == "circle" for kind in testfield.kinds], dtype=bool)
+    circles = testfield.circles
     normals = np.full((len(testfield), 3), np.nan)
     # Marker corners lie on the sheets too and help where circles are few.
     everything = target_normals(testfield.points)
@@ -240,34 +231,3 @@ def _apart(points: Array, rows: NDArray[np.int64], distance: float) -> list[NDAr
         groups.append(rows[group])
         left &= ~group
     return groups
-
-
-def observations_to_lists(seen: Observations, field: TestField) -> dict[str, Any]:
-    """Observations → lists by name, JSON-able."""
-    lists: dict[str, Any] = {
-        "target": [field.names[row] for row in seen.targets.tolist()],
-        "x": seen.points[:, 0].tolist(),
-        "y": seen.points[:, 1].tolist(),
-        "sx": seen.sigmas[:, 0].tolist(),
-        "sy": seen.sigmas[:, 1].tolist(),
-    }
-    if seen.covariances is not None:
-        lists["sxy"] = seen.covariances.tolist()
-    return lists
-
-
-def observations_from_lists(lists: Mapping[str, Any], field: TestField) -> Observations:
-    """The inverse of `observations_to_lists`; TestFieldError for a foreign target."""
-    rows = [field.index.get(name, -1) for name in lists["target"]]
-    if -1 in rows:
-        name = lists["target"][rows.index(-1)]
-        raise TestFieldError(
-            f"target {name!r} was measured but is not in the test field; is it the right field?"
-        )
-    n = len(rows)
-    return Observations(
-        np.array(rows, dtype=np.int64),
-        np.array([lists["x"], lists["y"]], dtype=float).T.reshape(n, 2),
-        np.array([lists["sx"], lists["sy"]], dtype=float).T.reshape(n, 2),
-        np.array(lists["sxy"], dtype=float) if "sxy" in lists else None,
-    )

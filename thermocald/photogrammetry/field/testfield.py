@@ -1,17 +1,22 @@
-"""The test field: known targets with their covariance, and what of them one image shows."""
+"""The test field: known targets with their covariance, and what of them one image shows.
+
+A camera that replays measurements instead of pictures gives a Frame whose metadata hold, under
+`observations`, {"target": [name …], "x": [px …], "y": […], "sx": […], "sy": […]} and, where it is
+known, "sxy" px². Names, not rows: the receiver has a test field of its own.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermocald.errors import TestFieldError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import ArrayLike, NDArray
 
@@ -77,6 +82,11 @@ class TestField:
     def index(self) -> dict[str, int]:
         """Row of each target by its name."""
         return {name: i for i, name in enumerate(self.names)}
+
+    @cached_property
+    def circles(self) -> NDArray[np.bool_]:
+        """Which targets (n,) are circles."""
+        return np.array([kind == "circle" for kind in self.kinds], dtype=bool)
 
     @cached_property
     def groups(self) -> NDArray[np.int64]:
@@ -174,3 +184,34 @@ class Observations:
             np.concatenate([self.covariances, other.covariances])[order],
             {k: np.concatenate([column(self, k), column(other, k)])[order] for k in names},
         )
+
+
+def observations_to_lists(seen: Observations, field: TestField) -> dict[str, Any]:
+    """Observations → lists by name, JSON-able."""
+    lists: dict[str, Any] = {
+        "target": [field.names[row] for row in seen.targets.tolist()],
+        "x": seen.points[:, 0].tolist(),
+        "y": seen.points[:, 1].tolist(),
+        "sx": seen.sigmas[:, 0].tolist(),
+        "sy": seen.sigmas[:, 1].tolist(),
+    }
+    if seen.covariances is not None:
+        lists["sxy"] = seen.covariances.tolist()
+    return lists
+
+
+def observations_from_lists(lists: Mapping[str, Any], field: TestField) -> Observations:
+    """The inverse of `observations_to_lists`; TestFieldError for a foreign target."""
+    rows = [field.index.get(name, -1) for name in lists["target"]]
+    if -1 in rows:
+        name = lists["target"][rows.index(-1)]
+        raise TestFieldError(
+            f"target {name!r} was measured but is not in the test field; is it the right field?"
+        )
+    n = len(rows)
+    return Observations(
+        np.array(rows, dtype=np.int64),
+        np.array([lists["x"], lists["y"]], dtype=float).T.reshape(n, 2),
+        np.array([lists["sx"], lists["sy"]], dtype=float).T.reshape(n, 2),
+        np.array(lists["sxy"], dtype=float) if "sxy" in lists else None,
+    )

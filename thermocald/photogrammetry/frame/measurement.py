@@ -21,6 +21,7 @@ from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera.camera_model import CameraModel, Sensor
 from thermocald.photogrammetry.field.planes import field_normals
 from thermocald.photogrammetry.field.testfield import Observations
+from thermocald.photogrammetry.linalg import MAD_TO_SD
 from thermocald.photogrammetry.orientation import Orientation, orient, refine
 from thermocald.photogrammetry.targets import ring_code
 from thermocald.photogrammetry.targets.boards import find_chessboards, locate_chess_corners
@@ -66,8 +67,7 @@ def predicted_maps(
 
     A circle whose plane is not known is taken as facing the camera, and has no eccentricity.
     """
-    circles = np.array([kind == "circle" for kind in testfield.kinds], dtype=bool)
-    rows = np.nonzero(circles & np.isfinite(testfield.diameters))[0]
+    rows = np.nonzero(testfield.circles & np.isfinite(testfield.diameters))[0]
     X = testfield.points[rows]
     normals = field_normals(testfield)[rows]
     view = orientation.exterior.centre - X
@@ -103,7 +103,7 @@ def measure_circles(
     observations, {row: reason} for circles that were not measured, and the orientation.
     """
     rows, maps = predicted_maps(testfield, orientation, eccentricity)
-    coded = np.array([ring_code.is_ring(testfield.codes[r]) for r in rows], dtype=bool)
+    coded = ring_code.have_rings(testfield, rows)
     fit = fit_circles(image, maps, coded, _USUAL_BLUR_PX)
     blur = float(np.median(fit.parameters[:, 5])) if len(rows) else _USUAL_BLUR_PX
     if blur > _WIDE_BLUR_PX:
@@ -132,7 +132,7 @@ def measure_circles(
             new_maps = new_maps.at(np.where(good[:, None], fit.points, new_maps.centre))
             start = fit.parameters if good.all() else None
         rows, maps = new_rows, new_maps
-        coded = np.array([ring_code.is_ring(testfield.codes[r]) for r in rows], dtype=bool)
+        coded = ring_code.have_rings(testfield, rows)
         fit = fit_circles(image, maps, coded, blur, None, start)
     return (*_observations(rows, fit, testfield, better), better)
 
@@ -308,8 +308,7 @@ def _measure(
     eccentricity: bool,
 ) -> Measurement:
     """The circles, once the marker corners are known."""
-    circles = np.array([kind == "circle" for kind in testfield.kinds], dtype=bool)
-    if not circles.any():
+    if not testfield.circles.any():
         return _finish(testfield, corners, missed, None, foreign=False)
 
     if prior.interior is not None and prior.exterior is not None:
@@ -358,7 +357,7 @@ def _few(
     foreign: bool,
 ) -> Measurement:
     """Too few codes for an orientation: those that there are, as ellipses."""
-    coded = np.array([ring_code.is_ring(testfield.codes[r]) for r in rows], dtype=bool)
+    coded = ring_code.have_rings(testfield, rows)
     fit = fit_circles(image, maps, coded)
     good = fit.good
     missed.update({int(r): why for r, why in zip(rows, fit.reasons, strict=True) if why})
@@ -450,7 +449,7 @@ def blur_trend(points: Array, blur: Array, sensor: Sensor) -> tuple[Array, Array
         A, b = design[good], blur[good]
         solution = np.linalg.lstsq(A, b, rcond=None)[0]
         residual = blur - design @ solution
-        sd = 1.4826 * float(np.median(np.abs(residual[good])))
+        sd = MAD_TO_SD * float(np.median(np.abs(residual[good])))
         variance = float(np.sum(residual[good] ** 2)) / max(int(good.sum()) - 4, 1)
         good = np.isfinite(blur) & (np.abs(residual) <= _BLUR_CUT * max(sd, 1e-6))
     normal = design[good].T @ design[good]

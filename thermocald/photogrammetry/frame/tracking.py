@@ -182,12 +182,9 @@ class _State:
 class Tracker:
     """Measures the frames of one camera and one test field, one after the other."""
 
-    def __init__(
-        self, testfield: TestField, prior: Prior | None = None, eccentricity: bool = True
-    ) -> None:
+    def __init__(self, testfield: TestField, prior: Prior | None = None) -> None:
         self._testfield = testfield
         self._prior = prior or Prior()
-        self._eccentricity = eccentricity
         self._state: _State | None = None
 
     def reset(self) -> None:
@@ -224,7 +221,7 @@ class Tracker:
         return None if parts is None else self._track(parts, state, _MARGIN_PX)
 
     def _search(self, image: NDArray[Any], why: str) -> TrackedMeasurement:
-        found = measure(image, self._testfield, self._prior, self._eccentricity)
+        found = measure(image, self._testfield, self._prior)
         # A frame that shows nothing says nothing about where the targets are: keep what is known.
         if found.status.ok:
             circles, markers = self._begin(image, found), found.markers or None
@@ -240,10 +237,10 @@ class Tracker:
         """Outlines and weights for every circle in view, measured or not."""
         if found.orientation is None:
             return None
-        rows, maps = predicted_maps(self._testfield, found.orientation, self._eccentricity)
+        rows, maps = predicted_maps(self._testfield, found.orientation)
         if len(rows) == 0:
             return None
-        coded = np.array([ring_code.is_ring(self._testfield.codes[r]) for r in rows], dtype=bool)
+        coded = ring_code.have_rings(self._testfield, rows)
         seen = np.isin(rows, found.observations.targets)
         at = np.searchsorted(found.observations.targets, rows[seen])
         centre = maps.centre.copy()

@@ -33,6 +33,7 @@ _FLIP = np.diag([1.0, -1.0, -1.0])  # our camera axes to OpenCV's
 _INLIER_PX = 6.0
 _MIN_RESECTION = 6
 _MIN_PAIR = 8
+_LEAST_ANGLE = np.radians(2.0)  # between two rays of a target
 # Principal distances to try, in image widths, where nothing is known: wide angle to tele.
 _TRIAL_DISTANCES = (0.75, 1.0, 1.35, 0.55, 2.0, 3.0)
 # A plane field has a second, false relative orientation per pair: three good pairs are tried.
@@ -83,7 +84,7 @@ class _Start:
         self.poses[photo] = (np.asarray(cv2.Rodrigues(turn)[0], dtype=float), _vector(t))
         return True
 
-    def intersect(self, min_angle: float = np.radians(2.0)) -> None:
+    def intersect(self) -> None:
         """Intersect every target that oriented photographs see under a sufficient angle."""
         oriented = np.isin(self.rays.photo, list(self.poses))
         for target in np.unique(self.rays.target[oriented]):
@@ -94,7 +95,7 @@ class _Start:
             t = np.array([self.poses[int(p)][1] for p in self.rays.photo[rows]])
             d = np.einsum("nji,nj->ni", R, self.directions[rows])
             d /= np.linalg.norm(d, axis=1, keepdims=True)
-            if np.arccos(np.clip((d @ d.T).min(), -1, 1)) < min_angle:
+            if np.arccos(np.clip((d @ d.T).min(), -1, 1)) < _LEAST_ANGLE:
                 continue
             X0 = -np.einsum("nji,nj->ni", R, t)
             P = np.eye(3) - d[:, :, None] * d[:, None, :]

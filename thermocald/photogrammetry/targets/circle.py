@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.targets.outline import LocalMap, Windows
 
 
-PARAMETERS = ("x", "y", "m11", "m12", "m22", "blur", "background", "contrast", "gx", "gy")
 _PIXEL_VARIANCE = 1 / 12
 _NORM = float(1 / np.sqrt(2 * np.pi))
 # Φ(z) = (1 + tanh(z·polynomial(z²)))/2 to 2e-5, fitted by minimax on 0 ≤ z ≤ 6.

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 REACH_PX = 10.0
 """Farther along the edges no pixels are used."""
 
+_CHUNK = 256  # corners that are fitted together
 _SERIES_TERMS = 9
 _ITERATIONS = 20
 _CONVERGED_PX = 2e-4
@@ -66,21 +67,19 @@ def fit_corners(
     before: Array,
     after: Array,
     cell: Array,
-    reach: float = REACH_PX,
-    chunk: int = 256,
 ) -> CornerFit:
     """Fit corners (n, 2) px whose neighbours along the outline are `before` and `after` (n, 2) px.
 
     cell (n,) px: width of the marker's border and of the quiet zone about it; nothing beyond is
-    looked at. reach: px, how far along the edges pixels are used.
+    looked at.
     """
     if len(corners) == 0:
         none = np.zeros(0)
         return CornerFit(np.zeros((0, 2)), np.zeros((0, 2, 2)), *(none,) * 5, ())
     parts = []
-    for i in range(0, len(corners), chunk):
-        s = slice(i, i + chunk)
-        parts.append(_fit(image, corners[s], before[s], after[s], cell[s], reach))
+    for i in range(0, len(corners), _CHUNK):
+        s = slice(i, i + _CHUNK)
+        parts.append(_fit(image, corners[s], before[s], after[s], cell[s]))
 
     def joined(name: str) -> Array:
         return np.concatenate([getattr(part, name) for part in parts])
@@ -170,14 +169,12 @@ def _is_saddle(grey: Array, d1: Array, d2: Array, near: NDArray[np.bool_]) -> ND
     return found & (clear & near & (d1 < 0) & (d2 < 0)).any(axis=1)
 
 
-def _fit(
-    image: Image, corners: Array, before: Array, after: Array, cell: Array, reach: float
-) -> CornerFit:
+def _fit(image: Image, corners: Array, before: Array, after: Array, cell: Array) -> CornerFit:
     n = len(corners)
     height, width = image.shape
     sides = np.stack([before - corners, after - corners])
     side = np.linalg.norm(sides, axis=-1).min(axis=0)
-    along = np.minimum(0.45 * side, reach)
+    along = np.minimum(0.45 * side, REACH_PX)
     half = int(np.ceil(along.max()))
     offset = np.arange(-half, half + 1)
     origin = np.rint(corners).astype(int)

@@ -134,6 +134,7 @@ def from_ellipses(centre: Array, semi_axes: Array, angle: Array) -> LocalMap:
 REACH_PX = 4.0
 """Pixels farther from the outline carry nothing about the centre."""
 _THIN = 3
+_CHUNK_PIXELS = 120_000  # of the windows that are looked at together
 _CUT_PX = 2.0  # pixels so near to the outline have to be in the image
 _RING_CLEARANCE = 2.6  # standard deviations of the blur between a used pixel and the code ring
 
@@ -169,9 +170,9 @@ class Windows:
         return replace(self, x=x, y=y, grey=grey, weight=weight)
 
 
-def window_reach(blur: float, reach: float = REACH_PX) -> float:
+def window_reach(blur: float) -> float:
     """How far from the outline pixels are used, px, at a blur of so many px."""
-    return max(reach, 4.0 * blur)
+    return max(REACH_PX, 4.0 * blur)
 
 
 def windows(
@@ -179,15 +180,13 @@ def windows(
     maps: LocalMap,
     coded: NDArray[np.bool_],
     blur: float = 0.9,
-    reach: float = REACH_PX,
-    chunk_pixels: int = 120_000,
 ) -> Iterator[Windows]:
     """The pixels near each outline, targets of like size together.
 
     coded (n,): targets with a code ring, which is kept out at `blur` px.
     """
     height, width = image.shape
-    reach_px = window_reach(blur, reach)
+    reach_px = window_reach(blur)
     half = np.ceil(maps.half_extent + reach_px).astype(int)
     # Targets of like size and like shape share a window.
     order = np.lexsort((half[:, 0], half.max(axis=1) // 3))
@@ -208,7 +207,7 @@ def windows(
         while stop < len(order):
             wider, higher = max(hx, sizes[stop][0]), max(hy, sizes[stop][1])
             area = (2 * wider + 1) * (2 * higher + 1)
-            if (stop + 1 - start) * area > chunk_pixels or area > largest:
+            if (stop + 1 - start) * area > _CHUNK_PIXELS or area > largest:
                 break
             stop, hx, hy = stop + 1, wider, higher
         rows = order[start:stop]

@@ -93,6 +93,11 @@ def is_ring(code: str) -> bool:
     return code.startswith("RING")
 
 
+def have_rings(testfield: TestField, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which targets in some rows (n,) of a test field have a code ring."""
+    return np.array([is_ring(testfield.codes[row]) for row in rows], dtype=bool)
+
+
 def parse(code: str) -> tuple[int, int]:
     """`RING12:47` → (12, 47); TestFieldError where no such code exists."""
     family, _, number = code.partition(":")

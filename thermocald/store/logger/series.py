@@ -16,7 +16,7 @@ import numpy as np
 from thermocald.epoch import Epoch
 from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import Sensor
-from thermocald.photogrammetry.camera_files.camera_file import read_camera
+from thermocald.photogrammetry.camera_files import read_camera
 from thermocald.store.logger.photographs import find_copies, other_camera
 from thermocald.store.logger.temperatures import LogOptions, TemperatureLog, read_log
 from thermocald.store.recording.head import CameraSpec, Channel, Head

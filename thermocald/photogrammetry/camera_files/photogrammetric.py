@@ -1,4 +1,6 @@
-"""An AICON .ior: photogrammetric terms in mm, radial ones balanced by R0.
+"""Files of photogrammetric programs: AICON and Agisoft Metashape.
+
+AICON's .ior holds photogrammetric terms in mm, radial ones balanced by R0.
 
 Written is the record that TU Dresden's FlowVeloTool (github.com/AnetteEltner/FlowVeloTool,
 photogrammetry_functions.py) reads as an AICON .ior, the one public reader there is: one line of
@@ -13,24 +15,30 @@ and refused.) Comments follow the record, where its reader does not look.
 
 Read are both this record and `name value [sd]` per line, as calibration sheets are typed over;
 there the terms are those of the measured point (Luhmann et al. 2014, section 3.3.2).
+
+Metashape's camera calibration is XML with the frame projection; a document of exported cameras with
+one sensor is read too, its covariance included.
 """
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
+from xml.sax.saxutils import escape
 
 import numpy as np
 
 from thermocald.errors import ConfigurationError
-from thermocald.photogrammetry.camera.conversions import MeasuredPoint, to_family
+from thermocald.photogrammetry.camera.conversions import MeasuredPoint, Metashape, to_family
 from thermocald.photogrammetry.camera_files.camera_record import (
     ForeignCamera,
     Format,
     Record,
     header,
+    number,
+    numbers,
 )
-from thermocald.photogrammetry.camera_files.file_text import number
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array
@@ -41,12 +49,11 @@ if TYPE_CHECKING:
     )
     from thermocald.photogrammetry.camera.conversions import Family
 
-
 # In the order of our ten: c x0 y0 A1 A2 A3 B1 B2 C1 C2.
-_NAMES = ("Ck", "Xh", "Yh", "A1", "A2", "A3", "B1", "B2", "C1", "C2")
-_LINES = ("Ck", "Xh", "Yh", "A1", "A2", "R0", "A3", "B1", "B2", "C1", "C2")
-_SIZES = ("sensor_width_mm", "sensor_height_mm", "pixels_x", "pixels_y")
-_FIELDS = ("camera", "type", *_LINES, *_SIZES)
+_AICON_NAMES = ("Ck", "Xh", "Yh", "A1", "A2", "A3", "B1", "B2", "C1", "C2")
+_AICON_LINES = ("Ck", "Xh", "Yh", "A1", "A2", "R0", "A3", "B1", "B2", "C1", "C2")
+_AICON_SIZES = ("sensor_width_mm", "sensor_height_mm", "pixels_x", "pixels_y")
+_AICON_FIELDS = ("camera", "type", *_AICON_LINES, *_AICON_SIZES)
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,29 +95,29 @@ class _Balanced:
         return found.with_values(C1=float(values[8]), C2=float(values[9]))
 
 
-def _encode(record: Record) -> tuple[str, str]:
+def _encode_aicon(record: Record) -> tuple[str, str]:
     sensor = record.model.sensor
     half_diagonal = 0.5 * float(np.hypot(sensor.width, sensor.height)) * sensor.pixel_pitch
     # the radial correction vanishes at two thirds of the way to the corner, as is usual
     r0 = float(f"{2 / 3 * half_diagonal:.4g}")
     result = to_family(record.model, _Balanced(r0), record.covariance)
-    values = dict(zip(_NAMES, result.values.tolist(), strict=True))
+    values = dict(zip(_AICON_NAMES, result.values.tolist(), strict=True))
     values |= {"Ck": -values["Ck"], "R0": r0}
     extent = sensor.width * sensor.pixel_pitch, sensor.height * sensor.pixel_pitch
-    numbers = [*(values[n] for n in _LINES), *extent, sensor.width, sensor.height]
+    numbers = [*(values[n] for n in _AICON_LINES), *extent, sensor.width, sensor.height]
     lines = [" ".join(["1", "1", *map(repr, numbers)]) + " "]
-    lines += [f"# fields: {' '.join(_FIELDS)}", f"# name: {' '.join(record.name.split())}"]
+    lines += [f"# fields: {' '.join(_AICON_FIELDS)}", f"# name: {' '.join(record.name.split())}"]
     if result.covariance is not None:
         sds = np.sqrt(np.diag(result.covariance)).tolist()
-        lines += [f"# sd {n} {sd!r}" for n, sd in zip(_NAMES, sds, strict=True)]
+        lines += [f"# sd {n} {sd!r}" for n, sd in zip(_AICON_NAMES, sds, strict=True)]
     return "\n".join(lines) + "\n" + header(record, result.statement), result.statement
 
 
-def _decode(text: str) -> ForeignCamera:
-    fields = _record(text)
+def _decode_aicon(text: str) -> ForeignCamera:
+    fields = _aicon_record(text)
     if fields is None:
         return _typed(text)
-    found = dict(zip(_FIELDS, fields, strict=True))
+    found = dict(zip(_AICON_FIELDS, fields, strict=True))
     spread, name = {}, "camera"
     for line in text.splitlines():
         words = line.split()
@@ -119,18 +126,18 @@ def _decode(text: str) -> ForeignCamera:
         if words[:2] == ["#", "sd"] and len(words) == 4:
             spread[words[2]] = number(words[3], f"standard deviation of {words[2]}")
     r0 = number(found["R0"], "R0")
-    if r0 == 0 and any(number(found[n], n) for n in _NAMES[3:8]):
+    if r0 == 0 and any(number(found[n], n) for n in _AICON_NAMES[3:8]):
         raise ConfigurationError(
             "R0 is 0: programs differ in the unit of such terms; type the numbers over, one name "
             "and value per line"
         )
-    return _foreign(found, spread, _Balanced(r0), name)
+    return _aicon_foreign(found, spread, _Balanced(r0), name)
 
 
-def _record(text: str) -> list[str] | None:
+def _aicon_record(text: str) -> list[str] | None:
     """The fields of a record, or None where the text is none."""
     words = [w for line in text.splitlines() for w in line.split("#")[0].split()]
-    if len(words) != len(_FIELDS):
+    if len(words) != len(_AICON_FIELDS):
         return None
     try:
         values = [float(w) for w in words]
@@ -151,8 +158,10 @@ def _typed(text: str) -> ForeignCamera:
         key, rest = words[0], words[1:]
         if key == "camera":
             name = " ".join(rest)
-        elif key not in (*_LINES, *_SIZES):
-            raise ConfigurationError(f"line {i}: {key!r} is none of {', '.join(_LINES + _SIZES)}")
+        elif key not in (*_AICON_LINES, *_AICON_SIZES):
+            raise ConfigurationError(
+                f"line {i}: {key!r} is none of {', '.join(_AICON_LINES + _AICON_SIZES)}"
+            )
         elif key in found:
             raise ConfigurationError(f"line {i}: {key} is duplicated")
         elif not rest:
@@ -161,19 +170,19 @@ def _typed(text: str) -> ForeignCamera:
             found[key] = rest[0]
             if len(rest) > 1:
                 spread[key] = number(rest[1], f"line {i}: standard deviation of {key}")
-    missing = [key for key in ("Ck", *_SIZES) if key not in found]
+    missing = [key for key in ("Ck", *_AICON_SIZES) if key not in found]
     if missing:
         raise ConfigurationError(f"{', '.join(missing)} missing")
     r0 = number(found.get("R0", 0.0), "R0")
-    return _foreign(found, spread, MeasuredPoint(r0), name)
+    return _aicon_foreign(found, spread, MeasuredPoint(r0), name)
 
 
-def _foreign(
+def _aicon_foreign(
     found: dict[str, str], spread: dict[str, float], family: Family, name: str
 ) -> ForeignCamera:
-    values = np.array([number(found.get(key, 0.0), key) for key in _NAMES])
+    values = np.array([number(found.get(key, 0.0), key) for key in _AICON_NAMES])
     values[0] = abs(values[0])
-    sizes = [number(found[key], key) for key in _SIZES]
+    sizes = [number(found[key], key) for key in _AICON_SIZES]
     r0 = number(found.get("R0", 0.0), "R0")
     if not 0 <= r0 < 1000:
         raise ConfigurationError(f"R0 is {r0:g} mm; it is a radius in the image")
@@ -181,14 +190,103 @@ def _foreign(
         raise ConfigurationError(f"{sizes[2]:g} columns of pixels are impossible")
     covariance = None
     if spread:
-        covariance = np.diag([spread.get(key, 0.0) ** 2 for key in _NAMES])
+        covariance = np.diag([spread.get(key, 0.0) ** 2 for key in _AICON_NAMES])
     size = int(sizes[2]), int(sizes[3])
     return ForeignCamera(size, family, values, name, covariance, sizes[0] / sizes[2])
 
 
-def _recognises(text: str) -> bool:
+def _is_aicon(text: str) -> bool:
     typed = any(line.split()[:1] == ["Ck"] for line in text.splitlines())
-    return typed or _record(text) is not None
+    return typed or _aicon_record(text) is not None
 
 
-FORMAT = Format("aicon", ".ior", "AICON interior orientation", _encode, _decode, _recognises)
+AICON = Format(
+    "aicon", ".ior", "AICON interior orientation", _encode_aicon, _decode_aicon, _is_aicon
+)
+
+
+_METASHAPE_FAMILY = Metashape()
+
+
+def _encode_metashape(record: Record) -> tuple[str, str]:
+    result = to_family(record.model, _METASHAPE_FAMILY)
+    sensor = record.model.sensor
+    # a comment must not hold a double hyphen
+    words = escape(header(record, result.statement, "  ")).replace("--", "- -")
+    lines = [
+        '<?xml version="1.0" encoding="UTF-8"?>',
+        f"<!--\n{words}-->",
+        "<calibration>",
+        "  <projection>frame</projection>",
+        f"  <width>{sensor.width}</width>",
+        f"  <height>{sensor.height}</height>",
+        *(
+            f"  <{tag}>{float(value)!r}</{tag}>"
+            for tag, value in zip(_METASHAPE_FAMILY.parameters, result.values, strict=True)
+        ),
+        "</calibration>",
+    ]
+    return "\n".join(lines) + "\n", result.statement
+
+
+def _decode_metashape(text: str) -> ForeignCamera:
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise ConfigurationError("a calibration needs no DOCTYPE and no entities")
+    try:
+        root = ET.fromstring(text)
+    except ET.ParseError as cause:
+        raise ConfigurationError(f"no valid XML: {cause}") from None
+    found = [root] if root.tag == "calibration" else root.findall(".//sensor/calibration")
+    found = [c for c in found if c.get("class") != "initial"]
+    if len(found) != 1:
+        raise ConfigurationError(
+            f"the file holds {len(found)} calibrations: one is wanted (Tools, Camera Calibration, "
+            "save as XML)"
+        )
+    calibration = found[0]
+    projection = calibration.findtext("projection") or calibration.get("type") or "frame"
+    if projection != "frame":
+        raise ConfigurationError(f"projection {projection!r}: only frame cameras can be read")
+    resolution = calibration.find("resolution")
+    size = [
+        calibration.findtext(side) if resolution is None else resolution.get(side)
+        for side in ("width", "height")
+    ]
+    values = np.array(
+        [number(calibration.findtext(tag, "0"), f"<{tag}>") for tag in _METASHAPE_FAMILY.parameters]
+    )
+    for tag in ("p3", "p4"):
+        if number(calibration.findtext(tag, "0"), f"<{tag}>") != 0:
+            raise ConfigurationError(f"<{tag}> has no counterpart in this model")
+    return ForeignCamera(
+        (int(number(size[0], "width")), int(number(size[1], "height"))),
+        _METASHAPE_FAMILY, values, covariance=_metashape_covariance(root),
+    )  # fmt: skip
+
+
+def _metashape_covariance(
+    root: ET.Element,
+) -> np.ndarray[tuple[int, int], np.dtype[np.float64]] | None:
+    """The covariance of a sensor in the order of the family, zero for what was held."""
+    node = root.find(".//sensor/covariance")
+    if node is None:
+        return None
+    names = (node.findtext("params") or "").split()
+    n = len(names)
+    C = numbers((node.findtext("coeffs") or "").split(), "covariance", (n * n,)).reshape(n, n)
+    full = np.zeros((len(_METASHAPE_FAMILY.parameters),) * 2)
+    rows = [
+        _METASHAPE_FAMILY.parameters.index(name)
+        for name in names
+        if name in _METASHAPE_FAMILY.parameters
+    ]
+    if len(rows) != n:
+        raise ConfigurationError("the covariance names parameters that this model does not have")
+    full[np.ix_(rows, rows)] = C
+    return full
+
+
+METASHAPE = Format(
+    "metashape", ".xml", "Agisoft Metashape calibration XML", _encode_metashape, _decode_metashape,
+    lambda text: "<calibration" in text,
+)  # fmt: skip

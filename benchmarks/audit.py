@@ -45,6 +45,7 @@ SECTIONS: dict[str, Callable[[int, np.random.Generator], list[Row]]] = {
     "significance": audit_study.significance,
     "thermal": audit_thermal.thermal,
     "distortion": audit_thermal.distortion,
+    "delay": audit_thermal.delay,
     "thermometer": audit_thermal.thermometer,
     "outside": audit_thermal.outside,
     "discovery": audit_thermal.discovery,

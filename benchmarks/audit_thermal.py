@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -101,6 +102,39 @@ def distortion(draws: int, rng: np.random.Generator) -> list[Row]:
               "noise of image and thermometer", np.array(rates)),
         share("`fit`", "distortion said to keep its place in the image; it follows the angle",
               "3 sd", wrong),
+    ]  # fmt: skip
+
+
+def read_apart(s: Any, late: float, interval: float = 15.0, noise_k: float = 0.05) -> SeriesInput:
+    """What was recorded, with a thermometer that is read between the frames; late: s, its clock."""
+    source, true = seen(s), s.true_history
+    rng = np.random.default_rng([s.seed, 8])
+    times = np.arange(rng.uniform(0, interval), s.frame_times[-1], interval)
+    T = np.interp(times, true.reading_times, true.readings[true.reference])
+    readings = {true.reference: T + rng.normal(0, noise_k, len(T))}
+    begin = source.frame_times[0] - s.frame_times[0]
+    return replace(
+        source, reading_times=times + late + begin, readings=readings,
+        resolutions={true.reference: None},
+    )  # fmt: skip
+
+
+def delay(draws: int, rng: np.random.Generator) -> list[Row]:
+    """A logger whose clock is wrong by up to 90 s, read every 15 s between the frames."""
+    shifts, rates, noise = [], [], []
+    for seed in _seeds(rng, draws):
+        s = simulated(seed, ())
+        late = float(rng.uniform(-90.0, 90.0))
+        f = fitted(read_apart(s, late), ModelEffect("time_offset", {"d": 0.0}))
+        shifts.append((f.model.effects[0].values["d"] + late) / f.sd("time_offset.d"))
+        rates.append([(f.model.rates[n] - s.model.rates[n]) / f.sd(f"rates.{n}") for n in NAMES])
+        noise.append(f.series[0].thermometer_sd / 0.05)
+    print(f"(thermometer: {np.mean(noise):.2f} of its noise)", file=sys.stderr)
+    return [
+        ratio("`fit`", "sd of a clock's shift, ± 90 s; readings of 15 s, ± 0.05 K",
+              "noise of image and thermometer", np.array(shifts)),
+        ratio("`fit`", "sd of the rates of c, x0, y0 beside it",
+              "noise of image and thermometer", np.array(rates)),
     ]  # fmt: skip
 
 

@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 
 from tests.analysis.test_thermal_model import LAG, for_fit, reduced, run, simulated
+from thermocald.analysis.thermal.model_text import model_lines
 from thermocald.analysis.thermal.prediction_test import predicted_error
+from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
+from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.physics import catalogue
 from thermocald.physics.effect import Effect, coefficient_units
 from thermocald.physics.model import ModelEffect
@@ -262,3 +265,33 @@ def test_short_series_are_examined_together():
         series = [reduced(short(k, f"M{k}", effects, 20, 9.0 - k)) for k in (1, 2)]
         assert fit_thermal_model(series, []).missing.found is missing
         assert fit_thermal_model(series[:1], []).missing.found is None
+
+
+def on_a_mount(s, px):
+    """What was recorded, the camera's angles on a random walk of so many px."""
+    source = epochs_input(s.head, s.field, list(s.epochs()), s.programme.series)
+    rng = np.random.default_rng([s.seed, 9])
+    epochs, eop = len(s.frame_times), s.truth.eop.copy()
+    step = px / np.sqrt(epochs) * s.model.sensor.pixel_pitch / s.model.interior.c
+    eop[:, :3] += np.cumsum(rng.normal(0.0, step, (epochs, 3)), axis=0)
+    points = project(s.model.sensor, s.truth.iop, eop, s.field.points)
+    points += rng.normal(0.0, NOISE_PX, points.shape)
+    points[~source.grid.observed] = np.nan
+    return replace(source, grid=replace(source.grid, points=points))
+
+
+@pytest.mark.parametrize("px", [0.3, 0.8])
+def test_a_mount_that_wanders_is_said_beside_a_missing_effect(px):
+    """`discover` finds nothing but the mount there: `fit` claims no effect that is none."""
+    for seed in (1, 2):
+        f = fit_thermal_model([for_fit(on_a_mount(simulated(seed, listed=()), px))], [])
+        assert f.missing.found
+        assert f.model.evidence["fit"]["trembles"]
+        document = ThermalCamera(f.model).as_dict()
+        assert "or the mount moves" in model_lines(document)[1]
+    still = fit_thermal_model([for_fit(on_a_mount(simulated(1, listed=()), 0.0))], [])
+    assert still.missing.found is False
+    assert "trembles" not in still.model.evidence["fit"]
+    lag = fit_thermal_model([reduced(simulated(1, listed=[LAG]))], [])
+    assert lag.missing.found
+    assert "trembles" not in lag.model.evidence["fit"]

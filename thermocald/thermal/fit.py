@@ -200,7 +200,8 @@ class HypothesisFitter:
     def _unresolved(self, terms: Sequence[Term], block: Block, series: int) -> Array | None:
         """Return the sd of a trajectory at single epochs (E,) beyond the readings' errors; or None.
 
-        The rate next to a switched lamp; where a play turns, which reading was the extreme.
+        The rate next to a switched lamp, and the temperature between the readings there; where a
+        play turns, which reading was the extreme.
         """
         evidence = self.series[series]
         history = evidence.history
@@ -213,8 +214,17 @@ class HypothesisFitter:
             left = term.kind.unresolved(here, self._slope_jump(series), **values)
             return left if left.any() else None
         drives = _drives(terms, series)
-        if not drives:
-            return None
+        late = [
+            float(values[key])
+            for name, values in drives
+            for key, p in catalogue.get(name).nonlinear.items()
+            if p.role == "delay"
+        ]
+        if len(late) == len(drives):  # a memory smooths what happens between two readings
+            if evidence.slope_jumps is None:
+                return None
+            left = instrument.between(evidence.times, evidence.slope_jumps, sum(late))
+            return left if left.any() else None
         before = driven_history(history, drives[:-1])
         name, values = drives[-1]
         turns = catalogue.get(name).turns(before, **values)

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.linalg import orthonormal_combinations
+from thermocald.photogrammetry.linalg import orthonormal_combinations, scaled_solve
 from thermocald.thermal import criteria
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.movement import weight_jumps_down
@@ -41,7 +41,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Mask
+    from thermocald.thermal.hypothesis import Fit
     from thermocald.thermal.series import ReducedSeries
+
+_JUMP_SD = 4.0  # of a slope that the images show
 
 _LEAST = 0.005  # fraction of the noise at T0 that is left where it is coldest
 
@@ -174,8 +177,9 @@ def calibrate_thermometers(series: Sequence[ReducedSeries]) -> list[ReducedSerie
     fit = fitter.fit(())
     fitter = HypothesisFitter(series)
     d = fit.direction(fit.blocks[0])[0]
-    variances, weights = [], []
+    variances, weights, jumps = [], [], []
     for s, e in enumerate(series):
+        jumps.append(_slope_jumps(e, d))
         instrument = e.thermometers[e.history.reference]
         precision = np.einsum("p,epq,q->e", d, e.N, d)
         ok = precision > 0
@@ -188,20 +192,79 @@ def calibrate_thermometers(series: Sequence[ReducedSeries]) -> list[ReducedSerie
             # what the image says of T beyond its level, in K
             rest = (e.b @ d)[ok] / precision[ok] - shown[ok]
             image = 6.0 * float(np.mean(1.0 / precision[ok][1:-1][alike]))
-            shown_by_image = (_estimate_clipped_sd(np.diff(rest, 2)[alike]) ** 2 - image) / 6.0
+            # between two readings the error is less than that of one, and neighbours share it
+            rows = matrix[ok]
+            second = (rows[2:] - 2.0 * rows[1:-1] + rows[:-2])[alike]
+            share = float(second.multiply(second).sum()) / second.shape[0]
+            power = _estimate_clipped_sd(np.diff(rest, 2)[alike]) ** 2 - image
+            shown_by_image = power / max(share, 1e-9)
             if shown_by_image < 1.5 * own:
-                own = max(0.5 * (own + shown_by_image), 0.25 * own)
+                weight = share / (share + 6.0)  # a half where frames and readings coincide
+                own = max((1.0 - weight) * own + weight * shown_by_image, 0.25 * own)
         variances.append(own)
         weights.append(float(ok.sum()))
     noise = float(np.sqrt(np.average(variances, weights=weights)))
     out = []
-    for e in series:
+    for e, jump in zip(series, jumps, strict=True):
         name = e.history.reference
         old = e.thermometers[name]
         ratio = noise / old.noise
         channels = {**e.thermometers, name: replace(old, sd=old.sd * ratio, noise=noise)}
-        out.append(replace(e, thermometers=channels))
+        out.append(replace(e, thermometers=channels, slope_jumps=jump))
     return out
+
+
+def _slope_jumps(series: ReducedSeries, direction: Array) -> Array:
+    """Return by how much (E,) K/s the slope of the temperature that the images show jumps."""
+    precision = np.einsum("p,epq,q->e", direction, series.N, direction)
+    rows = np.flatnonzero(precision > 0)
+    out = np.zeros(len(precision))
+    if len(rows) < 4:
+        return out
+    shown, step = (series.b @ direction)[rows] / precision[rows], np.diff(series.times[rows])
+    slope = np.diff(shown) / step
+    variance = (1.0 / precision[rows][1:] + 1.0 / precision[rows][:-1]) / step**2
+    jump = np.abs(slope[2:] - slope[:-2])
+    jump[jump**2 < _JUMP_SD**2 * (variance[2:] + variance[:-2])] = 0.0
+    # around the interval between two epochs
+    out[rows[1:-2]] = jump
+    out[rows[2:-1]] = np.maximum(out[rows[2:-1]], jump)
+    return out
+
+
+def sharpen_trajectories(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries] | None:
+    """Take as the point of linearisation what readings and images together say of the temperature.
+
+    The readings and their errors stay the data. A delay moves the smoothed readings along, and what
+    noise the smoothing has left in their slope would pass for knowledge of it. None where no effect
+    changes what drives the camera.
+    """
+    if not any(term.is_drive for term in fit.terms):
+        return None
+    d = fit.direction(fit.blocks[0])[0]
+    return [_sharpened(fitter, fit, s, d) for s in range(len(fitter.series))]
+
+
+def _sharpened(fitter: HypothesisFitter, fit: Fit, s: int, direction: Array) -> ReducedSeries:
+    e = fitter.series[s]
+    if e.blocks is not None:
+        return e
+    name = e.history.reference
+    old = e.thermometers[name]
+    precision = np.einsum("p,epq,q->e", direction, e.N, direction)
+    left = e.b - np.einsum("epq,eq->ep", e.N, fit.parameters(s))
+    operator, sd = fitter.drive(fit.terms, s)[1], old.sd
+    # normal equations of the states and of one level
+    A = np.column_stack([operator, np.ones(len(operator))])
+    normal = A.T @ (precision[:, None] * A)
+    normal[:-1, :-1] += np.diag(1.0 / sd**2)
+    right = A.T @ (left @ direction)
+    right[:-1] += old.deviation / sd**2
+    state = scaled_solve(normal, right, 1e-12)[:-1]
+    trajectory = old.trajectory + old.mixing @ state
+    new = replace(old, trajectory=trajectory, deviation=old.deviation - state)
+    history = replace(e.history, readings={**e.history.readings, name: trajectory})
+    return replace(e, history=history, thermometers={**e.thermometers, name: new})
 
 
 def _find_alike(series: ReducedSeries, ok: Mask) -> Mask:

@@ -136,7 +136,8 @@ class ReducedSeries:
     rows of targets left out; blocks: the epochs behind each row of a long series, or None; hidden,
     movement: what the likelihood integrates out (`random_effects`), or None; tremble (P, t):
     directions in which each epoch moves by itself, of unit variance; bend (E, T, 2) px: curvature
-    of the projection that was taken off the observations, or None.
+    of the projection that was taken off the observations, or None; slope_jumps (E,) K/s: where the
+    images show that the temperature's slope jumps, None where they were not asked.
     """
 
     source: SeriesInput
@@ -165,6 +166,7 @@ class ReducedSeries:
     tremble: Array | None = None
     bend: Array | None = None
     distortion: Distortion = "angle"
+    slope_jumps: Array | None = None
 
     @property
     def readings_history(self) -> History:
@@ -464,4 +466,5 @@ def in_blocks(evidence: ReducedSeries, rows: int = 720) -> ReducedSeries:
             first,
         ),
         hidden=evidence.hidden.in_blocks(first) if evidence.hidden else None,
+        slope_jumps=None,
     )

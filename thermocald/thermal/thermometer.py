@@ -50,12 +50,39 @@ class Thermometer:
     real: NDArray[np.bool_]
     noise: float
 
-    def slope_jump(self, times: Array) -> Array:
-        """Return how uncertain the rate (E,) K/s is at some times because it jumps next to them."""
+    def _jumps(self) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Return the readings' times (R,) s, by how much the slope K/s changes around each interval
+        (R - 1,) beyond noise, and whether that is significant.
+        """
         t, y = self.times[self.real], (self.trajectory + self.deviation)[self.real]
         bend, limit = _measure_bends(t, y, self.noise)
+        size = np.sqrt(np.maximum(bend**2 - (limit / 3.0) ** 2, 0.0)) / np.diff(t)
+        return t, size, np.abs(bend) > limit
+
+    def between(self, times: Array, seen: Array, late: float) -> Array:
+        """Return how uncertain the temperature (E,) K is at some times between two readings where
+        the slope jumps at an instant that nobody knows.
+
+        seen (E,) K/s: jumps of the slope that the images show; late s: of the readings they follow.
+        The straight line between two readings misses an eighth of the jump times the interval.
+        Where the readings show the jump themselves, the value in the middle of the interval is an
+        unknown of its own (`find_latent_times`); from the lines to it a kink anywhere differs by up
+        to 0.05 of that, half way between.
+        """
+        t, size, sharp = self._jumps()
+        i = np.clip(np.searchsorted(t, times - late, side="right") - 1, 0, len(t) - 2)
+        width = np.diff(t)[i]
+        share = np.clip((times - late - t[i]) / width, 0.0, 1.0)
+        known = 0.05 * size[i] * width * np.abs(np.sin(2.0 * np.pi * share))
+        near = np.abs(times[:, None] - times[None]) <= np.median(width)
+        hidden = 0.125 * width * np.max(np.where(near, seen[None], 0.0), axis=1)
+        out: Array = np.where(sharp[i], known, hidden)
+        return out
+
+    def slope_jump(self, times: Array) -> Array:
+        """Return how uncertain the rate (E,) K/s is at some times because it jumps next to them."""
+        t, size, _ = self._jumps()
         width = np.diff(t)
-        size = np.sqrt(np.maximum(bend**2 - (limit / 3.0) ** 2, 0.0)) / width
         middle = 0.5 * (t[:-1] + t[1:])
         near = np.abs(times[:, None] - middle[None]) < 1.1 * np.median(width)
         out: Array = 0.5 * np.max(np.where(near, size[None], 0.0), axis=1)

@@ -36,8 +36,11 @@ def model_lines(document: Mapping[str, Any]) -> list[str]:
             "that"
         )
     elif document.get("effect_missing"):
+        cause = "an effect is missing"
+        if document.get("trembles"):
+            cause += ", or the mount moves, as all targets jump together from epoch to epoch"
         lines.append(
-            f"  an effect is missing: the model leaves {document['misfit_px']:.3f} px in smooth "
+            f"  {cause}: the model leaves {document['misfit_px']:.3f} px in smooth "
             f"trajectories ({document['significance_sigmas']:.0f} standard deviations); "
             "run: thermocald discover\n"
             f"  fitted from {low:g} to {high:g} °C, {T0}; standard deviations are widened by what "

@@ -25,6 +25,7 @@ from thermocald.photogrammetry.linalg import scaled_inverse
 from thermocald.photogrammetry.series.normals import chunks
 from thermocald.physics import catalogue
 from thermocald.physics.model import RATED, ModelEffect, ThermalModel
+from thermocald.thermal.movement import detect_tremble
 from thermocald.thermal.series import COLUMNS
 
 if TYPE_CHECKING:
@@ -244,6 +245,7 @@ def fitted_model(
     fits = tuple(parts.fit_of(k, level, sigma) for k in range(len(series)))
     gap = replace(gap, left_over=max(f.left_over for f in fits))
     first = parts.model(0, level)
+    trembles = bool(gap.found) and any(map(detect_tremble, series))
     told = {} if distortion_sigmas is None else {"distortion_sigmas": round(distortion_sigmas, 1)}
     channels = dict.fromkeys(c for s in series for c in s.source.readings)
     model = replace(
@@ -259,7 +261,7 @@ def fitted_model(
              "rms_px": round(f.rms_px, 5), "thermometer_sd_K": round(f.thermometer_sd, 5)}
             for s, f in zip(series, fits, strict=True)
         ),
-        evidence={"fit": gap.as_mapping() | told},
+        evidence={"fit": gap.as_mapping() | told | ({"trembles": True} if trembles else {})},
     )  # fmt: skip
     sigma0 = sigma * float(np.sqrt(np.median(stated)))
     return FittedModel(model, tuple(names), covariance, sigma0, fits, gap)

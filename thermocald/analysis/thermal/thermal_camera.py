@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from thermocald.physics.model import ThermalModel
 
 _CHUNK = 20_000  # times in one go
-_TOLD = ("effect_missing", "misfit_px", "significance_sigmas", "distortion_sigmas")
+_TOLD = ("effect_missing", "misfit_px", "significance_sigmas", "distortion_sigmas", "trembles")
 
 
 def seconds(times: ArrayLike) -> Array:

@@ -25,7 +25,12 @@ from thermocald.physics import catalogue
 from thermocald.thermal.basis import choose_distortion
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.movement import add_jumps_to_noise
-from thermocald.thermal.noise import calibrate_thermometers, estimate_noise_slope, weight_slow_noise
+from thermocald.thermal.noise import (
+    calibrate_thermometers,
+    estimate_noise_slope,
+    sharpen_trajectories,
+    weight_slow_noise,
+)
 from thermocald.thermal.reduce import reweight, without_targets
 from thermocald.thermal.scan import remove_curvature
 from thermocald.thermal.series import in_blocks
@@ -107,7 +112,7 @@ def _fitted(
     terms = without_chance_events(fitter, fit)
     if terms != fit.terms:
         fit = fitter.refine(fitter.fit(terms), max_iterations=20)
-    for again in (remove_curvature, add_jumps_to_noise):
+    for again in (sharpen_trajectories, sharpen_trajectories, remove_curvature, add_jumps_to_noise):
         better = again(fitter, fit)
         if better is not None:
             fitter = HypothesisFitter(better)

@@ -1,0 +1,47 @@
+"""A thermometer that is read between the frames: its noise, its kinks, and its clock."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks.audit_thermal import NAMES, fitted, read_apart, simulated
+from thermocald.physics.model import ModelEffect
+from thermocald.thermal.noise import calibrate_thermometers
+from thermocald.thermal.reduce import reduce_series
+
+DELAY = ModelEffect("time_offset", {"d": 0.0})
+
+
+@pytest.mark.parametrize("interval", [10.0, 15.0])
+def test_the_noise_of_readings_between_the_frames(interval):
+    """What is interpolated between two readings errs by less than one of them."""
+    found = []
+    for seed in range(1, 7):
+        source = read_apart(simulated(seed, ()), 0.0, interval)
+        e = calibrate_thermometers([reduce_series(source, affinity=False, strict=False)])[0]
+        found.append(e.thermometers[e.history.reference].noise)
+    # eighty readings know it to 8 %, six series to 3.3 %; the lamp's kinks add 4 %
+    assert 0.90 < np.mean(found) / 0.05 < 1.14
+
+
+@pytest.mark.parametrize("late", [-90.0, -33.0, 0.0, 7.5, 90.0])
+def test_a_clock_that_is_wrong(late):
+    """From a start of 0: over the whole range, and at half an interval."""
+    for seed in (1, 2, 3):
+        s = simulated(seed, ())
+        f = fitted(read_apart(s, late), DELAY)
+        assert abs(f.model.effects[0].values["d"] + late) < 3.0 * f.sd("time_offset.d")
+        assert f.sd("time_offset.d") < 0.2
+        for name in NAMES:
+            off = f.model.rates[name] - s.model.rates[name]
+            assert abs(off) < 3.5 * f.sd(f"rates.{name}")
+
+
+def test_a_switched_lamp_between_two_readings_is_no_delay():
+    """Readings of 30 s: nobody knows when between two of them the slope jumped."""
+    errors = []
+    for seed in range(1, 7):
+        f = fitted(read_apart(simulated(seed, ()), 0.0, 30.0), DELAY)
+        errors.append(f.model.effects[0].values["d"])
+    assert np.max(np.abs(errors)) < 1.0  # s

@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.main_paths.crooked import CAMERA, PITCH, SIZE, project
+from thermocald.acquisition.calibrator import Calibrator
+from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.thermal.gauge import GaugeCalibrator, GaugeObserver
 from thermocald.analysis.thermal.predictor import Predictor
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
@@ -20,6 +23,7 @@ from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.physics.model import ModelEffect, ThermalModel
+from thermocald.store.recording.reader import read_recording
 
 POSE = np.array([np.deg2rad(70.0), 0.02, -0.01, 500.0, -1000.0, 6000.0])
 NAMES = ("c", "x0", "y0")
@@ -283,3 +287,37 @@ def test_an_epoch_that_had_to_wait_has_the_camera_of_its_time():
     assert late.interior.c == pytest.approx(results[9].adjustment.interior.c, abs=1e-12)
     now = gauge.calibrate(replace(epochs[-1], number=51, frame_time=START + 510.0))
     assert now.adjustment.interior.c == pytest.approx(results[-1].adjustment.interior.c)
+
+
+@pytest.mark.parametrize("number", [0, 1, 2, 6])
+def test_real_poses_of_eight_corners_agree_with_those_of_the_whole_field(number):
+    """Two boards of a real room as control points, 25 pairs a camera; the rest is scene.
+
+    The camera is the whole field's, with its covariance. Sds hold the 2 mm of the coordinates,
+    which both poses have in common: agreement is better than 1.
+    """
+    folder = Path(__file__).resolve().parents[3] / "shared" / "data" / f"aviary-cam{number}"
+    if not folder.is_dir():
+        pytest.skip("the real corners are not here: ../shared/data")
+    recording = read_recording(folder)
+    epoch = next(e for e in recording.epochs if e.observations is not None)
+    whole = Calibrator.of_recording(recording).calibrate(epoch).adjustment
+    boards: dict[str, list[int]] = {}
+    for row, target in enumerate(epoch.observations.targets):
+        boards.setdefault(recording.testfield.names[target].split(".")[0], []).append(row)
+    full = [board for board, rows in boards.items() if len(rows) == 4]
+    known = whole.values[:10], whole.covariance[:10, :10]
+    camera = Camera(recording.camera.sensor, math.nan, *known)
+    rng = np.random.default_rng(number)
+    ratio, posed = [], 0
+    for _ in range(25):
+        pair = rng.choice(full, 2, replace=False)
+        rows = np.array(sorted(boards[pair[0]] + boards[pair[1]]))
+        pose = camera.resect(recording.testfield, epoch.observations.select(rows))
+        assert pose.status in ("ok", "ambiguous_pose"), pose.reason  # of boards in one plane
+        if pose.ok:
+            posed += 1
+            ratio.append((pose.values[10:] - whole.values[10:]) / pose.sd[10:])
+    assert posed >= 15
+    assert np.sqrt(np.mean(np.square(ratio))) < 1.0
+    assert np.abs(ratio).max() < 3.0

@@ -350,8 +350,8 @@ class GaugeObserver:
         self._gauge, self._tell = gauge, tell
         self._status = self._reason = ""
 
-    def observe(self, calibrated: CalibratedEpoch) -> dict[str, float]:
-        """Take an epoch in; nothing more is to be stored of it."""
+    def observe(self, calibrated: CalibratedEpoch, *_: object) -> dict[str, float]:
+        """Take an epoch in; nothing more is to be stored of it. A gauge has no series to adjust."""
         epoch, result = calibrated.epoch, calibrated.adjustment
         if (moved := self._gauge.movement) is not None:
             self._tell("camera_moved", moved.sentence(), moved.since, epoch.number)

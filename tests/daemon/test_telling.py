@@ -157,9 +157,11 @@ def in_a_terminal(daemon, seconds: float, *options: str, key: bytes = b"") -> tu
                 os.write(terminal, key)
             else:
                 process.send_signal(signal.SIGINT)
-    if process.poll() is None:
+    try:
+        status = process.wait(30)  # the terminal is closed before the process has ended
+    except subprocess.TimeoutExpired:
         process.kill()
-    status = process.wait(30)
+        status = process.wait()
     os.close(terminal)
     return seen.decode(errors="replace"), status
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _MOST_TARGETS = 4000
 _LARGEST_MM = 1e9  # a thousand kilometres
-_SIGMAS_MM = (1e-9, 1e5)
+_SIGMAS_MM = (1e-9, 1e4)
 _REQUIRED = ("target", "X", "Y", "Z", "diameter", "sX", "sY", "sZ")
 
 # No camera of ours can look at a field smaller than this; one in metres is (a room: 6 "mm").

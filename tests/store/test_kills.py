@@ -121,7 +121,7 @@ def kill_one(store: Path, start, rng) -> int:
             other.kill()
         # a second daemon takes over where the first was killed: that is what it is for
         try:
-            other.wait(timeout=20)
+            other.wait(timeout=5)
         except subprocess.TimeoutExpired:
             other.kill()
             other.wait()

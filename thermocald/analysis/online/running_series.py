@@ -57,6 +57,7 @@ _MOST_TARGETS = 400  # seen in a series: the normal matrix of their offsets is a
 _TURNED_PX, _STAYS = 30.0, 2  # beyond one linearisation, and for so many epochs in a row
 _USUAL_TREMBLE_PX = 0.08  # the most that mounts of the real cameras do that were looked at
 _LEFT = 0.1  # of the error probability of the series' test of a point, for a second one
+_AGAINST = ("too_many_rejected", "global_test")  # what a series says of an epoch it contradicts
 _DOUBTED = 5  # epochs in a row that carry a result of their own and have none in the series
 
 _ESTIMATED = PARAMETER_NAMES[PRINCIPAL]
@@ -347,8 +348,7 @@ class RunningSeries:
 
     def _doubted(self, own: _Epoch | None, whole: _Epoch | None) -> bool:
         """Whether the series has contradicted so many epochs in a row that it starts again."""
-        words = {"too_many_rejected", "global_test"}
-        against = any(e is not None and e.status in words for e in (own, whole))
+        against = any(e is not None and e.status in _AGAINST for e in (own, whole))
         self._doubts = self._doubts + 1 if against else 0
         if self._doubts < _DOUBTED:
             return False
@@ -380,14 +380,15 @@ class RunningSeries:
         known = self._series is not None and not self._shows_more(newest.grid)
         if self._series is not None and known and self.epochs < self._look_at[1]:
             whole = self._series.further(newest.grid, n)
-            if whole.status == "ok":
+            if whole.status not in _AGAINST:
                 return self._further(newest.grid, whole), whole
         row = self._look()
         assert self._series is not None
         whole = self._series.epoch(row, T)
         if not self._offsets:
             return None, whole
-        if self._each is not None and self.epochs < self._look_at[0] and whole.status == "ok":
+        due = self._each is None or self.epochs >= self._look_at[0]
+        if not due and whole.status not in _AGAINST:
             return self._further(newest.grid, whole), whole
         self._each = self._look_at_each()
         own = self._each.epoch(row, T)
@@ -397,7 +398,7 @@ class RunningSeries:
         """The own result of an epoch that its series does not contradict."""
         if self._each is None:
             return None
-        gross = whole.rejected & self._binds
+        gross = whole.rejected & (self._binds and whole.status == "ok")
         own = self._each.further(grid.reject(gross[None]), len(self._kept))
         return replace(own, rejected=own.rejected | gross)
 

@@ -6,6 +6,7 @@ adjusted together from their observations (`adjusted`).
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import isfinite
@@ -342,10 +343,18 @@ class Epochs(Result):
 
     @property
     def without_result(self) -> dict[str, int]:
-        """{reason: epochs without a result}, the commonest first."""
+        """{reason: epochs without a result}, the commonest first.
+
+        Reasons that differ in their numbers only are one, in the words of its commonest.
+        """
         counts = Words.of(self.reasons).counts()
         counts.pop("", None)
-        return dict(sorted(counts.items(), key=lambda entry: -entry[1]))
+        alike: dict[str, tuple[str, int]] = {}
+        for reason, count in sorted(counts.items(), key=lambda entry: -entry[1]):
+            kind = re.sub(r"[\d.]+", "#", reason.partition(";")[0])
+            words, so_far = alike.get(kind, (reason, 0))
+            alike[kind] = (words, so_far + count)
+        return dict(sorted(alike.values(), key=lambda entry: -entry[1]))
 
     def to_pandas(self) -> pd.DataFrame:
         """Return a DataFrame: the columns of `to_csv` with `time`, the index is the epoch's number.

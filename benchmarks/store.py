@@ -162,7 +162,9 @@ def end_to_end(folder: Path, epochs: int) -> tuple[float, dict[str, float]]:
     path = folder / "M1"
     with RecordingWriter(path, HEAD, field) as writer:
         for i in range(epochs):
-            epoch = Epoch(i, 10.0 * i, 10.0 * i, {}, observations=observe(field, rng))
+            seen = observe(field, rng)
+            inside = ((seen.points > 0) & (seen.points < [SENSOR.width, SENSOR.height])).all(axis=1)
+            epoch = Epoch(i, 10.0 * i, 10.0 * i, {}, observations=seen.select(inside))
             writer.append(epoch)
 
     def adjusted(epoch: Epoch) -> EpochResult:

@@ -208,6 +208,8 @@ def true_parameters(
                 s = e["size"] * e["happens"]
                 p -= s * at((t >= e["time"]).astype(float))[:, None] * e["along"]
                 p += s * (frames >= e["time"])[:, None] * e["along"]
+    # the lens moves along its axis: its rays keep their angles
+    p[:, 3:10] *= (camera.base[0] / p[:, :1]) ** np.array([2, 4, 6, 1, 1, 0, 0])
     X = points[None] * (1 + np.stack([at(scale[:, k]) for k in range(3)], 1))[:, None, :]
     for rows, vector, time in moved:
         X[:, rows] += (frames >= time)[:, None, None] * vector

@@ -31,7 +31,7 @@ import numpy as np
 from thermocald.photogrammetry.linalg import orthonormal_combinations, scaled_solve
 from thermocald.thermal import criteria
 from thermocald.thermal.fit import HypothesisFitter
-from thermocald.thermal.movement import weight_jumps_down
+from thermocald.thermal.movement import detect_tremble, weight_jumps_down
 from thermocald.thermal.scan import ORDERS, cosines
 from thermocald.thermal.series import in_blocks
 
@@ -179,7 +179,8 @@ def calibrate_thermometers(series: Sequence[ReducedSeries]) -> list[ReducedSerie
     d = fit.direction(fit.blocks[0])[0]
     variances, weights, jumps = [], [], []
     for s, e in enumerate(series):
-        jumps.append(_slope_jumps(e, d))
+        # a mount that trembles bends the trajectory too
+        jumps.append(np.zeros(len(e.times)) if detect_tremble(e) else _slope_jumps(e, d))
         instrument = e.thermometers[e.history.reference]
         precision = np.einsum("p,epq,q->e", d, e.N, d)
         ok = precision > 0

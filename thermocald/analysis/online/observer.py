@@ -92,7 +92,7 @@ class OnlineObserver:
         innovation = self.filter.update(adjustment, temperature, errors, tremble)
         if innovation is None:
             return {}
-        self._watch_targets(calibrated)
+        self._watch_targets(calibrated, adjustment)
         event = innovation.change if innovation.change in _SENTENCES else ""
         if event:
             self._tell(event, _SENTENCES[event], epoch.frame_time, epoch.number)
@@ -140,9 +140,14 @@ class OnlineObserver:
                 report[f"sd_d{name}_dT"] = float(sd_rates[k])
         return report
 
-    def _watch_targets(self, calibrated: CalibratedEpoch) -> None:
-        """A target that is rejected again and again has moved, or its coordinates are wrong."""
-        rejected = set(calibrated.adjustment.rejected)
+    def _watch_targets(self, calibrated: CalibratedEpoch, adjusted: Adjustment) -> None:
+        """A target that is rejected again and again has moved, or its coordinates are wrong.
+
+        Of the epoch by itself, and not taken back by what its series knows of the field.
+        """
+        taken = np.isfinite(adjusted.residuals).all(axis=1)
+        used = set(adjusted.targets[taken].tolist()) - set(adjusted.rejected)
+        rejected = set(calibrated.adjustment.rejected) - used
         measured = set(calibrated.adjustment.targets.tolist())
         for row in list(self._rejected):
             if row in measured and row not in rejected:

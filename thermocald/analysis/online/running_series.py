@@ -56,7 +56,7 @@ _SOON = 0.05  # share for the series, whose own level moves with it, where there
 _MOST_TARGETS = 400  # seen in a series: the normal matrix of their offsets is a full one
 _TURNED_PX, _STAYS = 30.0, 2  # beyond one linearisation, and for so many epochs in a row
 _USUAL_TREMBLE_PX = 0.08  # the most that mounts of the real cameras do that were looked at
-_LEFT = 0.1  # of the error probability of the series' test of a point, for a second one
+_LEFT = 0.01  # of the error probability of the series' test of a point, for a second one
 _AGAINST = ("too_many_rejected", "global_test")  # what a series says of an epoch it contradicts
 _DOUBTED = 5  # epochs in a row that carry a result of their own and have none in the series
 

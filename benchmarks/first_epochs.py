@@ -16,9 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from thermocald.acquisition.pipeline import Pipeline
+from thermocald.acquisition.pipeline import calibrate_frame
 from thermocald.config import load_config
 from thermocald.daemon.plan import plan_cameras, running_series
+from thermocald.epoch import Epoch
 from thermocald.hal import VirtualClock, open_device
 
 
@@ -37,16 +38,18 @@ def start(seed: int, epochs: int) -> np.ndarray:
     thermometer = open_device("thermometer", "mock", {"seed": seed}, clock)
     rows = []
     with one.camera, thermometer:
-        pipeline = Pipeline(
-            one.camera, {"housing": thermometer}, one.calibrator, clock, period_s=camera.period_s
-        )
-        for calibrated, frame in pipeline.run(epochs):
+        for number in range(1, epochs + 1):
+            begin = clock.monotonic()
+            frame, reading = one.camera.capture(), thermometer.read()
+            epoch = Epoch(number, frame.utc, reading.utc, dict(reading.values))
+            calibrated = calibrate_frame(one.calibrator, epoch, frame)
             seen = calibrated.epoch.observations
             assert seen is not None
             result, _ = running.refine(calibrated, seen)
             truth = one.camera.truth(frame.monotonic).iop[0, :3]  # type: ignore[attr-defined]
             errors = (result.values[:3] - truth) / result.sd[:3]
             rows.append([result.sigma0, *errors, len(result.rejected), result.n_observations])
+            clock.sleep_until(begin + camera.period_s)
     return np.array(rows)
 
 

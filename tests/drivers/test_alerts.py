@@ -269,7 +269,8 @@ def test_a_webhook_with_tls_and_a_redirection_into_this_network(tmp_path, monkey
             with pytest.raises(DeviceError, match="not trusted") as error:
                 device.emit(OUT)
             assert "SECRET" not in str(error.value)
-            monkeypatch.setenv("SSL_CERT_FILE", str(ca))
+        monkeypatch.setenv("SSL_CERT_FILE", str(ca))
+        with open_device("output", "alert_webhook", options, VirtualClock()) as device:
             device.emit(OUT)
             assert [post[2]["state"] for post in server.posts] == ["out"]
             server.answer, server.location = 302, f"http://127.0.0.1:{inner.port}/meta-data"

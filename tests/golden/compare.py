@@ -1,7 +1,8 @@
 """Two outputs compared number by number, and long ones kept short.
 
 Numbers of a document: within a relative bound, or a share of the standard deviation that stands
-beside them (`sd_c` beside `c`, `sd` beside `value`). Numbers in a text: one unit of the last digit.
+beside them (`sd_c` beside `c`, `sd` beside `value`); members of a long list within a relative bound
+of its RMS. Numbers in a text: one unit of the last digit.
 """
 
 from __future__ import annotations
@@ -72,9 +73,9 @@ def _cell(text: str) -> Any:
 
 
 def differences(
-    expected: Any, found: Any, bounds: Bounds, where: str = "", sd: float = 0.0
+    expected: Any, found: Any, bounds: Bounds, where: str = "", sd: float = 0.0, size: float = 0.0
 ) -> Iterator[str]:
-    """Sentences on all that differs."""
+    """Sentences on all that differs; `size` is the RMS of the list that a number is a member of."""
     if isinstance(expected, dict) and isinstance(found, dict):
         if missing := [k for k in expected if k not in found]:
             yield f"{where}: without {', '.join(missing)}"
@@ -83,15 +84,16 @@ def differences(
         for key in expected.keys() & found.keys():
             own = sd if key in _SHORTENED else _beside(expected, key)
             inner = bounds._replace(relative=bounds.of_sds) if _is_sd(key) else bounds
-            yield from differences(expected[key], found[key], inner, f"{where}.{key}", own)
+            rms = expected.get("rms", 0.0) if key == "some" else 0.0
+            yield from differences(expected[key], found[key], inner, f"{where}.{key}", own, rms)
     elif isinstance(expected, list) and isinstance(found, list):
         if len(expected) != len(found):
             yield f"{where}: {len(found)} instead of {len(expected)}"
             return
         for i, (a, b) in enumerate(zip(expected, found, strict=True)):
-            yield from differences(a, b, bounds, f"{where}[{i}]", sd)
+            yield from differences(a, b, bounds, f"{where}[{i}]", sd, size)
     elif _is_number(expected) and _is_number(found):
-        bound = bounds.relative * max(abs(expected), abs(found)) + bounds.in_sds * sd + _NOTHING
+        bound = bounds.relative * max(abs(expected), abs(found), size) + bounds.in_sds * sd + _NOTHING
         if not (abs(expected - found) <= bound or expected == found):
             yield f"{where}: {found!r} instead of {expected!r}, beyond {bound:.1e}"
     elif isinstance(expected, str) and isinstance(found, str):

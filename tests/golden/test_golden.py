@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.golden.cases import CASES, EXCUSED, Case
-from tests.golden.compare import Bounds, differences
+from tests.golden.compare import Bounds, differences, shortened
 from tests.golden.corpora import CORPORA, check
 from tests.golden.workshop import DATA, EXPECTED, Workshop, wrong
 from thermocald.cli.commands import COMMANDS
@@ -50,6 +50,10 @@ def test_a_number_that_moved_is_seen():
     assert list(differences(before, {**before, "text": "c = 3.0402 mm in 12 epochs"}, bound))
     assert list(differences(before, {**before, "text": "c = 3.0400 mm in 13 epochs"}, bound))
     assert list(differences(before, {**before, "n": 13}, bound))
+    some = shortened([-1e-6, *range(20)])
+    moved = {**some, "some": [1e-9, *some["some"][1:]]}
+    assert list(differences(some, moved, Bounds(1e-6, 0, 0))) == []
+    assert list(differences(some, moved, Bounds(1e-8, 0, 0)))
     assert list(differences(before, {"c": 3.04}, bound)) == [": without sd_c, text, n"]
 
 

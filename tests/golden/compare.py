@@ -93,7 +93,9 @@ def differences(
         for i, (a, b) in enumerate(zip(expected, found, strict=True)):
             yield from differences(a, b, bounds, f"{where}[{i}]", sd, size)
     elif _is_number(expected) and _is_number(found):
-        bound = bounds.relative * max(abs(expected), abs(found), size) + bounds.in_sds * sd + _NOTHING
+        bound = (
+            bounds.relative * max(abs(expected), abs(found), size) + bounds.in_sds * sd + _NOTHING
+        )
         if not (abs(expected - found) <= bound or expected == found):
             yield f"{where}: {found!r} instead of {expected!r}, beyond {bound:.1e}"
     elif isinstance(expected, str) and isinstance(found, str):

@@ -297,6 +297,8 @@ class FramesConfig(Section):
     """Which frames are kept; events: knock, slip, failed epochs."""
     every_n: Annotated[int, Field(ge=1, le=1_000_000)] = 360
     """With every_n: one of so many."""
+    corrected: bool = False
+    """Cameras with a thermal_model: each kept frame a second time, as it had been at T₀."""
     folder: Path = Field(default=Path("frames"), validate_default=True)
     """Where they are kept."""
     max_age_days: Positive | None = 90.0
@@ -411,6 +413,8 @@ class Config(Section):
                         f"camera {camera.name!r}: there is no thermometer {name!r}"
                         + nearest(name, there)
                     )
+        if self.frames.corrected and not any(c.thermal_model for c in self.cameras):
+            raise wrong("frames.corrected needs a camera with a thermal_model")
         return self
 
     def calibration_of(self, camera: CameraConfig) -> CalibrationConfig:

@@ -48,6 +48,14 @@ def test_a_jpeg_stays_as_it_came_and_grey_values_lose_nothing(folder_of):
     assert np.array_equal(back, frame().image)
 
 
+def test_a_corrected_frame_goes_with_its_frame(folder_of):
+    folder = folder_of()
+    path = folder.keep("cam", "M1", 7, frame())
+    assert str(folder.keep_corrected(path, b"\xff\xd8")) == "cam/M1/0000/0000007-corrected.jpg"
+    folder.delete(path)
+    assert not [p for p in folder.root.rglob("*") if p.is_file()]
+
+
 def test_retention_by_age_and_by_size_takes_the_oldest_and_says_so(folder_of):
     folder = folder_of(max_age_days=10, max_size_gb=2.5e-6)
     now = time.time()

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import csv
+import json
 
 import numpy as np
 import pytest
 import yaml
+from PIL import Image
 
 from tests.commands import call
 from thermocald.physics.testfields import demonstration_field, demonstration_model
@@ -94,6 +96,32 @@ def test_posed_epochs_are_those_of_the_rendered_camera(
         assert error @ np.linalg.solve(C, error) < 30
 
 
+def test_kept_frames_stand_there_corrected_too(daemon, devices, thermal_model, control_points):
+    """Every second frame, and beside it the same at T₀ with the row's pose."""
+    document = at_work(devices, thermal_model, control_points=str(control_points))
+    folder = daemon.folder / "frames"
+    frames = {"keep": "every_n", "every_n": 2, "corrected": True, "folder": str(folder)}
+    daemon.configure(**document | {"frames": frames | {"min_free_gb": 0}})
+    daemon.start("--epochs", "6")
+    assert daemon.wait() == 0
+    kept = sorted(p.name for p in folder.rglob("*.*"))
+    numbers = ("0000002", "0000004", "0000006")
+    assert kept == sorted(f"{n}{tail}" for n in numbers for tail in ("-corrected.jpg", ".png"))
+    with Image.open(next(folder.rglob("0000006-corrected.jpg"))) as image:
+        told = json.loads(image.info["comment"])
+        assert image.size == (820, 616)
+    row = daemon.results()[-1]
+    assert (row["epoch"], row["status"]) == (6, "resected")
+    assert told["pose"]["omega"] == pytest.approx(row["omega"])
+    assert told["pose"]["sd_X0"] == pytest.approx(row["sd_X0"])
+    assert told["opencv"]["sd_fx"] == pytest.approx(row["opencv"]["sd_fx"])
+    assert told["pose"]["origin_mm"] == [192e6, 313e6, 0.0]
+    with Store.open(daemon.store) as store:
+        frames = [one.epoch.frame for one in store.epochs(store.find_series())]
+    # of a busy machine also frames that were kept until there was time for them
+    assert {f"{n}.png" for n in numbers} <= {f.name for f in frames if f}
+
+
 @pytest.mark.parametrize("command", ["study", "discover", "fit"])
 def test_predictions_are_not_taken_for_calibrations(daemon, devices, thermal_model, command):
     daemon.configure(**at_work(devices, thermal_model))
@@ -119,6 +147,15 @@ def test_what_does_not_go_together_is_said(daemon, devices, thermal_model, optio
     document = at_work(devices, thermal_model)
     document["cameras"][0] |= options
     daemon.configure(**document)
+    refused(daemon, words)
+
+
+def refused(daemon, words: str) -> None:
     done = call("check", daemon.config)
     assert done.returncode == 2
     assert words in " ".join(done.stderr.split())
+
+
+def test_corrected_frames_need_a_thermal_model(daemon, devices):
+    daemon.configure(**devices() | {"frames": {"corrected": True}})
+    refused(daemon, "frames.corrected needs a camera with a thermal_model")

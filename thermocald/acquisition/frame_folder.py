@@ -1,7 +1,8 @@
 """Frames on disk: which are kept, for how long, and what goes first when the disk fills up.
 
 `<folder>/<camera>/<series>/<thousands>/<epoch>.jpg` or `.png`. A JPEG is kept as the camera gave
-it, grey values as PNG. A file appears as a whole or not at all.
+it, grey values as PNG; `<epoch>-corrected.jpg` may stand beside it. A file appears as a whole or
+not at all.
 """
 
 from __future__ import annotations
@@ -90,20 +91,23 @@ class FrameFolder:
             data = png.tobytes()
         suffix = ".jpg" if data[:2] == b"\xff\xd8" else ".png"
         relative = Path(camera, series, f"{number // _PER_FOLDER:04d}", f"{number:07d}{suffix}")
-        try:
-            self._write(self.root / relative, data)
-        except OSError as error:
-            self._pause(f"{self.root}: {error.strerror or error}; no frames are kept")
+        if not self._written(relative, data):
             return None
         if self.paused:
             log.info("%s: frames are kept again", self.root)
             self.paused = ""
         return relative
 
+    def keep_corrected(self, relative: Path, jpeg: bytes) -> Path | None:
+        """Write a corrected frame beside the one that was kept; as `keep`."""
+        beside = _beside(relative)
+        return beside if self._written(beside, jpeg) else None
+
     def delete(self, relative: Path) -> None:
-        """Delete one frame; it is not an error if it is not there."""
-        with contextlib.suppress(OSError):
-            (self.root / relative).unlink()
+        """Delete one frame, and the corrected one; it is not an error if it is not there."""
+        for path in (relative, _beside(relative)):
+            with contextlib.suppress(OSError):
+                (self.root / path).unlink()
 
     def free_bytes(self) -> int:
         """Free space of the disk; nothing where it cannot be asked."""
@@ -180,6 +184,15 @@ class FrameFolder:
                     found = os.stat(path)
                     yield found.st_mtime, found.st_size, path
 
+    def _written(self, relative: Path, data: bytes) -> bool:
+        """Whether the disk has taken a file; `paused` says why not."""
+        try:
+            self._write(self.root / relative, data)
+        except OSError as error:
+            self._pause(f"{self.root}: {error.strerror or error}; no frames are kept")
+            return False
+        return True
+
     def _write(self, path: Path, data: bytes) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         partial = path.with_name(path.name + ".partial")
@@ -195,3 +208,7 @@ class FrameFolder:
         if not self.paused:
             log.warning(why, extra={"event": "frames_paused"})
         self.paused = why
+
+
+def _beside(relative: Path) -> Path:
+    return relative.with_name(f"{relative.stem}-corrected.jpg")

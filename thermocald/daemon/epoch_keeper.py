@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 from thermocald.daemon.plan import check_series, series_head
 from thermocald.daemon.store_guard import Row
-from thermocald.errors import StoreError
+from thermocald.errors import ImageError, StoreError
 from thermocald.names import WITH_VALUES
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.store.series import NOT_CALIBRATED, EpochResult, Event, StoredSeries
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
+    from pathlib import Path
 
     from thermocald.acquisition.calibrator import CalibratedEpoch
     from thermocald.acquisition.frame_folder import FrameFolder
@@ -62,6 +63,7 @@ class EpochKeeper:
         self._series: StoredSeries | None = self._existing()
         self._backlog: list[Epoch] = []
         self._searched_to = 0
+        self._uncorrected = ""
 
     def _existing(self) -> StoredSeries | None:
         found = [
@@ -155,6 +157,7 @@ class EpochKeeper:
         if calibrated is not None:
             result = EpochResult.from_adjustment(calibrated.adjustment)
             extra |= calibrated.extra
+            self._correct(path, calibrated)
         elif deferred and path is None:
             result = EpochResult("frame_not_kept", "calibration deferred, the frame not kept")
         epoch = replace(epoch, frame=path)
@@ -188,6 +191,23 @@ class EpochKeeper:
         if not wanted and stored is not None and stored.epoch.frame is not None:
             self._frames.delete(stored.epoch.frame)
             self.kept_frames -= 1
+        elif stored is not None:
+            self._correct(stored.epoch.frame, calibrated)
+
+    def _correct(self, frame: Path | None, calibrated: CalibratedEpoch) -> None:
+        """Keep a frame a second time, as the steady camera had seen it; said once where not."""
+        if frame is None or self.plan.corrector is None:
+            return
+        try:
+            encoded = (self._frames.root / frame).read_bytes()
+            jpeg = self.plan.corrector.correct(encoded, calibrated)
+        except (ImageError, OSError) as error:
+            if str(error) != self._uncorrected:
+                log.warning("camera %s: frames are not corrected: %s", self.plan.name, error)
+            self._uncorrected = str(error)
+            return
+        self._uncorrected = ""
+        self._frames.keep_corrected(frame, jpeg)
 
     def _stored(self, number: int) -> StoredEpoch | None:
         series = self.series

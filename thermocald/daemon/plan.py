@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from thermocald.analysis.online.running_series import RunningSeries
+    from thermocald.analysis.thermal.corrected_frame import FrameCorrector
     from thermocald.analysis.thermal.gauge import GaugeCalibrator
     from thermocald.config import CalibrationConfig, CameraConfig, Config
     from thermocald.hal import Camera, Clock, Frame
@@ -35,7 +36,7 @@ class CameraPlan:
 
     series: the one being taken, empty for none; sensor, testfield, calibrator: None if its epochs
     are only acquired; of a gauge the test field holds the control points, and there may be none;
-    extra: what the head of a series keeps besides.
+    extra: what the head of a series keeps besides; corrector: None where frames are kept as taken.
     """
 
     config: CameraConfig
@@ -46,6 +47,7 @@ class CameraPlan:
     calibrator: Calibrator | GaugeCalibrator | None
     series: str
     extra: Mapping[str, Any] = field(default_factory=dict)
+    corrector: FrameCorrector | None = None
 
     @property
     def name(self) -> str:
@@ -69,7 +71,7 @@ def _plan(config: Config, one: CameraConfig, clock: Clock) -> CameraPlan:
     camera: Camera = open_device("camera", one.driver, one.options, clock)
     calibration = config.calibration_of(one)
     if one.thermal_model is not None:
-        return _plan_gauge(one, calibration, camera)
+        return _plan_gauge(one, calibration, camera, corrected=config.frames.corrected)
     sensor, targets = _sensor(one), None
     if one.testfield is not None:
         targets = read_testfield(one.testfield)
@@ -94,8 +96,11 @@ def _plan(config: Config, one: CameraConfig, clock: Clock) -> CameraPlan:
     return CameraPlan(one, calibration, camera, sensor, targets, calibrator, one.series or "")
 
 
-def _plan_gauge(one: CameraConfig, calibration: CalibrationConfig, camera: Camera) -> CameraPlan:
+def _plan_gauge(
+    one: CameraConfig, calibration: CalibrationConfig, camera: Camera, *, corrected: bool
+) -> CameraPlan:
     """A camera that is predicted by its thermal model, and posed by control points."""
+    from thermocald.analysis.thermal.corrected_frame import FrameCorrector
     from thermocald.analysis.thermal.gauge import plan_gauge
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 
@@ -112,8 +117,9 @@ def _plan_gauge(one: CameraConfig, calibration: CalibrationConfig, camera: Camer
     if len(gauge.testfield):
         extra["control_origin_mm"] = origin
     return CameraPlan(
-        one, calibration, camera, gauge.sensor, gauge.testfield, gauge, one.series or "", extra
-    )
+        one, calibration, camera, gauge.sensor, gauge.testfield, gauge, one.series or "", extra,
+        FrameCorrector(thermal, one.name, origin) if corrected else None,
+    )  # fmt: skip
 
 
 def _check_size(one: CameraConfig, camera: Camera, sensor: Sensor | None) -> None:

@@ -14,7 +14,7 @@ from thermocald.analysis.thermal.correction import correct_points, image_correct
 from thermocald.analysis.thermal.timed_rows import STANDARD_INPUT, RowBlock, row_blocks
 from thermocald.errors import DataError, ImageError, ThermocaldError, UsageError
 from thermocald.files import make_folder, new_file, write_parts
-from thermocald.output.image_metadata import with_metadata
+from thermocald.photogrammetry.targets.image_metadata import with_metadata
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

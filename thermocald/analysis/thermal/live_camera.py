@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from thermocald.analysis.camera.camera import Camera
-from thermocald.analysis.camera.undistortion import ideal_points
+from thermocald.analysis.camera.resampling import Maps
 from thermocald.errors import UsageError
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, project
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.physics import catalogue
 from thermocald.physics.history import History
 
@@ -30,9 +30,6 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.physics.model import ModelEffect, ThermalModel
 
-_RENEWED_PX = 0.05
-_CELL = 8  # px between the nodes at which maps are computed
-_CHECKED = 5  # points per row and column that say whether the maps still hold
 _STEP = 1e-3  # of a parameter, for its derivative; as `along` has it
 
 
@@ -142,7 +139,7 @@ class LiveCamera:
         self._readings = _Readings(kept=self._asks_along)
         self._channels: tuple[str, ...] = ()
         self._now: Camera | None = None
-        self._maps: _Maps | None = None
+        self._maps: Maps | None = None
         self._moved = {
             name: tuple(_Drive(_moved_by(self._drives, name, sign)[0]) for sign in (1.0, -1.0))
             for name in thermal.parameters
@@ -224,7 +221,7 @@ class LiveCamera:
             raise UsageError("there is no reading yet: update(time, temperature) comes first")
         target = self.thermal.model.T0 if to is None else to
         if self._maps is None or self._maps.to != target:
-            self._maps = _Maps(self.thermal.at(target, extrapolate=True), target)
+            self._maps = Maps(self.thermal.at(target, extrapolate=True), target)
         return self._maps.of(self._now.values)
 
     def _checked(
@@ -316,50 +313,3 @@ def _influence(effects: Sequence[ModelEffect], history: History) -> Array:
     for effect in effects:
         total += catalogue.get(effect.name).influence(history, effect.values, None).iop[0]
     return total
-
-
-class _Maps:
-    """Maps of `cv2.remap` from a camera to a steady one, kept as long as they hold."""
-
-    def __init__(self, steady: Camera, to: float) -> None:
-        self.to, self.sensor = to, steady.sensor
-        width, height = self.sensor.width, self.sensor.height
-        # one node beyond each edge, where `cv2.resize` puts it
-        self.shape = (-(-height // _CELL) + 2, -(-width // _CELL) + 2)
-        v, u = (_CELL * np.arange(n) - (_CELL + 1) / 2.0 for n in self.shape)
-        self.nodes = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-        self.directions = _directions(steady, self.nodes)
-        u, v = np.linspace(0, width - 1, _CHECKED), np.linspace(0, height - 1, _CHECKED)
-        points = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-        self.checked = _directions(steady, points)
-        self.pixels = np.meshgrid(
-            np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)
-        )
-        self.seen: Array | None = None
-        self.maps: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
-
-    def of(self, values: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """The maps of a camera with some interior orientation (10,)."""
-        seen = project(self.sensor, values, np.zeros(6), self.checked)
-        far = math.inf if self.seen is None else float(np.abs(seen - self.seen).max())
-        if self.maps is not None and far <= _RENEWED_PX / math.sqrt(2.0):
-            return self.maps
-        self.seen, self.maps = seen, self._made(values)
-        return self.maps
-
-    def _made(self, values: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Shifts at the nodes, straight lines between them: 1e-4 px from those of every pixel."""
-        import cv2
-
-        moved = project(self.sensor, values, np.zeros(6), self.directions) - self.nodes
-        shifts = moved.astype(np.float32).reshape(*self.shape, 2)
-        rows, columns = self.shape
-        large = cv2.resize(shifts, (columns * _CELL, rows * _CELL), interpolation=cv2.INTER_LINEAR)[
-            _CELL : _CELL + self.sensor.height, _CELL : _CELL + self.sensor.width
-        ]
-        return self.pixels[0] + large[..., 0], self.pixels[1] + large[..., 1]
-
-
-def _directions(camera: Camera, points: Array) -> Array:
-    ideal = ideal_points(camera.sensor, camera.values, points)
-    return np.concatenate([ideal, np.full((len(ideal), 1), -1.0)], axis=1)

@@ -1,0 +1,153 @@
+"""Frames of a hot camera as the steady one had seen them: pixels, EXIF, camera and pose in them."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.analysis.test_gauge import START, thermal_camera
+from thermocald.acquisition.calibrator import CalibratedEpoch
+from thermocald.analysis.camera.resampling import Maps
+from thermocald.analysis.thermal.corrected_frame import FrameCorrector
+from thermocald.epoch import Epoch
+from thermocald.errors import ImageError
+from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation, project
+from thermocald.photogrammetry.epoch.adjustment import failed
+from thermocald.photogrammetry.frame.measurement import Prior
+from thermocald.photogrammetry.frame.tracking import Tracker
+from thermocald.physics.scene import Look, Scene
+from thermocald.physics.testfields import demonstration_field, demonstration_model
+
+HOT = 40.0
+FIELD = demonstration_field("markers")
+POSE = demonstration_model(FIELD).exterior.as_array()
+ORIGIN = (192e6, 313e6, 0.0)
+
+
+@pytest.fixture(scope="module")
+def thermal():
+    """The gauge's camera in small frames, moving 0.2 px/K, before the rendered corner."""
+    small = thermal_camera().for_images(820, 616)
+    rates = {name: 10 * rate for name, rate in small.model.rates.items()}
+    return replace(small, model=replace(small.model, rates=rates))
+
+
+def seen_at(thermal, T: float) -> np.ndarray:
+    """A frame of the corner without noise."""
+    scene = Scene(thermal.model.sensor, FIELD, Look(noise_dn=0.0))
+    return scene.render(thermal.at(T).values, POSE)
+
+
+def calibrated(thermal, T: float = HOT) -> CalibratedEpoch:
+    """An epoch as the gauge leaves it."""
+    covariance = np.zeros((16, 16))
+    covariance[:10, :10] = thermal.at(T).covariance
+    covariance[range(10, 16), range(10, 16)] = 1e-6
+    result = replace(
+        failed("resected", "", None), interior=thermal.at(T).interior, covariance=covariance,
+        exterior=ExteriorOrientation.from_array(POSE),
+    )  # fmt: skip
+    return CalibratedEpoch(Epoch(7, START + 0.25, START, {"housing": T}), result, {})
+
+
+def corrected(thermal, encoded: bytes, done: CalibratedEpoch | None = None) -> bytes:
+    corrector = FrameCorrector(thermal, "gauge", ORIGIN)
+    return corrector.correct(encoded, done or calibrated(thermal))
+
+
+def png(image: np.ndarray) -> bytes:
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
+def test_targets_of_a_corrected_frame_are_where_its_camera_and_pose_put_them(thermal):
+    hot = seen_at(thermal, HOT)
+    jpeg = corrected(thermal, png(hot))
+    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
+    steady = thermal.at(thermal.model.T0)
+    found = Tracker(FIELD, Prior(steady.sensor, steady.interior)).measure(image).observations
+    as_it_was = Tracker(FIELD, Prior(steady.sensor, steady.interior)).measure(hot).observations
+    told = json.loads(Image.open(io.BytesIO(jpeg)).info["comment"])
+    pose = np.array([told["pose"][n] for n in ("omega", "phi", "kappa", "X0", "Y0", "Z0")])
+    at = project(steady.sensor, steady.values, pose, FIELD.points)
+    left = found.points - at[found.targets]
+    before = as_it_was.points - at[as_it_was.targets]
+    assert len(found) > 100
+    assert np.sqrt(np.mean(before**2)) > 2.0
+    assert np.sqrt(np.mean(left**2)) < 0.05  # of markers of 20 px, through a JPEG
+    K = steady.opencv()[0]
+    for name, value in (("fx", K[0, 0]), ("fy", K[1, 1]), ("cx", K[0, 2]), ("cy", K[1, 2])):
+        assert told["opencv"][name] == pytest.approx(value)
+    assert told["opencv"]["sd_fy"] == pytest.approx(
+        thermal.at(HOT).sd["c"] / steady.sensor.pixel_pitch
+    )
+    assert (told["corrected_to"], told["temperature"], told["epoch"]) == (20.0, HOT, 7)
+    assert told["pose"]["origin_mm"] == list(ORIGIN)
+    assert told["pose"]["sd_X0"] == pytest.approx(1e-3)
+
+
+def test_exif_is_written_where_there_is_none(thermal):
+    exif = Image.open(io.BytesIO(corrected(thermal, png(seen_at(thermal, HOT))))).getexif()
+    details = exif.get_ifd(0x8769)
+    assert (exif[0x0110], exif[0x0112], exif[0x0131]) == ("gauge", 1, "thermocald")
+    assert details[0x9003] == "2023:11:14 22:13:20"
+    assert (details[0x9011], details[0x9291]) == ("+00:00", "250")
+    assert details[0x920A] == pytest.approx(thermal.model.interior.c, abs=1e-4)
+    assert details[0xA20E] == pytest.approx(1 / thermal.model.sensor.pixel_pitch, abs=1e-3)
+
+
+def test_exif_colours_and_comment_of_the_camera_stay(thermal):
+    """A phone's frame: its flag of a turned phone does not turn the pixels."""
+    grey = seen_at(thermal, HOT)
+    colour = np.stack([grey, grey, np.full_like(grey, 90)], axis=-1)
+    exif = Image.Exif()
+    exif[0x010F], exif[0x0112] = "Nexus", 6
+    buffer = io.BytesIO()
+    Image.fromarray(colour[..., ::-1]).save(buffer, "JPEG", exif=exif, comment=b"mine", quality=95)
+    jpeg = corrected(thermal, buffer.getvalue())
+    image = Image.open(io.BytesIO(jpeg))
+    assert (image.size, image.mode) == ((820, 616), "RGB")
+    assert (image.getexif()[0x010F], image.getexif()[0x0112]) == ("Nexus", 6)
+    assert b"mine" in jpeg[:2000]
+    assert json.loads(image.info["comment"])["format"] == "thermocald-frame/1"
+    assert abs(float(np.median(np.asarray(image)[..., 0])) - 90) < 3
+
+
+def test_sixteen_bits_become_a_jpeg(thermal):
+    hot = seen_at(thermal, HOT)
+    deep = corrected(thermal, png(hot.astype(np.uint16) << 8))
+    assert deep == corrected(thermal, png(hot))
+
+
+@pytest.mark.parametrize(
+    ("encoded", "words"),
+    [(png(np.zeros((60, 80), np.uint8)), "80×60 px, the model's camera 820×616"),
+     (b"\xff\xd8 no image", "cannot be decoded")],
+)  # fmt: skip
+def test_what_cannot_be_corrected_is_said(thermal, encoded, words):
+    with pytest.raises(ImageError, match=words):
+        corrected(thermal, encoded)
+
+
+def test_without_a_camera_there_is_no_corrected_frame(thermal):
+    far = CalibratedEpoch(calibrated(thermal).epoch, failed("outside_range", "90 °C"), {})
+    with pytest.raises(ImageError, match="outside_range: 90 °C"):
+        corrected(thermal, png(seen_at(thermal, HOT)), far)
+
+
+@pytest.mark.parametrize("size", [(820, 616), (821, 515), (300, 257)])
+def test_strips_are_the_whole_image(thermal, size):
+    """Of sizes that no strip and no node divides."""
+    here = thermal.for_images(1640, 1232)
+    steady, hot = here.at(20.0), here.at(HOT).values
+    small = replace(steady.sensor, width=size[0], height=size[1])
+    steady = replace(steady, sensor=small)
+    image = np.random.default_rng(0).integers(0, 256, size[::-1], dtype=np.uint8)
+    maps = Maps(steady, 20.0)
+    whole = cv2.remap(image, *maps.of(hot), cv2.INTER_CUBIC)
+    assert np.array_equal(maps.resample(image, hot), whole)

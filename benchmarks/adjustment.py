@@ -28,8 +28,9 @@ from thermocald.photogrammetry.camera.camera_model import (
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, adjust
 from thermocald.photogrammetry.epoch.gauss_markov import Problem, solve
 from thermocald.photogrammetry.field.testfield import Observations, TestField
-from thermocald.photogrammetry.series.adjustment import SeriesSettings, adjust_series
+from thermocald.photogrammetry.series.adjustment import adjust_series
 from thermocald.photogrammetry.series.normals import ObservationGrid
+from thermocald.photogrammetry.series.result import SeriesSettings
 
 SENSOR = Sensor(3280, 2464, 0.00112)
 INTERIOR = InteriorOrientation(3.04, 0.02, -0.03, -5e-3, 4e-4, -1e-5, 3e-4, -2e-4)

@@ -19,8 +19,8 @@ from thermocald.photogrammetry.camera.camera_model import (
 )
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, adjust
 from thermocald.photogrammetry.field.testfield import Observations, TestField
-from thermocald.photogrammetry.series.adjustment import SeriesSettings, adjust_series
-from thermocald.photogrammetry.series.result import Exterior
+from thermocald.photogrammetry.series.adjustment import adjust_series
+from thermocald.photogrammetry.series.result import Exterior, SeriesSettings
 from thermocald.physics.testfields import corner_field, demonstration_model
 
 if TYPE_CHECKING:

@@ -12,7 +12,8 @@ from thermocald.analysis.thermal.model_text import model_lines
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation
 from thermocald.photogrammetry.field.testfield import Observations
-from thermocald.photogrammetry.series.adjustment import SeriesSettings, adjust_series
+from thermocald.photogrammetry.series.adjustment import adjust_series
+from thermocald.photogrammetry.series.result import SeriesSettings
 from thermocald.physics.model import ModelEffect
 from thermocald.thermal.basis import choose_distortion
 from thermocald.thermal.reduce import reduce_series

@@ -9,8 +9,9 @@ import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP, PRINCIPAL, project
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.photogrammetry.series.adjustment import SeriesSettings, adjust_series
+from thermocald.photogrammetry.series.adjustment import adjust_series
 from thermocald.photogrammetry.series.normals import ObservationGrid, linearise
+from thermocald.photogrammetry.series.result import SeriesSettings
 
 
 @dataclass(frozen=True)

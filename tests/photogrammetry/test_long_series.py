@@ -8,10 +8,11 @@ import pytest
 
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.photogrammetry.series.adjustment import SeriesSettings, adjust_series
+from thermocald.photogrammetry.series.adjustment import adjust_series
 from thermocald.photogrammetry.series.blocks import GridBlocks, spread_windows
 from thermocald.photogrammetry.series.long_series import adjust_long_series
 from thermocald.photogrammetry.series.normals import ObservationGrid
+from thermocald.photogrammetry.series.result import SeriesSettings
 
 OWN = np.arange(8)
 EPOCHS = 480

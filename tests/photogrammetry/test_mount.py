@@ -9,10 +9,10 @@ from mount_cases import Tremble, simulate, small_field, standardised
 
 from thermocald.photogrammetry.camera.camera_model import PRINCIPAL, PRINCIPAL_POINT, project
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.photogrammetry.series.adjustment import SeriesSettings, adjust_series
+from thermocald.photogrammetry.series.adjustment import adjust_series
 from thermocald.photogrammetry.series.mount import drift_period
-from thermocald.photogrammetry.series.movement import Movement
-from thermocald.photogrammetry.series.variance_components import components
+from thermocald.photogrammetry.series.movement import Movement, components
+from thermocald.photogrammetry.series.result import SeriesSettings
 
 STILL, TREMBLES, SWAYS = Tremble(0.0), Tremble(0.1), Tremble(0.1, 0.8)
 

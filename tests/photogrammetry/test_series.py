@@ -11,8 +11,9 @@ import pytest
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.epoch.adjustment import adjust
 from thermocald.photogrammetry.field.testfield import Observations, TestField
-from thermocald.photogrammetry.series.adjustment import SeriesSettings, adjust_series
+from thermocald.photogrammetry.series.adjustment import adjust_series
 from thermocald.photogrammetry.series.normals import ObservationGrid
+from thermocald.photogrammetry.series.result import SeriesSettings
 
 OWN = np.arange(8)
 

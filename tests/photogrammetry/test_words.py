@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from thermocald.photogrammetry.series.words import Words
+from thermocald.photogrammetry.series.spool import Words
 
 
 def test_they_read_as_the_sequence_they_are():

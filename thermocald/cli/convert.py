@@ -10,8 +10,6 @@ import typer
 from thermocald.cli.common import progress, say
 from thermocald.errors import RecordingError, UsageError
 
-__all__ = ["convert"]
-
 _NAMES = {"csv": "observations.csv", "parquet": "observations.parquet"}
 
 

@@ -16,8 +16,6 @@ from thermocald.errors import UsageError
 if TYPE_CHECKING:
     from thermocald.fleet.forward import FrameRule
 
-__all__ = ["forward"]
-
 
 def forward(
     store: StoreArgument = None,

@@ -14,8 +14,6 @@ from thermocald.errors import DataError, OutputError, UsageError
 from thermocald.store.server.connection import is_server
 from thermocald.store.sources import source_name
 
-__all__ = ["reprocess"]
-
 
 def reprocess(
     archives: Annotated[

@@ -14,8 +14,6 @@ from thermocald.result import jsonable
 from thermocald.store.server.connection import ServerAddress, is_server
 from thermocald.store.sources import source_name
 
-__all__ = ["ANALYSES", "SeriesOutcome", "SeriesTask", "analyse", "find_series_tasks", "lost"]
-
 ANALYSES = ("discover", "study")
 
 

@@ -11,8 +11,6 @@ import typer
 from thermocald.cli.commands import subcommands
 from thermocald.cli.common import say, write_text
 
-__all__ = ["group"]
-
 _Address = Annotated[
     str, typer.Argument(metavar="ADDRESS", help="postgresql://OWNER@HOST/DATABASE, an owner's.")
 ]

@@ -22,10 +22,11 @@ import numpy as np
 from thermocald.discovery import criteria
 from thermocald.errors import DataError
 from thermocald.photogrammetry.field.planes import field_sheets
-from thermocald.photogrammetry.series.board_motion import board_movements, refined
 from thermocald.photogrammetry.series.field_motion import (
     FieldMovement,
     FieldSeries,
+    board_movements,
+    refined,
     wandering_targets,
 )
 from thermocald.photogrammetry.series.normals import ObservationGrid

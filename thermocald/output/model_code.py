@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 
-__all__ = ["c_header", "python_module", "write_code"]
-
 _C = """\
 /* {name}: thermal camera model, written by thermocald. No dependencies; C99 and C++.
 

@@ -38,20 +38,6 @@ if TYPE_CHECKING:
     Columns = dict[str, NDArray[np.integer] | Array | Sequence[str]]
     Row = dict[str, float | int | str | None]
 
-__all__ = [
-    "Besides",
-    "ExportStyle",
-    "as_csv",
-    "as_json",
-    "as_rows",
-    "besides",
-    "column_parts",
-    "columns_of",
-    "plain_rows",
-    "style_of",
-    "write_parquet",
-]
-
 UNITS = ("px", "um", "deg")
 _IN_IMAGE, _ANGLES = ("c", "x0", "y0"), ("omega", "phi", "kappa")
 _PLACE = ("X0", "Y0", "Z0")

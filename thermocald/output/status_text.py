@@ -13,8 +13,6 @@ from typing import Any
 from thermocald.names import WITH_VALUES
 from thermocald.numbers import duration, with_sd
 
-__all__ = ["WIDTH", "status_lines", "status_warnings"]
-
 WIDTH = 79
 _OLD_S = 10.0
 

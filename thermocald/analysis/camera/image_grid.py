@@ -10,8 +10,6 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
 
-__all__ = ["image_grid"]
-
 
 def image_grid(sensor: Sensor, size: int = 3) -> Array:
     """Image points (size², 2) px from corner to corner, row by row from the top."""

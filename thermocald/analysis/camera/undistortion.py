@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
 
-__all__ = ["ideal_points", "undistorted_points"]
-
 _BLOCK = 8192
 _DEGREE = 6
 _STEP_PX = 3e-6  # a second Newton step below this leaves less than 1e-9 px

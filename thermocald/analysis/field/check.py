@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
 
-__all__ = ["CELLS", "FREE", "FieldCheck", "Precision", "check_field", "precision", "usual_station"]
-
 FREE = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2")
 """The interior parameters whose standard deviations are predicted."""
 CELLS = (4, 3)

@@ -15,11 +15,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     InteriorOrientation,
 )
-from thermocald.photogrammetry.series.adjustment import (
-    SeriesAdjustment,
-    SeriesSettings,
-    adjust_series,
-)
+from thermocald.photogrammetry.series.adjustment import adjust_series
 from thermocald.photogrammetry.series.blocks import (
     ObservedBlocks,
     WithoutTargets,
@@ -28,8 +24,7 @@ from thermocald.photogrammetry.series.blocks import (
 )
 from thermocald.photogrammetry.series.long_series import adjust_long_series, together_at_most
 from thermocald.photogrammetry.series.mount import drift_period
-from thermocald.photogrammetry.series.spool import released
-from thermocald.photogrammetry.series.words import Words
+from thermocald.photogrammetry.series.spool import Words, released
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -40,8 +35,9 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import Observations, TestField
     from thermocald.photogrammetry.series.blocks import ObservationBlocks
-    from thermocald.photogrammetry.series.long_result import LongAdjustment, RowWriter
+    from thermocald.photogrammetry.series.long_series import LongAdjustment, RowWriter
     from thermocald.photogrammetry.series.normals import ObservationGrid
+    from thermocald.photogrammetry.series.result import SeriesAdjustment, SeriesSettings
     from thermocald.store.recording.head import Head
 
 __all__ = ["table_of_series"]

@@ -20,8 +20,7 @@ from thermocald.errors import DataError, DriverMissing
 from thermocald.figures import BAND
 from thermocald.files import write_parts
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
-from thermocald.photogrammetry.series.spool import released
-from thermocald.photogrammetry.series.words import Words
+from thermocald.photogrammetry.series.spool import Words, released
 from thermocald.physics.effect import PARAMETER_UNITS
 from thermocald.result import Result, jsonable, new_figure
 from thermocald.store.recording.reader import interpolate_readings
@@ -38,8 +37,8 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.field.testfield import Observations
-    from thermocald.photogrammetry.series.adjustment import SeriesAdjustment
     from thermocald.photogrammetry.series.field_motion import FieldMovement
+    from thermocald.photogrammetry.series.result import SeriesAdjustment
     from thermocald.store.recording.head import Head
 
 CSV_COLUMNS = (

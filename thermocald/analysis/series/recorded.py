@@ -13,7 +13,7 @@ from thermocald.analysis.series.epochs import Epochs, calibrate_epochs, frame_te
 from thermocald.errors import DataError
 from thermocald.photogrammetry.series.long_series import together_at_most
 from thermocald.photogrammetry.series.result import SeriesSettings
-from thermocald.photogrammetry.series.words import Words
+from thermocald.photogrammetry.series.spool import Words
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

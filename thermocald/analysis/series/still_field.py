@@ -12,11 +12,11 @@ import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP, IOP
 from thermocald.photogrammetry.field.planes import field_sheets
-from thermocald.photogrammetry.series.board_motion import board_movements
 from thermocald.photogrammetry.series.field_motion import (
     FEWEST_EPOCHS,
     FieldMovement,
     FieldSeries,
+    board_movements,
     put_back,
     wandering_targets,
 )
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.field.testfield import TestField
-    from thermocald.photogrammetry.series.adjustment import SeriesAdjustment
+    from thermocald.photogrammetry.series.result import SeriesAdjustment
 
 __all__ = ["still_field"]
 

@@ -31,8 +31,6 @@ from thermocald.analysis.statistics.noise_models import Frequencies, grid
 if TYPE_CHECKING:
     from thermocald.arrays import Array
 
-__all__ = ["SlopeNoise", "slope_noise"]
-
 _COLOURED = (0.15, 0.3, 0.5, 0.7, 0.85, 1.0)
 _WHITE = 0.3
 _LIKELY = (

@@ -14,8 +14,6 @@ import numpy as np
 if TYPE_CHECKING:
     from thermocald.arrays import Array
 
-__all__ = ["IopCorrelations", "correlations_of", "median_correlations"]
-
 
 @dataclass(frozen=True, eq=False)
 class IopCorrelations:

@@ -26,15 +26,6 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array, Mask
 
-__all__ = [
-    "Dependence",
-    "correlation_matrix",
-    "dependence",
-    "holm",
-    "pearson_p_value",
-    "slope_p_value",
-]
-
 _LEAST_EFFECTIVE = 3.0
 _CHANCE = 0.01
 _UNUSUAL = 3.0  # times the median sd of an epoch

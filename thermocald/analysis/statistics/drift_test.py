@@ -33,8 +33,6 @@ from thermocald.analysis.statistics.noise_models import (
 if TYPE_CHECKING:
     from thermocald.arrays import Array
 
-__all__ = ["DriftTest", "drift_test"]
-
 _LEAST_VALUES = 8
 _FIRST_BAND = 4  # low frequencies of the first band; the next have four times as many
 _WIDENING = 4

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
 
-__all__ = ["MODELS", "Frequencies", "cosines", "largest_p_value", "spectra"]
-
 # Beyond this many low frequencies, which carry the slow correlation, neighbours are pooled.
 _SINGLE_FREQUENCIES = 2000
 _POOLED_FREQUENCIES = 1000

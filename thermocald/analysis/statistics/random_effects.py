@@ -23,8 +23,6 @@ from thermocald.errors import DataError
 if TYPE_CHECKING:
     from thermocald.arrays import Array
 
-__all__ = ["Population", "Shrunk", "odd_specimens", "population"]
-
 _FEWEST = 2
 _FEWEST_FOR_CORRELATIONS = 4
 _ROUNDS = 60

@@ -19,14 +19,6 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
 
-__all__ = [
-    "MovingFTest",
-    "moving_f_test",
-    "moving_mean",
-    "moving_variance",
-    "unbroken_windows",
-]
-
 _CHUNK = 1 << 15
 # A window is broken by gaps when it lasts this much longer than n regular measurements.
 _STRETCH = 1.5

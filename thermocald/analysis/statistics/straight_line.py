@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
 
-__all__ = ["StraightLine", "fit_straight_line"]
-
 _ITERATIONS = 100
 _CONVERGED = 1e-7  # of the slope's standard deviation
 

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from starlette.requests import Request
     from starlette.types import ASGIApp, Receive, Scope, Send
 
-__all__ = ["build_application"]
-
 _STATIC = Path(__file__).parent / "static"
 _FILES = {
     "page.js": "text/javascript; charset=utf-8",

@@ -10,8 +10,6 @@ from prometheus_client.core import GaugeMetricFamily
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-__all__ = ["metrics_text"]
-
 _CAMERA = {
     "ticks": "Ticks of the camera's schedule.",
     "skipped": "Ticks skipped because they came too late.",

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from starlette.applications import Starlette
     from starlette.types import ASGIApp, Receive, Scope, Send
 
-__all__ = ["Limits", "bind", "run_server"]
-
 log = logging.getLogger(__name__)
 
 _CONNECTIONS = 100

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
     from thermocald.store.series import StoredSeries
 
-__all__ = ["View"]
-
 _SHOWN = ("c", "x0", "y0")
 _MOST_POINTS = 2000
 _ROWS_AT_ONCE = 500

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from thermocald.analysis.study.series_study import ChannelStudy, SeriesStudy, Significance
     from thermocald.analysis.study.study import CameraStudy, Study
 
-__all__ = ["FORMAT", "study_document"]
-
 FORMAT = "thermocald-study/1"
 
 

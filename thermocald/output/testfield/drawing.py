@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
     from thermocald.output.testfield.layout import Marker, Sheet, Target
 
-__all__ = ["draw", "pages_of", "require_matplotlib", "write_pdf", "write_svg"]
-
 _TARGET_NAME = 0.7
 """Height of a target's name in radii of its disc."""
 

@@ -28,17 +28,6 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
 
-__all__ = [
-    "PAPERS",
-    "Design",
-    "Marker",
-    "Sheet",
-    "Target",
-    "field_of",
-    "lay_out",
-    "paper_size",
-]
-
 PAPERS = {
     "A0": (841.0, 1189.0),
     "A1": (594.0, 841.0),

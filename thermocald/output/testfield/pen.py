@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["GREY", "Pen", "crop_marks", "draw_marker", "rectangle", "rulers", "square"]
-
 _MM_PER_INCH = 25.4
 _POINTS_PER_MM = 72 / _MM_PER_INCH
 _RULER = 100.0

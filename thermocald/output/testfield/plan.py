@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.output.testfield.layout import Sheet
 
-__all__ = ["ALLOWED_ANGLE_DEG", "STEPS", "draw_plan"]
-
 ALLOWED_ANGLE_DEG = 0.4
 """A wall that is off by this angle moves its far edge by the 3 mm that testfield.csv allows for."""
 

@@ -8,6 +8,8 @@ All epochs are in memory here; `long_series` adjusts one of any length in blocks
 `result`'s. A target that is hidden now and then shifts single epochs by its coordinate error; with
 `target_offsets` that error is an unknown with the test field's sigma as its prior.
 
+The exterior orientation is estimated as was asked for, or as the data show.
+
 Source: DESIGN idea 3; the test for standing still is Rao's score test (1948).
 """
 
@@ -18,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.camera.camera_model import EOP
+from thermocald.photogrammetry.camera.camera_model import EOP, IOP, free_columns
 from thermocald.photogrammetry.epoch.snooping import TRUSTED_REDUNDANCY
 from thermocald.photogrammetry.series.covariances import (
     all_cofactors,
@@ -31,18 +33,22 @@ from thermocald.photogrammetry.series.covariances import (
     stillness,
     typical_sensitivity,
 )
-from thermocald.photogrammetry.series.design import State
 from thermocald.photogrammetry.series.estimator import (
     ENOUGH_FOR_NOISE,
     NOISE_SHOWN,
     Estimate,
     SeriesEstimator,
 )
-from thermocald.photogrammetry.series.exterior import choose, loose_bound, observed_movement
-from thermocald.photogrammetry.series.mount import FEWEST_EPOCHS
-from thermocald.photogrammetry.series.normals import ObservationGrid, sums_of_squares
-from thermocald.photogrammetry.series.result import SeriesAdjustment, SeriesSettings
-from thermocald.photogrammetry.series.status import enough_targets, judge
+from thermocald.photogrammetry.series.mount import FEWEST_EPOCHS, estimate_movement
+from thermocald.photogrammetry.series.movement import STILL, Movement, together
+from thermocald.photogrammetry.series.normals import ObservationGrid, linearise, sums_of_squares
+from thermocald.photogrammetry.series.result import (
+    SeriesAdjustment,
+    SeriesSettings,
+    enough_targets,
+    judge,
+)
+from thermocald.photogrammetry.series.system import State
 from thermocald.photogrammetry.series.target_noise import excess_scatter, slow_errors
 
 if TYPE_CHECKING:
@@ -55,8 +61,73 @@ if TYPE_CHECKING:
         Sensor,
     )
     from thermocald.photogrammetry.field.testfield import Observations, TestField
+    from thermocald.photogrammetry.series.result import Exterior
 
-__all__ = ["Adjusted", "SeriesAdjustment", "SeriesSettings", "adjust_series", "adjusted"]
+
+_LOOSE_PX = 3.0  # far beyond what a mount trembles, and what one epoch knows of its perspective
+
+
+def loose_bound(series: SeriesEstimator, start: Array) -> Array:
+    """A bound (6, 6) of the mount to some pixels in the image by each parameter."""
+    A = linearise(series.sensor, series.testfield, start[IOP], start[EOP]).A[..., EOP]
+    return np.diag((A**2).sum(axis=1).mean(axis=0)) / _LOOSE_PX**2
+
+
+def choose(
+    series: SeriesEstimator, asked: Exterior, estimate: Estimate
+) -> tuple[SeriesEstimator, str]:
+    """The series with the exterior orientation that a first estimate allows, and why."""
+    good = int(estimate.system.good.sum())
+    if asked == "auto" and good < FEWEST_EPOCHS:
+        own = replace(series, s=replace(series.s, exterior="per_epoch"), bound=None)
+        return own, f"{good} epochs do not show how the mount moves ({FEWEST_EPOCHS} would)"
+    movement = observed_movement(series, estimate)
+    px = movement.image_px(estimate.system.design.at.A)
+    noise = movement.noise_px(estimate.system.design.at.A)
+    if movement.still and asked == "auto":
+        still = replace(series, s=replace(series.s, exterior="series"), bound=None)
+        return still, f"no movement of the mount beyond the noise of an epoch ({noise:.3f} px)"
+    mount = replace(series, bound=movement.precision(), movement=movement)
+    how = ""
+    if movement.memory:
+        part = movement.slow_fraction(estimate.system.design.at.A)
+        slowly = f"over about {movement.memory:.0f} epochs"
+        how = f", {part:.0%} of it {slowly if movement.memory < good / 3 else 'slowly'}"
+    if movement.jumps:
+        how += f", with jumps at row {', '.join(map(str, movement.jumps))}"
+    return mount, f"the mount moves by {px:.3f} px about its mean pose{how}"
+
+
+def observed_movement(series: SeriesEstimator, estimate: Estimate) -> Movement:
+    """The variance components of the mount's movements."""
+    system = estimate.system
+    variance = series.variance(estimate)
+    at = system.design.at
+    before = np.concatenate([at.iop, at.eop])
+    b = system.gradient(estimate.residuals)
+    N = system.N
+    b = b + np.einsum("eij,ej->ei", N, estimate.values - before)
+    correlated = None
+    if series.s.target_noise:
+        pairs = series.pairs(estimate, system.use)
+        if len(pairs):
+            typical = (series.grid.weights * system.use[..., None])[system.good].mean(axis=0)
+            extra = pairs.normal_matrices(typical[None], at.A[..., EOP])[0]
+            correlated = extra / variance**2
+    free = np.array(free_columns(series.s.free), dtype=np.int64)
+    good = system.good & np.isfinite(b).all(axis=1)  # without epochs that diverged
+    found, starts = [], []
+    for part in series.windows or (slice(0, len(N)),):
+        if good[part].sum() < FEWEST_EPOCHS and series.windows:
+            continue
+        starts.append(part.start)
+        found.append(
+            estimate_movement(
+                N[part] / variance, b[part] / variance, free, good[part],
+                series.s.drift_period, correlated,
+            )
+        )  # fmt: skip
+    return together(found, starts) if found else STILL
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,17 +17,6 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
-__all__ = [
-    "GridBlocks",
-    "ObservationBlocks",
-    "ObservedBlocks",
-    "WithoutTargets",
-    "gathered",
-    "recut",
-    "runs",
-    "spread_windows",
-]
-
 
 class ObservationBlocks(Protocol):
     """The observations of consecutive epochs, on all targets of the field."""

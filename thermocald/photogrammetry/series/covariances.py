@@ -12,25 +12,12 @@ import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP, EOP_COLUMNS
 from thermocald.photogrammetry.linalg import root_of
-from thermocald.photogrammetry.series.cofactors import among_all, cofactors
+from thermocald.photogrammetry.series.normals import among_all, cofactors
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.series.system import SeriesSystem
     from thermocald.photogrammetry.series.target_noise import CorrelatedPairs
-
-__all__ = [
-    "SeriesCofactors",
-    "all_cofactors",
-    "line_weights",
-    "of_common",
-    "of_correlated",
-    "of_priors",
-    "of_slow_targets",
-    "offset_cofactors",
-    "stillness",
-    "typical_sensitivity",
-]
 
 
 @dataclass(frozen=True, eq=False)

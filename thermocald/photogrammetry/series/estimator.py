@@ -13,7 +13,6 @@ import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP, IOP, PARAMETER_NAMES, project
 from thermocald.photogrammetry.epoch.snooping import Rejections
-from thermocald.photogrammetry.series.design import Design, State, offset_weights
 from thermocald.photogrammetry.series.movement import STILL, Movement
 from thermocald.photogrammetry.series.normals import (
     ObservationGrid,
@@ -29,7 +28,7 @@ from thermocald.photogrammetry.series.snooping import (
     snoop_series,
     typical_variance,
 )
-from thermocald.photogrammetry.series.system import SeriesSystem
+from thermocald.photogrammetry.series.system import Design, SeriesSystem, State, offset_weights
 from thermocald.photogrammetry.series.target_noise import (
     CorrelatedPairs,
     correlated_pairs,
@@ -42,8 +41,6 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.series.normals import Partials
     from thermocald.photogrammetry.series.result import SeriesSettings
-
-__all__ = ["ENOUGH_FOR_NOISE", "NOISE_SHOWN", "Estimate", "SeriesEstimator"]
 
 ENOUGH_FOR_NOISE = 20
 """Epochs that show the noise of single targets."""

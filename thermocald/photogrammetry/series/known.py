@@ -2,40 +2,259 @@
 
 Some epochs of the series are adjusted together (`adjustment`): they say how the camera stands, how
 far its mount moves, what single targets are measured to and where they are off. Any other epoch is
-then adjusted with that known, and adds to the sums of what all have in common (`common_sums`).
+then adjusted with that known, and adds to the sums of what all have in common (`CommonSums`): its
+normal equations with its own parameters reduced. At the epochs' own solution the reduced right-hand
+side is the plain gradient, which is summed epoch by epoch. The matrix is that of the mean weights
+of all epochs that see the same targets; it differs from the sum by the square of how much their
+weights vary, and costs one reduction per kind of epoch.
 
 Source: Helmert blocking, Wolf, H. (1978): The Helmert block method.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP
+from thermocald.photogrammetry.linalg import inverse_of_determined
 from thermocald.photogrammetry.series.adjustment import epoch_variance
-from thermocald.photogrammetry.series.cofactors import among_all
-from thermocald.photogrammetry.series.common_sums import CommonSums, Shared, kinds_of
 from thermocald.photogrammetry.series.covariances import of_correlated, of_priors
-from thermocald.photogrammetry.series.design import State
 from thermocald.photogrammetry.series.estimator import ENOUGH_FOR_NOISE
-from thermocald.photogrammetry.series.normals import ObservationGrid, planes, sums_of_squares
-from thermocald.photogrammetry.series.status import enough_targets, judge
+from thermocald.photogrammetry.series.normals import (
+    ObservationGrid,
+    among_all,
+    planes,
+    sums_of_squares,
+)
+from thermocald.photogrammetry.series.result import enough_targets, judge
+from thermocald.photogrammetry.series.system import SeriesSystem, State
 
 if TYPE_CHECKING:
-    from thermocald.arrays import Array, Mask
+    from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.series.adjustment import Adjusted
-    from thermocald.photogrammetry.series.common_sums import Alike
-    from thermocald.photogrammetry.series.design import Design
     from thermocald.photogrammetry.series.estimator import Estimate, SeriesEstimator
     from thermocald.photogrammetry.series.movement import Movement
     from thermocald.photogrammetry.series.result import SeriesAdjustment, SeriesSettings
+    from thermocald.photogrammetry.series.system import Design
     from thermocald.photogrammetry.series.target_noise import CorrelatedPairs
 
 
-__all__ = ["AdjustedBlock", "KnownSeries"]
+_FEW = 0.02  # share of a block's epochs that is worth a matrix of its own
+_MOST = 12  # kinds of epochs in a block
+_MOST_PATTERNS = 300  # of targets seen, over the series; the epochs of others count together
+
+
+@dataclass(frozen=True, eq=False)
+class Shared:
+    """What is known of the common unknowns: offsets (T, 2) px, pose (6,), their cofactors (q + 2T,
+    q + 2T), the mean G (p, q + 2T) by which own parameters follow an error of theirs; used: how
+    many observations they use up.
+    """
+
+    offsets: Array
+    pose: Array
+    cofactors: Array
+    mean: Array
+    used: float
+
+
+@dataclass(frozen=True, eq=False)
+class Alike:
+    """Epochs of a block that see nearly the same targets: rows (n,), system of one epoch with their
+    mean weights, G (p, q + 2T): by how much own parameters follow the common unknowns.
+    """
+
+    rows: Index
+    system: SeriesSystem
+    G: Array
+
+
+@dataclass(eq=False)
+class _Pattern:
+    """Epochs that see the same targets: how many, sums of their weights (T, 3), of their numbers,
+    and of the gradients (p,) of their own parameters.
+    """
+
+    epochs: int
+    weights: Array
+    times: float
+    right: Array
+
+
+@dataclass(eq=False)
+class CommonSums:
+    """The sums over the blocks so far.
+
+    design: the unknowns; gradient (q + 2T,); epochs, times, squares: how many, sums of their
+    numbers and of the squares; ends: the first and the last.
+    """
+
+    design: Design
+    gradient: Array = field(init=False)
+    epochs: int = 0
+    times: float = 0.0
+    squares: float = 0.0
+    ends: tuple[int, int] | None = None
+    patterns: dict[bytes, _Pattern] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.gradient = np.zeros(self.design.width)
+
+    def add(self, first: int, system: SeriesSystem, left: Array, right: Array) -> None:
+        """Add a block that begins at epoch `first`.
+
+        system: of the block, its common unknowns held; left (E, T, 2) px: residuals; right (E, p):
+        gradient of the own parameters, which is 0 at their solution.
+        """
+        good = np.flatnonzero(system.good)
+        if not len(good):
+            return
+        t = (first + good).astype(np.float64)
+        self.ends = (self.ends[0] if self.ends else int(t[0]), int(t[-1]))
+        self.epochs += len(good)
+        self.times += float(t.sum())
+        self.squares += float(t @ t)
+        if not self.design.width:
+            return
+        w = system.used(good)
+        self.gradient += self.design.gradient(w, left[good])
+        seen, of = np.unique(np.packbits(system.use[good], axis=1), axis=0, return_inverse=True)
+        for k, bits in enumerate(seen):
+            rows = np.flatnonzero(of.ravel() == k)
+            part = _Pattern(
+                len(rows), w[rows].sum(axis=0), float(t[rows].sum()), right[good[rows]].sum(axis=0)
+            )
+            self._count(bits.tobytes(), part)
+
+    def merge(self, later: CommonSums) -> None:
+        """Add the sums over later blocks."""
+        if later.ends is None:
+            return
+        self.ends = (self.ends[0] if self.ends else later.ends[0], later.ends[1])
+        self.epochs += later.epochs
+        self.times += later.times
+        self.squares += later.squares
+        self.gradient += later.gradient
+        for key, part in later.patterns.items():
+            self._count(key, part)
+
+    def _count(self, key: bytes, part: _Pattern) -> None:
+        """Add epochs that see the same targets; those of rare patterns together."""
+        if key not in self.patterns and len(self.patterns) >= _MOST_PATTERNS:
+            key = b""
+        if key not in self.patterns:
+            self.patterns[key] = part
+            return
+        found = self.patterns[key]
+        found.epochs += part.epochs
+        found.weights = found.weights + part.weights
+        found.times += part.times
+        found.right = found.right + part.right
+
+    def solved(self, known: Shared) -> Solved:
+        """What is known with these sums."""
+        design, n = self.design, max(self.epochs, 1)
+        p, q, width = len(design.own), len(design.common), design.width
+        patterns = list(self.patterns.values())
+        count = np.array([float(found.epochs) for found in patterns])
+        times = np.array([found.times for found in patterns])
+        right = np.array([found.right for found in patterns]).reshape(len(patterns), p)
+        weights = np.array([found.weights / found.epochs for found in patterns])
+        kinds = _typical(design, weights.reshape(len(patterns), len(design.at.A), 3))
+        prior = design.prior_matrix()
+        gradient = self.gradient + design.common_pull(known.pose, known.offsets)
+        mean, tilt = np.zeros((2, p, width))
+        for part, C in kinds.couplings():
+            G = kinds.Q[part] @ C
+            gradient -= np.einsum("kpi,kp->i", G, right[part])
+            mean += np.tensordot(count[part], G, axes=1)
+            tilt += np.tensordot(times[part], G, axes=1)
+        mean /= n
+        cofactors = inverse_of_determined(prior + kinds.common_normals(count))
+        change = cofactors @ gradient
+        offsets = known.offsets
+        if design.offset_prior is not None:
+            offsets = offsets + change[q:].reshape(2, -1).T
+        rest = 0.0
+        for part, C in kinds.couplings():
+            sd = np.sqrt(np.diagonal(kinds.Q[part], axis1=1, axis2=2))
+            other = (kinds.Q[part] @ C - mean) @ change
+            rest = max(rest, float(np.max(np.abs(other) / sd)))
+        middle = self.times / n
+        spread = self.squares - n * middle**2
+        line = np.zeros((p, width))
+        if spread > 0 and self.ends is not None:
+            line = (tilt - middle * n * mean) / spread * (self.ends[1] - self.ends[0])
+        pose = known.pose + change[:q] if q else known.pose
+        used = float(width - np.einsum("ij,ji->", cofactors, prior))
+        return Solved(Shared(offsets, pose, cofactors, mean, used), -mean @ change, line, rest)
+
+    def settle(self, shared: Shared) -> None:
+        """Carry the sums to the common unknowns that they were solved for, in place.
+
+        There only the priors' pull is left of the gradients.
+        """
+        self.gradient = -self.design.common_pull(shared.pose, shared.offsets)
+        for pattern in self.patterns.values():
+            pattern.right[:] = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """The common unknowns from all sums: shared; own (p,): the mean change of own parameters that
+    goes with them; line (p, q + 2T): what they do to a straight line from the first to the last
+    epoch; rest: by how many of their standard deviations single kinds of epochs change otherwise.
+    """
+
+    shared: Shared
+    own: Array
+    line: Array
+    rest: float
+
+
+def _typical(design: Design, weights: Array) -> SeriesSystem:
+    """The system of epochs with some weights (K, T, 3), without the priors of what is common."""
+    return SeriesSystem.formed(design.without_common_priors(), weights, weights[..., 0] > 0)
+
+
+def kinds_of(design: Design, system: SeriesSystem) -> list[Alike]:
+    """The kinds of epochs of a block: the frequent ones by what they see, the others together.
+
+    design: of the series; system: of the block, its common unknowns held.
+    """
+    good = np.flatnonzero(system.good)
+    if not len(good):
+        return []
+    seen = np.packbits(system.use[good], axis=1)
+    _, of, count = np.unique(seen, axis=0, return_inverse=True, return_counts=True)
+    of = of.ravel()
+    often = np.argsort(-count, kind="stable")[:_MOST]
+    often = often[count[often] >= max(_FEW * len(good), 2)]
+    groups = [good[of == label] for label in often]
+    rest = good[~np.isin(of, often)]
+    if len(rest):
+        groups.append(rest)
+    out = []
+    for rows in groups:
+        one = _typical(design, system.used(rows).mean(axis=0, keepdims=True))
+        if one.good[0]:
+            G = np.zeros((len(design.own), design.width))
+            for _, C in one.couplings():
+                G = one.Q[0] @ C[0]
+            out.append(Alike(rows, one, G))
+    return out
+
+
+def level_of(known: Shared, design: Design, G: Array) -> Array:
+    """Cofactors (16, 16) of what the common unknowns do to parameters that follow them by G."""
+    whole = np.zeros((16, design.width))
+    whole[design.common, np.arange(len(design.common))] = 1.0
+    whole[design.own] -= G
+    level: Array = whole @ known.cofactors @ whole.T
+    return level
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,16 +2,19 @@
 
 A sample of the epochs, runs of neighbours from the first to the last, is adjusted as a whole series
 (`adjustment`). The blocks then follow one after the other with what it says (`known`). Each gives
-its epochs' own parameters, and adds to the normal equations of what is common (`common_sums`). What
+its epochs' own parameters, and adds to the normal equations of what is common (`CommonSums`). What
 these change of the common unknowns is put on the epochs by its mean where single epochs differ by
 less than a twentieth of their standard deviation; else there is another pass.
+
+A block needs nothing of the others, so that blocks may be adjusted on several processes. The result
+is one row per epoch on disk, and a sample in full.
 
 Source: Helmert blocking, Wolf, H. (1978): The Helmert block method.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,18 +22,16 @@ import numpy as np
 from thermocald.parallel import in_order
 from thermocald.photogrammetry.linalg import root_of
 from thermocald.photogrammetry.series.adjustment import adjusted, result
-from thermocald.photogrammetry.series.block import Blocks, adjusted_block
 from thermocald.photogrammetry.series.blocks import gathered, spread_windows
-from thermocald.photogrammetry.series.common_sums import CommonSums, level_of
-from thermocald.photogrammetry.series.covariances import line_weights, of_slow_targets
+from thermocald.photogrammetry.series.covariances import line_weights, of_slow_targets, stillness
 from thermocald.photogrammetry.series.estimator import ENOUGH_FOR_NOISE
-from thermocald.photogrammetry.series.known import KnownSeries
-from thermocald.photogrammetry.series.long_result import LongAdjustment, RowWriter
-from thermocald.photogrammetry.series.spool import give_back
+from thermocald.photogrammetry.series.known import CommonSums, KnownSeries, level_of
+from thermocald.photogrammetry.series.normals import ObservationGrid, normal_matrices
+from thermocald.photogrammetry.series.spool import ColumnSpool, Words, give_back
 from thermocald.photogrammetry.series.target_noise import slow_errors
 
 if TYPE_CHECKING:
-    from thermocald.arrays import Index
+    from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.camera.camera_model import (
         ExteriorOrientation,
         InteriorOrientation,
@@ -39,11 +40,168 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.series.adjustment import Adjusted
     from thermocald.photogrammetry.series.blocks import ObservationBlocks
-    from thermocald.photogrammetry.series.common_sums import Solved
+    from thermocald.photogrammetry.series.known import AdjustedBlock, Solved
     from thermocald.photogrammetry.series.result import SeriesAdjustment, SeriesSettings
 
 
-__all__ = ["adjust_long_series", "together_at_most"]
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Consecutive epochs of a long series from epoch `first` on, as adjusted.
+
+    values, variance (n, 16): NaN and 0 where there is no result; status, reasons: of each epoch;
+    sigma0, redundancy, stillness (n,): NaN where there is none; observed, rejected (n,): how many
+    targets; sums: what the block adds to those of the series.
+    """
+
+    first: int
+    values: Array
+    variance: Array
+    status: list[str]
+    reasons: list[str]
+    sigma0: Array
+    redundancy: Array
+    stillness: Array
+    observed: Index
+    rejected: Index
+    sums: CommonSums
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """What adjusts the blocks of a series of so many epochs: known, and slow (16, 16), covariance
+    of a straight line over the series from slow errors of targets.
+    """
+
+    known: KnownSeries
+    epochs: int
+    slow: Array
+
+    def adjusted(self, first: int, grid: ObservationGrid) -> Block:
+        """The block of epochs from `first` on."""
+        known = self.known
+        block = known.adjusted(grid, self.epochs)
+        estimate, use, system = block.estimate, block.use, block.estimate.system
+        sums = CommonSums(known.design)
+        sums.add(first, system, estimate.residuals, block.right)
+        relative = known.covariance(block, known.shared.mean)
+        # Slow errors: a line through zero in the middle of the series, uncertain at its ends.
+        if self.slow.any():
+            line = (first + np.arange(len(grid))) / max(self.epochs - 1, 1) - 0.5
+            relative += (line * system.good)[:, None, None] ** 2 * self.slow
+        status, reasons = known.judged(block, relative)
+        ok = np.array([word == "ok" for word in status], dtype=bool)
+        return Block(
+            first, np.where(ok[:, None], estimate.values, np.nan),
+            np.where(ok[:, None], np.diagonal(relative, axis1=1, axis2=2), 0.0), status, reasons,
+            np.where(ok, block.sigma0, np.nan), block.redundancy, self._stillness(block),
+            use.sum(axis=1), (grid.observed & ~use).sum(axis=1), sums,
+        )  # fmt: skip
+
+    def _stillness(self, block: AdjustedBlock) -> Array:
+        """Chi-square (n,) of each epoch's pose being the series', NaN where epochs have poses."""
+        if self.known.s.exterior != "series":
+            return np.full(len(block.grid), np.nan)
+        system = block.estimate.system
+        N = normal_matrices(system.used(), system.design.at.A)
+        score = stillness(replace(system, N=N), block.estimate.residuals)
+        still: Array = score / np.where(block.redundancy > 0, block.unit, 1.0)
+        return still
+
+
+def adjusted_block(blocks: Blocks, block: tuple[int, ObservationGrid]) -> Block:
+    """A block from its first epoch and its observations, for `parallel.in_order`."""
+    return blocks.adjusted(*block)
+
+
+_MOST_SENTENCES = 60_000
+
+
+@dataclass(frozen=True, eq=False)
+class LongAdjustment:
+    """A long series as adjusted; parameters in the order of `PARAMETER_NAMES`.
+
+    rows: the epochs one by one; level_sd, trend_sd (16,), as in `SeriesAdjustment`; sample: some
+    epochs, those of `sampled` (P,), as adjusted together: their covariances, residuals and offsets;
+    passes: how often the observations were read.
+    """
+
+    rows: RowWriter
+    level_sd: Array
+    trend_sd: Array
+    sample: SeriesAdjustment
+    sampled: Index
+    passes: int
+
+
+class RowWriter:
+    """The rows of a long series.
+
+    values, sd (E, 16): NaN where an epoch has no result or a parameter was held, on disk (`release`
+    takes what was used of them out of memory); sigma0, redundancy, stillness (E,); observed,
+    rejected (E,): how many targets.
+    """
+
+    def __init__(self, epochs: int) -> None:
+        self._spools = ColumnSpool(epochs, 16), ColumnSpool(epochs, 16)
+        self.values, self.sd = (spool.array for spool in self._spools)
+        self.sigma0, self.redundancy, self.stillness = np.full((3, epochs), np.nan)
+        self.observed, self.rejected = np.zeros((2, epochs), dtype=np.int32)
+        self._ok = np.zeros(epochs, dtype=bool)
+        self._word, self._reason = np.zeros((2, epochs), dtype=np.uint16)
+        self._words: dict[str, int] = {"": 0}
+
+    def put(self, block: Block) -> None:
+        """The epochs of a block."""
+        here = slice(block.first, block.first + len(block.values))
+        self.values[here] = block.values
+        self.sd[here] = np.sqrt(np.where(block.variance > 0, block.variance, np.nan))
+        self._ok[here] = [word == "ok" for word in block.status]
+        self._word[here], self._reason[here] = (
+            self._numbers(said) for said in (block.status, block.reasons)
+        )
+        self.sigma0[here], self.redundancy[here] = block.sigma0, block.redundancy
+        self.stillness[here] = block.stillness
+        self.observed[here], self.rejected[here] = block.observed, block.rejected
+
+    def _numbers(self, sentences: list[str]) -> list[int]:
+        for sentence in dict.fromkeys(sentences):
+            if len(self._words) < _MOST_SENTENCES:
+                self._words.setdefault(sentence, len(self._words))
+        return [self._words.get(sentence, 0) for sentence in sentences]
+
+    @property
+    def status(self) -> Words:
+        """One word per epoch."""
+        return Words(self._word, tuple(self._words))
+
+    @property
+    def reasons(self) -> Words:
+        """One sentence per epoch, "" where it has a result."""
+        return Words(self._reason, tuple(self._words))
+
+    @property
+    def ok(self) -> Mask:
+        """(E,): epochs with a result."""
+        return self._ok
+
+    def shift(self, columns: Index, change: Array) -> None:
+        """Add a change (k,) to some parameters of all epochs."""
+        for column, size in zip(columns, change, strict=True):
+            self.values[:, column] += size
+            self.release()
+
+    def widen(self, columns: Index, variance: Array) -> None:
+        """Add variances (k,) to some parameters of all epochs with a result."""
+        for column, size in zip(columns, variance, strict=True):
+            old = np.nan_to_num(self.sd[:, column])
+            self.sd[:, column] = np.where(self._ok, np.sqrt(old**2 + size), np.nan)
+            self.release()
+
+    def release(self) -> None:
+        """Take the values on disk out of memory."""
+        for spool in self._spools:
+            spool.release()
+
 
 _TOGETHER_POINTS = 1_300_000  # a day of 150 targets: 200 MB
 _FEWEST_TOGETHER, _MOST_TOGETHER = 2_000, 10_000  # epochs

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP, IOP, partials, project
+from thermocald.photogrammetry.linalg import stacked_inverses
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -30,19 +31,6 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
-__all__ = [
-    "ObservationGrid",
-    "Partials",
-    "chunks",
-    "linearise",
-    "normal_matrices",
-    "planes",
-    "products",
-    "right_hand_sides",
-    "same_rows",
-    "series_residuals",
-    "sums_of_squares",
-]
 
 _CHUNK_POINTS = 20_000  # worked on at a time, in the processor's cache
 
@@ -283,3 +271,25 @@ def series_residuals(
         predicted = project(sensor, values[part, IOP], values[part, EOP], field_points)
         np.subtract(grid.points[part], predicted, out=out[part])
     return out
+
+
+def cofactors(N: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Inverse of each matrix (E, p, p), and which could be inverted (E,); the others get units."""
+    inverse, good = np.empty(N.shape), np.empty(len(N), dtype=bool)
+    for part in chunks(len(N), N.shape[-1] ** 2):
+        inverse[part], good[part] = stacked_inverses(N[part])
+    return inverse, good
+
+
+def among_all(Q: Array, own: NDArray[np.int64]) -> Array:
+    """Matrices (E, p, p) of some parameters as those of all (E, 16, 16), 0 for the others."""
+    whole = np.zeros((len(Q), 16, 16))
+    runs = np.split(np.arange(len(own)), np.flatnonzero(np.diff(own) > 1) + 1)
+    for rows in runs:
+        for columns in runs:
+            a, b = (
+                slice(own[rows[0]], own[rows[-1]] + 1),
+                slice(own[columns[0]], own[columns[-1]] + 1),
+            )
+            whole[:, a, b] = Q[:, rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    return whole

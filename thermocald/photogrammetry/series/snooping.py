@@ -21,10 +21,6 @@ if TYPE_CHECKING:
 
     Columns = NDArray[np.int64]
 
-__all__ = [
-    "point_tests", "pooled_variance", "pooled_with_stated", "snoop_series", "typical_variance",
-]  # fmt: skip
-
 
 def point_tests(system: SeriesSystem, residuals: Array) -> Array:
     """Chi-square (2) of every image point (E, T) against its epoch.

@@ -21,14 +21,6 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array, Mask
 
-__all__ = [
-    "CorrelatedPairs",
-    "correlated_pairs",
-    "excess_scatter",
-    "noise_ratios",
-    "slow_errors",
-]
-
 _PRIOR_FREEDOM = 8.0  # weight of the series' noise in a target's own
 _MEDIAN_CHI2_1 = 0.4549
 _SIGNIFICANT = 4.0  # correlations of n pairs below 4/√n are noise: 6e-5 two-sided

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from thermocald.physics.model import ModelEffect, ThermalModel
     from thermocald.physics.presets import Catalogue
     from thermocald.results import Calibration, Discovery, Study
+    from thermocald.thermal.series import ReducedSeries
 
 Progress = Callable[[int], None] | None
 Effects = Mapping[str, Mapping[str, Any]] | Iterable[str | Path] | Path
@@ -222,6 +223,10 @@ def study(
         for label, one in zip(named, series, strict=True)
     ]
     refuse_copies(measured)
+    measured = [
+        replace(found, doubts=tuple(one.doubts(interior=found.mean)))
+        for one, found in zip(series, measured, strict=True)
+    ]
     return as_result(Study, run(measured, settings, progress))
 
 
@@ -282,10 +287,12 @@ def fit(
     ]
     check_names(listed, reduced)
     if isinstance(kind, ThermalModel):
-        return fit_camera_of_type(reduced, kind)
-    if kind is not None:
-        return fit_type(reduced, listed, T0, kind)
-    return fit_camera(reduced, listed, T0)
+        camera = fit_camera_of_type(reduced, kind)
+    elif kind is not None:
+        camera = fit_type(reduced, listed, T0, kind)
+    else:
+        camera = fit_camera(reduced, listed, T0)
+    return replace(camera, fitted={**camera.as_dict(), "doubts": _doubts(series, reduced)})
 
 
 def discover(
@@ -326,6 +333,7 @@ def discover(
     evidence = reduce_together(inputs, None if old is None else old.T0)
     found = discover_series(evidence, say, () if old is None else terms_of(old), jobs)
     name = series.source.rsplit("/", 1)[-1]
+    found = replace(found, doubts=tuple(_doubts(every, evidence)))
     return as_result(Discovery, found, name=name, before=old)
 
 
@@ -441,6 +449,15 @@ def simulate(
     made = open(out)
     made.simulation = simulation
     return made
+
+
+def _doubts(series: Sequence[Series], reduced: Sequence[ReducedSeries]) -> list[str]:
+    """Return what is doubtful in some series, with the source of each where they are several."""
+    return [
+        text if len(series) == 1 else f"{one.source}: {text}"
+        for one, found in zip(series, reduced, strict=True)
+        for text in one.doubts(interior=found.at.iop)
+    ]
 
 
 def _paths(given: Path | str | Sequence[Path | str]) -> list[Path]:

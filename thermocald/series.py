@@ -158,18 +158,20 @@ class Series(ABC):
     ) -> Epochs:
         raise UsageError(f"{store}: {self.source} is in a store already")
 
-    def doubts(self, epochs: Epochs | None = None) -> list[str]:
+    def doubts(self, epochs: Epochs | None = None, interior: Array | None = None) -> list[str]:
         """Return what cannot have been meant in what was recorded, a sentence each.
 
-        epochs: as calibrated, for what their interior orientation tells of the camera.
+        epochs: as calibrated, for what their interior orientation tells of the camera; interior:
+        that itself, c, x0, y0 in mm and what follows.
 
         >>> tc.open("M1").doubts()
         []
         """
-        if epochs is None or not epochs.ok.any():
+        if epochs is not None and epochs.ok.any():
+            interior = np.median(epochs.values[epochs.ok, :3], axis=0)
+        if interior is None:
             return []
-        c, x0, y0 = np.median(epochs.values[epochs.ok, :3], axis=0).tolist()
-        return interior_doubts(self.head.camera, c, x0, y0)
+        return interior_doubts(self.head.camera, *(float(value) for value in interior[:3]))
 
     @abstractmethod
     def _opened(self) -> AbstractContextManager[Source]:
@@ -231,9 +233,9 @@ class RecordedSeries(Series):
         """As the recording's, interpolated to the frames' times."""
         return {name: self.recording.columns.at_frame(name) for name in self.head.channels}
 
-    def doubts(self, epochs: Epochs | None = None) -> list[str]:
+    def doubts(self, epochs: Epochs | None = None, interior: Array | None = None) -> list[str]:
         """As the base says, with times, readings and repeated epochs."""
-        return [*self.recording.doubts(), *super().doubts(epochs)]
+        return [*self.recording.doubts(), *super().doubts(epochs, interior)]
 
     def _opened(self) -> AbstractContextManager[Source]:
         return nullcontext(self.recording)

@@ -161,10 +161,13 @@ def test_one_result_prints_documents_draws_and_reports(epochs, M1, M2, camera, t
 
 
 def test_a_result_is_what_the_command_says(epochs, world):
-    said = call("replay", "M1", folder=world).stdout
-    document = json.loads(call("replay", "M1", "--json", "-", folder=world).stdout)
+    said = call("replay", "M1", folder=world)
+    written = call("replay", "M1", "--json", "-", folder=world)
+    # what it refused stands in its standard error: an empty output alone tells nothing
+    assert (said.returncode, written.returncode) == (0, 0), said.stderr + written.stderr
+    document = json.loads(written.stdout)
 
-    assert said.strip() == str(epochs).strip()
+    assert said.stdout.strip() == str(epochs).strip()
     assert document.pop("doubts") == tc.open(world / "M1").doubts(epochs)
     assert {k: v for k, v in document.items() if k not in ("recording", "store")} == json.loads(
         json.dumps(epochs.as_dict())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import shutil
+from html import escape
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import pytest
 import thermocald as tc
 from tests.commands import call
 from thermocald.errors import RecordingError, TestFieldError, ThermocaldError
+from thermocald.output.certificate import render_certificate
 from thermocald.store.recording.reader import read_recording
 from thermocald.store.recording.sense import find_spikes, find_unit_change, interior_doubts
 
@@ -330,3 +332,39 @@ def test_a_spike_beside_a_change_of_the_unit_hides_neither():
     values[[27, 33]] = 85.0, 185.0
     assert find_unit_change(values) == (30, "from °C to °F")
     assert find_spikes(values)[0][:2] == (27, 28)
+
+
+@pytest.mark.parametrize(
+    "name", ["a principal distance of another lens", "85.00 of a DS18B20", "an epoch twice",
+             "an hour as the interval"],
+)  # fmt: skip
+def test_a_study_a_fit_and_a_discovery_of_the_doubtful_say_so(recording, tmp_path, name):
+    """In the text, in `doubts` of the JSON, and among the notes of the report."""
+    damage, message = DOUBTS[name]
+    damage(recording)
+    series = tc.open(recording)
+    results = (tc.study(series, sets=100), tc.fit(series), tc.discover(series))
+    for k, result in enumerate(results):
+        (told,) = (text for text in result.as_dict()["doubts"] if message in text)
+        assert told.startswith("M1: ") == (k == 0)  # a study tells its series by their names
+        assert [line for line in result.lines() if "doubtful" in line and message in line]
+    results[0].report(tmp_path / "study.html")
+    results[2].report(tmp_path / "discovery.html")
+    (tmp_path / "fit.html").write_text(render_certificate(results[1]))
+    for kind in ("study", "discovery", "fit"):
+        assert escape(message) in (tmp_path / f"{kind}.html").read_text()
+
+
+def test_two_series_of_which_one_is_doubtful(recording, simulated):
+    """Which one is said."""
+    DOUBTS["85.00 of a DS18B20"][0](recording)
+    shutil.copytree(simulated, recording.parent / "N")
+    change(recording.parent / "N", "epochs.csv", frame_time=scaled(1, 1e5),
+           temperature_time=scaled(1, 1e5))  # fmt: skip
+    rng = np.random.default_rng(3)
+    change(recording.parent / "N", "observations.csv",
+           x=lambda t, _: f"{float(t) + rng.normal(0, 0.05):.4f}")  # fmt: skip
+    one, other = tc.open(recording), tc.open(recording.parent / "N")
+    for result in (tc.fit(one, other), tc.discover(other, verify=[one])):
+        (told,) = result.as_dict()["doubts"]
+        assert told.startswith(f"{recording}: temperature: 3 readings")

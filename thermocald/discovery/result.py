@@ -152,7 +152,10 @@ def measure_gap_of(
 
 @dataclass(frozen=True, eq=False)
 class Discovery:
-    """Verdict, effects, the staircase of the gap; fits: base and final, constants from M1 alone."""
+    """Verdict, effects, the staircase of the gap; fits: base and final, constants from M1 alone.
+
+    doubts: what cannot have been meant in what was recorded, a sentence each.
+    """
 
     verdict: str
     effects: tuple[EffectFound, ...]
@@ -161,6 +164,7 @@ class Discovery:
     base_fit: Fit
     final_fit: Fit
     cross_validation: tuple[float, float]
+    doubts: tuple[str, ...] = ()
 
     def excess_closed(self) -> float | None:
         """Return the share of the excess of reduced χ² over the floor that is closed on M2."""
@@ -197,6 +201,7 @@ class Discovery:
                 **({"verify_each": others} if len(others) > 1 else {}),
             },
             "model": None,
+            "doubts": list(self.doubts),
             **({"mount": mount} if mount is not None else {}),
             **({"field": field} if field is not None else {}),
         }

@@ -48,6 +48,7 @@ def render_certificate(camera: ThermalCamera, made: datetime | None = None) -> s
             Section("The model", tables=(_values(document), *_effects(document))),
             Section("What it rests on", tables=tuple(t for t in _evidence(document) if t.rows)),
         ),
+        notes=tuple(f"Doubtful: {text}." for text in document.get("doubts", ())),
     )  # fmt: skip
     return render_report(chapter.title, [chapter], made=made)
 

@@ -35,6 +35,7 @@ from thermocald.report import (
     of_drawing,
     render_report,
 )
+from thermocald.store.recording.sense import doubt_lines
 
 if TYPE_CHECKING:
     from datetime import datetime
@@ -61,7 +62,10 @@ def report_html(discovery: Discovery, title: str, made: datetime | None = None) 
         tuple(_origin(discovery)),
         tuple(
             f"{line[0].upper()}{line[1:].strip()}."
-            for line in (*mount_lines(discovery.examination), *field_lines(discovery.examination))
+            for line in (
+                *doubt_lines(discovery.doubts), *mount_lines(discovery.examination),
+                *field_lines(discovery.examination),
+            )
         ),
     )
     return render_report(chapter.title, [chapter], made=made)

@@ -60,7 +60,7 @@ def discovery_lines(found: Discovery) -> list[str]:
             f"{before.chi2_reduced:.3f} → {after.chi2_reduced:.3f}, "
             f"{before.object_mm_at_10m:.2f} → {after.object_mm_at_10m:.2f} mm at 10 m"
         )
-    return lines
+    return [*lines, *doubt_lines(found.doubts)]
 
 
 def calibration_document(

@@ -64,7 +64,8 @@ class MeasuredSeries:
     exterior: how the exterior orientation was estimated, choice: why; without_result: {reason:
     epochs}; start_utc: s UTC of the first epoch, 0 where it has no date; image_noise_ratio: noise
     of the image points found over the one stated, NaN where epochs were adjusted one by one;
-    field_movements: boards and targets that moved, taken off the observations.
+    field_movements: boards and targets that moved, taken off the observations; doubts: what cannot
+    have been meant in what was recorded.
     """
 
     label: str
@@ -88,6 +89,7 @@ class MeasuredSeries:
     choice: str = ""
     image_noise_ratio: float = float("nan")
     field_movements: tuple[FieldMovement, ...] = ()
+    doubts: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.time_s)

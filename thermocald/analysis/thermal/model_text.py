@@ -92,6 +92,7 @@ def model_lines(document: Mapping[str, Any]) -> list[str]:
         f"{h['floor_px']:.4f}), {h['object_mm']:.2f} mm at 10 m"
         for h in document.get("prediction_test", ())
     ]
+    lines += [f"  doubtful: {text}" for text in document.get("doubts", ())]
     return [part for line in lines for part in line.split("\n")]
 
 

@@ -26,6 +26,12 @@ def study_document(study: Study) -> dict[str, Any]:
             "format": FORMAT,
             "settings": {k: v for k, v in jsonable(s).items() if k != "jobs"},
             "cameras": [_camera(camera, s.distance_mm) for camera in study.cameras],
+            "doubts": [
+                f"{one.series.name}: {text}"
+                for camera in study.cameras
+                for one in camera.series
+                for text in one.series.doubts
+            ],
         }
     )
     return document
@@ -104,6 +110,7 @@ def _series(study: SeriesStudy, distance_mm: float) -> dict[str, Any]:
         },
         "correlation_matrix": {"columns": list(study.columns), "r": study.matrix.tolist()},
         "notes": list(study.notes),
+        "doubts": list(s.doubts),
     }
 
 

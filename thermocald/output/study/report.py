@@ -300,7 +300,12 @@ def _notes(camera: CameraStudy) -> list[str]:
         note if len(names) == len(camera.series) else f"{', '.join(names)}: {note}"
         for note, names in holders.items()
     ]
-    return notes + list(camera.notes)
+    doubts = [
+        f"{study.series.name} is doubtful: {text}."
+        for study in camera.series
+        for text in study.series.doubts
+    ]
+    return doubts + notes + list(camera.notes)
 
 
 def _file_name(label: str) -> str:

@@ -51,6 +51,8 @@ def study_lines(study: Study, comparisons: Sequence[Comparison] = ()) -> list[st
         lines.append(camera.label)
         lines += [f"  {sentence}" for sentence in summary(camera)]
         for one in camera.series:
+            lines += [f"  doubtful, {one.series.name}: {text}" for text in one.series.doubts]
+        for one in camera.series:
             lines += [f"  note, {one.series.name}: {note}" for note in one.notes]
         lines += [f"  note: {note}" for note in camera.notes]
     return lines

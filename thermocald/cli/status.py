@@ -29,7 +29,8 @@ StoreOption = Annotated[Path | None, typer.Option("--store", help="The daemon's 
 def status(config: ConfigOption = None, store: StoreOption = None, json: JsonOption = None) -> None:
     """How the daemon is doing: cameras, thermometers, store.
 
-    Exit status 1 if it does not run, or if an epoch that it took is lost.
+    Exit status 1 if it does not run, if its store cannot be written, or if an epoch that it took is
+    lost.
 
     Example: thermocald status --config /etc/thermocald/config.yaml
     """
@@ -37,8 +38,11 @@ def status(config: ConfigOption = None, store: StoreOption = None, json: JsonOpt
     if write_result(document, json):
         for line in status_lines(document):
             typer.echo(line)
-    if document["store"]["lost"]:
-        raise DataError(f"{document['store']['lost']} epochs were lost, taken and not kept")
+    store_ = document["store"]
+    if store_["lost"]:
+        raise DataError(f"{store_['lost']} epochs were lost, taken and not kept")
+    if store_["state"] == "out":
+        raise DataError(f"the store cannot be written, {store_['waiting']} epochs wait in memory")
 
 
 def top(

@@ -34,6 +34,8 @@ FORMAT = "thermocald-status/1"
 _RUN = Path("/run")
 _PREVIEW_PX = 1280
 _PREVIEW_QUALITY = 80
+_PAGE_BYTES = 4096
+_LOOKS, _PAUSE_S = 3, 0.01
 
 
 class LiveState:
@@ -79,6 +81,8 @@ class LiveState:
             log.debug("%s: %s", self.folder, error)
 
     def _write(self, name: str, data: bytes) -> None:
+        if name.endswith(".json"):  # with room to grow in place: blanks after a document are none
+            data = data.ljust((len(data) // _PAGE_BYTES + 2) * _PAGE_BYTES)
         partial = self.folder / f".{name}.partial"
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -88,9 +92,22 @@ class LiveState:
         except OSError as error:
             with contextlib.suppress(OSError):
                 partial.unlink(missing_ok=True)
+            if name.endswith(".json") and _overwrite(self.folder / name, data):
+                return  # a status from before the disk was full would say that all is well
             if not self._failed:
                 log.warning("%s: the status cannot be written: %s", self.folder, error)
             self._failed = True
+
+
+def _overwrite(path: Path, data: bytes) -> bool:
+    """Write a document over the one at the path, which takes no room; whether it fits."""
+    try:
+        with path.open("r+b", buffering=0) as file:
+            room = os.fstat(file.fileno()).st_size
+            document = data.rstrip()
+            return len(document) <= room and file.write(document.ljust(room)) == room
+    except OSError:
+        return False
 
 
 def _beside(store: Path) -> Path:
@@ -160,11 +177,16 @@ def find_state(store: Path) -> Path:
 
 def read_state(folder: Path) -> dict[str, Any]:
     """status.json of a folder; empty if nobody runs there."""
-    try:
-        document = json.loads((folder / "status.json").read_bytes())
-    except (OSError, ValueError):
-        return {}
-    return document if isinstance(document, dict) else {}
+    for _ in range(_LOOKS):
+        try:
+            document = json.loads((folder / "status.json").read_bytes())
+        except OSError:
+            return {}
+        except ValueError:
+            time.sleep(_PAUSE_S)  # on a full disk it is written in place
+        else:
+            return document if isinstance(document, dict) else {}
+    return {}
 
 
 def running_status(path: Path) -> dict[str, Any]:

@@ -63,7 +63,8 @@ def report_html(discovery: Discovery, title: str, made: datetime | None = None) 
         tuple(
             f"{line[0].upper()}{line[1:].strip()}."
             for line in (
-                *doubt_lines(discovery.doubts), *mount_lines(discovery.examination),
+                *doubt_lines(discovery.doubts),
+                *mount_lines(discovery.examination),
                 *field_lines(discovery.examination),
             )
         ),

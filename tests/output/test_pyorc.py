@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,8 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     Sensor,
 )
+from thermocald.photogrammetry.epoch.measuring import Line, on_line
+from thermocald.photogrammetry.field.testfield import TestField
 
 RIVER = Path(__file__).resolve().parents[3] / "shared" / "data" / "river"
 WARM = 36.0
@@ -198,6 +201,54 @@ def test_the_crosses_of_the_geul():
         assert (np.abs(moved) < 0.3 * found[0].pose.sd[10:]).all()
     clicks = ControlPoints.read(path, "m").seen
     assert np.abs(still.points - clicks.points).max() < 3
+
+
+def pyorc_heights() -> np.ndarray:
+    """Error (6,) mm of each cross's height above its place, by OpenCV's pose of the other five."""
+    import cv2
+
+    document = json.loads((RIVER / "geul-pyorc.json").read_text())
+    dst, src = (np.array(document["gcps"][k], dtype=float) for k in ("dst", "src"))
+    K, k = (np.array(document[key]) for key in ("camera_matrix", "dist_coeffs"))
+    dst -= dst.mean(axis=0)
+    _, *whole = cv2.solvePnP(dst, src, K, k)
+    errors = []
+    for row in range(6):
+        keep = np.arange(6) != row
+        _, rvec, tvec = cv2.solvePnP(dst[keep], src[keep], K, k, *(v.copy() for v in whole), True)
+        R, _ = cv2.Rodrigues(rvec)
+        at = cv2.undistortPoints(src[row].reshape(1, 1, 2), K, k).ravel()
+        A = np.column_stack([R.T @ [*at, 1.0], [0.0, 0.0, -1.0]])
+        errors.append(1000 * np.linalg.lstsq(A, dst[row] + R.T @ tvec.ravel(), rcond=None)[0][1])
+    return np.array(errors)
+
+
+@pytest.mark.skipif(not RIVER.is_dir(), reason="the river's frames are not here: ../shared/data")
+@pytest.mark.parametrize("frame", [None, RIVER / "geul-0.jpg"], ids=["clicked", "measured"])
+def test_levels_at_the_geul_have_true_sds(frame):
+    """A staff at each cross, read with the pose of the other five: its height is surveyed.
+
+    The six fit with a sigma0 of 2; so much larger than 20 mm and 1 px are the sigmas then.
+    """
+    camera = river_camera()
+    done = renew_configuration(RIVER / "geul-pyorc.json", camera, frame, frame)
+    known, seen = done.control.field, done.control.seen
+    factor = done.pose.sigma0
+    known = TestField.build(list(known.names), known.points, 20.0 * factor)
+    seen = replace(seen, sigmas=factor * seen.sigmas)
+    errors, sds = [], []
+    for row in range(6):
+        pose = camera.resect(known, seen.select(seen.targets != row), 0.0)
+        one, up = seen.select(seen.targets == row), np.array([0.0, 0.0, 1.0])
+        staff = Line(known.points[row], up, 20.0 * factor)
+        X, C = on_line(camera.sensor, pose.values, pose.covariance, one.points, one.sigmas, staff)
+        errors.append(X[0, 2] - known.points[row, 2])
+        sds.append(np.hypot(np.sqrt(C[2, 2]), 20.0 * factor))
+    ratio = np.array(errors) / sds
+    assert 0.5 < np.sqrt(np.mean(ratio**2)) < 1.5  # of six
+    assert np.abs(ratio).max() < 2.5
+    theirs = np.sqrt(np.mean(pyorc_heights() ** 2))
+    assert np.sqrt(np.mean(np.square(errors))) < 1.2 * theirs
 
 
 @pytest.mark.skipif(not RIVER.is_dir(), reason="the river's frames are not here: ../shared/data")

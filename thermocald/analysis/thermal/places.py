@@ -4,12 +4,14 @@ Control points that were seen once give the pose. At every other time the camera
 thermal model, corrected by what the control points have said of it; the mount is taken to stand
 still. Each place has the covariance of its image point, of camera and pose together, of the
 thermometer and of the plane, and stands beside the place that the same camera would have given
-without the thermal model, as it was when the control points were seen.
+without the thermal model, as it was when the control points were seen. Places on staffs and
+profiles at one time are where the water touches them: together they are its level.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -21,13 +23,14 @@ from thermocald.errors import ConfigurationError, DataError
 from thermocald.figures import BAND
 from thermocald.files import read_yaml
 from thermocald.photogrammetry.camera.camera_model import EOP, InteriorOrientation
-from thermocald.photogrammetry.epoch.measuring import Line, Plane, place_on, resect
-from thermocald.result import Result, new_figure
+from thermocald.photogrammetry.epoch.measuring import Line, Plane, Profile, place_on, resect
+from thermocald.result import Result, jsonable, new_figure
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from matplotlib.figure import Figure
+    from numpy.typing import NDArray
 
     from thermocald.analysis.thermal.control_points import ControlPoints
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
@@ -36,17 +39,17 @@ if TYPE_CHECKING:
     from thermocald.store.logger.temperatures import TemperatureLog
 
 
-def read_surface(path: Path, control: ControlPoints) -> Plane | Line:
-    """Read where the points lie: `level` (and `sd`) of a water, a `plane`, or a `line`.
+def read_surface(path: Path, control: ControlPoints) -> Plane | Line | Profile:
+    """Read where the points lie: `level` (and `sd`) of a water, `plane`, `line`, or `profile`.
 
     In the unit and the coordinates of the control points. Raises ConfigurationError.
     """
     document = read_yaml(path)
-    kinds = [k for k in ("level", "plane", "line") if k in document]
+    kinds = [k for k in ("level", "plane", "line", "profile") if k in document]
     if len(kinds) != 1 or set(document) - {*kinds, "sd", "sd_tilt_deg"}:
         raise ConfigurationError(
-            f"{path}: one of level, plane, line is needed, and sd, sd_tilt_deg may follow; found: "
-            f"{', '.join(document)}"
+            f"{path}: one of level, plane, line, profile is needed, and sd, sd_tilt_deg may "
+            f"follow; found: {', '.join(document)}"
         )
     scale = UNITS[control.unit]
     sd = scale * _number(path, document, "sd")
@@ -55,6 +58,9 @@ def read_surface(path: Path, control: ControlPoints) -> Plane | Line:
         height = scale * _number(path, document, "level") - control.origin[2]
         middle = control.field.points[:, :2].mean(axis=0)
         return Plane(np.array([*middle, height]), np.array([0.0, 0.0, 1.0]), sd, tilt)
+    if "profile" in document:
+        points = _profile(path, document["profile"])
+        return Profile(scale * points - control.origin, sd)
     kind, way = ("plane", "normal") if "plane" in document else ("line", "direction")
     parts = document[kind]
     if not isinstance(parts, dict) or set(parts) != {"point", way}:
@@ -67,6 +73,15 @@ def read_surface(path: Path, control: ControlPoints) -> Plane | Line:
     if kind == "line":
         return Line(point, along / size, sd)
     return Plane(point, along / size, sd, tilt)
+
+
+def _profile(path: Path, given: Any) -> Array:
+    if not isinstance(given, list) or len(given) < 2:
+        raise ConfigurationError(f"{path}, profile: holds at least two points [X, Y, Z], in order")
+    points = np.array([_vector(path, {"profile": point}, "profile") for point in given])
+    if not np.linalg.norm(np.diff(points, axis=0), axis=1).all():
+        raise ConfigurationError(f"{path}, profile: the same point stands there twice in a row")
+    return points
 
 
 def _number(path: Path, document: dict[str, Any], key: str) -> float:
@@ -89,13 +104,28 @@ def _vector(path: Path, document: dict[str, Any], key: str) -> Array:
     return vector
 
 
+@dataclass(frozen=True)
+class Level:
+    """The water's level at a time (s UTC): the weighted mean of `places` heights, with its sd.
+
+    sigma0: by how much the heights differ, over their standard deviations; 0 of a single place.
+    """
+
+    time: float
+    level: float
+    sd: float
+    places: int
+    sigma0: float
+
+
 @dataclass(frozen=True, eq=False)
 class Places(Result):
     """Where image points lie.
 
     names (n); points (n, 3) in the unit and the coordinates of the control points, with their joint
     covariance (3n, 3n); without (n, 3): as the camera of the control points' time would have it;
-    pose: the resection; temperatures (n,) °C, NaN where none is known.
+    pose: the resection; temperatures (n,) °C, NaN where none is known; times (n,) s UTC; levels:
+    of the water, where places on a staff or a profile tell them.
     """
 
     names: list[str]
@@ -106,6 +136,8 @@ class Places(Result):
     pose: Adjustment
     rejected: tuple[str, ...]
     temperatures: Array
+    times: Array
+    levels: tuple[Level, ...] = ()
 
     @cached_property
     def sd(self) -> Array:
@@ -134,6 +166,7 @@ class Places(Result):
         return {
             "format": "thermocald-places/1", "unit": self.unit, "places": places,
             "covariance": self.covariance.tolist(),
+            "levels": jsonable(self.levels),
             "pose": {
                 "sigma0": self.pose.sigma0, "redundancy": self.pose.redundancy,
                 "control_points": self.pose.n_observations, "rejected": list(self.rejected),
@@ -155,6 +188,12 @@ class Places(Result):
         for name, p, sd, shift in zip(self.names, self.points, self.sd, self.shift_mm, strict=True):
             at = ", ".join(f"{v:.{digits}f} ± {s:.{digits}f}" for v, s in zip(p, sd, strict=True))
             lines.append(f"{name:{wide}}  {at}; {shift:.1f}")
+        for one in self.levels:
+            said = f"level of {one.places} places: {one.level:.{digits}f} ± {one.sd:.{digits}f}"
+            lines.append(
+                f"{datetime.fromtimestamp(one.time, UTC):%Y-%m-%d %H:%M:%S} UTC, {said} {self.unit}"
+                + (f", sigma0 {one.sigma0:.2f}" if one.places > 1 else "")
+            )
         return lines
 
     def plot(self) -> Figure:
@@ -173,7 +212,7 @@ def measure_places(
     log: TemperatureLog,
     control: ControlPoints,
     when: float,
-    surface: Plane | Line,
+    surface: Plane | Line | Profile,
     names: list[str],
     times: Array,
     observed: Array,
@@ -194,7 +233,8 @@ def measure_places(
     readings = dict(log.channels)
     then = camera.along(log.times, readings, [when], extrapolate, temperature_sd=thermometer_sd)
     seen_at = float(then.temperatures[0])
-    now = camera.along(log.times, readings, times, extrapolate, seen_at, thermometer_sd)
+    moments, member = np.unique(times, return_inverse=True)
+    now = camera.along(log.times, readings, moments, extrapolate, seen_at, thermometer_sd)
     sensor = camera.model.sensor
     interior = InteriorOrientation.from_array(then.values[0])
     pose = resect(sensor, interior, then.covariance[0], control.field, control.seen)
@@ -204,11 +244,32 @@ def measure_places(
     without, _ = place_on(sensor, pose.values, pose.covariance, image, sigmas, surface)
     states = pose.values + np.pad(now.values - then.values, ((0, 0), (0, 6)))
     points, covariance = place_on(
-        sensor, states, pose.covariance, image, sigmas, surface, now.covariance
+        sensor, states[member], pose.covariance, image, sigmas, surface, now.covariance, member
     )
     scale = UNITS[control.unit]
+    points, covariance = (points + control.origin) / scale, covariance / scale**2
+    levels = () if isinstance(surface, Plane) else _levels(points, covariance, moments, member)
     return Places(
-        names, (points + control.origin) / scale, covariance / scale**2,
-        (without + control.origin) / scale, control.unit, pose,
-        tuple(control.field.names[r] for r in pose.rejected), now.temperatures,
+        names, points, covariance, (without + control.origin) / scale, control.unit, pose,
+        tuple(control.field.names[r] for r in pose.rejected), now.temperatures[member], times,
+        levels,
     )  # fmt: skip
+
+
+def _levels(
+    points: Array, covariance: Array, moments: Array, member: NDArray[np.int64]
+) -> tuple[Level, ...]:
+    """The weighted means of the heights of each time, with what they have in common."""
+    found = []
+    for k, time in enumerate(moments.tolist()):
+        rows = np.flatnonzero(member == k)
+        Z, C = points[rows, 2], covariance[np.ix_(3 * rows + 2, 3 * rows + 2)]
+        if not (C.diagonal() > 0).all():  # along a horizontal line there is no height to be read
+            continue
+        weights = np.linalg.pinv(C, hermitian=True)
+        variance = 1.0 / float(weights.sum())
+        level = variance * float((weights @ Z).sum())
+        left, freedom = Z - level, len(rows) - 1
+        sigma0 = float(left @ weights @ left / freedom) ** 0.5 if freedom else 0.0
+        found.append(Level(time, level, variance**0.5, len(rows), sigma0))
+    return tuple(found)

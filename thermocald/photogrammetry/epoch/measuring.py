@@ -22,6 +22,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     IOP_NAMES,
     ExteriorOrientation,
     partials,
+    project,
     rays,
     rotation,
 )
@@ -35,7 +36,7 @@ from thermocald.photogrammetry.epoch.adjustment import (
 from thermocald.photogrammetry.orientation import approximate_orientation
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
+    from numpy.typing import ArrayLike, NDArray
 
     from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
 
 _FEWEST = 4  # control points: three have up to four poses
 _AMBIGUITY = 2.0  # a second pose must fit this much worse to be excluded
+_BESIDE_PX = 5.0  # an image point may lie so far beyond a profile's end
 _GRAZING = np.sin(np.radians(1.0))  # between a ray and a plane: beyond it a pixel is metres
 
 
@@ -93,7 +95,7 @@ def resect(
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """A plane through `point` (3,) mm with a unit `normal` (3,).
+    """A plane through `point` (3,) mm with a unit `normal` (3,); (n, 3) are one per image point.
 
     sd_mm: of its place along the normal; sd_tilt: rad, of the normal about each axis across it.
     """
@@ -106,13 +108,25 @@ class Plane:
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """A line through `point` (3,) mm along the unit vector `direction` (3,): a staff, a profile.
+    """A line through `point` (3,) mm along a unit `direction` (3,), such as a staff; (n, 3) are one
+    per image point.
 
     sd_mm: of its place across its direction.
     """
 
     point: Array
     direction: Array
+    sd_mm: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """A surveyed profile: straight lines between `points` (k, 3) mm, such as a bank's.
+
+    sd_mm: of its place across its direction.
+    """
+
+    points: Array
     sd_mm: float = 0.0
 
 
@@ -124,21 +138,24 @@ def on_plane(
     sigmas: ArrayLike,
     plane: Plane,
     own: Array | None = None,
+    member: NDArray[np.int64] | None = None,
 ) -> tuple[Array, Array]:
     """Return where image points lie on a plane: (n, 3) mm, and their joint covariance (3n, 3n).
 
     values (16,) or (n, 16), covariance (16, 16): camera and pose, the pose of all is the same;
-    image_points (n, 2), sigmas (n, 2) px; own (n, 10, 10): what each point's camera has besides.
-    Raises GeometryError for a point whose ray does not meet the plane before the camera.
+    image_points (n, 2), sigmas (n, 2) px; own (g, 10, 10): what the cameras of g times have
+    besides, and member (n,): which of them took each point. Raises GeometryError for a point whose
+    ray does not meet the plane before the camera.
     """
     uv = np.atleast_2d(np.asarray(image_points, dtype=float))
     values = np.broadcast_to(values, (len(uv), 16))
     pose = values[0, EOP]
     ray = rays(sensor, values[:, IOP], uv[:, None])[:, 0] @ rotation(pose[:3]).T
     centre = pose[3:]
-    steep = ray @ plane.normal
+    normal = np.broadcast_to(plane.normal, ray.shape)
+    steep = np.sum(ray * normal, axis=1)
     with np.errstate(divide="ignore"):
-        reach = ((plane.point - centre) @ plane.normal) / steep
+        reach = np.sum((plane.point - centre) * normal, axis=1) / steep
     missed = (np.abs(steep) < _GRAZING) | ~(reach > 0)
     if missed.any():
         row = int(np.argmax(missed))
@@ -149,23 +166,26 @@ def on_plane(
     X = centre + reach[:, None] * ray
     # [B; n'] dX = [du - A dp; dh]
     _, A, B = (p[:, 0] for p in partials(sensor, values[:, IOP], values[:, EOP], X[:, None]))
-    left = np.concatenate([B, np.broadcast_to(plane.normal, (len(X), 1, 3))], axis=1)
+    left = np.concatenate([B, normal[:, None]], axis=1)
     inverse = np.linalg.inv(left)
     common = -inverse[:, :, :2] @ A
     moved = inverse[:, :, 2]
-    across = _across(plane.normal)
-    lever = (X - plane.point) @ across.T  # a tilt lifts a place by its distance from the axis
     shared = common.reshape(-1, 16)
-    tilted = (moved[:, :, None] * lever[:, None, :]).reshape(-1, 2)
     total = shared @ covariance @ shared.T
     total += plane.sd_mm**2 * np.outer(moved.ravel(), moved.ravel())
-    total += plane.sd_tilt**2 * tilted @ tilted.T
+    if plane.sd_tilt:  # which lifts a place by its distance from the axis
+        lever = (X - plane.point) @ _across(normal[0]).T
+        tilted = (moved[:, :, None] * lever[:, None, :]).reshape(-1, 2)
+        total += plane.sd_tilt**2 * tilted @ tilted.T
     noise = np.broadcast_to(np.asarray(sigmas, dtype=float), uv.shape)
     for i, block in enumerate(inverse[:, :, :2] * noise[:, None, :]):
         rows = slice(3 * i, 3 * i + 3)
         total[rows, rows] += block @ block.T
-        if own is not None:
-            total[rows, rows] += common[i][:, IOP] @ own[i] @ common[i][:, IOP].T
+    if own is not None and member is not None:
+        for k, Q in enumerate(own):
+            rows = np.flatnonzero(np.repeat(member == k, 3))
+            lever = shared[rows, IOP]
+            total[np.ix_(rows, rows)] += lever @ Q @ lever.T
     return X, total
 
 
@@ -177,6 +197,7 @@ def on_line(
     sigmas: ArrayLike,
     line: Line,
     own: Array | None = None,
+    member: NDArray[np.int64] | None = None,
 ) -> tuple[Array, Array]:
     """Return where image points lie on a line: (n, 3) mm, and their joint covariance (3n, 3n).
 
@@ -186,14 +207,42 @@ def on_line(
     centre = np.atleast_2d(values)[0, EOP][3:]
     aside = np.cross(line.direction, centre - line.point)
     normal = np.cross(aside, line.direction)
-    size = np.linalg.norm(normal)
-    if not size > 0:
+    size = np.linalg.norm(normal, axis=-1, keepdims=True)
+    if not (size > 0).all():
         raise GeometryError("the line passes through the camera: it is seen as a point")
     plane = Plane(line.point, normal / size, line.sd_mm)
-    X, covariance_of_X = on_plane(sensor, values, covariance, image_points, sigmas, plane, own)
-    along = np.outer(line.direction, line.direction)
-    block = np.kron(np.eye(len(X)), along)
-    return line.point + (X - line.point) @ along, block @ covariance_of_X @ block
+    X, C = on_plane(sensor, values, covariance, image_points, sigmas, plane, own, member)
+    direction = np.broadcast_to(line.direction, X.shape)
+    along = direction[:, :, None] * direction[:, None, :]
+    n = len(X)
+    C = np.einsum("iab,ibjc,jcd->iajd", along, C.reshape(n, 3, n, 3), along, optimize=True)
+    X = line.point + np.einsum("nab,nb->na", along, X - line.point)
+    return X, C.reshape(3 * n, 3 * n)
+
+
+def lines_of(profile: Profile, sensor: Sensor, values: Array, image_points: ArrayLike) -> Line:
+    """Return the line of a profile that each image point lies on: the one whose image is nearest.
+
+    values (16,) or (n, 16). Raises GeometryError for points beside the profile's ends.
+    """
+    uv = np.atleast_2d(np.asarray(image_points, dtype=float))
+    six = np.atleast_2d(values)[0, EOP]
+    ends = project(sensor, np.broadcast_to(values, (len(uv), 16))[:, IOP], six, profile.points)
+    begin, step = ends[:, :-1], np.diff(ends, axis=1)
+    size = np.sum(step**2, axis=2)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        at = np.sum((uv[:, None] - begin) * step, axis=2) / size
+        off = np.linalg.norm(uv[:, None] - begin - np.clip(at, 0, 1)[..., None] * step, axis=2)
+    chosen = np.argmin(np.where(np.isfinite(off), off, np.inf), axis=1)
+    rows = np.arange(len(uv))
+    beside = ~(np.abs(at[rows, chosen] - 0.5) * np.sqrt(size[rows, chosen])
+               <= 0.5 * np.sqrt(size[rows, chosen]) + _BESIDE_PX)  # fmt: skip
+    if beside.any():
+        x, y = uv[np.argmax(beside)]
+        raise GeometryError(f"image point {x:.1f}, {y:.1f} px lies beyond the profile's ends")
+    direction = np.diff(profile.points, axis=0)
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return Line(profile.points[chosen], direction[chosen], profile.sd_mm)
 
 
 def place_on(
@@ -202,13 +251,16 @@ def place_on(
     covariance: Array,
     image_points: ArrayLike,
     sigmas: ArrayLike,
-    surface: Plane | Line,
+    surface: Plane | Line | Profile,
     own: Array | None = None,
+    member: NDArray[np.int64] | None = None,
 ) -> tuple[Array, Array]:
     """Return what `on_plane` or `on_line` does, whichever the surface is."""
+    if isinstance(surface, Profile):
+        surface = lines_of(surface, sensor, values, image_points)
     if isinstance(surface, Line):
-        return on_line(sensor, values, covariance, image_points, sigmas, surface, own)
-    return on_plane(sensor, values, covariance, image_points, sigmas, surface, own)
+        return on_line(sensor, values, covariance, image_points, sigmas, surface, own, member)
+    return on_plane(sensor, values, covariance, image_points, sigmas, surface, own, member)
 
 
 def _across(normal: Array) -> Array:

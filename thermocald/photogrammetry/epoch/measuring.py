@@ -183,9 +183,9 @@ def on_plane(
         total[rows, rows] += block @ block.T
     if own is not None and member is not None:
         for k, Q in enumerate(own):
-            rows = np.flatnonzero(np.repeat(member == k, 3))
-            lever = shared[rows, IOP]
-            total[np.ix_(rows, rows)] += lever @ Q @ lever.T
+            at = np.flatnonzero(np.repeat(member == k, 3))
+            lever = shared[at, IOP]
+            total[at[:, None], at] += lever @ Q @ lever.T
     return X, total
 
 

@@ -22,8 +22,7 @@ import cv2
 import numpy as np
 
 from thermocald.acquisition.device_loop import Schedule
-from thermocald.acquisition.pairing import pair_readings
-from thermocald.acquisition.pipeline import AcquiredEpoch, make_epoch
+from thermocald.acquisition.pipeline import AcquiredEpoch, make_epoch, pair_readings
 from thermocald.analysis.online.observer import OnlineObserver
 from thermocald.hal import SystemClock, VirtualClock, open_device
 from thermocald.photogrammetry.targets.image_file import decode_grey

@@ -15,7 +15,7 @@ from pyarrow import parquet
 from benchmarks.adjustment import EXTERIOR, INTERIOR, SENSOR, SIGMA_PX
 from benchmarks.adjustment import corner_field as whole_field
 from thermocald.photogrammetry.camera.camera_model import project
-from thermocald.physics.distortion import follow_angle
+from thermocald.physics.model import follow_angle
 from thermocald.store.recording.head import CameraSpec, Channel, Head
 from thermocald.store.recording.reader import RecordingWriter
 

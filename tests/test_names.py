@@ -15,8 +15,7 @@ from hypothesis import given, settings, strategies
 from tests.commands import call
 from tests.drivers.fakes.sysfs import Sysfs
 from tests.store.test_crafted import change
-from thermocald.acquisition.pairing import Readings, require_columns
-from thermocald.acquisition.pipeline import AcquiredEpoch, Pipeline
+from thermocald.acquisition.pipeline import AcquiredEpoch, Pipeline, Readings, require_columns
 from thermocald.daemon.epoch_keeper import result_row
 from thermocald.epoch import Epoch
 from thermocald.errors import ConfigurationError, RecordingError, StoreError, WrongDevice

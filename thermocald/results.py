@@ -17,8 +17,7 @@ from thermocald.discovery.model import build_model
 from thermocald.errors import DataError
 from thermocald.files import write_text
 from thermocald.output.printed import calibration_document, calibration_lines, discovery_lines
-from thermocald.output.study.document import study_document
-from thermocald.output.study.summary import study_lines
+from thermocald.output.study.summary import study_document, study_lines
 from thermocald.physics.model_file import write_effects, write_model
 from thermocald.result import Result, jsonable, new_figure
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 
-from thermocald.acquisition.pairing import Readings, pair_readings
+from thermocald.acquisition.pipeline import Readings, pair_readings
 from thermocald.hal import Reading
 
 

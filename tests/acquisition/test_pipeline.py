@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from thermocald.acquisition.calibrator import CalibratedEpoch
-from thermocald.acquisition.pairing import Readings
-from thermocald.acquisition.pipeline import Pipeline
+from thermocald.acquisition.pipeline import Pipeline, Readings
 from thermocald.epoch import Epoch
 from thermocald.hal import Frame, SystemClock
 from thermocald.photogrammetry.epoch.adjustment import failed

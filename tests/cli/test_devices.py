@@ -10,7 +10,7 @@ import yaml
 from typer.testing import CliRunner
 
 from tests.drivers.fakes.sysfs import Sysfs, w1_slave
-from thermocald.cli.devices import devices as command
+from thermocald.cli.check import devices as command
 from thermocald.config import parse_config
 from thermocald.daemon import probe as devices
 from thermocald.errors import ConfigurationError, DeviceError

@@ -15,8 +15,7 @@ from thermocald_drivers.alert import Watch, condition_of
 from tests.commands import call
 from tests.daemon.conftest import make_recording
 from tests.daemon.test_store_file import guard, path  # noqa: F401
-from thermocald.acquisition.pairing import Readings
-from thermocald.acquisition.pipeline import Pipeline
+from thermocald.acquisition.pipeline import Pipeline, Readings
 from thermocald.cli.status import status
 from thermocald.daemon.live_state import LiveState
 from thermocald.errors import DataError, StoreError

@@ -11,7 +11,7 @@ from benchmarks.long_recording import INTERVAL_S, RATES, field_of, write_long_re
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.series.normals import ObservationGrid
-from thermocald.physics.distortion import follow_angle
+from thermocald.physics.model import follow_angle
 from thermocald.thermal.reduce import reduce_series
 from thermocald.thermal.series import SeriesInput
 

@@ -12,8 +12,8 @@ from thermocald.analysis.study.measured import Clip
 from thermocald.analysis.study.study import StudySettings, study
 from thermocald.errors import OutputError
 from thermocald.files import write_text
-from thermocald.output.study.document import study_document
 from thermocald.output.study.report import cut_clip, render_study, save_figures
+from thermocald.output.study.summary import study_document
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 
 

@@ -11,7 +11,7 @@ from tests.photogrammetry.exact_rendering import noisy
 from tests.photogrammetry.fields import PI_SENSOR
 from tests.photogrammetry.single_targets import single_targets
 from thermocald.photogrammetry.targets import ring_code
-from thermocald.photogrammetry.targets.detection import find_circles
+from thermocald.photogrammetry.targets.outline import find_circles
 from thermocald.photogrammetry.targets.ring_code import read_codes
 
 

@@ -1,4 +1,4 @@
-"""`thermocald check`: is this recording, configuration or store sound?"""
+"""`thermocald check`, `devices`, `doctor`: what is sound, what is attached, what is lacking."""
 
 from __future__ import annotations
 
@@ -7,9 +7,53 @@ from typing import Annotated
 
 import typer
 
+from thermocald.cli.commands import expert
 from thermocald.cli.common import say, write_result
 from thermocald.cli.options import JsonOption
 from thermocald.errors import DataError, DeviceError
+
+
+def devices(json: JsonOption = None) -> None:
+    """List attached cameras, thermometers and outputs, as they are written in config.yaml.
+
+    What is not certain (a serial port, an I2C bus: nobody knows what is on it) is a comment.
+
+    Example: thermocald devices >> config.yaml
+    """
+    from thermocald.daemon.probe import attached, stanzas
+
+    found, notes = attached()
+    document = {
+        "format": "thermocald-devices/1",
+        "devices": [one.as_dict() for one in found],
+        "notes": notes,
+    }
+    if write_result(document, json):
+        typer.echo("\n".join(stanzas(found)))
+    for note in notes:
+        say(note)
+
+
+def doctor(
+    root: Annotated[Path, expert(help="The machine's root folder, such as a mounted card.")] = Path(
+        "/"
+    ),
+    json: JsonOption = None,
+) -> None:
+    """Say what this machine lacks: camera stack, groups, I2C, clock, power, disk.
+
+    Below each thing that is missing is the command that mends it. Nothing is changed. Exit status 1
+    where something is missing.
+
+    Example: thermocald doctor
+    """
+    from thermocald.machine import Machine, finding_lines
+
+    findings = Machine.here(root).findings()
+    if write_result({"format": "thermocald-doctor/1", "findings": findings}, json):
+        typer.echo("\n".join(finding_lines(findings)))
+    if any(finding.state == "missing" for finding in findings):
+        raise typer.Exit(1)
 
 
 def check(

@@ -30,7 +30,7 @@ class Entry(NamedTuple):
 PANELS = {
     "Measure": {
         "demo": Entry("demo", "Try it all on a rendered camera, without hardware"),
-        "devices": Entry("devices", "List attached cameras, thermometers and outputs"),
+        "devices": Entry("check", "List attached cameras, thermometers and outputs"),
         "session": Entry("session", "Take one measurement series, from check to report", True),
         "run": Entry("run", "Acquire, calibrate and keep epochs until told to end"),
         "status": Entry("status", "Say how the daemon is doing"),
@@ -49,7 +49,7 @@ PANELS = {
     },
     "Use": {
         "predict": Entry("predict", "Predict the camera at a temperature, or along a log"),
-        "correct": Entry("correct", "Correct image points or images for the temperature"),
+        "correct": Entry("predict", "Correct image points or images for the temperature"),
         "measure": Entry("measure", "Measure in metres on a water surface, a plane, a staff"),
         "camera": Entry("camera", "Convert and compare cameras; one at a temperature", True),
     },
@@ -57,17 +57,17 @@ PANELS = {
         "testfield": Entry("testfield", "Print, import, survey and check a test field", True),
     },
     "Many cameras": {
-        "forward": Entry("forward", "Send a store's rows to a server"),
-        "fleet": Entry("fleet", "Show all cameras of a server, and which need a look"),
+        "forward": Entry("server", "Send a store's rows to a server"),
+        "fleet": Entry("server", "Show all cameras of a server, and which need a look"),
         "reprocess": Entry("reprocess", "Calibrate or analyse whole archives again"),
         "server": Entry("server", "Make a server's tables, and let stations write to them", True),
     },
     "Look after": {
-        "doctor": Entry("doctor", "Say what this machine lacks, and what mends it"),
+        "doctor": Entry("check", "Say what this machine lacks, and what mends it"),
         "check": Entry("check", "Say whether a recording, configuration or store is sound"),
-        "backup": Entry("backup", "Copy a store that is in use, and verify the copy"),
+        "backup": Entry("archive", "Copy a store that is in use, and verify the copy"),
         "archive": Entry("archive", "Write a store's series as recordings; delete old frames"),
-        "convert": Entry("convert", "Rewrite a recording's observations as Parquet or CSV"),
+        "convert": Entry("archive", "Rewrite a recording's observations as Parquet or CSV"),
     },
 }
 COMMANDS = {name: entry for panel in PANELS.values() for name, entry in panel.items()}

@@ -30,8 +30,7 @@ if TYPE_CHECKING:
 
     from thermocald.acquisition.device_loop import LinkEvent
     from thermocald.acquisition.frame_folder import FrameFolder
-    from thermocald.acquisition.pairing import Readings
-    from thermocald.acquisition.pipeline import AcquiredEpoch, FrameCheck
+    from thermocald.acquisition.pipeline import AcquiredEpoch, FrameCheck, Readings
     from thermocald.acquisition.steady_clock import SteadyClock
     from thermocald.daemon.live_state import LiveState
     from thermocald.daemon.output_loop import OutputLoop

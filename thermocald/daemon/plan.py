@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.acquisition.calibrator import Calibrator
-from thermocald.acquisition.pairing import require_columns
+from thermocald.acquisition.pipeline import require_columns
 from thermocald.errors import ConfigurationError
 from thermocald.hal import open_device
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor

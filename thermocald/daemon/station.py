@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from thermocald.acquisition.calibrator import Calibrator
 from thermocald.acquisition.device_loop import DeviceLoop, Link
 from thermocald.acquisition.frame_folder import FrameFolder
-from thermocald.acquisition.pairing import Readings, require_columns
+from thermocald.acquisition.pipeline import Readings, require_columns
 from thermocald.daemon.camera_line import CameraLine, link_status
 from thermocald.daemon.output_loop import OutputLoop
 from thermocald.daemon.plan import plan_cameras, require_thermometer_columns

@@ -23,11 +23,10 @@ from thermocald.photogrammetry.network.adjustment import Network, Photo, adjust_
 from thermocald.photogrammetry.network.datum import Distance
 from thermocald.photogrammetry.targets import ring_code
 from thermocald.photogrammetry.targets.circle import fit_circles
-from thermocald.photogrammetry.targets.detection import find_circles
 from thermocald.photogrammetry.targets.frame_status import inspect_frame
 from thermocald.photogrammetry.targets.image_file import decode_grey
 from thermocald.photogrammetry.targets.markers import locate_markers, measure_corners, to_8_bit
-from thermocald.photogrammetry.targets.outline import LocalMap, local_maps
+from thermocald.photogrammetry.targets.outline import LocalMap, find_circles, local_maps
 from thermocald.photogrammetry.targets.ring_code import read_codes
 
 if TYPE_CHECKING:

@@ -53,15 +53,14 @@ from thermocald.photogrammetry.camera.camera_model import (
     Sensor,
 )
 from thermocald.physics import catalogue
-from thermocald.physics.distortion import BASES
 from thermocald.physics.effect import PARAMETER_UNITS
-from thermocald.physics.model import RATED, ModelEffect, ThermalModel
+from thermocald.physics.model import BASES, RATED, ModelEffect, ThermalModel
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from thermocald.physics.distortion import Distortion
+    from thermocald.physics.model import Distortion
 
 
 @dataclass(frozen=True, slots=True)

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array, Mask
     from thermocald.photogrammetry.series.normals import ObservationGrid, Partials
-    from thermocald.physics.distortion import Distortion
+    from thermocald.physics.model import Distortion
 
 
 def no_temperature(source: SeriesInput, reference: str) -> str:

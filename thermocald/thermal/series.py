@@ -21,8 +21,8 @@ import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.linalg import best_level, explained, unit_diagonal
-from thermocald.physics.distortion import distortion_along, follow_angle
 from thermocald.physics.history import History
+from thermocald.physics.model import distortion_along, follow_angle
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.series.normals import ObservationGrid, Partials
-    from thermocald.physics.distortion import Distortion
+    from thermocald.physics.model import Distortion
     from thermocald.thermal.random_effects import HiddenTargets, Movement
     from thermocald.thermal.thermometer import Thermometer
 

@@ -27,8 +27,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     Sensor,
 )
-from thermocald.physics.distortion import BASES, choose_basis, distortion_along
-from thermocald.physics.model import RATED, ThermalModel
+from thermocald.physics.model import BASES, RATED, ThermalModel, choose_basis, distortion_along
 from thermocald.store.recording.readings import interpolate_readings
 
 if TYPE_CHECKING:
@@ -36,7 +35,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from thermocald.arrays import Array, Index
-    from thermocald.physics.distortion import Distortion
+    from thermocald.physics.model import Distortion
     from thermocald.store.logger.clock import DeviceClock
     from thermocald.store.logger.temperatures import TemperatureLog
 

@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from thermocald.numbers import with_sd
-from thermocald.physics.distortion import SURE
+from thermocald.physics.model import SURE
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

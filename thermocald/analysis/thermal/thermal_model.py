@@ -38,8 +38,7 @@ from thermocald.thermal.series import in_blocks
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from thermocald.physics.distortion import Distortion
-    from thermocald.physics.model import ModelEffect
+    from thermocald.physics.model import Distortion, ModelEffect
     from thermocald.thermal.hypothesis import Fit
     from thermocald.thermal.series import ReducedSeries
 

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.errors import UsageError
+from thermocald.output.testfield.drawing import Pen, crop_marks, draw_marker, rectangle, rulers
 from thermocald.output.testfield.layout import STRIP, TRIM
-from thermocald.output.testfield.pen import Pen, crop_marks, draw_marker, rectangle, rulers
 from thermocald.photogrammetry.targets import boards
 from thermocald.photogrammetry.targets.markers import marker_cells
 

@@ -1,21 +1,23 @@
 """The drawing of a test field's sheets, in mm: PDF and SVG, all of it vectors.
 
 One list of paths serves both formats; circles are Bézier curves of eight segments, exact to
-4·10⁻⁶ of their radius.
+4·10⁻⁶ of their radius. The sheet's lower left trimmed corner is the origin, x right, y up.
+
+The last page of a corner's PDF is its plan: which sheet goes where, how to fix it, what error of
+its angles is allowed. It shows the corner as somebody sees it who looks into it.
 """
 
 from __future__ import annotations
 
 import importlib.util
+import textwrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermocald.errors import DriverMissing
 from thermocald.files import cannot_write
-from thermocald.output.testfield.layout import STRIP
-from thermocald.output.testfield.pen import GREY, Pen, crop_marks, draw_marker, rulers, square
-from thermocald.output.testfield.plan import draw_plan
+from thermocald.output.testfield.layout import STRIP, TRIM
 from thermocald.photogrammetry.targets import outline, ring_code
 from thermocald.photogrammetry.targets.markers import marker_cells
 
@@ -25,7 +27,217 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.output.testfield.layout import Marker, Sheet, Target
+
+
+_MM_PER_INCH = 25.4
+_POINTS_PER_MM = 72 / _MM_PER_INCH
+_RULER = 100.0
+GREY = "0.62"
+"""What is read by people only: light enough never to be mistaken for a target."""
+
+
+class Pen:
+    """A figure of one page that is drawn on in mm from the lower left trimmed corner."""
+
+    def __init__(self, page: tuple[float, float], light: bool) -> None:
+        from matplotlib.figure import Figure
+        from matplotlib.transforms import Affine2D
+
+        self.figure = Figure(figsize=(page[0] / _MM_PER_INCH, page[1] / _MM_PER_INCH))
+        self.transform = (
+            Affine2D().translate(TRIM, TRIM).scale(1 / _MM_PER_INCH) + self.figure.dpi_scale_trans
+        )
+        self.colour = "white" if light else "black"
+
+    @staticmethod
+    def stretch(width: float, height: float) -> Any:
+        from matplotlib.transforms import Affine2D
+
+        return Affine2D().scale(width, height)
+
+    def fill(self, path: Any, colour: str) -> None:
+        from matplotlib.patches import PathPatch
+
+        self.figure.add_artist(
+            PathPatch(path, facecolor=colour, edgecolor="none", transform=self.transform)
+        )
+
+    def line(self, points: Sequence[tuple[float, float]], colour: str, width: float = 0.15) -> None:
+        from matplotlib.patches import PathPatch
+        from matplotlib.path import Path as Curve
+
+        self.figure.add_artist(
+            PathPatch(
+                Curve(np.asarray(points)), fill=False, edgecolor=colour,
+                linewidth=width * _POINTS_PER_MM, transform=self.transform, capstyle="butt",
+            )
+        )  # fmt: skip
+
+    def text(self, x: float, y: float, words: str, height: float, **style: Any) -> None:
+        style = {"color": self.colour, "ha": "left", "va": "baseline", **style}
+        self.figure.text(
+            x, y, words, transform=self.transform, fontsize=height * _POINTS_PER_MM, **style
+        )
+
+
+def rectangle(x: float, y: float, width: float, height: float) -> Any:
+    """A rectangle by its lower left corner and its sides, mm."""
+    from matplotlib.path import Path as Curve
+
+    x1, y1 = x + width, y + height
+    return Curve([(x, y), (x1, y), (x1, y1), (x, y1), (x, y)], closed=True)
+
+
+def square(x: float, y: float, side: float) -> Any:
+    """A square by its centre and side, mm."""
+    return rectangle(x - side / 2, y - side / 2, side, side)
+
+
+def draw_marker(
+    pen: Pen, centre: tuple[float, float], side: float, cells: NDArray[np.bool_]
+) -> None:
+    """A marker with its border: cells (n, n), True where black, the first row on top; mm.
+
+    The white cells are drawn on the black square, each row's runs in one piece. Every run reaches a
+    hair into a white row below it, so that no renderer leaves a dark seam.
+    """
+    pen.fill(square(*centre, side), "black")
+    white = ~cells
+    n = len(white)
+    cell = side / n
+    left, top = centre[0] - side / 2, centre[1] + side / 2
+    for j, row in enumerate(white):
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], row.astype(int), [0]])))
+        for a, b in edges.reshape(-1, 2).tolist():
+            seam = 0.02 * cell if j + 1 < n and white[j + 1, a:b].all() else 0.0
+            low = top - (j + 1) * cell - seam
+            pen.fill(rectangle(left + a * cell, low, (b - a) * cell, cell + seam), "white")
+
+
+def crop_marks(pen: Pen, size: tuple[float, float]) -> None:
+    """Where to cut: short lines outside of the four corners."""
+    w, h = size
+    for x, sx in ((0.0, -1.0), (w, 1.0)):
+        for y, sy in ((0.0, -1.0), (h, 1.0)):
+            pen.line([(x + sx * 1, y), (x + sx * (TRIM - 1.5), y)], "black", 0.1)
+            pen.line([(x, y + sy * 1), (x, y + sy * (TRIM - 1.5))], "black", 0.1)
+
+
+def rulers(pen: Pen, size: tuple[float, float]) -> None:
+    """A ruler per direction: printers scale the two differently."""
+    for along, length in enumerate(size):
+        total = min(_RULER, 10 * int((length - STRIP - 10) / 10))
+
+        def at(s: float, t: float, along: int = along) -> tuple[float, float]:
+            return (STRIP + s, t) if along == 0 else (t, STRIP + s)
+
+        pen.line([at(0, 4), at(total, 4)], pen.colour, 0.1)
+        for mm in range(int(total) + 1):
+            tick = 3.0 if mm % 10 == 0 else 2.0 if mm % 5 == 0 else 1.2
+            pen.line([at(mm, 4), at(mm, 4 + tick)], pen.colour, 0.1)
+        words = f"0 to {total:g} mm: measure it; if it is not {total:g}.0 mm, the printer scaled"
+        x, y = at(0, 1.2)
+        if along == 0:
+            pen.text(x, y, words, 1.9)
+        else:
+            pen.text(y=y, x=x + 1.9, words=words, height=1.9, rotation=90, ha="right", va="bottom")
+
+
+ALLOWED_ANGLE_DEG = 0.4
+"""A wall that is off by this angle moves its far edge by the 3 mm that testfield.csv allows for."""
+
+_TEXT = f"""
+Print all pages at "actual size" on matt paper of at least 160 g/m². Measure both rulers of each
+sheet; if they are not 100.0 mm the printer scaled, and the survey will find it.
+
+Cut along the crop marks. Sheet 1 may be smaller than its paper.
+
+Glue each sheet without bubbles to a board that stays flat: aluminium composite, MDF from 8 mm, or
+glass. Spray glue is best.
+
+Put the boards up so that edges with the same letter meet: A with A, B with B, C with C. Sheet 1
+lies, sheet 2 stands on the left, sheet 3 on the right. Gaps of a few mm do no harm.
+
+Fix every edge with two brackets screwed to both boards, and the whole to something heavy. From the
+survey on nothing may move by more than 0.02 mm: do not lift it or lean on it.
+
+Angles: if you survey the corner (you should) they may be off by 5°, since the survey measures them.
+If you use testfield.csv as it is, by {ALLOWED_ANGLE_DEG:g}° at most, which is 3 mm at the far edge
+of a sheet; c, x0 and y0 are then good to some tens of pixels only.
+
+Matt surroundings and even light: no lamp, window or reflection in the picture.
+
+testfield.csv, written with these pages, belongs to this corner. Next: thermocald testfield survey
+photos/ --field testfield.csv --scale …
+"""
+STEPS = tuple(" ".join(step.split()) for step in _TEXT.strip().split("\n\n"))
+
+
+def draw_plan(sheets: Sequence[Sheet]) -> Any:
+    """The plan as a matplotlib Figure of the sheets' page size."""
+    from matplotlib.figure import Figure
+
+    width, height = sheets[0].design.page
+    figure = Figure(figsize=(width / 25.4, height / 25.4))
+    portrait = height > width
+    size = min(width, height) / 297 * 13  # points
+    figure.text(0.08, 0.95, "How to put up this corner", fontsize=1.6 * size, va="top")
+    box = (0.08, 0.52, 0.84, 0.38) if portrait else (0.03, 0.1, 0.45, 0.75)
+    _draw_corner(figure, box, sheets, size)
+    x, y = (0.08, 0.49) if portrait else (0.5, 0.86)
+    for number, step in enumerate(STEPS, 1):
+        lines = textwrap.wrap(step, 84 if portrait else 62)
+        figure.text(x, y, f"{number}", fontsize=size, va="top", weight="bold")
+        figure.text(x + 0.03, y, "\n".join(lines), fontsize=size, va="top", linespacing=1.3)
+        y -= (1.3 * len(lines) + 0.6) * size / 72 * 25.4 / height
+    return figure
+
+
+def _draw_corner(
+    figure: Any, box: tuple[float, float, float, float], sheets: Sequence[Sheet], size: float
+) -> None:
+    from matplotlib.patches import Polygon
+
+    axes = figure.add_axes(box)
+    axes.set_aspect("equal")
+    axes.axis("off")
+    floor, left, right = (sheet.size for sheet in sheets)
+    x, y, z = np.eye(3)
+    outlines = {
+        "1": np.array([0 * x, floor[0] * x, floor[0] * x + floor[1] * y, floor[1] * y]),
+        "2": np.array([0 * x, left[0] * x, left[0] * x + left[1] * z, left[1] * z]),
+        "3": np.array([0 * x, right[0] * y, right[0] * y + right[1] * z, right[1] * z]),
+    }
+    for (name, corners), grey in zip(outlines.items(), ("0.88", "0.95", "0.92"), strict=True):
+        axes.add_patch(Polygon(_seen(corners), facecolor=grey, edgecolor="black", linewidth=1.2))
+        middle = _seen(corners).mean(axis=0)
+        axes.text(*middle, name, fontsize=3 * size, ha="center", va="center")
+    for letter, middle in (
+        ("A", 0.5 * floor[1] * y), ("B", 0.5 * floor[0] * x), ("C", 0.5 * left[1] * z),
+    ):  # fmt: skip
+        axes.text(
+            *_seen(middle[None])[0], letter, fontsize=1.5 * size, ha="center", va="center",
+            bbox={"facecolor": "white", "edgecolor": "black", "boxstyle": "circle"},
+        )  # fmt: skip
+    for name, end in (("X", 1.12 * floor[0] * x), ("Y", 1.12 * floor[1] * y),
+                      ("Z", 1.06 * left[1] * z)):  # fmt: skip
+        axes.annotate(
+            name, _seen(end[None])[0], ha="center", va="center", fontsize=size, color="0.35"
+        )
+    axes.autoscale_view()
+
+
+def _seen(points: Array) -> Array:
+    """Places in the drawing (n, 2) of points (n, 3): seen from (1, 1, 0.8), Z up, X to the left."""
+    towards = np.array([1.0, 1.0, 0.8])
+    towards /= np.linalg.norm(towards)
+    right = np.cross([0.0, 0.0, 1.0], towards)
+    right /= np.linalg.norm(right)
+    placed: Array = points @ np.stack([right, np.cross(towards, right)], axis=1)
+    return placed
+
 
 _TARGET_NAME = 0.7
 """Height of a target's name in radii of its disc."""

@@ -41,14 +41,19 @@ import numpy as np
 
 from thermocald.errors import TestFieldError
 from thermocald.photogrammetry.targets.circle import normal_cdf
-from thermocald.photogrammetry.targets.detection import Candidates, find_circles
 from thermocald.photogrammetry.targets.markers import (
     detect_markers,
     is_marker,
     parse_marker,
     to_8_bit,
 )
-from thermocald.photogrammetry.targets.outline import RING_INNER, RING_OUTER, LocalMap
+from thermocald.photogrammetry.targets.outline import (
+    RING_INNER,
+    RING_OUTER,
+    Candidates,
+    LocalMap,
+    find_circles,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Collection

@@ -1,24 +1,18 @@
-"""The planes and sheets of a test field, and its exchange with other programs.
+"""The planes of a test field: the boards that its targets are on, and the targets' normals.
 
-A test field's file has no normals. Targets are printed on sheets, so sheets are looked for: of all
-planes through a target and two of its neighbours the one that holds most targets nearby is a sheet;
-its targets are taken away, and the search goes on. (Majorities among neighbours alone fail in a
-corner, where a plane across the edge holds the outermost rows of both sheets.) The normal is that
-of the plane through a target's nearest on its own sheet, so that a sheet may be bent a little. A
-target on no sheet has no normal: its eccentricity cannot be known, and is left out.
-
-A test field's file does not say what is mounted on what. Planes are looked for that hold most
-targets, with the tolerance that their coordinates' errors ask for; what lies in one plane but far
-apart is taken for two boards. Boards that touch in one plane count as one.
+A test field's file says neither. Planes are looked for that hold most targets, with the tolerance
+that the field's spacing and its coordinates' errors ask for; what lies in one plane but far apart
+is taken for two boards. Boards that touch in one plane count as one. The normal of a target is that
+of the plane through its nearest on its own board, so that a board may be bent a little. A target on
+no board and no small plate has no normal: its eccentricity cannot be known, and is left out.
 
 Source: planes one after the other as Fischler, Bolles (1981), Comm. ACM 24, 381-395 (RANSAC), with
-every target as a seed instead of a random one.
+targets as seeds instead of random ones.
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
-from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,13 +24,18 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import TestField
 
 
-_NEIGHBOURS = 8
-_FLATNESS = 0.03  # of the distance between neighbours
-_FEWEST = 6  # targets on a sheet; three always are in a plane, five sometimes by chance
-_PLATE = 4  # targets of a small plate, or at the rim of a sheet
-_LOOSE = 0.03  # flatness of a target with its nearest where no sheet was found
+FEWEST_ON_A_SHEET = 6
+"""Targets on a board; three always are in a plane, five sometimes by chance."""
+
+_SEED = 12  # nearest targets that give a first plane
+_FLATNESS = 0.05  # of the distance between neighbours
+_SIGMAS = 4.0  # of the coordinates
+_APART = 2.5  # times the distance between neighbours: another board
+_SEEDS = 60
+_LOCAL = 8  # nearest targets on a board that give a normal
+_PLATE = 4  # targets of a small plate, or at the rim of a board
+_LOOSE = 0.03  # flatness of a target with its nearest where no board was found
 _COMPACT = 1.6  # how much farther than the nearest the others may be for that
-_LOCAL = 8
 
 
 @lru_cache(maxsize=16)
@@ -53,77 +52,32 @@ def field_normals(testfield: TestField) -> Array:
 
 def target_normals(points: Array) -> Array:
     """Unit normals (n, 3), of either sign, of targets at points (n, 3) mm; NaN for no plane."""
-    n = len(points)
-    normals = np.full((n, 3), np.nan)
-    if n < _PLATE:
+    normals = np.full((len(points), 3), np.nan)
+    if len(points) < _PLATE:
         return normals
-    # axis by axis: three times less memory than all differences at once
-    distance = np.sqrt(sum(np.square(np.subtract.outer(x, x)) for x in points.T))
-    near = np.argsort(distance, axis=1, kind="stable")[:, 1 : _NEIGHBOURS + 1]
-    spacing = float(np.median(np.take_along_axis(distance, near, 1)[:, 0]))
-    if spacing == 0:
-        return normals
-    tolerance = _FLATNESS * spacing
-    closeness = np.exp(-((distance / (3 * spacing)) ** 2))
-    seeds, planes = _planes_of_neighbours(points, near, spacing)
-    if len(seeds) == 0:
-        return normals
-    offset = np.sum(planes * points[seeds], axis=1)
-    holds = np.empty((len(seeds), n), dtype=bool)
-    for i in range(0, len(seeds), 4096):
-        s = slice(i, i + 4096)
-        holds[s] = np.abs(planes[s] @ points.T - offset[s, None]) < tolerance
-    left = np.ones(n, dtype=bool)
-    while left.sum() >= _FEWEST:
-        score = np.concatenate(
-            [
-                np.einsum("ij,ij->i", closeness[seeds[i : i + 4096]], holds[i : i + 4096] & left)
-                for i in range(0, len(seeds), 4096)
-            ]
-        )
-        best = int(np.argmax(score))
-        sheet = np.nonzero(holds[best] & left)[0]
-        if len(sheet) < _FEWEST:
-            break
-        for row in sheet.tolist():
-            local = sheet[np.argsort(distance[row, sheet], kind="stable")[:_LOCAL]]
-            spread = points[local] - points[local].mean(axis=0)
-            _, size, axes = np.linalg.svd(spread)
-            # A single row of targets does not say how its sheet is turned about it.
-            normals[row] = axes[2] if size[1] > 0.1 * size[0] else planes[best]
-        left[sheet] = False
-    for row in np.nonzero(left)[0].tolist():
-        # The rim of a sheet that bends, or a small plate of its own.
-        local = np.argsort(distance[row], kind="stable")[:_PLATE]
+    near, _ = _neighbours(points)
+    reach = np.linalg.norm(points[near[:, :_PLATE]] - points[:, None], axis=2)
+    spacing = float(np.median(reach[:, 1]))
+    labels = _sheets(points, 0.0)
+    for row, label in enumerate(labels):
+        board = np.flatnonzero(labels == label)
+        local = near[row, :_PLATE]
+        if label >= 0:
+            away = np.linalg.norm(points[board] - points[row], axis=1)
+            local = board[np.argsort(away, kind="stable")[:_LOCAL]]
         spread = points[local] - points[local].mean(axis=0)
         _, size, axes = np.linalg.svd(spread)
-        compact = distance[row, local[-1]] < _COMPACT * distance[row, local[1]]
-        if (
-            compact
+        if label >= 0:
+            # A single row of targets does not say how its board is turned about it.
+            broad = size[1] > 0.1 * size[0]
+            normals[row] = axes[2] if broad else plane_fit(points[board])[1][2]
+        elif (
+            reach[row, -1] < _COMPACT * reach[row, 1]
             and size[1] > 0.1 * size[0]
             and np.abs(spread @ axes[2]).max() < _LOOSE * spacing
         ):
             normals[row] = axes[2]
     return normals
-
-
-def _planes_of_neighbours(
-    points: Array, near: NDArray[np.int64], spacing: float
-) -> tuple[NDArray[np.int64], Array]:
-    """Planes through each point and two of its neighbours: the points, and unit normals (m, 3)."""
-    pairs = np.array(list(combinations(range(near.shape[1]), 2)), dtype=np.int64).reshape(-1, 2)
-    d = points[near] - points[:, None]
-    cross = np.cross(d[:, pairs[:, 0]], d[:, pairs[:, 1]])
-    size = np.linalg.norm(cross, axis=2)
-    length = np.linalg.norm(d, axis=2)
-    usable = size > 0.2 * np.maximum(length[:, pairs[:, 0]] * length[:, pairs[:, 1]], spacing**2)
-    seeds, which = np.nonzero(usable)
-    planes = cross[seeds, which] / size[seeds, which, None]
-    # The same plane comes from many pairs; a coarse raster of directions per point is enough.
-    sign = np.where(planes @ np.array([1.0, 1e-3, 1e-6]) < 0, -1.0, 1.0)[:, None]
-    key = np.column_stack([seeds, np.rint(planes * sign * 200).astype(np.int64)])
-    _, first = np.unique(key, axis=0, return_index=True)
-    return seeds[first], planes[first]
 
 
 def plane_fit(points: ArrayLike, tolerance: float = 0.002) -> tuple[Array, Array, bool]:
@@ -141,25 +95,21 @@ def plane_fit(points: ArrayLike, tolerance: float = 0.002) -> tuple[Array, Array
     return centre, axes, bool(s2[0] <= tolerance**2 * max(s2[2], 1e-300))
 
 
-FEWEST_ON_A_SHEET = 6
-"""Targets on a board; three always are in a plane, five sometimes by chance."""
-
-_SEED = 12  # nearest targets that give a first plane
-_SHEET_FLATNESS = 0.05  # of the distance between neighbours
-_SIGMAS = 4.0  # of the coordinates
-_APART = 2.5  # times the distance between neighbours: another board
-_SEEDS = 60
-
-
 @lru_cache(maxsize=16)
 def field_sheets(testfield: TestField) -> NDArray[np.int64]:
     """Label (n,) of the board of each target, -1 where it is on none."""
-    points = testfield.points
+    labels = _sheets(testfield.points, _SIGMAS * float(np.median(testfield.sigmas)))
+    labels.setflags(write=False)
+    return labels
+
+
+def _sheets(points: Array, least: float) -> NDArray[np.int64]:
+    """Label (n,) of the board of each point, -1 where it is on none; least: tolerance, mm."""
     labels = np.full(len(points), -1, dtype=np.int64)
     if len(points) < FEWEST_ON_A_SHEET:
         return labels
     near, spacing = _neighbours(points)
-    tolerance = max(_SHEET_FLATNESS * spacing, _SIGMAS * float(np.median(testfield.sigmas)))
+    tolerance = max(_FLATNESS * spacing, least)
     left = np.ones(len(points), dtype=bool)
     count = 0
     while left.sum() >= FEWEST_ON_A_SHEET:
@@ -174,7 +124,6 @@ def field_sheets(testfield: TestField) -> NDArray[np.int64]:
             if len(board) >= FEWEST_ON_A_SHEET:
                 labels[board] = count
                 count += 1
-    labels.setflags(write=False)
     return labels
 
 

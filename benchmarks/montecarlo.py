@@ -18,7 +18,7 @@ import tracemalloc
 import cv2
 import numpy as np
 
-from thermocald.analysis.camera.image_grid import image_grid
+from thermocald.analysis.camera.undistortion import image_grid
 from thermocald.analysis.study.montecarlo import draw_root, plane_errors, simulate_errors
 from thermocald.analysis.study.object_plane import on_plane
 from thermocald.photogrammetry.camera.camera_model import Sensor

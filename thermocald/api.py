@@ -266,8 +266,12 @@ def fit(
     >>> camera.model.camera
     'rpi-v2.1'
     """
-    from thermocald.analysis.thermal.camera_fit import fit_camera, fit_camera_of_type, fit_type
-    from thermocald.analysis.thermal.type_model import require_type
+    from thermocald.analysis.thermal.camera_fit import (
+        fit_camera,
+        fit_camera_of_type,
+        fit_type,
+        require_type,
+    )
     from thermocald.physics.model import ThermalModel
     from thermocald.physics.model_file import read_model
     from thermocald.thermal.effect_options import check_names

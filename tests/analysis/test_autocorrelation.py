@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from thermocald.analysis.statistics.autocorrelation import slope_noise
+from thermocald.analysis.statistics.dependence import slope_noise
 
 N = 150
 WARM_UP = 1 - np.exp(-np.arange(N) / 30)

@@ -13,7 +13,7 @@ from PIL import Image
 
 from tests.analysis.test_gauge import START, thermal_camera
 from thermocald.acquisition.calibrator import CalibratedEpoch
-from thermocald.analysis.camera.resampling import Maps
+from thermocald.analysis.camera.undistortion import Maps
 from thermocald.analysis.thermal.corrected_frame import FrameCorrector
 from thermocald.epoch import Epoch
 from thermocald.errors import ImageError
@@ -148,6 +148,6 @@ def test_strips_are_the_whole_image(thermal, size):
     small = replace(steady.sensor, width=size[0], height=size[1])
     steady = replace(steady, sensor=small)
     image = np.random.default_rng(0).integers(0, 256, size[::-1], dtype=np.uint8)
-    maps = Maps(steady, 20.0)
+    maps = Maps(steady.sensor, steady.values, 20.0)
     whole = cv2.remap(image, *maps.of(hot), cv2.INTER_CUBIC)
     assert np.array_equal(maps.resample(image, hot), whole)

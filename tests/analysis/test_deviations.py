@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from thermocald.analysis.camera.image_grid import image_grid
+from thermocald.analysis.camera.undistortion import image_grid
 from thermocald.analysis.study.deviations import deviation, image_displacement
 from thermocald.photogrammetry.camera.camera_model import Sensor
 

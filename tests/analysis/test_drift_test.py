@@ -5,7 +5,7 @@ import pytest
 from scipy import signal
 
 from thermocald.analysis.statistics.dependence import holm, slope_p_value
-from thermocald.analysis.statistics.drift_test import drift_test
+from thermocald.analysis.statistics.noise_models import drift_test
 
 N = 150
 TIME_S = np.arange(N) * 10.0

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.montecarlo import CORRELATION, IOP, SDS, SENSOR
-from thermocald.analysis.camera.image_grid import image_grid
+from thermocald.analysis.camera.undistortion import image_grid
 from thermocald.analysis.study import montecarlo
 from thermocald.analysis.study.montecarlo import draw_root, plane_errors, simulate_errors
 from thermocald.analysis.study.object_plane import on_plane, plane_jacobian, propagate

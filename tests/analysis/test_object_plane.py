@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from thermocald.analysis.camera.image_grid import image_grid
+from thermocald.analysis.camera.undistortion import image_grid
 from thermocald.analysis.study.object_plane import (
     DistanceLaw,
     on_plane,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from thermocald.analysis.statistics.straight_line import fit_straight_line
+from thermocald.analysis.statistics.dependence import fit_straight_line
 
 # Pearson (1901) with the weights of York (1966); solution in York et al. (2004), table II.
 X = np.array([0.0, 0.9, 1.8, 2.6, 3.3, 4.4, 5.2, 6.1, 6.5, 7.4])

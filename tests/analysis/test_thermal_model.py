@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from thermocald.analysis.thermal.camera_fit import type_model
 from thermocald.analysis.thermal.prediction_test import predicted_error
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
-from thermocald.analysis.thermal.type_model import type_model
 from thermocald.cli import application
 from thermocald.errors import ConfigurationError, DataError, ThermocaldError, UsageError
 from thermocald.photogrammetry.camera.camera_model import project

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from thermocald.analysis.thermal.camera_fit import fit_with_type, type_model, weight_of_type
 from thermocald.analysis.thermal.prediction_test import predicted_error
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
-from thermocald.analysis.thermal.type_model import fit_with_type, type_model, weight_of_type
 from thermocald.cli import application
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation
 from thermocald.physics.heat import Course

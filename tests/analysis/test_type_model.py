@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermocald.analysis.thermal.type_model import odd_cameras, shrunk_to_type, type_model
+from thermocald.analysis.thermal.camera_fit import odd_cameras, shrunk_to_type, type_model
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
 from thermocald.physics.model import ModelEffect, ThermalModel

@@ -13,7 +13,7 @@ import time
 import pytest
 
 from thermocald.analysis.online.equilibrium import Equilibrium
-from thermocald.cli import status
+from thermocald.cli import run
 from thermocald.output.status_text import WIDTH, status_lines
 
 LONG = "/srv/recordings/2026/under-the-old-bridge/second-arch/thermocald-left-bank.db"
@@ -90,14 +90,14 @@ def test_q_leaves_top_and_the_terminal_is_as_before(terminal, monkeypatch):
     master, slave = terminal
     before = termios.tcgetattr(slave)
     asked = []
-    monkeypatch.setattr(status, "read_status", lambda *_: asked.append(1) or document())
+    monkeypatch.setattr(run, "read_status", lambda *_: asked.append(1) or document())
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setattr(sys, "stdout", io.StringIO())
     typed = threading.Timer(0.3, os.write, (master, b"xq"))
     typed.start()
     start = time.monotonic()
-    status.top(interval=30.0)
+    run.top(interval=30.0)
     typed.join()
     assert time.monotonic() - start < 10
     assert len(asked) == 2  # the first picture, and one more after x
@@ -114,10 +114,10 @@ def test_top_in_a_pipe_writes_lines_until_it_ends(monkeypatch, capsys):
         except StopIteration:
             raise KeyboardInterrupt from None
 
-    monkeypatch.setattr(status, "read_status", read)
+    monkeypatch.setattr(run, "read_status", read)
     monkeypatch.delenv("FORCE_COLOR", raising=False)
     with pytest.raises(KeyboardInterrupt):
-        status.top(interval=0.01)
+        run.top(interval=0.01)
     said = capsys.readouterr().out
     assert said.count("thermocald 0.1.0, pid 30190") == 2
     assert "\x1b" not in said

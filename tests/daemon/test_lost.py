@@ -16,7 +16,7 @@ from tests.commands import call
 from tests.daemon.conftest import make_recording
 from tests.daemon.test_store_file import guard, path  # noqa: F401
 from thermocald.acquisition.pipeline import Pipeline, Readings
-from thermocald.cli.status import status
+from thermocald.cli.run import status
 from thermocald.daemon.live_state import LiveState
 from thermocald.errors import DataError, StoreError
 from thermocald.hal import Frame, SystemClock
@@ -81,7 +81,7 @@ def test_the_exit_status_of_status_says_so(guard, tmp_path, monkeypatch, capsys)
         "clock": {"trusted": True}, "frames": {"paused": ""}, "sessions": {}, "age_s": 0.0,
         "utc": 1.0, "started": 0.0, "pid": 1, "version": "0",
     }  # fmt: skip
-    monkeypatch.setattr("thermocald.cli.status.read_status", lambda *_: document)
+    monkeypatch.setattr("thermocald.cli.run.read_status", lambda *_: document)
     with pytest.raises(DataError, match="1 epochs were lost"):
         status()
     assert "1 epochs are lost" in capsys.readouterr().out

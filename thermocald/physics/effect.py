@@ -34,8 +34,7 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
-    from thermocald.physics.following import Follower
-    from thermocald.physics.history import History
+    from thermocald.physics.history import Follower, History
 
 
 @dataclass(frozen=True, slots=True, eq=False)

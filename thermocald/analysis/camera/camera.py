@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.analysis.camera.image_grid import image_grid
-from thermocald.analysis.camera.undistortion import undistorted_points
+from thermocald.analysis.camera.undistortion import image_grid, undistorted_points
 from thermocald.errors import UsageError
 from thermocald.numbers import with_sd
 from thermocald.photogrammetry.camera.camera_model import (

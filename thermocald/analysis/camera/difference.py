@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from thermocald.analysis.camera.image_grid import image_grid
+from thermocald.analysis.camera.undistortion import image_grid
 from thermocald.errors import ConfigurationError
 from thermocald.numbers import plain, with_sd
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, partials, project

@@ -4,8 +4,11 @@ The reference (Elias et al. 2020, section 4.1) compares the two-sided moving var
 over n consecutive measurements with the two-sided moving average of its squared standard deviations
 by an F-test at each epoch, and gives the fraction of epochs at which it succeeds. Neighbouring
 windows have n-1 of n measurements in common, so these tests are not independent and their fraction
-has no p-value; `drift_test` gives one for the whole series.
-"""
+has no p-value; `noise_models` gives one for the whole series.
+
+Of the correlations of the interior orientation the reference (section 4.3) takes the median of
+every coefficient over all epochs and both series, and calls their scatter over the epochs the noise
+of the coefficients. """
 
 from __future__ import annotations
 
@@ -18,6 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
+
 
 _CHUNK = 1 << 15
 # A window is broken by gaps when it lasts this much longer than n regular measurements.
@@ -134,3 +138,44 @@ def moving_f_test(
         degrees_sd,
         len(values) - len(starts),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class IopCorrelations:
+    """Median (10, 10) and noise (10, 10) of the coefficients; 0 where a parameter is held fixed.
+
+    noise: standard deviation of a coefficient over the epochs, within its series; largest: the
+    largest deviation from the median; epochs: how many matrices were used.
+    """
+
+    median: Array
+    noise: Array
+    largest: Array
+    epochs: int
+
+
+def correlations_of(covariances: Array) -> Array:
+    """Covariances (n, k, k) → correlations; 0 for parameters held fixed, 1 on the diagonal."""
+    sd = np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
+    inverse = np.divide(1.0, sd, out=np.zeros_like(sd), where=sd > 0)
+    r = covariances * inverse[..., :, None] * inverse[..., None, :]
+    k = r.shape[-1]
+    r[..., np.arange(k), np.arange(k)] = 1.0
+    return np.asarray(np.clip(r, -1.0, 1.0))
+
+
+def median_correlations(series: list[Array]) -> IopCorrelations:
+    """Medians over the correlation matrices (n_i, k, k) of several series together.
+
+    Raises ValueError where there is no matrix at all.
+    """
+    matrices = [m for m in series if len(m)]
+    if not matrices:
+        raise ValueError("no epoch has a covariance matrix")
+    every = np.concatenate(matrices)
+    median = np.median(every, axis=0)
+    within = np.concatenate([m - m.mean(axis=0) for m in matrices])
+    degrees = max(1, len(within) - len(matrices))
+    noise = np.sqrt(np.sum(within**2, axis=0) / degrees)
+    largest = np.max(np.abs(every - median), axis=0)
+    return IopCorrelations(median, noise, largest, len(every))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.statistics.correlations import correlations_of
+from thermocald.analysis.statistics.significance import correlations_of
 from thermocald.analysis.study.measured import Clip, MeasuredSeries, Thermometer
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.camera.image_grid import image_grid
+from thermocald.analysis.camera.undistortion import image_grid
 from thermocald.analysis.study.object_plane import on_plane, plane_jacobian
 from thermocald.errors import GeometryError
 from thermocald.parallel import in_order

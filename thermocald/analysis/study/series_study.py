@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.camera.image_grid import image_grid
+from thermocald.analysis.camera.undistortion import image_grid
 from thermocald.analysis.statistics.dependence import (
     Dependence,
     correlation_matrix,
     dependence,
     holm,
 )
-from thermocald.analysis.statistics.drift_test import DriftTest, drift_test
+from thermocald.analysis.statistics.noise_models import DriftTest, drift_test
 from thermocald.analysis.statistics.significance import moving_f_test, unbroken_windows
 from thermocald.analysis.study.depth_of_field import (
     DepthOfField,

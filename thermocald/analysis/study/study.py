@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.statistics.correlations import IopCorrelations, median_correlations
+from thermocald.analysis.statistics.significance import IopCorrelations, median_correlations
 from thermocald.analysis.study.montecarlo import MonteCarlo, draw_root, simulate_errors
 from thermocald.analysis.study.object_plane import DistanceLaw, plane_jacobian, propagate
 from thermocald.analysis.study.series_study import SeriesStudy, StudySettings, study_series

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.camera.image_grid import image_grid
+from thermocald.analysis.camera.undistortion import image_grid
 from thermocald.analysis.statistics.dependence import correlation_matrix
 from thermocald.analysis.study.montecarlo import plane_errors
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES

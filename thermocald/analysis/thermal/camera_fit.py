@@ -1,28 +1,253 @@
-"""A thermal camera fitted to the series of a camera, or the type to those of several cameras."""
+"""A thermal camera fitted to the series of a camera, or the type to those of several cameras.
+
+A type is the mean of several specimens, and how much they differ. Its standard deviation is that of
+one more specimen: scatter between the cameras, and how well their mean is known. It is what a user
+has who did not calibrate, and the prior of one who measured at a few temperatures. """
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from thermocald.analysis.statistics.random_effects import Population, odd_specimens, population
 from thermocald.analysis.thermal.calibrations import fit_calibrations
 from thermocald.analysis.thermal.prediction_test import predicted_error
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
-from thermocald.analysis.thermal.type_model import fit_with_type, type_model, weight_of_type
+from thermocald.errors import DataError
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, InteriorOrientation
+from thermocald.photogrammetry.linalg import scaled_inverse
+from thermocald.physics import catalogue
+from thermocald.physics.model import RATED, ModelEffect, ThermalModel
 from thermocald.physics.model_file import model_document
 from thermocald.thermal.basis import choose_distortion
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from thermocald.analysis.thermal.calibrations import Calibration
     from thermocald.analysis.thermal.prediction_test import PredictedError
     from thermocald.analysis.thermal.result import FittedModel
-    from thermocald.physics.model import ModelEffect, ThermalModel
+    from thermocald.arrays import Array
     from thermocald.thermal.series import ReducedSeries
+
+
+_FEWEST_TO_COMPARE = 3
+_NORMAL_95 = 1.959964
+
+
+def type_model(models: Sequence[ThermalModel], name: str) -> ThermalModel:
+    """The type model of several cameras' models, which must have one structure and one T₀.
+
+    DataError for fewer than two, or for models that are not alike.
+    """
+    if len(models) < 2:
+        raise DataError("a type model needs at least two cameras")
+    # what happened to one camera at one time is nothing of the type
+    models = [
+        replace(m, effects=tuple(e for e in m.effects if not catalogue.get(e.name).is_event))
+        for m in models
+    ]
+    first = models[0]
+    for m in models[1:]:
+        same = [e.name for e in m.effects] == [e.name for e in first.effects]
+        same = same and m.distortion == first.distortion
+        if m.sensor != first.sensor or m.T0 != first.T0 or not same:
+            raise DataError(
+                f"the models of {first.camera} and {m.camera} are not alike: sensor, reference "
+                "temperature and effects must be the same; fit them with the same options"
+            )
+    names = _names(first)
+    values = np.array([[_value(m, n) for n in names] for m in models])
+    n = len(models)
+    people = population(values, np.array([_covariance(m, names) for m in models]))
+    low = max(m.validity[c][0] for m in models for c in list(m.validity)[:1])
+    high = min(m.validity[c][1] for m in models for c in list(m.validity)[:1])
+    channel = next(iter(first.validity), "temperature")
+    mean = _with_values(first, names, people.mean, people.prior, name)
+    own = {k: v for k, v in mean.sds.items() if k.split(".")[0] in ("interior", "rates")}
+    return replace(
+        mean,
+        camera=name,
+        name=f"type {name}, {n} cameras",
+        exterior=None,
+        sds=own,
+        evidence={},
+        validity={channel: (low, high)} if low < high else first.validity,
+        fitted_on=tuple({"camera": m.camera, "version": m.version} for m in models),
+    )
+
+
+def odd_cameras(models: Sequence[ThermalModel]) -> dict[str, float]:
+    """{camera: probability that a camera of this type is as unlike the others as it is}.
+
+    Compared are the thermal parameters: rates and effects. DataError for fewer than three.
+    """
+    if len(models) < _FEWEST_TO_COMPARE:
+        raise DataError(f"odd cameras show among {_FEWEST_TO_COMPARE} or more")
+    names = tuple(n for n in _names(models[0]) if not n.startswith("interior."))
+    values = np.array([[_value(m, n) for n in names] for m in models])
+    covariances = np.array([_covariance(m, names) for m in models])
+    varied = (np.ptp(values, axis=0) > 0) | (np.einsum("ikk->ik", covariances) > 0).any(axis=0)
+    found = odd_specimens(values[:, varied], covariances[:, varied][:, :, varied])
+    return {m.camera: float(p) for m, p in zip(models, found, strict=True)}
+
+
+def fit_with_type(series: Sequence[ReducedSeries], kind: ThermalModel) -> FittedModel:
+    """A camera that was measured at few temperatures, fitted with what its type says of the rest.
+
+    Non-linear parameters, which few temperatures may not show at all, have the type's as a prior
+    within the adjustment; all others are shrunk afterwards. Raises DataError.
+    """
+    require_type(kind)
+    sd = {e.name: e.sds for e in kind.effects}
+    priors = {
+        f"{e.name}.{key}": (float(value), float(sd[e.name][key]))
+        for e in kind.effects
+        for key, value in e.values.items()
+        if key in catalogue.get(e.name).nonlinear and sd[e.name].get(key, 0.0) > 0
+    }
+    fixed = [
+        f"{e.name}.{key}"
+        for e in kind.effects
+        for key in catalogue.get(e.name).nonlinear
+        if f"{e.name}.{key}" not in priors
+    ]
+    fitted = fit_thermal_model(series, kind.effects, kind.T0, False, fixed, priors, kind.distortion)
+    return replace(fitted, model=shrunk_to_type(fitted.model, kind, priors))
+
+
+def require_type(kind: ThermalModel) -> None:
+    """DataError where a model is not that of a type."""
+    if kind.covariance is None or len(kind.fitted_on) < 2 or not all(
+        "camera" in one for one in kind.fitted_on
+    ):  # fmt: skip
+        raise DataError(f"{kind.name or kind.camera} is not a type model (`fit --type` writes one)")
+
+
+def shrunk_to_type(
+    model: ThermalModel,
+    kind: ThermalModel,
+    priors: Mapping[str, tuple[float, float]] | None = None,
+) -> ThermalModel:
+    """A camera that was measured at few temperatures, with what its type says of the rest.
+
+    model: its own fit; kind: of `type_model`, with the same T₀ and effects; priors: what its fit
+    has already of the type, {name: (value, sd)}. The standard deviations are such that 95 % lie
+    within 1.96 of them, few specimens or not.
+    """
+    names = _names(kind)
+    require_type(kind)
+    if model.sensor != kind.sensor or model.T0 != kind.T0 or _names(model) != names:
+        raise DataError(
+            f"the model of {model.camera} and the type {kind.camera} are not alike: sensor, "
+            "reference temperature and effects must be the same; fit with --t0 and --effect of "
+            "the type"
+        )
+    n = len(kind.fitted_on)
+    prior = np.array(kind.covariance)
+    own = _covariance(model, names)
+    people = Population(
+        np.array([_value(kind, name) for name in names]),
+        prior / (n + 1),
+        prior * n / (n + 1),
+        np.zeros_like(prior),
+        n - 1.0,
+        n,
+    )
+    free = (np.diag(own) > 0) & (np.diag(prior) > 0)
+    information = np.zeros_like(prior)
+    information[np.ix_(free, free)] = scaled_inverse(own[np.ix_(free, free)])
+    values = np.array([_value(model, name) for name in names])
+    gradient = np.zeros(len(names))
+    for name, (value, prior_sd) in (priors or {}).items():
+        # the type counts once: what the fit knew of it is taken out again
+        at = names.index(name)
+        information[at, at] -= 1.0 / prior_sd**2
+        gradient[at] = (values[at] - value) / prior_sd**2
+        if information[at, at] <= 0:
+            information[at], information[:, at], gradient[at] = 0.0, 0.0, 0.0
+    new = people.posterior(values, information, gradient)
+    sd = np.sqrt(np.maximum(np.diag(new.covariance), 0.0))
+    wider = np.ones(len(names))
+    for i in np.flatnonzero(sd > 0):
+        value, low, _ = new.interval(np.eye(len(names))[i])
+        wider[i] = (value - low) / (_NORMAL_95 * sd[i])
+    return _with_values(
+        model, names, new.values, new.covariance * np.outer(wider, wider), str(kind.camera)
+    )
+
+
+def weight_of_type(model: ThermalModel, kind: ThermalModel) -> dict[str, float]:
+    """{rate or effect's parameter: the fraction of it that is the type's}.
+
+    model: of `fit_with_type`. 1 where its recordings say nothing of the parameter, so that value
+    and standard deviation are the type's; near 0 where they say all. It is the variance of the
+    parameter over its variance among the cameras of the type.
+    """
+    names = [n for n in _names(kind) if not n.startswith("interior.") and _sd(kind, n) > 0]
+    return {n: min(1.0, (_sd(model, n) / _sd(kind, n)) ** 2) for n in names}
+
+
+def _with_values(
+    model: ThermalModel, names: tuple[str, ...], values: Array, covariance: Array, kind: str
+) -> ThermalModel:
+    found = dict(zip(names, values.tolist(), strict=True))
+    sd = dict(zip(names, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True))
+    listed = []
+    for effect in model.effects:
+        own = {k: f"{effect.name}.{k}" for k in effect.values if f"{effect.name}.{k}" in found}
+        listed.append(
+            ModelEffect(
+                effect.name,
+                {**effect.values, **{k: found[f] for k, f in own.items()}},
+                {**effect.sds, **{k: sd[f] for k, f in own.items()}},
+            )
+        )
+    return replace(
+        model,
+        interior=InteriorOrientation(**{p: found[f"interior.{p}"] for p in IOP_NAMES}),
+        rates={p: found[f"rates.{p}"] for p in RATED},
+        effects=tuple(listed),
+        sds={**model.sds, **{k: v for k, v in sd.items() if k.startswith(("interior.", "rates."))}},
+        covariance_names=names,
+        covariance=tuple(tuple(row) for row in covariance.tolist()),
+        evidence={**model.evidence, "shrunk_to_type": kind},
+    )
+
+
+def _names(model: ThermalModel) -> tuple[str, ...]:
+    return tuple(n for n in model.parameter_names() if not n.startswith("exterior."))
+
+
+def _value(model: ThermalModel, name: str) -> float:
+    group, key = name.split(".", 1)
+    if group == "interior":
+        return float(getattr(model.interior, key))
+    if group == "rates":
+        return float(model.rates.get(key, 0.0))
+    return float(next(e for e in model.effects if e.name == group).values[key])
+
+
+def _covariance(model: ThermalModel, names: tuple[str, ...]) -> Array:
+    """The covariance (k, k) of a model's numbers; else of its standard deviations."""
+    if model.covariance is None or not set(names) & set(model.covariance_names):
+        return np.diag([_sd(model, n) ** 2 for n in names])
+    place = {n: i for i, n in enumerate(model.covariance_names)}
+    full = np.array(model.covariance)
+    rows = [place.get(n, -1) for n in names]
+    known = np.array([r >= 0 for r in rows])
+    return np.where(np.outer(known, known), full[np.ix_(rows, rows)], 0.0)
+
+
+def _sd(model: ThermalModel, name: str) -> float:
+    group, key = name.split(".", 1)
+    if group in ("interior", "rates"):
+        return float(model.sds.get(name, 0.0))
+    return float(next(e for e in model.effects if e.name == group).sds.get(key, 0.0))
+
 
 _NUMBERS = ("interior", "distortion", "rates", "effects", "validity")
 

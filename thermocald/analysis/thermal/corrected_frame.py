@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from thermocald.analysis.camera.resampling import Maps
+from thermocald.analysis.camera.undistortion import Maps
 from thermocald.errors import ImageError
 from thermocald.photogrammetry.camera.camera_model import EOP, EOP_NAMES, IOP
 from thermocald.photogrammetry.camera.conversions import opencv_terms
@@ -65,7 +65,7 @@ class FrameCorrector:
                 f"the frame has {image.shape[1]}×{image.shape[0]} px, the model's camera "
                 f"{sensor.width}×{sensor.height}"
             )
-        self._maps = self._maps or Maps(self._steady, self.to)
+        self._maps = self._maps or Maps(self._steady.sensor, self._steady.values, self.to)
         resampled = self._maps.resample(image, result.interior.as_array())
         _, data = cv2.imencode(".jpg", resampled, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
         jpeg = with_metadata(data.tobytes(), encoded)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from thermocald.analysis.camera.camera import Camera
-from thermocald.analysis.camera.resampling import Maps
+from thermocald.analysis.camera.undistortion import Maps
 from thermocald.errors import UsageError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.physics import catalogue
@@ -221,7 +221,8 @@ class LiveCamera:
             raise UsageError("there is no reading yet: update(time, temperature) comes first")
         target = self.thermal.model.T0 if to is None else to
         if self._maps is None or self._maps.to != target:
-            self._maps = Maps(self.thermal.at(target, extrapolate=True), target)
+            steady = self.thermal.at(target, extrapolate=True)
+            self._maps = Maps(steady.sensor, steady.values, target)
         return self._maps.of(self._now.values)
 
     def _checked(

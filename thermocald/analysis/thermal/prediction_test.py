@@ -6,6 +6,10 @@ phase; an event, which no model can foresee). All drifts are the model's. What i
 points is compared with the noise floor: image noise, and what the thermometer's noise, and the
 times at which it was read, do to the prediction. The 95 % bands hold the model's own uncertainty
 too; of a model that misses an effect no band is stated.
+
+How a prediction depends on the model's parameters and on the readings is known epoch by epoch;
+parameters (22,) are the camera's 16, three scales of the field's coordinates, and a displacement in
+mm. An amplitude keeps its size, and an event its own height and time.
 """
 
 from __future__ import annotations
@@ -17,22 +21,226 @@ import numpy as np
 
 from thermocald.analysis.thermal.displacement import moved_targets
 from thermocald.analysis.thermal.level import estimate_level, projected, series_means
-from thermocald.analysis.thermal.own import with_own
-from thermocald.analysis.thermal.sensitivity import derivatives, reading_operators, unresolved
+from thermocald.analysis.thermal.terms import event_worth
 from thermocald.analysis.thermal.thermal_model import targets_of
 from thermocald.errors import ConfigurationError, DataError
-from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation
+from thermocald.photogrammetry.camera.camera_model import (
+    IOP_NAMES,
+    PARAMETER_NAMES,
+    ExteriorOrientation,
+)
+from thermocald.photogrammetry.linalg import scaled_solve
 from thermocald.physics import catalogue
+from thermocald.physics.catalogue import drive_matrix
+from thermocald.thermal.fit import HypothesisFitter
+from thermocald.thermal.hypothesis import BASE, Term, make_candidate, make_known_term
 from thermocald.thermal.reduce import without_targets
+from thermocald.thermal.scan import Scanner
+from thermocald.thermal.series import COLUMNS
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
     from numpy.typing import NDArray
+    from scipy.sparse import csr_array
 
     from thermocald.arrays import Array
-    from thermocald.physics.model import ThermalModel
+    from thermocald.photogrammetry.field.testfield import TestField
+    from thermocald.physics.history import History
+    from thermocald.physics.model import ModelEffect, Prediction, ThermalModel
+    from thermocald.thermal.hypothesis import Fit
     from thermocald.thermal.series import ReducedSeries
 
-__all__ = ["PredictedError", "predicted_error"]
+
+_COLUMNS = (*PARAMETER_NAMES, "scale_X", "scale_Y", "scale_Z", "dX", "dY", "dZ")
+
+
+def derivatives(
+    history: History, field: TestField, model: ThermalModel, names: Sequence[str]
+) -> Array:
+    """∂ parameters / ∂ numbers of the model (E, 22, q), by central differences."""
+    found = []
+    for name in names:
+        group, key = name.split(".", 1)
+        if group == "rates":
+            value = model.rates.get(key, 0.0)
+            step = 1e-3 * max(abs(value), 1e-6)
+            sides = [replace(model, rates={**model.rates, key: value + d}) for d in (step, -step)]
+        else:
+            place = next(i for i, e in enumerate(model.effects) if e.name == group)
+            effect = model.effects[place]
+            value = float(effect.values[key])
+            kind = catalogue.get(group)
+            searched = kind.nonlinear.get(key)
+            step = searched.difference_step(value) if searched else 1e-3 * max(abs(value), 1e-6)
+            sides = []
+            for moved in (value + step, value - step):
+                changed = replace(effect, values={**effect.values, key: moved})
+                listed = (*model.effects[:place], changed, *model.effects[place + 1 :])
+                sides.append(replace(model, effects=listed))
+        one, other = (_packed(m.predict(history, field)) for m in sides)
+        found.append((one - other) / (2.0 * step))
+    return np.stack(found, axis=2) if found else np.zeros((len(history.times), 22, 0))
+
+
+def _packed(prediction: Prediction) -> Array:
+    """What a model says, as parameters (E, 22)."""
+    d = np.zeros((len(prediction.iop), len(_COLUMNS)))
+    d[:, :10], d[:, 10:16], d[:, 16:19] = prediction.iop, prediction.eop, prediction.scale
+    for displacement in prediction.displacements:
+        d[:, 19:22] += displacement.active[:, None] * displacement.vector
+    return d
+
+
+def reading_operators(history: History, model: ThermalModel) -> list[tuple[Array, str, csr_array]]:
+    """How the readings' errors reach the parameters: weights (22,), channel, operator (E, R)."""
+    found: list[tuple[Array, str, csr_array]] = []
+    rates = _rates(model)
+    if np.any(rates):
+        operator = drive_matrix(history, model.drives)
+        assert operator is not None
+        found.append((rates, history.reference, operator))
+    for effect in model.effects:
+        kind = catalogue.get(effect.name)
+        nonlinear, coefficients = kind.split(effect.values)
+        if kind.is_drive or kind.seen_in == "noise" or not any(coefficients.values()):
+            continue
+        S = kind.sensitivity(history, **nonlinear)
+        if S.nnz:
+            channel = kind.channel(history, **nonlinear)
+            found.append((_weights(model, effect.name, coefficients), channel, S))
+    return found
+
+
+def unresolved(
+    history: History, model: ThermalModel, rate_jump: Array
+) -> list[tuple[Array, Array]]:
+    """What the readings' times leave open: weights (22,) and standard deviations (E,)."""
+    found = []
+    for effect in model.effects:
+        kind = catalogue.get(effect.name)
+        nonlinear, coefficients = kind.split(effect.values)
+        if kind.kind == "image":
+            continue
+        left = kind.unresolved(history, rate_jump, **nonlinear)
+        weights = _rates(model) if kind.is_drive else _weights(model, effect.name, coefficients)
+        if np.any(left) and np.any(weights):
+            found.append((weights, left))
+    return found
+
+
+def _rates(model: ThermalModel) -> Array:
+    weights = np.zeros(len(_COLUMNS))
+    weights[: len(IOP_NAMES)] = model.rate_vector
+    return _carried(model, weights)
+
+
+def _weights(model: ThermalModel, name: str, coefficients: Mapping[str, float]) -> Array:
+    weights = np.zeros(len(_COLUMNS))
+    for key, value in coefficients.items():
+        weights[_COLUMNS.index(catalogue.get(name).column(key))] = value
+    return _carried(model, weights)
+
+
+def _carried(model: ThermalModel, weights: Array) -> Array:
+    """Let the distortion follow what moves c, about T₀."""
+    moved = model.carried_derivatives(model.interior.as_array(), weights[:10, None])[:, 0]
+    return np.concatenate([moved, weights[10:]])
+
+
+_ROUNDS = 3  # phases and events look for each other
+
+
+def with_own(model: ThermalModel, series: ReducedSeries) -> ThermalModel:
+    """The model with the phases and events of a series; its T₀ and reference are the model's."""
+    listed = {e.name: e for e in model.effects if catalogue.get(e.name).seen_in == "trajectory"}
+    own = [e for e in listed if Term(e).is_separate]
+    if not own:
+        return model
+    fitter = HypothesisFitter([series])
+    for e in own:
+        if catalogue.get(e).is_event:
+            listed[e] = _nothing(listed[e])
+    for _ in range(_ROUNDS):
+        for name in own:
+            find = _phase if catalogue.get(name).is_periodic else _event
+            listed[name] = find(fitter, model, listed, name)
+    return replace(model, effects=tuple(listed.get(e.name, e) for e in model.effects))
+
+
+def _nothing(effect: ModelEffect) -> ModelEffect:
+    """An event that did not happen."""
+    return replace(
+        effect, values={**effect.values, **dict.fromkeys(catalogue.get(effect.name).linear, 0.0)}
+    )
+
+
+def _known(
+    fitter: HypothesisFitter, model: ThermalModel, listed: dict[str, ModelEffect]
+) -> tuple[Fit, Array]:
+    """A fit of some effects, and their coefficients as the model has them, px-scaled."""
+    fit = fitter.fit([make_known_term(e.name, e.values, 1) for e in listed.values()])
+    scale = fitter.series[0].scale
+    x = fit.coefficients.copy()
+    for block in fit.blocks:
+        units = np.array([scale[COLUMNS.index(p)] for p in block.parameters])
+        if block.term < 0:
+            x[block.start : block.stop] = [model.rates.get(p, 0.0) for p in BASE] * units
+            continue
+        effect = listed[fit.terms[block.term].effect]
+        kind = catalogue.get(effect.name)
+        names = {kind.column(n): n for n in kind.linear}
+        weights = np.array([kind.weights(effect.values, names[p]) for p in block.parameters])
+        x[block.start : block.stop] = (weights * units[:, None]).T.ravel()
+    return fit, x
+
+
+def _phase(
+    fitter: HypothesisFitter, model: ThermalModel, listed: dict[str, ModelEffect], name: str
+) -> ModelEffect:
+    """A cycle with the phase that fits best, its amplitude as it is."""
+    fit, x = _known(fitter, model, listed)
+    block = next(b for b in fit.blocks if b.term >= 0 and fit.terms[b.term].effect == name)
+    reduced, index = fit.reduced[0], fit.designs[0][2]
+    inside = (index >= block.start) & (index < block.stop)
+    A = reduced.A[np.ix_(inside, inside)]
+    right = reduced.c[inside] - reduced.A[np.ix_(inside, ~inside)] @ x[index[~inside]]
+    pair = x[block.start : block.stop].reshape(2, -1)
+    key = next(k for k in listed[name].values if k in catalogue.get(name).fresh)
+    phase = float(listed[name].values[key])
+    amplitude = pair[0] * np.cos(phase) + pair[1] * np.sin(phase)
+    angles = np.linspace(-np.pi, np.pi, 1440, endpoint=False)
+    sides = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    trial = (sides[:, :, None] * amplitude).reshape(len(angles), -1)
+    cost = np.einsum("ai,ij,aj->a", trial, A, trial) - 2.0 * trial @ right
+    best = float(angles[int(np.argmin(cost))])
+    return replace(listed[name], values={**listed[name].values, key: best})
+
+
+def _event(
+    fitter: HypothesisFitter, model: ThermalModel, listed: dict[str, ModelEffect], name: str
+) -> ModelEffect:
+    """An event where it explains most, or none."""
+    fit, x = _known(fitter, model, {n: e for n, e in listed.items() if n != name})
+    effect, kind = listed[name], catalogue.get(name)
+    linear = tuple(n for n in kind.linear if n in effect.values)
+    candidate = make_candidate(kind, linear, fitter.series)
+    directions = np.eye(len(COLUMNS))[:, [COLUMNS.index(p) for p in candidate.parameters]]
+    C, V, index = fit.designs[0]
+    stack = Scanner(fitter).stack(candidate, 0, fit)
+    A, c, B = fit.weightings[0].scan(stack, directions, (C, V))
+    rest = c - B @ x[index]
+    heights = scaled_solve(A, rest, 1e-9)
+    gain = np.einsum("gi,gi->g", rest, heights)
+    best = int(np.argmax(gain))
+    series = fitter.series[0]
+    if gain[best] <= event_worth(series, len(linear)):
+        return _nothing(effect)
+    units = series.scale[[COLUMNS.index(p) for p in candidate.parameters]]
+    values = dict(zip(linear, (heights[best] / units).tolist(), strict=True))
+    time = float(0.5 * (series.times[best] + series.times[best + 1]))
+    return replace(effect, values={**effect.values, **values, candidate.name: time})
+
 
 _BAND = 1.959964  # standard deviations that hold 95 %
 

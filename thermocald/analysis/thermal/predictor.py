@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.analysis.camera.camera import Camera
-from thermocald.analysis.camera.image_grid import image_grid
+from thermocald.analysis.camera.undistortion import image_grid
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

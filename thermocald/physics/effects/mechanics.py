@@ -16,7 +16,7 @@ from thermocald.physics.effect import (
     coefficient_units,
     say_estimate,
 )
-from thermocald.physics.following import PlayFollower
+from thermocald.physics.history import PlayFollower
 from thermocald.physics.operators import (
     lag,
     lag_matrix,
@@ -34,8 +34,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
     from thermocald.arrays import Array
-    from thermocald.physics.following import Follower
-    from thermocald.physics.history import History
+    from thermocald.physics.history import Follower, History
 
 
 class Hysteresis(Effect):

@@ -8,7 +8,8 @@ has no p-value; `noise_models` gives one for the whole series.
 
 Of the correlations of the interior orientation the reference (section 4.3) takes the median of
 every coefficient over all epochs and both series, and calls their scatter over the epochs the noise
-of the coefficients. """
+of the coefficients.
+"""
 
 from __future__ import annotations
 

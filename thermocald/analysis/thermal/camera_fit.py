@@ -2,7 +2,8 @@
 
 A type is the mean of several specimens, and how much they differ. Its standard deviation is that of
 one more specimen: scatter between the cameras, and how well their mean is known. It is what a user
-has who did not calibrate, and the prior of one who measured at a few temperatures. """
+has who did not calibrate, and the prior of one who measured at a few temperatures.
+"""
 
 from __future__ import annotations
 

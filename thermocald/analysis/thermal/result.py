@@ -5,7 +5,8 @@ thermometer is known without the model: from what a free camera per epoch leaves
 readings' own roughness. Smooth trajectories that are left beyond it are an effect that the model
 lacks. Its time series is known as far as it was not absorbed: taken as a random time series with
 the power that it has in each order of cosines, it is carried into the unknowns, and into the
-interior orientation that the model predicts. """
+interior orientation that the model predicts.
+"""
 
 from __future__ import annotations
 

@@ -7,14 +7,10 @@ done in it. Only for what does not leave the function that asked.
 from __future__ import annotations
 
 import threading
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-
-if TYPE_CHECKING:
-    from numpy.typing import DTypeLike
-
+from numpy.typing import DTypeLike, NDArray
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera, load_camera
 from thermocald.errors import UsageError
-from thermocald.series import source_of
+from thermocald.series import Series, source_of
 from thermocald.store.logger.clock import device_clock
 from thermocald.store.logger.temperatures import LogOptions, log_options
 
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.camera_files import Conversion
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.survey import Survey
-    from thermocald.series import Series
 
     Model = ThermalCamera | Path | str
     LogRead = LogOptions | Mapping[str, Any] | None

@@ -21,7 +21,7 @@ from collections import deque
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
-from thermocald.acquisition.calibrator import CalibratedEpoch
+from thermocald.acquisition.calibrator import CalibratedEpoch, EpochCalibrator
 from thermocald.epoch import Epoch
 from thermocald.errors import DataError
 from thermocald.names import require_channels
@@ -32,7 +32,6 @@ from thermocald.photogrammetry.targets.image_file import EncodedImage
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
-    from thermocald.acquisition.calibrator import EpochCalibrator
     from thermocald.hal import Clock, Frame, Reading
 
 

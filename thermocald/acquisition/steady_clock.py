@@ -14,14 +14,13 @@ import logging
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from thermocald.hal import SystemClock
+from thermocald.hal import Clock, SystemClock
 from thermocald.machine import NOT_BEFORE, machine_clock_trusted
 
 if TYPE_CHECKING:
     import threading
     from collections.abc import Callable
 
-    from thermocald.hal import Clock
 
 log = logging.getLogger(__name__)
 

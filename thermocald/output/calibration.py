@@ -20,7 +20,7 @@ from thermocald.numbers import (
     plain,
     with_sd,
 )
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.report import (
     Answer,
     Chapter,
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
     from thermocald.analysis.camera.photographs import PhotographResult, Photographs
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.camera.camera_model import Sensor
 
 _CELLS = (12, 9)
 _MOST_ARROWS = 3000

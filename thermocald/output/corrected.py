@@ -10,7 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.analysis.thermal.correction import correct_points, image_corrections
+from thermocald.analysis.thermal.correction import (
+    ImageCorrection,
+    correct_points,
+    image_corrections,
+)
 from thermocald.analysis.thermal.timed_rows import STANDARD_INPUT, RowBlock, row_blocks
 from thermocald.errors import DataError, ImageError, ThermocaldError, UsageError
 from thermocald.files import make_folder, new_file, write_parts
@@ -19,7 +23,6 @@ from thermocald.photogrammetry.targets.image_metadata import with_metadata
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from thermocald.analysis.thermal.correction import ImageCorrection
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
     from thermocald.store.logger.clock import DeviceClock
     from thermocald.store.logger.temperatures import TemperatureLog

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.discovery.gap import image_chi2
-from thermocald.discovery.result import field_lines, mount_lines
-from thermocald.discovery.search import MOUNT
+from thermocald.discovery.gap import Gap, image_chi2
+from thermocald.discovery.result import Discovery, field_lines, mount_lines
+from thermocald.discovery.search import MOUNT, Solution
 from thermocald.discovery.unnamed import resolve
 from thermocald.figures import (
     BAND,
@@ -42,9 +42,6 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
     from thermocald.discovery.entries import EffectFound
-    from thermocald.discovery.gap import Gap
-    from thermocald.discovery.result import Discovery
-    from thermocald.discovery.search import Solution
     from thermocald.discovery.validation import SurrogateTest
     from thermocald.thermal.hypothesis import Fit
     from thermocald.thermal.series import ReducedSeries

@@ -6,18 +6,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.field.check import CELLS
+from thermocald.analysis.field.check import CELLS, FieldCheck
 from thermocald.figures import PALETTE, Curve, Figure, Panel
 from thermocald.numbers import parameter_label, percent, plain
-from thermocald.photogrammetry.camera.camera_model import project
+from thermocald.photogrammetry.camera.camera_model import CameraModel, project
 from thermocald.report import Answer, Chapter, Section, Table, of_figure, render_report
 
 if TYPE_CHECKING:
     from datetime import datetime
 
     from thermocald.analysis.field.advice import FieldAssessment
-    from thermocald.analysis.field.check import FieldCheck
-    from thermocald.photogrammetry.camera.camera_model import CameraModel
     from thermocald.photogrammetry.field.testfield import TestField
 
 

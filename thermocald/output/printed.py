@@ -8,17 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.discovery.result import field_lines, mount_lines
+from thermocald.discovery.result import Discovery, field_lines, mount_lines
 from thermocald.numbers import UNITS, plain, with_sd
-from thermocald.photogrammetry.camera.camera_model import EOP_NAMES, IOP_NAMES
+from thermocald.photogrammetry.camera.camera_model import EOP_NAMES, IOP_NAMES, Sensor
 from thermocald.store.logger.photographs import focal_length, moment_taken
 from thermocald.store.recording.head import CameraSpec
 from thermocald.store.recording.sense import doubt_lines, interior_doubts
 
 if TYPE_CHECKING:
     from thermocald.analysis.camera.photographs import PhotographResult, Photographs
-    from thermocald.discovery.result import Discovery
-    from thermocald.photogrammetry.camera.camera_model import Sensor
 
 
 def discovery_lines(found: Discovery) -> list[str]:

@@ -20,7 +20,7 @@ import numpy as np
 from thermocald.analysis.thermal.control_points import ControlPoints
 from thermocald.errors import DataError, UsageError
 from thermocald.files import write_text
-from thermocald.photogrammetry.camera.camera_model import EOP, IOP
+from thermocald.photogrammetry.camera.camera_model import EOP, IOP, ExteriorOrientation
 from thermocald.photogrammetry.camera.conversions import opencv_terms
 from thermocald.photogrammetry.frame.templates import Templates
 from thermocald.photogrammetry.targets.image_file import decode_grey
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
     from thermocald.analysis.camera.camera import Camera
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation
     from thermocald.photogrammetry.epoch.adjustment import Adjustment
 
 _AXES = np.diag([1.0, -1.0, -1.0])  # ours: y up, looking along -Z

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.series.epochs import CSV_COLUMNS, csv_text
+from thermocald.analysis.series.epochs import CSV_COLUMNS, Epochs, csv_text
 from thermocald.errors import DriverMissing, UsageError
 from thermocald.files import make_folder, new_file
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from thermocald.analysis.series.epochs import Epochs
     from thermocald.arrays import Array
     from thermocald.store.series import StoredEpoch
 

@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.camera.camera_model import Sensor
 
 _FLIP = np.diag([1.0, -1.0, -1.0])  # OpenCV's camera looks along +Z with y down
 _FIELDS_OF_VIEW_DEG = (18.0, 25.0, 33.0, 42.0, 52.0, 62.0, 73.0, 85.0, 98.0)

@@ -15,9 +15,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.errors import GeometryError, ImageError
-from thermocald.photogrammetry.camera.camera_model import EOP_NAMES, IOP_NAMES, Sensor
+from thermocald.photogrammetry.camera.camera_model import (
+    EOP_NAMES,
+    IOP_NAMES,
+    CameraModel,
+    ExteriorOrientation,
+    InteriorOrientation,
+    Sensor,
+)
 from thermocald.photogrammetry.field.planes import target_normals
-from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.frame.measurement import circle_observations
 from thermocald.photogrammetry.network.adjustment import Network, Photo, adjust_network, advice
 from thermocald.photogrammetry.network.datum import Distance
@@ -36,12 +43,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Image
-    from thermocald.photogrammetry.camera.camera_model import (
-        CameraModel,
-        ExteriorOrientation,
-        InteriorOrientation,
-    )
-    from thermocald.photogrammetry.field.testfield import Observations
 
 
 # Scale and polarity (-1 dark on light) in which codes are looked for, until so many are found.

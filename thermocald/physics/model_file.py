@@ -54,13 +54,11 @@ from thermocald.photogrammetry.camera.camera_model import (
 )
 from thermocald.physics import catalogue
 from thermocald.physics.effect import PARAMETER_UNITS
-from thermocald.physics.model import BASES, RATED, ModelEffect, ThermalModel
+from thermocald.physics.model import BASES, RATED, Distortion, ModelEffect, ThermalModel
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
-
-    from thermocald.physics.model import Distortion
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.camera.camera_model import distort, image_to_px
+from thermocald.photogrammetry.camera.camera_model import Sensor, distort, image_to_px
 from thermocald.photogrammetry.targets import outline, ring_code
 from thermocald.photogrammetry.targets.markers import is_marker, marker_cells, parse_marker
 
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.field.testfield import TestField
 
     Integers = NDArray[np.int64]

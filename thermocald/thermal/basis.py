@@ -13,7 +13,7 @@ import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP
 from thermocald.photogrammetry.linalg import unit_diagonal
-from thermocald.physics.model import BASES, choose_basis
+from thermocald.physics.model import BASES, Distortion, choose_basis
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
-    from thermocald.physics.model import Distortion
     from thermocald.thermal.series import ReducedSeries
 
 _ORDERS = 8  # of cosines over a series, with which the camera may move

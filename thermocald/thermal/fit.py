@@ -15,8 +15,14 @@ from thermocald.photogrammetry.linalg import scaled_inverse, scaled_solve
 from thermocald.physics import catalogue
 from thermocald.physics.catalogue import drive, drive_matrix, driven_history
 from thermocald.thermal.hypothesis import BASE, Block, Fit, Term, sum_normals
-from thermocald.thermal.likelihood import ReadingErrorTerm, add_error_term, prepare
-from thermocald.thermal.series import COLUMNS, unit_directions
+from thermocald.thermal.likelihood import (
+    NormalEquations,
+    ReadingErrorTerm,
+    Weighting,
+    add_error_term,
+    prepare,
+)
+from thermocald.thermal.series import COLUMNS, ReducedSeries, unit_directions
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,8 +31,6 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
     from thermocald.arrays import Array
-    from thermocald.thermal.likelihood import NormalEquations, Weighting
-    from thermocald.thermal.series import ReducedSeries
 
 # relative standard deviation with which the readings themselves tell their noise
 _NOISE_KNOWN = 0.05

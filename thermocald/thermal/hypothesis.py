@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.physics import catalogue
-from thermocald.thermal.series import COLUMNS, unit_directions
+from thermocald.thermal.series import COLUMNS, ReducedSeries, unit_directions
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.physics.effect import Effect, Parameter
     from thermocald.thermal.likelihood import NormalEquations, Weighting
-    from thermocald.thermal.series import ReducedSeries
 
 BASE = ("c", "x0", "y0")
 

@@ -32,13 +32,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.thermal.random_effects import Couplings
+from thermocald.thermal.random_effects import Couplings, Movement
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
-    from thermocald.thermal.random_effects import Movement
     from thermocald.thermal.series import ReducedSeries
 
 

@@ -33,7 +33,7 @@ from thermocald.thermal import criteria
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.movement import detect_tremble, weight_jumps_down
 from thermocald.thermal.scan import ORDERS, cosines
-from thermocald.thermal.series import in_blocks
+from thermocald.thermal.series import ReducedSeries, in_blocks
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -42,7 +42,6 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array, Mask
     from thermocald.thermal.hypothesis import Fit
-    from thermocald.thermal.series import ReducedSeries
 
 _JUMP_SD = 4.0  # of a slope that the images show
 

@@ -33,6 +33,8 @@ from thermocald.photogrammetry.field.planes import plane_fit
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.photogrammetry.linalg import MAD_TO_SD
 from thermocald.photogrammetry.series.normals import (
+    ObservationGrid,
+    Partials,
     linearise,
     normal_matrices,
     right_hand_sides,
@@ -50,7 +52,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Mask
-    from thermocald.photogrammetry.series.normals import ObservationGrid, Partials
     from thermocald.physics.model import Distortion
 
 

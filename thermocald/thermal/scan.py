@@ -35,17 +35,15 @@ from thermocald.photogrammetry.linalg import (
     scaled_solve,
 )
 from thermocald.thermal import criteria
-from thermocald.thermal.hypothesis import BASE
-from thermocald.thermal.series import solve
+from thermocald.thermal.hypothesis import BASE, Candidate, Fit
+from thermocald.thermal.series import ReducedSeries, solve
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from thermocald.arrays import Array, Index
     from thermocald.thermal.fit import HypothesisFitter
-    from thermocald.thermal.hypothesis import Candidate, Fit
     from thermocald.thermal.likelihood import Weighting
-    from thermocald.thermal.series import ReducedSeries
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,10 +19,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
+from thermocald.photogrammetry.camera.camera_model import (
+    PARAMETER_NAMES,
+    InteriorOrientation,
+    Sensor,
+)
 from thermocald.photogrammetry.linalg import best_level, explained, unit_diagonal
 from thermocald.physics.history import History
-from thermocald.physics.model import distortion_along, follow_angle
+from thermocald.physics.model import Distortion, distortion_along, follow_angle
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -31,10 +35,8 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.series.normals import ObservationGrid, Partials
-    from thermocald.physics.model import Distortion
     from thermocald.thermal.random_effects import HiddenTargets, Movement
     from thermocald.thermal.thermometer import Thermometer
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from thermocald.acquisition.calibrator import Calibrator, calibrated_epochs
 from thermocald.photogrammetry.linalg import MAD_TO_SD
-from thermocald.photogrammetry.series.blocks import recut
+from thermocald.photogrammetry.series.blocks import ObservationBlocks, recut
 from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.store.recording.reader import Recording
 from thermocald.thermal import criteria
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array, Index
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.field.testfield import TestField
-    from thermocald.photogrammetry.series.blocks import ObservationBlocks
     from thermocald.store.recording.head import Head
     from thermocald.store.recording.readings import Readings
     from thermocald.store.stored_recording import StoredRecording

@@ -16,6 +16,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     CameraModel,
     ExteriorOrientation,
     InteriorOrientation,
+    Sensor,
     partials,
     project,
 )
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.epoch.adjustment import Adjustment
     from thermocald.photogrammetry.epoch.measuring import Line, Plane
     from thermocald.photogrammetry.field.testfield import Observations, TestField

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from thermocald.analysis.camera.undistortion import image_grid
 from thermocald.errors import ConfigurationError
 from thermocald.numbers import plain, with_sd
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, partials, project
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, CameraModel, partials, project
 from thermocald.physics.effect import PARAMETER_UNITS
 from thermocald.result import Result, new_figure
 
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.camera.camera_model import CameraModel
 
 _GRID = 25  # points a side
 _IN_PX = ("c", "x0", "y0")

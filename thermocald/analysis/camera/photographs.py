@@ -10,9 +10,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.errors import GeometryError, ImageError, UsageError
-from thermocald.photogrammetry.camera.camera_model import Sensor
+from thermocald.photogrammetry.camera.camera_model import (
+    ExteriorOrientation,
+    InteriorOrientation,
+    Sensor,
+)
 from thermocald.photogrammetry.camera_files import CameraFile
-from thermocald.photogrammetry.epoch.adjustment import cold_start, pose_only
+from thermocald.photogrammetry.epoch.adjustment import (
+    Adjustment,
+    AdjustmentSettings,
+    cold_start,
+    pose_only,
+)
 from thermocald.photogrammetry.frame.measurement import Prior, measure
 from thermocald.photogrammetry.network.common_interior import CommonInterior, adjust_common_interior
 from thermocald.photogrammetry.orientation import approximate_orientation
@@ -25,11 +34,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.camera.camera_model import (
-        ExteriorOrientation,
-        InteriorOrientation,
-    )
-    from thermocald.photogrammetry.epoch.adjustment import Adjustment, AdjustmentSettings
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 _IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".tif", ".tiff", ".webp"})

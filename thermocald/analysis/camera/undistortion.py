@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.photogrammetry.camera.camera_model import project, rays
+from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor, project, rays
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
 
 
 def image_grid(sensor: Sensor, size: int = 3) -> Array:

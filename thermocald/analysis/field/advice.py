@@ -17,11 +17,14 @@ from thermocald.analysis.field.check import (
     station_at,
     usual_station,
 )
-from thermocald.photogrammetry.camera.camera_model import EOP_NAMES
+from thermocald.photogrammetry.camera.camera_model import (
+    EOP_NAMES,
+    CameraModel,
+    ExteriorOrientation,
+)
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.camera.camera_model import CameraModel, ExteriorOrientation
     from thermocald.photogrammetry.field.testfield import TestField
 
 _NONE = 1e300  # a standard deviation that does not exist

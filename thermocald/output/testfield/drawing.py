@@ -17,7 +17,7 @@ import numpy as np
 
 from thermocald.errors import DriverMissing
 from thermocald.files import cannot_write
-from thermocald.output.testfield.layout import STRIP, TRIM
+from thermocald.output.testfield.layout import STRIP, TRIM, Marker, Sheet, Target
 from thermocald.photogrammetry.targets import outline, ring_code
 from thermocald.photogrammetry.targets.markers import marker_cells
 
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
-    from thermocald.output.testfield.layout import Marker, Sheet, Target
 
 
 _MM_PER_INCH = 25.4

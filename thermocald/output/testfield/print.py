@@ -11,21 +11,19 @@ from typing import TYPE_CHECKING, Any
 
 from thermocald.errors import UsageError
 from thermocald.files import cannot_write, new_file
-from thermocald.output.testfield.board import draw_board
+from thermocald.output.testfield.board import Board, draw_board
 from thermocald.output.testfield.drawing import (
     pages_of,
     require_matplotlib,
     write_pdf,
     write_svg,
 )
-from thermocald.output.testfield.layout import field_of, lay_out
+from thermocald.output.testfield.layout import Design, Sheet, field_of, lay_out
 from thermocald.store.recording.testfield_file import write_testfield
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from thermocald.output.testfield.board import Board
-    from thermocald.output.testfield.layout import Design, Sheet
     from thermocald.photogrammetry.field.testfield import TestField
 
 ONE_PLANE = (

@@ -30,7 +30,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from thermocald.errors import ConfigurationError
-from thermocald.photogrammetry.camera.conversions import MeasuredPoint, Metashape, to_family
+from thermocald.photogrammetry.camera.conversions import Family, MeasuredPoint, Metashape, to_family
 from thermocald.photogrammetry.camera_files.camera_record import (
     ForeignCamera,
     Format,
@@ -47,7 +47,6 @@ if TYPE_CHECKING:
         InteriorOrientation,
         Sensor,
     )
-    from thermocald.photogrammetry.camera.conversions import Family
 
 # In the order of our ten: c x0 y0 A1 A2 A3 B1 B2 C1 C2.
 _AICON_NAMES = ("Ck", "Xh", "Yh", "A1", "A2", "A3", "B1", "B2", "C1", "C2")

@@ -30,6 +30,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     PARAMETER_NAMES,
     ExteriorOrientation,
     InteriorOrientation,
+    Sensor,
 )
 from thermocald.photogrammetry.epoch.gauss_markov import (
     NoConvergenceError,
@@ -56,7 +57,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Mask
-    from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 DEFAULT_FREE = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2")

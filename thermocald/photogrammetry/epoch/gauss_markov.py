@@ -19,6 +19,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     EOP,
     IOP,
     PARAMETER_NAMES,
+    Sensor,
     partials,
     project,
 )
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Mask
-    from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 

@@ -12,14 +12,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.camera.camera_model import EOP, IOP_NAMES, PARAMETER_NAMES, rotation
+from thermocald.photogrammetry.camera.camera_model import (
+    EOP,
+    IOP_NAMES,
+    PARAMETER_NAMES,
+    Sensor,
+    rotation,
+)
 from thermocald.photogrammetry.field.planes import plane_fit
 
 if TYPE_CHECKING:
     from collections.abc import Container, Iterable
 
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.camera.camera_model import Sensor
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,6 +21,8 @@ from thermocald.photogrammetry.camera.camera_model import (
     IOP,
     IOP_NAMES,
     ExteriorOrientation,
+    InteriorOrientation,
+    Sensor,
     partials,
     project,
     rays,
@@ -28,6 +30,7 @@ from thermocald.photogrammetry.camera.camera_model import (
 )
 from thermocald.photogrammetry.epoch.adjustment import (
     NO_BOUNDS,
+    Adjustment,
     AdjustmentSettings,
     adjust,
     failed,
@@ -39,8 +42,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
-    from thermocald.photogrammetry.epoch.adjustment import Adjustment
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 _FEWEST = 4  # control points: three have up to four poses

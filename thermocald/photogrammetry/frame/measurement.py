@@ -13,19 +13,24 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermocald.errors import GeometryError
-from thermocald.photogrammetry.camera.camera_model import CameraModel, Sensor
+from thermocald.photogrammetry.camera.camera_model import (
+    CameraModel,
+    ExteriorOrientation,
+    InteriorOrientation,
+    Sensor,
+)
 from thermocald.photogrammetry.field.planes import field_normals
-from thermocald.photogrammetry.field.testfield import Observations
+from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.linalg import MAD_TO_SD
 from thermocald.photogrammetry.orientation import Orientation, orient, refine
 from thermocald.photogrammetry.targets import ring_code
 from thermocald.photogrammetry.targets.boards import find_chessboards, locate_chess_corners
-from thermocald.photogrammetry.targets.circle import fit_circles
+from thermocald.photogrammetry.targets.circle import CircleFit, fit_circles
 from thermocald.photogrammetry.targets.frame_status import OK, FrameStatus, inspect_frame
 from thermocald.photogrammetry.targets.markers import (
     MarkerCorners,
@@ -39,18 +44,9 @@ from thermocald.photogrammetry.targets.outline import LocalMap, local_maps
 from thermocald.photogrammetry.targets.ring_code import find_coded
 
 if TYPE_CHECKING:
-    from typing import Any
-
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Image
-    from thermocald.photogrammetry.camera.camera_model import (
-        ExteriorOrientation,
-        InteriorOrientation,
-    )
-    from thermocald.photogrammetry.field.testfield import TestField
-    from thermocald.photogrammetry.targets.circle import CircleFit
-    from thermocald.photogrammetry.targets.outline import LocalMap
 
 _LARGEST_TILT_COSINE = 0.2  # 78°: beyond, a sheet is seen edge-on
 _GROSS_SD = 8.0

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from thermocald.errors import ConfigurationError, GeometryError, ImageError
-from thermocald.photogrammetry.field.testfield import Observations
+from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.frame.measurement import Measurement
 from thermocald.photogrammetry.targets.frame_status import OK, FrameStatus, inspect_frame
 from thermocald.photogrammetry.targets.image_file import EncodedImage, decode_grey
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.field.testfield import TestField
 
 MATCHING_SD = "matching_px"
 """Quality of an observation: its sd without that of the click, which all frames share."""

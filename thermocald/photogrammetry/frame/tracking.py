@@ -19,30 +19,24 @@ estimated with the rest and taken out of the step.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from thermocald.photogrammetry.field.testfield import Observations
+from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.frame.measurement import Measurement, Prior, measure, predicted_maps
 from thermocald.photogrammetry.targets import ring_code
 from thermocald.photogrammetry.targets.circle import blurred_disc, fit_circles
 from thermocald.photogrammetry.targets.corner import REACH_PX as CORNER_REACH_PX
-from thermocald.photogrammetry.targets.frame_status import OK, inspect_frame
+from thermocald.photogrammetry.targets.frame_status import OK, NoiseModel, inspect_frame
 from thermocald.photogrammetry.targets.image_file import EncodedImage
-from thermocald.photogrammetry.targets.markers import measure_corners
-from thermocald.photogrammetry.targets.outline import window_reach, windows
+from thermocald.photogrammetry.targets.markers import MarkerCorners, measure_corners
+from thermocald.photogrammetry.targets.outline import LocalMap, window_reach, windows
 
 if TYPE_CHECKING:
-    from typing import Any
-
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Image, Single
-    from thermocald.photogrammetry.field.testfield import TestField
-    from thermocald.photogrammetry.targets.frame_status import NoiseModel
-    from thermocald.photogrammetry.targets.markers import MarkerCorners
-    from thermocald.photogrammetry.targets.outline import LocalMap
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -27,7 +27,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     Sensor,
 )
 from thermocald.photogrammetry.network import bundle as nb
-from thermocald.photogrammetry.network.bundle import covariance
+from thermocald.photogrammetry.network.bundle import Bundle, ImageRays, covariance
 from thermocald.photogrammetry.network.datum import Datum, Distance, bring_to_datum
 from thermocald.photogrammetry.network.start import approximate
 
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array, Index
     from thermocald.photogrammetry.field.testfield import Observations
-    from thermocald.photogrammetry.network.bundle import Bundle, ImageRays
 
 
 @dataclass(frozen=True, slots=True)

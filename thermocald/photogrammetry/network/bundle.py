@@ -25,6 +25,7 @@ from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera.camera_model import (
     IOP_NAMES,
     ExteriorOrientation,
+    Sensor,
     partials,
     project,
 )
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Index
-    from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.field.testfield import Observations
 
 

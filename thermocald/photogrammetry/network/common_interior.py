@@ -20,6 +20,7 @@ from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     InteriorOrientation,
+    Sensor,
     free_columns,
     turning_axes,
 )
@@ -45,7 +46,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from thermocald.arrays import Array, Index, Mask
-    from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 _ITERATIONS = 60

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.errors import GeometryError
-from thermocald.photogrammetry.camera.camera_model import InteriorOrientation
+from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
 from thermocald.photogrammetry.camera.camera_model import rays as camera_rays
 from thermocald.photogrammetry.network.bundle import Bundle, ImageRays, residuals, solve
 
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from thermocald.arrays import Array, Index
-    from thermocald.photogrammetry.camera.camera_model import Sensor
 
 
 _FLIP = np.diag([1.0, -1.0, -1.0])  # our camera axes to OpenCV's

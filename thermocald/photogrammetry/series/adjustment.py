@@ -20,7 +20,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.camera.camera_model import EOP, IOP, free_columns
+from thermocald.photogrammetry.camera.camera_model import (
+    EOP,
+    IOP,
+    ExteriorOrientation,
+    InteriorOrientation,
+    Sensor,
+    free_columns,
+)
 from thermocald.photogrammetry.epoch.snooping import TRUSTED_REDUNDANCY
 from thermocald.photogrammetry.series.covariances import (
     all_cofactors,
@@ -43,6 +50,7 @@ from thermocald.photogrammetry.series.mount import FEWEST_EPOCHS, estimate_movem
 from thermocald.photogrammetry.series.movement import STILL, Movement, together
 from thermocald.photogrammetry.series.normals import ObservationGrid, linearise, sums_of_squares
 from thermocald.photogrammetry.series.result import (
+    Exterior,
     SeriesAdjustment,
     SeriesSettings,
     enough_targets,
@@ -55,13 +63,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from thermocald.arrays import Array, Mask
-    from thermocald.photogrammetry.camera.camera_model import (
-        ExteriorOrientation,
-        InteriorOrientation,
-        Sensor,
-    )
     from thermocald.photogrammetry.field.testfield import Observations, TestField
-    from thermocald.photogrammetry.series.result import Exterior
 
 
 _LOOSE_PX = 3.0  # far beyond what a mount trembles, and what one epoch knows of its perspective

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.camera.camera_model import EOP, IOP, PARAMETER_NAMES, project
+from thermocald.photogrammetry.camera.camera_model import EOP, IOP, PARAMETER_NAMES, Sensor, project
 from thermocald.photogrammetry.epoch.snooping import Rejections
 from thermocald.photogrammetry.series.movement import STILL, Movement
 from thermocald.photogrammetry.series.normals import (
     ObservationGrid,
+    Partials,
     linearise,
     planes,
     series_residuals,
@@ -37,9 +38,7 @@ from thermocald.photogrammetry.series.target_noise import (
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array, Index, Mask
-    from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.field.testfield import TestField
-    from thermocald.photogrammetry.series.normals import Partials
     from thermocald.photogrammetry.series.result import SeriesSettings
 
 ENOUGH_FOR_NOISE = 20

@@ -20,25 +20,26 @@ import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP
 from thermocald.photogrammetry.linalg import inverse_of_determined
-from thermocald.photogrammetry.series.adjustment import epoch_variance
+from thermocald.photogrammetry.series.adjustment import Adjusted, epoch_variance
 from thermocald.photogrammetry.series.covariances import of_correlated, of_priors
-from thermocald.photogrammetry.series.estimator import ENOUGH_FOR_NOISE
+from thermocald.photogrammetry.series.estimator import ENOUGH_FOR_NOISE, Estimate, SeriesEstimator
 from thermocald.photogrammetry.series.normals import (
     ObservationGrid,
     among_all,
     planes,
     sums_of_squares,
 )
-from thermocald.photogrammetry.series.result import enough_targets, judge
-from thermocald.photogrammetry.series.system import SeriesSystem, State
+from thermocald.photogrammetry.series.result import (
+    SeriesAdjustment,
+    SeriesSettings,
+    enough_targets,
+    judge,
+)
+from thermocald.photogrammetry.series.system import Design, SeriesSystem, State
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array, Index, Mask
-    from thermocald.photogrammetry.series.adjustment import Adjusted
-    from thermocald.photogrammetry.series.estimator import Estimate, SeriesEstimator
     from thermocald.photogrammetry.series.movement import Movement
-    from thermocald.photogrammetry.series.result import SeriesAdjustment, SeriesSettings
-    from thermocald.photogrammetry.series.system import Design
     from thermocald.photogrammetry.series.target_noise import CorrelatedPairs
 
 

@@ -21,11 +21,17 @@ import numpy as np
 
 from thermocald.parallel import in_order
 from thermocald.photogrammetry.linalg import root_of
-from thermocald.photogrammetry.series.adjustment import adjusted, result
-from thermocald.photogrammetry.series.blocks import gathered, spread_windows
+from thermocald.photogrammetry.series.adjustment import Adjusted, adjusted, result
+from thermocald.photogrammetry.series.blocks import ObservationBlocks, gathered, spread_windows
 from thermocald.photogrammetry.series.covariances import line_weights, of_slow_targets, stillness
 from thermocald.photogrammetry.series.estimator import ENOUGH_FOR_NOISE
-from thermocald.photogrammetry.series.known import CommonSums, KnownSeries, level_of
+from thermocald.photogrammetry.series.known import (
+    AdjustedBlock,
+    CommonSums,
+    KnownSeries,
+    Solved,
+    level_of,
+)
 from thermocald.photogrammetry.series.normals import ObservationGrid, normal_matrices
 from thermocald.photogrammetry.series.spool import ColumnSpool, Words, give_back
 from thermocald.photogrammetry.series.target_noise import slow_errors
@@ -38,9 +44,6 @@ if TYPE_CHECKING:
         Sensor,
     )
     from thermocald.photogrammetry.field.testfield import TestField
-    from thermocald.photogrammetry.series.adjustment import Adjusted
-    from thermocald.photogrammetry.series.blocks import ObservationBlocks
-    from thermocald.photogrammetry.series.known import AdjustedBlock, Solved
     from thermocald.photogrammetry.series.result import SeriesAdjustment, SeriesSettings
 
 

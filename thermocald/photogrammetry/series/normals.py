@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.photogrammetry.camera.camera_model import EOP, IOP, partials, project
+from thermocald.photogrammetry.camera.camera_model import EOP, IOP, Sensor, partials, project
 from thermocald.photogrammetry.linalg import stacked_inverses
 
 if TYPE_CHECKING:
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 

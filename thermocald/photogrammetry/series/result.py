@@ -21,9 +21,10 @@ from thermocald.photogrammetry.camera.camera_model import (
     PRINCIPAL_POINT,
     ExteriorOrientation,
     InteriorOrientation,
+    Sensor,
     free_columns,
 )
-from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, Adjustment
+from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, Adjustment, AdjustmentSettings
 from thermocald.photogrammetry.epoch.geometry import GeometryBounds, weaknesses
 from thermocald.photogrammetry.epoch.snooping import (
     TRUSTED_REDUNDANCY,
@@ -38,8 +39,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Index, Mask
-    from thermocald.photogrammetry.camera.camera_model import Sensor
-    from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.series.normals import ObservationGrid
 

@@ -11,13 +11,12 @@ import numpy as np
 
 from thermocald.photogrammetry.epoch.snooping import TRUSTED_REDUNDANCY, chi2_2d
 from thermocald.photogrammetry.series.normals import chunks, products
-from thermocald.photogrammetry.series.system import alike
+from thermocald.photogrammetry.series.system import SeriesSystem, alike
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Mask
-    from thermocald.photogrammetry.series.system import SeriesSystem
 
     Columns = NDArray[np.int64]
 

@@ -19,6 +19,7 @@ import numpy as np
 from thermocald.photogrammetry.camera.camera_model import EOP
 from thermocald.photogrammetry.linalg import inverse_of_determined
 from thermocald.photogrammetry.series.normals import (
+    Partials,
     chunks,
     cofactors,
     normal_matrices,
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.field.testfield import TestField
-    from thermocald.photogrammetry.series.normals import Partials
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,15 +32,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.arrays import scratch
+from thermocald.arrays import Array, Image, Single, scratch
 from thermocald.photogrammetry.targets.frame_status import NoiseModel, estimate_noise
-from thermocald.photogrammetry.targets.outline import inverse_2x2, windows
+from thermocald.photogrammetry.targets.outline import LocalMap, Windows, inverse_2x2, windows
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    from thermocald.arrays import Array, Image, Single
-    from thermocald.photogrammetry.targets.outline import LocalMap, Windows
 
 
 _PIXEL_VARIANCE = 1 / 12

@@ -29,14 +29,13 @@ import cv2
 import numpy as np
 
 from thermocald.errors import TestFieldError
-from thermocald.photogrammetry.field.testfield import Observations
+from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.targets.corner import fit_corners
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Image
-    from thermocald.photogrammetry.field.testfield import TestField
 
 
 _FEWEST = 3

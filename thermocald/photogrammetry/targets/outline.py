@@ -24,16 +24,13 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from thermocald.arrays import scratch
-from thermocald.photogrammetry.camera.camera_model import project
+from thermocald.arrays import Array, Image, Single, scratch
+from thermocald.photogrammetry.camera.camera_model import Sensor, project
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
-
-    from thermocald.arrays import Array, Image, Single
-    from thermocald.photogrammetry.camera.camera_model import Sensor
 
 
 RING_INNER = 2.0

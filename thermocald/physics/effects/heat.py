@@ -15,7 +15,7 @@ from thermocald.physics.effect import (
     coefficient_units,
     say_estimate,
 )
-from thermocald.physics.history import DelayFollower, LagFollower
+from thermocald.physics.history import DelayFollower, Follower, History, LagFollower
 from thermocald.physics.operators import interpolation_matrix, lag, lag_matrix, slope_matrix
 
 if TYPE_CHECKING:
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
     from thermocald.arrays import Array
-    from thermocald.physics.history import Follower, History
 
 
 class ThermalLag(Effect):

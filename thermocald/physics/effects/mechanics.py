@@ -16,7 +16,7 @@ from thermocald.physics.effect import (
     coefficient_units,
     say_estimate,
 )
-from thermocald.physics.history import PlayFollower
+from thermocald.physics.history import Follower, History, PlayFollower
 from thermocald.physics.operators import (
     lag,
     lag_matrix,
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
     from thermocald.arrays import Array
-    from thermocald.physics.history import Follower, History
 
 
 class Hysteresis(Effect):

@@ -1,15 +1,13 @@
-"""Kills with everything beside the writer that can stand there: what was reported is kept.
+"""300 kills with everything beside the writer that can stand there: what was reported is kept.
 
-`THERMOCALD_KILLS=300` runs as many as were promised once; the slow suite runs some of each kind.
+All processes are forked from one that has everything imported, which makes of an hour two minutes.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
-import signal
 import subprocess
-import sys
 import textwrap
 import time
 from pathlib import Path
@@ -17,13 +15,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.daemon.conftest import ENVIRONMENT, make_recording
+from tests.daemon.conftest import forker, make_recording  # noqa: F401
+from tests.daemon.forking import Forked, Forker
 from thermocald.errors import StoreError
 from thermocald.store.database.store import Store
 
 pytestmark = pytest.mark.slow
 
-KILLS = int(os.environ.get("THERMOCALD_KILLS", "36"))
+KILLS = 300
+_TAKEOVER_S = 0.2  # that a second daemon has when the first was killed: it writes ever on
 # As a daemon keeps epochs: through its guard; says after each what it has reported as kept.
 DAEMON = textwrap.dedent(
     """
@@ -35,15 +35,14 @@ DAEMON = textwrap.dedent(
     from thermocald.photogrammetry.field.testfield import Observations
     from thermocald.store.series import EpochResult
 
-    guard = StoreGuard(Path(sys.argv[1]), durable=False)
+    guard = StoreGuard(Path(sys.argv[2]), durable=False)
     (series,) = guard.store.all_series()
     number = (guard.store.last_epoch(series) or 0) + 1
     while True:
         seen = Observations(np.arange(12), np.full((12, 2), float(number)), np.ones((12, 2)))
         result = EpochResult("ok", "", np.full(16, float(number)), np.eye(16))
         guard.store.append(series, Epoch(number, 10.0 * number, np.nan, observations=seen), result)
-        sys.stdout.write(f"{number}\\n")
-        sys.stdout.flush()
+        print(number, flush=True)
         number += 1
     """
 )
@@ -68,15 +67,14 @@ def other_device(tmp_path_factory):
     pytest.skip("there is one device only")
 
 
-def writes(*arguments) -> subprocess.Popen:
-    return subprocess.Popen(
-        [sys.executable, "-m", "thermocald", *map(str, arguments)],
-        env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-    )  # fmt: skip
-
-
-def beside(kind: str, store: Path, recording: Path, k: int) -> list[subprocess.Popen]:
+def beside(forker: Forker, kind: str, store: Path, recording: Path, k: int) -> list[Forked]:  # noqa: F811
     """What stands beside the writer, and processes that try to write too."""
+
+    def writes(*arguments: object, script: str = "") -> Forked:
+        folder = store.parent / f"beside-{k}-{len(list(store.parent.glob(f'beside-{k}-*')))}"
+        folder.mkdir()
+        return forker.start(folder, *map(str, arguments), script=script)
+
     other = store.with_name(f"other-{k}.db")
     link = store.with_name(f"link-{k}.db")
     if kind == "hard link":
@@ -91,8 +89,7 @@ def beside(kind: str, store: Path, recording: Path, k: int) -> list[subprocess.P
                 shutil.copy(source, other.with_name(name.replace(store.name, other.name)))
         return []
     if kind == "second daemon":
-        return [subprocess.Popen([sys.executable, "-c", DAEMON, store], stdout=subprocess.DEVNULL,
-                                 stderr=subprocess.DEVNULL)]  # fmt: skip
+        return [writes("daemon", store, script=DAEMON)]
     if kind == "replay":
         return [writes("replay", recording, "--store", store)]
     if kind == "run":
@@ -105,53 +102,68 @@ def beside(kind: str, store: Path, recording: Path, k: int) -> list[subprocess.P
 KINDS = ["alone", "hard link", "soft link", "copies", "second daemon", "replay", "run", "readers"]
 
 
-def kill_one(store: Path, start, rng) -> int:
+def kill_one(forker: Forker, store: Path, start, rng) -> int:  # noqa: F811
     """Start the writer, and what `start` begins once it writes; the last epoch it reported."""
-    writer = subprocess.Popen([sys.executable, "-c", DAEMON, str(store)], stdout=subprocess.PIPE)
-    said = [writer.stdout.readline()]
+    folder = store.parent / f"writer-{len(list(store.parent.glob('writer-*')))}"
+    folder.mkdir()
+    writer = forker.start(folder, "daemon", str(store), script=DAEMON)
+
+    def reported() -> list[str]:
+        # what follows the last line end is half a line
+        return (folder / "log.txt").read_text().split("\n")[:-1]
+
+    def until(count: int) -> None:
+        deadline = time.monotonic() + 60.0
+        while len(reported()) < count:
+            assert writer.poll() is None, "the writer ended:\n" + (folder / "log.txt").read_text()
+            assert time.monotonic() < deadline, reported()
+            time.sleep(0.001)
+
+    until(1)
     others = start()
-    said += [writer.stdout.readline() for _ in range(int(rng.integers(1, 60)))]
+    until(1 + int(rng.integers(1, 30)))
     time.sleep(float(rng.uniform(0, 0.02)))
-    os.kill(writer.pid, signal.SIGKILL)
-    said += writer.stdout.read().splitlines()
-    writer.stdout.close()
+    writer.kill()
     writer.wait()
     for other in others:
         if rng.random() < 0.5:
             other.kill()
         # a second daemon takes over where the first was killed: that is what it is for
         try:
-            other.wait(timeout=5)
+            other.wait(_TAKEOVER_S)
         except subprocess.TimeoutExpired:
             other.kill()
             other.wait()
-    return int([line for line in said if line.strip()][-1])
+    return int(reported()[-1])
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_was_reported_is_kept(store_path, head, field, recording, kind):
-    _kill_often(store_path, head, field, recording, kind, max(KILLS // (len(KINDS) + 1), 3))
+def test_what_was_reported_is_kept(forker, store_path, head, field, recording, kind):  # noqa: F811
+    _kill_often(forker, store_path, head, field, recording, kind)
 
 
-def test_links_over_devices(other_device, tmp_path, head, field, recording):
+def test_links_over_devices(forker, other_device, tmp_path, head, field, recording):  # noqa: F811
     """The store on one device, its name on another, and the writer knows the name alone."""
     real = other_device / "real.db"
     name = tmp_path / "named.db"
     name.symlink_to(real)
     with pytest.raises(OSError, match="cross-device"):
         os.link(other_device, tmp_path / "hard")
-    _kill_often(name, head, field, recording, "replay", max(KILLS // (len(KINDS) + 1), 3))
+    _kill_often(forker, name, head, field, recording, "replay")
     assert real.is_file()
     assert name.is_symlink()
 
 
-def _kill_often(store_path, head, field, recording, kind, times) -> None:
+def _kill_often(forker, store_path, head, field, recording, kind) -> None:  # noqa: F811
+    times = -(-KILLS // (len(KINDS) + 1))
     with Store.open(store_path, "append", durable=False) as store:
         store.create_series(head, field)
     rng = np.random.default_rng(len(kind))
     reported, before = 0, 0
     for k in range(times):
-        said = kill_one(store_path, lambda k=k: beside(kind, store_path, recording, k), rng)
+        said = kill_one(
+            forker, store_path, lambda k=k: beside(forker, kind, store_path, recording, k), rng
+        )
         for name in store_path.parent.glob("other-*.db"):
             name.unlink()  # a daemon writes on beside a hard link; nothing else would
         reported += said - before
@@ -171,12 +183,12 @@ def _kill_often(store_path, head, field, recording, kind, times) -> None:
     assert reported > times
 
 
-def test_a_name_that_lacks_the_wal_is_not_read_as_whole(store_path, head, field, recording):
+def test_a_name_that_lacks_the_wal_is_not_read_as_whole(forker, store_path, head, field):  # noqa: F811
     """While the writer is dead and its -wal waits: a hard link shows the store without it."""
     with Store.open(store_path, "append", durable=False) as store:
         store.create_series(head, field)
     rng = np.random.default_rng(1)
-    said = kill_one(store_path, list, rng)
+    said = kill_one(forker, store_path, list, rng)
     other = store_path.with_name("other.db")
     os.link(store_path, other)
     with pytest.raises(StoreError, match="another of its names"):

@@ -79,6 +79,7 @@ def page_of(browser):
 
     def open_(url: str, width: int = 1280, height: int = 900, **options):
         page = browser.new_page(viewport={"width": width, "height": height}, **options)
+        page.set_default_timeout(120_000)  # ms: busy machines
         pages.append(page)
         page.problems = []
         page.on(

@@ -20,7 +20,8 @@ UNITS = {
 }
 _SYMBOLS = {"sigma0": "σ₀", "x0": "x₀", "y0": "y₀"}
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-_COMPUTED = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?)e([+-]?\d{1,3})(?![\w.]*\w)")
+_COMPUTED = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?|\([-+]?\d[\d. ±]*\))e([+-]?\d{1,3})(?![\w.]*\w)")
+_UNIT_POWER = re.compile(r"(?<![\w-])mm(-\d)(?![\w-])")
 _MINUS = "−"
 
 
@@ -56,8 +57,13 @@ def superscript(exponent: int) -> str:
 
 
 def typeset_powers(text: str) -> str:
-    """Return a text in which numbers as a computer prints them, 1.2e-06, read 1.2·10⁻⁶."""
-    return _COMPUTED.sub(lambda m: f"{m[1]}·10{superscript(int(m[2]))}", text)
+    """Return a text in which what a computer prints, (-1.2 ± 0.1)e-06 mm-1, reads as in a book:
+    (−1.2 ± 0.1)·10⁻⁶ mm⁻¹.
+    """
+    text = _COMPUTED.sub(
+        lambda m: f"{m[1].replace('-', _MINUS)}·10{superscript(int(m[2]))}", text
+    )
+    return _UNIT_POWER.sub(lambda m: f"mm{m[1].translate(_SUPERSCRIPT)}", text)
 
 
 def with_sd(value: float, sd: float, unit: str = "") -> str:
@@ -74,7 +80,7 @@ def with_sd(value: float, sd: float, unit: str = "") -> str:
     body = f"{v:.{decimals}f} ± {s:.{decimals}f}".replace("-", _MINUS)
     if scale:
         body = f"({body})·10{superscript(scale)}"
-    return f"{body} {unit}".rstrip()
+    return typeset_powers(f"{body} {unit}").rstrip()
 
 
 def signed(value: float, sd: float, unit: str = "") -> str:
@@ -91,7 +97,7 @@ def rounded(value: float, sd: float, unit: str = "") -> str:
         exponent = math.floor(math.log10(max(abs(value), sd)))
         decimals = max(0, 1 + exponent - math.floor(math.log10(sd)))
         body = f"{value / 10**exponent:.{decimals}f}·10{superscript(exponent)}"
-        return f"{body} {unit}".rstrip().replace("-", _MINUS)
+        return typeset_powers(f"{body} {unit}").rstrip().replace("-", _MINUS)
     decimals = max(0, 1 - math.floor(math.log10(sd)))
     return f"{value:.{decimals}f} {unit}".rstrip().replace("-", _MINUS)
 
@@ -107,7 +113,7 @@ def plain(value: float, unit: str = "", digits: int = 4) -> str:
         body = f"{value:.{max(0, digits - 1 - exponent)}f}"
     else:
         body = f"{value / 10**exponent:.{digits - 1}f}·10{superscript(exponent)}"
-    return f"{body} {unit}".rstrip().replace("-", _MINUS)
+    return typeset_powers(f"{body} {unit}").rstrip().replace("-", _MINUS)
 
 
 def duration(seconds: float) -> str:

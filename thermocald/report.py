@@ -8,6 +8,7 @@ does not cover. The page can be read without its script, which copies tables and
 from __future__ import annotations
 
 import base64
+import re
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -25,6 +26,10 @@ if TYPE_CHECKING:
 
 _TEMPLATES = Path(__file__).parent / "templates"
 _A_YEAR = 31_557_600.0
+_RIGHT_TO_LEFT = "\u0590-\u08ff\ufb1d-\ufdff\ufe70-\ufefc"
+_WORDS_TO_LEFT = re.compile(
+    f"[{_RIGHT_TO_LEFT}](?:[{_RIGHT_TO_LEFT}\\s\u200c\u200d-]*[{_RIGHT_TO_LEFT}])?"
+)
 
 
 @dataclass(frozen=True)
@@ -104,6 +109,7 @@ def render_report(
         autoescape=select_autoescape(["html", "j2"]),
         undefined=StrictUndefined,
         trim_blocks=True,
+        finalize=lambda value: isolated(value) if type(value) is str else value,
     )
     environment.filters["powers"] = typeset_powers
     at = made or datetime.now(tz=UTC)
@@ -117,6 +123,14 @@ def render_report(
         style=(_TEMPLATES / "report.css").read_text(encoding="utf-8"),
         script=(_TEMPLATES / "report.js").read_text(encoding="utf-8"),
     )
+
+
+def isolated(text: str) -> str:
+    """Return a text in which Hebrew and Arabic words turn nothing around but themselves.
+
+    Else a camera's name exchanges the width and the height that follow it.
+    """
+    return _WORDS_TO_LEFT.sub(lambda m: f"\u2068{m[0]}\u2069", text)
 
 
 def of_figure(figure: Figure, prefix: str = "") -> Drawing:

@@ -26,9 +26,10 @@ def shown(daemon, devices):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    daemon.configure(**devices(period_s=0.5), dashboard={"enabled": True, "port": port})
+    # slow enough for a busy machine: what is deferred is calibrated later, and not drawn
+    daemon.configure(**devices(period_s=1.5), dashboard={"enabled": True, "port": port})
     daemon.start()
-    daemon.until(lambda: len(daemon.results()) > 5)
+    daemon.until(lambda: len(daemon.results()) > 2)
     daemon.until(lambda: _listens(port))
     yield f"http://127.0.0.1:{port}/"
     if daemon.process.poll() is None:
@@ -43,19 +44,16 @@ def _listens(port: int) -> bool:
 
 def test_it_is_live_on_desk_and_phone_light_and_dark(daemon, shown, page_of):
     page = page_of(shown)
-    page.wait_for_function("() => document.querySelector('#figures dd') !== null", timeout=30000)
+    page.wait_for_function("() => document.querySelector('#figures dd') !== null")
     epoch = int(page.text_content("#figures dd").split()[0])
     page.wait_for_function(
-        f"() => parseInt(document.querySelector('#figures dd').textContent) > {epoch + 2}",
-        timeout=30000,
+        f"() => parseInt(document.querySelector('#figures dd').textContent) > {epoch + 2}"
     )
     assert page.text_content("#connection") == "live"
     page.wait_for_function("() => document.querySelectorAll('#overlay circle').length > 100")
     page.wait_for_function("() => document.querySelectorAll('#overlay line').length > 100")
-    page.wait_for_function(
-        "() => document.querySelector('#frame').naturalWidth > 300", timeout=20000
-    )
-    page.wait_for_function(f"() => ({_DRAWN})() >= 5", timeout=30000)
+    page.wait_for_function("() => document.querySelector('#frame').naturalWidth > 300")
+    page.wait_for_function(f"() => ({_DRAWN})() >= 5")
     for span in ("86400", ""):
         page.check(f'input[name=span][value="{span}"]')
         page.wait_for_function(f"() => ({_DRAWN})() >= 5")
@@ -68,7 +66,7 @@ def test_it_is_live_on_desk_and_phone_light_and_dark(daemon, shown, page_of):
 
     phone = page_of(shown, width=390, color_scheme="dark")
     phone.wait_for_function("() => document.querySelector('#figures dd') !== null")
-    phone.wait_for_function(f"() => ({_DRAWN})() >= 5", timeout=30000)
+    phone.wait_for_function(f"() => ({_DRAWN})() >= 5")
     assert not phone.evaluate(_WIDER)
     assert phone.evaluate("getComputedStyle(document.body).backgroundColor") != light
     assert phone.problems == []
@@ -76,10 +74,8 @@ def test_it_is_live_on_desk_and_phone_light_and_dark(daemon, shown, page_of):
 
 def test_the_keyboard_reaches_everything(shown, page_of):
     page = page_of(shown)
-    page.wait_for_function("() => document.querySelector('#figures dd') !== null", timeout=30000)
-    page.wait_for_function(
-        "() => document.querySelector('#series').options.length > 0", timeout=30000
-    )
+    page.wait_for_function("() => document.querySelector('#figures dd') !== null")
+    page.wait_for_function("() => document.querySelector('#series').options.length > 0")
     reached = []
     for _ in range(12):
         page.keyboard.press("Tab")
@@ -104,7 +100,7 @@ def test_the_death_of_the_page_does_not_touch_acquisition(daemon, shown):
 
 def test_a_page_that_is_open_says_when_acquisition_ended(daemon, shown, page_of):
     page = page_of(shown)
-    page.wait_for_function("() => document.querySelector('#figures dd') !== null", timeout=30000)
+    page.wait_for_function("() => document.querySelector('#figures dd') !== null")
     daemon.stop()
     page.wait_for_function(
         "() => document.querySelector('#connection').textContent"

@@ -132,7 +132,7 @@ def test_an_epoch_that_is_not_handed_over_is_lost(how):
     pipeline.start()
     count = 2 if how == "the keeper breaks" else 8 if how in ("too slow", "too many wait") else 3
     for _ in range(count):
-        pipeline.submit(Frame(np.zeros((4, 4), np.uint8), 0.0, 0.0))
+        pipeline.submit(Frame(np.zeros((5000, 5000), np.uint8), 0.0, 0.0))
     if how == "the keeper breaks":
         until(lambda: len(told) == count)
     elif how == "the end":

@@ -143,6 +143,8 @@ class Readings:
 log = logging.getLogger(__name__)
 
 _DEPTH = 3
+_MOST_BYTES = 64_000_000  # of frames that wait to be kept
+_MOST_WAITING = 200
 _PATIENCE_S = 2.0
 _IDLE_S = 0.5
 
@@ -254,12 +256,20 @@ class Pipeline:
     def submit(self, frame: Frame) -> None:
         """Take a frame over; returns at once."""
         with self._changed:
-            if len(self._items) > 2 * self._depth:
+            if len(self._items) > 2 * self._depth and self._is_full():
                 self._lose("it cannot be kept fast enough")
                 return
             self._items.append(AcquiredEpoch(self.next_number, frame, self._trusted()))
             self.next_number += 1
             self._changed.notify_all()
+
+    def _is_full(self) -> bool:
+        """Whether no frame more may wait: a machine that stalls for seconds costs none."""
+        frames = [i.frame for i in self._items]
+        held = sum(
+            len(f.encoded or b"") + (0 if f.image is None else f.image.nbytes) for f in frames
+        )
+        return len(frames) > _MOST_WAITING or held > _MOST_BYTES
 
     def _lose(self, why: str) -> None:
         self.lost += 1

@@ -48,9 +48,17 @@ def render_certificate(camera: ThermalCamera, made: datetime | None = None) -> s
             Section("The model", tables=(_values(document), *_effects(document))),
             Section("What it rests on", tables=tuple(t for t in _evidence(document) if t.rows)),
         ),
+        about=(_about(camera, document),),
         notes=tuple(f"Doubtful: {text}." for text in document.get("doubts", ())),
     )  # fmt: skip
     return render_report(chapter.title, [chapter], made=made)
+
+
+def _about(camera: ThermalCamera, document: Mapping[str, Any]) -> str:
+    sensor = camera.model.sensor
+    text = f"{sensor.width} × {sensor.height} px of {sensor.pixel_pitch * 1000:g} µm"
+    series = ", ".join(str(s["name"]) for s in document.get("series", ()))
+    return f"{text}; fitted to {series}." if series else f"{text}."
 
 
 def _sentence(document: Mapping[str, Any], pitch: float, low: float, high: float) -> str:

@@ -72,8 +72,9 @@ def report_html(discovery: Discovery, title: str, made: datetime | None = None) 
 def _answer(d: Discovery) -> Answer:
     before, after = d.stages[0], d.stages[-1]
     temperatures = _temperatures(d)
-    if d.effects:
-        sentence = ". ".join(_sentence(e.statement) for e in d.effects) + "."
+    closing = sorted(d.effects, key=lambda e: e.gap_after.rms_px - e.gap_before.rms_px)
+    if closing:
+        sentence = f"{_sentence(closing[0].statement)}."
     else:
         sentence = (
             f"The model reproduces the recording within its noise of {_noise_px(d, 0):.3f} px"
@@ -83,8 +84,10 @@ def _answer(d: Discovery) -> Answer:
     if d.effects:
         gaps = zip(_names(d), (before.fit, *before.others), (after.fit, *after.others), strict=True)
         said = [f"{a.rms_px:.3f} to {b.rms_px:.3f} px RMS on {name}" for name, a, b in gaps]
+        more += [f"Also found: {e.statement.rstrip('.')}." for e in closing[1:]]
+        it = "it" if len(closing) == 1 else "all of it"
         more.append(
-            f"With it the gap between model and measurement goes from {' and from '.join(said)}"
+            f"With {it} the gap between model and measurement goes from {' and from '.join(said)}"
             f"{temperatures}; the noise of an image coordinate is {_noise_px(d, 0):.3f} px."
         )
     if d.verdict == "unexplained":
@@ -213,7 +216,8 @@ def _trajectory(d: Discovery) -> Drawing:
             below.plot(x, rests[0] @ along, ".", color=_BASE, ms=2.5)
             if found:
                 shown = measured - rests[1] @ along
-                top.plot(x, shown, "-", color=_FOUND, lw=1.2, label=f"with {name}")
+                label = f"with {name}" if len(d.effects) == 1 else "with what was found"
+                top.plot(x, shown, "-", color=_FOUND, lw=1.2, label=label)
                 below.plot(x, rests[1] @ along, ".", color=_FOUND, ms=2.5)
             below.axhspan(-BAND * noise, BAND * noise, color=GREY, alpha=0.25, lw=0)
             below.axhline(0.0, color=GREY, lw=0.6)
@@ -333,7 +337,7 @@ def _gap_row(name: str, gap: Gap) -> tuple[str, ...]:
 
 
 def _effect(effect: EffectFound) -> Section:
-    rows = [(name.replace("_", " "), _value(e)) for name, e in effect.estimates.items()]
+    rows = [(_parameter(name), _value(e)) for name, e in effect.estimates.items()]
     text = []
     if proposal := effect.evidence.get("proposal"):
         test = proposal["surrogates"]
@@ -364,6 +368,13 @@ def _effect(effect: EffectFound) -> Section:
     return Section(f"What was found: {effect.effect}", tuple(text), (), (table,), tuple(items))
 
 
+def _parameter(name: str) -> str:
+    """How a parameter of an effect is called: a_c is the amplitude of c."""
+    return f"amplitude of {parameter_label(name[2:])}" if name.startswith("a_") else (
+        name.replace("_", " ")
+    )  # fmt: skip
+
+
 def _value(estimate: dict[str, Any]) -> str:
     value, sd = estimate["value"], estimate["sd"]
     unit = "" if estimate["unit"] == "1" else estimate["unit"]
@@ -382,11 +393,10 @@ def _noise_test(d: Discovery) -> Section:
     names = x.best.names[len(x.base.terms) :]
     tests = list(zip(names, x.surrogates, strict=False))
     with drawing_style():
-        drawing = new_drawing(9.0, 0.9 + 1.2 * len(tests))
+        drawing = new_drawing(9.0, 0.4 + 1.7 * len(tests))
         axes = np.atleast_1d(drawing.subplots(len(tests), 1))
         for axis, (name, test) in zip(axes, tests, strict=True):
             _draw_surrogates(axis, name, test)
-        label_axes(axes[-1], "gain in −2 log L, less the penalty (no unit)")
     text = "; ".join(f"{name}: p {_p(t.p, len(t.surrogates))}" for name, t in tests)
     figure = of_drawing(
         drawing, "surrogates", "Surrogates",
@@ -413,7 +423,7 @@ def _draw_surrogates(axis: Any, name: str, test: SurrogateTest) -> None:
     if not beyond:
         axis.axvline(test.gain, color=_FOUND, lw=2)
     axis.set_title(name, loc="left")
-    label_axes(axis, y="surrogates (count)")
+    label_axes(axis, "gain in −2 log L, less the penalty (no unit)", "surrogates (count)")
 
 
 def _candidates(d: Discovery) -> Section:

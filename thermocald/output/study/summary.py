@@ -124,9 +124,10 @@ def rates(study: SeriesStudy, distance_mm: float) -> str:
     low, high = float(np.nanmin(T)), float(np.nanmax(T))
     joined = parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
     rough = " (so short a series gives these standard deviations only roughly)"
+    where = parameter_label(channel.thermometer.name)
     return (
         f"{study.series.name}: between {low:.0f} and {high:.0f} °C "
-        f"({parameter_label(channel.thermometer.name)}) {joined}"
+        f"{'' if where == 'temperature' else f'({where}) '}{joined}"
         f"{rough if any(d.too_short for *_, d in found) else ''}."
     )
 

@@ -42,6 +42,7 @@ from thermocald.photogrammetry.series.covariances import (
 )
 from thermocald.photogrammetry.series.estimator import (
     ENOUGH_FOR_NOISE,
+    FEW_EPOCHS,
     NOISE_SHOWN,
     Estimate,
     SeriesEstimator,
@@ -216,10 +217,13 @@ def result(found: Adjusted) -> SeriesAdjustment:
     excess, own, sound = np.zeros(16), system.design.own, system.good
     block = (slice(None), own[:, None], own)
     if s.scale == "posterior":
+        few = series.has_offsets and len(use) < FEW_EPOCHS
+        # what errors of image points have in common in few epochs the offsets take up
+        least = np.maximum(unit, 1.0) if few else unit
         # What priors contribute is known as well as they are, not as the epoch.
         bound = of_priors(system)
         relative[block] -= bound
-        relative *= epoch_variance(unit, redundancy, pooled)[:, None, None]
+        relative *= epoch_variance(least, redundancy, pooled)[:, None, None]
         relative[block] += pooled * bound
         level *= pooled
     trend *= pooled

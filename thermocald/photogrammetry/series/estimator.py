@@ -44,6 +44,9 @@ if TYPE_CHECKING:
 ENOUGH_FOR_NOISE = 20
 """Epochs that show the noise of single targets."""
 
+FEW_EPOCHS = 10
+"""Epochs below which targets that wander slowly look like targets that lie elsewhere."""
+
 NOISE_SHOWN = 0.5
 """Share of the redundancy below which residuals show the priors, not the noise: of one epoch."""
 

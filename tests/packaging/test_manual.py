@@ -35,6 +35,10 @@ def complete(manual: Path, *words: str) -> list[str]:
 def test_every_command_has_a_page(manual):
     pages = {page.stem for page in (manual / "man1").iterdir()}
     assert {"thermocald", "thermocald-study", "thermocald-testfield-print"} <= pages
+    for page in (manual / "man1").iterdir():
+        name, _, line = page.read_text().splitlines()[2].partition(r" \- ")
+        assert name.replace("\\", "") == page.stem
+        assert line, f"{page.stem} has no line that says what it does"
     text = (manual / "man1/thermocald-testfield-print.1").read_text()
     assert '.TH THERMOCALD-TESTFIELD-PRINT 1 "1970-01-02"' in text
     assert r"\-\-paper" in text

@@ -117,7 +117,7 @@ def add_commands(app: typer.Typer, load: Callable[[str], bool]) -> None:
                 function = command(name) if load(name) else _not_loaded
                 app.command(name, cls=Command, **told)(function)
             elif load(name):
-                app.add_typer(group(name), name=name, cls=Group, **told)
+                app.add_typer(group(name), name=name, cls=Group, help=f"{entry.line}.", **told)
             else:
                 app.command(name, cls=Command, **told)(_not_loaded)
 

@@ -260,6 +260,19 @@ def test_a_camera_that_stands_still_in_changing_heat_is_not_moved():
         assert told == []
 
 
+def test_a_past_that_fades_is_no_movement():
+    """Carried out of a warm room, with a lag of 600 s: twenty minutes of another camera."""
+    for seed in range(5):
+        world = World(600 + seed)
+        gauge = GaugeCalibrator(thermal_camera(TAU), world.field)
+        epochs, warm = [], world.rng.normal(20.0, 12.0)
+        for k in range(1, 121):
+            lens = 20.0 + (warm - 20.0) * np.exp(-10.0 * k / TAU)
+            epochs.append(replace(world.epoch(k, lens), temperatures={"housing": 20.0}))
+        _, told = followed(gauge, epochs)
+        assert told == []
+
+
 def test_the_movement_has_true_sds():
     square = []
     for seed in range(60):

@@ -9,11 +9,17 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates, spline_filter
 
-from tests.analysis.test_gauge import RATES, START, thermal_camera
+from tests.analysis.test_gauge import RATES, SD_RATE, START, thermal_camera
 from tests.commands import call
-from thermocald.analysis.thermal.scene import SceneTracker, common_movement, follow_scene
+from thermocald.analysis.thermal.scene import (
+    SceneCourse,
+    SceneTracker,
+    common_movement,
+    follow_scene,
+)
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import project, rotation
+from thermocald.physics.model import ModelEffect
 from thermocald.store.logger.temperatures import TemperatureLog
 
 WIDTH, HEIGHT = 410, 308
@@ -88,6 +94,72 @@ def series(folder, seed: int, beside: float, count: int = 8):
         frames.append((path, times[k]))
     log = TemperatureLog(times, {"housing": temperatures})
     return follow_scene(camera(), log, frames)
+
+
+NONE_OF_POINT = {"x0": 0.0, "y0": 0.0}
+LACKING = {
+    "": (),
+    "thermal_lag": (ModelEffect("thermal_lag", {"tau": 7200.0}),),
+    "self_heating": (ModelEffect("self_heating", {"tau": 3600.0, "c": 1e-2, **NONE_OF_POINT}),),
+    "nonlinear_expansion": (ModelEffect("nonlinear_expansion", {"c": 5e-5, **NONE_OF_POINT}),),
+    "creep": (ModelEffect("creep", {"c": 2e-7, **NONE_OF_POINT}),),
+    "permanent_set": (ModelEffect("permanent_set", {"c": 4e-4, **NONE_OF_POINT}),),
+}
+"""Effects by up to 10 µm of c, 0.8 px in the corners of these frames; the lag of 7 µm."""
+
+
+def day(folder, seed: int, lacks: str = "") -> SceneCourse:
+    """Thirteen frames of a day from 10 to 35 °C and back, of a model that lacks an effect.
+
+    Rates, readings, light and the mount are as uncertain as the model and the scene say.
+    """
+    bank, known = Bank(seed), camera()
+    rng = bank.rng
+    rates = {n: r + rng.normal(0, SD_RATE) for n, r in known.model.rates.items()}
+    true = replace(known, model=replace(known.model, rates=rates, effects=LACKING[lacks]))
+    hours = np.arange(0, 12.01, 1 / 12)
+    T = 10 + 25 * np.sin(np.pi * hours / 12) ** 1.5
+    times = START + 3600 * hours
+    states = true.along(times, {"housing": T}, times[::12])
+    bank.cold = states[0]
+    frames = []
+    for k, time in enumerate(times[::12]):
+        path = folder / f"{seed}-{k}.png"
+        turn = rng.normal(0, 2e-4, 3) if k else np.zeros(3)
+        cv2.imwrite(str(path), bank.frame(states[k], turn, rng.uniform(0.8, 1.1)))
+        frames.append((path, time))
+    log = TemperatureLog(times, {"housing": T + rng.normal(0, 0.05, len(T))})
+    course = follow_scene(known, log, frames)
+    for path, _ in frames:
+        path.unlink()
+    return course
+
+
+@pytest.mark.slow
+def test_courses_of_other_effects_are_found_too(tmp_path):
+    """Of `python -m benchmarks.river`, whose hundred days say how often."""
+    assert not any(day(tmp_path, 700 + k).model_misses for k in range(5))
+    for lacks in ("self_heating", "permanent_set"):
+        assert sum(day(tmp_path, 710 + k, lacks).model_misses for k in range(4)) >= 3
+
+
+def test_a_camera_that_was_moved_is_said_with_the_frame(tmp_path):
+    bank, thermal = Bank(11), camera()
+    turned = np.array([3e-4, -4e-4, 0.0])
+    frames = []
+    warmth = np.array([20.0, 24.0, 28.0, 30.0, 32.0])
+    for k, T in enumerate(warmth):
+        path = tmp_path / f"{k}.png"
+        cv2.imwrite(str(path), bank.frame(thermal.at(T), turned if k > 2 else np.zeros(3)))
+        frames.append((path, START + 600.0 * k))
+    log = TemperatureLog(START + 600.0 * np.arange(5), {"housing": warmth})
+    course = follow_scene(thermal, log, frames)
+    ((row, turn, covariance),) = course.movements
+    assert row == 3
+    error = turn - turned
+    assert error @ np.linalg.solve(covariance, error) < 16  # of 3 degrees of freedom, one in 1000
+    assert "3.png: the camera was moved since the frame before: it turned by 0.02" in str(course)
+    assert course.as_dict()["movements"][0]["frame"] == "3.png"
 
 
 def test_a_model_that_lacks_an_effect_is_found_and_one_that_holds_is_not(tmp_path):

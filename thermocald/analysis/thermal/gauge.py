@@ -73,11 +73,13 @@ class _Finder(Protocol):
 class Pose:
     """A pose as it was resected: what later frames are compared with.
 
-    time s; predicted (10,), eop (6,) and its covariance (6, 6); seen: the control points then.
+    time s; predicted (10,) and unknown (10,), as of `PredictedCamera`; eop (6,) and its covariance
+    (6, 6); seen: the control points then.
     """
 
     time: float
     predicted: Array
+    unknown: Array
     temperature: float
     eop: ExteriorOrientation
     covariance: Array
@@ -157,7 +159,8 @@ class GaugeCalibrator:
                 known = self.predictor.at(one.epoch.frame_time)
                 if known is not None:
                     pose = Pose(
-                        one.epoch.frame_time, known.camera.values, known.camera.temperature,
+                        one.epoch.frame_time, known.camera.values, known.unknown,
+                        known.camera.temperature,
                         ExteriorOrientation.from_array(result.values[EOP]),
                         covariance[EOP, EOP], seen.select(keep),
                     )  # fmt: skip
@@ -233,7 +236,7 @@ class GaugeCalibrator:
         assert result.exterior is not None
         keep = seen.select(~np.isin(seen.targets, result.rejected))
         pose = Pose(
-            epoch.frame_time, camera.values, camera.temperature, result.exterior,
+            epoch.frame_time, camera.values, now.unknown, camera.temperature, result.exterior,
             result.covariance[EOP, EOP], keep,
         )  # fmt: skip
         if in_order:
@@ -305,7 +308,7 @@ class GaugeCalibrator:
         """Return how the camera moved between two poses, None where too few points are in both.
 
         Of the same points the errors of their coordinates cancel, and so does what the model is
-        off by at both times; image noise and the rates' error are left.
+        off by at both times; image noise, the rates' error and a past that fades are left.
         """
         both = np.intersect1d(then.seen.targets, now.seen.targets)
         if len(both) < _FEWEST:
@@ -321,7 +324,8 @@ class GaugeCalibrator:
         scale = np.sqrt(np.diag(N))
         inverse = np.linalg.pinv(N / np.outer(scale, scale), rcond=1e-12) / np.outer(scale, scale)
         gain = inverse @ (A[:, EOP] / noise[:, None]).T
-        drift = gain @ A[:, IOP] @ self._rates_root(now.temperature - then.temperature)
+        root = self._rates_root(now.temperature - then.temperature)
+        drift = gain @ A[:, IOP] @ np.column_stack([root, now.unknown - then.unknown])
         return Movement(now.time, gain @ moved, inverse + drift @ drift.T)
 
     def _rates_root(self, change_k: float) -> Array:

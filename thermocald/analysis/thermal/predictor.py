@@ -39,12 +39,14 @@ _REMEMBERED = 4000  # readings
 class PredictedCamera:
     """A camera as it is predicted: `camera`, with the covariance of model, thermometer and past.
 
-    age_s: of its last reading; unknown_px: what the unknown past adds, the largest sd in the image;
-    beyond: K outside the temperatures of the fit, `far` if nothing should be predicted there.
+    age_s: of its last reading; unknown (10,): what the unknown past adds, one standard deviation,
+    and unknown_px, the largest of it in the image; beyond: K outside the temperatures of the fit,
+    `far` if nothing should be predicted there.
     """
 
     camera: Camera
     age_s: float
+    unknown: Array
     unknown_px: float
     beyond: float
     far: bool
@@ -118,7 +120,7 @@ class Predictor:
             covariance = covariance + np.diag((rates * beyond) ** 2)
         model = self.thermal.model
         now = Camera(model.sensor, T, camera.values, covariance, beyond, model.camera)
-        return PredictedCamera(now, age, _largest_px(now, unknown), beyond, bool(far))
+        return PredictedCamera(now, age, unknown, _largest_px(now, unknown), beyond, bool(far))
 
     def _row(self, readings: Mapping[str, float]) -> dict[str, float] | None:
         """The reference and the channels that the model names; None where one was not read yet."""

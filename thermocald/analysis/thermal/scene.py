@@ -3,7 +3,8 @@
 Features of a reference frame are found again in every frame. Most of what a river shows moves by
 itself (water, leaves, shadows); what has a common movement is the camera's. Of it the thermal
 model's prediction is taken off; the rest is a turn of the mount about three axes and a change of
-the principal distance, which the model did not predict.
+the principal distance, which the model did not predict. A turn from one frame to the next is a
+camera that was moved; a principal distance with a course of its own, an effect that is missing.
 
 From one place a shift of the principal point cannot be told from a turn, nor a shift of the camera
 from either where depths are unknown: what is stated as a turn may be any of them. The principal
@@ -21,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
+from scipy.stats import f as f_distribution
 
 from thermocald.analysis.thermal.correction import require_inside
 from thermocald.errors import DataError, ImageError
@@ -52,6 +54,9 @@ _NEAR_PX = 0.6  # of a common movement: a draw's followers
 _TUKEY = 4.685
 _ROUNDS = 10
 _WORD_SIGMAS = 4.0
+_MISSED_ALPHA = 1e-3  # of a model that holds
+_MOVED_CHI2 = 30.7  # three degrees of freedom, one in a million
+_USUAL_THERMOMETER_SD = 0.05  # K, where no fit has found it
 _LOCKED_PX = 0.004  # of matching, as a function of the pixel's part moved: common to all features
 
 
@@ -169,9 +174,9 @@ def _consensus(A: Array, left: Array, rng: np.random.Generator) -> Array | None:
 class SceneCourse(Result):
     """What a series of frames shows beside a thermal model's prediction.
 
-    names (E); times (E,) s UTC; temperatures (E,) °C; values (E, 4) and sd (E, 4) as of
-    `SceneMovement`, NaN where a frame shows nothing; features (E,); locked (4,); pitch_rad: of a
-    pixel.
+    names (E); times (E,) s UTC; temperatures (E,) °C; values (E, 4) and covariance (E, 4, 4) as of
+    `SceneMovement`, NaN where a frame shows nothing; unsure (E, 4): sds of the prediction itself,
+    since the reference frame; features (E,); locked (4,); pitch_rad: of a pixel.
     """
 
     camera: str
@@ -179,11 +184,17 @@ class SceneCourse(Result):
     times: Array
     temperatures: Array
     values: Array
-    sd: Array
+    covariance: Array
+    unsure: Array
     features: NDArray[np.int64]
     reasons: tuple[str, ...]
     locked: Array
     pitch_rad: float
+
+    @cached_property
+    def sd(self) -> Array:
+        """(E, 4) of what is seen."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
     @cached_property
     def seen(self) -> NDArray[np.bool_]:
@@ -211,11 +222,53 @@ class SceneCourse(Result):
             slopes[k], sds[k] = x[1], np.hypot(np.sqrt(inverse[1, 1] * max(1.0, scatter)), ends)
         return slopes, sds
 
-    @property
+    @cached_property
     def model_misses(self) -> bool:
-        """Whether the principal distance changes with the temperature beside the prediction."""
+        """Whether the principal distance changes beside the prediction, more than that is sure to.
+
+        With the temperature, or with anything else that has a course: noise is what differs from
+        one frame to the next, if that is more than stated.
+        """
         slope, sd = (v[3] for v in self.per_kelvin)
-        return bool(abs(slope) > _WORD_SIGMAS * sd)
+        change = float(np.ptp(self.temperatures[self.seen])) if self.seen.any() else 0.0
+        own = float(np.nanmax(self.unsure[:, 3], initial=0.0)) / max(change, 1e-9)
+        if abs(slope) > _WORD_SIGMAS * np.hypot(sd, own):
+            return True
+        rows = np.flatnonzero(self.seen)
+        if len(rows) < 4:
+            return False
+        y, variance = self.values[rows, 3], self.covariance[rows, 3, 3]
+        steps = np.diff(y) ** 2 / (variance[1:] + variance[:-1])
+        noise = max(1.0, float(steps.mean()))
+        known = self.unsure[rows, 3] * np.sign(self.temperatures[rows] - self.temperatures[0])
+        covariance = noise * np.diag(variance) + np.outer(known, known)
+        covariance += noise * float(np.median(variance))  # of the reference frame, common to all
+        of_noise = 2.0 * len(rows) / 3.0 if noise > 1.0 else 1e6
+        bound = float(f_distribution.ppf(1.0 - _MISSED_ALPHA, len(rows), of_noise))
+        return bool(y @ np.linalg.solve(covariance, y) / len(rows) > bound)
+
+    @cached_property
+    def movements(self) -> list[tuple[int, Array, Array]]:
+        """Frames in which the camera was moved since the one before: turn (3,) rad, covariance.
+
+        The next frame must show it too, where there is one. A mount that follows the temperature
+        slowly is none.
+        """
+        rows = np.flatnonzero(self.seen)
+        values = np.vstack([np.zeros(3), self.values[rows, :3]])
+        spread = np.zeros((len(values), 3, 3))
+        spread[1:] = self.covariance[rows, :3, :3]
+        spread[1:, range(3), range(3)] += self.unsure[rows, :3] ** 2
+        found = []
+        for k in range(1, len(values)):
+            beyond = []
+            for after in range(k, min(k + 2, len(values))):
+                turn, C = values[after] - values[k - 1], spread[after] + spread[k - 1]
+                beyond.append(turn @ np.linalg.solve(C, turn) > _MOVED_CHI2)
+            if all(beyond):
+                turn, C = values[k] - values[k - 1], spread[k] + spread[k - 1]
+                found.append((int(rows[k - 1]), turn, C))
+        return found
 
     def as_dict(self) -> dict[str, Any]:
         slopes, sds = self.per_kelvin
@@ -236,6 +289,14 @@ class SceneCourse(Result):
             "per_kelvin": dict(zip(keys, slopes.tolist(), strict=True)),
             "sd_per_kelvin": dict(zip(keys, sds.tolist(), strict=True)),
             "model_misses_an_effect": self.model_misses,
+            "movements": [
+                {
+                    "frame": self.names[row], "time": float(self.times[row]),
+                    **dict(zip(keys[:3], turn.tolist(), strict=True)),
+                    **{f"sd_{k}": v**0.5 for k, v in zip(keys[:3], C.diagonal(), strict=True)},
+                }
+                for row, turn, C in self.movements
+            ],
         }  # fmt: skip
 
     def lines(self) -> list[str]:
@@ -254,6 +315,12 @@ class SceneCourse(Result):
             )
         else:
             out.append("the temperature hardly changed: the model cannot be checked")
+        for row, turn, C in self.movements:
+            angle, sd = (float(np.degrees(np.linalg.norm(v))) for v in (turn, C.diagonal() ** 0.5))
+            out.append(
+                f"{self.names[row]}: the camera was moved since the frame before: it turned by "
+                f"{angle:.4f} ± {sd:.4f}°; a shift looks alike"
+            )
         reasons = [why for why in self.reasons if why]
         out += [f"{reasons.count(why)} × {why}" for why in sorted(set(reasons))]
         return out
@@ -290,9 +357,13 @@ def follow_scene(
     reference = decode_grey(frames[0][0])
     thermal = thermal.for_images(reference.shape[1], reference.shape[0])
     along = thermal.along(log.times, dict(log.channels), times, extrapolate)
+    noise = thermal.thermometer_sd or _USUAL_THERMOMETER_SD
+    since = thermal.along(
+        log.times, dict(log.channels), times, extrapolate, float(along.temperatures[0]), noise
+    ).sd
     tracker = SceneTracker(reference)
     E = len(frames)
-    values, sd = np.full((E, 4), np.nan), np.full((E, 4), np.nan)
+    values, covariance = np.full((E, 4), np.nan), np.full((E, 4, 4), np.nan)
     locked = np.zeros(4)
     features, reasons = np.zeros(E, dtype=np.int64), [""] * E
     for k, (path, _) in enumerate(frames):
@@ -314,13 +385,15 @@ def follow_scene(
             reasons[k] = str(error)
             found = None
         if found is not None:
-            values[k], sd[k] = found.values, np.sqrt(np.diag(found.covariance))
+            values[k], covariance[k] = found.values, found.covariance
             features[k], locked = found.features, found.locked
         advance(1)
     interior = InteriorOrientation.from_array(along.values[0])
+    unsure = since[:, [2, 1, 0, 0]] / [interior.c, interior.c, np.inf, 1.0]
     return SceneCourse(
         thermal.model.camera, tuple(path.name for path, _ in frames), times, along.temperatures,
-        values, sd, features, tuple(reasons), locked, thermal.model.sensor.pixel_pitch / interior.c,
+        values, covariance, unsure, features, tuple(reasons), locked,
+        thermal.model.sensor.pixel_pitch / interior.c,
     )  # fmt: skip
 
 

@@ -1,0 +1,82 @@
+"""Rendered rivers: the water line's error over its sd, and the check of a model by the scene.
+
+Run: python -m benchmarks.river [--scenes 56] [--days 100] [--first 100] [--check]
+Bounds: error/sd 0.9 to 1.1 pooled, with control points in the frame and in the first frame alone,
+where no movement was flagged; what temperature does at least 10 times smaller with the model; every
+knock and no other scene is a movement; at most 2 % false alarms. --days: of a model that holds, and
+as many of models that lack an effect.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+
+from tests.analysis.river_scenes import KINDS, Outcome, play
+from tests.analysis.test_scene import LACKING, day
+
+
+def rms(values: list[float]) -> float:
+    found = np.array(values)[np.isfinite(values)]
+    return float(np.sqrt(np.mean(found**2))) if found.size else float("nan")
+
+
+def water_lines(count: int, first: int, folder: Path) -> bool:
+    scenes = [play(first + k, KINDS[k % len(KINDS)], folder) for k in range(count)]
+    columns = (
+        "scene", "n", "statuses of the last frame", "error/sd, posed", "error/sd, first pose",
+        "drift before mm", "after mm", "moved", "flagged",
+    )  # fmt: skip
+    print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|")
+
+    def row(name: str, mine: list[Outcome]) -> tuple[float, float, float]:
+        posed = rms([(s.chi2 / 6) ** 0.5 for s in mine])
+        still = rms([(s.chi2_first / 6) ** 0.5 for s in mine if not s.flagged])
+        before, after = rms([s.before for s in mine]), rms([s.after for s in mine])
+        last = [s.statuses[-1] for s in mine]
+        words = ", ".join(f"{last.count(w)} {w}" for w in sorted(set(last)))
+        moved, flagged = (sum(getattr(s, n) for s in mine) for n in ("moved", "flagged"))
+        figures = f"{posed:.2f} | {still:.2f} | {before:.1f} | {after:.2f} | {moved} | {flagged}"
+        print(f"| {name} | {len(mine)} | {words} | {figures} |", flush=True)
+        return posed, still, before / after
+
+    for kind in KINDS:
+        row(kind, [s for s in scenes if s.kind == kind])
+    posed, still, ratio = row("all", scenes)
+    right = all(s.moved == (s.kind == "knocked") for s in scenes)
+    return 0.9 <= posed <= 1.1 and 0.9 <= still <= 1.1 and ratio >= 10 and right
+
+
+def checks(count: int, first: int, folder: Path) -> bool:
+    print("\n| the model lacks | days | found |\n|---|---|---|")
+    found = {}
+    for i, lacks in enumerate(LACKING):
+        days = count if not lacks else count // (len(LACKING) - 1)
+        seeds = range(first + 1000 * i, first + 1000 * i + days)
+        found[lacks] = sum(day(folder, seed, lacks).model_misses for seed in seeds)
+        print(f"| {lacks or 'nothing'} | {days} | {found[lacks]} |", flush=True)
+    return found[""] <= max(1, 0.02 * count)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--scenes", type=int, default=56)
+    parser.add_argument("--days", type=int, default=100)
+    parser.add_argument("--first", type=int, default=100)
+    parser.add_argument("--check", action="store_true")
+    a = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        passed = water_lines(a.scenes, a.first, Path(folder))
+        passed &= checks(a.days, a.first, Path(folder))
+    return 0 if passed or not a.check else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 from typing import get_args
@@ -204,3 +205,50 @@ def test_the_comments_of_config_yaml_name_drivers_that_exist():
             assert words <= set(driver_names(kind.removesuffix("s")))
             seen += len(words)
     assert seen >= 8
+
+
+PLACES = {
+    "the store": ("./t.db", "is the store"),
+    "its -wal file": ("./t.db-wal", "is the store"),
+    "its -shm file": ("./t.db-shm", "is the store"),
+    "a link to the store": ("./link", "is the store"),
+    "a hard link to the store": ("./hard", "is the store"),
+    "a way round to the store": ("./a/../t.db", "is the store"),
+    "the configuration": ("./config.yaml", "is the configuration"),
+    "another output's": ("./one.jsonl", "is what one writes"),
+    "another output's through a link": ("./alias", "is what one writes"),
+}
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_outputs_do_not_write_into_what_is_not_theirs(tmp_path, place):
+    """Lines of JSON in a store, or among those of another output."""
+    (tmp_path / "t.db").write_bytes(b"store")
+    (tmp_path / "link").symlink_to("t.db")
+    (tmp_path / "alias").symlink_to("one.jsonl")
+    os.link(tmp_path / "t.db", tmp_path / "hard")
+    (tmp_path / "a").mkdir()
+    path, expected = PLACES[place]
+    document = {
+        "store": {"path": "t.db"},
+        "thermometers": [{"name": "housing", "driver": "mock"}],
+        "outputs": [{"name": "one", "driver": "jsonl", "path": "./one.jsonl"},
+                    {"name": "two", "driver": "jsonl", "path": path}],
+    }  # fmt: skip
+    with pytest.raises(ConfigurationError, match=expected) as caught:
+        parse_config(document, tmp_path / "config.yaml")
+    assert "outputs[1].path" in str(caught.value)
+    document["outputs"][1]["path"] = "./two.jsonl"
+    parse_config(document, tmp_path / "config.yaml")
+    document["frames"] = {"folder": "./t.db"}
+    with pytest.raises(ConfigurationError, match=r"frames\.folder: is the store"):
+        parse_config(document, tmp_path / "config.yaml")
+
+
+def test_two_outputs_may_write_to_one_device(tmp_path):
+    document = {
+        "store": {"path": "t.db"},
+        "thermometers": [{"name": "housing", "driver": "mock"}],
+        "outputs": [{"name": n, "driver": "jsonl", "path": "/dev/null"} for n in ("one", "two")],
+    }
+    assert len(parse_config(document, tmp_path / "config.yaml").outputs) == 2

@@ -447,7 +447,45 @@ def parse_config(
             file = getattr(camera, key)
             if file is not None and not file.is_file():
                 raise ConfigurationError(f"{path}: cameras[{i}].{key}: there is no file {file}")
+    _check_places(config, path)
     return config
+
+
+def _check_places(config: Config, path: Path) -> None:
+    """Refuse outputs that write into one another, into the store, or into the configuration."""
+    store = config.store.path
+    taken = {
+        "the store": [store, *(store.with_name(f"{store.name}-{x}") for x in ("wal", "shm"))],
+        "the configuration": [path],
+    }
+    for i, output in enumerate(config.outputs):
+        place = output.options.get("path")
+        if not isinstance(place, str) or "\0" in place or _is_device(Path(place)):
+            continue
+        for what, files in taken.items():
+            if any(_same_file(Path(place), file) for file in files):
+                raise ConfigurationError(
+                    f"{path}: outputs[{i}].path: {place}: is {what}; choose another file"
+                )
+        taken[f"what {output.name} writes"] = [Path(place)]
+    for what, files in taken.items():
+        if any(_same_file(config.frames.folder, file) for file in files):
+            raise ConfigurationError(f"{path}: frames.folder: is {what}; choose another folder")
+    if _same_file(store, path):
+        raise ConfigurationError(f"{path}: store.path: is the configuration; choose another file")
+
+
+def _is_device(path: Path) -> bool:
+    """Whether several may write to a path."""
+    return path.exists() and not path.is_file()
+
+
+def _same_file(one: Path, other: Path) -> bool:
+    """Whether two paths lead to one file, by links of either kind, there or not."""
+    try:
+        return one.samefile(other)
+    except OSError:
+        return one.resolve() == other.resolve()
 
 
 def _devices(config: Config) -> Iterator[tuple[str, str, DeviceConfig]]:

@@ -32,7 +32,11 @@ _ADVICE = {
     errno.EDQUOT: "; free some space",
     errno.ENOENT: "; its folder does not exist",
     errno.EISDIR: "; give the name of a file in it",
+    errno.EEXIST: "; choose another name",
 }
+_DATABASE = b"SQLite format 3\0"
+_WAL_MAGIC = (b"\x37\x7f\x06\x82", b"\x37\x7f\x06\x83")
+_RECORDED = {"epochs.csv", "observations.csv", "observations.parquet", "readings.csv"}
 
 _LONGEST_NAME = 60
 
@@ -49,7 +53,8 @@ def output_place(path: Path) -> tuple[Path, bool]:
     """Where an output goes: (the file that links lead to, whether it is written straight).
 
     Straight is what must stay what it is: a device, a pipe, a descriptor of this process. Raises
-    OSError for a folder and for a file that may not be written.
+    OSError for a folder, for a file that may not be written, and for what was measured: `-o` where
+    `--store` was meant must not cost a store.
     """
     try:
         found = path.stat()
@@ -64,7 +69,21 @@ def output_place(path: Path) -> tuple[Path, bool]:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     if not stat.S_ISREG(found.st_mode) or place.is_relative_to("/proc"):
         return path, True
+    if what := is_measured(place):
+        raise FileExistsError(errno.EEXIST, f"it is {what}")
     return place, False
+
+
+def is_measured(path: Path) -> str:
+    """Say what of the measurements a file is that nothing else may be written to, "" if none."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(len(_DATABASE))
+    except OSError:
+        return ""
+    if head == _DATABASE:
+        return "a store (an SQLite database)"
+    return "what was written last to a store" if head.startswith(_WAL_MAGIC) else ""
 
 
 @contextmanager
@@ -113,6 +132,9 @@ def write_text(path: Path, text: str) -> None:
 
 def write_parts(path: Path, parts: Iterable[str]) -> None:
     """Write a text file that comes in parts, whole or not at all; raises OutputError."""
+    place = Path(os.path.realpath(path))
+    if place.name in _RECORDED and place.exists() and (place.parent / "recording.yaml").exists():
+        raise cannot_write(path, FileExistsError(errno.EEXIST, "it is part of a recording"))
     with new_file(path) as partial, partial.open("w", encoding="utf-8") as file:
         file.writelines(parts)
 

@@ -60,9 +60,7 @@ def typeset_powers(text: str) -> str:
     """Return a text in which what a computer prints, (-1.2 ± 0.1)e-06 mm-1, reads as in a book:
     (−1.2 ± 0.1)·10⁻⁶ mm⁻¹.
     """
-    text = _COMPUTED.sub(
-        lambda m: f"{m[1].replace('-', _MINUS)}·10{superscript(int(m[2]))}", text
-    )
+    text = _COMPUTED.sub(lambda m: f"{m[1].replace('-', _MINUS)}·10{superscript(int(m[2]))}", text)
     return _UNIT_POWER.sub(lambda m: f"mm{m[1].translate(_SUPERSCRIPT)}", text)
 
 

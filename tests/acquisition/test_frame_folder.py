@@ -116,3 +116,27 @@ def test_a_frame_of_1970_has_no_age(folder_of):
     path = folder.root / folder.keep("cam", "M1", 1, frame())
     os.utime(path, (3600.0, 3600.0))
     assert folder.enforce(time.time()) == []
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "holiday.jpg", "IMG_0001.jpg", "0000001.jpg", "cam/0000001.png", "cam/M1/0000001.jpg",
+        "cam/M1/0000/IMG_0000001.jpg", "cam/M1/0000/scan.png", "cam/M1/0000/notes.partial",
+        "cam/M1/00/0000001.jpg", "DCIM/100CANON/0000/thumb.jpg", "cam/M1/0000/123.jpg",
+    ],
+)  # fmt: skip
+def test_photographs_of_somebody_else_are_never_deleted(folder_of, name):
+    """A folder of frames that a person chose among her own photographs."""
+    folder = folder_of(max_age_days=1, max_size_gb=1e-9)
+    path = folder.root / name
+    path.parent.mkdir(parents=True)
+    path.write_bytes(b"\xff\xd8" + bytes(998))
+    os.utime(path, (1.7e9 + 1,) * 2)
+    ours = folder.root / folder.keep("cam", "M1", 7, frame(b"\xff\xd8" + bytes(998)))
+    cut_off = ours.with_name("0000008.jpg.partial")
+    cut_off.write_bytes(bytes(9))
+    assert sum(d.frames for d in folder.enforce(time.time())) == 2
+    assert path.exists()
+    assert not ours.exists()
+    assert not cut_off.exists()

@@ -36,6 +36,7 @@ from thermocald.physics.scene import Scene
 from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import open_recording
 from thermocald.store.recording.testfield_file import read_testfield
+from thermocald.store.series import Event
 
 _OVERRIDE_PERMISSIONS = 1 << 1  # CAP_DAC_OVERRIDE
 
@@ -432,3 +433,41 @@ def test_standard_output_on_a_full_disk_is_one_sentence(world):
     assert done.returncode == 3
     assert "Traceback" not in done.stderr
     assert "No space left" in done.stderr
+
+
+MEASURED = {
+    "a store": "t.db",
+    "a store through a link": "link",
+    "a store under another name": "hard.csv",
+    "a store's -wal": "t.db-wal",
+    "observations of a recording": "M/observations.csv",
+    "epochs of a recording": "M/epochs.csv",
+    "epochs through a link": "epochs-link",
+}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=() if name in QUICK_FILES else pytest.mark.slow) for name in FILES],
+)
+def test_what_was_measured_is_never_written_over(world, monkeypatch, capsys, tmp_path, name):
+    """`-o thermocald.db` in place of `--store`: a month of epochs for a table."""
+    with Store.open(tmp_path / "t.db", "append") as store:
+        store.add_event(Event(1.0, "started", "kept"))
+        for part in ("", "-wal"):
+            shutil.copy(tmp_path / f"t.db{part}", tmp_path / f"kept.db{part}")
+    for part in ("", "-wal"):  # as a writer leaves them that is killed
+        shutil.move(tmp_path / f"kept.db{part}", tmp_path / f"t.db{part}")
+    os.link(tmp_path / "t.db", tmp_path / "hard.csv")
+    (tmp_path / "link").symlink_to("t.db")
+    shutil.copytree(world["M1"], tmp_path / "M")
+    (tmp_path / "epochs-link").symlink_to("M/epochs.csv")
+    for what, place in MEASURED.items():
+        before = (tmp_path / place).read_bytes()
+        code, said = written_to(world, monkeypatch, capsys, name, tmp_path / place)
+        assert code == 2, what
+        assert "cannot be written: it is" in said
+        assert "choose another name" in said
+        assert (tmp_path / place).read_bytes() == before, what
+    with Store.open(tmp_path / "t.db") as store:
+        assert [event.text for event in store.events()] == ["kept"]

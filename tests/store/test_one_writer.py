@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
+import socket
+import stat
 import subprocess
 import sys
 
@@ -146,3 +149,40 @@ def test_a_copy_is_a_store_of_its_own(daemon, path, tmp_path, recording):
     assert call("replay", recording, "--store", tmp_path / "copy.db").returncode == 0
     with Store.open(tmp_path / "copy.db") as store:
         assert len(store.all_series()) == 2
+
+
+@pytest.mark.parametrize("kind", ["null", "full", "pipe", "socket", "link to null"])
+@pytest.mark.parametrize("command", ["replay", "run"])
+def test_a_device_is_no_store_and_stays(tmp_path, recording, kind, command):
+    """Found by hand: as root the node of the null device was removed, being an empty file."""
+    place = node = tmp_path / "node"
+    if kind == "pipe":
+        os.mkfifo(node)
+    elif kind == "socket":
+        with contextlib.closing(socket.socket(socket.AF_UNIX)) as server:
+            server.bind(str(node))
+    else:
+        try:
+            os.mknod(node, 0o666 | stat.S_IFCHR, os.makedev(1, 7 if kind == "full" else 3))
+        except PermissionError:
+            pytest.skip("no device can be made here")
+        if kind.startswith("link"):
+            place = tmp_path / "link"
+            place.symlink_to(node)
+    before = node.lstat().st_ino, node.lstat().st_mode
+    words = ["replay", recording] if command == "replay" else ["run", "--recording", recording]
+    done = call(*words, "--store", place)
+    assert done.returncode in (1, 2)
+    assert "is a device or a pipe; a store is a file of its own" in done.stderr
+    assert (node.lstat().st_ino, node.lstat().st_mode) == before
+    assert {p.name for p in tmp_path.iterdir()} <= {"node", "link", "node.live", "link.live"}
+
+
+def test_an_empty_file_that_was_there_stays_where_no_store_can_be_made(tmp_path):
+    """Its owner and its mode may have been chosen by whoever made it."""
+    path = tmp_path / "t.db"
+    path.touch()
+    (tmp_path / "t.db-wal").mkdir()  # no store can be opened beside it
+    with pytest.raises(StoreError):
+        StoreGuard(path)
+    assert path.exists()

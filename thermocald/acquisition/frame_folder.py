@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import re
 import shutil
 import time
 from dataclasses import dataclass
@@ -29,6 +30,8 @@ _DAY_S = 86400.0
 _NOT_BEFORE = 1_700_000_000.0
 _GB = 1e9
 _PER_FOLDER = 1000
+_NUMBER = re.compile(r"\d{4,}")
+_OURS = re.compile(r"\d{7,}(-corrected)?\.(jpg|png)(\.partial)?")
 _FAST_PNG = 1  # of 9: what takes longer makes it hardly smaller
 
 
@@ -177,8 +180,8 @@ class FrameFolder:
         """(time of change s, bytes, path) of all frames, and of pieces left by a crash."""
         for folder, _, names in os.walk(self.root):
             for name in names:
-                if not name.endswith((".jpg", ".png", ".partial")):
-                    continue
+                if not _OURS.fullmatch(name) or not _NUMBER.fullmatch(os.path.basename(folder)):
+                    continue  # photographs of somebody else are not ours to delete
                 path = os.path.join(folder, name)
                 with contextlib.suppress(OSError):
                     found = os.stat(path)

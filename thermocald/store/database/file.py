@@ -61,6 +61,9 @@ class StoreFile:
         found = _identity(path)
         if found in _CLAIMED:
             raise _taken(path)
+        self._made = found is None
+        if found is not None and not path.is_dir() and not _is_ordinary(path):
+            raise StoreError(f"{path}: is a device or a pipe; a store is a file of its own")
         try:
             self._handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         except OSError as error:
@@ -81,8 +84,9 @@ class StoreFile:
         os.close(self._handle)
 
     def discard_empty(self) -> None:
-        """Remove a file that was only made to be locked."""
-        if os.fstat(self._handle).st_size == 0 and _identity(self.path) == self.identity:
+        """Remove a file that was only made to be locked; one that was there before stays."""
+        empty = os.fstat(self._handle).st_size == 0
+        if self._made and empty and _identity(self.path) == self.identity:
             self.path.unlink(missing_ok=True)
 
     @property
@@ -152,6 +156,11 @@ def written_elsewhere(path: Path) -> bool:
         "FLOCK" in line and line.split()[-3].rsplit(":", 1)[-1] == str(found.st_ino)
         for line in locks.splitlines()
     )
+
+
+def _is_ordinary(path: Path) -> bool:
+    """Whether a path leads to a file on a disk: no device, no pipe, nothing of the kernel's."""
+    return path.is_file() and path.resolve().parts[:2] not in (("/", "proc"), ("/", "sys"))
 
 
 def _taken(path: Path) -> StoreError:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 
 import cv2
@@ -106,9 +107,7 @@ class River:
 
     def interior(self, k: int) -> dict[str, float]:
         """What the camera is like at a moment."""
-        return {
-            n: CAMERA[n] + self.off[n] + self.rate[n] * (self.inside[k] - 20.0) for n in NAMES
-        }
+        return {n: CAMERA[n] + self.off[n] + self.rate[n] * (self.inside[k] - 20.0) for n in NAMES}
 
     def image(self, points: np.ndarray, k: int) -> np.ndarray:
         """Where the camera sees points at a moment, px of the small frame."""
@@ -310,3 +309,63 @@ def _files(folder: Path, river: River, shots) -> list[tuple[Path, float]]:
         cv2.imwrite(str(path), image)
         out.append((path, float(river.moments[k])))
     return out
+
+
+GRID_M = np.array([192_000.0, 313_000.0, 138.0])  # where the example's coordinates count from
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "river"
+_MORNING = 1_714_975_200.0  # 6 May 2024, 06:00 UTC
+_SHOTS = (120, 150, 180, 210, 240, 270)  # moments of the example's photographs
+_KNOCKED = 4  # from this photograph on the mount stands otherwise
+
+
+def write_example(folder: Path = EXAMPLE) -> River:
+    """Write the tutorial's gauge: photographs, control points, a logger's file, a model."""
+    river = River(7, "day")
+    river.level = 120.0
+    river.moments = river.moments - START + _MORNING
+    thermal = thermal_camera(TAU).for_images(WIDTH, HEIGHT)
+    photographs = folder / "photographs"
+    photographs.mkdir(parents=True, exist_ok=True)
+    thermal.save(folder / "camera.thermal.yaml")
+    names = []
+    for i, k in enumerate(_SHOTS):
+        if i == _KNOCKED:
+            turn = np.deg2rad([0.03, -0.02, 0.0])
+            river.pose = river.pose + np.concatenate([turn, np.zeros(3)])
+        moment = datetime.fromtimestamp(float(river.moments[k]), UTC)
+        names.append(f"{moment:%Y%m%d-%H%M%S}.jpg")
+        image = river.frame(k, river.rng.uniform(0.9, 1.05), clear=True)
+        cv2.imwrite(str(photographs / names[-1]), image, [cv2.IMWRITE_JPEG_QUALITY, 80])
+    river.pose = POSE.copy()
+    clicks = np.round(river.image(river.boards, _SHOTS[0]))
+    rows = [
+        [name, *(f"{v:.4f}" for v in at / 1000 + GRID_M), *[SURVEY_MM / 1000] * 3, *uv, 1, 1]
+        for name, at, uv in zip(river.field.names, river.field.points, clicks, strict=True)
+    ]
+    _write(folder / "gcp.csv", "target,X,Y,Z,sX,sY,sZ,x,y,sx,sy", rows)
+    readings = zip(river.moments.tolist(), river.shown.tolist(), strict=True)
+    _write(
+        folder / "logger.csv", "time,temperature", [[f"{t:.0f}", f"{T:.2f}"] for t, T in readings]
+    )
+    section = 1e-3 * np.array([[-6e3, 0, 0], [-_BANK, 0, 0], [_BANK, 0, 0], [6e3, 0, 0]])
+    section[:, 1] = 12.0
+    section[:, 2] = river.ground(1000 * section[:, 0]) / 1000
+    points = [", ".join(f"{v:.3f}" for v in at) for at in section + GRID_M]
+    (folder / "section.yaml").write_text(f"profile: [[{'], ['.join(points)}]]\nsd: 0.005\n")
+    x = _BANK + river.level / _SLOPE
+    touched = np.array([[-x, 12_000.0, river.level], [x, 12_000.0, river.level]])
+    seen = []
+    for i in (0, 3):
+        uv = river.image(touched, _SHOTS[i]) + river.rng.normal(0, 0.3, (2, 2))
+        seen += [[f"{river.moments[_SHOTS[i]]:.0f}", side, *(f"{v:.1f}" for v in at), 0.3, 0.3]
+                 for side, at in zip(("left", "right"), uv, strict=True)]  # fmt: skip
+    _write(folder / "waterline.csv", "time,name,x,y,sx,sy", seen)
+    return river
+
+
+def _write(path: Path, head: str, rows: list[list[object]]) -> None:
+    path.write_text("\n".join([head, *(",".join(map(str, row)) for row in rows)]) + "\n")
+
+
+if __name__ == "__main__":
+    write_example()

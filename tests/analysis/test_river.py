@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
-from tests.analysis.river_scenes import KINDS, play
+from tests.analysis.river_scenes import EXAMPLE, KINDS, play, write_example
 
 
 @pytest.mark.slow
@@ -25,3 +26,16 @@ def test_the_water_line_has_true_sds_and_what_is_not_sure_is_flagged(tmp_path):
     assert {s.kind for s in scenes if s.flagged} == {"knocked", "night"}
     assert all(s.flagged for s in scenes if s.kind in ("knocked", "night"))
     assert all(s.statuses[1:] == ("last_pose",) * 2 for s in scenes if s.kind == "night")
+
+
+@pytest.mark.slow
+def test_the_example_is_what_its_writer_writes(tmp_path):
+    """Texts to the letter; photographs but for what another JPEG encoder makes of them."""
+    write_example(tmp_path)
+    for path in sorted(p for p in tmp_path.rglob("*") if p.is_file()):
+        shipped = EXAMPLE / path.relative_to(tmp_path)
+        if path.suffix == ".jpg":
+            a, b = (cv2.imread(str(p), cv2.IMREAD_GRAYSCALE).astype(float) for p in (path, shipped))
+            assert np.abs(a - b).mean() < 2.0
+        else:
+            assert path.read_text() == shipped.read_text(), path.name

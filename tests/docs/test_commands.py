@@ -113,7 +113,7 @@ UNTIL = {
 STAYS = {"thermocald run --config config.yaml"}
 """Of these, what runs on while the rest of the page is done."""
 
-SHOWN = {"docs/tutorial/raspberry-pi.md"}
+SHOWN = {"docs/tutorial/raspberry-pi.md", "docs/tutorial/river.md"}
 """Pages whose `text` blocks are what the command before them says of this world."""
 
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
@@ -262,7 +262,7 @@ def runnable(page: Path) -> bool:
     )
 
 
-QUICK = {"docs/reference/store.md"}
+QUICK = {"docs/reference/store.md", "docs/tutorial/river.md"}
 
 
 @pytest.mark.timeout(1500)  # a tutorial is several series and their analysis

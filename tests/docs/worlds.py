@@ -231,6 +231,9 @@ WORLDS: dict[str, World] = {
     "docs/reference/store.md": store,
     "docs/tutorial/phone.md": tutorial_phone,
     "docs/tutorial/raspberry-pi.md": tutorial_rpi,
+    "docs/tutorial/river.md": lambda _, f: shutil.copytree(
+        ROOT / "examples/river", f, dirs_exist_ok=True
+    ),
 }
 """By page: what is put into its folder."""
 

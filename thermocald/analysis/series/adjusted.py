@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +25,7 @@ from thermocald.photogrammetry.series.blocks import (
 )
 from thermocald.photogrammetry.series.long_series import adjust_long_series, together_at_most
 from thermocald.photogrammetry.series.mount import drift_period
-from thermocald.photogrammetry.series.spool import Words, released
+from thermocald.photogrammetry.series.spool import released
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -63,8 +64,7 @@ def table_of_series(
     """
     ok = apart.ok
     if start is None and not ok.any():
-        counts = Words.of(apart.reasons).counts()
-        counts.pop("", None)
+        counts = Counter(reason for reason in apart.reasons if reason)
         why = max(counts, key=lambda reason: counts[reason], default="-")
         raise DataError(f"{head.name}: no epoch has a result; most often: {why}")
     if start is None:
@@ -169,7 +169,7 @@ def _table(
 ) -> Epochs:  # fmt: skip
     """The table of adjusted epochs (`rows`), of the series as a whole, and of epochs in full."""
     rejected = _count(rows.rejected)
-    status, reasons = _said(rows.status, rows.reasons, apart)
+    status, reasons = _said(rows, apart)
     return replace(
         apart,
         values=rows.values,
@@ -195,18 +195,17 @@ def _count(targets: NDArray[Any]) -> NDArray[np.int64]:
     return count
 
 
-def _said(status: Sequence[str], reasons: Sequence[str], apart: Epochs) -> tuple[Words, Words]:
+def _said(
+    rows: SeriesAdjustment | RowWriter, apart: Epochs
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Words and sentences of the epochs; what the epoch itself said of a frame without a result
     says more than "no observations".
     """
-    words, sentences = Words.of(status), Words.of(reasons)
-    rows = np.flatnonzero(words.are("no_observations") & ~apart.ok)
-    if not len(rows):
-        return words, sentences
-    new_words, new_sentences = list(words), list(sentences)
-    for row in rows.tolist():
-        new_words[row], new_sentences[row] = apart.status[row], apart.reasons[row]
-    return Words.of(new_words), Words.of(new_sentences)
+    status, reasons = list(rows.status), list(rows.reasons)
+    for row in np.flatnonzero(~rows.ok & ~apart.ok).tolist():
+        if status[row] == "no_observations":
+            status[row], reasons[row] = apart.status[row], apart.reasons[row]
+    return tuple(status), tuple(reasons)
 
 
 def _groups(testfield: TestField, result: SeriesAdjustment) -> dict[str, NDArray[np.int64]]:

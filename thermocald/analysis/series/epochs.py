@@ -7,6 +7,7 @@ adjusted together from their observations (`adjusted`).
 from __future__ import annotations
 
 import re
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import isfinite
@@ -20,7 +21,7 @@ from thermocald.errors import DataError, DriverMissing
 from thermocald.figures import BAND
 from thermocald.files import write_parts
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
-from thermocald.photogrammetry.series.spool import Words, released
+from thermocald.photogrammetry.series.spool import released
 from thermocald.physics.effect import PARAMETER_UNITS
 from thermocald.result import Result, jsonable, new_figure
 from thermocald.store.recording.reader import interpolate_readings
@@ -212,10 +213,10 @@ class Epochs(Result):
             released(self.values)
             released(self.sd)
 
-    @property
+    @cached_property
     def ok(self) -> NDArray[np.bool_]:
         """(E,): epochs with a result."""
-        return Words.of(self.status).are("ok")
+        return np.fromiter((word == "ok" for word in self.status), bool, len(self.status))
 
     @property
     def time(self) -> NDArray[np.datetime64]:
@@ -346,8 +347,8 @@ class Epochs(Result):
 
         Reasons that differ in their numbers only are one, in the words of its commonest.
         """
-        counts = Words.of(self.reasons).counts()
-        counts.pop("", None)
+        counts = Counter(self.reasons)
+        del counts[""]
         alike: dict[str, tuple[str, int]] = {}
         for reason, count in sorted(counts.items(), key=lambda entry: -entry[1]):
             kind = re.sub(r"[\d.]+", "#", reason.partition(";")[0])

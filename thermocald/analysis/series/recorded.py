@@ -13,7 +13,6 @@ from thermocald.analysis.series.epochs import Epochs, calibrate_epochs, frame_te
 from thermocald.errors import DataError
 from thermocald.photogrammetry.series.long_series import together_at_most
 from thermocald.photogrammetry.series.result import SeriesSettings
-from thermocald.photogrammetry.series.spool import Words
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -94,7 +93,7 @@ def _not_calibrated(recording: Recording) -> Epochs:
     temperature = np.full(E, np.nan) if channel is None else columns.at_frame(channel)
     return Epochs(
         columns.numbers, columns.frame_time, temperature, nothing, nothing, nothing[:, 0],
-        none, none, Words.repeated("ok", E), Words.repeated("", E),
+        none, none, ("ok",) * E, ("",) * E,
         "per_epoch",
     )  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from itertools import islice
 from typing import TYPE_CHECKING
@@ -15,7 +16,7 @@ from thermocald.analysis.series.epochs import Epochs
 from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.series.result import SeriesSettings
-from thermocald.photogrammetry.series.spool import ColumnSpool, Words
+from thermocald.photogrammetry.series.spool import ColumnSpool
 from thermocald.store.database.store import Store
 from thermocald.store.series import EpochResult
 from thermocald.store.stored_recording import StoredRecording
@@ -116,8 +117,8 @@ def table_of_stored(
         np.where(ok, columns["sigma0"], np.nan),
         columns["n_observations"].astype(np.int64),
         columns["n_rejected"].astype(np.int64),
-        Words.of(columns["status"].tolist()),
-        Words.of(reasons),
+        tuple(map(sys.intern, columns["status"].tolist())),
+        tuple(reasons),
         "per_epoch",
         head=series.head,
     )

@@ -8,6 +8,7 @@ its covariance matrices.
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,7 +17,7 @@ from thermocald.analysis.statistics.significance import correlations_of
 from thermocald.analysis.study.measured import Clip, MeasuredSeries, Thermometer
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
-from thermocald.photogrammetry.series.spool import ColumnSpool, Words, released
+from thermocald.photogrammetry.series.spool import ColumnSpool, released
 from thermocald.store.recording.readings import interpolate_readings
 from thermocald.thermal.thermometer import estimate_reading_noise
 
@@ -194,9 +195,9 @@ def _thermometers(
 
 def _assessed(status: Sequence[str]) -> tuple[NDArray[np.bool_], dict[str, int]]:
     """Which epochs have a result, and how many have none for which reason."""
-    words = Words.of(status)
-    lost = sorted((word, n) for word, n in words.counts().items() if word != "ok")
-    return words.are("ok"), {word.replace("_", " "): n for word, n in lost}
+    ok = np.fromiter((word == "ok" for word in status), bool, len(status))
+    lost = sorted((word, n) for word, n in Counter(status).items() if word != "ok")
+    return ok, {word.replace("_", " "): n for word, n in lost}
 
 
 def _whole(

@@ -14,6 +14,7 @@ Source: Helmert blocking, Wolf, H. (1978): The Helmert block method.
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -33,11 +34,11 @@ from thermocald.photogrammetry.series.known import (
     level_of,
 )
 from thermocald.photogrammetry.series.normals import ObservationGrid, normal_matrices
-from thermocald.photogrammetry.series.spool import ColumnSpool, Words, give_back
+from thermocald.photogrammetry.series.spool import ColumnSpool, give_back
 from thermocald.photogrammetry.series.target_noise import slow_errors
 
 if TYPE_CHECKING:
-    from thermocald.arrays import Array, Index, Mask
+    from thermocald.arrays import Array, Index
     from thermocald.photogrammetry.camera.camera_model import (
         ExteriorOrientation,
         InteriorOrientation,
@@ -116,9 +117,6 @@ def adjusted_block(blocks: Blocks, block: tuple[int, ObservationGrid]) -> Block:
     return blocks.adjusted(*block)
 
 
-_MOST_SENTENCES = 60_000
-
-
 @dataclass(frozen=True, eq=False)
 class LongAdjustment:
     """A long series as adjusted; parameters in the order of `PARAMETER_NAMES`.
@@ -141,7 +139,8 @@ class RowWriter:
 
     values, sd (E, 16): NaN where an epoch has no result or a parameter was held, on disk (`release`
     takes what was used of them out of memory); sigma0, redundancy, stillness (E,); observed,
-    rejected (E,): how many targets.
+    rejected (E,): how many targets; ok (E,): epochs with a result; status, reasons: E words and
+    sentences, "" where it has one.
     """
 
     def __init__(self, epochs: int) -> None:
@@ -149,43 +148,21 @@ class RowWriter:
         self.values, self.sd = (spool.array for spool in self._spools)
         self.sigma0, self.redundancy, self.stillness = np.full((3, epochs), np.nan)
         self.observed, self.rejected = np.zeros((2, epochs), dtype=np.int32)
-        self._ok = np.zeros(epochs, dtype=bool)
-        self._word, self._reason = np.zeros((2, epochs), dtype=np.uint16)
-        self._words: dict[str, int] = {"": 0}
+        self.ok = np.zeros(epochs, dtype=bool)
+        self.status, self.reasons = [""] * epochs, [""] * epochs
 
     def put(self, block: Block) -> None:
         """The epochs of a block."""
         here = slice(block.first, block.first + len(block.values))
         self.values[here] = block.values
         self.sd[here] = np.sqrt(np.where(block.variance > 0, block.variance, np.nan))
-        self._ok[here] = [word == "ok" for word in block.status]
-        self._word[here], self._reason[here] = (
-            self._numbers(said) for said in (block.status, block.reasons)
-        )
+        self.ok[here] = [word == "ok" for word in block.status]
+        # each text once, however many epochs have it
+        self.status[here] = map(sys.intern, block.status)
+        self.reasons[here] = map(sys.intern, block.reasons)
         self.sigma0[here], self.redundancy[here] = block.sigma0, block.redundancy
         self.stillness[here] = block.stillness
         self.observed[here], self.rejected[here] = block.observed, block.rejected
-
-    def _numbers(self, sentences: list[str]) -> list[int]:
-        for sentence in dict.fromkeys(sentences):
-            if len(self._words) < _MOST_SENTENCES:
-                self._words.setdefault(sentence, len(self._words))
-        return [self._words.get(sentence, 0) for sentence in sentences]
-
-    @property
-    def status(self) -> Words:
-        """One word per epoch."""
-        return Words(self._word, tuple(self._words))
-
-    @property
-    def reasons(self) -> Words:
-        """One sentence per epoch, "" where it has a result."""
-        return Words(self._reason, tuple(self._words))
-
-    @property
-    def ok(self) -> Mask:
-        """(E,): epochs with a result."""
-        return self._ok
 
     def shift(self, columns: Index, change: Array) -> None:
         """Add a change (k,) to some parameters of all epochs."""
@@ -197,7 +174,7 @@ class RowWriter:
         """Add variances (k,) to some parameters of all epochs with a result."""
         for column, size in zip(columns, variance, strict=True):
             old = np.nan_to_num(self.sd[:, column])
-            self.sd[:, column] = np.where(self._ok, np.sqrt(old**2 + size), np.nan)
+            self.sd[:, column] = np.where(self.ok, np.sqrt(old**2 + size), np.nan)
             self.release()
 
     def release(self) -> None:

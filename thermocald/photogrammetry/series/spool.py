@@ -1,4 +1,4 @@
-"""What a year of epochs gives is larger than memory should be: columns on disk, and short words."""
+"""Arrays of a long series on disk: what a year of epochs gives is larger than memory should be."""
 
 from __future__ import annotations
 
@@ -6,15 +6,12 @@ import ctypes
 import gc
 import mmap
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from thermocald.arrays import Array, Mask
+    from thermocald.arrays import Array
 
 
 _LONG = 2_000_000  # rows
@@ -73,78 +70,3 @@ def released(array: Array) -> None:
         owner = owner.obj if isinstance(owner, memoryview) else getattr(owner, "base", None)
     if isinstance(owner, mmap.mmap):
         owner.madvise(mmap.MADV_DONTNEED)
-
-
-_AT_ONCE = 100_000
-
-
-class Words(Sequence[str]):
-    """A sequence of words; numbers (E,): of each epoch's word in `words`."""
-
-    __slots__ = ("_numbers", "_words")
-    __hash__ = None  # type: ignore[assignment]  # it compares by its content, as a list does
-
-    def __init__(self, numbers: NDArray[np.unsignedinteger], words: Sequence[str]) -> None:
-        self._numbers = numbers
-        self._words = tuple(words)
-
-    @classmethod
-    def of(cls, words: Iterable[str]) -> Words:
-        """The words of any sequence; of this class as they are."""
-        if isinstance(words, Words):
-            return words
-        known: dict[str, int] = {}
-        every = (known.setdefault(str(word), len(known)) for word in words)
-        numbers = np.fromiter(every, dtype=np.uint32)
-        return cls(numbers, tuple(known))
-
-    @classmethod
-    def repeated(cls, word: str, count: int) -> Words:
-        """One word, `count` times."""
-        return cls(np.broadcast_to(np.uint16(0), (count,)), (word,))
-
-    def __len__(self) -> int:
-        return len(self._numbers)
-
-    @overload
-    def __getitem__(self, index: int) -> str: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> Words: ...
-
-    def __getitem__(self, index: int | slice) -> str | Words:
-        if isinstance(index, slice):
-            return Words(self._numbers[index], self._words)
-        return self._words[int(self._numbers[index])]
-
-    def __iter__(self) -> Iterator[str]:
-        for first in range(0, len(self), _AT_ONCE):
-            for number in self._numbers[first : first + _AT_ONCE].tolist():
-                yield self._words[number]
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Sequence) or isinstance(other, str):
-            return NotImplemented
-        return len(self) == len(other) and all(a == b for a, b in zip(self, other, strict=True))
-
-    def __contains__(self, word: object) -> bool:
-        return self.count(word) > 0
-
-    def __repr__(self) -> str:
-        return f"Words({self.counts()})"
-
-    def are(self, word: str) -> Mask:
-        """(E,): the epochs with this word."""
-        if word not in self._words:
-            return np.zeros(len(self), dtype=bool)
-        mask: Mask = self._numbers == self._words.index(word)
-        return mask
-
-    def count(self, word: object) -> int:
-        """How many epochs have this word."""
-        return self.counts().get(str(word), 0)
-
-    def counts(self) -> dict[str, int]:
-        """How many epochs have each word, those that none has left out."""
-        found = np.bincount(self._numbers, minlength=len(self._words))
-        return {word: int(n) for word, n in zip(self._words, found, strict=True) if n}

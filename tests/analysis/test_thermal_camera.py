@@ -12,8 +12,8 @@ import pytest
 from benchmarks.thermal_model import undistorting
 from thermocald.analysis.camera.undistortion import ideal_points
 from thermocald.analysis.thermal.predictions import warm_up
+from thermocald.analysis.thermal.steady import ExtrapolationWarning
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
-from thermocald.analysis.thermal.validity import ExtrapolationWarning
 from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor, rays
 from thermocald.physics.model import ModelEffect

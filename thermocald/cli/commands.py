@@ -45,7 +45,7 @@ PANELS = {
         "study": Entry("study", "Test how the camera changes with its temperature; report it"),
         "discover": Entry("discover", "Find which effect a model misses, name it, prove it"),
         "fit": Entry("fit", "Fit a thermal model to all series of a camera"),
-        "calibrate": Entry("calibrate", "Calibrate a camera from photographs of a test field"),
+        "calibrate": Entry("camera", "Calibrate a camera from photographs of a test field"),
     },
     "Use": {
         "predict": Entry("predict", "Predict the camera at a temperature, or along a log"),

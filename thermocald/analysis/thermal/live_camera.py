@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from thermocald.analysis.thermal.validity import Validity
+    from thermocald.analysis.thermal.steady import Validity
     from thermocald.arrays import Array
     from thermocald.physics.model import ModelEffect, ThermalModel
 

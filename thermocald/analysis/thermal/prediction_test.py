@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.thermal.displacement import moved_targets
-from thermocald.analysis.thermal.level import estimate_level, projected, series_means
+from thermocald.analysis.thermal.level import estimate_level, moved_targets, projected, series_means
 from thermocald.analysis.thermal.terms import event_worth
 from thermocald.analysis.thermal.thermal_model import targets_of
 from thermocald.errors import ConfigurationError, DataError

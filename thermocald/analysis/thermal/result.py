@@ -39,7 +39,7 @@ from thermocald.thermal.series import COLUMNS
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from thermocald.analysis.thermal.displacement import Moved
+    from thermocald.analysis.thermal.level import Moved
     from thermocald.analysis.thermal.terms import Unknown
     from thermocald.arrays import Array
     from thermocald.thermal.fit import HypothesisFitter

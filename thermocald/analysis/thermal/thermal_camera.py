@@ -26,8 +26,7 @@ import numpy as np
 from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.thermal.live_camera import LiveCamera
 from thermocald.analysis.thermal.model_text import model_lines
-from thermocald.analysis.thermal.steady import SteadyCamera, steady_camera
-from thermocald.analysis.thermal.validity import Validity
+from thermocald.analysis.thermal.steady import SteadyCamera, Validity, steady_camera
 from thermocald.errors import ConfigurationError, UsageError
 from thermocald.figures import BAND
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor

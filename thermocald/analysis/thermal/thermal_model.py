@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.thermal.displacement import moved_targets
+from thermocald.analysis.thermal.level import moved_targets
 from thermocald.analysis.thermal.result import FittedModel, fitted_model
 from thermocald.analysis.thermal.terms import term_of, without_chance_events
 from thermocald.errors import DataError

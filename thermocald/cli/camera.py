@@ -1,4 +1,4 @@
-"""`thermocald calibrate` and `camera`: cameras calibrated, converted, compared, at a temperature."""
+"""`thermocald calibrate` and `camera`: cameras calibrated, converted, compared, predicted."""
 
 from __future__ import annotations
 

@@ -21,8 +21,8 @@ from thermocald.analysis.study.input import measured_series, stored_series
 from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
+from thermocald.photogrammetry.series.blocks import give_back
 from thermocald.photogrammetry.series.result import EXTERIOR_CHOICES
-from thermocald.photogrammetry.series.spool import give_back
 from thermocald.store.recording.reader import Recording, open_recording
 from thermocald.store.recording.sense import interior_doubts
 from thermocald.store.server.connection import is_server

@@ -100,7 +100,7 @@ def fit(
 
         document["code"] = [str(file) for file in write_code(camera, code)]
     if report is not None:
-        from thermocald.output.certificate import render_certificate
+        from thermocald.output.model_code import render_certificate
 
         write_text(report, render_certificate(camera))
     if write_result(document, json):

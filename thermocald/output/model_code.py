@@ -1,24 +1,34 @@
-"""A thermal model as code: a C header and a Python module without dependencies.
+"""A thermal model as code, in C and in Python without dependencies, and as a certificate to read.
 
-Both evaluate the camera that has long been at a temperature T: the ten parameters as polynomials in
-T, OpenCV's camera matrix and distortion coefficients, and the projection itself, which holds also
-where C1 or C2 are not zero and OpenCV has no place for them.
+The code evaluates the camera that has long been at a temperature T: the ten parameters as
+polynomials in T, OpenCV's camera matrix and distortion coefficients, and the projection itself,
+which holds also where C1 or C2 are not zero and OpenCV has no place for them.
+
+The certificate says how the camera follows its temperature, and how far.
 """
 
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from thermocald.figures import BAND, PALETTE, Curve, Figure, Panel
 from thermocald.files import write_text
+from thermocald.numbers import UNITS, parameter_label, plain, signed, with_sd
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
+from thermocald.report import Answer, Chapter, Section, Table, of_figure, render_report
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from datetime import datetime
     from pathlib import Path
 
-    import numpy as np
     from numpy.typing import NDArray
 
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
+
 
 _C = """\
 /* {name}: thermal camera model, written by thermocald. No dependencies; C99 and C++.
@@ -232,3 +242,146 @@ def _plain(text: str) -> str:
 
 def _row(values: NDArray[np.float64] | tuple[float, ...]) -> str:
     return ", ".join(repr(float(v)) for v in values)
+
+
+_DISTANCE_MM = 10_000.0
+_STEPS = 41
+
+
+def render_certificate(camera: ThermalCamera, made: datetime | None = None) -> str:
+    """Return the page as HTML text; made: the time that it bears, by default now."""
+    document = camera.as_dict()
+    low, high = next(iter(document["validity"].values()))
+    T = np.linspace(low, high, _STEPS)
+    states = [camera.at(float(t)) for t in T]
+    values = np.array([state.interior.as_array() for state in states])
+    sds = np.array([[state.sd.get(name, 0.0) for name in IOP_NAMES] for state in states])
+    missing = bool(document.get("effect_missing"))
+    chapter = Chapter(
+        f"Thermal model of {document['camera']}",
+        Answer(
+            _sentence(document, camera.model.sensor.pixel_pitch, low, high),
+            of_figure(_drift(T, values, sds, missing)),
+            tuple(_judged(document)),
+            ("Find what is missing: thermocald discover.",) if missing
+            else ("Correct measurements with: thermocald correct.",),
+            (
+                f"Temperatures below {low:g} and above {high:g} °C.",
+                "Focus or lens moved since: calibrate again.",
+                "Errors of the camera model itself, which no standard deviation here holds.",
+            ),
+        ),
+        (
+            Section("The model", tables=(_values(document), *_effects(document))),
+            Section("What it rests on", tables=tuple(t for t in _evidence(document) if t.rows)),
+        ),
+        about=(_about(camera, document),),
+        notes=tuple(f"Doubtful: {text}." for text in document.get("doubts", ())),
+    )  # fmt: skip
+    return render_report(chapter.title, [chapter], made=made)
+
+
+def _about(camera: ThermalCamera, document: Mapping[str, Any]) -> str:
+    sensor = camera.model.sensor
+    text = f"{sensor.width} × {sensor.height} px of {sensor.pixel_pitch * 1000:g} µm"
+    series = ", ".join(str(s["name"]) for s in document.get("series", ()))
+    return f"{text}; fitted to {series}." if series else f"{text}."
+
+
+def _sentence(document: Mapping[str, Any], pitch: float, low: float, high: float) -> str:
+    """The largest of the rates with its sd, the range, and what that is on a plane."""
+    rates = {n: (r["value"], r.get("sd", float("nan"))) for n, r in document["rates"].items()}
+    if not rates:
+        return f"The camera does not follow the temperature between {low:.0f} and {high:.0f} °C."
+    name = max(rates, key=lambda n: abs(rates[n][0]))
+    rate, sd = rates[name]
+    text = (
+        f"{parameter_label(name)} moves by {signed(rate / pitch, sd / pitch, 'px/K')} between "
+        f"{low:.0f} and {high:.0f} °C"
+    )
+    if name != "c":
+        c = document["interior"]["c"]["value"]
+        text += f"; at 10 m that is {plain(abs(rate) * (high - low) / c * _DISTANCE_MM, 'mm', 3)}"
+    return f"{text}."
+
+
+def _judged(document: Mapping[str, Any]) -> list[str]:
+    if why := document.get("not_examined"):
+        return [f"Whether an effect is missing was not examined: {why}."]
+    if document.get("effect_missing"):
+        left = document.get("misfit_px")
+        size = "" if left is None else f" of {left:.3f} px"
+        return [(f"An effect is missing: the model leaves smooth trajectories{size}. The standard "
+                "deviations are widened by that, and no 95 % band is stated.")]  # fmt: skip
+    return ["The model leaves no more than noise."]
+
+
+def _drift(T: np.ndarray, values: np.ndarray, sds: np.ndarray, missing: bool) -> Figure:
+    middle = len(T) // 2
+    panels = []
+    for name in ("c", "x0", "y0"):
+        k = IOP_NAMES.index(name)
+        y, half = 1e3 * (values[:, k] - values[middle, k]), 1e3 * BAND * sds[:, k]
+        curve = (
+            Curve("", T, y, "line", PALETTE[0]) if missing
+            else Curve("", T, y, "band", PALETTE[0], y - half, y + half)
+        )  # fmt: skip
+        label = parameter_label(name)
+        panels.append(Panel(label, "temperature in °C", f"Δ{label} in µm", (curve,)))
+    band = "no band is stated" if missing else "bands hold 95 %, the level's uncertainty included"
+    return Figure(
+        "drift", "How the camera follows its temperature",
+        f"Each parameter less its value in the middle of the range, of a camera that has long been "
+        f"at a temperature; {band}.",
+        tuple(panels),
+    )  # fmt: skip
+
+
+def _shown(entry: Mapping[str, Any], scale: float, unit: str) -> str:
+    return with_sd(scale * entry["value"], scale * entry.get("sd", float("nan")), unit)
+
+
+def _values(document: Mapping[str, Any]) -> Table:
+    rates = document["rates"]
+    rows = tuple(
+        (
+            parameter_label(name),
+            _shown(entry, 1.0, UNITS.get(name, "")),
+            _shown(rates[name], 1e3, "µm/K") if name in rates else "",
+        )
+        for name, entry in document["interior"].items()
+    )
+    T0 = f"at {document['reference_temperature']:g} °C"
+    return Table("Interior orientation", ("parameter", T0, "rate"), rows)
+
+
+def _effects(document: Mapping[str, Any]) -> list[Table]:
+    rows = tuple(
+        (effect["effect"], name, _shown(entry, 1.0, "" if entry["unit"] == "1" else entry["unit"]))
+        for effect in document["effects"]
+        for name, entry in effect["parameters"].items()
+        if isinstance(entry, dict)
+    )
+    return [Table("Effects", ("effect", "parameter", "value ± sd"), rows)] if rows else []
+
+
+def _evidence(document: Mapping[str, Any]) -> list[Table]:
+    return [
+        Table(
+            "Series",
+            ("series", "epochs", "left over px RMS", "noise px", "thermometer ± K"),
+            tuple(
+                (s["name"], str(s["epochs"]), f"{s['rms_px']:.4f}", f"{s['noise_px']:.4f}",
+                 f"{s['thermometer_sd']:.3f}")
+                for s in document.get("series", ())
+            ),
+        ),
+        Table(
+            "Each series predicted from the others",
+            ("series", "error px RMS", "noise alone px", "mm at 10 m"),
+            tuple(
+                (h["name"], f"{h['rms_px']:.4f}", f"{h['floor_px']:.4f}", f"{h['object_mm']:.2f}")
+                for h in document.get("prediction_test", ())
+            ),
+        ),
+    ]  # fmt: skip

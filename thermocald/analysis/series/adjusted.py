@@ -21,11 +21,11 @@ from thermocald.photogrammetry.series.blocks import (
     ObservedBlocks,
     WithoutTargets,
     gathered,
+    released,
     spread_windows,
 )
 from thermocald.photogrammetry.series.long_series import adjust_long_series, together_at_most
 from thermocald.photogrammetry.series.mount import drift_period
-from thermocald.photogrammetry.series.spool import released
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -19,7 +19,7 @@ from thermocald.analysis.series.epochs import LEVEL, Course
 from thermocald.analysis.statistics.dependence import holm, slope_noise, slope_p_value
 from thermocald.analysis.statistics.noise_models import drift_test
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
-from thermocald.photogrammetry.series.spool import released
+from thermocald.photogrammetry.series.blocks import released
 from thermocald.photogrammetry.series.target_noise import slow_errors
 
 if TYPE_CHECKING:

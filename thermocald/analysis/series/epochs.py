@@ -21,7 +21,7 @@ from thermocald.errors import DataError, DriverMissing
 from thermocald.figures import BAND
 from thermocald.files import write_parts
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
-from thermocald.photogrammetry.series.spool import released
+from thermocald.photogrammetry.series.blocks import released
 from thermocald.physics.effect import PARAMETER_UNITS
 from thermocald.result import Result, jsonable, new_figure
 from thermocald.store.recording.reader import interpolate_readings

@@ -15,8 +15,8 @@ from thermocald.analysis.series.drift import with_drifts
 from thermocald.analysis.series.epochs import Epochs
 from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
+from thermocald.photogrammetry.series.blocks import ColumnSpool
 from thermocald.photogrammetry.series.result import SeriesSettings
-from thermocald.photogrammetry.series.spool import ColumnSpool
 from thermocald.store.database.store import Store
 from thermocald.store.series import EpochResult
 from thermocald.store.stored_recording import StoredRecording

@@ -17,7 +17,7 @@ from thermocald.analysis.statistics.significance import correlations_of
 from thermocald.analysis.study.measured import Clip, MeasuredSeries, Thermometer
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
-from thermocald.photogrammetry.series.spool import ColumnSpool, released
+from thermocald.photogrammetry.series.blocks import ColumnSpool, released
 from thermocald.store.recording.readings import interpolate_readings
 from thermocald.thermal.thermometer import estimate_reading_noise
 

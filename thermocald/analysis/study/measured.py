@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
-from thermocald.photogrammetry.series.spool import released
+from thermocald.photogrammetry.series.blocks import released
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

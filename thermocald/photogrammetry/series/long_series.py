@@ -23,7 +23,13 @@ import numpy as np
 from thermocald.parallel import in_order
 from thermocald.photogrammetry.linalg import root_of
 from thermocald.photogrammetry.series.adjustment import Adjusted, adjusted, result
-from thermocald.photogrammetry.series.blocks import ObservationBlocks, gathered, spread_windows
+from thermocald.photogrammetry.series.blocks import (
+    ColumnSpool,
+    ObservationBlocks,
+    gathered,
+    give_back,
+    spread_windows,
+)
 from thermocald.photogrammetry.series.covariances import line_weights, of_slow_targets, stillness
 from thermocald.photogrammetry.series.estimator import ENOUGH_FOR_NOISE
 from thermocald.photogrammetry.series.known import (
@@ -34,7 +40,6 @@ from thermocald.photogrammetry.series.known import (
     level_of,
 )
 from thermocald.photogrammetry.series.normals import ObservationGrid, normal_matrices
-from thermocald.photogrammetry.series.spool import ColumnSpool, give_back
 from thermocald.photogrammetry.series.target_noise import slow_errors
 
 if TYPE_CHECKING:

@@ -116,24 +116,14 @@ def _robust_resection(
 ) -> tuple[ExteriorOrientation, Array] | None:
     """RANSAC resection; the exterior orientation and each pair's residual in px, or None."""
     try:
-        direction = rays(sensor, interior.as_array(), uv)
+        ideal = _ideal(sensor, interior, uv)
     except GeometryError:
         return None
-    ideal = np.ascontiguousarray(direction[:, :2] / -direction[:, 2:] * [1.0, -1.0])
-    cv2.setRNGSeed(0)
     threshold = _TOLERANCE * sensor.width * sensor.pixel_pitch / interior.c
-    try:
-        ok, rvec, tvec, inliers = cv2.solvePnPRansac(
-            X, ideal, np.eye(3), None, iterationsCount=300, reprojectionError=threshold,
-            confidence=0.9999, flags=cv2.SOLVEPNP_SQPNP,
-        )  # fmt: skip
-    except cv2.error:
+    found = majority_pose(X, ideal, threshold)
+    if found is None:
         return None
-    if not ok or inliers is None or len(inliers) < _MINIMUM:
-        return None
-    rows = inliers.ravel()
-    rvec, tvec = cv2.solvePnPRefineLM(X[rows], ideal[rows], np.eye(3), None, rvec, tvec)
-    exterior = _from_opencv(rvec, tvec)
+    exterior, rows = _exterior(*found[:2]), found[2]
     predicted = project(sensor, interior.as_array(), exterior.as_array(), X)
     residuals = np.linalg.norm(np.nan_to_num(predicted - uv, nan=1e9), axis=1)
     if len(rows) <= _CLEAR * len(X):
@@ -147,9 +137,37 @@ def _robust_resection(
     return exterior, residuals
 
 
-def _from_opencv(rvec: NDArray[Any], tvec: NDArray[Any]) -> ExteriorOrientation:
-    R = cv2.Rodrigues(rvec)[0]
-    return ExteriorOrientation.from_rotation(R.T @ _FLIP, (-R.T @ tvec).ravel())
+def majority_pose(
+    X: Array, ideal: Array, threshold: float, fewest: int = _MINIMUM, seed: int = 0
+) -> tuple[Array, Array, NDArray[Any]] | None:
+    """OpenCV's R (3, 3) and t (3,), object to camera, and the pairs that they explain, or None.
+
+    X (n, 3) mm; ideal (n, 2): image points at the distance 1, y down; threshold: of what fits;
+    fewest: pairs that must. RANSAC with SQPnP, refined on the pairs that fit.
+    """
+    cv2.setRNGSeed(seed)
+    try:
+        ok, rvec, tvec, inliers = cv2.solvePnPRansac(
+            X, ideal, np.eye(3), None, iterationsCount=300, reprojectionError=threshold,
+            confidence=0.9999, flags=cv2.SOLVEPNP_SQPNP,
+        )  # fmt: skip
+    except cv2.error:  # degenerate points fail an assertion in there
+        return None
+    if not ok or inliers is None or len(inliers) < fewest:
+        return None
+    rows = inliers.ravel()
+    rvec, tvec = cv2.solvePnPRefineLM(X[rows], ideal[rows], np.eye(3), None, rvec, tvec)
+    return np.asarray(cv2.Rodrigues(rvec)[0], float), np.asarray(tvec, float).ravel(), rows
+
+
+def _ideal(sensor: Sensor, interior: InteriorOrientation, uv: Array) -> Array:
+    """Image points (n, 2) at the distance 1 as OpenCV has them, y down."""
+    direction = rays(sensor, interior.as_array(), uv)
+    return np.ascontiguousarray(direction[:, :2] / -direction[:, 2:] * [1.0, -1.0])
+
+
+def _exterior(R: NDArray[Any], t: NDArray[Any]) -> ExteriorOrientation:
+    return ExteriorOrientation.from_rotation(R.T @ _FLIP, -R.T @ t)
 
 
 def resection(
@@ -162,8 +180,7 @@ def resection(
     """
     X = np.ascontiguousarray(field_points, dtype=float)
     uv = np.asarray(image_points, dtype=float)
-    direction = rays(sensor, interior.as_array(), uv)
-    ideal = np.ascontiguousarray(direction[:, :2] / -direction[:, 2:] * [1.0, -1.0])
+    ideal = _ideal(sensor, interior, uv)
     centre, axes, flat = plane_fit(X)
     if flat:
         local = np.ascontiguousarray((X - centre) @ axes.T)
@@ -179,7 +196,8 @@ def resection(
             )
     else:
         _, rvec, tvec = cv2.solvePnP(X, ideal, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP)
-        poses = [_from_opencv(*cv2.solvePnPRefineLM(X, ideal, np.eye(3), None, rvec, tvec))]
+        rvec, tvec = cv2.solvePnPRefineLM(X, ideal, np.eye(3), None, rvec, tvec)
+        poses = [_exterior(cv2.Rodrigues(rvec)[0], tvec.ravel())]
     solutions = []
     for pose in poses:
         predicted = project(sensor, interior.as_array(), pose.as_array(), X)

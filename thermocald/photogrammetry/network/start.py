@@ -21,10 +21,9 @@ from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
 from thermocald.photogrammetry.camera.camera_model import rays as camera_rays
 from thermocald.photogrammetry.network.bundle import Bundle, ImageRays, residuals, solve
+from thermocald.photogrammetry.orientation import majority_pose
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
     from thermocald.arrays import Array, Index
 
 
@@ -59,28 +58,16 @@ class _Start:
 
     def resect(self, photo: int) -> bool:
         """Orient one photograph on the targets known so far; False if it cannot be done."""
-        import cv2
-
         rows = self.rows(photo)
         rows = rows[np.isfinite(self.points[self.rays.target[rows], 0])]
         if len(rows) < _MIN_RESECTION:
             return False
         known, image = self.points[self.rays.target[rows]], self.normalised[rows]
-        cv2.setRNGSeed(1)
-        try:
-            found, turn, t, inliers = cv2.solvePnPRansac(
-                known, image[:, None, :], np.eye(3), None, iterationsCount=200,
-                reprojectionError=self.threshold, confidence=0.999, flags=cv2.SOLVEPNP_SQPNP,
-            )  # fmt: skip
-        except cv2.error:  # degenerate points fail an assertion in there
+        fewest = max(_MIN_RESECTION, len(rows) // 3)
+        found = majority_pose(known, image, self.threshold, fewest, seed=1)
+        if found is None:
             return False
-        if not found or inliers is None or len(inliers) < max(_MIN_RESECTION, len(rows) // 3):
-            return False
-        keep = inliers.ravel()
-        turn, t = cv2.solvePnPRefineLM(
-            known[keep], image[keep][:, None, :], np.eye(3), None, turn, t
-        )
-        self.poses[photo] = (np.asarray(cv2.Rodrigues(turn)[0], dtype=float), _vector(t))
+        self.poses[photo] = found[:2]
         return True
 
     def intersect(self) -> None:
@@ -146,10 +133,6 @@ class _Start:
         self.intersect()
 
 
-def _vector(t: ArrayLike) -> Array:
-    return np.asarray(t, dtype=float).ravel()
-
-
 def _pairs(rays: ImageRays, normalised: Array) -> list[tuple[int, int]]:
     """Pairs of photographs to begin with, the most promising first.
 
@@ -201,7 +184,7 @@ def _from_pair(start: _Start, pair: tuple[int, int]) -> bool:
         return False
     start.poses = {
         pair[0]: (np.eye(3), np.zeros(3)),
-        pair[1]: (np.asarray(R, dtype=float), _vector(t)),
+        pair[1]: (np.asarray(R, dtype=float), np.asarray(t, dtype=float).ravel()),
     }
     start.points[:] = np.nan
     start.intersect()

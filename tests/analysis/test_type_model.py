@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermocald.analysis.thermal.camera_fit import odd_cameras, shrunk_to_type, type_model
+from thermocald.analysis.thermal.camera_fit import shrunk_to_type, type_model
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
 from thermocald.physics.model import ModelEffect, ThermalModel
@@ -75,15 +75,6 @@ def test_intervals_hold_over_a_thousand_fleets():
     assert np.mean(np.abs(pulls) < 1.96) == pytest.approx(0.95, abs=0.01)
 
 
-def test_a_camera_unlike_its_type_is_named():
-    _, fleet = cameras(np.random.default_rng(9), 10, 0.1)
-    rates = {**fleet[4].rates, "x0": fleet[4].rates["x0"] + 10 * SCATTER[2]}
-    fleet[4] = replace(fleet[4], rates=rates)
-    found = odd_cameras(fleet)
-    assert found["cam4"] < 0.01
-    assert min(p for name, p in found.items() if name != "cam4") > 0.01
-
-
 def test_models_that_are_not_alike_are_refused():
     _, fleet = cameras(np.random.default_rng(9), 4, 0.1)
     kind = type_model(fleet, "rpi")
@@ -91,5 +82,3 @@ def test_models_that_are_not_alike_are_refused():
         shrunk_to_type(fleet[0], replace(kind, covariance=None))
     with pytest.raises(DataError, match="not alike"):
         shrunk_to_type(replace(fleet[0], T0=20.0), kind)
-    with pytest.raises(DataError, match="3 or more"):
-        odd_cameras(fleet[:2])

@@ -74,6 +74,8 @@ def test_with_the_model_found_nothing_is_missing(recordings, tmp_path):
 
 
 def test_simulate_runs_the_new_model(recordings, tmp_path):
+    import numpy as np
+
     from thermocald.physics.history import History
     from thermocald.physics.model_file import read_model
     from thermocald.store.recording.reader import read_recording
@@ -83,11 +85,13 @@ def test_simulate_runs_the_new_model(recordings, tmp_path):
     assert discover(recordings / "M1", "--model-out", model).exit_code == 0
     recording = read_recording(recordings / "M1")
     thermal = read_model(model)
-    history = History.from_epochs(recording.epochs, "temperature", thermal.T0)
-
+    frames, (times, readings) = (
+        recording.columns.frame_time, recording.columns.readings_of("temperature")
+    )  # fmt: skip
+    history = History(
+        frames - frames[0], times - frames[0], {"temperature": readings}, "temperature", thermal.T0
+    )
     predicted = thermal.predict(history)
-
-    import numpy as np
 
     from thermocald.photogrammetry.camera.camera_model import project
 

@@ -25,13 +25,12 @@ from thermocald.errors import DataError
 from thermocald.physics.operators import interpolation_matrix
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
     from numpy.typing import ArrayLike
     from scipy.sparse import csr_array
 
     from thermocald.arrays import Array
-    from thermocald.epoch import Epoch
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,24 +73,6 @@ class History:
                 f"there is no temperature column {self.reference!r}; there are: "
                 f"{', '.join(self.readings) or 'none'}"
             )
-
-    @classmethod
-    def from_epochs(cls, epochs: Sequence[Epoch], reference: str, T0: float) -> Self:
-        """Take the readings of a recording's epochs; time 0 is the first frame's time."""
-        frames = np.array([e.frame_time for e in epochs], dtype=float)
-        stamped = [e for e in epochs if np.isfinite(e.temperature_time)]
-        channels = dict.fromkeys(name for e in stamped for name in e.temperatures)
-        begin = float(frames[0]) if len(frames) else 0.0
-        return cls(
-            frames - begin,
-            np.array([e.temperature_time for e in stamped], dtype=float) - begin,
-            {
-                name: np.array([e.temperatures.get(name, np.nan) for e in stamped], dtype=float)
-                for name in channels
-            },
-            reference,
-            T0,
-        )
 
     def at(self, times: ArrayLike) -> Self:
         """Ask for other times."""

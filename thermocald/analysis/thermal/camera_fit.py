@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.analysis.statistics.random_effects import Population, odd_specimens, population
+from thermocald.analysis.statistics.random_effects import Population, population
 from thermocald.analysis.thermal.calibrations import fit_calibrations
 from thermocald.analysis.thermal.prediction_test import predicted_error
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from thermocald.thermal.series import ReducedSeries
 
 
-_FEWEST_TO_COMPARE = 3
 _NORMAL_95 = 1.959964
 
 
@@ -79,21 +78,6 @@ def type_model(models: Sequence[ThermalModel], name: str) -> ThermalModel:
         validity={channel: (low, high)} if low < high else first.validity,
         fitted_on=tuple({"camera": m.camera, "version": m.version} for m in models),
     )
-
-
-def odd_cameras(models: Sequence[ThermalModel]) -> dict[str, float]:
-    """{camera: probability that a camera of this type is as unlike the others as it is}.
-
-    Compared are the thermal parameters: rates and effects. DataError for fewer than three.
-    """
-    if len(models) < _FEWEST_TO_COMPARE:
-        raise DataError(f"odd cameras show among {_FEWEST_TO_COMPARE} or more")
-    names = tuple(n for n in _names(models[0]) if not n.startswith("interior."))
-    values = np.array([[_value(m, n) for n in names] for m in models])
-    covariances = np.array([_covariance(m, names) for m in models])
-    varied = (np.ptp(values, axis=0) > 0) | (np.einsum("ikk->ik", covariances) > 0).any(axis=0)
-    found = odd_specimens(values[:, varied], covariances[:, varied][:, :, varied])
-    return {m.camera: float(p) for m, p in zip(models, found, strict=True)}
 
 
 def fit_with_type(series: Sequence[ReducedSeries], kind: ThermalModel) -> FittedModel:

@@ -24,7 +24,7 @@ Sources: Whittle (1953), Estimation and information in stationary time series; B
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -228,7 +228,7 @@ class DriftTest:
     sds; epochs: how many were used.
     """
 
-    p_value: float
+    p_value: float = field(metadata={"json": "p"})
     p_excess: float
     variance_ratio: float
     noise_ratio: float

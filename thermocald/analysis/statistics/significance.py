@@ -13,7 +13,7 @@ of the coefficients.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -151,7 +151,7 @@ class IopCorrelations:
 
     median: Array
     noise: Array
-    largest: Array
+    largest: Array = field(metadata={"json": "largest_deviation"})
     epochs: int
 
 

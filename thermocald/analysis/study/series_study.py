@@ -5,7 +5,7 @@ What cannot be computed is None, and `notes` says why.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -91,12 +91,12 @@ class Significance:
     left_out: int
     degrees_variance: int
     degrees_sd: float
-    critical: float
+    critical: float = field(metadata={"json": "critical_ratio"})
     median_ratio: float
-    course: Array
-    drift: DriftTest | None
-    p_holm: float = float("nan")
-    p_excess_holm: float = float("nan")
+    course: Array = field(metadata={"json": ""})
+    drift: DriftTest | None = field(metadata={"json": ""})
+    p_holm: float = field(default=float("nan"), metadata={"json": ""})
+    p_excess_holm: float = field(default=float("nan"), metadata={"json": ""})
 
 
 @dataclass(frozen=True, eq=False)

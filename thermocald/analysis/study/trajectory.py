@@ -8,7 +8,7 @@ against three that a user may hold fixed: that of the first epoch, the mean of t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -43,8 +43,8 @@ class Trajectory:
 
     reference: str
     fractions: Array
-    mean: float
-    mean_largest: float
+    mean: float = field(metadata={"json": "mean_mm"})
+    mean_largest: float = field(metadata={"json": "mean_of_maxima_mm"})
     epochs: int
 
 

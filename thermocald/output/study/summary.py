@@ -284,34 +284,16 @@ def study_document(study: Study) -> dict[str, Any]:
 def _camera(camera: CameraStudy, distance_mm: float) -> dict[str, Any]:
     correlations = None
     if camera.correlations is not None:
-        correlations = {
-            "parameters": list(IOP_NAMES),
-            "median": camera.correlations.median.tolist(),
-            "noise": camera.correlations.noise.tolist(),
-            "largest_deviation": camera.correlations.largest.tolist(),
-            "epochs": camera.correlations.epochs,
-        }
+        correlations = {"parameters": IOP_NAMES, **jsonable(camera.correlations)}
     return {
         "label": camera.label,
         "series": [_series(one, distance_mm) for one in camera.series],
         "interior_orientation": dict(zip(IOP_NAMES, camera.iop.tolist(), strict=True)),
         "sd_over_time": dict(zip(IOP_NAMES, camera.sds.tolist(), strict=True)),
         "iop_correlations": correlations,
-        "correlations_over_time": {
-            "parameters": list(IOP_NAMES),
-            "r": camera.over_time.tolist(),
-        },
+        "correlations_over_time": {"parameters": IOP_NAMES, "r": camera.over_time},
         "object_space": _object_space(camera),
-        "trajectory": [
-            {
-                "reference": one.reference,
-                "fractions": one.fractions.tolist(),
-                "mean_mm": one.mean,
-                "mean_of_maxima_mm": one.mean_largest,
-                "epochs": one.epochs,
-            }
-            for one in camera.trajectories
-        ],
+        "trajectory": camera.trajectories,
         "notes": list(camera.notes),
     }
 
@@ -359,27 +341,9 @@ def _series(study: SeriesStudy, distance_mm: float) -> dict[str, Any]:
 
 
 def _significance(test: Significance) -> dict[str, Any]:
-    return {
-        "success_ratio": test.success_ratio,
-        "tests": test.tests,
-        "left_out": test.left_out,
-        "degrees_variance": test.degrees_variance,
-        "degrees_sd": test.degrees_sd,
-        "critical_ratio": test.critical,
-        "median_ratio": test.median_ratio,
-        "drift_test": None
-        if test.drift is None
-        else {
-            "p": test.drift.p_value,
-            "p_holm": test.p_holm,
-            "p_excess": test.drift.p_excess,
-            "p_excess_holm": test.p_excess_holm,
-            "variance_ratio": test.drift.variance_ratio,
-            "noise_ratio": test.drift.noise_ratio,
-            "sd_noise_ratio": test.drift.sd_noise_ratio,
-            "epochs": test.drift.epochs,
-        },
-    }
+    p_holm = {"p_holm": test.p_holm, "p_excess_holm": test.p_excess_holm}
+    drift = None if test.drift is None else {**jsonable(test.drift), **p_holm}
+    return {**jsonable(test), "drift_test": drift}
 
 
 def _channel(study: SeriesStudy, channel: ChannelStudy, distance_mm: float) -> dict[str, Any]:

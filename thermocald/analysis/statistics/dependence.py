@@ -35,7 +35,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.statistics.noise_models import MODELS, Frequencies, grid, largest_p_value
+from thermocald.analysis.statistics.noise_models import (
+    MODELS,
+    Frequencies,
+    grid,
+    largest_p_value,
+    mixtures,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -117,7 +123,7 @@ def slope_noise(
     r *= r
     uu, ur, rr = at.sums(uu), at.sums(ur), at.sums(r)
     phi, coloured, tau, prior = _models(max(_LONGEST, float(n)))
-    spectrum = at.spectra(phi, coloured)
+    spectrum = at.spectra(mixtures(phi, coloured))
 
     weight = 1.0 / spectrum
     information = np.maximum(weight @ uu, np.finfo(float).tiny)
@@ -274,7 +280,7 @@ def slope_p_value(values: Array, temperature: Array, times: Array | None = None)
     at = Frequencies.of(len(values), times)
     v, u = at.coefficients(values), at.coefficients(temperature)
     vv, uv, uu = at.sums(v * v), at.sums(u * v), at.sums(u * u)
-    spectrum = at.spectra(*MODELS)
+    spectrum = at.spectra(MODELS)
     weight = 1.0 / spectrum
     information, product = weight @ uu, weight @ uv
     left = np.maximum(weight @ vv - product**2 / information, np.finfo(float).tiny)

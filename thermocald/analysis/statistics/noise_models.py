@@ -1,7 +1,8 @@
 """Models of a series' noise, and whether it drifts beyond noise of whatever size and memory.
 
-Noise is first-order autoregressive plus white, spectrum σ² (a·s(φ) + 1 - a), with φ up to 0.995.
-The coefficients of the cosine transform of a stationary series are nearly independent, with its
+Noise is a sum of first-order autoregressive parts: white noise with one beside it, φ up to 0.995, or
+with flicker noise of a spectrum 1/f to 1/f^1.6, whose parts have memories evenly spread in their
+logarithm (van der Ziel 1950, Physica 16). The coefficients of the cosine transform of a stationary series are nearly independent, with its
 spectrum as variances (Whittle's approximation); a likelihood costs one transform. Of long series
 the high frequencies, which hold nothing of the slow noise, are pooled, and the last epochs are left
 out, a few of ten thousand, where that makes a length with small factors: the transform of a year of
@@ -46,24 +47,55 @@ _PHI = (0.2, 0.4, 0.6, 0.75, 0.85, 0.92, 0.95, 0.97, 0.985, 0.995)
 _COLOURED = (0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0)
 
 
-def grid(phi: ArrayLike, coloured: ArrayLike) -> tuple[Array, Array]:
-    """All pairs of φ and a (g,), and before them white noise (0, 0)."""
-    phis, parts = (g.ravel() for g in np.meshgrid(phi, coloured))
-    return np.append(0.0, phis), np.append(0.0, parts)
-
+_FLICKER = (1.0, 1.3, 1.6)  # exponents of 1/f
+_MEMORIES = 0.4 * 3.0 ** np.arange(10)  # epochs, of the parts of flicker noise
 
 _GAP = 3.0  # usual intervals between neighbours: a longer one ends a stretch
 _TYPICAL_PHI = 0.97
 
-MODELS = grid(_PHI, _COLOURED)
-"""φ (g,) and the coloured part a (g,) of the models that tests run through."""
+
+@dataclass(frozen=True, eq=False)
+class NoiseModels:
+    """Noises of unit variance: shares (g, P) of the variance of autoregressive parts of φ (P,)."""
+
+    phi: Array
+    shares: Array
 
 
-def spectra(frequency: Array, phi: Array, coloured: Array) -> Array:
-    """Spectra (g, m) of unit variance at frequencies (m,) rad, correlation a φᵏ at lag k > 0."""
-    phi, coloured = phi[:, None], coloured[:, None]
-    shape = (1 - phi**2) / (1 + phi**2 - 2 * phi * np.cos(frequency))
-    return np.asarray(coloured * shape + (1 - coloured))
+def mixtures(phi: Array, coloured: Array) -> NoiseModels:
+    """White noise with a coloured part of the variance (g,) that has φ (g,)."""
+    parts, column = np.unique(np.append(0.0, phi), return_inverse=True)
+    shares = np.zeros((len(phi), len(parts)))
+    shares[:, column[0]] = 1.0 - coloured
+    shares[np.arange(len(phi)), column[1:]] += coloured
+    return NoiseModels(parts, shares)
+
+
+def grid(first: ArrayLike, coloured: ArrayLike) -> tuple[Array, Array]:
+    """All pairs of two lists, and before them white noise (0, 0)."""
+    firsts, parts = (g.ravel() for g in np.meshgrid(first, coloured))
+    return np.append(0.0, firsts), np.append(0.0, parts)
+
+
+def _flicker() -> NoiseModels:
+    """Flicker noise with white noise beside it; the memories of the parts have these weights."""
+    shape = np.array([_MEMORIES ** (a - 1.0) for a in _FLICKER])
+    shape /= shape.sum(axis=1, keepdims=True)
+    coloured = np.tile(_COLOURED, len(_FLICKER))
+    shares = coloured[:, None] * np.repeat(shape, len(_COLOURED), axis=0)
+    phi = np.append(0.0, np.exp(-1.0 / _MEMORIES))
+    return NoiseModels(phi, np.column_stack([1.0 - coloured, shares]))
+
+
+def _either(a: NoiseModels, b: NoiseModels) -> NoiseModels:
+    """The models of both."""
+    upper = np.hstack([a.shares, np.zeros((len(a.shares), len(b.phi)))])
+    lower = np.hstack([np.zeros((len(b.shares), len(a.phi))), b.shares])
+    return NoiseModels(np.append(a.phi, b.phi), np.vstack([upper, lower]))
+
+
+MODELS = _either(mixtures(*grid(_PHI, _COLOURED)), _flicker())
+"""The models that tests run through."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,11 +145,13 @@ class Frequencies:
         # orthonormal, orthogonal to a constant, and independent for noise with a long memory
         root = np.sqrt(np.array(lengths) / sum(lengths))
         flat = np.linalg.svd(root[None])[2][1:]
-        slow = found.means_covariance(_TYPICAL_PHI, 1.0)
+        slow = found.means_covariance(_TYPICAL_PHI)
         return replace(found, contrasts=np.linalg.eigh(flat @ slow @ flat.T)[1].T @ flat)
 
-    def means_covariance(self, phi: float, coloured: float) -> Array:
+    def means_covariance(self, phi: float) -> Array:
         """Covariance (K, K) of the stretches' means, times √length, of noise of unit variance."""
+        if phi == 0.0:
+            return np.eye(len(self.pieces))
         size = np.array([p.stop - p.start for p in self.pieces], dtype=float)
         phi = min(phi, 1.0 - 1e-9)
         geometric = (1.0 - phi**size) / (1.0 - phi)
@@ -125,7 +159,7 @@ class Frequencies:
         scaled = geometric / np.sqrt(size)
         between = scaled[:, None] * scaled[None] * phi**self.pauses
         np.fill_diagonal(between, own)
-        return np.asarray(coloured * between + (1 - coloured) * np.eye(len(size)))
+        return np.asarray(between)
 
     def coefficients(self, y: Array) -> Array:
         """Orthonormal coefficients of a series about its mean, without the constant one."""
@@ -141,14 +175,15 @@ class Frequencies:
         """Sums (m,) of something per coefficient."""
         return power if len(self.starts) == len(power) else np.add.reduceat(power, self.starts)
 
-    def spectra(self, phi: Array, coloured: Array) -> Array:
-        """Mean variances (g, m) of the coefficients of noise of unit variance."""
-        out = spectra(self.mean, phi, coloured)
-        for k, (one, part) in enumerate(zip(phi, coloured, strict=True)):
-            if len(self.contrasts):
-                C = self.contrasts
-                out[k, : len(C)] = np.einsum("ij,jk,ik->i", C, self.means_covariance(one, part), C)
-        return out
+    def spectra(self, models: NoiseModels) -> Array:
+        """Mean variances (g, m) of the coefficients of noises of unit variance."""
+        phi = models.phi[:, None]
+        parts = (1 - phi**2) / (1 + phi**2 - 2 * phi * np.cos(self.mean))
+        if C := len(self.contrasts):
+            for part, one in zip(parts, models.phi.tolist(), strict=True):
+                slow = self.means_covariance(one)
+                part[:C] = np.einsum("ij,jk,ik->i", self.contrasts, slow, self.contrasts)
+        return np.asarray(models.shares @ parts)
 
 
 def _pieces(n: int, times: Array | None) -> tuple[tuple[slice, ...], Array]:
@@ -337,7 +372,7 @@ def _slow_against_fast(whole: _Spectrum, fast: _Spectrum, trend: Array, band: in
     """p-value of the slow band, continued from the fast one."""
     from scipy.stats import f
 
-    models = whole.at.spectra(*MODELS)
+    models = whole.at.spectra(MODELS)
     high = _without_trend(fast, trend, band)
     degrees = float(fast.count[band:].sum()) - 2.0
     if degrees < _LEAST_FAST:
@@ -373,7 +408,7 @@ def _excess(whole: _Spectrum, fast: _Spectrum, band: int, redundancy: float) -> 
     """p-value of the variance of the standardised series, which the sds say is 1."""
     from scipy.stats import f
 
-    models = whole.at.spectra(*MODELS)
+    models = whole.at.spectra(MODELS)
     deviance = (fast.power[band:] / models[:, band:]).sum(axis=1)
     deviance = deviance + np.log(models[:, band:]) @ fast.count[band:]
     # A sum of squares of unequal variances: Satterthwaite's degrees of freedom.

@@ -237,3 +237,66 @@ def test_gross_errors_among_twelve_targets_end_in_a_status(seed, gross_px, exter
         off = (r.values - truth)[r.ok][:, :3]
         z = (off - np.median(off, axis=0)) / r.sd[r.ok][:, :3]
         assert np.sqrt(np.mean(z**2)) < 1.3
+
+
+@pytest.mark.parametrize("factor", [1.0, 5.0])
+def test_a_field_worse_than_stated_is_said_and_scales_the_level(factor):
+    """Over 20 series of 25 epochs; with the stated sigmas the level was wrong by `factor` sd."""
+    rng = np.random.default_rng(32)
+    z, ratios = [], []
+    for _ in range(20):
+        field, truth, observations = series(rng, epochs=25, coordinate_error=0.02 * factor)
+        stated = TestField.build(field.names, field.points, 0.02)
+        r = adjust_series(
+            scene.SENSOR, stated, observations, scene.INTERIOR, scene.EXTERIOR,
+            SeriesSettings(exterior="series"),
+        )  # fmt: skip
+        ratios.append(r.field_ratio)
+        error = (r.values - truth)[r.ok][:, :3].mean(axis=0)
+        z.append(error / r.level_sd[:3])
+    assert np.median(ratios) == pytest.approx(factor, rel=0.2)
+    assert (max(ratios) == 1.0) is (factor == 1.0)
+    assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.3  # 60 values, correlated
+
+
+def noisy_outside(rng, factor):
+    """25 epochs of a camera at rest, whose outermost target is `factor` times as noisy."""
+    field = scene.corner_field(0.0)
+    interior, exterior = scene.INTERIOR.as_array(), scene.EXTERIOR.as_array()
+    true = project(scene.SENSOR, interior, exterior, field.points)
+    middle = 0.5 * np.array([scene.SENSOR.width - 1, scene.SENSOR.height - 1])
+    share = np.linalg.norm(true - middle, axis=1) ** 2
+    noise = scene.SIGMA_PX * factor ** (share / share.max())
+    rows, sigmas = np.arange(len(true)), np.full(true.shape, scene.SIGMA_PX)
+    return field, [
+        Observations(rows, true + rng.normal(0, 1, true.shape) * noise[:, None], sigmas)
+        for _ in range(25)
+    ]
+
+
+@pytest.mark.parametrize("factor", [1.0, 3.0])
+def test_noise_that_grows_towards_the_edge_is_seen_with_its_sd(factor):
+    off = []
+    for seed in range(12):
+        field, observations = noisy_outside(np.random.default_rng(seed), factor)
+        r = adjust_series(scene.SENSOR, field, observations, scene.INTERIOR, scene.EXTERIOR)
+        value, sd = r.outer_noise
+        off.append((value - factor) / sd)
+    assert np.sqrt(np.mean(np.square(off))) < 1.6  # 99.9 % point of twelve
+    if factor > 1.0:
+        assert value - 1.0 > 5.0 * sd
+
+
+def test_what_the_perspective_knows_is_what_an_epoch_knows_by_itself():
+    field, observations = noisy_outside(np.random.default_rng(1), 1.0)
+    alike, apart = (
+        adjust_series(
+            scene.SENSOR, field, observations, scene.INTERIOR, scene.EXTERIOR,
+            SeriesSettings(exterior=exterior),
+        )
+        for exterior in ("series", "per_epoch")
+    )  # fmt: skip
+    assert np.isnan(apart.perspective_sd).all()
+    own = np.median(apart.sd[:, :3], axis=0)
+    assert alike.perspective_sd[:3] == pytest.approx(own, rel=0.15)
+    assert (alike.perspective_sd[:3] > 5 * np.median(alike.sd[:, :3], axis=0)).any()

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from thermocald.analysis.series.epochs import CAUSES_OF_SIGMA0, MATERIAL
 from thermocald.discovery.result import Discovery, field_lines, mount_lines
 from thermocald.numbers import UNITS, plain, with_sd
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES, IOP_NAMES, Sensor
@@ -139,6 +140,7 @@ def calibration_lines(document: dict[str, Any]) -> list[str]:
         lines.append(
             f"calibrated from {used} of {document['n_photographs']} photographs: sigma0 "
             f"{document['sigma0']:.2f}, redundancy {document['redundancy']}"
+            + (f"; {CAUSES_OF_SIGMA0}" if document["sigma0"] > 1.0 + MATERIAL else "")
         )
         rows = [("", "value ± sd", "in px")]
         pitch = document["camera"]["pixel_pitch"]

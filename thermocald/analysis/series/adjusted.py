@@ -184,6 +184,7 @@ def _table(
         adjustment=sample,
         groups=_groups(testfield, sample),
         trend_sd=whole.trend_sd,
+        perspective_sd=sample.perspective_sd,
         redundancy=rows.redundancy,
         stillness=rows.stillness,
     )

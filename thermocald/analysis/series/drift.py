@@ -117,6 +117,7 @@ def courses(table: Epochs, names: tuple[str, ...] = ("c", "x0", "y0")) -> list[C
                 float(y[-1] - y[0]),
                 float(np.hypot(sd[-1], sd[0])),
                 sd_slope,
+                float(np.sqrt(2.0) * table.perspective_sd[IOP_NAMES.index(line.name)]),
             )
         )
     return result

@@ -22,6 +22,7 @@ from thermocald.figures import BAND
 from thermocald.files import write_parts
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.series.blocks import released
+from thermocald.photogrammetry.series.mount import FASTEST_DRIFT_S
 from thermocald.physics.effect import PARAMETER_UNITS
 from thermocald.result import Result, jsonable, new_figure
 from thermocald.store.recording.reader import interpolate_readings
@@ -54,6 +55,13 @@ CSV_COLUMNS = (
     *(f"sd_{name}" for name in PARAMETER_NAMES),
 )
 
+MATERIAL = 0.1
+"""Which sigma0 beyond 1 is worth a word."""
+CAUSES_OF_SIGMA0 = (
+    "it can be the noise of the image points, a test field worse than stated, or a lens that the "
+    "distortion does not describe"
+)
+_UNEVEN = 1.3  # times the noise in the middle
 _ROWS = 20_000  # of a table that are worked on at a time
 
 
@@ -83,7 +91,8 @@ class Course:
     group of targets; rests_on: the group without which there would be no drift, or "";
     per_kelvin, sd_per_kelvin, p_temperature: slope on the reference temperature, its standard
     deviation and its p-value, corrected, NaN where that is constant or not known;
-    last_minus_first: between the first and the last epoch.
+    last_minus_first: between the first and the last epoch; sd_by_perspective: of that, if the
+    mount could stand anywhere in each: a mount that moves slowly is excluded no better.
     """
 
     name: str
@@ -100,6 +109,7 @@ class Course:
     last_minus_first: float = float("nan")
     sd_last_minus_first: float = float("nan")
     sd_per_kelvin: float = float("nan")
+    sd_by_perspective: float = float("nan")
 
     @property
     def moves(self) -> bool:
@@ -127,6 +137,7 @@ class Course:
             "sd_change": self.sd_change,
             "last_minus_first": self.last_minus_first,
             "sd_last_minus_first": self.sd_last_minus_first,
+            "sd_last_minus_first_by_perspective": self.sd_by_perspective,
             "p": self.p,
             "drift": self.moves,
             "per_kelvin": self.per_kelvin,
@@ -175,6 +186,7 @@ class Epochs(Result):
     without: Callable[[NDArray[np.int64], bool], Epochs] | None = None
     left_out: tuple[str, ...] = ()
     trend_sd: Array = field(default_factory=lambda: np.zeros(16))
+    perspective_sd: Array = field(default_factory=lambda: np.full(16, np.nan))
     redundancy: Array = field(default_factory=lambda: np.zeros(0))
     stillness: Array = field(default_factory=lambda: np.zeros(0))
     sampled: NDArray[np.int64] | None = None
@@ -258,6 +270,8 @@ class Epochs(Result):
             "ok": int(ok.sum()),
             "sigma0": float(np.median(self.sigma0[ok])) if ok.any() else None,
             "noise_ratio": None if self.adjustment is None else self.adjustment.noise_ratio,
+            "field_ratio": None if self.adjustment is None else self.adjustment.field_ratio,
+            "outer_noise": _outer_noise(self.adjustment),
             "rejected": int(self.n_rejected.sum()),
             "left_out": list(self.left_out),
             "field_movements": [
@@ -284,7 +298,18 @@ class Epochs(Result):
         if document["sigma0"] is not None:
             out.append(
                 f"sigma0 {document['sigma0']:.2f}: image points scatter that many times as much as "
-                "their stated standard deviations say"
+                f"their stated standard deviations say{self._cause_of_noise()}"
+            )
+        if (ratio := document["field_ratio"] or 1.0) > 1.0:
+            out.append(
+                f"the targets are off by the same in all epochs, {ratio:.1f} times what the test "
+                "field's stated standard deviations allow: its coordinates, or a lens that the "
+                "distortion does not describe; the level is scaled by that"
+            )
+        if outer := document["outer_noise"]:
+            out.append(
+                "the outermost targets are as noisy as those in the image's middle times "
+                f"{outer['value']:.1f} ± {outer['sd']:.1f}; the weights follow that"
             )
         if document["exterior_choice"]:
             out.append(f"--exterior {self.exterior}: {document['exterior_choice']}")
@@ -294,6 +319,12 @@ class Epochs(Result):
             for name in self.left_out
         ]
         out += _table_of(self.drifts)
+        if limits := [c for c in self.drifts if isfinite(c.sd_by_perspective)]:
+            sds = ", ".join(f"{c.name} ± {1e3 * c.sd_by_perspective:.3f}" for c in limits)
+            out.append(
+                f"a mount that moves more slowly than in {FASTEST_DRIFT_S / 60:.0f} min looks like "
+                f"the camera; by the perspective alone last - first is {sds} µm"
+            )
         reasons = [f"{w['status']}: {w['reason']}" for w in document["without_result"]]
         out += [f"{reasons.count(text)} × {text}" for text in sorted(set(reasons))]
         still = document.get("stood_still")
@@ -304,6 +335,14 @@ class Epochs(Result):
                 f"{still['largest_chi2']:.0f}, {bound}): use --exterior per_epoch"
             )
         return out
+
+    def _cause_of_noise(self) -> str:
+        """Return what a sigma0 beyond 1 can be, "" where it is not."""
+        if not np.median(self.sigma0[self.ok]) > 1.0 + MATERIAL:
+            return ""
+        if self.adjustment is None or not np.isfinite(self.adjustment.offsets).any():
+            return f"; {CAUSES_OF_SIGMA0}"
+        return "; it changes from epoch to epoch: noise of the image points, not the test field"
 
     def plot(self, against: str = "time") -> Figure:
         """Draw how c, x0 and y0 changed since the first epoch, µm, with 95 % of each epoch.
@@ -424,6 +463,14 @@ def unit_of(column: str) -> str:
     """Return the unit of a column of `CSV_COLUMNS`, "" where it has none."""
     others = {"frame_time": "s", "temperature": "degC"}
     return others.get(column) or PARAMETER_UNITS.get(column.removeprefix("sd_"), "")
+
+
+def _outer_noise(adjustment: SeriesAdjustment | None) -> dict[str, float] | None:
+    """Return the outermost targets' noise over that in the middle, None where that is chance."""
+    value, sd = (1.0, 0.0) if adjustment is None else adjustment.outer_noise
+    if not abs(value - 1.0) > max(3.0 * sd, _UNEVEN - 1.0):
+        return None
+    return {"value": value, "sd": sd}
 
 
 def _imported(module: str) -> Any:

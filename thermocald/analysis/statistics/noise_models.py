@@ -1,12 +1,12 @@
 """Models of a series' noise, and whether it drifts beyond noise of whatever size and memory.
 
-Noise is a sum of first-order autoregressive parts: white noise with one beside it, φ up to 0.995, or
-with flicker noise of a spectrum 1/f to 1/f^1.6, whose parts have memories evenly spread in their
-logarithm (van der Ziel 1950, Physica 16). The coefficients of the cosine transform of a stationary series are nearly independent, with its
-spectrum as variances (Whittle's approximation); a likelihood costs one transform. Of long series
-the high frequencies, which hold nothing of the slow noise, are pooled, and the last epochs are left
-out, a few of ten thousand, where that makes a length with small factors: the transform of a year of
-prime length takes 400 MB.
+Noise is a sum of first-order autoregressive parts: white noise with one beside it, φ up to 0.995,
+or with flicker noise, 1/f to 1/f^1.6, whose parts have memories evenly spread in their logarithm
+(van der Ziel 1950, Physica 16). The coefficients of the cosine transform of a stationary series are
+nearly independent, with its spectrum as variances (Whittle's approximation); a likelihood costs one
+transform. Of long series the high frequencies, which hold nothing of the slow noise, are pooled,
+and the last epochs are left out, a few of ten thousand, where that makes a length with small
+factors: the transform of a year of prime length takes 400 MB.
 
 *Drift* asks whether the slow part (periods longer than two windows) is larger than the fast part,
 continued to low frequencies, allows: an F-test for each noise model. The size σ is taken from the

@@ -203,8 +203,7 @@ def _circumstances(series: MeasuredSeries) -> list[str]:
             notes.append(
                 f"The series has {count} gap{'s' if count > 1 else ''}, the longest of "
                 f"{float(steps.max()):.3g} s at an interval of {series.interval_s:.3g} s; windows "
-                "across them are not tested, and correlation between neighbours counts epochs, "
-                "not seconds."
+                "across them are not tested, and the noise forgets in them as between epochs."
             )
     held = [name for name in IOP_NAMES if name not in series.free]
     if held:

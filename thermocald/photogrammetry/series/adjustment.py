@@ -31,6 +31,7 @@ from thermocald.photogrammetry.camera.camera_model import (
 from thermocald.photogrammetry.epoch.snooping import TRUSTED_REDUNDANCY
 from thermocald.photogrammetry.series.covariances import (
     all_cofactors,
+    by_perspective,
     line_weights,
     of_common,
     of_correlated,
@@ -57,8 +58,13 @@ from thermocald.photogrammetry.series.result import (
     enough_targets,
     judge,
 )
+from thermocald.photogrammetry.series.snooping import point_tests
 from thermocald.photogrammetry.series.system import State
-from thermocald.photogrammetry.series.target_noise import excess_scatter, slow_errors
+from thermocald.photogrammetry.series.target_noise import (
+    excess_scatter,
+    noise_by_radius,
+    slow_errors,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -268,8 +274,24 @@ def result(found: Adjusted) -> SeriesAdjustment:
         estimate.residuals, estimate.offsets if series.has_offsets else estimate.offsets * np.nan,
         _sds(offset_cofactors(system) * pooled), tuple(status), tuple(reasons), still,
         np.sqrt(excess), np.sqrt(np.diag(trend + mount_trend)),
+        _sds(by_perspective(system) * pooled), float(np.sqrt(series.field_variance)),
+        _outer_noise(series, estimate),
         _noise_ratio(sigma0, sound), movement, found.choice,
     )  # fmt: skip
+
+
+def _outer_noise(series: SeriesEstimator, estimate: Estimate) -> tuple[float, float]:
+    """Noise of the outermost target over that in the image's middle, and its sd."""
+    system, sensor = estimate.system, series.sensor
+    half = 0.5 * np.array([sensor.width - 1, sensor.height - 1])
+    radius = np.linalg.norm(system.design.at.predicted - half, axis=1)
+    weights = system.weights[..., 0]
+    stated = np.divide(
+        series.stated[..., 0], weights, out=np.zeros_like(weights), where=weights > 0
+    )
+    tests = point_tests(system, estimate.residuals) * stated
+    offered = series.grid.observed & system.good[:, None]  # the rejected too: noise is cut else
+    return noise_by_radius(tests, offered, radius)
 
 
 def _sds(variances: Array) -> Array:

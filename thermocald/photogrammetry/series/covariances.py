@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP, EOP_COLUMNS
-from thermocald.photogrammetry.linalg import root_of
+from thermocald.photogrammetry.linalg import inverse_of_determined, root_of
 from thermocald.photogrammetry.series.normals import among_all, cofactors
 
 if TYPE_CHECKING:
@@ -129,6 +129,19 @@ def typical_sensitivity(system: SeriesSystem) -> Array:
     Q, _ = cofactors((N[design.own[:, None], design.own] + design.own_prior)[None])
     sensitivity: Array = Q[0] @ N[design.own[:, None], EOP_COLUMNS]
     return sensitivity
+
+
+def by_perspective(system: SeriesSystem) -> Array:
+    """Cofactors (16,) of a typical epoch's parameters if the mount could stand anywhere in each.
+
+    NaN for what is held, and where nothing is common to the epochs.
+    """
+    out = np.full(16, np.nan)
+    if len(system.design.common) and system.good.any():
+        free = np.union1d(system.design.own, EOP_COLUMNS)
+        N = system.N[system.good].mean(axis=0)[free[:, None], free]
+        out[free] = np.diag(inverse_of_determined(N))
+    return out
 
 
 def of_common(system: SeriesSystem, covariance: Array) -> Array:

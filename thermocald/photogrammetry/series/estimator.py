@@ -56,6 +56,12 @@ _SMALL = 0.1  # standard deviations: a last step that the partials carry to 1e-3
 _SMALLER = 1e-4  # of one block among many: the result must not depend on the blocks
 _NEAR = 10.0  # standard deviations: by what the residuals follow a step by the partials
 _ROUNDS = 8  # of data snooping
+_FIELD_ROUNDS = 4  # of the field's own variance component
+_SAME_FIELD = 0.1  # of it
+_LEAST_TOLD = 0.1  # of an offset by the image points, to count
+_FEWEST_OFFSETS = 8
+_MEDIAN_WORTH = 0.37  # of a degree of freedom in a mean
+_BEYOND_CHANCE = 3.1  # standard deviations
 _RELINEARISE_PX = 1.0  # movement of the mean that changes the partials by more than about 1e-3
 
 
@@ -79,7 +85,8 @@ class SeriesEstimator:
     held: the linearisation at which common unknowns are known, None where they are estimated; unit:
     variance of unit weight that the priors start with; windows: runs of consecutive epochs, where
     the series is a sample of a longer one; typical: variance of unit weight for epochs too poor to
-    tell their own, None: that of these epochs.
+    tell their own, None: that of these epochs; field_variance: by what the stated covariance of the
+    field's coordinates is multiplied.
     """
 
     sensor: Sensor
@@ -93,6 +100,7 @@ class SeriesEstimator:
     unit: float = 1.0
     windows: tuple[slice, ...] = ()
     typical: float | None = None
+    field_variance: float = 1.0
 
     def adjusted(self, start: State, use: Mask) -> tuple[SeriesEstimator, Estimate, Mask]:
         """Solve, find the gross errors and the targets' own noise; the series with that noise."""
@@ -112,7 +120,39 @@ class SeriesEstimator:
                 series = series.with_target_noise(estimate, use)
                 estimate = series.solve(estimate, use, 1.0)
                 estimate, use = series.snoop(estimate, use, use)
+            for _ in range(_FIELD_ROUNDS):
+                variance = series.estimate_field_variance(estimate)
+                if variance is None or abs(variance / series.field_variance - 1.0) < _SAME_FIELD:
+                    break
+                series = replace(series, field_variance=variance)
+                estimate = series.solve(estimate, use, series.variance(estimate))
+                estimate, use = series.snoop(estimate, use, offered)
         return series, estimate, use
+
+    def estimate_field_variance(self, estimate: Estimate) -> float | None:
+        """Estimate what the field's stated covariance is to be multiplied by, at least 1.
+
+        From the targets' offsets: their weighted squares over how much of each the image points
+        tell, the median, which targets that have moved do not reach. None where that shows nothing
+        beyond chance.
+        """
+        design, q = estimate.system.design, len(estimate.system.design.common)
+        Q = estimate.system.Q_common
+        if design.offset_prior is None or self.held is not None or len(Q) <= q:
+            return None
+        (wx, wy, wxy), (x, y) = design.offset_prior.T, estimate.offsets.T
+        T = len(wx)
+        at, to = q + np.arange(T), q + T + np.arange(T)
+        held = wx * Q[at, at] + wy * Q[to, to] + 2.0 * wxy * Q[at, to]
+        told = 1.0 - held / 2.0  # of an offset's two coordinates
+        shown = told > _LEAST_TOLD
+        if shown.sum() < _FEWEST_OFFSETS:
+            return None
+        squares = (wx * x * x + wy * y * y + 2.0 * wxy * x * y) / self.variance(estimate)
+        ratio = float(np.median(squares[shown] / told[shown])) / (2.0 * np.log(2.0))
+        ratio *= self.field_variance
+        chance = 1.0 + _BEYOND_CHANCE * np.sqrt(2.0 / (_MEDIAN_WORTH * 2.0 * told[shown].sum()))
+        return ratio if ratio > chance or self.field_variance > 1.0 else None
 
     def _screened(self, start: State, use: Mask) -> Mask:
         """Which points (E, T) take part where most epochs do not converge: what fits each one's
@@ -282,7 +322,9 @@ class SeriesEstimator:
         offsets = self.has_offsets and with_common
         return Design(
             at, own, common, known, own_prior, weight[common], self.bound is not None,
-            offset_weights(self.testfield, at) * variance if offsets else None,
+            offset_weights(self.testfield, at) * (variance / self.field_variance)
+            if offsets
+            else None,
         )  # fmt: skip
 
     def _residuals(self, values: Array, offsets: Array, out: Array) -> Array:

@@ -120,8 +120,12 @@ class SeriesAdjustment:
     or the light flickers; contained in the covariance, 0 where it is not significant; trend_sd
     (16,): what a straight line from the first epoch to the last owes to targets: their coordinates'
     uncertainty where the visible ones changed on the way, slow errors of their own, and a mount
-    with memory; noise_ratio: the noise found over the one stated; movement: of the mount; choice:
-    how the exterior orientation was estimated and why.
+    with memory; perspective_sd (16,): of an epoch whose mount could stand anywhere, NaN where each
+    has its own exterior orientation anyway; field_ratio: the standard deviations of the field's
+    coordinates over those stated, 1 where no more are shown; outer_noise: noise of the outermost
+    target over that in the image's middle, and its standard deviation; noise_ratio: the noise found
+    over the one stated; movement: of the mount; choice: how the exterior orientation was estimated
+    and why.
     """
 
     settings: SeriesSettings
@@ -140,6 +144,9 @@ class SeriesAdjustment:
     stillness: Array
     excess_sd: Array
     trend_sd: Array
+    perspective_sd: Array
+    field_ratio: float = 1.0
+    outer_noise: tuple[float, float] = (float("nan"), float("nan"))
     noise_ratio: float = 1.0
     movement: Movement = STILL
     choice: str = ""

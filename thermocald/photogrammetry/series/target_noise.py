@@ -27,6 +27,8 @@ _SIGNIFICANT = 4.0  # correlations of n pairs below 4/√n are noise: 6e-5 two-s
 _FEWEST_PAIRS = 40
 _LEAST_CORRELATION = 0.3
 _SMOOTH = 15  # epochs
+_FEWEST_RADII = 8  # targets
+_LOG_CHI2 = np.pi**2 / 6  # variance of the logarithm of chi-square with two degrees of freedom
 _CLIP = 60.0  # times the median square: beyond it is not scatter but a jump
 
 
@@ -116,6 +118,31 @@ def correlated_pairs(
         np.concatenate(right),
         np.concatenate(covariances) / redundancy_share,
     )
+
+
+def noise_by_radius(tests: Array, used: Mask, radius: Array) -> tuple[float, float]:
+    """Noise of the outermost target over that in the image's middle, and its standard deviation.
+
+    tests (E, T): squared residuals over their stated variance; used (E, T); radius (T,): of the
+    targets from the image's middle. The logarithm of the noise is a straight line in r², which
+    gross errors do not bend; targets scatter about it as they do. NaN where nothing shows it.
+    """
+    n = (used & (tests > 0)).sum(axis=0)
+    with np.errstate(divide="ignore"):
+        logarithms = np.where(used & (tests > 0), np.log(tests), 0.0).sum(axis=0)
+    seen = n > 0
+    if seen.sum() < _FEWEST_RADII or not np.ptp(radius[seen]) > 0:
+        return float("nan"), float("nan")
+    y, x, w = logarithms[seen] / n[seen], radius[seen] ** 2, n[seen].astype(float)
+    outermost = float(x.max())
+    x = x - (w @ x) / w.sum()
+    y = y - (w @ y) / w.sum()
+    information = float(w @ (x * x))
+    slope = float(w @ (x * y)) / information
+    scatter = float(w @ (y - slope * x) ** 2) / (len(y) - 2)
+    sd = np.sqrt(max(scatter, _LOG_CHI2) / information)
+    ratio = float(np.exp(0.5 * slope * outermost))
+    return ratio, ratio * 0.5 * outermost * float(sd)
 
 
 def slow_errors(residuals: Array, used: Mask) -> Array:

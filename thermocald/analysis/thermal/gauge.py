@@ -73,14 +73,12 @@ class _Finder(Protocol):
 class Pose:
     """A pose as it was resected: what later frames are compared with.
 
-    time s; predicted (10,) and unknown (10,), as of `PredictedCamera`; eop (6,) and its covariance
-    (6, 6); seen: the control points then.
+    time s; predicted: the camera then; eop (6,) and its covariance (6, 6); seen: the control points
+    then.
     """
 
     time: float
-    predicted: Array
-    unknown: Array
-    temperature: float
+    predicted: PredictedCamera
     eop: ExteriorOrientation
     covariance: Array
     seen: Observations
@@ -159,8 +157,7 @@ class GaugeCalibrator:
                 known = self.predictor.at(one.epoch.frame_time)
                 if known is not None:
                     pose = Pose(
-                        one.epoch.frame_time, known.camera.values, known.unknown,
-                        known.camera.temperature,
+                        one.epoch.frame_time, known,
                         ExteriorOrientation.from_array(result.values[EOP]),
                         covariance[EOP, EOP], seen.select(keep),
                     )  # fmt: skip
@@ -223,7 +220,6 @@ class GaugeCalibrator:
         self, epoch: Epoch, now: PredictedCamera, seen: Observations | None, why: str,
         in_order: bool,
     ) -> Adjustment:  # fmt: skip
-        camera = now.camera
         if not len(self.testfield):
             return self._unposed("predicted", "", now)
         if seen is None or len(seen) < _FEWEST:
@@ -236,8 +232,7 @@ class GaugeCalibrator:
         assert result.exterior is not None
         keep = seen.select(~np.isin(seen.targets, result.rejected))
         pose = Pose(
-            epoch.frame_time, camera.values, now.unknown, camera.temperature, result.exterior,
-            result.covariance[EOP, EOP], keep,
+            epoch.frame_time, now, result.exterior, result.covariance[EOP, EOP], keep
         )  # fmt: skip
         if in_order:
             self._watch(pose)
@@ -315,30 +310,33 @@ class GaugeCalibrator:
             return None
         a, b = (p.seen.select(np.searchsorted(p.seen.targets, both)) for p in (then, now))
         points, eop = self.testfield.points[both], then.eop.as_array()
-        seen = np.array([project(self.sensor, p.predicted, eop, points) for p in (then, now)])
+        before, after = then.predicted, now.predicted
+        seen = [project(self.sensor, p.camera.values, eop, points) for p in (before, after)]
         moved = (b.points - a.points - (seen[1] - seen[0])).ravel()
-        _, A, _ = partials(self.sensor, then.predicted, eop, points)
+        _, A, _ = partials(self.sensor, before.camera.values, eop, points)
         A = A.reshape(-1, 16)
         noise = (_matching(a) ** 2 + _matching(b) ** 2 + _UNMODELLED_PX**2).ravel()
         N = A[:, EOP].T @ (A[:, EOP] / noise[:, None])
         scale = np.sqrt(np.diag(N))
         inverse = np.linalg.pinv(N / np.outer(scale, scale), rcond=1e-12) / np.outer(scale, scale)
         gain = inverse @ (A[:, EOP] / noise[:, None]).T
-        root = self._rates_root(now.temperature - then.temperature)
-        drift = gain @ A[:, IOP] @ np.column_stack([root, now.unknown - then.unknown])
+        drift = gain @ A[:, IOP] @ self._change_root(before, after)
         return Movement(now.time, gain @ moved, inverse + drift @ drift.T)
 
-    def _rates_root(self, change_k: float) -> Array:
-        """A root (10, n) of the covariance of what the model says of a change of temperature."""
+    def _change_root(self, before: PredictedCamera, after: PredictedCamera) -> Array:
+        """A root (10, n) of the covariance of what is predicted of a change of the camera."""
+        change_k = after.camera.temperature - before.camera.temperature
         thermal = self.thermal
         rows = [k for k, n in enumerate(thermal.parameters) if n.startswith("rates.")]
         names = [IOP_NAMES.index(thermal.parameters[k].split(".")[1]) for k in rows]
         block = thermal.covariance[np.ix_(rows, rows)] * change_k**2
-        root = np.zeros((10, len(rows) + 1))
+        root = np.zeros((10, len(rows) + 2))
         if rows:
             values, vectors = np.linalg.eigh(block)
             root[names, : len(rows)] = vectors * np.sqrt(np.maximum(values, 0.0))
-        root[:, -1] = math.sqrt(2.0) * self.predictor.noise_k * thermal.model.rate_vector
+        unsure_k = math.hypot(before.temperature_sd, after.temperature_sd)
+        root[:, -2] = unsure_k * thermal.model.rate_vector
+        root[:, -1] = after.unknown - before.unknown
         return root
 
 

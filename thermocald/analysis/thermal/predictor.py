@@ -39,13 +39,15 @@ _REMEMBERED = 4000  # readings
 class PredictedCamera:
     """A camera as it is predicted: `camera`, with the covariance of model, thermometer and past.
 
-    age_s: of its last reading; unknown (10,): what the unknown past adds, one standard deviation,
+    age_s: of its last reading; temperature_sd: K, of its temperature, with what a reading's age and
+    the limits of the fit add; unknown (10,): what the unknown past adds, one standard deviation,
     and unknown_px, the largest of it in the image; beyond: K outside the temperatures of the fit,
     `far` if nothing should be predicted there.
     """
 
     camera: Camera
     age_s: float
+    temperature_sd: float
     unknown: Array
     unknown_px: float
     beyond: float
@@ -112,15 +114,17 @@ class Predictor:
         T, unknown = camera.temperature, other.values - self._now[0].values
         rates = self.thermal.model.rate_vector
         covariance = camera.covariance + np.outer(unknown, unknown)
-        drifted = self.noise_k**2 + (self._change(age) ** 2 if age > _GAP_S else 0.0)
-        covariance = covariance + drifted * np.outer(rates, rates)
+        drifted = math.hypot(self.noise_k, self._change(age) if age > _GAP_S else 0.0)
+        covariance = covariance + drifted**2 * np.outer(rates, rates)
         beyond = far = 0.0
         if (validity := self.thermal.validity) is not None:
             beyond, far = validity.distance(T)
             covariance = covariance + np.diag((rates * beyond) ** 2)
         model = self.thermal.model
         now = Camera(model.sensor, T, camera.values, covariance, beyond, model.camera)
-        return PredictedCamera(now, age, unknown, _largest_px(now, unknown), beyond, bool(far))
+        shift = _largest_px(now, unknown)
+        spread = math.hypot(drifted, beyond)
+        return PredictedCamera(now, age, spread, unknown, shift, beyond, bool(far))
 
     def _row(self, readings: Mapping[str, float]) -> dict[str, float] | None:
         """The reference and the channels that the model names; None where one was not read yet."""

@@ -28,6 +28,17 @@ ADDRESSES = [
     f"postgresql://db.example/thermocald?user=a&password={SECRET}",
     f"mqtt+ssl://a:{SECRET}@broker:8883",
     f"https://example.org/hook?token={SECRET}&x=1",
+    f"example.org with PGPASSWORD={SECRET}",
+    f"example.org, password='{SECRET} and more'",
+    f"host=db.example sslpassword={SECRET} dbname=x",
+    f"example.org/?access_token={SECRET}",
+    f"example.org {{'api-key': '{SECRET}', 'pwd': \"{SECRET}\"}}",
+    f'example.org {{"password": "{SECRET}"}}',
+    f"example.org, Authorization: Bearer {SECRET}",
+    f"example.org, {{'Authorization': 'Basic {SECRET}=='}}",
+    f"//user:{SECRET}@example.org/x",
+    f"user:{SECRET}@example.org:5432",
+    f"(user:{SECRET}@[::1]:5432) broker",
 ]
 
 
@@ -40,7 +51,19 @@ def test_an_address_is_cleaned_and_still_says_where(address):
 
 
 @pytest.mark.parametrize(
-    "text", ["https://medium.com/@user", "http://host:8080/@x", "a@b.example", "ratio 3:/1@2", ""]
+    "text",
+    [
+        "https://medium.com/@user",
+        "http://host:8080/@x",
+        "a@b.example",
+        "ratio 3:/1@2",
+        "",
+        "dashboard.token: must be 16 characters or more",
+        "password: unknown key",
+        "epoch 3: 12 targets @ 21 °C",
+        "mailto:a@b.example",
+        "at 12:30 bob@x wrote",
+    ],
 )
 def test_what_is_no_secret_stays(text):
     assert without_secrets(text) == text

@@ -19,12 +19,22 @@ Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
 _ADDRESS = re.compile(r"(?P<scheme>\b[a-zA-Z][a-zA-Z0-9+.-]*:/{1,2})(?P<rest>[^\s'\"<>]*)")
-_PAIR = re.compile(r"(?i)\b(passw(?:or)?d|token|secret|api_?key)=[^\s&'\"]*")
+_KEY = r"(?:passw(?:or)?d|passphrase|pwd|token|secret|api[_-]?key)"
+_VALUE = r"(?:'[^']*'|\"[^\"]*\"|[^\s&'\"]*)"
+# `key=value` of a query or of libpq, 'key': 'value' of a mapping that a library printed, a header
+_PAIR = re.compile(rf"(?i)({_KEY}\s*=\s*){_VALUE}|({_KEY}['\"]\s*:\s*){_VALUE}")
+_HEADER = re.compile(
+    r"(?i)(authorization['\"]?\s*[:=]\s*['\"]?(?:basic|bearer|digest)?)\s*[^\s'\"]+"
+)
+_PLAIN_USER = re.compile(
+    r"(?<![^\s'\"(=<])(?://)?(?!mailto:)[^\s:@/'\"(=<]+:[^\s:@/'\"]+@(?=[\w\[])"
+)
 
 
 def without_secrets(text: str) -> str:
     """A text without the user information and the passwords of the addresses in it."""
-    return _PAIR.sub(r"\1=…", _ADDRESS.sub(_without_user, text))
+    text = _PLAIN_USER.sub("", _ADDRESS.sub(_without_user, text))
+    return _PAIR.sub(r"\1\2…", _HEADER.sub(r"\1 …", text))
 
 
 def _without_user(found: re.Match[str]) -> str:

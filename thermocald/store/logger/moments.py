@@ -19,7 +19,7 @@ _ZONE = r"\s*(?P<zone>Z|UTC|GMT|CES?T|MES?Z|(?:UTC|GMT)?[+-]\d{2}:?\d{2}|[+-]\d{
 _FULL = re.compile(rf"(?:{_DATE}|{_COMPACT_DATE})[ T,;_-]+(?:{_TIME}|{_COMPACT_TIME}){_ZONE}")
 _ONLY_DATE = re.compile(rf"(?:{_DATE}|{_COMPACT_DATE})")
 _ONLY_TIME = re.compile(rf"{_TIME}{_ZONE}")
-_NUMBER = re.compile(r"\d{9,13}(?:[.,]\d+)?")
+_NUMBER = re.compile(r"\d{9,13}(?:[.,]\d+)?|\d{16}|\d{19}")
 _NAMED_DATE = re.compile(
     r"(?:[^\W\d_]{2,9}\.?,?\s+)?"  # the day of the week
     r"(?:(?P<m1>[^\W\d_]{3,9})\.?\s+(?P<d1>\d{1,2})(?:st|nd|rd|th)?,?\s+(?P<y1>\d{4})"
@@ -36,7 +36,7 @@ _MONTHS = {
 _WORD = re.compile(r"[A-Za-z]{3}")
 _CHINESE = str.maketrans({"年": "-", "月": "-", "日": " "})
 _ZONES_H = {"Z": 0, "UTC": 0, "GMT": 0, "CET": 1, "MEZ": 1, "CEST": 2, "MESZ": 2}
-_MS_FROM = 1e11  # seconds since 1970 are fewer for 3000 years
+_PARTS = ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3))  # seconds since 1970 are fewer for 3000 years
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ class MomentFormat:
 def parse_moment(text: str, form: MomentFormat | None = None) -> datetime | date | time:
     """A date with a time, with or without a zone; or a date, or a time, alone.
 
-    Numbers are seconds (or ms) since 1970 UTC. Raises ValueError for what is none of these.
+    Numbers are seconds (or ms, µs, ns) since 1970 UTC. Raises ValueError for what is none of these.
     """
     form = form or MomentFormat()
     text = _numbered(text.strip())
@@ -65,12 +65,16 @@ def parse_moment(text: str, form: MomentFormat | None = None) -> datetime | date
 
 
 def seconds_as_moment(seconds: float) -> datetime:
-    """Seconds, or milliseconds, since 1970 UTC; ValueError where they are not."""
-    value = seconds / 1000 if seconds >= _MS_FROM else seconds
+    """Seconds, or ms, µs, ns, since 1970 UTC; ValueError where they are not."""
     try:
-        return datetime.fromtimestamp(value, UTC)
+        return datetime.fromtimestamp(whole_seconds(seconds), UTC)
     except (OverflowError, OSError) as cause:
         raise ValueError(f"{seconds} is not a time") from cause
+
+
+def whole_seconds(number: float) -> float:
+    """Seconds since 1970 of a number of s, ms, µs, or ns, told by its size."""
+    return number / next((parts for least, parts in _PARTS if number >= least), 1.0)
 
 
 def is_date_like(text: str) -> bool:

@@ -26,9 +26,10 @@ from thermocald.store.logger.moments import (
     day_and_month,
     is_date_like,
     parse_moment,
+    whole_seconds,
 )
 from thermocald.store.logger.units import UNITS, stated_unit, to_celsius
-from thermocald.store.recording.sense import find_spikes, find_unit_change
+from thermocald.store.recording.sense import find_spikes, find_unit_change, stuck_doubts
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -51,6 +52,7 @@ _OTHER_NAME = re.compile(
     r"|^epoch$|pixel|^(?:c|x0|y0|sigma0)$|^sd_|^#$|^no\.?$",
     re.IGNORECASE,
 )
+_MEAN = re.compile(r"(?<![^\W_])(?:avg|mean)(?![^\W_])", re.IGNORECASE)
 _HEADER_ZONE = re.compile(r"(?:GMT|UTC)\s*[+-]\s*\d{1,2}(?::?\d{2})?", re.IGNORECASE)
 _NUMBER = re.compile(r"[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?")
 _UNIT_BEHIND = re.compile(r"\s*(?:[°º]\s*[CFK]?|℃|℉|deg\s?[CF]|(?<=[\d\s])[CFK])$")
@@ -60,7 +62,8 @@ _NO_READING = {-127.0, -999.0, -9999.0, -99.0, 9999.0}
 _PLAUSIBLE_C = (-90.0, 180.0)
 _KELVIN = (220.0, 450.0)
 _GOOD_SHARE = 0.8
-_MS_FROM = 1e11  # seconds since 1970 are fewer for 3000 years
+_FAHRENHEIT = (45.0, 120.0)  # °F of rooms and cameras, which may be °C of a hot one
+_LATEST_S = 1e11
 _LONGER = 10.0  # times: a log in the wrong order of day and month runs over months
 
 
@@ -303,14 +306,12 @@ class _Table:
 
 
 def _as_seconds(text: str) -> float | None:
-    """Seconds since 1970, or milliseconds, of any number; None for a date."""
+    """Seconds since 1970, or ms, µs, ns, of any number; None for a date."""
     try:
-        seconds = float(text)
+        seconds = whole_seconds(float(text))
     except ValueError:
         return None
-    if seconds >= _MS_FROM:
-        seconds /= 1000.0
-    return seconds if seconds < _MS_FROM else None
+    return seconds if seconds < _LATEST_S else None
 
 
 def _clock(clock: DeviceClock, header: str) -> tuple[DeviceClock, list[str]]:
@@ -495,6 +496,9 @@ def _temperature_columns(
     others = [n for n in numeric if not _OTHER_NAME.search(n) and n not in OUR_TIMES]
     if len(others) == 1:
         return (others[0],)
+    means = [n for n in numeric if _TEMPERATURE_NAME.search(n) and _MEAN.search(n)]
+    if len(means := [n for n in means if not _OTHER_NAME.search(_MEAN.sub("", n))]) == 1:
+        return (means[0],)
     shown = "; ".join(f"{n!r}: {file.column(n)[0]}" for n in numeric) or "none with numbers"
     raise DataError(
         f"{file.path}: which column is the temperature? Say --temperature-column NAME. {shown}"
@@ -512,6 +516,11 @@ def _celsius(table: _Table, name: str, options: LogOptions) -> tuple[Array, list
         if len(known) and known.min() > _KELVIN[0] and known.max() < _KELVIN[1]:
             raise DataError(
                 f"{path}, column {name!r}: {known[0]:g} looks like kelvin: say --unit K to convert"
+            )
+        if len(known) and known.min() > _FAHRENHEIT[0] and known.max() < _FAHRENHEIT[1]:
+            notes.append(
+                f"doubtful: {name!r} names no unit: {known[0]:g} is taken as °C; if it is °F, it is "
+                f"{(known[0] - 32) / 1.8:.1f} °C: say --unit degF, or degC"
             )
         unit = "degC"
     elif unit != "degC" and options.unit is None:
@@ -549,7 +558,7 @@ def _measured(
         return celsius, [f"doubtful: {where}"]
     spikes = find_spikes(celsius)
     measured = celsius.copy()
-    notes = []
+    notes = [f"doubtful: {text}" for text in stuck_doubts(celsius, repr(name))]
     for said, sort in (("left empty", False), ("kept", True)):
         found = [s for s in spikes if s.measured is sort]
         if not found:

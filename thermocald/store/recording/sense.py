@@ -200,12 +200,25 @@ def reading_doubts(values: Array, label: str) -> Iterator[str]:
             f"{label}: the unit seems to change {words} at reading {row + 1}: "
             f"{values[:row][np.isfinite(values[:row])][-1]:g}, then {values[row]:g}"
         )
+    yield from stuck_doubts(values, label)
     if spikes := find_spikes(values):
         first = spikes[0]
         why = "leap away and back" if first.measured else "are what it gives without a measurement"
         yield (
             f"{label}: {sum(s.stop - s.first for s in spikes)} readings {why}, the first "
             f"{values[first.first]:g} °C at reading {first.first + 1}; leave them empty"
+        )
+
+
+def stuck_doubts(values: Array, label: str) -> Iterator[str]:
+    """Yield that all readings (n,) °C are one that thermometers give without a measurement."""
+    known = values[np.isfinite(values)]
+    if len(known) < _AROUND or np.ptp(known) > 0:
+        return
+    if np.isclose(known[0], _NOT_MEASURED, atol=0.006).any():
+        yield (
+            f"{label}: all {len(known)} readings are {known[0]:g} °C, which a thermometer gives "
+            "without a measurement"
         )
 
 

@@ -1,0 +1,89 @@
+"""Files of loggers as their makers' programs write them: read right, or called doubtful."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+
+import numpy as np
+import pytest
+
+from thermocald.errors import DataError
+from thermocald.store.logger.clock import DeviceClock, time_zone
+from thermocald.store.logger.temperatures import LogOptions, read_log
+
+START = datetime(2026, 7, 6, 13, 55, tzinfo=UTC)
+MOMENTS = [START + timedelta(seconds=60 * i) for i in range(12)]
+CELSIUS = [21.5 + 0.1 * i for i in range(12)]
+NEAR = (MOMENTS[0].timestamp(), MOMENTS[-1].timestamp())
+
+
+def read(path, head, row, unit=""):
+    """The log with head lines and a row of each moment, °C, and number."""
+    rows = [row(m, t, i) for i, (m, t) in enumerate(zip(MOMENTS, CELSIUS, strict=True))]
+    path.write_bytes("\r\n".join([*head, *rows, ""]).encode())
+    options = LogOptions(clock=DeviceClock(zone=time_zone("UTC")), unit=unit or None)
+    return read_log(path, options, NEAR)
+
+
+TOA5 = [
+    '"TOA5","CR1000","CR1000","1234","CR1000.Std.32","CPU:prog.CR1","1","Table1"',
+    '"TIMESTAMP","RECORD","AirTC_Avg","BattV_Min"',
+    '"TS","RN","Deg C","Volts"',
+    '"","","Avg","Min"',
+]
+DIALECTS = {
+    "Campbell TOA5": (TOA5, lambda m, t, i: f'"{m:%Y-%m-%d %H:%M:%S}",{i},{t:.2f},12.9'),
+    "Onset, twelve hours": (
+        ["#,Date-Time (UTC),Ch: 1 - Temperature   (°C )"],
+        lambda m, t, i: f"{i + 1},{m:%m/%d/%Y %I:%M:%S %p},{t:.2f}"),
+    "Elitech": (["No.,Time,Temperature°C"],
+                lambda m, t, i: f"{i + 1},{m:%Y-%m-%d %H:%M:%S},{t:.1f}"),
+    "Ruuvi": (["Date,Temperature (°C),Humidity (%),RSSI (dBm)"],
+              lambda m, t, i: f"{m:%Y-%m-%dT%H:%M:%S.000Z},{t:.2f},50.1,-60"),
+    "Govee in °F": (["Timestamp for sample frequency every 1 min,Temperature_Fahrenheit"],
+                    lambda m, t, i: f"{m:%Y-%m-%d %H:%M:%S},{1.8 * t + 32:.2f}"),
+    "Tinytag": (["Record,Date,Time,Temperature"],
+                lambda m, t, i: f"{i + 1},{m:%d %b %Y},{m:%H:%M:%S},{t:.2f} °C"),
+    "InfluxDB in ns": (["name,time,value"],
+                       lambda m, t, i: f"temp,{int(m.timestamp())}000000000,{t:.2f}"),
+    "InfluxDB in µs": (["name,time,value"],
+                       lambda m, t, i: f"temp,{int(m.timestamp())}000000,{t:.2f}"),
+    "least, most and mean": (
+        ["time,T max °C,T min °C,T avg °C"],
+        lambda m, t, i: f"{int(m.timestamp())},{t + 0.5:.2f},{t - 0.5:.2f},{t:.2f}"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DIALECTS)
+def test_it_is_read_without_a_question(tmp_path, name):
+    found = read(tmp_path / "log.csv", *DIALECTS[name])
+    assert found.times.tolist() == [m.timestamp() for m in MOMENTS]
+    (values,) = found.channels.values()
+    assert np.abs(values - CELSIUS).max() < 0.006
+    assert not [note for note in found.notes if "doubtful" in note]
+
+
+@pytest.mark.parametrize("head", ["temp", "T1", "Sensor 1", "value"])
+def test_fahrenheit_without_a_unit_is_doubtful(tmp_path, head):
+    def row(m, t, i):
+        return f"{int(m.timestamp())},{1.8 * t + 32:.2f}"
+
+    found = read(tmp_path / "log.csv", [f"time,{head}"], row)
+    (note,) = [note for note in found.notes if "doubtful" in note]
+    assert "70.7 is taken as °C; if it is °F, it is 21.5 °C: say --unit" in note
+    found = read(tmp_path / "log.csv", [f"time,{head}"], row, "degF")
+    assert not [note for note in found.notes if "doubtful" in note]
+    assert next(iter(found.channels.values()))[0] == pytest.approx(21.5)
+
+
+@pytest.mark.parametrize("value", ["85.00", "0.0", "127.94", "-40.0", "125.00", "-45.00"])
+def test_a_log_of_nothing_but_what_is_no_measurement_is_doubtful(tmp_path, value):
+    found = read(tmp_path / "log.csv", ["time,temp °C"], lambda m, t, i: f"{int(m.timestamp())},{value}")
+    (note,) = [note for note in found.notes if "doubtful" in note]
+    assert f"all 12 readings are {float(value):g} °C" in note
+
+
+@pytest.mark.parametrize("factor", [1000, 10])
+def test_thousandths_and_tenths_are_refused(tmp_path, factor):
+    with pytest.raises(DataError, match="Another unit"):
+        read(tmp_path / "log.csv", ["time,temp"], lambda m, t, i: f"{int(m.timestamp())},{round(factor * t)}")

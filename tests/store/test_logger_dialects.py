@@ -78,7 +78,9 @@ def test_fahrenheit_without_a_unit_is_doubtful(tmp_path, head):
 
 @pytest.mark.parametrize("value", ["85.00", "0.0", "127.94", "-40.0", "125.00", "-45.00"])
 def test_a_log_of_nothing_but_what_is_no_measurement_is_doubtful(tmp_path, value):
-    found = read(tmp_path / "log.csv", ["time,temp °C"], lambda m, t, i: f"{int(m.timestamp())},{value}")
+    found = read(
+        tmp_path / "log.csv", ["time,temp °C"], lambda m, t, i: f"{int(m.timestamp())},{value}"
+    )
     (note,) = [note for note in found.notes if "doubtful" in note]
     assert f"all 12 readings are {float(value):g} °C" in note
 
@@ -86,4 +88,8 @@ def test_a_log_of_nothing_but_what_is_no_measurement_is_doubtful(tmp_path, value
 @pytest.mark.parametrize("factor", [1000, 10])
 def test_thousandths_and_tenths_are_refused(tmp_path, factor):
     with pytest.raises(DataError, match="Another unit"):
-        read(tmp_path / "log.csv", ["time,temp"], lambda m, t, i: f"{int(m.timestamp())},{round(factor * t)}")
+        read(
+            tmp_path / "log.csv",
+            ["time,temp"],
+            lambda m, t, i: f"{int(m.timestamp())},{round(factor * t)}",
+        )

@@ -519,8 +519,8 @@ def _celsius(table: _Table, name: str, options: LogOptions) -> tuple[Array, list
             )
         if len(known) and known.min() > _FAHRENHEIT[0] and known.max() < _FAHRENHEIT[1]:
             notes.append(
-                f"doubtful: {name!r} names no unit: {known[0]:g} is taken as °C; if it is °F, it is "
-                f"{(known[0] - 32) / 1.8:.1f} °C: say --unit degF, or degC"
+                f"doubtful: {name!r} names no unit: {known[0]:g} is taken as °C; if it is °F, it "
+                f"is {(known[0] - 32) / 1.8:.1f} °C: say --unit degF, or degC"
             )
         unit = "degC"
     elif unit != "degC" and options.unit is None:

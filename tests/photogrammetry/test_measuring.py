@@ -152,6 +152,22 @@ def test_few_points(rows, start, word):
     assert resect(SENSOR, INTERIOR, Q, field, seen, near).status == word
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+def test_corners_of_three_markers_on_one_board_give_a_pose(noise):
+    """Exactly in one plane and on two lines, which a solver of OpenCV does not bear."""
+    points = np.array([[0.0, y, z] for z in range(6) for y in (22.5, 127.5)])
+    points[:, 2] = np.repeat([577.5, 472.5, 427.5, 322.5, 277.5, 172.5], 2)
+    pose = np.array([-0.7854, 0.6155, 2.6180, 950.0, 950.0, 950.0])
+    field = TestField.build([f"g{i}" for i in range(12)], points, 0.1)
+    uv = project(points, pose, INTERIOR.c, INTERIOR.x0, INTERIOR.y0)
+    uv = uv + np.random.default_rng(8).normal(0, noise, uv.shape)
+    seen = Observations(np.arange(12), uv, np.full((12, 2), 0.05))
+    r = resect(SENSOR, INTERIOR, np.zeros((10, 10)), field, seen)
+    assert r.status == "ok", r.reason
+    d = r.values[10:] - pose
+    assert d @ np.linalg.solve(r.covariance[10:, 10:], d) < 22.5  # of 6 degrees of freedom
+
+
 def test_points_in_one_line_determine_no_pose():
     rng = np.random.default_rng(6)
     points = np.array([-2_000.0, 9_000.0, 500.0]) + np.linspace(0, 1, 8)[:, None] * [0, 20_000, 0]

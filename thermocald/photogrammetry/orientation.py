@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 _FLIP = np.diag([1.0, -1.0, -1.0])  # OpenCV's camera looks along +Z with y down
 _FIELDS_OF_VIEW_DEG = (18.0, 25.0, 33.0, 42.0, 52.0, 62.0, 73.0, 85.0, 98.0)
 _TOLERANCE = 0.005  # of the image width: distortion is not known yet
+_MANY = 8  # pairs
 _MINIMUM = 4
 _CLEAR = 0.5  # of the pairs, that fit
 
@@ -143,21 +144,43 @@ def majority_pose(
     """OpenCV's R (3, 3) and t (3,), object to camera, and the pairs that they explain, or None.
 
     X (n, 3) mm; ideal (n, 2): image points at the distance 1, y down; threshold: of what fits;
-    fewest: pairs that must. RANSAC with SQPnP, refined on the pairs that fit.
+    fewest: pairs that must. RANSAC with SQPnP, refined on the pairs that fit; with three points at
+    a time where that finds none, as of points that lie exactly in a plane.
     """
-    cv2.setRNGSeed(seed)
-    try:
-        ok, rvec, tvec, inliers = cv2.solvePnPRansac(
-            X, ideal, np.eye(3), None, iterationsCount=300, reprojectionError=threshold,
-            confidence=0.9999, flags=cv2.SOLVEPNP_SQPNP,
-        )  # fmt: skip
-    except cv2.error:  # degenerate points fail an assertion in there
-        return None
-    if not ok or inliers is None or len(inliers) < fewest:
-        return None
-    rows = inliers.ravel()
-    rvec, tvec = cv2.solvePnPRefineLM(X[rows], ideal[rows], np.eye(3), None, rvec, tvec)
-    return np.asarray(cv2.Rodrigues(rvec)[0], float), np.asarray(tvec, float).ravel(), rows
+    # three points fit a few others by chance
+    second = (cv2.SOLVEPNP_AP3P,) if len(X) >= _MANY else ()
+    for solver in (cv2.SOLVEPNP_SQPNP, *second):
+        cv2.setRNGSeed(seed)
+        try:
+            ok, rvec, tvec, inliers = cv2.solvePnPRansac(
+                X, ideal, np.eye(3), None, iterationsCount=300, reprojectionError=threshold,
+                confidence=0.9999, flags=solver,
+            )  # fmt: skip
+        except cv2.error:  # degenerate points fail an assertion in there
+            continue
+        if ok and inliers is not None and len(inliers) >= fewest:
+            rows = inliers.ravel()
+            centre, axes, flat = plane_fit(X[rows])
+            if flat and solver == cv2.SOLVEPNP_AP3P:  # it may be the mirrored one
+                poses = _plane_poses(X[rows], ideal[rows], centre, axes)
+                return (*poses[0], rows) if poses else None
+            rvec, tvec = cv2.solvePnPRefineLM(X[rows], ideal[rows], np.eye(3), None, rvec, tvec)
+            return np.asarray(cv2.Rodrigues(rvec)[0], float), np.asarray(tvec, float).ravel(), rows
+    return None
+
+
+def _plane_poses(X: Array, ideal: Array, centre: Array, axes: Array) -> list[tuple[Array, Array]]:
+    """Both poses R (3, 3), t (3,) of points in a plane (`plane_fit`), the better one first."""
+    local = np.ascontiguousarray((X - centre) @ axes.T)
+    local[:, 2] = 0.0
+    _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
+        local, ideal, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+    )  # fmt: skip
+    poses = []
+    for rvec, tvec in zip(rvecs, tvecs, strict=True):
+        R = np.asarray(cv2.Rodrigues(rvec)[0] @ axes, float)
+        poses.append((R, np.asarray(tvec, float).ravel() - R @ centre))
+    return poses
 
 
 def _ideal(sensor: Sensor, interior: InteriorOrientation, uv: Array) -> Array:
@@ -183,17 +206,7 @@ def resection(
     ideal = _ideal(sensor, interior, uv)
     centre, axes, flat = plane_fit(X)
     if flat:
-        local = np.ascontiguousarray((X - centre) @ axes.T)
-        local[:, 2] = 0.0
-        _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
-            local, ideal, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
-        )
-        poses = []
-        for rvec, tvec in zip(rvecs, tvecs, strict=True):
-            R = cv2.Rodrigues(rvec)[0] @ axes
-            poses.append(
-                ExteriorOrientation.from_rotation(R.T @ _FLIP, centre - R.T @ tvec.ravel())
-            )
+        poses = [_exterior(R, t) for R, t in _plane_poses(X, ideal, centre, axes)]
     else:
         _, rvec, tvec = cv2.solvePnP(X, ideal, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP)
         rvec, tvec = cv2.solvePnPRefineLM(X, ideal, np.eye(3), None, rvec, tvec)

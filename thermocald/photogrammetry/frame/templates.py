@@ -65,12 +65,11 @@ class Templates:
     """Measures control points (rows of `field`) in frames, from a reference frame and clicks."""
 
     def __init__(self, reference: NDArray[Any], field: TestField, clicks: Observations) -> None:
-        image = reference.astype(np.float32)
         self._shape, self._field = reference.shape, field
         self.patches = [
-            _patch(image, int(row), point, sigma)
+            _patch(reference, int(row), point, sigma)
             for row, point, sigma in zip(clicks.targets, clicks.points, clicks.sigmas, strict=True)
-            if _inside(image, point)
+            if _inside(reference, point)
         ]
         self._shift = np.zeros(2)
         self._sought = _SEARCH_PX
@@ -108,12 +107,11 @@ class Templates:
         status = inspect_frame(image, (self._shape[1], self._shape[0]))
         if not status.ok:
             return Measurement(Observations.none(), status)
-        grey = image.astype(np.float32)
         missed: dict[int, str] = {}
         found = []
         for patch in self.patches:
             try:
-                found.append((patch, *self._matched(grey, patch)))
+                found.append((patch, *self._matched(image, patch)))
             except GeometryError as error:
                 missed[patch.row] = str(error)
         if len(found) < _FEWEST and self._shift.any():
@@ -251,7 +249,7 @@ def _searched(image: NDArray[Any], patch: Array, near: Array, reach: int) -> Arr
     half = patch.shape[0] // 2
     x, y = (round(float(c)) for c in near)
     left, top = max(x - reach - half, 0), max(y - reach - half, 0)
-    window = image[top : y + reach + half + 1, left : x + reach + half + 1]
+    window = image[top : y + reach + half + 1, left : x + reach + half + 1].astype(np.float32)
     if x < 0 or y < 0 or min(window.shape) <= 2 * half or window.std() < _LEAST_CONTRAST:
         raise GeometryError("outside the frame, or in the dark")
     score = cv2.matchTemplate(window, patch.astype(np.float32), cv2.TM_CCOEFF_NORMED)

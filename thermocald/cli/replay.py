@@ -155,18 +155,15 @@ def export(
     opened = tc.open(source, series)
     with progress(len(opened) if folder else None, "calibrating") as advance:
         table = opened.calibrate(exterior=exterior, free=free, jobs=jobs, progress=advance)
-    if format_ == "csv" and style.is_plain and not extra:
-        write_parts(table.csv_lines(), output)
-    elif format_ == "json" and not extra:
-        write_parts(series_export.as_json(series_export.plain_rows(table)), output)
-    else:
+    known = None
+    if extra or format_ == "parquet" or not style.is_plain:
         known = series_export.besides(source, series, table.number, extra=extra)
-        parts = series_export.column_parts(table, style, known)
-        if format_ == "parquet":
-            series_export.write_parquet(parts, Path(output))
-        elif format_ == "json":
-            write_parts(series_export.as_json(series_export.as_rows(parts)), output)
-        else:
-            write_parts(series_export.as_csv(parts, style), output)
+    parts = series_export.column_parts(table, style, known)
+    if format_ == "parquet":
+        series_export.write_parquet(parts, Path(output))
+    elif format_ == "json":
+        write_parts(series_export.as_json(parts), output)
+    else:
+        write_parts(series_export.as_csv(parts, style), output)
     for sentence, count in sorted(table.without_result.items()):
         say(f"{count} epochs without a result: {sentence}")

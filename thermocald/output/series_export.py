@@ -6,36 +6,31 @@ The columns of CONVENTIONS §4 with other units have them in their names (`c_px`
 
 from __future__ import annotations
 
-import csv
 import importlib.util
-import io
 import json
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from itertools import islice
-from math import isfinite
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.series.epochs import CSV_COLUMNS, Epochs, csv_text
+from thermocald.analysis.series.epochs import csv_text
 from thermocald.errors import DriverMissing, UsageError
 from thermocald.files import make_folder, new_file
-from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
+from thermocald.result import jsonable
 from thermocald.store.recording.reader import open_recording
 from thermocald.store.sources import open_source
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
 
+    from thermocald.analysis.series.epochs import Columns, Epochs
     from thermocald.arrays import Array
     from thermocald.store.series import StoredEpoch
 
-    Columns = dict[str, NDArray[np.integer] | Array | Sequence[str]]
-    Row = dict[str, float | int | str | None]
 
 UNITS = ("px", "um", "deg")
 _IN_IMAGE, _ANGLES = ("c", "x0", "y0"), ("omega", "phi", "kappa")
@@ -165,21 +160,12 @@ def columns_of(
     pixel_pitch = others.pixel_pitch
     if "px" in style.units and pixel_pitch is None:
         raise UsageError("--units px: the size of the pixels is not known here")
-    moments: Array | tuple[str, ...] = table.frame_time
+    columns: Columns = {}
+    for name, values in table.columns().items():
+        suffix, factor = _unit(name.removeprefix("sd_"), style, pixel_pitch)
+        columns[name + suffix] = values if not suffix else np.asarray(values) * factor
     if style.time == "iso":
-        moments = tuple(_iso(t) for t in table.frame_time.tolist())
-    columns: Columns = {
-        "epoch": table.number, "frame_time": moments, "temperature": table.temperature
-    }  # fmt: skip
-    for prefix, values in (("", table.values), ("sd_", table.sd)):
-        for k, name in enumerate(PARAMETER_NAMES):
-            suffix, factor = _unit(name, style, pixel_pitch)
-            columns[f"{prefix}{name}{suffix}"] = values[:, k] * factor
-        if not prefix:
-            columns["sigma0"] = table.sigma0
-            columns["n_observations"] = table.n_observations.astype(np.int64)
-            columns["n_rejected"] = table.n_rejected.astype(np.int64)
-            columns["status"] = table.status
+        columns["frame_time"] = tuple(_iso(t) for t in table.frame_time.tolist())
     for name, readings in others.thermometers.items():
         columns[f"temperature {name}"] = readings
     for name, column in others.extra.items():
@@ -205,55 +191,19 @@ def _iso(seconds: float) -> str:
 
 def as_csv(parts: Iterable[Columns], style: ExportStyle) -> Iterator[str]:
     """The columns as text; numbers keep every digit, what is not known stays empty."""
-    for number, columns in enumerate(parts):
-        text = io.StringIO()
-        writer = csv.writer(text, delimiter=style.separator, lineterminator="\n")
-        if not number:
-            writer.writerow(columns)
-        cells = [_cells(name, values, style) for name, values in columns.items()]
-        writer.writerows(zip(*cells, strict=True))
-        yield text.getvalue()
+    return csv_text(parts, style.separator, style.decimal)
 
 
-def as_rows(parts: Iterable[Columns]) -> Iterator[Row]:
-    """The columns as a row per epoch for JSON; what is not known is null."""
-    for columns in parts:
-        lists = [
-            [None if isinstance(v, float) and not np.isfinite(v) else v for v in column]
-            for column in (c.tolist() if isinstance(c, np.ndarray) else c for c in columns.values())
-        ]
-        for row in zip(*lists, strict=True):
-            yield dict(zip(columns, row, strict=True))
-
-
-def plain_rows(table: Epochs) -> Iterator[Row]:
-    """The rows of CONVENTIONS §4; what is not known is null."""
-    for line in islice(csv_text(table), 1, None):
-        cells = zip(CSV_COLUMNS, line.rstrip("\n").split(","), strict=True)
-        yield {n: v if n == "status" else float(v) if v else None for n, v in cells}
-
-
-def as_json(rows: Iterable[Row]) -> Iterator[str]:
-    """Rows as one JSON list, row by row."""
+def as_json(parts: Iterable[Columns]) -> Iterator[str]:
+    """The columns as one JSON list with a row per epoch; what is not known is null."""
     start = "[\n"
-    for row in rows:
-        yield start + " " + json.dumps(row, indent=1).replace("\n", "\n ")
-        start = ",\n"
+    for columns in parts:
+        lists = [c.tolist() if isinstance(c, np.ndarray) else c for c in columns.values()]
+        for row in zip(*lists, strict=True):
+            said = json.dumps(jsonable(dict(zip(columns, row, strict=True))), indent=1)
+            yield start + " " + said.replace("\n", "\n ")
+            start = ",\n"
     yield "\n]\n" if start != "[\n" else "[]\n"
-
-
-def _cells(
-    name: str, values: NDArray[np.integer] | Array | Sequence[str], style: ExportStyle
-) -> list[str]:
-    if not isinstance(values, np.ndarray):
-        return list(values)
-    if np.issubdtype(values.dtype, np.integer):
-        return [str(v) for v in values.tolist()]
-    digits = [
-        "" if not isfinite(v) else f"{v:.6f}" if name == "frame_time" else repr(v)
-        for v in values.tolist()
-    ]
-    return [d.replace(".", style.decimal) for d in digits] if style.decimal != "." else digits
 
 
 def write_parquet(parts: Iterable[Columns], path: Path) -> None:

@@ -6,6 +6,8 @@ adjusted together from their observations (`adjusted`).
 
 from __future__ import annotations
 
+import csv
+import io
 import re
 from collections import Counter
 from dataclasses import dataclass, field, replace
@@ -43,17 +45,7 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.series.result import SeriesAdjustment
     from thermocald.store.recording.head import Head
 
-CSV_COLUMNS = (
-    "epoch",
-    "frame_time",
-    "temperature",
-    *PARAMETER_NAMES,
-    "sigma0",
-    "n_observations",
-    "n_rejected",
-    "status",
-    *(f"sd_{name}" for name in PARAMETER_NAMES),
-)
+    Columns = dict[str, NDArray[np.integer] | Array | Sequence[str]]
 
 MATERIAL = 0.1
 """Which sigma0 beyond 1 is worth a word."""
@@ -220,7 +212,7 @@ class Epochs(Result):
 
     def parts(self) -> Iterator[Epochs]:
         """All rows, some thousand at a time; what was used of a long series leaves memory."""
-        for first in range(0, len(self.number), _ROWS):
+        for first in range(0, max(len(self.number), 1), _ROWS):
             yield self.part(slice(first, first + _ROWS))
             released(self.values)
             released(self.sd)
@@ -378,7 +370,7 @@ class Epochs(Result):
 
     def csv_lines(self) -> Iterable[str]:
         """Yield the lines of `to_csv`."""
-        return csv_text(self)
+        return csv_text(part.columns() for part in self.parts())
 
     @property
     def without_result(self) -> dict[str, int]:
@@ -406,8 +398,7 @@ class Epochs(Result):
         ('epoch', 'mm')
         """
         pandas = _imported("pandas")
-        columns = {"time": self.time, **self._columns()}
-        frame = pandas.DataFrame(columns, index=pandas.Index(self.number, name="epoch"))
+        frame = pandas.DataFrame({"time": self.time, **self.columns()}).set_index("epoch")
         frame.attrs["units"] = {n: u for n in frame.columns if (u := unit_of(str(n)))}
         return frame
 
@@ -423,9 +414,9 @@ class Epochs(Result):
         ('mm', ('epoch', 'parameter', 'parameter_2'))
         """
         xarray = _imported("xarray")
-        columns = self._columns()
+        columns = self.columns()
         coordinates = {
-            "epoch": self.number,
+            "epoch": columns.pop("epoch"),
             "time": ("epoch", self.time.astype("datetime64[ns]")),
             "temperature": ("epoch", columns.pop("temperature")),
         }
@@ -446,21 +437,23 @@ class Epochs(Result):
                 data[name].attrs["units"] = unit
         return data
 
-    def _columns(self) -> dict[str, Any]:
+    def columns(self) -> Columns:
+        """Return the columns of `to_csv` (CONVENTIONS §4) by name, E values each."""
         return {
+            "epoch": self.number,
             "frame_time": self.frame_time,
             "temperature": self.temperature,
-            **{name: getattr(self, name) for name in PARAMETER_NAMES},
+            **dict(zip(PARAMETER_NAMES, self.values.T, strict=True)),
             "sigma0": self.sigma0,
-            "n_observations": self.n_observations,
-            "n_rejected": self.n_rejected,
-            "status": tuple(self.status),
-            **{f"sd_{name}": getattr(self, f"sd_{name}") for name in PARAMETER_NAMES},
+            "n_observations": self.n_observations.astype(np.int64),
+            "n_rejected": self.n_rejected.astype(np.int64),
+            "status": self.status,
+            **dict(zip((f"sd_{name}" for name in PARAMETER_NAMES), self.sd.T, strict=True)),
         }
 
 
 def unit_of(column: str) -> str:
-    """Return the unit of a column of `CSV_COLUMNS`, "" where it has none."""
+    """Return the unit of a column of `Epochs.columns`, "" where it has none."""
     others = {"frame_time": "s", "temperature": "degC"}
     return others.get(column) or PARAMETER_UNITS.get(column.removeprefix("sd_"), "")
 
@@ -573,25 +566,27 @@ def frame_temperatures(
     return dict(zip(number.tolist(), values.tolist(), strict=True))
 
 
-def csv_text(table: Epochs) -> Iterable[str]:
-    """The table as lines of CSV (CONVENTIONS §4): a result's figures with all their digits."""
-    yield ",".join(CSV_COLUMNS) + "\n"
-
-    for part in table.parts():
-        columns = [
-            [str(n) for n in part.number.tolist()],
-            [f"{t:.6f}" for t in part.frame_time.tolist()],
-            _cells(part.temperature),
-            *(_cells(column) for column in part.values.T),
-            _cells(part.sigma0),
-            [str(n) for n in part.n_observations.tolist()],
-            [str(n) for n in part.n_rejected.tolist()],
-            part.status,
-            *(_cells(column) for column in part.sd.T),
-        ]
-        yield from (",".join(row) + "\n" for row in zip(*columns, strict=True))
+def csv_text(parts: Iterable[Columns], separator: str = ",", decimal: str = ".") -> Iterator[str]:
+    """Yield columns as CSV; numbers keep every digit, what is not known stays empty."""
+    for number, columns in enumerate(parts):
+        text = io.StringIO()
+        writer = csv.writer(text, delimiter=separator, lineterminator="\n")
+        if not number:
+            writer.writerow(columns)
+        cells = [_cells(name, values, decimal) for name, values in columns.items()]
+        writer.writerows(zip(*cells, strict=True))
+        yield text.getvalue()
 
 
-def _cells(column: Array) -> list[str]:
-    """Numbers with all their digits, nothing where there is none."""
-    return [repr(v) if isfinite(v) else "" for v in column.tolist()]
+def _cells(
+    name: str, values: NDArray[np.integer] | Array | Sequence[str], decimal: str
+) -> Sequence[str]:
+    if not isinstance(values, np.ndarray):
+        return values
+    if np.issubdtype(values.dtype, np.integer):
+        return [str(v) for v in values.tolist()]
+    digits = [
+        "" if not isfinite(v) else f"{v:.6f}" if name == "frame_time" else repr(v)
+        for v in values.tolist()
+    ]
+    return [d.replace(".", decimal) for d in digits] if decimal != "." else digits

@@ -209,6 +209,17 @@ DOUBTS = {
     "zeros of a lost sensor": (
         lambda p: change(p, "epochs.csv", board_temperature=put("0.0", 12)),
         "board_temperature: 1 readings are"),
+    "a thermometer in another time zone": (
+        lambda p: change(p, "epochs.csv", temperature_time=scaled(1, 3600)),
+        "read 3600 s after their frames"),
+    "a thermometer whose clock is a day late": (
+        lambda p: change(p, "epochs.csv", temperature_time=scaled(1, -86400)),
+        "read 86400 s before their frames"),
+    "°F from the beginning": (
+        lambda p: change(p, "epochs.csv", temperature=scaled(1.8, 32)), "are they °F?"),
+    "nothing but 85.00": (
+        lambda p: change(p, "epochs.csv", board_temperature=lambda *_: "85.0"),
+        "board_temperature: all 40 readings are 85 °C"),
     "°C, then °F": (lambda p: change(p, "epochs.csv", temperature=fahrenheit), "from °C to °F"),
     "a reading that leaps": (
         lambda p: change(p, "epochs.csv", temperature=put("71.3", 12)), "leap away and back"),

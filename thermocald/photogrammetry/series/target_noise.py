@@ -127,9 +127,9 @@ def noise_by_radius(tests: Array, used: Mask, radius: Array) -> tuple[float, flo
     targets from the image's middle. The logarithm of the noise is a straight line in r², which
     gross errors do not bend; targets scatter about it as they do. NaN where nothing shows it.
     """
-    n = (used & (tests > 0)).sum(axis=0)
-    with np.errstate(divide="ignore"):
-        logarithms = np.where(used & (tests > 0), np.log(tests), 0.0).sum(axis=0)
+    counted = used & (tests > 0)
+    n = counted.sum(axis=0)
+    logarithms = np.log(np.where(counted, tests, 1.0)).sum(axis=0)
     seen = n > 0
     if seen.sum() < _FEWEST_RADII or not np.ptp(radius[seen]) > 0:
         return float("nan"), float("nan")

@@ -28,7 +28,12 @@ from thermocald.store.recording.readings import (
     temperature_at_frame,
     temperatures_at_frame,
 )
-from thermocald.store.recording.sense import reading_doubts, time_doubts, time_fault
+from thermocald.store.recording.sense import (
+    pairing_doubts,
+    reading_doubts,
+    time_doubts,
+    time_fault,
+)
 from thermocald.store.recording.table import Table
 from thermocald.store.recording.testfield_file import (
     read_testfield,
@@ -182,6 +187,7 @@ class Recording:
         """
         columns = self.columns
         found = list(time_doubts(columns.numbers, columns.frame_time, self.interval))
+        found += pairing_doubts(columns.frame_time, columns.temperature_time, self.interval)
         for name, values in columns.temperatures.items():
             found += reading_doubts(values, name)
         if columns.readings is not None:

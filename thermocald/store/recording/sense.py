@@ -34,6 +34,8 @@ _SMALLEST_EXTENT = 0.02  # of the image: less are millimetres, not px
 _FARTHEST_PX = 1e6
 _SIGMAS_PX = (1e-6, 1e4)
 _RHYTHM = 5.0  # times the stated interval
+_APART, _APART_S = 5.0, 60.0  # of a frame and its reading, intervals and s
+_HOT_C = 65.0  # no lens is made for that
 _DISTANCES = (0.8, 1.25)  # fitted to stated principal distance
 _CENTRE = 0.1  # of the image's diagonal
 _PITCH_OPTION = "--pixel-pitch, or pixel_pitch in recording.yaml or the camera file"
@@ -201,6 +203,12 @@ def reading_doubts(values: Array, label: str) -> Iterator[str]:
             f"{values[:row][np.isfinite(values[:row])][-1]:g}, then {values[row]:g}"
         )
     yield from stuck_doubts(values, label)
+    known = values[np.isfinite(values)]
+    if len(known) and known.min() > _HOT_C:
+        yield (
+            f"{label}: all readings lie between {known.min():g} and {known.max():g} °C, too hot "
+            "for a camera: are they °F?"
+        )
     if spikes := find_spikes(values):
         first = spikes[0]
         why = "leap away and back" if first.measured else "are what it gives without a measurement"
@@ -239,6 +247,19 @@ def time_doubts(numbers: NDArray[np.int64], times: Array, interval: float) -> It
         yield (
             f"frames follow one another every {rhythm:.3g} s, recording.yaml says {interval:.4g} s:"
             " is frame_time in seconds?"
+        )
+
+
+def pairing_doubts(frames: Array, readings: Array, interval: float) -> Iterator[str]:
+    """Yield that readings (E,) s, NaN for none, were not taken with their frames (E,) s."""
+    apart = (readings - frames)[np.isfinite(readings)]
+    if len(apart) == 0:
+        return
+    usual = float(np.median(apart))
+    if abs(usual) > max(_APART * interval, _APART_S):
+        yield (
+            f"temperatures were read {abs(usual):.0f} s {'after' if usual > 0 else 'before'} their "
+            "frames (median): is one of the clocks in another time zone, or not set?"
         )
 
 

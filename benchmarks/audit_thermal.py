@@ -17,7 +17,7 @@ from thermocald.discovery.model import build_model
 from thermocald.discovery.result import discover_series
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, project
 from thermocald.physics.heat import Course
-from thermocald.physics.model import ModelEffect
+from thermocald.physics.model import ModelEffect, follow_angle
 from thermocald.physics.presets import preset_simulation
 from thermocald.store.logger.temperatures import TemperatureLog
 from thermocald.thermal.reduce import reduce_series
@@ -210,7 +210,10 @@ def thermometer(draws: int, rng: np.random.Generator) -> list[Row]:
 def _corrected(s: Any, camera: ThermalCamera) -> list[float]:
     """Error over sd of points seen at 40 °C, corrected to 25 °C: a log that stands still."""
     truth = s.model
-    warm, cool = (truth.interior.as_array() + (T - truth.T0) * truth.rate_vector for T in (40, 25))
+    start = truth.interior.as_array()
+    warm, cool = (
+        follow_angle(start + (T - truth.T0) * truth.rate_vector, start[0]) for T in (40, 25)
+    )
     eop = s.truth.eop[0]
     rows = np.flatnonzero(s.model.sensor.contains(project(truth.sensor, cool, eop, s.field.points)))
     points = s.field.points[rows[:: max(1, len(rows) // 3)][:3]]

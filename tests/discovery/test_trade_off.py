@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.discovery.test_tremble import trembling
-from thermocald.discovery.entries import find_trade_off
+from thermocald.discovery.entries import find_ridge, find_trade_off
 from thermocald.physics import catalogue
 from thermocald.physics.formula import Node
 from thermocald.thermal.fit import HypothesisFitter
@@ -46,3 +46,25 @@ def test_a_constant_that_is_not_determined_is_said_so():
 
     assert "about 1.2e+02" not in said
     assert "about 120 s" in said
+
+
+def saturating(fitter, middle, width):
+    """A saturation of the temperature, centred somewhere, with its constants as unknowns."""
+    T = Node("", name=fitter.series[0].history.reference)
+    structure, values = Node("saturation", (T,), (middle, width)).named()
+    return fitter.refine(
+        fitter.fit((Term(structure.text(), BASE, tuple(values.items())),)), max_iterations=0
+    )
+
+
+def test_a_saturation_far_outside_the_recorded_range_is_known_by_its_course_alone(lagging):
+    """Its tail is an exponential: middle and size are one number."""
+    found = find_ridge(lagging, saturating(lagging, 3783.7, 288.2), 0)
+
+    assert found.names == ("k",)
+    assert "only their product" in found.sentence
+
+
+def test_a_saturation_within_the_recorded_range_is_known(lagging):
+    T = lagging.series[0].history.temperature()
+    assert find_ridge(lagging, saturating(lagging, float(T.mean()), 8.0), 0) is None

@@ -45,6 +45,8 @@ if TYPE_CHECKING:
 Estimate = dict[str, Any]
 
 _SURE = 3.0  # standard deviations of a thermometer's lag
+_EXCHANGED = 1e-9  # of the scaled normal matrix: along it nothing is known
+_TAKES_PART = 0.1  # of a unit vector along it
 _UNLIKE = 0.01  # probability below which the gradients are not one lag times the rates
 
 
@@ -336,6 +338,52 @@ def find_trade_off(fitter: HypothesisFitter, fit: Fit, number: int) -> TradeOff 
     Q = inverse_of_determined(A[np.ix_(kept, kept)])
     sd = float(np.sqrt(Q[kept.tolist().index(one), kept.tolist().index(one)]))
     return TradeOff((first, second), a + b, sd)
+
+
+@dataclass(frozen=True)
+class Ridge:
+    """names: of constants of which M1 knows only what they make of its temperatures together."""
+
+    names: tuple[str, ...] = field(metadata={"json": "parameters"})
+
+    @property
+    def sentence(self) -> str:
+        """What is added to a statement."""
+        return (
+            f"; of {', '.join(self.names)} and the size only their product over the recorded range "
+            "is known: others explain the same"
+        )
+
+
+def find_ridge(fitter: HypothesisFitter, fit: Fit, number: int) -> Ridge | None:
+    """Find the constants of a term that M1 exchanges for its size or each other; None without any.
+
+    tanh far below its middle is an exponential: middle and size are one number, and its slopes are
+    nothing but rounding, which looks like knowledge. So a temperature outside the recorded ones by
+    more than their range counts, whatever the normal equations say.
+    """
+    history = fitter.series[0].history
+    recorded = np.concatenate([history.temperature(name) for name in history.readings])
+    low, high = float(np.nanmin(recorded)), float(np.nanmax(recorded))
+    kind = fit.terms[number].kind
+    A, _, searched = fitter.normal_equations(fit, only=[0])
+    shares, axes = np.linalg.eigh(unit_diagonal(A)[0])
+    loose = axes[:, shares < _EXCHANGED]
+    names = [
+        name
+        for place, (owner, name) in enumerate(searched, len(fit.coefficients))
+        if owner == number
+        and (
+            float(np.abs(loose[place]).max(initial=0.0)) > _TAKES_PART
+            or (
+                kind.nonlinear[name].unit == "degC"
+                and not 2 * low - high
+                <= float(dict(fit.terms[number].nonlinear)[name])
+                <= 2 * high - low
+            )
+        )
+    ]
+    return Ridge(tuple(names)) if names else None
 
 
 def list_image_places(x: Examination) -> list[str]:

@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.discovery import criteria
-from thermocald.discovery.entries import EffectFound, estimate_term, find_trade_off
+from thermocald.discovery.entries import (
+    EffectFound,
+    Ridge,
+    TradeOff,
+    estimate_term,
+    find_ridge,
+    find_trade_off,
+)
 from thermocald.discovery.gap import Gap, fit_first
 from thermocald.discovery.proposal import propose
 from thermocald.photogrammetry.linalg import explained, inverse_of_determined
@@ -196,8 +203,17 @@ def propose_entry(
     term = found.terms[-1]
     e = found.fitter.series[0]
     estimates = estimate_term(final_fit, len(found.best.terms) - 1, e)
+    together: Ridge | TradeOff | None = find_ridge(
+        found.fitter, final_fit, len(found.best.terms) - 1
+    )
+    if together is not None:  # what the inverse says of them is of the others held
+        estimates = {
+            k: {**v, "sd": None} if k in together.names or k.startswith("a_") else v
+            for k, v in estimates.items()
+        }
+    else:
+        together = find_trade_off(found.fitter, final_fit, len(found.best.terms) - 1)
     sentence = catalogue.get(term.effect).sentence(estimates)
-    together = find_trade_off(found.fitter, final_fit, len(found.best.terms) - 1)
     if together is not None:
         sentence += together.sentence
     alternatives = [

@@ -22,7 +22,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
-from benchmarks import audit_camera, audit_field, audit_study, audit_thermal
+from benchmarks import audit_camera, audit_field, audit_null, audit_study, audit_thermal
 from benchmarks.audit_rows import Row, ratio, share
 
 if TYPE_CHECKING:
@@ -40,9 +40,12 @@ SECTIONS: dict[str, Callable[[int, np.random.Generator], list[Row]]] = {
     "series": audit_camera.series,
     "mount": audit_camera.mount,
     "calibrate": audit_camera.calibrate,
+    "noise": audit_camera.noise,
     "survey": audit_field.survey,
     "online": audit_camera.online,
     "significance": audit_study.significance,
+    "null": audit_null.null,
+    "named": audit_null.named,
     "thermal": audit_thermal.thermal,
     "distortion": audit_thermal.distortion,
     "delay": audit_thermal.delay,

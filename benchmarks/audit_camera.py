@@ -138,6 +138,62 @@ def mount(draws: int, rng: np.random.Generator) -> list[Row]:
     return rows
 
 
+def _noisy(
+    scene: Scene, targets: int, factor: float, edge: float, epochs: int
+) -> list[Observations]:
+    """Epochs of some targets; noise `factor` times as stated, and `edge` times at the corners."""
+    kept = scene.rng.choice(len(scene.field), targets, replace=False)
+    half = 0.5 * np.array([scene.sensor.width - 1, scene.sensor.height - 1])
+    out = []
+    for _ in range(epochs):
+        o = scene.observe(scene.iop, scene.eop)
+        share = np.linalg.norm(o.points - half, axis=1) / np.linalg.norm(half)
+        more = np.sqrt((factor * edge**share) ** 2 - 1.0)[:, None]
+        o.points[:] += NOISE_PX * more * scene.rng.standard_normal(o.points.shape)
+        out.append(o.select(np.isin(o.targets, kept)))
+    return out
+
+
+def noise(draws: int, rng: np.random.Generator) -> list[Row]:
+    """Epochs of some targets; noise `factor` times as stated, `edge` times more at the corners."""
+    rows = []
+    for what, targets, factor, edge, worse in (
+        ("12 targets", 12, 1.0, 1.0, 1.0),
+        ("24 targets, noise three times as stated", 24, 3.0, 1.0, 1.0),
+        ("24 targets, corners three times noisier", 24, 1.0, 3.0, 1.0),
+        ("24 targets, field ten times worse than stated", 24, 1.0, 1.0, 10.0),
+        ("48 targets, field ten times worse than stated", 48, 1.0, 1.0, 10.0),
+    ):  # fmt: skip
+        off, refused, change, level, factors = [], 0, [], [], []
+        for _ in range(draws // 2):
+            scene = Scene(rng, 0.01)
+            scene.points = scene.field.points + worse * (scene.points - scene.field.points)
+            seen = _noisy(scene, targets, factor, edge, 24)
+            alone = scene.adjust(seen[0])
+            truth = np.concatenate([scene.iop, scene.eop])
+            refused += not alone.ok
+            if alone.ok:
+                off.append(((alone.values - truth) / alone.sd)[:3])
+            found = adjust_series(
+                scene.sensor, scene.field, seen, InteriorOrientation.from_array(scene.iop),
+                ExteriorOrientation.from_array(scene.eop), SeriesSettings(exterior="series"),
+            )  # fmt: skip
+            if found.ok.all():
+                error, sd = (found.values - truth)[:, :3], found.sd[:, :3]
+                change.append((error[-1] - error[0]) / np.hypot(sd[0], sd[-1]))
+                level.append(error.mean(axis=0) / found.level_sd[:3])
+                factors.append(found.field_ratio)
+        field = f"field × {np.median(factors):.1f}"
+        print(f"({what}: {refused} of {draws // 2} refused, {field})", file=sys.stderr)
+        rows.append(ratio("`replay`, daemon: an epoch", f"sd of c, x0, y0; {what}",
+                          "noise and field as the residuals show them", np.array(off)))  # fmt: skip
+        rows.append(ratio("`replay`, `study`: a series", f"sd of last − first; {what}",
+                          "noise of both epochs", np.array(change)))  # fmt: skip
+        rows.append(ratio("`replay`, `study`: a series", f"sd of the level; {what}",
+                          "EOP and field, as the offsets show it", np.array(level)))  # fmt: skip
+    return rows
+
+
 def calibrate(draws: int, rng: np.random.Generator) -> list[Row]:
     """Four photographs before one field."""
     rows = []

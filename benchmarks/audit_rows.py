@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the page: a ratio of error to sd, or a share of false alarms at 5 %."""
+    """One line of the page: a ratio of error to sd, or a share of false alarms at a level."""
 
     printed_by: str
     what: str
@@ -23,19 +23,19 @@ class Row:
     value: float
     sd: float
     draws: int
-    is_share: bool = False
+    level: float | None = None
     low: float = 0.9
 
     @property
     def met(self) -> bool:
-        if self.is_share:
-            return self.value <= 0.05 + 3 * self.sd
+        if self.level is not None:
+            return self.value <= self.level + 3 * self.sd
         return self.low - 3 * self.sd <= self.value <= 1.1 + 3 * self.sd
 
     def text(self, seed: int) -> str:
-        shown = (
-            f"{100 * self.value:.1f} %" if self.is_share else f"{self.value:.2f} ± {self.sd:.2f}"
-        )
+        shown = f"{self.value:.2f} ± {self.sd:.2f}"
+        if self.level is not None:
+            shown = f"{100 * self.value:.1f} ± {100 * self.sd:.1f} %"
         return (
             f"| {self.printed_by} | {self.what} | {self.holds} | {shown} | {self.draws} | {seed} |"
         )
@@ -49,8 +49,8 @@ def ratio(printed_by: str, what: str, holds: str, standardised: Array, low: floa
     return Row(printed_by, what, holds, value, value / np.sqrt(2 * draws), draws, low=low)
 
 
-def share(printed_by: str, what: str, holds: str, alarms: list[bool]) -> Row:
+def share(printed_by: str, what: str, holds: str, alarms: list[bool], level: float = 0.05) -> Row:
+    """A row of false alarms; its sd is that of a share as large as the level."""
     n = len(alarms)
-    return Row(
-        printed_by, what, holds, float(np.mean(alarms)), np.sqrt(0.05 * 0.95 / n), n, is_share=True
-    )
+    sd = np.sqrt(level * (1 - level) / n)
+    return Row(printed_by, what, holds, float(np.mean(alarms)), sd, n, level=level)

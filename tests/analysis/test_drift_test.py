@@ -117,6 +117,17 @@ def test_one_bad_epoch_is_no_drift():
     assert min(found) > 0.05
 
 
+@pytest.mark.parametrize("step", [0.5, 2.0])
+def test_values_that_are_rounded_are_no_drift(step):
+    """Most steps are then 0 and the others jumps: 95 % drifted at 1 %."""
+    rng = np.random.default_rng(17)
+    found = []
+    for _ in range(100):
+        y = step * np.round(noise(rng, 0, 0) / step) + 1e-3 * noise(rng, 0, 0)
+        found.append(drift_test(y, ONES, REDUNDANCY).p_value <= 0.01)
+    assert np.mean(found) <= 0.05  # 99.9 % point of a share of 1 %
+
+
 @pytest.mark.parametrize("size", [0.5, 1.0, 2.0])
 def test_the_noise_found_is_the_noise_there_is(size):
     rng = np.random.default_rng(11)

@@ -248,6 +248,7 @@ _FIRST_BAND = 4  # low frequencies of the first band; the next have four times a
 _WIDENING = 4
 _LEAST_FAST = 4
 _JUMP = 6.0  # sd of the increments; noise never does that
+_MOST_JUMPS = 0.1  # of the epochs
 _NORMAL_MEDIAN = 0.6745  # of |x| of a standard normal x
 _MEDIAN_SD = 1.5  # times 1/√n: relative sd of that median over third differences of white noise
 _NOTHING = 1e-200  # variance of a series that does not scatter at all
@@ -340,15 +341,20 @@ def _without_spikes(y: Array) -> Array:
     _, scale = _scale_of_steps(np.diff(y))
     inner = out[1:-1]
     spike = np.abs(inner - between) > _JUMP * scale
-    inner[spike] = between[spike]
+    if spike.sum() <= _MOST_JUMPS * len(y):
+        inner[spike] = between[spike]
     return out
 
 
 def _without_jumps(y: Array) -> Array:
-    """The series with its sudden steps taken out: they would pass as noise with a memory."""
+    """The series with its sudden steps taken out: they would pass as noise with a memory.
+
+    Many are noise themselves, of few values: rounded, or to and fro.
+    """
     steps = np.diff(y)
     middle, scale = _scale_of_steps(steps)
-    calm = np.where(np.abs(steps - middle) > _JUMP * scale, middle, steps)
+    jump = np.abs(steps - middle) > _JUMP * scale
+    calm = np.where(jump & (jump.sum() <= _MOST_JUMPS * len(y)), middle, steps)
     return np.concatenate([[0.0], np.cumsum(calm)])
 
 

@@ -155,7 +155,7 @@ def _noisy(
 
 
 def noise(draws: int, rng: np.random.Generator) -> list[Row]:
-    """Epochs of some targets; noise `factor` times as stated, `edge` times more at the corners."""
+    """Few targets, noise or a field that are not as stated: epochs by themselves, and series."""
     rows = []
     for what, targets, factor, edge, worse in (
         ("12 targets", 12, 1.0, 1.0, 1.0),

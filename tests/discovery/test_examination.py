@@ -116,7 +116,7 @@ def test_document(evidence_of):
     first = [next(i for i, line in enumerate(said) if line.startswith(s)) for s in stages]
     assert first == sorted(first)
     assert said.count("targets that moved") == 1
-    assert list(document) == ["format", "verdict", "effects", "gap", "model"]
+    assert list(document) == ["format", "verdict", "effects", "gap", "model", "doubts"]
     assert document["format"] == "thermocald-discovery/1"
     entry = document["effects"][0]
     assert set(entry) == KEYS

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 _FLIP = np.diag([1.0, -1.0, -1.0])  # OpenCV's camera looks along +Z with y down
 _FIELDS_OF_VIEW_DEG = (18.0, 25.0, 33.0, 42.0, 52.0, 62.0, 73.0, 85.0, 98.0)
 _TOLERANCE = 0.005  # of the image width: distortion is not known yet
-_MANY = 8  # pairs
+_MANY = 8  # pairs that three of them do not explain by chance
 _MINIMUM = 4
 _CLEAR = 0.5  # of the pairs, that fit
 
@@ -147,9 +147,8 @@ def majority_pose(
     fewest: pairs that must. RANSAC with SQPnP, refined on the pairs that fit; with three points at
     a time where that finds none, as of points that lie exactly in a plane.
     """
-    # three points fit a few others by chance
-    second = (cv2.SOLVEPNP_AP3P,) if len(X) >= _MANY else ()
-    for solver in (cv2.SOLVEPNP_SQPNP, *second):
+    by_three = max(fewest, _MANY, int(_CLEAR * len(X)) + 1)
+    for solver, least in ((cv2.SOLVEPNP_SQPNP, fewest), (cv2.SOLVEPNP_AP3P, by_three)):
         cv2.setRNGSeed(seed)
         try:
             ok, rvec, tvec, inliers = cv2.solvePnPRansac(
@@ -158,7 +157,7 @@ def majority_pose(
             )  # fmt: skip
         except cv2.error:  # degenerate points fail an assertion in there
             continue
-        if ok and inliers is not None and len(inliers) >= fewest:
+        if ok and inliers is not None and len(inliers) >= least:
             rows = inliers.ravel()
             centre, axes, flat = plane_fit(X[rows])
             if flat and solver == cv2.SOLVEPNP_AP3P:  # it may be the mirrored one

@@ -216,7 +216,7 @@ def _trajectory(d: Discovery) -> Drawing:
             below.plot(x, rests[0] @ along, ".", color=_BASE, ms=2.5)
             if found:
                 shown = measured - rests[1] @ along
-                label = f"with {name}" if len(d.effects) == 1 else "with what was found"
+                label = f"with {name}" if len(d.effects) == 1 else "with all effects"
                 top.plot(x, shown, "-", color=_FOUND, lw=1.2, label=label)
                 below.plot(x, rests[1] @ along, ".", color=_FOUND, ms=2.5)
             below.axhspan(-BAND * noise, BAND * noise, color=GREY, alpha=0.25, lw=0)

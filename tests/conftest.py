@@ -18,8 +18,8 @@ LONGEST = (
     # of the slow suite, by `make test-slow` with --durations
     "daemon/test_endurance", "blind/test_score", "store/test_bounds", "docs/test_commands",
     "analysis/test_running_series", "cli/test_first_hour", "photogrammetry/test_mount",
-    "daemon/test_rhythm", "real_corners/test_real_corners", "main_paths/test_live", "test_properties",
-    "store/test_kills", "analysis/test_scene",
+    "daemon/test_rhythm", "real_corners/test_real_corners", "main_paths/test_live",
+    "test_properties", "store/test_kills", "analysis/test_scene",
     # of the quick one
     "daemon/test_faults", "daemon/test_page_attacks", "discovery/test_examination",
     "daemon/test_sessions", "cli/test_commands", "photogrammetry/test_boards",

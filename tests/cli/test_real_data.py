@@ -144,7 +144,7 @@ def test_hand_held_photographs_of_a_chessboard(shared, tmp_path):
     images = {p.name: cv2.imread(str(p), cv2.IMREAD_GRAYSCALE) for p in sorted(folder.iterdir())}
     opencv = [n for n, g in images.items() if cv2.findChessboardCornersSB(g, (9, 6))[0]]
     y, x = np.mgrid[:720, :1280].astype(np.float32)
-    bent = cv2.remap(images["f240.jpg"], x + 25 * np.sin(y / 150), y, cv2.INTER_LINEAR)
+    bent = cv2.remap(images["f240.jpg"], x + 40 * np.sin(y / 150), y, cv2.INTER_LINEAR)
     cut = images["f090.jpg"].copy()
     cut[:, :560] = 90
     others = {

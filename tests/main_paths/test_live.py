@@ -81,10 +81,13 @@ def test_real_cameras(shared, program, tmp_path, camera):
     assert "was moved" not in said
     for name in MAIN:
         values, sds = column(good(live), name), column(good(live), f"sd_{name}")
-        ratio = ((values - values.mean()) / sds).std(ddof=1)
+        each = (values - values.mean()) / sds
+        ratio = each.std(ddof=1)
         # the aim is 0.9 to 1.1; eight of cam1's targets wander, which its first rows could not know
         most = 1.4 if camera == "aviary-cam1" else 1.25
-        assert 0.75 <= ratio <= most, f"{name}: {ratio:.2f} sd"
+        assert ratio <= most, f"{name}: {ratio:.2f} sd"
+        # the first nine rest on the stated noise, which is more than there is
+        assert each[9:].std(ddof=1) >= 0.75, f"{name}: {each[9:].std(ddof=1):.2f} sd"
     # as somebody would see it who looks at the table: cam1 loses half of its boards on the way
     spread = column(good(live), "c").std() / np.median(column(good(live), "sd_c"))
     assert 0.6 < spread < 1.5, f"c scatters {spread:.2f} of the usual sd"

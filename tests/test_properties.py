@@ -99,7 +99,7 @@ def test_any_value_anywhere_in_a_configuration(amount):
             one_line(error)
             return
         again = config.model_dump(mode="json", by_alias=True)
-        # as text: a driver's option may be no finite number, which the driver refuses and JSON has as null
+        # as text: an option that is no finite number, which its driver refuses, is null in JSON
         first, second = (
             re.sub(r"-?\b(nan|inf)\b", "None", repr(c))
             for c in (config, parse_config(again, SHIPPED, option_names=option_names))

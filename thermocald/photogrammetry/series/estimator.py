@@ -138,7 +138,8 @@ class SeriesEstimator:
         """
         design, q = estimate.system.design, len(estimate.system.design.common)
         Q = estimate.system.Q_common
-        if design.offset_prior is None or self.held is not None or len(Q) <= q:
+        alone = self.s.exterior == "per_epoch"  # takes up what offsets have in common
+        if alone or design.offset_prior is None or self.held is not None or len(Q) <= q:
             return None
         (wx, wy, wxy), (x, y) = design.offset_prior.T, estimate.offsets.T
         T = len(wx)

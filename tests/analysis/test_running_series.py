@@ -259,9 +259,9 @@ def test_an_epoch_of_month_twelve_costs_what_one_of_the_first_days_does(monkeypa
     together: list[int] = []
     real = running_series.adjusted
 
-    def counted(sensor, field, grid, *rest):
+    def counted(sensor, field, grid, *rest, **told):
         together.append(len(grid))
-        return real(sensor, field, grid, *rest)
+        return real(sensor, field, grid, *rest, **told)
 
     monkeypatch.setattr(running_series, "adjusted", counted)
     scene = Scene(11)

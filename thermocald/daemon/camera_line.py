@@ -198,8 +198,9 @@ class SeriesRun:
             if "series_restarted" in columns:
                 self._tell_restart(calibrated)
         if self.observer is not None and in_order:
-            tremble = None if self.running is None else self.running.tremble
-            columns |= self.observer.observe(calibrated, adjusted, tremble)
+            known = self.running
+            told = () if known is None else (known.tremble, known.field_variance)
+            columns |= self.observer.observe(calibrated, adjusted, *told)
         return replace(calibrated, adjustment=adjusted, extra={**calibrated.extra, **columns})
 
     def _tell_restart(self, calibrated: CalibratedEpoch) -> None:

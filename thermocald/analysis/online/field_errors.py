@@ -66,16 +66,19 @@ class FieldErrors:
         self._c = 0.0
         self._compared = 0
 
-    def split(self, adjustment: Adjustment, observations: Observations) -> EpochErrors:
+    def split(
+        self, adjustment: Adjustment, observations: Observations, field_variance: float = 1.0
+    ) -> EpochErrors:
         """The errors of an epoch that has a result, from its own adjustment.
 
-        adjustment: of these observations; its covariance tells which parameters are free.
+        adjustment: of these observations; its covariance tells which parameters are free;
+        field_variance: by what the stated covariance of the coordinates is to be multiplied.
         """
         free = np.flatnonzero(np.diag(adjustment.covariance) > 0)
         used = observations.select(~np.isin(observations.targets, adjustment.rejected))
         rows = used.targets
         A, B = self._design(adjustment.values)
-        A, B = A[rows], B[rows]
+        A, B = A[rows], np.sqrt(field_variance) * B[rows]
         image = _blocks(point_covariances(used, None, None))
         total = _blocks(point_covariances(used, B, self._field.sigmas[rows] ** 2))
         A = A[:, :, free]

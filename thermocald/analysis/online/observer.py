@@ -76,19 +76,19 @@ class OnlineObserver:
 
     def observe(
         self, calibrated: CalibratedEpoch, adjusted: Adjustment | None = None,
-        tremble: Array | None = None,
+        tremble: Array | None = None, field_variance: float = 1.0,
     ) -> dict[str, float]:  # fmt: skip
         """Take an epoch in; returns columns for the store.
 
         adjusted: its result given its series, by default that of the epoch by itself; tremble
         (6, 6): covariance of the mount's movements about its mean, as the epochs up to this one
-        show it.
+        show it; field_variance: by what the stated covariance of the field is to be multiplied.
         """
         epoch, adjustment = calibrated.epoch, adjusted or calibrated.adjustment
         temperature = next(iter(epoch.temperatures.values()), math.nan)
         if not adjustment.ok or epoch.observations is None:
             return {}
-        errors = self._errors.split(adjustment, epoch.observations)
+        errors = self._errors.split(adjustment, epoch.observations, field_variance)
         innovation = self.filter.update(adjustment, temperature, errors, tremble)
         if innovation is None:
             return {}

@@ -226,6 +226,11 @@ class RunningSeries:
         return covariance
 
     @property
+    def field_variance(self) -> float:
+        """By what the stated covariance of the field's coordinates is to be multiplied."""
+        return 1.0 if self._series is None else self._series.found.series.field_variance
+
+    @property
     def any(self) -> bool:
         """Whether there is something that epochs share, and something of their own beside it."""
         s = self._asked
@@ -478,17 +483,21 @@ class RunningSeries:
         if self._binds:
             # the series has tested every point: only what is far off is left to a second test
             s = replace(s, snooping_alpha=_LEFT * s.snooping_alpha)
-        each = self._together(grid, start, s, moved)
+        # epochs by themselves do not show how well the field is known
+        each = self._together(grid, start, s, moved, self.field_variance)
         self._level = self._moved_level(kept, each.sample)
         self._look_at[0] = self._again(_OFTEN)
         return each
 
     def _together(
         self, grid: ObservationGrid, start: Array, s: SeriesSettings,
-        moved: tuple[FieldMovement, ...],
+        moved: tuple[FieldMovement, ...], field_variance: float = 1.0,
     ) -> _Together:  # fmt: skip
         seen = np.flatnonzero(grid.observed.any(axis=0))
-        found = adjusted(self._sensor, self._field.subset(seen), grid.targets(seen), start, s)
+        found = adjusted(
+            self._sensor, self._field.subset(seen), grid.targets(seen), start, s,
+            field_variance=field_variance,
+        )  # fmt: skip
         return _Together(seen, found, result(found), moved)
 
     def _moved_level(self, kept: list[_Kept], sample: SeriesAdjustment) -> Array:

@@ -181,14 +181,18 @@ def adjusted(
     start: Array,
     s: SeriesSettings,
     windows: tuple[slice, ...] = (),
+    field_variance: float = 1.0,
 ) -> Adjusted:
     """Estimate a series on a grid of epochs × all targets of its field, from values (16,).
 
-    windows: runs of consecutive epochs, where the series is a sample of a longer one.
+    windows: runs of consecutive epochs, where the series is a sample of a longer one;
+    field_variance: by what the field's stated covariance is to be multiplied, as far as is known.
     """
     use = grid.observed & enough_targets(grid, s)[:, None]
     first = State(np.tile(start, (len(use), 1)), np.zeros((len(testfield), 2)), start[EOP])
-    series = SeriesEstimator(sensor, testfield, grid, grid.weights, s, windows=windows)
+    series = SeriesEstimator(
+        sensor, testfield, grid, grid.weights, s, windows=windows, field_variance=field_variance
+    )
     if s.exterior in ("mount", "auto"):
         # Loosely bound at first, so that no movement is taken for gross errors.
         bound = loose_bound(series, start)
